@@ -13,9 +13,8 @@ from flame_mdm.formats.motion import Motion
 from flame_mdm.representations.skeleton import KIT21, SMPL22
 from flame_mdm.visualize import player_page, render
 from flame_mdm.visualize.bodies import load_body
-from flame_mdm.visualize.body import ANCHORS, Mesh, fit_body, mannequin, rasterize, try_fit
+from flame_mdm.visualize.body import ANCHORS, Mesh, fit_body, mannequin, rasterize, sides, try_fit
 from flame_mdm.visualize.posture import JOINT
-from flame_mdm.visualize.scene import sides
 
 
 def volume(points: np.ndarray, triangles: np.ndarray) -> float:

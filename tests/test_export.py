@@ -283,7 +283,7 @@ def test_what_does_not_fit_a_file_is_refused(tmp_path, circle):
     kit = Motion(np.random.default_rng(0).normal(size=(5, len(KIT21), 3)), 12.5, KIT21)
     options: dict[str, Any]
     for motion, name, options, message in (
-        (circle, "a.glb", {"rest_pose": True}, "rest_pose is only for .bvh"),
+        (circle, "a.glb", {"rest_pose": True}, "rest_pose only for .bvh"),
         (
             circle,
             "a.bvh",

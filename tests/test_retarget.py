@@ -61,9 +61,11 @@ def test_local_axes_are_those_of_the_skeleton(kick: Motion):
         *(("lafan1", "Hips", "x", (0, 1, 0)), ("lafan1", "Hips", "y", (0, 0, 1)), ("lafan1", "Hips", "z", (1, 0, 0))),
         *(("lafan1", "LeftLeg", "x", "LeftFoot"), ("lafan1", "RightLeg", "x", "RightFoot")),
         *(("lafan1", "LeftArm", "x", "LeftForeArm"), ("lafan1", "RightForeArm", "x", "RightHand")),
-        *(("soma", "LeftShin", "x", "LeftFoot"), ("geno", "LeftArm", "y", "LeftForeArm")),
-        *(("geno", "RightFoot", "z", "RightToeBase"), ("geno", "RightArm", "z", (0, 0, 1))),
-        *(("100style", "LeftShoulder", "x", (1, 0, 0)), ("mixamo", "mixamorig:LeftArm", "y", (0, 1, 0))),
+        *(
+            ("soma", "LeftShin", "x", "LeftFoot"),
+            ("100style", "LeftShoulder", "x", (1, 0, 0)),
+            ("mixamo", "mixamorig:LeftArm", "y", (0, 1, 0)),
+        ),
     ):
         rig = preset(name, kick.posed())
         at, number = dict(zip(rig.joints, rig.positions, strict=True)), rig.joints.index(joint)
@@ -276,7 +278,7 @@ def test_a_folder_is_converted(kick: Motion, tmp_path: Path, capsys: pytest.Capt
 
 @pytest.mark.tools
 @pytest.mark.parametrize("ending", [".glb", ".bvh"])
-@pytest.mark.parametrize("name", ["mixamo", "unreal", "lafan1", "soma", "geno", "hero"])
+@pytest.mark.parametrize("name", ["mixamo", "unreal", "lafan1", "soma", "hero"])
 def test_blender_shows_the_pose(name: str, ending: str, kick: Motion, tmp_path: Path):
     python = blender()
     path, hero = tmp_path / f"a{ending}", tmp_path / f"hero{ending}"

@@ -207,11 +207,11 @@ def test_tables_of_data_folders(folder: Callable):
 def test_long_motions_are_not_resampled_without_end():
     for rate, fps, joints in ((0.1, 20, 22), (1, 1000, 22), (1, 20, 5000)):
         with pytest.raises(ValueError, match="would become"):
-            resampling.resampled_frames(10_000, rate, fps, joints)
+            resampling.frame_pairs(10_000, rate, fps, joints)
     with pytest.raises(ValueError, match="at most 500,000"):
-        resampling.resampled_frames(10**6, 120, 20, 22)
-    assert resampling.resampled_frames(432_000, 120, 20, 52) == 72_000  # an hour
-    assert resampling.resampled_frames(3, 0.1, 20, 22) == 401
+        resampling.frame_pairs(10**6, 120, 20, 22)
+    assert len(resampling.frame_pairs(432_000, 120, 20, 52)[0]) == 72_000  # an hour
+    assert len(resampling.frame_pairs(3, 0.1, 20, 22)[0]) == 401
 
 
 TAKE = "dataset-1_walk_happy_001.bvh"

@@ -201,10 +201,10 @@ def test_bad_motions_are_refused_by_name():
         ({"joints": joints}, "'m': joint 5 in frame 2 is not finite"),
         ({"joints": np.zeros((4, 66))}, r"'m': joints have shape \(4, 66\)"),
         ({"joints": np.zeros((0, 22, 3))}, r"'m': joints have shape \(0, 22, 3\)"),
-        ({"joints": np.zeros((4, 24, 3))}, "'m': 24 joints, but skeleton smpl22 has 22"),
+        ({"joints": np.zeros((4, 24, 3))}, r"'m': joints have shape \(4, 24, 3\), smpl22 needs \(frames, 22, 3\)"),
         ({"fps": 0}, "'m': fps is 0"),
         ({"fps": float("nan")}, "'m': fps is nan"),
-        ({"contacts": np.zeros((3, 4))}, r"contacts have shape \(3, 4\), expected \(frames, feet\) = \(4, 4\)"),
+        ({"contacts": np.zeros((3, 4))}, r"contacts have shape \(3, 4\), expected \(4, 4\)"),
     ):
         with pytest.raises(UserError, match=message):
             Motion(**{**good, **change})

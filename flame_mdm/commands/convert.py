@@ -36,7 +36,7 @@ class ConvertSettings(BodySettings, FileSettings):
     out: str = required(".bvh, .glb, .npz (layout of AMASS), .json or .npy; .mp4 or .gif to look at")
     format: str | None = option(None, "if MOTION is a folder: ending of the files that are written to the folder OUT")
     rest_pose: bool = option(False, "true = .bvh begins with a frame of the rest pose, arms out")
-    rig: str | None = option(None, "skeleton: mixamo, unreal, unity, rigify, lafan1, soma, cmu, geno or 100style")
+    rig: str | None = option(None, "skeleton: mixamo, unreal, unity, rigify, lafan1, soma, cmu or 100style")
     character: str | None = option(
         None, "your own .glb or .bvh file, written with the motion: docs/characters.md", existing
     )

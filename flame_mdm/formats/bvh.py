@@ -21,7 +21,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flame_mdm.errors import UserError
-from flame_mdm.formats.resampling import RATES, frame_pairs, slerp
+from flame_mdm.formats.resampling import RATES, frame_pairs
 from flame_mdm.safe_io import TEXT_LIMIT, regular_file, write_text
 
 CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "XYZ")
@@ -104,8 +104,13 @@ class Bvh:
         """
         before, after, share = frame_pairs(len(self.frames), self.fps, fps, len(self.joints), slack=0)
         translations = self.translations()
-        moved = (1 - share[:, None, None]) * translations[before] + share[:, None, None] * translations[after]
-        return slerp(self.rotations(), before, after, share), moved
+        share = share[:, None, None]
+        moved = (1 - share) * translations[before] + share * translations[after]
+        rotations = self.rotations()
+        turn = rotations[before].mT @ rotations[after]
+        vectors = Rotation.from_matrix(turn.reshape(-1, 3, 3)).as_rotvec().reshape(turn.shape[:3])
+        part = Rotation.from_rotvec((share * vectors).reshape(-1, 3)).as_matrix().reshape(turn.shape)
+        return rotations[before] @ part, moved
 
 
 def forward_kinematics(

@@ -23,9 +23,8 @@ from flame_mdm.formats.retarget import continuous_euler, joint_names, presets
 from flame_mdm.formats.rig import RestPose, Rig, follow, matched, plain, recognized, rest_pose
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.safe_io import read_yaml
-from flame_mdm.visualize.body import fit_body
+from flame_mdm.visualize.body import Shown, fit_body
 from flame_mdm.visualize.posture import JOINT, world_rotations
-from flame_mdm.visualize.scene import Shown
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.linalg import solveh_banded
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
-from flame_mdm.formats.limbs import depths, unit
+from flame_mdm.formats.faults import depths, unit
 from flame_mdm.formats.motion import Motion
 from flame_mdm.representations.skeleton import Skeleton
 

@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import binary_opening
 
-from flame_mdm.formats.limbs import depths, unit
 from flame_mdm.formats.motion import Motion
 
 LOW = 0.05
@@ -29,6 +28,11 @@ LIMITS = {
     "frozen": (0.02, "m/s", "no joint moves faster than 2 cm/s for a second or more"),
 }
 """Fault -> limit, its unit, and what it is. docs/motion-faults.md has the share of real clips that each flags."""
+PALM = 0.3
+"""Distance from the wrist to the middle of the hand, relative to the forearm, whose direction the hand continues."""
+TRUNK, WIDTH, THIGH = 0.18, 1.4, 0.17
+"""Radius of the trunk from front to back, relative to its length from pelvis to neck; how many times as wide as deep
+the trunk is; and radius of a thigh, relative to its length."""
 
 
 class Fault(NamedTuple):
@@ -51,27 +55,27 @@ def find_faults(motion: Motion) -> list[Fault]:
     joints, skeleton, fps = motion.joints.astype(float), motion.skeleton, motion.fps
     names = skeleton.joints
     step = np.linalg.norm(np.diff(joints, axis=0), axis=-1) * fps
-    faults = [
-        *_runs("skating", names, *_skating(joints, skeleton.feet[1::2], fps), frames=math.ceil(0.4 * fps)),
-        *_runs("pop", names, *_pops(joints, fps)),
-        *_runs("bone length", names, *_stretched(joints, skeleton.edges)),
-        *_runs("penetration", names, -joints[..., 1] > LIMITS["penetration"][0], -joints[..., 1]),
-        *_runs("inside", names, *_inside(joints, names)),
-        *_runs("limit", names, *_bends(joints, names)),
-    ]
-    height = joints[..., 1].min(1)[:, None]
+    height, still = joints[..., 1].min(1)[:, None], step.max(1, initial=0.0)[:, None]
     aloft, slow = height > LOW, np.append(step[:, :1], step[-1:, :1], axis=0) < STANDSTILL
     floats = [binary_opening(flag, np.ones((math.ceil(s * fps), 1))) for s, flag in ((0.8, aloft), (0.3, aloft & slow))]
-    faults += _runs("floating", ("body",), np.logical_or(*floats), height)
-    still = step.max(1, initial=0.0)[:, None]
-    frames = max(2, round(fps))
-    faults += _runs("frozen", ("body",), still < LIMITS["frozen"][0], still, frames=frames)
+    faults = [
+        *_runs("skating", names, _skating(joints, skeleton.feet[1::2], fps), frames=math.ceil(0.4 * fps)),
+        *_runs("pop", names, _pops(joints, fps)),
+        *_runs("bone length", names, *_stretched(joints, skeleton.edges)),
+        *_runs("penetration", names, -joints[..., 1]),
+        *_runs("inside", names, _inside(joints, names)),
+        *_runs("limit", names, *_bends(joints, names)),
+        *_runs("floating", ("body",), height, np.logical_or(*floats)),
+        *_runs("frozen", ("body",), still, still < LIMITS["frozen"][0], max(2, round(fps))),
+    ]
     return sorted(faults, key=lambda fault: (fault.start, fault.kind, fault.joint))
 
 
-def _runs(kind: str, names: Sequence[str], flags: np.ndarray, values: np.ndarray, frames: int = 1) -> list[Fault]:
-    """Returns the runs of at least `frames` True in flags (F, J), with the largest of values (F, J)."""
-    runs = []
+def _runs(
+    kind: str, names: Sequence[str], values: np.ndarray, flags: np.ndarray | None = None, frames: int = 1
+) -> list[Fault]:
+    """Returns the runs of at least `frames` frames with flags (F, J), or values (F, J) above the limit."""
+    runs, flags = [], values > LIMITS[kind][0] if flags is None else flags
     for joint in np.flatnonzero(flags.any(0)).tolist():
         flag = binary_opening(flags[:, joint], np.ones(frames)) if frames > 1 else flags[:, joint]
         edges = np.flatnonzero(np.diff(np.r_[0, flag.astype(int), 0]))
@@ -80,39 +84,38 @@ def _runs(kind: str, names: Sequence[str], flags: np.ndarray, values: np.ndarray
     return runs
 
 
-def _skating(joints: np.ndarray, toes: Sequence[int], fps: float) -> tuple[np.ndarray, np.ndarray]:
+def _skating(joints: np.ndarray, toes: Sequence[int], fps: float) -> np.ndarray:
     speed = np.zeros(joints.shape[:2])
     low = joints[:, toes, 1] < LOW
     travel = np.linalg.norm(np.diff(joints[:, toes][..., [0, 2]], axis=0), axis=-1) * fps
     speed[:-1, toes] = travel * (low[1:] & low[:-1])
-    return speed > LIMITS["skating"][0], speed
+    return speed
 
 
-def _pops(joints: np.ndarray, fps: float) -> tuple[np.ndarray, np.ndarray]:
-    """Finds frames in which a joint is far from the middle of its neighbors in time."""
+def _pops(joints: np.ndarray, fps: float) -> np.ndarray:
+    """Returns how far each joint is from the middle of its neighbors in time, as an acceleration."""
     size = np.zeros(joints.shape[:2])
     size[1:-1] = np.linalg.norm(np.diff(joints, n=2, axis=0), axis=-1) * fps**2
-    return size > LIMITS["pop"][0], size
+    return size
 
 
 def _stretched(joints: np.ndarray, edges: Sequence[tuple[int, int]]) -> tuple[np.ndarray, np.ndarray]:
-    change = np.zeros(joints.shape[:2])
-    flags = np.zeros(joints.shape[:2], bool)
+    change, flags = np.zeros(joints.shape[:2]), np.zeros(joints.shape[:2], bool)
     for parent, joint in edges:
         length = np.linalg.norm(joints[:, joint] - joints[:, parent], axis=-1)
         usual = np.median(length)
         change[:, joint] = np.abs(length - usual) / max(usual, 1e-6)
         flags[:, joint] = (change[:, joint] > LIMITS["bone length"][0]) & (np.abs(length - usual) > 0.01)
-    return flags, change
+    return change, flags
 
 
-def _inside(joints: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Finds elbows and wrists in the body; the hand counts as the wrist."""
+def _inside(joints: np.ndarray, names: Sequence[str]) -> np.ndarray:
+    """Returns how deep elbows and wrists are in the body; the hand counts as the wrist."""
     depth = np.zeros(joints.shape[:2])
     for side in ("left", "right"):
         elbow, wrist, hand = depths(joints, names, side)[0].T
         depth[:, names.index(f"{side}_elbow")], depth[:, names.index(f"{side}_wrist")] = elbow, np.maximum(wrist, hand)
-    return depth > LIMITS["inside"][0], depth
+    return depth
 
 
 def _bends(joints: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
@@ -133,4 +136,48 @@ def _bends(joints: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.nda
                 forward = (tilt > limit) & (np.linalg.norm(front, axis=-1) > 0.5)  # a pointed foot has no front
                 flags[:, at] |= forward
                 worst[:, at] = np.where(forward, tilt, worst[:, at])
-    return flags, worst
+    return worst, flags
+
+
+# Arms inside the body -------------------------------------------------------------------------------------------------
+
+
+def depths(joints: np.ndarray, names: Sequence[str], side: str) -> tuple[np.ndarray, np.ndarray]:
+    """Measures the left or right arm against capsules about trunk and thighs, whose sizes follow from the bones.
+
+    Returns:
+        Depth (F, 3) in meters of the elbow, the wrist and the middle of the hand, negative outside; and unit vectors
+        (F, 3, 3) from the axis of the part in which a point is deepest; of joints (F, J, 3) in meters.
+    """
+    at = {name: joints[:, number] for number, name in enumerate(names)}
+    elbow, wrist = at[f"{side}_elbow"], at[f"{side}_wrist"]
+    points = np.stack([elbow, wrist, wrist + PALM * (wrist - elbow)], 1)
+    across = unit(at["left_shoulder"] - at["right_shoulder"])
+    trunk = _away(points, joints[:, 0], at["neck"])
+    lateral = (trunk * across[:, None]).sum(-1, keepdims=True) * across[:, None]
+    away = [trunk - (1 - 1 / WIDTH) * lateral]
+    sizes = [TRUNK * _length(at["neck"] - joints[:, 0])]
+    for leg in ("left", "right"):
+        hip, knee = at[f"{leg}_hip"], at[f"{leg}_knee"]
+        away.append(_away(points, hip, knee))
+        sizes.append(THIGH * _length(knee - hip))
+    depth = np.stack([size - np.linalg.norm(way, axis=-1) for size, way in zip(sizes, away, strict=True)])
+    deepest = depth.argmax(0)[None]
+    way = np.take_along_axis(np.stack(away), deepest[..., None], 0)[0]
+    return np.take_along_axis(depth, deepest, 0)[0], unit(way)
+
+
+def _away(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Returns vectors (F, P, 3) to points (F, P, 3) from the nearest point of a segment with ends (F, 3)."""
+    axis, points = (end - start)[:, None], points - start[:, None]
+    share = (points * axis).sum(-1, keepdims=True) / np.maximum((axis**2).sum(-1, keepdims=True), 1e-9)
+    return points - np.clip(share, 0, 1) * axis
+
+
+def _length(bones: np.ndarray) -> float:
+    return float(np.median(np.linalg.norm(bones, axis=-1)))
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Returns vectors (..., 3) of length 1, or 0 for a vector of no length."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)

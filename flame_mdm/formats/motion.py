@@ -18,8 +18,9 @@ import numpy as np
 import torch
 
 from flame_mdm.errors import UserError, shortened
-from flame_mdm.formats import WRITTEN, bvh, characters, skinned
+from flame_mdm.formats import WRITTEN, bvh, characters
 from flame_mdm.formats.characters import Character
+from flame_mdm.formats.glb import Binary, quaternions
 from flame_mdm.formats.poses import Poses, solve
 from flame_mdm.formats.retarget import continuous_euler, preset, retarget, smpl
 from flame_mdm.formats.rig import CENTIMETER, Rig
@@ -27,10 +28,11 @@ from flame_mdm.representations import rotation
 from flame_mdm.representations.skeleton import SMPL22, Skeleton
 from flame_mdm.representations.smpl import ADULT
 from flame_mdm.safe_io import atomic_write, write_text
-from flame_mdm.visualize.body import Mesh, try_fit
+from flame_mdm.visualize.body import ANCHORS, FittedBody, Mesh, largest_weights, try_fit
 
 AMASS_AXES = torch.tensor([[-1.0, 0, 0], [0, 0, 1], [0, 1, 0]], dtype=torch.float64)
 """Converts AMASS's coordinates, z up, to y up as in HumanML3D: (-x, z, y). It is its own inverse."""
+VERTICES, INDICES = 34962, 34963  # uses of a buffer view in glTF
 END_SITES = {
     **{"head": (0.0, 0.18, 0.0), "left_foot": (0.0, 0.0, 0.06), "right_foot": (0.0, 0.0, 0.06)},
     **{"left_wrist": ADULT[22], "right_wrist": ADULT[23]},
@@ -75,10 +77,8 @@ class Motion:
         name, skeleton = f"motion {self.id!r}", self.skeleton
         self.joints = np.asarray(self.joints, dtype=np.float32)
         shape = self.joints.shape
-        if len(shape) != 3 or shape[2] != 3 or not shape[0]:
-            raise UserError(f"{name}: joints have shape {shape}, expected (frames, joints, 3)")
-        if shape[1] != len(skeleton.joints):
-            raise UserError(f"{name}: {shape[1]} joints, but skeleton {skeleton.name} has {len(skeleton.joints)}")
+        if shape[1:] != (len(skeleton), 3) or not shape[0]:
+            raise UserError(f"{name}: joints have shape {shape}, {skeleton.name} needs (frames, {len(skeleton)}, 3)")
         if not np.isfinite(self.joints).all():
             frame, joint, _ = np.argwhere(~np.isfinite(self.joints))[0]
             raise UserError(f"{name}: joint {joint} in frame {frame} is not finite; did the model diverge?")
@@ -87,9 +87,9 @@ class Motion:
             raise UserError(f"{name}: fps is {self.fps}, expected a number above 0")
         if self.contacts is not None:
             self.contacts = np.asarray(self.contacts, dtype=bool)
-            actual, expected = self.contacts.shape, (shape[0], len(skeleton.feet))
-            if actual != expected:
-                raise UserError(f"{name}: contacts have shape {actual}, expected (frames, feet) = {expected}")
+            expected = (shape[0], len(skeleton.feet))
+            if self.contacts.shape != expected:
+                raise UserError(f"{name}: contacts have shape {self.contacts.shape}, expected {expected}")
 
     def __repr__(self) -> str:
         name = shortened(self.text or self.id, 60)
@@ -123,27 +123,26 @@ class Motion:
             rest_pose: begin a `.bvh` file with a frame of the rest pose, arms out, which some programs expect.
             rig: the skeleton of a `.bvh` or `.glb` file, one of `flame_mdm.formats.retarget.presets`; default: SMPL's.
             character: a `.bvh` or `.glb` file, or what `flame_mdm.formats.characters.read` returned; the same kind of
-                file with this motion is written. The other options do not apply.
+                file with this motion is written.
             body: the body in `.glb`, `.gif` and `.mp4` files, from `flame_mdm.visualize.bodies.load_body`; default: the
                 mannequin.
             facts: additional entries of an `.npz` file, such as the seed.
 
-        Raises:
-            UserError: If the extension, an option or the rig is unknown or does not apply, `.bvh` or `.glb` is
-                requested for another skeleton than SMPL's, the file cannot be written, `.mp4` is requested and the
-                package av is not installed, or the character cannot be used.
+        Raises `UserError` if the extension, an option or the rig is unknown or does not apply, `.bvh` or `.glb` is
+        requested for another skeleton than SMPL's, the file cannot be written, `.mp4` is requested and the package av
+        is not installed, or the character cannot be used.
         """
         path = Path(path)
         ending = path.suffix.lower()
         if ending not in WRITTEN:
             raise UserError(f"{path}: unknown kind of motion file. Use one of {', '.join(WRITTEN)}")
-        if rest_pose and ending != ".bvh":
-            raise UserError(f"{path}: rest_pose is only for .bvh files")
-        if rig is not None and ending not in (".bvh", ".glb"):
-            raise UserError(f"{path}: rig is only for .bvh and .glb files, which contain a skeleton")
+        rigged = character is None and ending in (".bvh", ".glb")
+        if (rig is not None and not rigged) or (rest_pose and (ending != ".bvh" or not rigged)):
+            raise UserError(
+                f"{path}: rig is only for .bvh and .glb files, and rest_pose only for .bvh files; neither is for the "
+                "file of a character"
+            )
         if character is not None:
-            if rest_pose or rig is not None:
-                raise UserError(f"{path}: rest_pose and rig do not apply to a character's own file")
             character = character if isinstance(character, Character) else characters.read(character)
             what = characters.write(path, character, self, self.text or self.id or "motion")
         elif ending == ".bvh":
@@ -229,20 +228,22 @@ def _write_bvh(motion: Motion, path: Path, rest_pose: bool, rig: str | None) -> 
         turns = np.concatenate([skeleton.rest()[None], turns])
         root = np.concatenate([skeleton.positions[None, skeleton.hips], root])
     angles = np.round(np.degrees(continuous_euler(torch.from_numpy(turns), skeleton.orders).numpy()), 6)
-    positions = np.tile(offsets, (len(angles), 1, 1))
-    positions[:, skeleton.hips] = np.round(root / skeleton.unit, 5)
-    moving = [skeleton.moving or joint <= skeleton.hips for joint in range(len(offsets))]
+    channels, columns = [], []
+    for joint, order in enumerate(skeleton.orders):
+        channels.append(tuple(f"{axis}rotation" for axis in order))
+        if joint <= skeleton.hips:  # and a root below which the hips move
+            channels[joint] = (*bvh.CHANNELS[:3], *channels[joint])
+            at_rest = np.tile(offsets[joint], (len(angles), 1))
+            columns.append(np.round(root / skeleton.unit, 5) if joint == skeleton.hips else at_rest)
+        columns.append(angles[:, joint])
     offsets[skeleton.hips] = 0  # programs disagree on whether the channels replace the offset or add to it
     ends = {skeleton.sources.index(SMPL22.joints.index(name)): site for name, site in END_SITES.items()}
-    moves = [("Xposition", "Yposition", "Zposition") * free for free in moving]
-    turning = [tuple(f"{axis}rotation" for axis in order) for order in skeleton.orders]
-    columns = [part for j, free in enumerate(moving) for part in ([positions[:, j]] * free + [angles[:, j]])]
     bvh.write(
         bvh.Bvh(
             joints=skeleton.joints,
             parents=skeleton.parents,
             offsets=offsets,
-            channels=tuple(first + then for first, then in zip(moves, turning, strict=True)),
+            channels=tuple(channels),
             end_parents=tuple(ends),
             end_offsets=np.stack([site @ skeleton.neutral[joint] for joint, site in ends.items()]) / skeleton.unit,
             frames=np.concatenate(columns, axis=1),
@@ -255,10 +256,80 @@ def _write_bvh(motion: Motion, path: Path, rest_pose: bool, rig: str | None) -> 
 
 
 def _write_glb(motion: Motion, path: Path, rig: str | None, body: Mesh | None) -> str:
+    """Writes a .glb file of the motion in meters, y up; the rest pose faces +z, as the format requires.
+
+    It contains one node per joint, one animation that rotates all nodes and moves the hips, with one key per frame in
+    seconds, and a body skinned to the joints, stored in an A-pose, if one fits. The node above the joints lifts it by
+    the thickness of its soles; its toes bend as in pictures.
+    """
     poses = motion.posed()
     fitted, reason = try_fit(motion, body)
-    skinned.write(path, poses, _rig(poses, rig), motion.fps, motion.text, motion.id, fitted)
+    skeleton = _rig(poses, rig)
+    binary = Binary()
+    moved = poses if fitted is None else Poses(poses.offsets, torch.from_numpy(fitted.local()), poses.root)
+    turns, root = retarget(moved, skeleton)
+    turns = quaternions(np.concatenate([skeleton.rest()[None], turns]))
+    curves = [("rotation", node, turns[1:, node]) for node in range(len(skeleton.joints))]
+    curves.append(("translation", skeleton.hips, root.astype("f4")))
+    nodes: list[dict[str, Any]] = [
+        {"name": name, "translation": offset.tolist(), "rotation": turn.tolist()}
+        for name, offset, turn in zip(skeleton.joints, skeleton.offsets(), turns[0], strict=True)
+    ]
+    for joint, parent in enumerate(skeleton.parents):
+        if parent >= 0:
+            nodes[parent].setdefault("children", []).append(joint)
+    animation = binary.animation(motion.text or motion.id or "motion", motion.fps, curves)
+    figure: dict[str, Any] = {}
+    if fitted is not None:
+        nodes.append({"name": "figure", "mesh": 0, "skin": 0})
+        figure = _skin(binary, fitted, skeleton)
+    nodes.append({"name": "lifted", "children": [0], "translation": [0, fitted.lift if fitted else 0, 0]})
+    document = {
+        "asset": {"version": "2.0", "generator": "flame_mdm", "extras": {"fps": motion.fps, "text": motion.text}},
+        "scene": 0,
+        "scenes": [{"nodes": list(range(len(skeleton.joints), len(nodes)))}],
+        "nodes": nodes,
+        "animations": [animation],
+        **figure,
+    }
+    binary.save(path, document)
     return f"meters, y up; {_error(motion, poses)}" + (reason and f"; without a body: {reason}")
+
+
+def _skin(binary: Binary, body: FittedBody, rig: Rig) -> dict[str, Any]:
+    """Appends a body in its stored pose, lifted onto the floor, and returns the document's parts that describe it.
+
+    Helper bones of the body join their joints.
+    """
+    mesh, floor = body.mesh, np.array([0, body.points[:, 1].min(), 0])
+    weights = mesh.weights[:, : len(SMPL22)].copy()
+    np.add.at(weights.T, list(ANCHORS[len(SMPL22) :]), mesh.weights[:, len(SMPL22) :].T)
+    joint, weight = largest_weights(weights)
+    light = np.rint(255 * (np.asarray(mesh.colors) / 255) ** 2.2)  # colors of screens to linear ones
+    attributes = {
+        "POSITION": binary.add((body.points - floor).astype("<f4"), VERTICES, bounds=True),
+        "NORMAL": binary.add(mesh.normals.astype("<f4"), VERTICES),
+        "COLOR_0": binary.add(
+            np.pad(light, ((0, 0), (0, 1)), constant_values=255).astype("u1"), VERTICES, normalized=True
+        ),
+        "JOINTS_0": binary.add(joint, VERTICES),
+        "WEIGHTS_0": binary.add(weight, VERTICES, normalized=True),
+    }
+    indices = binary.add(mesh.triangles.astype("<u2").ravel(), INDICES)
+    skinned = [rig.sources.index(number) for number in range(len(SMPL22))]
+    others = [joint for joint, source in enumerate(rig.sources) if source < 0]
+    bind = np.tile(np.eye(4), (len(rig.joints), 1, 1))
+    stored = body.neutral @ mesh.turns[: len(SMPL22)].mT
+    moves = -(stored @ (body.joints - floor)[..., None])
+    bind[: len(SMPL22), :3] = rig.neutral[skinned].mT @ np.concatenate([stored, moves], -1)
+    bind[len(SMPL22) :, :3, :3] = rig.turns[others].mT
+    bind[len(SMPL22) :, :3, 3:] = -(rig.turns[others].mT @ rig.positions[others, :, None])
+    matrices = binary.add(bind.mT.reshape(-1, 16).astype("<f4"))  # matrices are stored in column-major order
+    return {
+        "meshes": [{"primitives": [{"attributes": attributes, "indices": indices, "material": 0}]}],
+        "materials": [{"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.8}}],
+        "skins": [{"joints": skinned + others, "skeleton": 0, "inverseBindMatrices": matrices}],
+    }
 
 
 def _write_json(motion: Motion, path: Path) -> str:

@@ -7,7 +7,6 @@ import math
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from flame_mdm.errors import UserError
 
@@ -32,11 +31,13 @@ def check_frames(frames: int) -> None:
         raise UserError(f"{frames:,} frames, but a motion may have at most {MAX_FRAMES:,}: cut it")
 
 
-def resampled_frames(frames: int, rate: float, fps: float, joints: int, slack: float = 0.0) -> int:
-    """Returns the number of frames after resampling from `rate` to `fps`, from the first to the last frame.
+def frame_pairs(
+    frames: int, rate: float, fps: float, joints: int, slack: float = 1e-6
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns the frames before and after each new frame, and its position between them, 0 to 1.
 
-    The last frame may be past the end by `slack` of a frame. Raises `UserError` if there are more than `MAX_FRAMES`
-    frames before, or more than `MAX_RESAMPLED` positions after.
+    New frames are at times 0, 1/fps, 2/fps, ... up to the last frame of the motion, or past it by `slack` of a frame.
+    Raises `UserError` if there are more than `MAX_FRAMES` frames before, or more than `MAX_RESAMPLED` positions after.
     """
     check_frames(frames)
     count = math.floor((frames - 1) * fps / rate + slack) + 1
@@ -45,23 +46,13 @@ def resampled_frames(frames: int, rate: float, fps: float, joints: int, slack: f
             f"{frames:,} frames at {rate:g} frames per second would become {count:,} at {fps:g}, with {joints} joints: "
             "too many; check the frame rate, or cut the motion"
         )
-    return count
-
-
-def frame_pairs(
-    frames: int, rate: float, fps: float, joints: int, slack: float = 1e-6
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns the frames before and after each new frame, and its position between them, 0 to 1.
-
-    New frames are at times 0, 1/fps, 2/fps, ... up to the last frame of the motion; see `resampled_frames`.
-    """
-    times = np.arange(resampled_frames(frames, rate, fps, joints, slack)) * rate / fps
+    times = np.arange(count) * rate / fps
     before = np.minimum(times.astype(int), frames - 1)
     return before, np.minimum(before + 1, frames - 1), times - before
 
 
 def resample(values: np.ndarray, rate: float, fps: float, cubic: bool = False) -> np.ndarray:
-    """Resamples positions (F, ...) from `rate` to `fps` frames per second, within the limits of `resampled_frames`.
+    """Resamples positions (F, ...) from `rate` to `fps` frames per second, within the limits of `frame_pairs`.
 
     Cubic splines preserve bone lengths to about 0.1 %; otherwise, it is linear.
     """
@@ -72,11 +63,3 @@ def resample(values: np.ndarray, rate: float, fps: float, cubic: bool = False) -
         return CubicSpline(np.arange(len(values)), values)(before + share)
     share = share.reshape(-1, *[1] * (values.ndim - 1))
     return (1 - share) * values[before] + share * values[after]
-
-
-def slerp(rotations: np.ndarray, before: np.ndarray, after: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Interpolates rotations (F, J, 3, 3) on the sphere and returns (F', J, 3, 3); arguments as from `frame_pairs`."""
-    turn = np.swapaxes(rotations[before], -1, -2) @ rotations[after]
-    vectors = Rotation.from_matrix(turn.reshape(-1, 3, 3)).as_rotvec().reshape(turn.shape[:3])
-    part = Rotation.from_rotvec((share[:, None, None] * vectors).reshape(-1, 3)).as_matrix().reshape(turn.shape)
-    return rotations[before] @ part

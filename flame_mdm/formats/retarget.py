@@ -95,7 +95,6 @@ def preset(name: str, poses: Poses) -> Rig:
         neutral=np.stack(neutral),
         orders=(data["order"],) * len(joints),
         unit=data.get("unit", CENTIMETER),
-        moving=data.get("moving", False),
     )
 
 
@@ -118,8 +117,8 @@ def _axes(axes: dict[str, Any], part: str, joint: str, bone: np.ndarray, right: 
         toward = np.array(DIRECTIONS[direction], float) if direction in DIRECTIONS else bone * flip
         for column in columns:
             toward = toward - matrix[:, column] * (matrix[:, column] @ toward)
-        columns.append("xyz".index(axis[-1]))
-        matrix[:, columns[-1]] = toward / np.linalg.norm(toward) * (-1 if axis.startswith("-") else 1)
+        columns.append("xyz".index(axis))
+        matrix[:, columns[-1]] = toward / np.linalg.norm(toward)
     if columns:
         third = 3 - sum(columns)
         matrix[:, third] = np.cross(matrix[:, (third + 1) % 3], matrix[:, (third + 2) % 3])

@@ -47,8 +47,6 @@ class Rig:
     neutral: np.ndarray  # (J, 3, 3), rotations of these joints in the world while SMPL's are those of its rest pose
     orders: tuple[str, ...]  # of the Euler angles of each joint in BVH files
     unit: float = CENTIMETER  # meters per unit of length in BVH files
-    # every joint has channels of its position in BVH files, not only the pelvis and joints above it
-    moving: bool = False
     frame: np.ndarray = field(default_factory=lambda: np.eye(3))  # (3, 3), rotation from the world of the file
     # (J,), units of the world per unit in the frame of each joint; none = 1
     scales: np.ndarray = field(default_factory=lambda: np.ones(0))

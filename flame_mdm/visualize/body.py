@@ -1,16 +1,22 @@
-"""A body: its mesh, fitted to the bone lengths of a clip and skinned to a motion."""
+"""Motions to draw, and bodies: their mesh, fitted to the bone lengths of a clip and skinned to a motion."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flame_mdm.errors import UserError
-from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.representations.skeleton import SMPL22, Skeleton
 from flame_mdm.visualize.posture import JOINT, complete, world_rotations
-from flame_mdm.visualize.scene import Shown
+
+if TYPE_CHECKING:  # drawing needs numpy and Pillow, not torch
+    from torch import Tensor
 
 TWISTED = {"hip": 0.4, "shoulder": 0.4, "elbow": 0.55}
 """Joints whose limb has a helper bone, and how much of the twist about the limb this has: of the joint's own twist, and
@@ -30,6 +36,51 @@ SKIN, HAIR, SHIRT, TROUSERS, SHOES = MATERIALS = (
     *((98, 106, 124), (64, 62, 66)),
 )
 """Colors of the figure."""
+
+
+class Posed(Protocol):
+    """A body in motion, such as `flame_mdm.formats.poses.Poses`, which describes the attributes."""
+
+    offsets: Tensor
+    rotations: Tensor
+
+
+class Shown(Protocol):
+    """A motion to draw, such as `flame_mdm.formats.motion.Motion`, which describes the attributes."""
+
+    joints: np.ndarray
+    fps: float
+    skeleton: Skeleton
+    text: str
+    id: str
+    contacts: np.ndarray | None
+
+    @property
+    def poses(self) -> Posed | None: ...
+    def posed(self) -> Posed: ...
+
+
+def check_any(motions: Sequence[Shown], path: Path) -> None:
+    """Raises `UserError` if there are no motions to write to `path`."""
+    if not motions:
+        raise UserError(f"{path}: no motions to show")
+
+
+def sides(skeleton: Skeleton) -> list[int]:
+    """Returns for each joint 1 = left, -1 = right, 0 = middle."""
+    return [name.startswith("left_") - name.startswith("right_") for name in skeleton.joints]
+
+
+def head(skeleton: Skeleton) -> int | None:
+    return skeleton.joints.index("head") if "head" in skeleton.joints else None
+
+
+def radii(skeleton: Skeleton) -> list[float]:
+    """Returns the radius of the body around each joint in meters, which grows with the number of its descendants."""
+    below = [0] * len(skeleton.parents)
+    for joint in reversed(range(1, len(below))):
+        below[skeleton.parents[joint]] += below[joint] + 1
+    return [round(0.024 + 0.011 * count**0.5, 4) for count in below]
 
 
 class Mesh:
@@ -80,21 +131,27 @@ def packed(
     `bones` (V, 4) and `weights` (V, 4), which add up to 255; `colors` (V, 3); `triangles` (T, 3); `joints` (22, 3) and
     `turns` (22, 3, 3), the stored pose.
     """
-    bones = np.argsort(-weights, axis=1, kind="stable")[:, :4]
-    most = np.take_along_axis(weights, bones, 1)
-    most = np.floor(255 * most / most.sum(1, keepdims=True) + 0.5).astype(int)
-    most[:, 0] += 255 - most.sum(1)
+    bones, shares = largest_weights(weights)
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
     return {
         "points": np.rint(points * 20000).astype("<i2"),
         "normals": np.rint(normals * 127).astype("i1"),
-        "bones": np.where(most > 0, bones, 0).astype("u1"),
-        "weights": most.astype("u1"),
+        "bones": bones,
+        "weights": shares,
         "colors": np.rint(colors).astype("u1"),
         "triangles": triangles.astype("<u2"),
         "joints": joints,
         "turns": turns,
     }
+
+
+def largest_weights(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the four bones (V, 4) with the largest of weights (V, B), and integers (V, 4) that add up to 255."""
+    bones = np.argsort(-weights, axis=1, kind="stable")[:, :4]
+    most = np.take_along_axis(weights, bones, 1)
+    most = np.floor(255 * most / most.sum(1, keepdims=True) + 0.5).astype(int)
+    most[:, 0] += 255 - most.sum(1)
+    return np.where(most > 0, bones, 0).astype("u1"), most.astype("u1")
 
 
 @cache

@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from flame_mdm.errors import shortened
 from flame_mdm.safe_io import write_text
-from flame_mdm.visualize.body import ANCHORS, FittedBody, Mesh, mannequin, try_fit
-from flame_mdm.visualize.scene import Shown, check_any, head, radii, sides
+from flame_mdm.visualize.body import ANCHORS, FittedBody, Mesh, Shown, check_any, head, mannequin, radii, sides, try_fit
 
 MILLIMETER = 0.001
 

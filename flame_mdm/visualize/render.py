@@ -8,23 +8,33 @@ from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
 from importlib import import_module
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFilter, ImageFont
 
 from flame_mdm.errors import UserError, shortened
 from flame_mdm.safe_io import atomic_write
-from flame_mdm.visualize.body import MATERIALS, FittedBody, Mesh, rasterize, shaded, try_fit
-from flame_mdm.visualize.scene import Shown, check_any, frame_at, head, radii, sides
+from flame_mdm.visualize.body import (
+    MATERIALS,
+    FittedBody,
+    Mesh,
+    Shown,
+    check_any,
+    head,
+    radii,
+    rasterize,
+    shaded,
+    sides,
+    try_fit,
+)
 
 Color = tuple[int, int, int]
 SIDE_COLORS: dict[int, Color] = {1: (47, 127, 209), -1: (226, 112, 42), 0: (140, 149, 163)}
+RIM_COLORS: dict[int, Color] = {1: (26, 70, 115), -1: (124, 62, 23), 0: (77, 82, 90)}
 PAPER, GROUND, LINE, TEXT, FAINT = (255, 255, 255), (243, 245, 247), (205, 211, 219), (28, 36, 48), (102, 112, 133)
 SHADOW, TRAIL, CONTACT = (212, 216, 222), (122, 91, 208), (15, 157, 107)
 NEAR = 0.3
 """Distance from the camera in meters below which nothing is drawn."""
-LIT, DARK = 0.3, -0.45
 YAW, PITCH = 0.6, 0.24
 TOWARD = np.array([math.sin(YAW) * math.cos(PITCH), math.sin(PITCH), math.cos(YAW) * math.cos(PITCH)])
 """Direction from the body to the camera, which is in front, to the left and above."""
@@ -93,8 +103,6 @@ def contact_sheet(
     """
     path = Path(path)
     check_any(motions, path)
-    if frames < 1:
-        raise UserError(f"{path}: {frames} poses per row, expected at least 1")
     rows = []
     for motion in motions:
         fitted, _ = try_fit(motion, body)
@@ -126,8 +134,7 @@ def thumbnail(motion: Shown, height: int = 120) -> bytes:
 
 def _palette() -> Image.Image:
     """Returns one palette of all colors and their blends at smoothed edges, so that colors do not flicker."""
-    limbs = [color for side in SIDE_COLORS.values() for color in (side, _shade(side, LIT), _shade(side, DARK))]
-    drawn = np.array([*limbs, LINE, TEXT, FAINT, SHADOW, TRAIL, CONTACT])
+    drawn = np.array([*SIDE_COLORS.values(), *RIM_COLORS.values(), LINE, TEXT, FAINT, SHADOW, TRAIL, CONTACT])
     light = np.linspace(0.4, 1.12, 26)[:, None]
     body = np.concatenate([np.minimum(light * color, 255) for color in MATERIALS])
     grounds = np.array([PAPER, GROUND])
@@ -155,7 +162,8 @@ def _video(motions: Sequence[Shown], fps: float, size: int, mesh: Mesh | None) -
 
     with ThreadPoolExecutor(min(len(motions), os.cpu_count() or 1)) as pool:
         for tick in range(count):
-            now = [frame_at(motion, tick / fps) for motion in motions]
+            # past its end, a motion stays at its last frame
+            now = [min(int(tick / fps * motion.fps + 1e-6), len(motion.joints) - 1) for motion in motions]
             panels, frames = list(pool.map(draw, range(len(motions)), now)), now
             height = panels[0].height
             image = Image.new("RGB", (columns * size, math.ceil(len(motions) / columns) * height + 3), PAPER)
@@ -198,9 +206,8 @@ def _figure(motion: Shown, body: FittedBody | None, frame: int, size: int) -> Im
     shadow = project(joints * floor)
     soft = shadow * [0.25, 0.25, 0.25, 1]  # drawn smaller and then enlarged
     dark = Image.new("L", (side // 4, side // 4))
-    for joint, parent in enumerate(motion.skeleton.parents):
-        if parent >= 0:
-            _capsule(ImageDraw.Draw(dark), soft[parent], soft[joint], 0.055, 0.055, 255)
+    for parent, joint in motion.skeleton.edges:
+        _capsule(ImageDraw.Draw(dark), soft[parent], soft[joint], 0.055, 255)
     dark = dark.filter(ImageFilter.BoxBlur(size / 192))
     if box := dark.getbbox():  # enlarged with a margin, so that its edge is the same as that of the whole image
         left, top, right, bottom = max(0, box[0] - 4), max(0, box[1] - 4), box[2] + 4, box[3] + 4
@@ -215,9 +222,7 @@ def _figure(motion: Shown, body: FittedBody | None, frame: int, size: int) -> Im
         at, pixels = project(points), np.array(image)
         rasterize(pixels, at[:, :2], at[:, 3], shaded(normals, body.mesh.colors, TOWARD), body.mesh.triangles)
         return Image.fromarray(pixels).reduce(SMOOTH)
-    for limb in sorted(_limbs(motion, joints, project), key=lambda limb: -limb.depth):
-        if min(limb.a[3], limb.b[3]) > NEAR:
-            _draw(pen, limb, pixel)
+    _draw_skeleton(pen, motion, joints, project, pixel)
     return image.reduce(SMOOTH)
 
 
@@ -243,93 +248,56 @@ def _points(projected: np.ndarray) -> list[tuple[float, float]]:
     return [(x, y) for x, y in projected[:, :2].tolist()]
 
 
-class Limb(NamedTuple):
-    """Two ends (x, y, pixels per meter, depth), their radii in meters, and a color."""
-
-    a: np.ndarray
-    b: np.ndarray
-    radius_a: float
-    radius_b: float
-    color: Color
-
-    @property
-    def depth(self) -> float:
-        return float(self.a[3] + self.b[3]) / 2
-
-
-def _limbs(motion: Shown, joints: np.ndarray, project: Callable[[np.ndarray], np.ndarray]) -> list[Limb]:
-    at, skeleton, parents = project(joints), motion.skeleton, motion.skeleton.parents
+def _draw_skeleton(
+    pen: ImageDraw.ImageDraw, motion: Shown, joints: np.ndarray, project: Callable[[np.ndarray], np.ndarray], rim: float
+) -> None:
+    """Draws joints (J, 3) and the head, the farthest limb first, each with a dark rim of `rim` pixels."""
+    at, skeleton = project(joints), motion.skeleton
     thickness, side_of, top = radii(skeleton), sides(skeleton), head(skeleton)
     limbs = []
-    for joint, parent in enumerate(parents):
-        if parent >= 0:
-            color = SIDE_COLORS[side_of[joint] if side_of[parent] == side_of[joint] else 0]
-            thick = min(thickness[parent], 1.35 * thickness[joint])
-            limbs.append(Limb(at[parent], at[joint], thick, thickness[joint], color))
+    for parent, joint in skeleton.edges:
+        side = side_of[joint] if side_of[parent] == side_of[joint] else 0
+        limbs.append((at[parent], at[joint], thickness[joint], side))
     if top is not None:
-        up = joints[top] - joints[parents[top]]
+        up = joints[top] - joints[skeleton.parents[top]]
         up /= np.linalg.norm(up) or 1
-        chin, crown = project(joints[top] + np.array([[0.05], [0.11]]) * up)
-        limbs.append(Limb(chin, crown, 0.08, 0.09, SIDE_COLORS[0]))
-    return limbs
-
-
-def _draw(pen: ImageDraw.ImageDraw, limb: Limb, rim: float) -> None:
-    """Draws a limb in its color, with a dark rim and a highlight toward the light from the upper left."""
-    a, b, radius_a, radius_b, color = limb
-    _capsule(pen, a, b, radius_a, radius_b, _shade(color, DARK), grow=rim)
-    _capsule(pen, a, b, radius_a, radius_b, color)
-    across = np.array([-(b - a)[1], (b - a)[0]])
-    across /= np.linalg.norm(across) or 1
-    if across @ [-0.5, -0.87] < 0:
-        across = -across
-    shift = np.append(across * min(radius_a * a[2], radius_b * b[2]) * 0.35, [0, 0])
-    _capsule(pen, a + shift, b + shift, 0.45 * radius_a, 0.45 * radius_b, _shade(color, LIT))
+        limbs.append((*project(joints[top] + np.array([[0.05], [0.11]]) * up), 0.085, 0))
+    for a, b, radius, side in sorted(limbs, key=lambda limb: -limb[0][3] - limb[1][3]):
+        if min(a[3], b[3]) > NEAR:
+            _capsule(pen, a, b, radius, RIM_COLORS[side], rim)
+            _capsule(pen, a, b, radius, SIDE_COLORS[side])
 
 
 def _capsule(
-    pen: ImageDraw.ImageDraw, a: np.ndarray, b: np.ndarray, ra: float, rb: float, color: Color | int, grow: float = 0
+    pen: ImageDraw.ImageDraw, a: np.ndarray, b: np.ndarray, radius: float, color: Color | int, grow: float = 0
 ) -> None:
-    """Fills the convex hull of two circles of radius `ra` and `rb` meters, `grow` pixels wider."""
-    (ax, ay, ra), (bx, by, rb) = (*a[:2], ra * a[2] + grow), (*b[:2], rb * b[2] + grow)
-    length = math.hypot(bx - ax, by - ay)
-    if length > abs(ra - rb):
-        angle, open_ = math.atan2(by - ay, bx - ax), math.acos((ra - rb) / length)
-        corners = [
-            (x + r * math.cos(angle + turn), y + r * math.sin(angle + turn))
-            for x, y, r, turn in ((ax, ay, ra, open_), (bx, by, rb, open_), (bx, by, rb, -open_), (ax, ay, ra, -open_))
-        ]
-        pen.polygon(corners, color)
-    for x, y, r in ((ax, ay, ra), (bx, by, rb)):
-        pen.ellipse((x - r, y - r, x + r, y + r), color)
-
-
-def _shade(color: Color, light: float) -> Color:
-    """Returns a darker or lighter color: -1 is black, 0 is unchanged, 1 is white."""
-    red, green, blue = (round(c + (255 - c) * light if light > 0 else c * (1 + light)) for c in color)
-    return red, green, blue
+    """Draws a line with round ends, whose radius is `radius` meters and `grow` pixels."""
+    (ax, ay, per_meter_a, *_), (bx, by, per_meter_b, *_) = a, b
+    size_a, size_b = radius * per_meter_a + grow, radius * per_meter_b + grow
+    pen.line([(ax, ay), (bx, by)], color, round(size_a + size_b))
+    for x, y, size in ((ax, ay, size_a), (bx, by, size_b)):
+        pen.ellipse((x - size, y - size, x + size, y + size), color)
 
 
 def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     return ImageFont.load_default(max(10, size // 18))
 
 
-def _wrapped(text: str, width: int, size: int) -> list[str]:
-    """Breaks a caption into lines of words that fit; a third line ends in an ellipsis if text is left."""
+def _lines(motion: Shown, body: FittedBody | None, width: int, size: int) -> list[str]:
+    """Returns the lines of a motion's caption; a third one ends in an ellipsis if text is left.
+
+    A last line says so if the motion is drawn as a skeleton.
+    """
     lines, font = [""], _font(size)
-    for word in shortened(text, width).split():  # more does not fit into three lines
+    for word in shortened(motion.text or motion.id, width).split():  # more does not fit into three lines
         longer = f"{lines[-1]} {word}".strip()
         if font.getlength(longer) <= width - 16:
             lines[-1] = longer
         else:
             lines.append(word)
     lines = [line for line in lines if line]
-    return [*lines[:2], f"{lines[2]} …"] if len(lines) > 3 else lines
-
-
-def _lines(motion: Shown, body: FittedBody | None, width: int, size: int) -> list[str]:
-    """Returns the lines of a motion's caption; the last one says so if it is drawn as a skeleton."""
-    return [*_wrapped(motion.text or motion.id, width, size), *["(no body fits)"] * (body is None)]
+    lines = [*lines[:2], f"{lines[2]} …"] if len(lines) > 3 else lines
+    return lines if body else [*lines, "(no body fits)"]
 
 
 def _caption(texts: Sequence[str], width: int, lines: int, size: int) -> Image.Image:

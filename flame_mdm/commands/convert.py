@@ -38,7 +38,7 @@ class ConvertSettings(BodySettings, FileSettings):
     rest_pose: bool = option(False, "true = .bvh begins with a frame of the rest pose, arms out")
     rig: str | None = option(None, "skeleton: mixamo, unreal, unity, rigify, lafan1, soma, cmu or 100style")
     character: str | None = option(
-        None, "your own .glb or .bvh file, written with the motion: docs/characters.md", existing
+        None, "your own .glb file with a skin, written with the motion: docs/characters.md", existing
     )
 
 

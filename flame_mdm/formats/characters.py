@@ -1,4 +1,4 @@
-"""Motions on a user's own character: the skeleton of a .bvh file, or of the skin of a .glb file.
+"""Motions on a user's own character: the skeleton of the skin of a .glb file.
 
 The character may have other proportions, units, axes, names and another rest pose than SMPL's body. Bones of arms and
 legs take the directions of those of the motion. Trunk, head, hands and feet are turned as in the motion, starting from
@@ -14,12 +14,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from flame_mdm.errors import UserError, did_you_mean
-from flame_mdm.formats import bvh, glb
+from flame_mdm.formats import glb
 from flame_mdm.formats.layouts import LAYOUTS
-from flame_mdm.formats.retarget import continuous_euler, joint_names, presets
+from flame_mdm.formats.retarget import joint_names, presets
 from flame_mdm.formats.rig import RestPose, Rig, follow, matched, plain, recognized, rest_pose
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.safe_io import read_yaml
@@ -29,9 +28,9 @@ from flame_mdm.visualize.posture import JOINT, world_rotations
 
 @dataclass(frozen=True, eq=False)
 class Character(RestPose):
-    """A character and its BVH or GLB file."""
+    """A character and its file."""
 
-    file: bvh.Bvh | glb.Glb
+    file: glb.Glb
 
 
 def read(path: str | Path) -> Character:
@@ -40,26 +39,8 @@ def read(path: str | Path) -> Character:
     Raises `UserError` if the file is damaged, or has no skin, known joints (`UnknownJoints`) or usable rest pose.
     """
     path = Path(path)
-    if path.suffix.lower() == ".glb":
-        return _read_glb(path)
-    if path.suffix.lower() != ".bvh":
-        raise UserError(f"character={path}: not a character. Use a .bvh or .glb file")
-    file = bvh.read(path)
-    joints = identify(path, dict(enumerate(file.joints)))
-    identity = np.tile(np.eye(3), (1, len(file.joints), 1, 1))
-    problem = None
-    for turns, offsets in ((identity, file.offsets[None]), (file.rotations()[:1], file.translations()[:1])):
-        positions, turned = (values[0] for values in bvh.forward_kinematics(file.parents, turns, offsets))
-        ends = [positions[p] + turned[p] @ end for p, end in zip(file.end_parents, file.end_offsets, strict=True)]
-        try:
-            pose = rest_pose(path, file.joints, file.parents, positions, turned, joints, [*positions, *ends])
-            return Character(pose.rig, pose.map, pose.floor, file)
-        except UserError as error:  # many files have no rest pose, but begin with one
-            problem = problem or error
-    raise problem or AssertionError
-
-
-def _read_glb(path: Path) -> Character:
+    if path.suffix.lower() != ".glb":
+        raise UserError(f"character={path}: not a character. Use a .glb file")
     file = glb.read(path)
     skeletons: list[set[int]] = []
     for skin in file.skins:
@@ -157,16 +138,16 @@ def identify(path: Path, names: Mapping[int, str]) -> dict[str, int]:
 
 
 def _listed(path: Path, listed: Path, chosen: object, names: Mapping[int, str]) -> dict[str, list[int]]:
-    if not isinstance(chosen, dict) or not all(isinstance(name, str | None) for name in chosen.values()):
+    if not isinstance(chosen, dict):
         raise UserError(f"{listed}: not a list of names, each on a line such as `left_knee: Calf L`")
-    if unknown := next((joint for joint in chosen if joint not in JOINT), None):
-        raise UserError(f"{listed}: {unknown} is no joint of SMPL.{did_you_mean(str(unknown), JOINT)}")
     candidates = {}
     for joint, name in chosen.items():
+        if joint not in JOINT:
+            raise UserError(f"{listed}: {joint} is no joint of SMPL.{did_you_mean(str(joint), JOINT)}")
         if name is not None:
             candidates[joint] = [number for number, own in names.items() if own == name]
             if not candidates[joint]:
-                similar = did_you_mean(name, names.values())
+                similar = did_you_mean(str(name), names.values())
                 raise UserError(f"{listed}: {joint}: {path} has no joint {name}.{similar}")
     return candidates
 
@@ -181,49 +162,10 @@ def known_skeletons() -> list[dict[str, str]]:
 
 
 def write(path: Path, character: Character, motion: Shown, name: str) -> str:
-    """Writes the character's file with a motion, and returns a line that describes it; raises `UserError` if it cannot.
-
-    A .glb file keeps its content and gets a further animation, the first one; a .bvh file gets other frames.
-    """
-    ending = ".bvh" if isinstance(character.file, bvh.Bvh) else ".glb"
-    if path.suffix.lower() != ending:
-        raise UserError(f"{path}: this character is a {ending} file, so name a {ending} file for the result")
-    world, positions, rig = moved(character, motion)
-    if isinstance(character.file, bvh.Bvh):
-        _write_bvh(path, character.file, rig, world, positions, motion.fps)
-    else:
-        _write_glb(path, character.file, rig, world, positions, motion.fps, name)
-    follow = sum(source >= 0 for source in rig.sources)
-    return f"{follow} of {len(rig.joints)} joints follow the motion, {len(rig.joints) - follow} keep their angle"
-
-
-def _write_bvh(path: Path, file: bvh.Bvh, rig: Rig, world: np.ndarray, positions: np.ndarray, fps: float) -> None:
-    local, offsets, frames = rig.local(world), rig.offsets(), np.zeros((len(world), file.frames.shape[1]))
-    mover = hips = rig.hips
-    while rig.parents[mover] >= 0 and not any(name.endswith("position") for name in file.channels[mover]):
-        mover = rig.parents[mover]
-    moves = positions[:, hips] - rig.positions[hips]
-    for joint, (names, column) in enumerate(zip(file.channels, file.columns(), strict=True)):
-        order = "".join(name[0] for name in names if name.endswith("rotation"))
-        if len(order) < 3 and rig.sources[joint] >= 0:
-            raise UserError(
-                f"{path}: {rig.joints[joint]} has {len(order)} rotation channels in the character's file, not 3"
-            )
-        position = np.tile(offsets[joint], (len(world), 1))
-        if joint == mover:
-            position = rig.within(rig.positions[joint] + moves, joint)
-        values = {f"{axis}position": position[:, k] for k, axis in enumerate("XYZ")}
-        if len(order) == 3:
-            angles = continuous_euler(torch.from_numpy(local[:, [joint]]), (order,))[:, 0].numpy()
-            values |= {f"{axis}rotation": np.degrees(angles[:, k]) for k, axis in enumerate(order)}
-        for k, name in enumerate(names):
-            frames[:, column.start + k] = np.round(values.get(name, np.zeros(len(world))), 6)
-    bvh.write(replace(file, frames=frames, fps=fps), path)
-
-
-def _write_glb(
-    path: Path, file: glb.Glb, rig: Rig, world: np.ndarray, positions: np.ndarray, fps: float, name: str
-) -> None:
+    """Writes the character's file with a further animation, the first one, and returns a line that describes it."""
+    if path.suffix.lower() != ".glb":
+        raise UserError(f"{path}: this character is a .glb file, so name a .glb file for the result")
+    file, (world, positions, rig) = character.file, moved(character, motion)
     document, hips = copy.deepcopy(file.document), rig.hips
     binary = glb.Binary(file.data, document["bufferViews"], document["accessors"])
     local, offsets, rest = rig.local(world), rig.offsets(), rig.rest()
@@ -241,5 +183,7 @@ def _write_glb(
                 curves.append(("rotation", file.nodes[joint], turns[1:]))
     curves.append(("translation", file.nodes[hips], rig.within(positions[:, hips], hips).astype("f4")))
     # programs show the first animation
-    document["animations"] = [binary.animation(name, fps, curves), *document.get("animations", [])]
+    document["animations"] = [binary.animation(name, motion.fps, curves), *document.get("animations", [])]
     binary.save(path, document)
+    follow = sum(source >= 0 for source in rig.sources)
+    return f"{follow} of {len(rig.joints)} joints follow the motion, {len(rig.joints) - follow} keep their angle"

@@ -122,8 +122,8 @@ class Motion:
             path: the file; its extension selects the format.
             rest_pose: begin a `.bvh` file with a frame of the rest pose, arms out, which some programs expect.
             rig: the skeleton of a `.bvh` or `.glb` file, one of `flame_mdm.formats.retarget.presets`; default: SMPL's.
-            character: a `.bvh` or `.glb` file, or what `flame_mdm.formats.characters.read` returned; the same kind of
-                file with this motion is written.
+            character: a `.glb` file with a skin, or what `flame_mdm.formats.characters.read` returned; it is written
+                with this motion.
             body: the body in `.glb`, `.gif` and `.mp4` files, from `flame_mdm.visualize.bodies.load_body`; default: the
                 mannequin.
             facts: additional entries of an `.npz` file, such as the seed.

@@ -158,7 +158,7 @@ def rest_pose(
     turned: np.ndarray,
     joints: Mapping[str, int],
     lowest: Sequence[np.ndarray] | np.ndarray,
-    vertical: Sequence[int] | None = None,
+    vertical: Sequence[int],
 ) -> RestPose:
     """Returns a rest pose, turned to y up and +z ahead.
 
@@ -168,7 +168,7 @@ def rest_pose(
         positions, turned: (J, 3) and rotations (J, 3, 3) in a world of any unit and direction.
         joints: SMPL's joint -> index of the character's.
         lowest: points that include the lowest one.
-        vertical: (3,), up; None = the one of y and z along which the trunk points.
+        vertical: (3,), up.
     """
     at = {joint: positions[number] for joint, number in joints.items()}
 
@@ -176,8 +176,7 @@ def rest_pose(
         return (at[f"left_{name}"] + at[f"right_{name}"]) / 2
 
     trunk, legs = middle("shoulder") - middle("hip"), middle("hip") - middle("ankle")
-    _, y, z = np.eye(3)
-    up = max((y, -y, z, -z), key=lambda axis: trunk @ axis) if vertical is None else np.array(vertical)
+    up = np.array(vertical)
     shortest = max(1e-4 * float(np.linalg.norm(legs)), 1e-9)
     for side in SIDES:
         for start, end in LIMBS.items():

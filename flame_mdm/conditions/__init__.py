@@ -34,11 +34,7 @@ class ConditionEncoder(nn.Module, ABC):
         """Fills the encoder's cache on disk, if it has one, for these captions. Called in one process only."""
 
     def load_cache(self, captions: Sequence[str], folder: Path) -> None:
-        """Opens the cache that `precompute` filled, in every process.
-
-        Raises:
-            FileNotFoundError, ValueError: If there is no cache for these captions, or it is damaged.
-        """
+        """Opens the cache that `precompute` filled, in every process; raises `UserError` if it is damaged."""
 
     def cache_size(self) -> int:
         """Returns the size of the opened cache in bytes."""

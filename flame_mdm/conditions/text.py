@@ -4,27 +4,25 @@ import hashlib
 import importlib.util
 import json
 import re
-import shutil
-import uuid
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
 from torch import Tensor, nn
-from torch.nn.utils.rnn import pad_sequence
 
-from flame_mdm.batch import Condition, MotionBatch, length_mask, sent
+from flame_mdm.batch import Condition, MotionBatch, sent
 from flame_mdm.conditions import ConditionEncoder
 from flame_mdm.errors import UserError
 from flame_mdm.progress import ProgressBar
-from flame_mdm.safe_io import made_folder, sha256, writing
+from flame_mdm.safe_io import atomic_write, sha256
 
 CAPTIONS_AT_ONCE = 64
-POOLINGS = ("projection", "mean", "pooler")
 
 
 class PretrainedText(ConditionEncoder):
@@ -55,9 +53,6 @@ class PretrainedText(ConditionEncoder):
         encode_null: the null is the encoded "" (FLAME); otherwise it is zeros (MDM), with the token mask of the
             sample it replaces.
         freeze: False fine-tunes the language model together with the motion model.
-
-    Raises:
-        ValueError: `pooling` is unknown.
     """
 
     pooler_weight: Tensor
@@ -79,12 +74,10 @@ class PretrainedText(ConditionEncoder):
         freeze: bool = True,
     ):
         super().__init__()
-        if pooling not in POOLINGS:
-            raise UserError(f"condition.pooling={pooling} is unknown: choose one of {', '.join(POOLINGS)}")
         self.features, self.max_tokens, self.pooling, self.normalize = features, max_tokens, pooling, normalize
         self.tokens, self.attend_padding, self.encode_null, self.freeze = tokens, attend_padding, encode_null, freeze
         self._pretrained = Pretrained(model, revision, package, sha256)
-        self._cache: CaptionCache | None = None
+        self._cache: EncodedCaptions | None = None
         if not freeze:
             with torch.device("cpu"):  # also in a model that is built on the meta device
                 self.network = self._pretrained.load_network().train()
@@ -117,34 +110,24 @@ class PretrainedText(ConditionEncoder):
         return Condition(pooled, tokens, token_mask, null)
 
     def precompute(self, captions: Sequence[str], folder: Path) -> None:
-        """Encodes each distinct caption once, unless a complete cache exists; rebuilds a damaged one."""
+        path = self._cache_path(captions, folder)
         if not self.freeze:
             return
-        distinct, path = self._distinct(captions), self._cache_path(captions, folder)
         if path.exists():
             try:
-                CaptionCache(path).verify()
+                EncodedCaptions.open(path)
                 return
-            except ValueError as error:
+            except UserError as error:
                 warnings.warn(f"{error}; rebuilding it", stacklevel=2)
-                shutil.rmtree(path)
         device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-        encoded = ProgressBar(
-            self._encode_frozen(distinct, device),
-            desc=f"encoding captions with {self._pretrained.model}",
-            total=len(distinct),
-            disable=None,
-        )
-        CaptionCache.write(path, distinct, encoded, self.features)
+        encoded = self._encode_frozen(self._distinct(captions), device, quiet=False)
+        with atomic_write(path) as temporary:
+            encoded.save(temporary)
         self._pretrained.unload()
 
     def load_cache(self, captions: Sequence[str], folder: Path) -> None:
-        if not self.freeze:
-            return
-        path = self._cache_path(captions, folder)
-        if not path.exists():
-            raise FileNotFoundError(f"{path}: no cached embeddings of these captions; precompute them first")
-        self._cache = CaptionCache(path)
+        if self.freeze:
+            self._cache = EncodedCaptions.open(self._cache_path(captions, folder))
 
     def cache_size(self) -> int:
         return self._cache.pooled.nbytes + self._cache.tokens.nbytes if self._cache else 0
@@ -162,7 +145,7 @@ class PretrainedText(ConditionEncoder):
         options = [source.model, source.revision, source.sha256, self.features, self.max_tokens]
         options += [self.pooling, self.tokens, self.attend_padding]
         key = hashlib.sha256(json.dumps([options, self._distinct(captions)]).encode()).hexdigest()
-        return Path(folder) / f"{Path(source.model).name}-{key[:16]}"
+        return Path(folder) / f"{Path(source.model).name}-{key[:16]}.safetensors"
 
     def _pool(self, first: Tensor) -> Tensor:
         """Applies the steps of pooling that are not cached: (N, C) -> (N, C)."""
@@ -199,28 +182,24 @@ class PretrainedText(ConditionEncoder):
         size = hidden.shape[1] if self.tokens else 0
         return first, (hidden * token_mask[..., None])[:, :size], token_mask[:, :size]
 
-    def _encode_frozen(self, captions: Sequence[str], device: torch.device) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Yields vector (C,) float32 and tokens (S, C) float16 of each caption; encodes in batches."""
-        network = self._pretrained.network.to(device)
-        for start in range(0, len(captions), CAPTIONS_AT_ONCE):
-            with torch.no_grad(), torch.autocast(device.type, enabled=False):
+    def _encode_frozen(self, captions: Sequence[str], device: torch.device, quiet: bool = True) -> "EncodedCaptions":
+        network, encoded, offsets = self._pretrained.network.to(device), [], [0]
+        batches = range(0, len(captions), CAPTIONS_AT_ONCE)
+        title = f"encoding captions with {self._pretrained.model}"
+        with torch.no_grad(), torch.autocast(device.type, enabled=False):
+            for start in ProgressBar(batches, title, unit=" batches", disable=quiet or None):
                 first, tokens, token_mask = self._encode(captions[start : start + CAPTIONS_AT_ONCE], network, device)
-            lengths = token_mask.sum(1).tolist()
-            for f, t, length in zip(first.cpu().numpy(), tokens.half().cpu().numpy(), lengths, strict=True):
-                yield f, t[:length]
+                encoded.append((first.cpu(), tokens[token_mask].half().cpu()))
+                offsets += (offsets[-1] + token_mask.sum(1).cumsum(0)).tolist()
+            pooled, tokens = (torch.cat(parts) for parts in zip(*encoded, strict=True))
+        return EncodedCaptions(captions, pooled, tokens, torch.tensor(offsets))
 
     def _look_up(self, captions: Sequence[str], device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-        """Like `_encode`, but reads captions from the cache if possible."""
-        if self._cache is not None and all(caption in self._cache for caption in captions):
-            return self._cache.gather(captions, device)
-        encoded = {c: self._cache[c] for c in captions if c in self._cache} if self._cache is not None else {}
-        missing = sorted(set(captions) - set(encoded), key=len)
-        if missing:
-            encoded |= zip(missing, self._encode_frozen(missing, device), strict=True)
-        first = torch.from_numpy(np.stack([encoded[caption][0] for caption in captions]))
-        tokens = [torch.from_numpy(encoded[caption][1]) for caption in captions]
-        token_mask = length_mask(torch.tensor([len(rows) for rows in tokens])).to(device)
-        return first.to(device), pad_sequence(tokens, batch_first=True).to(device).float(), token_mask
+        """Like `_encode`, but reads the captions from the cache if it has all of them."""
+        encoded, distinct = self._cache, set(captions)
+        if encoded is None or not encoded.rows.keys() >= distinct:
+            encoded = self._encode_frozen(sorted(distinct, key=len), device)
+        return encoded.gather(captions, device)
 
 
 SAFE = {"trust_remote_code": False}
@@ -228,13 +207,10 @@ SAFE = {"trust_remote_code": False}
 
 
 class Pretrained:
-    """Source of a language model, which is loaded on first use and not included in copies and pickles."""
+    """Source of a language model, which is loaded on first use."""
 
     def __init__(self, model: str, revision: str | None, package: str | None, sha256: str | None):
         self.model, self.revision, self.package, self.sha256 = model, revision, package, sha256
-
-    def __reduce__(self):
-        return Pretrained, (self.model, self.revision, self.package, self.sha256)
 
     @cached_property
     def tokenizer(self):
@@ -253,8 +229,8 @@ class Pretrained:
     def load_network(self) -> nn.Module:
         """Loads a new copy of the network, float32.
 
-        Raises:
-            FileNotFoundError, UserError: If it cannot be had, has an unexpected hash or gaps, or names no commit.
+        Raises `FileNotFoundError` or `UserError` if it is missing or incomplete, has an unexpected hash, or names no
+        commit.
         """
         from transformers import AutoConfig, AutoModel, CLIPTextModelWithProjection, T5EncoderModel, logging
 
@@ -265,8 +241,8 @@ class Pretrained:
                 f"{weights} is not the published file (sha256 {self.sha256}): "
                 "pip install --force-reinstall flame-mdm[offline]"
             )
-        text_half = {"clip": CLIPTextModelWithProjection, "clip_text_model": CLIPTextModelWithProjection}
-        loader = {**text_half, "t5": T5EncoderModel}.get(kind, AutoModel)
+        text_halves = dict.fromkeys(("clip", "clip_text_model"), CLIPTextModelWithProjection) | {"t5": T5EncoderModel}
+        loader = text_halves.get(kind, AutoModel)
         # The published pooler of BERT is not used, and RoBERTa has none: see PretrainedText.
         options = {"add_pooling_layer": False} if kind in ("bert", "roberta") else {}
         verbosity = logging.get_verbosity()
@@ -309,40 +285,31 @@ class Pretrained:
         return Path(spec.origin).parent / "model"
 
 
-class CaptionCache:
-    """Outputs of a language model on disk: a folder with two arrays and an index.
+class EncodedCaptions:
+    """Outputs of a language model: vectors (N, C) float32 and tokens (T, C) float16 of N captions.
 
-    The index contains the captions, the offsets of their tokens, and the sha256 of the arrays. The arrays `pooled`
-    (N, C) and `tokens` (T, C) are memory-mapped until they are moved to a device; copies of the cache map the files.
+    The tokens of caption n are those from `offsets[n]` to `offsets[n + 1]`. Arrays read from a file are memory-mapped.
     """
 
-    POOLED, TOKENS, INDEX = "pooled.f32", "tokens.f16", "index.json"
-
-    def __init__(self, folder: Path):
-        """Opens a cache. Raises `UserError` if the index cannot be read, or an array has the wrong size."""
-        self.folder = folder
-        try:
-            index = json.loads((folder / self.INDEX).read_text())
-            captions, features = index["captions"], index["features"]
-            self.offsets = np.array(index["offsets"], np.int64)
-            self.sha256: dict[str, str] = index["sha256"]
-        except (OSError, ValueError, KeyError, OverflowError) as error:
-            raise UserError(f"{folder / self.INDEX} is damaged ({error})") from error
+    def __init__(self, captions: Sequence[str], pooled: Tensor, tokens: Tensor, offsets: Tensor):
         self.rows = {caption: row for row, caption in enumerate(captions)}
-        self.pooled = self._open(self.POOLED, np.float32, (len(captions), features))
-        self.tokens = self._open(self.TOKENS, np.float16, (self.offsets[-1], features))
+        self.pooled, self.tokens, self.offsets = pooled, tokens, offsets.numpy()
+        if not len(pooled) + 1 == len(offsets) == len(captions) + 1 or offsets[-1] != len(tokens):
+            raise ValueError("its arrays do not belong together")
 
-    def __reduce__(self):
-        return CaptionCache, (self.folder,)
+    @classmethod
+    def open(cls, path: Path) -> "EncodedCaptions":
+        """Returns the content of a file; raises `UserError` if it is missing or damaged."""
+        try:
+            with safe_open(path, "pt") as file:
+                captions = json.loads(file.metadata()["captions"])
+                return cls(captions, *(file.get_tensor(name) for name in ("pooled", "tokens", "offsets")))
+        except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
+            raise UserError(f"{path} is damaged ({error})") from error
 
-    def __contains__(self, caption: str) -> bool:
-        return caption in self.rows
-
-    def __getitem__(self, caption: str) -> tuple[np.ndarray, np.ndarray]:
-        """Returns vector (C,) and tokens (S, C) of a caption."""
-        row = self.rows[caption]
-        tokens = self.tokens[self.offsets[row] : self.offsets[row + 1]]
-        return self.pooled[row].cpu().numpy(), tokens.cpu().numpy()
+    def save(self, path: Path) -> None:
+        arrays = {"pooled": self.pooled, "tokens": self.tokens, "offsets": torch.from_numpy(self.offsets)}
+        save_file(arrays, path, {"captions": json.dumps(list(self.rows))})
 
     def gather(self, captions: Sequence[str], device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
         """Returns vectors (N, C), tokens (N, S, C) and their mask (N, S) of captions, float32, on a device."""
@@ -356,48 +323,4 @@ class CaptionCache:
         # On a CPU, this is ten times as fast as indexing the tables.
         pooled, tokens = nn.functional.embedding(row, self.pooled), nn.functional.embedding(index, self.tokens)
         pooled, tokens, token_mask = (sent(x, device) for x in (pooled, tokens, token_mask))
-        tokens = tokens.float()
-        if (lengths < lengths.max()).any():
-            tokens.masked_fill_(~token_mask[..., None], 0)
-        return pooled, tokens, token_mask
-
-    def verify(self) -> None:
-        """Checks the hashes of the arrays. Raises `UserError` if an array has changed since it was written."""
-        for name, expected in self.sha256.items():
-            if sha256(self.folder / name) != expected:
-                raise UserError(f"{self.folder / name} is damaged (its sha256 differs from the index)")
-
-    @classmethod
-    def write(
-        cls, folder: Path, captions: Sequence[str], encoded: Iterable[tuple[np.ndarray, np.ndarray]], features: int
-    ) -> None:
-        """Writes a cache next to `folder` and renames it when it is complete."""
-        partial, offsets = folder.with_name(f".{folder.name}-{uuid.uuid4().hex}"), [0]
-        with made_folder(folder.parent):
-            try:
-                with writing(folder, partial):
-                    partial.mkdir()
-                    with (partial / cls.POOLED).open("wb") as pooled, (partial / cls.TOKENS).open("wb") as tokens:
-                        for vector, rows in encoded:
-                            pooled.write(vector.astype(np.float32).tobytes())
-                            tokens.write(rows.astype(np.float16).tobytes())
-                            offsets.append(offsets[-1] + len(rows))
-                    hashes = {name: sha256(partial / name) for name in (cls.POOLED, cls.TOKENS)}
-                    index = {"captions": list(captions), "offsets": offsets, "features": features, "sha256": hashes}
-                    (partial / cls.INDEX).write_text(json.dumps(index))
-                try:
-                    partial.rename(folder)
-                except OSError:
-                    if not folder.exists():  # otherwise another run was faster, with the same content
-                        raise
-            finally:
-                shutil.rmtree(partial, ignore_errors=True)
-
-    def _open(self, name: str, dtype: type, shape: tuple[int, int]) -> Tensor:
-        path = self.folder / name
-        expected = shape[0] * shape[1] * np.dtype(dtype).itemsize
-        size = path.stat().st_size if path.is_file() else 0
-        if size != expected:
-            raise UserError(f"{path} is damaged ({size} bytes instead of {expected})")
-        # Mode "c" never changes the file; torch warns of arrays that cannot be written.
-        return torch.from_numpy(np.memmap(path, dtype, "c", shape=shape) if expected else np.zeros(shape, dtype))
+        return pooled, tokens.float().masked_fill_(~token_mask[..., None], 0), token_mask

@@ -232,15 +232,16 @@ EXPECTED = {
 _adapter = functools.cache(TypeAdapter)
 
 
-def check_shape(content: Any, kind: type[T] | Any) -> T:
+def check_shape(content: Any, kind: type[T] | Any, strict: bool = True) -> T:
     """Returns content of a file converted to a `Schema` or another type that pydantic supports.
 
-    Raises `ValueError` if it has another type; the message gives key, found value and expected type.
+    Raises `ValueError` if it has another type; the message gives key, found value and expected type. For dataclasses,
+    `strict` is False, and "1" is a number.
     """
     if large := _too_large(content):
         raise ValueError(f"{large[:40]} ... is too large for a JSON integer; the maximum is {MAX_INTEGER:,}")
     try:
-        return _adapter(kind).validate_python(content, strict=True)
+        return _adapter(kind).validate_python(content, strict=strict)
     except ValidationError as error:
         raise ValueError(_first_error(error, content)) from error
 

@@ -33,7 +33,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "conditions": GROUND,
     "visualize": GROUND | {"representations"},
     "formats": GROUND | {"representations", "visualize"},
-    "data": GROUND | {"representations", "visualize", "formats"},
+    "data": GROUND | {"representations", "visualize", "formats", "schemas"},
     "generator": GROUND | AXES,
     "task": GROUND | AXES | {"data", "generator"},
     "schemas": GROUND,

@@ -84,12 +84,12 @@ def test_what_is_not_paired_has_no_difference(three, tmp_path, capsys):
     values = {"fid": of(4.5, [4.4, 4.6])}
     put(three[0], values=values)
     for changes, message in (
-        (None, "mine/two: no evaluation. To evaluate: make evaluate CKPT="),
+        (None, "No evaluation in common"),
         ({"seed": 1}, "not compared: other seed"),
         ({"invalid_because": ["real motions are off"]}, "not compared: not valid: real motions are off"),
         ({"values": {"fid": of(4.2, [4.1, 4.3], n=65)}}, "not compared: no metric has values per replication"),
         ({"values": result()["values"]}, "evaluate both again; motions are not generated again"),
-        ({"protocol": {"name": "q", "version": 3}}, "mine/two: q version 3, synthetic test, data abc"),
+        ({"protocol": {"name": "q", "version": 3}}, "q version 3, synthetic test, data abc"),
         ({"extractor": {"sha256": "0" * 64}}, "No evaluation in common"),
     ):
         if changes is not None:

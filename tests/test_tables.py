@@ -20,9 +20,7 @@ from flame_mdm.reporting.tables.build import build
 from flame_mdm.reporting.tables.format import (
     Cell,
     Line,
-    Part,
     Table,
-    fragment,
     markdown,
     ranks,
 )
@@ -460,13 +458,3 @@ def test_a_result_is_outdated_when_checkpoint_or_extractor_are_others_now(folder
             assert outdated(path, request) == stand_in
     (folder / "mdm.ckpt").write_bytes(b"trained again")
     assert outdated(path, request)
-
-
-def test_pages_show_no_empty_rows_and_columns():
-    lines = [Line("a", "measured", [Cell("1.5"), None]), Line("b", "measured", [None, None], state="no checkpoint")]
-    lines.append(Line("c", "measured", [None, None], state="NOT VALID"))
-    body = str(fragment(Table("t", "T", [Part("p", {"FID": "lower", "Jitter": "real"}, lines)])))
-    assert "Jitter" not in body
-    assert body.count("<tr") == 3
-    assert "c (NOT VALID)</td>" in body
-    assert "Without values: b (no checkpoint)" in body

@@ -77,7 +77,7 @@ SPECS = {
     ROWS.format(keys="note: '${oc.env:HOME}'"): "holds an interpolation",
     ROWS.format(keys="data.source._target_: os.system"): "data.source._target_",
     ROWS.format(keys="hydra.searchpath: x"): "only keys of the data",
-    f"title: t\nparts: {{P: {{protocol: x, rows: [], columns: {{{COLUMNS}}}}}}}\n": "500 exceed the limit of 100",
+    f"title: t\nparts: {{P: {{protocol: x, rows: [], columns: {{{COLUMNS}}}}}}}\n": "not a shorter list",
     ROWS.format(keys="note: n") + f"figures: [{{part: P, x: nfe, y: {['FID'] * 300}}}]\n": "300 exceed the limit",
     "title: caf\udce9\n": "not a UTF-8 text file",
     "title: t\nparts: {P: {recipes: {a: quickstart}, keys: {}}}\n": "keys is {}, not a longer",

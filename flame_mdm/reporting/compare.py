@@ -158,15 +158,11 @@ def grouped(runs: Mapping[str, Run]) -> dict[str, list[tuple[str, Result]]]:
 
 
 def in_common(runs: Mapping[str, Run]) -> list[str]:
-    """Returns why no evaluation can be compared, one line per run; [] if two runs have the same evaluation."""
+    """Returns why no evaluation can be compared; [] if two runs have the same evaluation."""
     groups = grouped(runs)
     if any(len({label for label, _ in columns}) > 1 for columns in groups.values()):
         return []
-    lines = ["No evaluation in common: differences need the same protocol, data and extractor."]
-    for label, run in runs.items():
-        titles = [title for title, columns in groups.items() if columns[0][0] == label]
-        lines.append(f"{label}: {'; '.join(titles) or f'no evaluation. To evaluate: make evaluate CKPT={run.folder}'}")
-    return lines
+    return ["No evaluation in common: differences need the same protocol, data and extractor.", *groups]
 
 
 def tested(columns: Sequence[tuple[str, Result]]) -> list[tuple[str, list[list[str]]]]:

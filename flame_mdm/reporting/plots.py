@@ -112,8 +112,9 @@ def _drawn(panel: Panel) -> dict[str, Any] | None:
     if not logarithmic:
         reach = [y + sign * s.spread.get(x, 0) for s in series for x, y in points[s.name] for sign in (-1, 1)]
         low, high = min([low, *reach, *panel.levels]), max([high, *reach, *panel.levels])
-    y_axis = _log_axis(low, high) if logarithmic else _linear_axis(low, high)
-    x_axis = _log_axis(min(xs), max(xs)) if panel.log_x else _snug_axis(0 if panel.from_zero else min(xs), max(xs))
+    y_axis = _log_axis(low, high) if logarithmic else _linear_axis(low, high, to_ticks=True)
+    first = 0 if panel.from_zero else min(xs)
+    x_axis = _log_axis(min(xs), max(xs)) if panel.log_x else _linear_axis(first, max(xs), to_ticks=False)
 
     def at(x: float, y: float) -> tuple[str, str]:
         across, down = WIDE - LEFT - RIGHT, HIGH - TOP - BOTTOM
@@ -171,22 +172,17 @@ def _thinned(points: Sequence[tuple[float, float]]) -> Sequence[tuple[float, flo
     return [p for part in parts for p in sorted({min(part, key=lambda q: q[1]), max(part, key=lambda q: q[1])})]
 
 
-def _linear_axis(low: float, high: float) -> _Axis:
-    """Returns an axis that ends at ticks."""
+def _linear_axis(low: float, high: float, to_ticks: bool) -> _Axis:
+    """Returns an axis that ends at the extreme values, or at ticks."""
     low, high = (value if abs(value) > SMALLEST else 0.0 for value in (low, high))
     if high - low <= 1e-9 * max(abs(low), abs(high)):
         low, high = low - (abs(low) or 1) / 10, high + (abs(high) or 1) / 10
-    step = _round_step((high - low) / 4)
-    ticks = [k * step for k in range(math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9) + 1)]
-    return _Axis(ticks[0], ticks[-1], ticks)
-
-
-def _snug_axis(low: float, high: float) -> _Axis:
-    """Returns an axis that ends at the extreme values."""
-    if high - low <= SMALLEST:
-        low, high = low - (low != 0) * max(1, abs(low) / 1e9), low + max(1, abs(low) / 1e9)
-    step = _round_step((high - low) / 5)
-    begin, end = math.ceil(low / step - 0.02), math.floor(high / step + 0.02)  # an axis up to 2999 has a tick at 3k
+    step = _round_step((high - low) / (4 if to_ticks else 5))
+    if to_ticks:
+        begin, end = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
+        low, high = begin * step, end * step
+    else:
+        begin, end = math.ceil(low / step - 0.02), math.floor(high / step + 0.02)  # 2999 has a tick at 3k
     return _Axis(low, high, [k * step for k in range(begin, end + 1)])
 
 

@@ -7,8 +7,8 @@ import io
 import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from itertools import compress, groupby
+from dataclasses import dataclass, field
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -154,7 +154,7 @@ def fragment(table: Table) -> Markup:
 
 
 def _rendered(template: str, table: Table) -> Markup:
-    functions = {"blocks": _blocks, "head": _head, "label": _label, "linked": _linked, "filled": _filled, "tex": _tex}
+    functions = {"blocks": _blocks, "head": _head, "label": _label, "linked": _linked, "tex": _tex}
     ranked = any(better != "none" for part in table.parts for better in part.columns.values())
     return render(
         template,
@@ -176,19 +176,6 @@ def _linked(table: Table, text: str) -> list[tuple[str, str]]:
         (part, Path(os.path.relpath(part, table.folder)).as_posix() if i % 2 and Path(part).exists() else "")
         for i, part in enumerate(CARD.split(text))
     ]
-
-
-def _filled(part: Part) -> tuple[Part, list[str]]:
-    """Returns a part without rows and columns that have no value, and the labels of the rows that are left out.
-
-    Rows that are not valid stay, so that nobody misses the reason.
-    """
-    lines = [line for line in part.lines if any(line.cells) or line.state in NO_RESULTS]
-    empty = [_label(line) for line in part.lines if line not in lines]
-    shown = [any(line.cells[k] for line in lines) for k in range(len(part.columns))]
-    columns = dict(compress(part.columns.items(), shown))
-    lines = [replace(line, cells=list(compress(line.cells, shown))) for line in lines]
-    return replace(part, columns=columns, lines=lines), empty
 
 
 def _blocks(part: Part) -> list[tuple[str, list[Line]]]:

@@ -85,11 +85,11 @@ class RowSpec(Options):
 class PartSpec(Options):
     """A part of a table: either columns and rows, recipes and keys, or lengths."""
 
-    columns: dict[str, ColumnSpec] = Field({}, min_length=1)
+    columns: dict[str, ColumnSpec] = Field({}, min_length=1, max_length=MOST_COLUMNS)
     rows: list[RowSpec] = Field([])
-    recipes: dict[str, str] = Field({}, min_length=1)
-    keys: dict[str, str] = Field({}, min_length=1)
-    lengths: list[str] = Field([])
+    recipes: dict[str, str] = Field({}, min_length=1, max_length=MOST_COLUMNS)
+    keys: dict[str, str] = Field({}, min_length=1, max_length=MOST_ROWS)
+    lengths: list[str] = Field([], max_length=MOST_COLUMNS)
 
     @model_validator(mode="after")
     def _one_kind(self) -> Self:
@@ -98,9 +98,6 @@ class PartSpec(Options):
             raise ValueError("needs columns and rows, or recipes and keys, or lengths")
         options = [[len(as_list(getattr(row, n))) for n in SWEPT if n in row.model_fields_set] for row in self.rows]
         _at_most("rows", sum(map(math.prod, options)), MOST_ROWS)
-        _at_most("keys", len(self.keys), MOST_ROWS)
-        for name in ("columns", "recipes", "lengths"):
-            _at_most(name, len(getattr(self, name)), MOST_COLUMNS)
         if self.rows and not self.protocol:
             raise ValueError("needs a protocol")
         return self

@@ -14,7 +14,6 @@ from scipy.stats import hypergeom, rankdata
 from torch import Tensor
 from torchmetrics import Metric
 
-from evaluators.audit_sets import BASE, REAL, Inputs, Scene, Text, text_of
 from evaluators.evaluator import Evaluator, Motions, Rows
 from evaluators.extractors import OwnExtractor
 from evaluators.metrics import alignment, make_metrics, physics, update_metrics
@@ -22,7 +21,7 @@ from evaluators.metrics.attributes import AttributeAccuracy, read_attributes, ri
 from evaluators.metrics.distribution import FrechetMotionDistance, frechet_distance
 from evaluators.metrics.diversity import Diversity
 from evaluators.metrics.published_physics import MeanOverMotions
-from evaluators.perturbations import Perturbation
+from evaluators.perturbations import BASE, REAL, Inputs, Perturbation, Scene, Text, text_of
 from evaluators.plan import open_data
 from evaluators.protocol import digest, open_protocol
 from evaluators.request import EvaluationRequest

@@ -11,13 +11,12 @@ import pytest
 import torch
 from support.fixtures import ROOT
 
-import evaluators.audit_sets as audit_sets
+from evaluators import perturbations
 from evaluators.audit import _inputs, _Measure
-from evaluators.audit_sets import BASE, REAL, Text
 from evaluators.evaluator import Evaluator, Motions
 from evaluators.extractors import Extractor
 from evaluators.metrics.alignment import MotionsForText, TextsForMotion
-from evaluators.perturbations import PERTURBATIONS
+from evaluators.perturbations import BASE, PERTURBATIONS, REAL, Text
 from evaluators.protocol import load_protocol
 from flame_mdm.__main__ import main
 from flame_mdm.data.synthetic import Synthetic
@@ -166,7 +165,7 @@ def test_pages_escape(card, tmp_path):
 def test_an_audit_resumes_and_gives_the_same_card(tmp_path, monkeypatch, capsys):
     names = ("jitter", "mirrored", "near misses", "missing actions", "memorized", "fewer", "half precision")
     few = [perturbation for perturbation in PERTURBATIONS if perturbation.name in names]
-    monkeypatch.setattr(audit_sets, "PERTURBATIONS", few)
+    monkeypatch.setattr(perturbations, "PERTURBATIONS", few)
     passes: list[int] = []
     extract = Evaluator.extract
     monkeypatch.setattr(Evaluator, "extract", lambda self, x: passes.append(len(x)) or extract(self, x))

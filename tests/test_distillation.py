@@ -419,8 +419,6 @@ def test_the_demo_offers_a_model_with_and_without_an_adapter(taught):
     expected = flame_mdm.load(base, adapter=adapter).state_dict()
     torch.testing.assert_close(studio.model(f"{base} + {adapter}").state_dict(), expected, rtol=0, atol=0)
     request = DemoRequest(model=f"{base} + {adapter}", text="a person walks")
-    assert f"flame-mdm sample {base} 'text=a person walks'" in request.command("text", None)
-    assert f"adapter={adapter}" in request.command("text", None)
     assert f"flame_mdm.load({base!r}, adapter={adapter!r})" in request.python("text", "cpu")
 
 

@@ -235,7 +235,6 @@ def test_cleanup_is_noted_in_the_results(trained, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["sample", f"ckpt={trained}", "text=a person walks", "samples=1", "seconds=1.5", "cleanup=true"]) == 0
     (path,) = Path("samples").rglob("motion_000.npz")
-    assert "-cleanup=True" in path.parent.name
     model, raw = load(trained), generate(load(trained), "a person walks", seconds=1.5)[0]
     with np.load(path) as motion:
         assert motion["cleanup"]

@@ -17,8 +17,8 @@ from flame_mdm.checkpoints.locating import find
 from flame_mdm.checkpoints.model_files import state_sha256
 from flame_mdm.conditions.tokens import LearnedTokens
 from flame_mdm.conditions.vocabulary import words
-from flame_mdm.config import EXPERIMENTS, Config, check, compose, instantiate
-from flame_mdm.config.composition import quoted
+from flame_mdm.config import EXPERIMENTS, Config, check, instantiate
+from flame_mdm.config.composition import ConfigSource, prepare_overrides, quoted, resolve
 from flame_mdm.data import Clip, MotionSource
 from flame_mdm.data.adaptation import LessonData, check_clips, styled
 from flame_mdm.data.folder import Folder
@@ -120,7 +120,8 @@ def _about(model: MotionGeneration, captions: Sequence[str], name: str, rank: in
 def _recipe(model: MotionGeneration, captions: Sequence[str], name: str, out: Path, overrides: Sequence[str]) -> Config:
     if own := [word for word in overrides if word.partition(".")[0] in OF_BASE]:
         raise UserError(f"{own[0]}: an adaptation keeps the {own[0].partition('.')[0]} of its base. Drop it")
-    config = compose(str(EXPERIMENTS / "adapt.yaml"), [quoted(f"run.dir={out}"), *overrides])
+    recipe = ConfigSource(EXPERIMENTS, "adapt")  # checked by the caller, once it is complete
+    config = resolve(recipe, *prepare_overrides(recipe, [quoted(f"run.dir={out}"), *overrides]))
     config |= {part: model.config[part] for part in OF_BASE if part in model.config}
     config["experiment"], config["run"]["name"], config["data"]["name"] = f"adapt/{name}", name, name
     data, longest = model.config.get("data") or {}, model.facts["max_frames"] // 4 * 4

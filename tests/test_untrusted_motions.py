@@ -377,8 +377,17 @@ def small_store(folder: Path, clip: dict[str, Any], info: dict[str, Any]) -> Non
     (folder / "store.json").write_text(json.dumps(content | info))
 
 
-CLIPS = [("action", 99), ("action", -1), ("action", "a"), ("action", True), ("id", 5), ("id", ""), ("captions", None)]
-CLIPS += [("captions", [5]), ("start", 3.0), ("length", "4"), ("source", 1), ("split", []), ("attributes", [])]
+CLIPS = [("action", 99), ("action", -1), ("action", "a"), ("action", {}), ("id", 5), ("id", ""), ("captions", None)]
+CLIPS += [
+    ("captions", [5]),
+    ("start", 3.5),
+    ("start", -1),
+    ("length", 0),
+    ("length", 5),
+    ("source", 1),
+    ("split", []),
+    ("attributes", []),
+]
 COUNTS = {"train": 1, "val": 0, "test": 0}
 INFOS = [("hours", 10**400), ("fps", 10**400), ("clips", COUNTS | {"<b>x": 1}), ("clips", COUNTS | {"val": "x"})]
 INFOS += [("clips", {"train": 1}), ("actions", [1])]
@@ -394,10 +403,10 @@ def test_every_field_of_a_store_is_checked(tmp_path: Path):
     Store(tmp_path).verify()
     for name, value in CLIPS:
         small_store(tmp_path, {name: value}, {})
-        refuses(f"clips.jsonl: damaged: line 1: no valid {name}", opened, tmp_path)
+        refuses("clips.jsonl: damaged: line 1: ", opened, tmp_path)
     for name, value in INFOS:
         small_store(tmp_path, {}, {name: value})
-        refuses(f"store.json: damaged: no valid {name}", opened, tmp_path)
+        refuses("store.json: damaged: ", opened, tmp_path)
     small_store(tmp_path, {}, {"fingerprint": "0123456789abcdef"})
     refuses("store.json: damaged: its fingerprint", opened, tmp_path)
     for content in (zipped({"a.npy": b"x"}), header((2**70, 263), "<f4"), header((-1, 263), "<f4")):

@@ -46,7 +46,7 @@ from flame_mdm.safe_io import (
     regular_file,
     sha256,
 )
-from flame_mdm.schemas import Int, Schema, check_shape
+from flame_mdm.schemas import ClosedSchema, Int, Schema, check_shape
 
 FORMAT = 1
 BLOCK = 8192  # frames that are read together for the statistics
@@ -59,7 +59,7 @@ class Entry:
 
     id: Annotated[str, Field(min_length=1)]
     start: Count
-    length: Annotated[int, Field(ge=1)]
+    length: Annotated[Count, Field(ge=1)]
     split: Split
     source: str
     captions: list[str]
@@ -67,7 +67,7 @@ class Entry:
     attributes: dict[str, Any] = field(default_factory=dict)
 
 
-class Splits(Schema):
+class Splits(ClosedSchema):
     """Number of clips of each split."""
 
     train: Int

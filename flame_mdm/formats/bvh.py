@@ -10,7 +10,6 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal
@@ -27,8 +26,6 @@ from flame_mdm.safe_io import TEXT_LIMIT, regular_file, write_text
 CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "XYZ")
 MAX_JOINTS = 4096  # maximum number of joints and end sites of a file
 LARGEST = 1e9  # largest number that is read
-MAX_LABELED_LINE = 200
-"""Maximum length of a line with a label. Python needs quadratic time for numbers with many digits."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,12 +47,8 @@ class Bvh:
         return [slice(end - len(names), end) for end, names in zip(ends, self.channels, strict=True)]
 
     def with_end_joints(self) -> Bvh:
-        """Returns the file with its end sites as joints: `NAME.end`, or `NAME.end2` for the second one of a joint."""
-        count = Counter[int]()
-        names = []
-        for parent in self.end_parents:
-            count[parent] += 1
-            names.append(f"{self.joints[parent]}.end{count[parent] if count[parent] > 1 else ''}")
+        """Returns the file with its end sites as joints: `NAME.end`, also if a joint has several."""
+        names = [f"{self.joints[parent]}.end" for parent in self.end_parents]
         return replace(
             self,
             joints=(*self.joints, *names),
@@ -138,55 +131,43 @@ def read(path: str | Path) -> Bvh:
 def parse(data: bytes, name: str) -> Bvh:
     """Reads the bytes of a BVH file, called `name` in errors."""
     source = _Source(data, name)
-    joints: list[str] = []
-    parents: list[int] = []
-    offsets: list[list[float] | None] = []
-    channels: list[tuple[str, ...]] = []
-    end_parents: list[int] = []
-    end_offsets: list[list[float] | None] = []
-    blocks: list[int] = []  # the joints whose braces are open, then -1 inside an end site
+    joints: list[_Node] = []
+    ends: list[_Node] = []
+    blocks: list[_Node] = []  # those whose braces are open
 
     while (keyword := source.token().upper()) != "MOTION":
-        joint = blocks[-1] if blocks else None
-        if len(joints) + len(end_parents) > MAX_JOINTS:
+        node = blocks[-1] if blocks else None
+        inside = node is not None and node.number >= 0
+        if len(joints) + len(ends) > MAX_JOINTS:
             source.fail(f"more than {MAX_JOINTS} joints and end sites")
-        if (keyword == "ROOT" and joint is None) or (keyword == "JOINT" and joint is not None and joint >= 0):
-            blocks.append(len(joints))
-            joints.append(source.token())
-            parents.append(-1 if joint is None else joint)
-            offsets.append(None)
-            channels.append(())
+        if keyword == ("ROOT" if node is None else "JOINT") and (node is None or inside):
+            blocks.append(_Node(len(joints), node.number if node else -1, source.token()))
+            joints.append(blocks[-1])
             source.token("{")
-        elif keyword == "END" and joint is not None and joint >= 0:
-            blocks.append(-1)
-            end_parents.append(joint)
-            end_offsets.append(None)
+        elif keyword == "END" and node is not None and inside:
             source.token("SITE")
+            blocks.append(_Node(-1, node.number))
+            ends.append(blocks[-1])
             source.token("{")
-        elif keyword == "OFFSET" and joint is not None:
-            offset = [source.number() for _ in range(3)]
-            if joint < 0:
-                end_offsets[-1] = offset
-            else:
-                offsets[joint] = offset
-        elif keyword == "CHANNELS" and joint is not None and joint >= 0:
-            names = tuple(source.token().capitalize() for _ in range(int(source.number())))
-            if len(set(names)) < len(names) or not set(names) <= set(CHANNELS):
-                source.fail(f"channels must be distinct and among {', '.join(CHANNELS)}, found {' '.join(names)[:80]}")
-            channels[joint] = names
-        elif keyword == "}" and joint is not None:
-            if (end_offsets[-1] if joint < 0 else offsets[joint]) is None:
+        elif keyword == "OFFSET" and node is not None:
+            node.offset = [source.number() for _ in range(3)]
+        elif keyword == "CHANNELS" and node is not None and inside:
+            node.channels = tuple(source.token().capitalize() for _ in range(int(source.number())))
+            if len(set(node.channels)) < len(node.channels) or not set(node.channels) <= set(CHANNELS):
+                names = " ".join(node.channels)[:80]
+                source.fail(f"channels must be distinct and among {', '.join(CHANNELS)}, found {names}")
+        elif keyword == "}" and node is not None:
+            if not node.offset:
                 source.fail("joint or end site without OFFSET")
             blocks.pop()
         else:
             source.fail(f"unexpected {keyword[:40]}")
     if blocks or not joints:
         source.fail("MOTION before the end of the hierarchy")
-    if not source.text.upper().endswith("MOTION"):
-        source.fail(f"expected MOTION at the end of its line, found {source.text[:40]}")
 
     count = int(source.labeled(r"Frames:\s*(\d{1,18})", "Frames: and a number"))
-    pattern = r"Frame Time:\s*((?:\d+(?:\.\d+)?|\.\d+)(?:E[-+]?\d+)?)"
+    # few digits, because Python needs quadratic time for many
+    pattern = r"Frame Time:\s*((?:\d{1,9}(?:\.\d{1,30})?|\.\d{1,30})(?:E[-+]?\d{1,3})?)"
     seconds = source.labeled(pattern, "Frame Time: and a number of seconds")
     time = float(seconds)
     if not 1 / RATES[1] <= time <= 1 / RATES[0]:
@@ -195,22 +176,33 @@ def parse(data: bytes, name: str) -> Bvh:
     whole, last_digit = max(round(1 / time), 1), 10.0 ** int(Decimal(seconds).as_tuple().exponent)
     fps = float(whole) if abs(1 / whole - time) < min(last_digit, 0.01 * time) else 1 / time
     return Bvh(
-        tuple(joints),
-        tuple(parents),
-        np.array(offsets, float),
-        tuple(channels),
-        tuple(end_parents),
-        np.array(end_offsets, float).reshape(-1, 3),
-        source.table(count, sum(map(len, channels))),
+        tuple(node.name for node in joints),
+        tuple(node.parent for node in joints),
+        np.array([node.offset for node in joints], float),
+        tuple(node.channels for node in joints),
+        tuple(node.parent for node in ends),
+        np.array([node.offset for node in ends], float).reshape(-1, 3),
+        source.table(count, sum(len(node.channels) for node in joints)),
         fps,
     )
+
+
+@dataclass
+class _Node:
+    """A joint of a hierarchy, or an end site, whose number is -1."""
+
+    number: int
+    parent: int
+    name: str = ""
+    offset: Sequence[float] = ()
+    channels: tuple[str, ...] = ()
 
 
 class _Source:
     """Lines of a BVH file, read one after the other; tracks the line number for error messages."""
 
     def __init__(self, data: bytes, name: str):
-        self.name, self.line, self.text = name, 1, ""
+        self.name, self.line = name, 1
         try:
             lines = data.decode("utf-8-sig").splitlines()
         except UnicodeDecodeError as error:
@@ -220,14 +212,14 @@ class _Source:
         self.line, first = next(self.lines, (1, ""))
         if first.upper() != "HIERARCHY":
             self.fail("not a BVH file (it must begin with HIERARCHY)")
-        self.tokens = ((number, token, line) for number, line in self.lines for token in line.split())
+        self.tokens = ((number, token) for number, line in self.lines for token in line.split())
 
     def fail(self, what: str) -> NoReturn:
         raise UserError(f"{self.name}, line {self.line}: {what}")
 
     def token(self, expected: str = "") -> str:
         """Returns the next word of the hierarchy; it must be `expected` (case-insensitive) if that is given."""
-        self.line, token, self.text = next(self.tokens, (self.line, "", ""))
+        self.line, token = next(self.tokens, (self.line, ""))
         if not token:
             self.fail("the file ends inside the hierarchy")
         if expected and token.upper() != expected:
@@ -247,8 +239,7 @@ class _Source:
     def labeled(self, pattern: str, expected: str) -> str:
         """Returns the value on the next line, the first group of `pattern`."""
         self.line, line = next(self.lines, (self.line, ""))
-        match = re.fullmatch(pattern, line, re.IGNORECASE) if len(line) <= MAX_LABELED_LINE else None
-        if match is None:
+        if not (match := re.fullmatch(pattern, line, re.IGNORECASE)):
             self.fail(f"expected {expected}, found {line[:40] or 'the end of the file'}")
         return match[1]
 

@@ -39,22 +39,15 @@ def cleaned(motion: Motion, contacts: np.ndarray | None = None) -> Motion:
 
 
 def cleanup(joints: np.ndarray, fps: float, skeleton: Skeleton, contacts: np.ndarray | None = None) -> np.ndarray:
-    """Removes pops, changes of bone lengths, sliding feet and hands inside the body from a motion.
+    """Removes pops, changes of bone lengths, sliding feet and hands inside the body from joints (F, J, 3), y up.
 
     In this order: paths of the joints are smoothed, bones get their median lengths, the body moves over the ground so
     that its feet in contact stand still on average, and two-bone inverse kinematics keeps each toe in place during its
-    contacts and moves hands out of the trunk and the thighs.
+    contacts and moves hands out of the trunk and the thighs. Motions of fewer than 4 frames are returned unchanged.
 
-    Args:
-        joints: (F, J, 3) in meters, y up.
-        fps: frames per second.
-        skeleton: of the J joints; its first two chains are the legs.
-        contacts: (F, N), probability that each of `skeleton.feet` stands on the floor from this frame to the next, as
-            models predict it for some representations. Otherwise contacts are estimated from height and speed of the
-            toes, which is less reliable if they slide.
-
-    Returns:
-        (F, J, 3) float32. Motions of fewer than 4 frames are returned unchanged.
+    `contacts` (F, N) are the probabilities that each of `skeleton.feet` stands on the floor from this frame to the
+    next, as models predict them for some representations. Otherwise contacts are estimated from height and speed of the
+    toes, which is less reliable if they slide.
     """
     if len(joints) < 4:
         return np.array(joints, np.float32)

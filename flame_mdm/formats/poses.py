@@ -55,11 +55,9 @@ def solve(joints: Tensor, fps: float) -> Poses:
     """Computes a body and rotations that reproduce its joint positions in every frame.
 
     Bones get their mean length over the clip. Pelvis and chest, which have three bones each, are rotated for the best
-    fit of all three (Kabsch 1976); every other joint aims its bone at the next joint. The positions are reproduced
-    exactly if bones keep their length and the three bones of pelvis and chest their angles, as in recorded motion.
-    Positions do not determine the twist of a bone about its own axis: thighs and upper arms are twisted so that knees
-    and elbows bend like hinges, the spine twists evenly from pelvis to chest, and all other joints follow their parent.
-    The rotations of head, hands and toes are not observable.
+    fit of all three (Kabsch 1976); every other joint aims its bone at the next joint. Positions do not determine the
+    twist of a bone about its own axis: thighs and upper arms are twisted so that knees and elbows bend like hinges, the
+    spine twists evenly from pelvis to chest, and all other joints, also head, hands and toes, follow their parent.
 
     Joints (F, 22, 3) are in meters, y up, in the order of `SMPL22`. Raises `UserError` if they are of another skeleton,
     or a bone has no length.
@@ -81,8 +79,7 @@ def solve(joints: Tensor, fps: float) -> Poses:
 def solve_checked(joints: Tensor, fps: float) -> tuple[Tensor, Tensor]:
     """Returns offsets (22, 3) and quaternions (F, 22, 4) of `solve` in the joints' precision, without checks.
 
-    Nothing branches on numbers, so that it can be exported as a graph; joints that are alike are solved together, so
-    that the graph is small.
+    Nothing branches on numbers, and joints that are alike are solved together: it is exported as a small graph.
     """
     bones = SMPL22.bones(joints)
     lengths = torch.linalg.vector_norm(bones, dim=-1).mean(0)

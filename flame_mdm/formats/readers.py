@@ -48,9 +48,8 @@ def read(
         fields: fields of `Layout` that override those of a known skeleton, as from `find_skeleton`; `fps` and `unit`
             override them in turn. Not for .json and .npz files written by this project, nor for AMASS.
 
-    Raises:
-        FileNotFoundError: If the file does not exist.
-        UserError: If the file is damaged, of another kind or in a wrong unit, or has no frame rate.
+    Raises `FileNotFoundError` if the file does not exist, and `UserError` if it is damaged, of another kind or in a
+    wrong unit, or has no frame rate.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -109,10 +108,7 @@ def from_array(joints: Any, fps: float | None) -> Motion:
 
 
 def read_arrays(path: Path) -> dict[str, Any]:
-    """Reads the arrays of an .npz, .json or .npy motion: joints, or poses and trans as in AMASS; and fps if present.
-
-    `posed_joints`, as in files of NVIDIA's Kimodo, are returned as joints. A `UserError` names the file.
-    """
+    """Reads the arrays of an .npz, .json or .npy motion: joints, or poses and trans as in AMASS; and fps if present."""
     suffix = path.suffix.lower()
     with naming(path):
         if suffix == ".npz":
@@ -132,10 +128,9 @@ def read_arrays(path: Path) -> dict[str, Any]:
             raise UserError("features are not an array (frames, features) of real numbers")
         if "poses" in data and data.get("trans", np.zeros(0)).shape != (len(data["poses"]), 3):
             raise UserError("AMASS files have poses (F, 3 K), trans (F, 3) and mocap_framerate")
-        keys = ("fps", "mocap_framerate", "mocap_frame_rate")
-        rate = next((key for key in (keys if "joints" in data else keys[::-1]) if key in data), None)
-        if rate is not None:
-            data["fps"] = frame_rate(data[rate], rate)
+        for key in ("fps", "mocap_framerate", "mocap_frame_rate"):
+            if key in data:
+                data["fps"] = frame_rate(data[key], key)
     return data
 
 

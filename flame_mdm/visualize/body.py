@@ -97,22 +97,17 @@ class Mesh:
     """
 
     def __init__(self, path: Path) -> None:
-        """Reads a file; raises `UserError` if it is missing or damaged."""
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                self.stored = {name: file[name] for name in file.files}
-            self.points, self.colors = self.stored["points"] / 20000, self.stored["colors"].astype(float)
-            self.normals = self.stored["normals"] / np.linalg.norm(self.stored["normals"], axis=1, keepdims=True)
-            self.triangles, self.joints = self.stored["triangles"].astype(int), self.stored["joints"]
-            self.weights = np.zeros((len(self.points), len(ANCHORS)))
-            for bone, weight in zip(self.stored["bones"].T, self.stored["weights"].T / 255, strict=True):
-                self.weights[np.arange(len(self.points)), bone] += weight
-            self.turns = self.stored["turns"][list(ANCHORS)]
-        except (OSError, ValueError, KeyError, IndexError) as error:
-            todo = "Install flame-mdm again" if path == MANNEQUIN else "Delete it; it is made again"
-            raise UserError(f"{path}: the figure cannot be read ({error}). {todo}") from error
-        above = self.joints - self.joints[[max(parent, 0) for parent in SMPL22.parents]]
-        self.rest = (self.turns[[max(parent, 0) for parent in SMPL22.parents]].mT @ above[..., None])[..., 0]
+        with np.load(path, allow_pickle=False) as file:
+            self.stored = {name: file[name] for name in file.files}
+        self.points, self.colors = self.stored["points"] / 20000, self.stored["colors"].astype(float)
+        self.normals = self.stored["normals"] / np.linalg.norm(self.stored["normals"], axis=1, keepdims=True)
+        self.triangles, self.joints = self.stored["triangles"].astype(int), self.stored["joints"]
+        self.weights = np.zeros((len(self.points), len(ANCHORS)))
+        for bone, weight in zip(self.stored["bones"].T, self.stored["weights"].T / 255, strict=True):
+            self.weights[np.arange(len(self.points)), bone] += weight
+        self.turns = self.stored["turns"][list(ANCHORS)]
+        above = [max(parent, 0) for parent in SMPL22.parents]
+        self.rest = (self.turns[above].mT @ (self.joints - self.joints[above])[..., None])[..., 0]
         self.sole = float(self.joints[JOINT["left_foot"], 1] - self.points[:, 1].min())
 
 
@@ -127,9 +122,7 @@ def packed(
 ) -> dict[str, np.ndarray]:
     """Returns the arrays of the file of a body, which `Mesh` reads.
 
-    `points` (V, 3) in units of 1/20 mm and `normals` (V, 3) in 1/127, of the stored pose with the pelvis at 0;
-    `bones` (V, 4) and `weights` (V, 4), which add up to 255; `colors` (V, 3); `triangles` (T, 3); `joints` (22, 3) and
-    `turns` (22, 3, 3), the stored pose.
+    Points are stored in 1/20 mm, with the pelvis at 0, and normals in 1/127.
     """
     bones, shares = largest_weights(weights)
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
@@ -217,26 +210,22 @@ def fit_body(motion: Shown, body: Mesh | None = None) -> FittedBody:
     neutral = np.tile(np.eye(3), (len(SMPL22), 1, 1))
     if motion.poses is None:
         neutral, world, offsets = complete(joints, offsets, world)
+    lift = wide * body.sole
     for toe in (JOINT["left_foot"], JOINT["right_foot"]):
         _, high, long = body.rest[toe]
-        tall = (wide * body.sole - offsets[toe, 1]) / (body.sole - high)
-        fit[SMPL22.parents[toe]] = np.diag([wide, tall, offsets[toe, 2] / long])
-    turns = body.turns
-    rest = np.zeros((len(SMPL22), 3))
+        fit[SMPL22.parents[toe]] = np.diag(
+            [wide, (lift - offsets[toe, 1]) / (body.sole - high), offsets[toe, 2] / long]
+        )
+    turns, rest = body.turns, np.zeros((len(SMPL22), 3))
     for parent, joint in SMPL22.edges:
         rest[joint] = rest[parent] + turns[parent] @ offsets[joint]
     stretched = turns[: len(rest)] @ fit @ turns[: len(rest)].mT
-    lift = wide * body.sole
-    return FittedBody(
-        body,
-        stretched,
-        rest,
-        bound(body, stretched, rest),
-        neutral,
-        _with_helpers(world, offsets) @ turns.mT,
-        joints[:, list(ANCHORS)] + [0, lift, 0],
-        lift,
-    )
+    anchors = list(ANCHORS)
+    moves = rest - (stretched @ body.joints[..., None])[..., 0]
+    blended = body.weights @ np.concatenate([stretched.reshape(-1, 9), moves], 1)[anchors]
+    points = (blended[:, :9].reshape(-1, 3, 3) @ body.points[..., None])[..., 0] + blended[:, 9:]
+    bones, starts = _with_helpers(world, offsets) @ turns.mT, joints[:, anchors] + [0, lift, 0]
+    return FittedBody(body, stretched, rest, points, neutral, bones, starts, lift)
 
 
 def try_fit(motion: Shown, body: Mesh | None = None) -> tuple[FittedBody | None, str]:
@@ -255,19 +244,10 @@ def shaded(normals: np.ndarray, colors: np.ndarray, toward: np.ndarray) -> np.nd
     return np.clip(colors * (0.5 + 0.12 * normals[:, 1] + 0.52 * lit)[:, None], 0, 255)
 
 
-def bound(body: Mesh, stretched: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """Returns the mesh (V, 3) with other proportions: linear maps (22, 3, 3) and joints (22, 3) of the stored pose."""
-    anchors = list(ANCHORS)
-    moves = rest - (stretched @ body.joints[..., None])[..., 0]
-    blended = body.weights @ np.concatenate([stretched.reshape(-1, 9), moves], 1)[anchors]
-    return (blended[:, :9].reshape(-1, 3, 3) @ body.points[..., None])[..., 0] + blended[:, 9:]
-
-
 def proportions(body: Mesh, offsets: np.ndarray) -> tuple[np.ndarray, float]:
     """Returns the linear map (22, 3, 3) of each joint's part to a clip's proportions, and the ratio of widths.
 
-    `offsets` (22, 3) are the positions of the clip's joints relative to their parents in the rest pose. Raises
-    `UserError` if a limb is much longer or shorter than people's.
+    `offsets` (22, 3) are the positions of the clip's joints relative to their parents in the rest pose.
     """
     lengths, usual = np.linalg.norm(offsets, axis=1), np.linalg.norm(body.rest, axis=1)
     ratio = np.divide(lengths, usual, out=np.ones_like(lengths), where=usual > 0)
@@ -287,8 +267,7 @@ def proportions(body: Mesh, offsets: np.ndarray) -> tuple[np.ndarray, float]:
 
     hips, shoulders = width("hip"), width("collar", "shoulder")
     fit = np.tile(wide * np.eye(3), (len(SMPL22), 1, 1))
-    for joint in range(len(SMPL22)):
-        name = SMPL22.joints[joint]
+    for joint, name in enumerate(SMPL22.joints):
         children = [child for child, parent in enumerate(SMPL22.parents) if parent == joint]
         if name in TRUNK:
             above = children[-1] if name == "pelvis" else children[0]
@@ -320,12 +299,8 @@ def _with_helpers(world: np.ndarray, offsets: np.ndarray) -> np.ndarray:
 def rasterize(image: np.ndarray, at: np.ndarray, depth: np.ndarray, colors: np.ndarray, triangles: np.ndarray) -> None:
     """Draws triangles into an image, the nearest one at each pixel, with colors interpolated between their corners.
 
-    Args:
-        image: (height, width, 3) uint8, drawn into.
-        at: (V, 2) pixel coordinates, y down.
-        depth: (V,) distance from the camera.
-        colors: (V, 3), 0 to 255.
-        triangles: (T, 3), counterclockwise seen from outside; those seen from inside are not drawn.
+    The image is (height, width, 3) uint8; `at` (V, 2) are pixel coordinates, y down; `depth` (V,) distances from the
+    camera; `colors` (V, 3) from 0 to 255. Triangles (T, 3) seen from inside, clockwise, are not drawn.
     """
     lowest = np.clip(np.floor(at.min(0)), 0, image.shape[1::-1]).astype(int)
     highest = np.clip(np.ceil(at.max(0)), lowest, image.shape[1::-1]).astype(int)

@@ -38,9 +38,7 @@ def player_page(
     """Returns a self-contained HTML page that plays motions side by side in 3D, with a shared clock and camera.
 
     It shows a body, or the skeleton at the push of a button. Motions that no body fits are shown as skeletons, with the
-    reason in their caption.
-
-    Positions are rounded to millimeters; a motion that spans more than 65 m is rounded to 1/65534 of its span.
+    reason in their caption. Positions are rounded to millimeters, or to 1/65534 of the span of a motion.
 
     Args:
         motions: motions to show; skeletons, lengths and frame rates may differ.
@@ -48,8 +46,7 @@ def player_page(
         about: HTML of a collapsible section below the heading; its texts must be escaped.
         columns: motions per row; 0 = as many as fit into the window.
         groups: for each motion, a name to filter by, such as its split; "" = none.
-        beside: for each motion, the id of an earlier one to show it next to, such as the original of a mirrored copy;
-            "" = none.
+        beside: for each motion, the id of an earlier one to show it next to, such as its original; "" = none.
         marks: for each motion, spans of its time line to mark: first frame, end (exclusive), kind and description.
         body: the body to draw; None = the mannequin.
     """

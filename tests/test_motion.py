@@ -14,7 +14,6 @@ from support.runs import TINY, untrained
 
 import flame_mdm
 from flame_mdm.__main__ import main
-from flame_mdm.commands import compare
 from flame_mdm.data.folder import Folder
 from flame_mdm.errors import UserError
 from flame_mdm.formats.motion import Motion
@@ -88,12 +87,6 @@ def test_every_kind_is_converted_edited_and_own_data(
     (clip,) = Folder(str(own)).clips(30.0)
     assert clip.motion.shape == walk.joints.shape
     assert np.abs(clip.motion - walk.joints).max() < tolerance(kind)
-
-
-def test_every_kind_with_a_frame_rate_is_compared(folder: Path):
-    motions = compare._read(folder)
-    assert len(motions) == 5
-    assert sorted(text for text, _ in motions) == ["", "", "", "a person walks", "a person walks"]
 
 
 def test_a_saved_motion_comes_back(tmp_path: Path, walk: Motion):

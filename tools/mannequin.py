@@ -11,13 +11,13 @@ from collections.abc import Callable, Sequence
 
 import fast_simplification
 import numpy as np
+from human import hairline, packed, smooth, with_helpers
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 from skimage import measure
 
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.representations.smpl import ADULT
-from flame_mdm.visualize.bodies import hairline, smooth, with_helpers
 from flame_mdm.visualize.body import (
     HAIR,
     HELPERS,
@@ -27,7 +27,6 @@ from flame_mdm.visualize.body import (
     SKIN,
     TROUSERS,
     TWISTED,
-    packed,
 )
 from flame_mdm.visualize.posture import JOINT, orthonormal
 

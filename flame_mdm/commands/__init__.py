@@ -53,9 +53,8 @@ def about_key(key: str) -> Iterator[None]:
 
 
 def body_name(key: str, body: str) -> None:
-    if body.split()[:1] not in (["mannequin"], ["anny"]):
-        choices = 'mannequin, anny, or anny with its shape: body="anny age=0.9"'
-        raise UserError(f"{key}={body}: unknown. Use {choices}")
+    if body != "mannequin" and not Path(body).is_file():
+        raise UserError(f"{key}={body}: no such file. Use mannequin, or a file of tools/human.py")
 
 
 def device_name(key: str, device: str) -> None:
@@ -105,9 +104,7 @@ class FileSettings:
 class BodySettings:
     """The body in pictures, pages and files."""
 
-    body: str = option(
-        "mannequin", 'or anny, also with a shape, such as "anny gender=1 age=0.9": docs/formats.md', body_name
-    )
+    body: str = option("mannequin", "or the file of another body: docs/formats.md", body_name)
 
 
 @dataclass(frozen=True, kw_only=True)

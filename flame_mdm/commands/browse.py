@@ -34,7 +34,7 @@ def main(settings: BrowseSettings) -> None:
     node = settings.data_node(settings.source)
 
     from flame_mdm.data.store import Store
-    from flame_mdm.visualize.bodies import load_body
+    from flame_mdm.visualize.body import load_body
 
     body = load_body(settings.body)
     representation = instantiate(settings.nodes["representation"])

@@ -41,7 +41,7 @@ class CompareSettings(BodySettings):
 
 def main(settings: CompareSettings) -> None:
     runs = find([Path(folder) for folder in settings.runs])
-    from flame_mdm.visualize.bodies import load_body
+    from flame_mdm.visualize.body import load_body
 
     texts = None if settings.prompts is None else list(dict.fromkeys(read_prompts(settings.prompts)))
     shown = [_sampled(run.folder, texts, settings) if texts else _newest(run) for run in runs.values()]

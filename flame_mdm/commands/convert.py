@@ -82,7 +82,7 @@ def _convert(settings: ConvertSettings, path: Path, out: Path, character: Charac
     from flame_mdm.formats.layouts import find_skeleton, head_height, leg_length
     from flame_mdm.formats.readers import read
     from flame_mdm.representations.skeleton import SMPL22
-    from flame_mdm.visualize.bodies import load_body
+    from flame_mdm.visualize.body import load_body
 
     body = load_body(settings.body)
     motion = read(path, settings.fps, settings.unit, fields=find_skeleton(path, settings.up))

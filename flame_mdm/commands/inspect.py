@@ -54,7 +54,7 @@ def main(settings: InspectSettings) -> None:
         settings.data_node(settings.source)
     from flame_mdm.formats.faults import LIMITS, find_faults
     from flame_mdm.visualize import write_player
-    from flame_mdm.visualize.bodies import load_body
+    from flame_mdm.visualize.body import load_body
 
     body = load_body(settings.body)
     name, count, motions = _read(settings, files) if files else _clips(settings)

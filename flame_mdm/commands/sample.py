@@ -57,7 +57,7 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
         import torch
 
         from flame_mdm.checkpoints.loading import load
-        from flame_mdm.visualize.bodies import load_body
+        from flame_mdm.visualize.body import load_body
 
         body = load_body(self.body)
         return load(file, self.device or ("cuda" if torch.cuda.is_available() else "cpu"), **self.adapters()), body

@@ -124,7 +124,7 @@ class Motion:
             rig: the skeleton of a `.bvh` or `.glb` file, one of `flame_mdm.formats.retarget.presets`; default: SMPL's.
             character: a `.glb` file with a skin, or what `flame_mdm.formats.characters.read` returned; it is written
                 with this motion.
-            body: the body in `.glb`, `.gif` and `.mp4` files, from `flame_mdm.visualize.bodies.load_body`; default: the
+            body: the body in `.glb`, `.gif` and `.mp4` files, from `flame_mdm.visualize.body.load_body`; default: the
                 mannequin.
             facts: additional entries of an `.npz` file, such as the seed.
 

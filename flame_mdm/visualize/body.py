@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from flame_mdm.errors import UserError
 from flame_mdm.representations.skeleton import SMPL22, Skeleton
+from flame_mdm.safe_io import naming, read_npz
 from flame_mdm.visualize.posture import JOINT, complete, world_rotations
 
 if TYPE_CHECKING:  # drawing needs numpy and Pillow, not torch
@@ -86,7 +87,8 @@ def radii(skeleton: Skeleton) -> list[float]:
 class Mesh:
     """A closed mesh in its stored pose, an A-pose with the pelvis at 0.
 
-    `stored` are the arrays of its file (`packed`), `points` (V, 3) and `joints` (22, 3) in meters, `colors` 0 to 255.
+    `stored` are the arrays of its file, which tools/mannequin.py and tools/human.py write; `points` (V, 3) and `joints`
+    (22, 3) are in meters, `colors` 0 to 255.
 
     Attributes:
         weights: (V, 28), of the 22 joints of SMPL and `HELPERS`; at most four are not 0.
@@ -97,8 +99,7 @@ class Mesh:
     """
 
     def __init__(self, path: Path) -> None:
-        with np.load(path, allow_pickle=False) as file:
-            self.stored = {name: file[name] for name in file.files}
+        self.stored = read_npz(path)
         self.points, self.colors = self.stored["points"] / 20000, self.stored["colors"].astype(float)
         self.normals = self.stored["normals"] / np.linalg.norm(self.stored["normals"], axis=1, keepdims=True)
         self.triangles, self.joints = self.stored["triangles"].astype(int), self.stored["joints"]
@@ -109,33 +110,6 @@ class Mesh:
         above = [max(parent, 0) for parent in SMPL22.parents]
         self.rest = (self.turns[above].mT @ (self.joints - self.joints[above])[..., None])[..., 0]
         self.sole = float(self.joints[JOINT["left_foot"], 1] - self.points[:, 1].min())
-
-
-def packed(
-    points: np.ndarray,
-    normals: np.ndarray,
-    weights: np.ndarray,
-    colors: np.ndarray,
-    triangles: np.ndarray,
-    joints: np.ndarray,
-    turns: np.ndarray,
-) -> dict[str, np.ndarray]:
-    """Returns the arrays of the file of a body, which `Mesh` reads.
-
-    Points are stored in 1/20 mm, with the pelvis at 0, and normals in 1/127.
-    """
-    bones, shares = largest_weights(weights)
-    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    return {
-        "points": np.rint(points * 20000).astype("<i2"),
-        "normals": np.rint(normals * 127).astype("i1"),
-        "bones": bones,
-        "weights": shares,
-        "colors": np.rint(colors).astype("u1"),
-        "triangles": triangles.astype("<u2"),
-        "joints": joints,
-        "turns": turns,
-    }
 
 
 def largest_weights(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -150,6 +124,12 @@ def largest_weights(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 @cache
 def mannequin() -> Mesh:
     return Mesh(MANNEQUIN)
+
+
+def load_body(name: str) -> Mesh:
+    """Returns the mannequin, or the body in a file; raises `UserError` if the file is damaged."""
+    with naming(name, KeyError, ValueError, IndexError, what="not a body: "):
+        return mannequin() if name == "mannequin" else Mesh(Path(name))
 
 
 @dataclass(frozen=True, eq=False)

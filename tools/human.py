@@ -1,30 +1,28 @@
-"""Bodies to choose from: the mannequin, and Anny, a model of people of all ages and shapes (extra `body`).
+"""Makes a body for `body=FILE` with Anny, a model of people of all ages and shapes (pip install "flame-mdm[body]"):
+
+    python tools/human.py OUT.npz [gender=0.5] [age=0.67] [height=0.45] [weight=0.4]
 
 Brégier et al., "Human Mesh Modeling for Anny Body", 2026, https://arxiv.org/abs/2511.03589: (c) 2025 NAVER Corp.,
 Apache-2.0; its shapes and weights are those of MakeHuman and MPFB2, CC0. Topologies of SMPL and SMPL-X, which Anny
 downloads and which are not free for commercial use, are never built.
 """
 
-import os
-from concurrent.futures import ThreadPoolExecutor, wait
+import sys
 from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 
-from flame_mdm.errors import UserError
-from flame_mdm.progress import ProgressBar
+from flame_mdm.errors import UserError, say
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.representations.smpl import ADULT
 from flame_mdm.safe_io import atomic_write
-from flame_mdm.visualize.body import HAIR, HELPERS, SHIRT, SHOES, SKIN, TROUSERS, Mesh, mannequin, packed
+from flame_mdm.visualize.body import HAIR, HELPERS, SHIRT, SHOES, SKIN, TROUSERS, largest_weights, mannequin
 from flame_mdm.visualize.posture import JOINT, orthonormal, shortest_turns
 
 SHAPE = {"gender": 0.5, "age": 2 / 3, "height": 0.45, "weight": 0.4}
 """Anny's numbers and their defaults, 0 to 1: male to female, baby to old (2/3: a young adult), small to tall, light to
 heavy."""
-SECONDS = 90
-"""About how long Anny's model takes to build for the first time."""
 PARTS = {
     "spine1": "spine04 spine03",
     "spine2": "spine02",
@@ -50,49 +48,27 @@ CLOTHES = {"neck": SKIN, "head": SKIN, "wrist": SKIN, "ankle": SHOES, "foot": SH
 )
 
 
-def load_body(name: str) -> Mesh:
-    """Returns the mesh of a body: mannequin, or anny, with numbers of `SHAPE`, such as "anny gender=1 age=0.9".
-
-    Anny's is made once per shape, with a progress bar, and kept in the user's cache.
-    """
-    kind, *options = name.split() or [""]
-    if kind not in ("mannequin", "anny") or (options and kind != "anny"):
-        raise UserError(f'body={name}: unknown. Use mannequin, anny, or anny with its shape: body="anny age=0.9"')
-    return Mesh(_anny(name, options)) if kind == "anny" else mannequin()
-
-
-def _anny(name: str, options: list[str]) -> Path:
+def shape_of(words: list[str]) -> dict[str, float]:
+    """Returns the numbers of a shape from words such as age=0.9."""
     shape = dict(SHAPE)
-    for option in options:
-        key, _, value = option.partition("=")
+    for word in words:
+        key, _, value = word.partition("=")
         try:
             shape[key] = float(value) if key in SHAPE else np.nan
         except ValueError:
             shape[key] = np.nan
         if not 0 <= shape[key] <= 1:
-            raise UserError(f"body={name}: {option} is not one of {', '.join(SHAPE)} with a number from 0 to 1")
-    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "flame-mdm"
-    path = folder / f"anny1-{'-'.join(f'{key}{value:.3g}' for key, value in shape.items())}.npz"
-    if not path.exists():
-        figure = bake(shape)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_write(path) as temporary, temporary.open("wb") as file:
-            np.savez_compressed(file, allow_pickle=False, **figure)
-    return path
+            raise UserError(f"{word} is not one of {', '.join(SHAPE)} with a number from 0 to 1")
+    return shape
 
 
 def bake(shape: dict[str, float]) -> dict[str, np.ndarray]:
-    """Returns the arrays of the file of a figure of Anny: `packed`."""
+    """Returns the arrays of the file of a figure of Anny: `packed`. Anny takes about 90 seconds the first time."""
     try:
         package = import_module("anny")
     except ImportError:
-        raise UserError('body=anny needs the package anny. Run pip install "flame-mdm[body]"') from None
-    with ProgressBar(desc="making the body, once", total=SECONDS, unit=" s") as bar, ThreadPoolExecutor(1) as pool:
-        built = pool.submit(package.Anny, rig="anny", topology="notoes_collapse10pc", skinning_method="lbs")
-        while not wait([built], 1).done:
-            bar.update(bar.n < SECONDS - 1)
-        model = built.result()
-        bar.update(SECONDS - bar.n)
+        raise UserError('this needs the package anny. Run pip install "flame-mdm[body]"') from None
+    model = package.Anny(rig="anny", topology="notoes_collapse10pc", skinning_method="lbs")
     output = model(phenotype_kwargs={**shape, "muscle": 0.5, "proportions": 0.5})
     axes = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # Anny's z is up, and it faces -y
     points, heads = (output[key][0].detach().numpy() @ axes.T for key in ("rest_vertices", "rest_bone_heads"))
@@ -198,3 +174,42 @@ def with_helpers(points: np.ndarray, weights: np.ndarray, joints: np.ndarray) ->
         weights[:, joint] -= helper
         columns.append(helper)
     return np.concatenate([weights, np.stack(columns, 1)], 1)
+
+
+def packed(
+    points: np.ndarray,
+    normals: np.ndarray,
+    weights: np.ndarray,
+    colors: np.ndarray,
+    triangles: np.ndarray,
+    joints: np.ndarray,
+    turns: np.ndarray,
+) -> dict[str, np.ndarray]:
+    """Returns the arrays of the file of a body, which `Mesh` reads.
+
+    Points are stored in 1/20 mm, with the pelvis at 0, and normals in 1/127.
+    """
+    bones, shares = largest_weights(weights)
+    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    return {
+        "points": np.rint(points * 20000).astype("<i2"),
+        "normals": np.rint(normals * 127).astype("i1"),
+        "bones": bones,
+        "weights": shares,
+        "colors": np.rint(colors).astype("u1"),
+        "triangles": triangles.astype("<u2"),
+        "joints": joints,
+        "turns": turns,
+    }
+
+
+if __name__ == "__main__":
+    try:
+        out = Path(sys.argv[1])
+        figure = bake(shape_of(sys.argv[2:]))
+        with atomic_write(out) as temporary, temporary.open("wb") as file:
+            np.savez_compressed(file, allow_pickle=False, **figure)
+        say(f"written: {out}")
+    except UserError as error:
+        say(f"error: {error}", error=True)
+        sys.exit(1)

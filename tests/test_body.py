@@ -157,7 +157,8 @@ def test_a_motion_that_no_body_fits_says_why():
 
 
 def test_bodies_in_files_are_drawn_and_damaged_ones_named(tmp_path):
-    stored, motion = mannequin().stored, posed(left_knee=(60, 0, 0), left_hip=(-30, 0, 0))
+    stored: dict[str, Any] = mannequin().stored
+    motion = posed(left_knee=(60, 0, 0), left_hip=(-30, 0, 0))
     np.savez(tmp_path / "other.npz", **stored | {"colors": 255 - stored["colors"]})
     body = load_body(str(tmp_path / "other.npz"))
     assert fit_body(motion, body).mesh is body

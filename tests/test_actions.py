@@ -189,7 +189,7 @@ def test_unconditioned_motions_are_compared_with_the_reference_motions(tmp_path:
     shown = (motion[:, :, list(UNCONSTRAINED_JOINTS)] * torch.tensor([1.0, -1.0, -1.0]) + 3).permute(0, 2, 3, 1)
     reference = tmp_path / "humanact12_unconstrained_modi_struct.npy"
     torch.save(Unconstrained().state_dict(), tmp_path / "humanact12_gru_modi_struct.pth.tar")
-    with pytest.raises(FileNotFoundError, match=r"it lacks humanact12_unconstrained_modi_struct\.npy"):
+    with pytest.raises(FileNotFoundError, match=r"humanact12_unconstrained_modi_struct\.npy: no such file"):
         UnconstrainedExtractor(str(tmp_path))
     np.save(reference, np.pad(shown.numpy(), ((0, 0), (0, 3), (0, 0), (0, 0))))
     extractor = UnconstrainedExtractor(str(tmp_path))
@@ -387,7 +387,7 @@ def test_what_was_not_made_for_one_another_is_refused(trained, data, tmp_path, c
     released = tmp_path / "released.tar"
     torch.save({"model": ActionGRU().state_dict()}, released)
     for protocol, file, message in (
-        ("action_to_motion", trained, "For classifiers of make train"),
+        ("action_to_motion", trained, "contains no weights under 'model'"),
         ("action_to_motion_own", released, f"{released}: not a checkpoint of this framework"),
     ):
         words = ["baseline=real", *DATA, data, f"protocol={protocol}", f"extractor={file}"]
@@ -418,5 +418,5 @@ def test_recipes_build_the_sizes_of_their_data():
         task = ClassifierTask.build(config, instantiate(config["representation"]), actions=list("abcdefg"))
         joints = torch.randn(2, 12, len(task.representation.skeleton.parents), 3)
         mask = length_mask(torch.tensor([12, 7]))
-        assert task.logits(joints, mask).shape == (2, 7)
+        assert task.network.logits(joints, mask).shape == (2, 7)
         assert len(task(joints, mask)) == 2

@@ -30,6 +30,7 @@ from evaluators.metrics import (
 )
 from evaluators.metrics.samples import SampleMetric
 from flame_mdm.batch import MotionBatch, length_mask
+from flame_mdm.conditions import Unconditional
 from flame_mdm.errors import UserError
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.skeleton import KIT21
@@ -265,7 +266,8 @@ def validate(rank: int, world: int) -> tuple[float, ...]:
     torch.manual_seed(0)
     representation = HumanML("smpl22", "clean", 20)
     network = JointSTGCN(representation.skeleton.parents, 3, widths=(4,), strides=(1,))
-    task = ClassifierTask(network, representation, optimizer={}).eval()
+    task = ClassifierTask(network, Unconditional(), representation, optimizer={}).eval()
+    task.val_metrics.update(task.metrics())
     x, labels = torch.randn(10, 8, representation.features), torch.arange(10) % 3
     for name, buffer in network.named_buffers():
         if "running" in name:

@@ -10,11 +10,12 @@ from torch import Tensor, nn
 
 from evaluators.extractors.action_gru import ActionGRU
 from evaluators.extractors.classifier import ClassifierTask
-from evaluators.extractors.mardm import MARDMClip, clip_tokens, load_mardm_clip
+from evaluators.extractors.mardm import MARDMClip, clip_tokens
 from evaluators.extractors.motion_clip import MotionCLIPTask
 from evaluators.extractors.stgcn import UESTC, Unconstrained
-from evaluators.extractors.t2m import T2MEvaluator, WordVectors, load_t2m
+from evaluators.extractors.t2m import T2MEvaluator, WordVectors, load_t2m, read_statistics
 from evaluators.extractors.t2m_training import T2MTask
+from evaluators.extractors.training import ExtractorTask
 from flame_mdm.checkpoints.loading import find, load_task
 from flame_mdm.checkpoints.model_files import weights_sha256
 from flame_mdm.checkpoints.released_weights import load_strictly, read_weights
@@ -24,7 +25,6 @@ from flame_mdm.errors import UserError
 from flame_mdm.representations import Representation
 from flame_mdm.safe_io import sha256
 from flame_mdm.seeds import key
-from flame_mdm.task import Task
 
 
 class Extractor(ABC):
@@ -60,14 +60,10 @@ class Extractor(ABC):
 
 
 class OwnExtractor(Extractor):
-    """A network trained with `make train`, loaded from its checkpoint.
+    """A network trained with `make train`, loaded from its checkpoint; raises `UserError` if it holds another one."""
 
-    Raises:
-        FileNotFoundError, UserError: If the checkpoint does not exist, or holds another network.
-    """
-
-    task: Task
-    trained: type[Task]
+    task: ExtractorTask
+    trained: type[ExtractorTask]
     recipes: str  # folder of the recipes that train it
 
     def __init__(self, path: str, device: str | torch.device = "cpu"):
@@ -77,17 +73,19 @@ class OwnExtractor(Extractor):
         self.fingerprint = self.task.facts.get("fingerprint")
 
     def check(self, representation: Representation, dataset: str) -> None:
-        own, advice = self.task.representation, f"Train one with make train EXP={self.recipes}/..."
+        own, learned = self.task.representation, self.task.facts.get("dataset", dataset)
         if not self.reads(representation):
-            raise UserError(
-                f"extractor {self.path}: trained on {own.name} at {own.fps:g} frames per second, but the motions are "
-                f"{representation.name} at {representation.fps:g}. {advice}"
+            difference = (
+                f"{own.name} at {own.fps:g} frames per second, but the motions are {representation.name} at "
+                f"{representation.fps:g}"
             )
-        if self.task.facts.get("dataset", dataset) != dataset:
-            raise UserError(
-                f"extractor {self.path}: trained on the data set {self.task.facts['dataset']}, but the motions are "
-                f"from {dataset}. {advice}"
-            )
+        elif learned != dataset:
+            difference = f"the data set {learned}, but the motions are from {dataset}"
+        else:
+            return
+        raise UserError(
+            f"extractor {self.path}: trained on {difference}. Train one with make train EXP={self.recipes}/..."
+        )
 
     def reads(self, representation: Representation) -> bool:
         """Returns whether the network reads motions in a representation."""
@@ -128,9 +126,7 @@ class OwnT2MExtractor(OwnExtractor):
         return part or super().reads(representation)
 
     def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
-        if self.task.learns_words:
-            return self.task.text([words(caption) for caption in captions])
-        return self.task.text(_tagged(self.path, tokens))
+        return self.task.text(list(map(words, captions)) if self.task.learns_words else _tagged(self.path, tokens))
 
 
 class OwnClassifierExtractor(OwnExtractor):
@@ -140,7 +136,7 @@ class OwnClassifierExtractor(OwnExtractor):
     task: ClassifierTask
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
-        return {"features": self.task(joints, mask), "logits": self.task.logits(joints, mask)}
+        return {"features": self.task(joints, mask), "logits": self.task.network.logits(joints, mask)}
 
 
 def _tagged(path: Path, tokens: Sequence[Sequence[str] | None]) -> list[Sequence[str]]:
@@ -157,8 +153,7 @@ def _tagged(path: Path, tokens: Sequence[Sequence[str] | None]) -> list[Sequence
 class ReleasedExtractor(Extractor):
     """A network with the weights that its authors released, from a folder of `FILES`, or from one file.
 
-    Raises:
-        FileNotFoundError, UserError: If a file is missing, or has other content.
+    Raises `FileNotFoundError` or `UserError` if a file is missing, or has other content.
     """
 
     FILES: tuple[str, ...] = ()
@@ -169,13 +164,9 @@ class ReleasedExtractor(Extractor):
     def __init__(self, path: str):
         self.path = Path(path)
         files = [self.path / name for name in self.FILES] or [self.path]
-        missing = [file.name for file in files if not file.is_file()]
+        missing = [str(file) for file in files if not file.is_file()]
         if missing:
-            raise FileNotFoundError(
-                f"{path}: not a folder of released files: it lacks {', '.join(missing)}"
-                if self.FILES
-                else f"{path}: no such file. Give the path of the weights released by the authors"
-            )
+            raise FileNotFoundError(f"{', '.join(missing)}: no such file. Give the path of what the authors released")
         hashes = [sha256(file) for file in files]
         self.sha256 = hashes[0] if len(hashes) == 1 else hashlib.sha256("".join(hashes).encode()).hexdigest()
 
@@ -228,18 +219,19 @@ class MARDMClipExtractor(ReleasedExtractor):
 
     def __init__(self, path: str, device: str | torch.device = "cpu"):
         super().__init__(path)
-        self.network = load_mardm_clip(self.path).to(device)
+        network, weights = MARDMClip(*read_statistics(self.path)), self.path / self.FILES[0]
+        self.network = load_strictly(network, read_weights(weights, "contrast_model"), weights).to(device)
 
     def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
         return self.network.text(clip_tokens(captions).to(self.network.mean.device))
 
 
-CLASSIFIERS: dict[str, tuple[type[ActionGRU | UESTC | Unconstrained], str | None, str, str]] = {
-    "humanact12": (ActionGRU, "model", "humanact12", "joints"),
-    "humanact12_unconstrained": (Unconstrained, None, "humanact12", "joints"),
-    "uestc": (UESTC, None, "uestc", "features"),
+CLASSIFIERS: dict[str, tuple[type[ActionGRU | UESTC | Unconstrained], str | None, str]] = {
+    "humanact12": (ActionGRU, "model", "humanact12"),
+    "humanact12_unconstrained": (Unconstrained, None, "humanact12"),
+    "uestc": (UESTC, None, "uestc"),
 }
-"""Released action classifiers: network, key of the weights in its file, data set and input.
+"""Released action classifiers: network, key of the weights in its file, and data set.
 
 The authors' files are action_recognition_model_humanact12.tar (humanact12_gru.tar in MDM),
 humanact12_gru_modi_struct.pth.tar (not a GRU despite its name) and uestc_rot6d_stgcn.tar."""
@@ -253,42 +245,33 @@ class ClassifierExtractor(ReleasedExtractor):
     it is the same in any batch.
     """
 
+    network: ActionGRU | UESTC | Unconstrained
+
     def __init__(self, kind: str, path: str, device: str | torch.device = "cpu", *, random_start: bool = False):
         super().__init__(path)
-        network, weights_key, dataset, self.input = CLASSIFIERS[kind]
+        network, weights_key, dataset = CLASSIFIERS[kind]
         weights = self.path / self.FILES[0] if self.FILES else self.path
-        try:
-            self.network = load_strictly(network(), read_weights(weights, weights_key), weights).to(device)
-        except UserError as error:
-            raise UserError(
-                f"{error}. For classifiers of make train EXP=classifier/..., use protocol=action_to_motion_own"
-            ) from error
+        self.network = load_strictly(network(), read_weights(weights, weights_key), weights).to(device)
         self.made_for, self.random_start = ("rot6d-25", dataset), random_start
         if random_start and network is not ActionGRU:
             raise UserError(f"random_start: the classifier {kind} is not recurrent")
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
-        x = joints if self.input == "joints" else features
-        start: dict[str, tuple[Tensor, ...]] = {"features": (), "logits": ()}
-        if self.random_start:
-            pairs = zip(x, mask, strict=True)
-            names = [hashlib.sha256(motion[real].cpu().numpy().tobytes()).hexdigest() for motion, real in pairs]
-            start = {use: (torch.cat([self._start(use, name) for name in names], 1),) for use in start}
-        assert isinstance(self.network, ActionGRU | UESTC | Unconstrained)
-        return {
-            "features": self.network(x, mask, *start["features"]),
-            "logits": self.network.logits(x, mask, *start["logits"]),
-        }
-
-    def _start(self, use: str, name: str) -> Tensor:
-        assert isinstance(self.network, ActionGRU)
-        return self.network.random_state(1, torch.Generator().manual_seed(key(use, name)))
+        network = self.network
+        x = features if isinstance(network, UESTC) else joints
+        if not (self.random_start and isinstance(network, ActionGRU)):
+            return {"features": network(x, mask), "logits": network.logits(x, mask)}
+        pairs = zip(x, mask, strict=True)
+        names = [hashlib.sha256(motion[real].cpu().numpy().tobytes()).hexdigest() for motion, real in pairs]
+        start = {use: network.random_state([key(use, name) for name in names]) for use in ("features", "logits")}
+        return {"features": network(x, mask, start["features"]), "logits": network.logits(x, mask, start["logits"])}
 
 
 class UnconstrainedExtractor(ClassifierExtractor):
     """The classifier of unconstrained HumanAct12 with its reference motions, from a folder of two files."""
 
     FILES = ("humanact12_gru_modi_struct.pth.tar", "humanact12_unconstrained_modi_struct.npy")
+    network: Unconstrained
 
     def __init__(self, path: str, device: str | torch.device = "cpu"):
         super().__init__("humanact12_unconstrained", path, device)
@@ -296,7 +279,6 @@ class UnconstrainedExtractor(ClassifierExtractor):
 
     def reference(self) -> Tensor:
         """(N, 256) features of the reference motions."""
-        assert isinstance(self.network, Unconstrained)
         batches = self.real.split(64)
         masks = [torch.ones(batch.shape[:2], dtype=torch.bool, device=batch.device) for batch in batches]
         features = [self.network.published(batch, mask) for batch, mask in zip(batches, masks, strict=True)]

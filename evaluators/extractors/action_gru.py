@@ -1,5 +1,7 @@
 """The action classifier of HumanAct12: a GRU over joint positions (Guo et al. 2020, "Action2Motion")."""
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
 
@@ -11,7 +13,7 @@ class ActionGRU(nn.Module):
 
     The released weights provide the features and the accuracy in every HumanAct12 table. The authors draw the initial
     state from a normal distribution in every call, so their numbers are random even for fixed motions. Here, the
-    initial state is zero, unless one is given (`random_state` draws it as the authors do).
+    initial `state` (layers, B, hidden) is zero, unless one is given.
     """
 
     features = 30
@@ -23,27 +25,25 @@ class ActionGRU(nn.Module):
         self.linear2 = nn.Linear(self.features, num_actions)
 
     def forward(self, joints: Tensor, mask: Tensor, state: Tensor | None = None) -> Tensor:
-        """Returns features (B, 30) in (-1, 1) of motions, which the network sees with y down and from the first pelvis.
+        """Returns features (B, 30) in (-1, 1) of joints (B, F, J, 3) in meters, y up, with mask (B, F).
 
-        Args:
-            joints: (B, F, J, 3) in meters, y up; the 24 SMPL joints for the released weights.
-            mask: (B, F) bool, True = real frame; every motion has at least one.
-            state: (layers, B, hidden) initial state; None = zeros.
+        The network sees them with y down and relative to the first position of the pelvis.
         """
         joints = joints * joints.new_tensor([1.0, -1.0, -1.0])
         return self.published(joints - joints[:, :1, :1], mask, state)
 
     def published(self, x: Tensor, mask: Tensor, state: Tensor | None = None) -> Tensor:
-        """Returns features (B, 30) of what the network sees (B, F, J, 3); other arguments as for `forward`."""
+        """Returns features (B, 30) of what the network sees (B, F, J, 3)."""
         outputs, _ = self.recurrent(x.flatten(2), state)
         last = mask.sum(1) - 1
         return torch.tanh(self.linear1(outputs[torch.arange(len(last), device=last.device), last]))
 
     def logits(self, joints: Tensor, mask: Tensor, state: Tensor | None = None) -> Tensor:
-        """Returns unnormalized log-probabilities (B, actions) of the actions; arguments as for `forward`."""
+        """Returns unnormalized log-probabilities (B, actions); arguments as for `forward`."""
         return self.linear2(self(joints, mask, state))
 
-    def random_state(self, batch: int, generator: torch.Generator) -> Tensor:
-        """Draws an initial state (layers, B, hidden) from a standard normal distribution, as the authors do."""
-        shape = (self.recurrent.num_layers, batch, self.recurrent.hidden_size)
-        return torch.randn(shape, generator=generator).to(self.linear1.weight)
+    def random_state(self, seeds: Sequence[int]) -> Tensor:
+        """Draws initial states (layers, B, hidden) from a standard normal distribution, as the authors do."""
+        shape = (self.recurrent.num_layers, 1, self.recurrent.hidden_size)
+        states = [torch.randn(shape, generator=torch.Generator().manual_seed(seed)) for seed in seeds]
+        return torch.cat(states, 1).to(self.linear1.weight)

@@ -4,14 +4,11 @@ The networks load the released weights. MARDM's other evaluator is `evaluators.e
 """
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from evaluators.extractors.t2m import read_statistics
-from flame_mdm.checkpoints.released_weights import load_strictly, read_weights
 from flame_mdm.conditions.text import Pretrained
 from flame_mdm.denoisers.layers import sinusoid
 
@@ -44,10 +41,7 @@ class _MotionEncoder(nn.Module):
 class MARDMClip(nn.Module):
     """Embeds the essential features of motions, and captions, as vectors of length 1.
 
-    Args:
-        mean, std: (67,) of the features.
-        width, hidden, layers, heads: of the transformers; `hidden` is the width of their linear layers.
-        words, slots: size of the vocabulary, and tokens of a caption.
+    `mean` and `std` (67,) are those of the features; `hidden` is the width of the linear layers of the transformers.
     """
 
     mean: Tensor
@@ -92,9 +86,3 @@ def clip_tokens(captions: Sequence[str]) -> Tensor:
     tokenizer = Pretrained(*CLIP, None, None).tokenizer
     encoded = tokenizer(list(captions), padding="max_length", truncation=True, max_length=77, return_tensors="pt")
     return encoded["input_ids"] * encoded["attention_mask"]
-
-
-def load_mardm_clip(folder: Path) -> MARDMClip:
-    """Loads the evaluator with the authors' weights from a folder that `MARDMClipExtractor` describes."""
-    path = folder / "finest.tar"
-    return load_strictly(MARDMClip(*read_statistics(folder)), read_weights(path, "contrast_model"), path)

@@ -2,15 +2,16 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Self
+from typing import Any, Self
 
 import torch
 import torch.distributed
 import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.distributed.nn.functional import all_gather
+from torchmetrics import Metric
 
-from evaluators.extractors.validation import log_validation, update_pairs
+from evaluators.extractors.training import ExtractorTask
 from evaluators.metrics.alignment import MotionsForText, TextsForMotion
 from evaluators.metrics.samples import SampleMetric
 from flame_mdm.batch import MotionBatch
@@ -21,8 +22,6 @@ from flame_mdm.denoisers.flame import cosine_first_sinusoid
 from flame_mdm.denoisers.layers import Transformer, with_prefix
 from flame_mdm.errors import UserError
 from flame_mdm.representations import Representation
-from flame_mdm.seeds import key
-from flame_mdm.task import Task
 
 POOL = 32  # pairs per pool in which validation ranks, as in R-precision
 
@@ -35,7 +34,6 @@ class MotionCLIP(nn.Module):
 
     Args:
         in_features, text_features, embedding_dim: D of the motions, C of the pooled condition, E of the joint space.
-        latent_dim, ff_size, num_layers, num_heads, dropout: of the transformer, see `Denoiser`.
         max_frames: longest motion that the length token supports.
         blind_features: number of features at the beginning of each frame that are set to 0. It is 3 in FLAME's
             code, whose motions begin with the root's translation: scores do not depend on position and height.
@@ -59,8 +57,7 @@ class MotionCLIP(nn.Module):
         roughness: bool = False,
     ):
         super().__init__()
-        self.roughness = roughness
-        self.max_frames, self.blind_features = max_frames, blind_features
+        self.max_frames, self.blind_features, self.roughness = max_frames, blind_features, roughness
         self.cls = nn.Parameter(torch.randn(latent_dim))
         # Row 0, unused in the authors' code, is that of the longest motion: see the FLAME denoiser.
         self.length_embedding = nn.Embedding(max_frames, latent_dim)
@@ -101,12 +98,11 @@ def info_nce(
 ) -> Tensor:
     """Contrastive loss over the pairs of all processes: the mean of both cross-entropies.
 
-    Oord et al. 2018, eq. 4; symmetric, as in Radford et al. 2021. Each process compares its own pairs with all motions
-    and texts. If all processes have the same number of pairs, the average over processes, as of gradients in DDP, is
-    the loss and gradient of a single process with all pairs.
+    Oord et al. 2018, eq. 4; symmetric, as in Radford et al. 2021. Each process compares its own pairs (B, E) with all
+    motions and texts. If all processes have the same number of pairs, the average over processes, as of gradients in
+    DDP, is the loss and gradient of a single process with all pairs.
 
     Args:
-        motion, text: (B, E) features.
         logit_scale: (), logarithm of the inverse temperature.
         meaning: (B, M) int64. Pairs that are equal in one of the M numbers are not negatives of each other.
         wrong_text: (B, K, E) features of texts that are negatives of one motion each.
@@ -128,7 +124,6 @@ def info_nce(
 
 
 def _of_all_processes(x: Tensor) -> Tensor:
-    """Returns the rows of x (B, ...) of all processes, in the order of their ranks."""
     several = torch.distributed.is_initialized() and torch.distributed.get_world_size() > 1
     return torch.cat(all_gather(x)) if several else x
 
@@ -143,7 +138,7 @@ class PooledLoss(SampleMetric):
     states = ("generated", "text")
 
     def update(self, generated: Tensor, text: Tensor, keys: Tensor, scale: Tensor) -> None:
-        """Adds features of motions and texts, (B, E) of length 1, with keys (B,), and the inverse temperature ()."""
+        """Adds features of length 1, and the inverse temperature ()."""
         super().update(keys=keys, generated=scale * generated, text=text)
 
     def value(self, motion: Tensor, text: Tensor) -> float:
@@ -156,55 +151,27 @@ class PooledLoss(SampleMetric):
         return torch.cat(losses).mean().item()
 
 
-class MotionCLIPTask(Task):
-    """Task that trains motion-CLIP (`make train EXP=motion_clip/...`), and the resulting feature extractor.
-
-    Args:
-        network: motion encoder and text projection.
-        condition: text encoder, independent of that of the evaluated model; frozen in FLAME.
-        representation: of the motions; an extractor can only measure motions in this representation.
-        optimizer: a mapping with the `_target_` of a torch optimizer and its arguments.
-        seed: determines the dropout of a training step, together with the step and the rank.
-    """
+class MotionCLIPTask(ExtractorTask):
+    """Trains motion-CLIP (`make train EXP=motion_clip/...`); the text encoder is frozen in FLAME."""
 
     noun = "a motion-CLIP"
-
-    def __init__(
-        self,
-        network: MotionCLIP,
-        condition: ConditionEncoder,
-        representation: Representation,
-        *,
-        optimizer: Config,
-        seed: int = 0,
-    ):
-        super().__init__(condition, representation, optimizer=optimizer, seed=seed)
-        self.network = network
-        with torch.device("cpu"):  # a loaded model is built on the meta device, of which metrics cannot be moved
-            self.val_metrics = nn.ModuleDict(
-                {"loss": PooledLoss(), "texts_for_motion": TextsForMotion(), "motions_for_text": MotionsForText()}
-            )
+    network: MotionCLIP
 
     @classmethod
-    def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:
+    def parts(cls, config: Config, representation: Representation, actions: Sequence[str]) -> dict[str, Any]:
         condition: ConditionEncoder = instantiate(config["condition"])
         widths = {"in_features": representation.features, "text_features": condition.features}
-        network: MotionCLIP = instantiate(config["task"]["network"], **widths)
-        task = cls(network, condition, representation, optimizer=config["optimizer"], seed=config["seed"])
-        task.config, task.facts = config, {"actions": list(actions)}
-        return task
+        return {"condition": condition, "network": instantiate(config["task"]["network"], **widths)}
+
+    def metrics(self) -> dict[str, Metric]:
+        return {"loss": PooledLoss(), "texts_for_motion": TextsForMotion(), "motions_for_text": MotionsForText()}
 
     @classmethod
     def import_released(cls, state: Mapping[str, Tensor], config: Config) -> Self:
-        """Imports FLAME's released motion-CLIP into the task of a recipe with the same sizes.
+        """Imports FLAME's released motion-CLIP, by the authors' names, into the task of a recipe with the same sizes.
 
-        Args:
-            state: weights by the authors' names, see `released_state`. The pooler, with the random weights that the
-                network was trained on, is loaded into the text encoder.
-            config: `experiments/motion_clip/humanml3d_smpl.yaml`, composed.
-
-        Raises:
-            ValueError: If weights or sizes do not match, or there is no pooler.
+        The pooler, with the random weights that the network was trained on, is loaded into the text encoder. Raises
+        `ValueError` if weights or sizes do not match, or there is no pooler.
         """
         representation: Representation = instantiate(config["representation"])
         task = cls.build(config, representation)
@@ -215,43 +182,35 @@ class MotionCLIPTask(Task):
         task.facts |= {"fingerprint": None, "max_frames": task.network.max_frames}
         return task.eval()
 
-    # Feature extraction -----------------------------------------------------------------------------------------------
-
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
         """Returns features (B, E) of motions (B, F, D) in the data's units, with mask (B, F)."""
         return self.network(self.representation.normalize(x), mask)
 
     def text(self, captions: Sequence[str]) -> Tensor:
         """Returns features (B, E) of captions."""
-        return self.network.text(self._pooled(list(captions)))
-
-    def _pooled(self, captions: list[str]) -> Tensor:
         x = torch.zeros(len(captions), 1, self.representation.features, device=self.device)
         mask = torch.ones(len(captions), 1, dtype=torch.bool, device=self.device)
-        return self.condition(MotionBatch(x, mask, ids=captions, text=captions)).pooled
+        return self.text_features(MotionBatch(x, mask, ids=list(captions), text=list(captions)))
 
-    # Training ---------------------------------------------------------------------------------------------------------
+    def text_features(self, batch: MotionBatch) -> Tensor:
+        cond = self.condition(batch)
+        if cond.null is not None:  # gives a learned null, which is not used here, a gradient, as DDP requires
+            cond = cond.drop(torch.zeros(len(cond.pooled), dtype=torch.bool, device=self.device))
+        return self.network.text(cond.pooled)
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
         """Returns the loss of one batch, with the pairs of the other processes as negatives."""
-        torch.manual_seed(key("step", self.seed, batch_idx, self.global_rank))
-        cond = self.condition(batch)
-        if cond.null is not None:  # gives a learned null, which is not used here, a gradient, as DDP requires
-            cond = cond.drop(torch.zeros(len(batch), dtype=torch.bool, device=self.device))
-        motion, text = self.network(batch.x, batch.mask), self.network.text(cond.pooled)
+        self.seed_step(batch_idx)
+        text, motion = self.text_features(batch), self.network(batch.x, batch.mask)
         loss = info_nce(motion, text, self.network.logit_scale)
-        self.log_dict(
-            {"train/loss": loss, "train/temperature": (-self.network.logit_scale).exp()}, batch_size=len(batch)
-        )
+        values = {"train/loss": loss, "train/temperature": (-self.network.logit_scale).exp()}
+        self.log_dict(values, batch_size=len(batch))
         return loss
 
     def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:
         motion = F.normalize(self.network(batch.x, batch.mask), dim=-1)
-        text = F.normalize(self.network.text(self.condition(batch).pooled), dim=-1)
-        update_pairs(self, self.val_metrics, batch, motion, text, scale=self.network.logit_scale.exp())
-
-    def on_validation_epoch_end(self) -> None:
-        log_validation(self, self.val_metrics)
+        text = F.normalize(self.text_features(batch), dim=-1)
+        self.update_pairs(batch, motion, text, scale=self.network.logit_scale.exp())
 
 
 _MCLIP = {

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Self
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -47,48 +47,41 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
     near_misses: dict[str, list[list[str]]]
 
     @classmethod
-    def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:
-        """Builds the task of a recipe. Raises `UserError` if the representation does not encode joints."""
+    def parts(cls, config: Config, representation: Representation, actions: Sequence[str]) -> dict[str, Any]:
+        """Raises `UserError` if the representation does not encode joints."""
         if not isinstance(representation, HumanML):
             raise UserError(
                 f"representation={representation.name}: {cls.__name__} adds noise to joints and encodes them again, "
                 "which takes a representation such as humanml_clean. Train another recipe of motion_clip/..."
             )
-        return super().build(config, representation, actions=actions)
+        return super().parts(config, representation, actions)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Returns features (B, E) of length `LENGTH` of motions (B, F, D) in the data's units, with mask (B, F)."""
+        """Returns features (B, E) of length `LENGTH`."""
         return LENGTH * F.normalize(super().forward(x, mask), dim=-1)
 
     def text(self, captions: Sequence[str]) -> Tensor:
-        """Returns features (B, E) of length `LENGTH` of captions."""
+        """Returns features (B, E) of length `LENGTH`."""
         return LENGTH * F.normalize(super().text(captions), dim=-1)
 
     def on_fit_start(self) -> None:
         """Looks up the near misses of the training clips."""
         super().on_fit_start()
         clips = self.trainer.datamodule.train.clips  # type: ignore[attr-defined]
-        self.meanings = {
-            clip.id: [
-                key("captions", *sorted(clip.captions)),
-                key("attributes", json.dumps(clip.attributes if "action" in clip.attributes else clip.id)),
-            ]
-            for clip in clips
-        }
-        pairs = zip(clips, near_misses(clips), strict=True)
-        self.near_misses = {clip.id: list(texts.values()) for clip, texts in pairs}
+        self.meanings, self.near_misses = {}, {}
+        for clip, texts in zip(clips, near_misses(clips), strict=True):
+            attributes = json.dumps(clip.attributes if "action" in clip.attributes else clip.id)
+            self.meanings[clip.id] = [key("captions", *sorted(clip.captions)), key("attributes", attributes)]
+            self.near_misses[clip.id] = list(texts.values())
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
-        torch.manual_seed(key("step", self.seed, batch_idx, self.global_rank))
+        self.seed_step(batch_idx)
         assert batch.text is not None
         wrong = [self.near_miss(name, number, batch_idx) for name in batch.ids for number in range(NEAR_MISSES)]
-        cond = self.condition(replace(batch, text=batch.text + wrong))
-        if cond.null is not None:  # gives a learned null, which is not used here, a gradient, as DDP requires
-            cond = cond.drop(torch.zeros(len(cond.pooled), dtype=torch.bool, device=self.device))
-        text, wrong_text = self.network.text(cond.pooled).tensor_split([len(batch)])
-        meaning = [
-            [*self.meanings[name], key("caption", text)] for name, text in zip(batch.ids, batch.text, strict=True)
-        ]
+        texts = self.text_features(replace(batch, text=batch.text + wrong))
+        text, wrong_text = texts.tensor_split([len(batch)])
+        pairs = zip(batch.ids, batch.text, strict=True)
+        meaning = [[*self.meanings[name], key("caption", caption)] for name, caption in pairs]
 
         chosen = torch.randperm(len(batch))[: (len(batch) + 1) // 2].to(self.device)
         strength = torch.rand(len(chosen)) ** 2

@@ -18,9 +18,8 @@ def adjacency(parents: Sequence[int]) -> Tensor:
     """Returns (3, V, V) matrices that gather from a vertex itself, its neighbors, and its neighbors nearer the center.
 
     Entry (v, w) is the weight of v in w, divided by the number of vertices that contribute to w. The center is the root
-    of the tree. As in the authors' code, only distances up to 1 from the center are distinguished, and all vertices
-    beyond are equally far. The spatial partition of Yan et al. 2018 (section 3.3) thus only affects the vertices next
-    to the center.
+    of the tree. As in the authors' code, all vertices beyond distance 1 from the center are equally far, so the spatial
+    partition of Yan et al. 2018 (section 3.3) only affects the vertices next to the center.
     """
     size, root = len(parents), parents.index(-1)
     linked = torch.eye(size)
@@ -42,26 +41,22 @@ class STGCN(nn.Module):
     the end of the longest one, so features do not depend on the other motions of a batch. In the published evaluations,
     all motions have 60 frames, and short clips repeat their last frame.
 
-    Args:
-        in_channels, num_actions: C, channels per joint, and number of classes.
-        parents: parent of each joint, -1 for the center.
-        widths, strides: channels after each block, and its temporal stride.
+    `in_channels` is C; `parents` is -1 for the center; `widths` and `strides` are those of the blocks.
     """
 
     def __init__(
         self, in_channels: int, num_actions: int, parents: Sequence[int], widths: Sequence[int], strides: Sequence[int]
     ):
         super().__init__()
-        graph = adjacency(parents)
-        self.register_buffer("A", graph)
+        self.register_buffer("A", adjacency(parents))
         self.A: Tensor
         self.data_bn = nn.BatchNorm1d(in_channels * len(parents))
         channels = [in_channels, *widths]
         self.st_gcn_networks = nn.ModuleList(
-            _Block(channels[i], width, len(graph), stride, residual=i > 0)
+            _Block(channels[i], width, len(self.A), stride, residual=i > 0)
             for i, (width, stride) in enumerate(zip(widths, strides, strict=True))
         )
-        self.edge_importance = nn.ParameterList([nn.Parameter(torch.ones_like(graph)) for _ in widths])
+        self.edge_importance = nn.ParameterList([nn.Parameter(torch.ones_like(self.A)) for _ in widths])
         self.fcn = nn.Conv2d(widths[-1], num_actions, 1)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
@@ -123,14 +118,11 @@ class Unconstrained(STGCN):
         super().__init__(3, 12, UNCONSTRAINED_PARENTS, (64, 64, 64, 128, 128, 256), (1, 1, 1, 2, 1, 2))
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Returns features (B, 256) of joints (B, F, 24, 3) in meters, y up.
-
-        The network sees them relative to the pelvis and with y down, as published.
-        """
+        """Returns features (B, 256) of joints (B, F, 24, 3) in meters, y up; the network sees them with y down."""
         return self.published(x[:, :, list(UNCONSTRAINED_JOINTS)] * x.new_tensor([1.0, -1.0, -1.0]), mask)
 
     def published(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Returns features (B, 256) of the 15 joints (B, F, 15, 3) of the published reference motions, y down."""
+        """Returns features (B, 256) of joints (B, F, 15, 3) as in the published reference motions, y down."""
         return super().forward(x - x[:, :, 8:9], mask)
 
 
@@ -141,5 +133,4 @@ class JointSTGCN(STGCN):
         super().__init__(3, num_actions, parents, widths, strides)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Returns features (B, E) of joints (B, F, J, 3) in meters, y up, with mask (B, F)."""
         return super().forward(x - x[:, :1, :1], mask)

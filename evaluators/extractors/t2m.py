@@ -1,7 +1,6 @@
 """The evaluator of HumanML3D and KIT-ML (Guo et al. 2022, "Generating Diverse and Natural 3D Human Motions from Text").
 
-The networks load the released weights. The authors' code returns embeddings in the order of descending length; here,
-they are in the order of the input.
+The authors' code returns embeddings in the order of descending length; here, they are in the order of the input.
 """
 
 from collections.abc import Sequence
@@ -10,6 +9,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.nn.utils.rnn import pack_padded_sequence
 
@@ -21,6 +21,7 @@ from flame_mdm.data.t2m import MAX_TOKENS, frame_tokens
 from flame_mdm.errors import UserError
 from flame_mdm.safe_io import read_npy
 
+SLOTS = MAX_TOKENS + 2  # of a caption, with start and end marks
 UNIT = 4  # frames per vector of the movement encoder
 CONTACTS = 4  # number of features at the end of each frame that the evaluator ignores
 PARTS_OF_SPEECH = (
@@ -48,12 +49,7 @@ class Words(NamedTuple):
 
 
 class WordVectors:
-    """Vectors of words, such as the GloVe vectors of the captions of HumanML3D and KIT-ML.
-
-    Args:
-        rows: row of each word.
-        vectors: (N, 300).
-    """
+    """Vectors (N, 300) of words, such as GloVe's of the captions of HumanML3D and KIT-ML, and the row of each word."""
 
     def __init__(self, rows: dict[str, int], vectors: Tensor):
         self.rows, self.vectors = rows, vectors
@@ -61,52 +57,39 @@ class WordVectors:
     @classmethod
     def read(cls, folder: Path) -> Self:
         """Reads our_vab_data.npy and our_vab_idx.pkl; raises `FileNotFoundError`, or `UserError` for other content."""
-        data, index = folder / "our_vab_data.npy", folder / "our_vab_idx.pkl"
-        for file in (data, index):
-            if not file.is_file():
-                raise FileNotFoundError(
-                    f"{file}: no such file. Give the folder of the GloVe vectors released by the authors"
-                )
-        rows, vectors = restricted_pickle.read(index), _read_numbers(data).astype(np.float32)
-        if not isinstance(rows, dict) or vectors.ndim != 2 or not {"sos", "eos", "unk"} <= rows.keys():
-            raise UserError(f"{folder}: not the released GloVe vectors, which have sos, eos, unk and one row per word")
-        if not all(isinstance(row, int | np.integer) and row >= 0 for row in rows.values()):
-            raise UserError(f"{index}: not a mapping of words to row numbers")
-        if max(rows.values()) >= len(vectors):
-            raise UserError(f"{data}: has {len(vectors)} rows, but the index refers to more")
+        rows = restricted_pickle.read(folder / "our_vab_idx.pkl")
+        vectors = _read_numbers(folder / "our_vab_data.npy").astype(np.float32)
+        known = isinstance(rows, dict) and vectors.ndim == 2 and {"sos", "eos", "unk"} <= rows.keys()
+        if not known or not all(isinstance(row, int | np.integer) and 0 <= row < len(vectors) for row in rows.values()):
+            raise UserError(f"{folder}: not the released GloVe vectors: sos, eos, unk and other words, each with a row")
         return cls(rows, torch.from_numpy(vectors))
 
     def __call__(self, captions: Sequence[Sequence[str]], *, full_length: bool = False) -> Words:
         """Returns the text encoder's input for captions.
 
-        Args:
-            captions: lists of "word/PART" tokens as in the files of the data sets, without start and end marks. Tokens
-                after the 20th are dropped. A word without a vector is unknown, and so is its part of speech.
-            full_length: legacy option of MDM's code before January 2024, and of MFM's: every caption is treated as
-                filling all 22 slots, which lowers R-precision.
+        Captions are lists of "word/PART" tokens as in the files of the data sets, without start and end marks. Tokens
+        after the 20th are dropped. A word without a vector is unknown, and so is its part of speech. `full_length` is a
+        legacy option of MDM's code before January 2024, and of MFM's: every caption is treated as filling all 22 slots,
+        which lowers R-precision.
         """
-        index = {part: number for number, part in enumerate(PARTS_OF_SPEECH)}
-        rows = torch.full((len(captions), MAX_TOKENS + 2), self.rows["unk"])
-        parts = torch.zeros(len(captions), MAX_TOKENS + 2, len(PARTS_OF_SPEECH))
-        numbers = torch.full((len(captions), MAX_TOKENS + 2), index["OTHER"])
-        lengths = torch.full((len(captions),), MAX_TOKENS + 2)
+        rows = torch.full((len(captions), SLOTS), self.rows["unk"])
+        parts = torch.full((len(captions), SLOTS), PARTS_OF_SPEECH.index("OTHER"))
+        lengths = torch.full((len(captions),), SLOTS)
         for i, caption in enumerate(captions):
             tokens, filled = frame_tokens(caption)
             for j, token in enumerate(tokens):
                 word, _, part = token.rpartition("/")
+                part = SPECIAL.get(word, part)
                 if word in self.rows:
                     rows[i, j] = self.rows[word]
-                    numbers[i, j] = index.get(SPECIAL.get(word, part), index["OTHER"])
+                    parts[i, j] = PARTS_OF_SPEECH.index(part if part in PARTS_OF_SPEECH else "OTHER")
             if not full_length:
                 lengths[i] = filled
-        return Words(self.vectors[rows], parts.scatter_(2, numbers[..., None], 1), lengths)
+        return Words(self.vectors[rows], F.one_hot(parts, len(PARTS_OF_SPEECH)).float(), lengths)
 
 
 class LearnedWords(nn.Module):
-    """Word vectors learned with the evaluator, for data sets without tagged words; see `vocabulary.hashed`.
-
-    Parts of speech are unknown: their vectors are 0.
-    """
+    """Word vectors learned with the evaluator, for data sets without tagged words; vectors of parts of speech are 0."""
 
     def __init__(self):
         super().__init__()
@@ -124,17 +107,10 @@ class LearnedWords(nn.Module):
 class T2MEvaluator(nn.Module):
     """Embeds motions and captions in a joint space, for R-precision, MM-Dist, FID and diversity on HumanML3D and KIT.
 
-    Features are in the data's units, and are normalized with the statistics of the released weights, not with those of
-    the data set. As in the authors' code for real motions, motions are padded to `max_frames` with zeros after
-    normalization; the convolutions see 3 frames past the end.
-
-    Args:
-        mean, std: (D,) of the evaluator: 263 or 251 features.
-        movement_hidden, movement_latent: channels after the first convolution, and of a movement vector.
-        text_hidden, motion_hidden, embedding: widths of the GRUs and of the joint space.
-        max_frames: length to which every motion is padded.
-        used_features: number of features that the network sees, from the first; MARDM's sees 67 (KIT: 64). None =
-            all but the contacts.
+    Features are in the data's units, and are normalized with the statistics `mean` and `std` (D,) of the released
+    weights, not with those of the data set. As in the authors' code for real motions, motions are padded to
+    `max_frames` with zeros after normalization; the convolutions see 3 frames past the end. The network sees the first
+    `used_features` (MARDM's 67, KIT: 64); None = all but the contacts.
     """
 
     mean: Tensor

@@ -2,25 +2,23 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Self
+from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torchmetrics import MeanMetric
+from torchmetrics import MeanMetric, Metric
 
 from evaluators.extractors.t2m import UNIT, LearnedWords, T2MEvaluator, WordVectors
-from evaluators.extractors.validation import log_validation, update_pairs
+from evaluators.extractors.training import ExtractorTask
 from evaluators.metrics.alignment import MotionsForText, MultimodalDistance
 from evaluators.metrics.samples import SampleMetric
 from flame_mdm.batch import MotionBatch
-from flame_mdm.conditions import Unconditional
+from flame_mdm.conditions import ConditionEncoder, Unconditional
 from flame_mdm.conditions.vocabulary import words as words_of
 from flame_mdm.config import Config, instantiate
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.errors import UserError
 from flame_mdm.representations import Representation
-from flame_mdm.seeds import key
-from flame_mdm.task import Task
 
 
 class _MovementDecoder(nn.Module):
@@ -93,29 +91,28 @@ class MatchingLoss(SampleMetric):
         return matching_loss(motion, text, self.margin).item() if len(motion) > 1 else None
 
 
-class T2MTask(Task):
-    """Task that trains the evaluator (`make train EXP=t2m/...`), and the resulting feature extractor.
+class T2MTask(ExtractorTask):
+    """Trains the evaluator (`make train EXP=t2m/...`).
 
     Until step `movement_steps`, the movement encoder is trained with a decoder to reconstruct motions. It is then
     frozen, and the encoders of text and motion are trained to match. Checkpoints contain the word vectors.
 
     Many clips may share a caption, so a motion is a wrong one for a text only if the text is not among its captions.
+    The last 4 features of the motions are contacts.
 
     Args:
-        network: the evaluator; its statistics are set to those of the data.
-        representation: of the motions, whose last 4 features are contacts.
         words: folder of our_vab_data.npy and our_vab_idx.pkl, see `WordVectors`, only read for training; "learned" for
             data sets whose words are not tagged, see `LearnedWords`.
-        movement_steps: steps of the first stage.
         sparsity, smoothness: weights of the mean magnitude of movement vectors, and of differences of successive ones.
-        margin: of `matching_loss`.
     """
 
     noun = "a trained evaluator of Guo et al."
+    network: T2MEvaluator
 
     def __init__(
         self,
         network: T2MEvaluator,
+        condition: ConditionEncoder,
         representation: Representation,
         *,
         words: str,
@@ -126,63 +123,53 @@ class T2MTask(Task):
         optimizer: Config,
         seed: int = 0,
     ):
-        super().__init__(Unconditional(), representation, optimizer=optimizer, seed=seed)
-        self.network = network
-        linear = network.movement_encoder.out_net
-        first = network.movement_encoder.main[0]
+        super().__init__(network, condition, representation, optimizer=optimizer, seed=seed)
+        first, linear = network.movement_encoder.main[0], network.movement_encoder.out_net
         assert isinstance(first, nn.Conv1d)
         self.decoder = _MovementDecoder(linear.out_features, first.out_channels, first.in_channels)
         self.word_folder, self.movement_steps = words, movement_steps
         self.sparsity, self.smoothness, self.margin = sparsity, smoothness, margin
         self.words: WordVectors | LearnedWords | None = LearnedWords() if words == "learned" else None
         self.tokens: dict[str, dict[str, list[str]]] = {}  # of the captions of each clip
-        with torch.device("cpu"):  # a loaded model is built on the meta device, of which metrics cannot be moved
-            pairs = {
-                "loss": MatchingLoss(margin),
-                "mm_dist": MultimodalDistance(),
-                "motions_for_text": MotionsForText(),
-            }
-            self.val_metrics = nn.ModuleDict(pairs | {"reconstruction": MeanMetric()})
 
     @classmethod
-    def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:
-        options = {name: value for name, value in config["task"].items() if name not in ("_target_", "network")}
+    def parts(cls, config: Config, representation: Representation, actions: Sequence[str]) -> dict[str, Any]:
+        """Builds the network with the statistics of the data."""
         statistics = {"mean": representation.mean.clone(), "std": representation.std.clone()}
-        network: T2MEvaluator = instantiate(config["task"]["network"], **statistics)
-        task = cls(network, representation, **options, optimizer=config["optimizer"], seed=config["seed"])
-        task.config, task.facts = config, {"actions": list(actions)}
-        return task
+        return {"network": instantiate(config["task"]["network"], **statistics), "condition": Unconditional()}
+
+    def metrics(self) -> dict[str, Metric]:
+        return {
+            "loss": MatchingLoss(self.margin),
+            "mm_dist": MultimodalDistance(),
+            "motions_for_text": MotionsForText(),
+            "reconstruction": MeanMetric(),
+        }
 
     def setup(self, stage: str) -> None:
         """Sets up the task, reads the word vectors, and collects the tagged words of all captions.
 
-        Raises:
-            FileNotFoundError, UserError: If one of them is missing or damaged, or the batch size is less than 2.
+        Raises `FileNotFoundError` or `UserError` if they are missing or damaged, or the batch size is less than 2.
         """
         super().setup(stage)
         data: MotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
         if data.batch_size < 2:
             raise UserError(f"data.batch_size={data.batch_size}: matching needs at least two motions per batch")
         if not self.learns_words:
-            if not Path(self.word_folder).is_dir():
-                raise FileNotFoundError(
-                    f"task.words={self.word_folder}: no such folder. Give that of our_vab_data.npy and our_vab_idx.pkl"
-                )
             self.words = WordVectors.read(Path(self.word_folder))
             self.facts["words"] = {str(word): int(row) for word, row in self.words.rows.items()}
         self.network.mean.copy_(self.representation.mean)
         self.network.std.copy_(self.representation.std)
-        clips = [*data.train.clips, *data.val.clips]
-        for clip in clips:
+        for clip in (*data.train.clips, *data.val.clips):
             tagged = map(words_of, clip.captions) if self.learns_words else clip.attributes.get("tokens", ())
             # The first of equal captions counts.
             self.tokens[clip.id] = dict(reversed(list(zip(clip.captions, tagged, strict=False))))
         bare = [name for name, tokens in self.tokens.items() if not tokens]
         if bare:
+            kind = "captions" if self.learns_words else "captions with tagged words"
             raise UserError(
-                f"{data.folder}: {len(bare)} clips have no captions"
-                f"{'' if self.learns_words else ' with tagged words'}, such as {bare[0]}. Choose a data "
-                "set with captions; tagged words, as in HumanML3D and KIT-ML, are not needed with task.words=learned"
+                f"{data.folder}: {len(bare)} clips have no {kind}, such as {bare[0]}. Choose a data set with captions; "
+                "tagged words, as in HumanML3D and KIT-ML, are not needed with task.words=learned"
             )
 
     @property
@@ -202,22 +189,14 @@ class T2MTask(Task):
             raise UserError(f"task.words={self.word_folder}: these are not the word vectors that this run began with")
         self.words = WordVectors(self.facts["words"], state.cpu())
 
-    # Feature extraction -----------------------------------------------------------------------------------------------
-
-    def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Returns features (B, E) of motions (B, F, D) in the data's units, with mask (B, F)."""
-        return self.network(x, mask)
-
     def text(self, tokens: Sequence[Sequence[str]]) -> Tensor:
         """Returns features (B, E) of captions, given as "word/PART" tokens, or as words if they are learned."""
         assert self.words is not None
         return self.network.text(self.words(tokens))
 
-    # Training ---------------------------------------------------------------------------------------------------------
-
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
         """Returns the loss of one batch: reconstruction until `movement_steps`, then matching."""
-        torch.manual_seed(key("step", self.seed, batch_idx, self.global_rank))
+        self.seed_step(batch_idx)
         self.network.movement_encoder.train(self._learns_movement)
         if self._learns_movement:
             values = reconstruction_terms(self.network, self.decoder, batch)
@@ -250,10 +229,6 @@ class T2MTask(Task):
         return self(self.representation.denormalize(batch.x), batch.mask), self.text(tokens)
 
     def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:
-        update_pairs(self, self.val_metrics, batch, *self._embed(batch))
+        self.update_pairs(batch, *self._embed(batch))
         errors = reconstruction_terms(self.network, self.decoder, batch)["reconstruction"]
         self.val_metrics["reconstruction"].update(errors)  # type: ignore[operator]
-
-    def on_validation_epoch_end(self) -> None:
-        """Logs the matching loss in both stages of training, so that the best checkpoint is from the second."""
-        log_validation(self, self.val_metrics)

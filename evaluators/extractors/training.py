@@ -1,0 +1,103 @@
+"""Base class of the tasks that train feature extractors."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Self
+
+import torch
+from torch import Tensor, nn
+from torchmetrics import Metric
+
+from evaluators.metrics import update_metrics
+from evaluators.metrics.samples import SampleMetric
+from flame_mdm.batch import MotionBatch
+from flame_mdm.conditions import ConditionEncoder
+from flame_mdm.config import Config
+from flame_mdm.errors import UserError
+from flame_mdm.representations import Representation
+from flame_mdm.seeds import key
+from flame_mdm.task import Task
+
+
+class ExtractorTask(Task):
+    """Task that trains a network whose features evaluate motions, and the resulting feature extractor.
+
+    The text encoder is independent of that of the evaluated model. An extractor can only measure motions in the
+    representation it was trained on.
+    """
+
+    network: nn.Module
+
+    def __init__(
+        self,
+        network: nn.Module,
+        condition: ConditionEncoder,
+        representation: Representation,
+        *,
+        optimizer: Config,
+        seed: int = 0,
+    ):
+        super().__init__(condition, representation, optimizer=optimizer, seed=seed)
+        self.network, self.val_metrics = network, nn.ModuleDict()
+
+    @classmethod
+    def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:
+        options = {name: value for name, value in config["task"].items() if name != "_target_"}
+        options |= {"representation": representation, "optimizer": config["optimizer"], "seed": config["seed"]}
+        task = cls(**options | cls.parts(config, representation, actions))
+        task.config, task.facts = config, {"actions": list(actions)}
+        return task
+
+    @classmethod
+    def parts(cls, config: Config, representation: Representation, actions: Sequence[str]) -> dict[str, Any]:
+        """Builds `network` and `condition` of a recipe."""
+        raise NotImplementedError
+
+    def metrics(self) -> Mapping[str, Metric]:
+        """Returns the metrics of a validation; their "loss" selects the best checkpoint."""
+        raise NotImplementedError
+
+    def setup(self, stage: str) -> None:
+        super().setup(stage)
+        self.val_metrics.update(self.metrics())
+
+    def forward(self, x: Tensor, mask: Tensor) -> Tensor:
+        """Returns features (B, E) of motions (B, F, ...) in the data's units, with mask (B, F)."""
+        return self.network(x, mask)
+
+    def seed_step(self, batch_idx: int) -> None:
+        """Makes the random draws of a training step a function of (seed, batch number, rank)."""
+        torch.manual_seed(key("step", self.seed, batch_idx, self.global_rank))
+
+    def update_pairs(self, batch: MotionBatch, motion: Tensor, text: Tensor, **more: Tensor) -> None:
+        """Updates the metrics of samples with the pairs of a batch, each on one process; features are (B, E).
+
+        With fewer clips than processes, every process has all clips, and only the first one counts.
+        """
+        data = self.trainer.datamodule  # type: ignore[attr-defined]
+        if self.global_rank and len(data.val) < self.trainer.world_size:
+            return
+        keys, text_keys = (
+            torch.tensor([key(kind, name) for name in names], device=self.device)
+            for kind, names in (("motion", batch.ids), ("caption", batch.text or ()))
+        )
+        of_pairs = {name: metric for name, metric in self.val_metrics.items() if isinstance(metric, SampleMetric)}
+        update_metrics(of_pairs, generated=motion, text=text, keys=keys, text_keys=text_keys, **more)
+
+    def on_validation_epoch_end(self) -> None:
+        """Logs the metrics of a validation over all processes, and resets them.
+
+        Metrics other than the loss that have too few samples are left out: R-precision needs 32 captions.
+        """
+        for name, metric in self.val_metrics.items():
+            assert isinstance(metric, Metric)
+            try:
+                value = metric.compute()
+            except UserError:
+                if name == "loss":
+                    raise
+                value = None
+            parts = {f"{name}_{part}": x for part, x in value.items()} if isinstance(value, dict) else {name: value}
+            for part, x in parts.items():
+                if x is not None:
+                    self.log(f"val/{part}", x, prog_bar=part == "loss")
+            metric.reset()

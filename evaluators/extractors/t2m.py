@@ -59,8 +59,8 @@ class WordVectors:
         """Reads our_vab_data.npy and our_vab_idx.pkl; raises `FileNotFoundError`, or `UserError` for other content."""
         rows = restricted_pickle.read(folder / "our_vab_idx.pkl")
         vectors = _read_numbers(folder / "our_vab_data.npy").astype(np.float32)
-        known = isinstance(rows, dict) and vectors.ndim == 2 and {"sos", "eos", "unk"} <= rows.keys()
-        if not known or not all(isinstance(row, int | np.integer) and 0 <= row < len(vectors) for row in rows.values()):
+        named = isinstance(rows, dict) and vectors.ndim == 2 and {"sos", "eos", "unk"} <= rows.keys()
+        if not named or not all(isinstance(row, int | np.integer) and 0 <= row < len(vectors) for row in rows.values()):
             raise UserError(f"{folder}: not the released GloVe vectors: sos, eos, unk and other words, each with a row")
         return cls(rows, torch.from_numpy(vectors))
 

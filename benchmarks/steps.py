@@ -108,15 +108,6 @@ def batch_of(lengths: np.ndarray, frames: int, device: str) -> MotionBatch:
     return MotionBatch(x.to(device), mask.to(device), [str(i) for i in range(len(lengths))])
 
 
-def matrix_peak(device: str, size: int) -> dict[str, float]:
-    """Returns the measured floating-point operations per second of a matrix product, as used by each speed."""
-    rates = {}
-    for speed, dtype in zip(SPEEDS, (torch.float32, torch.bfloat16), strict=True):
-        a, b = (torch.randn(size, size, device=device).to(dtype) for _ in range(2))
-        rates[speed] = 2 * size**3 / take_turns({"matmul": partial(torch.mm, a, b)}, 9, device)["matmul"]
-    return rates
-
-
 def take_turns(runs: Mapping[str, Callable[[], object]], rounds: int, device: str = "cpu") -> dict[str, float]:
     """Returns the median seconds of each function. They take turns, so that a busy machine slows all of them.
 
@@ -133,7 +124,7 @@ def take_turns(runs: Mapping[str, Callable[[], object]], rounds: int, device: st
     return {name: statistics.median(taken[1:]) for name, taken in times.items()}
 
 
-def full_size(size: list[str], batches: int, peak: dict[str, float], device: str) -> tuple[list[Row], str]:
+def full_size(size: list[str], batches: int, device: str) -> tuple[list[Row], str]:
     """Returns rows of the full-size step, and a text about the batches."""
     config = compose("humanml3d/mdm", ["data.batch_size=16", *size])
     rows = config["data"]["batch_size"]
@@ -147,7 +138,6 @@ def full_size(size: list[str], batches: int, peak: dict[str, float], device: str
 
     bucketed = batches_of(1)
     real = sum(int(chosen.sum()) for chosen in drawn)
-    operations = sum(cost(config, rows, batch.x.shape[1])[0] for batch in bucketed)
     width, layers = config["denoiser"]["latent_dim"], config["denoiser"]["num_layers"]
     ways: dict[str, tuple[Callable[[MotionBatch], None], list[MotionBatch]]] = {
         "plain PyTorch, padded to 196": (peer_step(width, layers, device), batches_of(LONGEST)),
@@ -164,30 +154,27 @@ def full_size(size: list[str], batches: int, peak: dict[str, float], device: str
     slowest = next(iter(times.values()))
     table: list[Row] = []
     for name, taken in times.items():
-        rate = peak.get(name.removeprefix("speed="))
         row: Row = {"training": name, "ms per step": 1000 * taken / batches, "times as fast": slowest / taken}
-        share = f"{operations / taken / rate:.0%}" if rate else None
-        table.append(row | {"frames per second": real / taken, "share of the matrix peak": share})
+        table.append(row | {"frames per second": real / taken})
     mean = sum(batch.x.shape[1] for batch in bucketed) / batches
     text = f"{rows} clips of {real / rows / batches:.0f} frames on average, padded to {mean:.0f} by the framework"
     return table, text
 
 
-def backbones(names: Sequence[str], rounds: int, peak: dict[str, float], device: str) -> list[Row]:
+def backbones(names: Sequence[str], rounds: int, device: str) -> list[Row]:
     """Returns a row per network of `BACKBONES`, in its size for CPU runs."""
     rows: list[Row] = []
     lengths = np.random.default_rng(1).integers(36, 61, 32)
     for name in names:
         config = compose(BACKBONES[name][0], ["condition=none", *BACKBONES[name][1:]])
         batch = batch_of(lengths, int(lengths.max()), device)
-        operations, _, parameters = cost(config, len(batch), batch.x.shape[1])
+        parameters = cost(config, len(batch), batch.x.shape[1])[2]
         runs = {speed: partial(recipe_step(config, speed, device)[0], batch) for speed in SPEEDS}
         times = take_turns(runs, rounds, device)
         row: Row = {"network": name, "parameters, M": parameters / 1e6}
         row |= {f"ms, {speed}": 1000 * taken for speed, taken in times.items()}
         row["times as fast"] = times["reference"] / times["fast"]
         row |= {f"frames per second, {speed}": int(lengths.sum()) / taken for speed, taken in times.items()}
-        row |= {f"share of peak, {s}": f"{operations / taken / peak[s]:.0%}" for s, taken in times.items()}
         rows.append(row)
     return rows
 
@@ -234,15 +221,14 @@ def measure(*words: str) -> Section:
     warnings.filterwarnings("ignore")
     torch.manual_seed(0)
     torch.set_float32_matmul_precision("high")  # as in training
-    peak = matrix_peak(device, 64 if quick else 2048 if device == "cpu" else 8192)
     size = ["data.batch_size=2", "denoiser.latent_dim=16", "denoiser.ff_size=32", "denoiser.num_layers=1"]
-    full, batches = full_size(size if quick else [], 1 if quick else 8, peak, device)
+    full, batches = full_size(size if quick else [], 1 if quick else 8, device)
     tables = {"full size": full}
     if device == "cuda":
         memory = torch.cuda.max_memory_allocated() / 2**30
         batches += f"; at most {memory:.1f} GiB of memory for all three models together"
     names = ["FLAME", "MFM"] if quick else list(BACKBONES)
-    tables["networks in their size for CPU runs"] = backbones(names, 1 if quick else 15, peak, device)
+    tables["networks in their size for CPU runs"] = backbones(names, 1 if quick else 15, device)
     if device == "cpu":
         tables["quickstart"] = quickstart(60, 4, 1) if quick else quickstart(600, 150, 2)
     reference, fast = full[1]["times as fast"], full[2]["times as fast"]
@@ -252,10 +238,8 @@ def measure(*words: str) -> Section:
         f"{batches}. Lengths are uniform from 40 to 196 frames, in units of 4, as a stand-in for HumanML3D's, and "
         "batches are those of the framework's sampler. Plain PyTorch trains `nn.TransformerEncoder` with AdamW on the "
         "same clips, padded to 196 frames as in the published codes, in float32. Everything takes turns; medians of 3 "
-        "rounds over all batches. The share of the matrix peak compares the operations of a step with a measured "
-        f"matrix product: {peak['reference'] / 1e9:,.0f} GFLOP/s in float32 (`reference`) and "
-        f"{peak['fast'] / 1e9:,.0f} in bfloat16 (`fast`). The small networks have 32 clips per batch and no text "
-        "encoder; the quickstart is trained by the complete framework, with its text encoder.",
+        "rounds over all batches. The small networks have 32 clips per batch and no text encoder; the quickstart is "
+        "trained by the complete framework, with its text encoder.",
         "summary": f"At full size, `speed=reference` is {reference:.1f} times as fast as plain PyTorch, "
         f"and `speed=fast` {fast:.1f} times.",
         "tables": tables,

@@ -25,14 +25,6 @@ def head(name: str) -> tuple[str, str]:
     return what.strip(), ("Deviations" + deviations if deviations else "")
 
 
-FILTER = (
-    '<input type="search" placeholder="Filter: kit, decoder, table 3 ..." oninput="for (const row of '
-    "document.querySelectorAll('tbody tr')) "
-    'row.hidden = !row.textContent.toLowerCase().includes(this.value.toLowerCase())">'
-)
-"""A field above the table of recipes; code hosts leave it out."""
-
-
 def recipes_page() -> str:
     """Returns the page of all recipes, with the paper, table and row that each reproduces."""
     page = f"""# Recipes
@@ -44,7 +36,7 @@ EXP=humanml3d/mdm`. Recipes that name no table are not rows of a paper; their fi
 mdm" are the deviations of the recipe `mdm` in the same folder. Some hold for all recipes: a batch contains motions of
 about the same length, every sample of a batch has the same weight, and checkpoints are chosen on validation clips.
 """
-    page += f"\n{FILTER}\n\n| recipe | what it reproduces |\n|---|---|\n"
+    page += "\n| recipe | what it reproduces |\n|---|---|\n"
     for name in sorted(recipes(), key=lambda name: ("/" in name, name)):
         what, deviations = head(name)
         what = re.sub(r"(Kim|Tevet|Hu) et al\., (AAAI |ICLR )?\d{4}, arXiv:[\d.]+(, )?", "", what).replace(" ()", "")

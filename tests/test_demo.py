@@ -132,7 +132,7 @@ def test_a_request_stops_within_a_step_and_the_next_one_runs(studio):
         if calls == 5:
             stop.set()
 
-    with pytest.raises(module.Stopped, match="canceled"):
+    with pytest.raises(UserError, match="canceled"):
         studio.motions(request, report, stop)
     assert seen == [0, 1, 2, 3, 4, 5]
     assert len(studio.motions(request)) == 1

@@ -135,8 +135,6 @@ class DataSettings:
     def data_node(self, source: str | None = None) -> Config:
         """Returns the configuration of the data set, with the path given as `source`."""
         node = self.nodes["data"]
-        if source == "":
-            raise UserError("source= is empty. Give the folder of the data set, or drop it")
         if source is not None:
             if "path" not in node["source"]:
                 raise UserError(f"source={source}: {node['name']} is generated and has no source. Drop source=")

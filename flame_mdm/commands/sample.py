@@ -159,9 +159,6 @@ def main(settings: SampleSettings) -> None:
             say(summary(folder, made, settings))
         if request.targets is not None:
             say(_distance(request.targets, model, made))
-    if settings.loop and settings.seconds is settings.frames is None:
-        seconds = len(motions[0].joints) / motions[0].fps
-        say(f"a loop has {seconds:g} seconds by default, so that one window covers it. For 3 seconds, add seconds=3")
     if settings.prompts is not None:
         say(_gallery(settings, folders, body))
 

@@ -24,10 +24,6 @@ TIME_LIMIT = 300.0  # maximum number of seconds of one request on the model
 FORMATS = {".bvh": "BVH", ".glb": "GLB", ".npz": "NPZ", ".mp4": "MP4"}  # files to download, and their names on the page
 
 
-class Stopped(UserError):
-    """The user canceled the request."""
-
-
 class Studio:
     """Makes the motions of requests with a fixed set of models on a device, of which the first is loaded at once.
 
@@ -56,8 +52,7 @@ class Studio:
     ) -> list[Motion]:
         """Returns the motions of a request, from memory if they were made before; ends one that takes too long.
 
-        Before each call of the network, `report` gets the number of calls so far; once `stop` is set, it raises
-        `Stopped`.
+        Before each call of the network, `report` gets the number of calls so far; `stop` ends the request.
         """
         with self._working:
             model = self.model(request.model)
@@ -67,7 +62,7 @@ class Studio:
             def before(*_: object) -> None:
                 nonlocal calls
                 if stop is not None and stop.is_set():
-                    raise Stopped("canceled")
+                    raise UserError("canceled")
                 if time.monotonic() > deadline:
                     raise UserError(f"stopped after {TIME_LIMIT:g} seconds. Take fewer steps, samples or seconds")
                 report(calls)

@@ -22,19 +22,19 @@ from typing import Any
 
 import numpy as np
 import torch
-from cost import cost, training_step
-from hydra.utils import get_class
 from lightning import Callback
 from run import Row, Section, body
 from torch import Tensor, nn
 
-from flame_mdm.batch import MotionBatch, padded_length
+from flame_mdm.batch import Condition, MotionBatch, padded_length
 from flame_mdm.config import compose, instantiate
 from flame_mdm.data.datamodule import TrainingBatches
+from flame_mdm.task import MotionGeneration
 from flame_mdm.training import fit as training
 from flame_mdm.training.speed import accelerate
 
 WIDTH, LONGEST = 263, 196
+TOKENS = 30  # tokens of a caption
 BACKBONES = {
     "MDM, encoder": ["synthetic/mdm"],
     "MDM, decoder": ["synthetic/mdm_decoder"],
@@ -49,6 +49,16 @@ QUIET = [
     *("trainer.accelerator=cpu", "trainer.enable_progress_bar=false", "trainer.val_check_interval=1000000"),
     *("callbacks.samples=null", "callbacks.best=null", "callbacks.checkpoints.every_n_steps=1000000", "logger=csv"),
 ]
+
+
+def training_step(task: MotionGeneration, batch: MotionBatch) -> Tensor:
+    """Returns the loss of a step, with a condition of the right shape instead of an encoded text."""
+    features = task.condition.features
+    rows = len(batch)
+    real = torch.ones(rows, TOKENS, dtype=torch.bool)
+    null = Condition(torch.zeros(1, features), torch.zeros(1, TOKENS, features), real[:1])
+    cond = Condition(torch.zeros(rows, features), torch.zeros(rows, TOKENS, features), real, null)
+    return task.process.loss(task.denoiser, batch.x, batch.mask, cond, auxiliary=task.losses)["loss"].mean()
 
 
 class Peer(nn.Module):
@@ -80,12 +90,15 @@ def peer_step(width: int, layers: int, device: str) -> Callable[[MotionBatch], N
     return step
 
 
+def build_task(config: dict[str, Any]) -> MotionGeneration:
+    return MotionGeneration.build(config, instantiate(config["representation"]))
+
+
 def recipe_step(config: dict[str, Any], speed: str, device: str) -> tuple[Callable[[MotionBatch], None], int]:
     """Returns a training step of a recipe, with zeros in place of the text, and the multiple of frames it pads to."""
     config = deepcopy(config)
     config["trainer"]["accelerator"] = device
-    representation = instantiate(config["representation"])
-    task = get_class(config["task"]["_target_"]).build(config, representation).to(device).train()
+    task = build_task(config).to(device).train()
     data: Any = SimpleNamespace(pad_multiple=1)
     half = speed == "fast" and accelerate(task, data, config) == "bf16-mixed"
     optimizer, clip = task.make_optimizer(), config["trainer"]["gradient_clip_val"]
@@ -168,7 +181,7 @@ def backbones(names: Sequence[str], rounds: int, device: str) -> list[Row]:
     for name in names:
         config = compose(BACKBONES[name][0], ["condition=none", *BACKBONES[name][1:]])
         batch = batch_of(lengths, int(lengths.max()), device)
-        parameters = cost(config, len(batch), batch.x.shape[1])[2]
+        parameters = sum(p.numel() for p in build_task(config).parameters() if p.requires_grad)
         runs = {speed: partial(recipe_step(config, speed, device)[0], batch) for speed in SPEEDS}
         times = take_turns(runs, rounds, device)
         row: Row = {"network": name, "parameters, M": parameters / 1e6}

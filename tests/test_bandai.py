@@ -254,7 +254,6 @@ def test_wrong_input_is_explained(tiny, tmp_path):
         shutil.copy(next(tiny.rglob(f"{HAPPY}.bvh")), tmp_path / name)
     cases: tuple[tuple[Path, dict[str, Any], str], ...] = (
         (tiny, {"exclude": ["dataset-1_walk_hapy_001"]}, "data.source.exclude: .* has no dataset-1_walk_hapy_001"),
-        (tiny, {"split": "random"}, "data.source.split=random: give takes or compositional"),
         (tmp_path / "notes.txt", {}, "notes.txt: neither a folder nor a zip or tar archive"),
         (tmp_path / "swim", {}, "dataset-1_swim_happy_001.bvh: .* no content swim with style happy"),
         (tmp_path / "twice", {}, f"{HAPPY} exists twice, as .*one/.* and .*two/"),

@@ -19,7 +19,6 @@ from flame_mdm.data import hashed_split
 from flame_mdm.data.folder import Folder
 from flame_mdm.data.store import Store, write_store
 from flame_mdm.data.synthetic import Synthetic
-from flame_mdm.errors import UserError
 from flame_mdm.formats import bvh
 from flame_mdm.formats.layouts import LAYOUTS, read_skeleton
 from flame_mdm.formats.readers import read
@@ -41,16 +40,9 @@ def skeleton(folder: Path, **content) -> None:
     (folder / "skeleton.yaml").write_text(json.dumps(content))
 
 
-def write_table(folder: Path, rows: list[dict], kind: str = "csv") -> None:
-    if kind == "csv":
-        lines = [",".join(rows[0]), *(",".join(f'"{cell}"' for cell in row.values()) for row in rows)]
-        (folder / "captions.csv").write_text("\n".join(lines))
-        return
-    content: dict[str, dict] = {}
-    for row in rows:
-        content.setdefault(row["id"], {**row, "text": []})["text"].append(row["text"])
-    content = {name: {key: row[key] for key in row if key != "id"} for name, row in content.items()}
-    (folder / "captions.json").write_text(json.dumps(content))
+def write_table(folder: Path, rows: list[dict]) -> None:
+    lines = [",".join(rows[0]), *(",".join(f'"{cell}"' for cell in row.values()) for row in rows)]
+    (folder / "captions.csv").write_text("\n".join(lines))
 
 
 INCH = 1 / 2.54
@@ -58,15 +50,11 @@ MIXAMO = {joint: name if isinstance(name, str) else next(iter(name)) for joint, 
 CHANNELS = ("Xposition", "Yposition", "Zposition", "Zrotation", "Xrotation", "Yrotation")
 
 
-def mixamo(path: Path, scale: float = 1.0, prefix: str = "", toes: float = 1.0, frames: int = 40) -> Path:
+def mixamo(path: Path, scale: float = 1.0, toes: float = 1.0, frames: int = 40) -> Path:
     """A stiff body that turns so fast that straight lines between positions would shorten its bones.
 
-    Args:
-        path: of the BVH file.
-        scale: of all lengths, in centimeters.
-        prefix: of the names of the joints.
-        toes: if not 1, feet have end sites at so much of their length in place of toes.
-        frames: length.
+    Lengths are in centimeters, times `scale`; unless `toes` is 1, feet end after this share of their length, at end
+    sites instead of toes.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     parents = SMPL22.parents
@@ -77,7 +65,7 @@ def mixamo(path: Path, scale: float = 1.0, prefix: str = "", toes: float = 1.0, 
     numbers[:, :3] = 100 * scale * WALK[0, 0]
     numbers[:, 5] = np.arange(frames) * 40.0
     body = bvh.Bvh(
-        tuple(prefix + MIXAMO[SMPL22.joints[k]] for k in kept),
+        tuple(MIXAMO[SMPL22.joints[k]] for k in kept),
         tuple(kept.index(parents[k]) if k else -1 for k in kept),
         offsets[kept],
         (CHANNELS, *[CHANNELS[3:]] * (len(kept) - 1)),
@@ -164,15 +152,14 @@ def test_a_skeleton_file_maps_any_joints(tmp_path: Path):
     np.testing.assert_allclose(only(tmp_path), WALK, atol=1e-5)
 
 
-@pytest.mark.parametrize("kind", ["csv", "json"])
-def test_tables_give_captions_actions_splits_and_sources(kind: str, tmp_path: Path):
+def test_the_table_gives_captions_actions_splits_and_sources(tmp_path: Path):
     rows = []
     for k in range(12):
         np.savez(tmp_path / f"{k:02d}.npz", joints=WALK + 0.01 * k, fps=30)
         facts = {"action": ("turn left", "turn right", "walk")[k % 3], "split": "val" if k == 11 else "train"}
         facts["source"] = f"take {k // 2 if k < 10 else k}"
         rows += [{"id": f"{k:02d}", "text": text, **facts} for text in ("turns Left, clockwise", "is bright")]
-    write_table(tmp_path, rows, kind)
+    write_table(tmp_path, rows)
     source = Folder(str(tmp_path), mirror=True)
     store = write_store(tmp_path / "store", source, HumanML())
     assert store.info["actions"] == ["turn left", "turn right", "walk"]
@@ -193,7 +180,11 @@ BAD = {
     "no caption": (lambda f: (f / "one.txt").unlink(), "1 of 3 motions have no caption, such as one"),
     "unknown id": (lambda f: write_table(f, [{"id": "once", "text": "a"}]), r"captions\.csv, line 2: .*'once'"),
     "cells": (lambda f: (f / "captions.csv").write_text("id,text\none,a, b\n"), r"line 2: not one cell per column"),
-    "json": (lambda f: (f / "captions.json").write_text("{"), r"captions\.json: not a JSON file"),
+    "split": (lambda f: write_table(f, [{"id": "one", "split": "dev"}]), "line 2: unknown split 'dev'; use train, val"),
+    "columns": (
+        lambda f: write_table(f, [{"id": "one", "name": "a"}]),
+        r"captions\.csv: its columns are \['id', 'name'\]",
+    ),
     "two splits": (
         lambda f: write_table(f, [{"id": "one", "split": "val"}, {"id": "one", "split": "test"}]),
         "line 3: one has two values of split: val and test",
@@ -219,13 +210,6 @@ def test_every_fault_is_named_in_a_line(case: str, arrays: Path):
         list(Folder(str(arrays)).clips(30.0))
     assert "\n" not in str(error.value)
     assert str(arrays) in str(error.value)
-
-
-def test_missing_joints_are_named(tmp_path: Path):
-    file = mixamo(tmp_path / "a.bvh")
-    file.write_text(file.read_text().replace("Spine2", "Back"))
-    with pytest.raises(UserError, match=r"a\.bvh: unknown skeleton\. Mixamo is the nearest .*; missing: Spine2\."):
-        only(tmp_path)
 
 
 def test_motions_are_excluded_by_name(arrays: Path):
@@ -299,12 +283,13 @@ def test_arrays_of_kimodo_are_known(tmp_path: Path):
 def test_check_lists_skeletons_and_all_failures(tmp_path: Path):
     mixamo(tmp_path / "a.bvh")
     mixamo(tmp_path / "b.bvh", INCH)
-    mixamo(tmp_path / "c.bvh", INCH)
+    (tmp_path / "c.bvh").write_text((tmp_path / "a.bvh").read_text().replace("Spine2", "Back"))
     (tmp_path / "d.bvh").write_text("HIERARCHY\n")
     lines = Folder(str(tmp_path)).check()
     expected = (
-        r"Mixamo, unit 0\.01, 30 fps: 1 motion, 40 frames, 1\.3 s, legs 0\.8\d m, head joint at 1\.\d\d m",
-        r"error: .*b\.bvh and 1 more: the legs are.*",
+        r"Mixamo, unit 0\.01, 30 fps: 1 motions",
+        r"error: .*b\.bvh: the legs are.*",
+        r"error: .*c\.bvh: unknown skeleton\. Mixamo is the nearest .*; missing: Spine2\. .*",
         r"error: .*d\.bvh, line 1: .*",
         r"error: 3 of 4 motions of .* cannot be prepared",
     )
@@ -317,13 +302,13 @@ def test_a_first_frame_in_an_unusual_pose_is_not_an_error(tmp_path: Path):
         ankle, foot = (SMPL22.joints.index(f"{side}_{name}") for name in ("ankle", "foot"))
         motion[0, foot] = 2 * motion[0, ankle] - motion[0, foot]
     np.savez(tmp_path / "a.npz", joints=motion, fps=30)
-    assert Folder(str(tmp_path)).check()[0].startswith("SMPL, unit 1, 30 fps: 1 motion, ")
+    assert Folder(str(tmp_path)).check()[0] == "SMPL, unit 1, 30 fps: 1 motions"
     np.savez(tmp_path / "a.npz", joints=np.tile(motion[:1], (30, 1, 1)), fps=30)
     assert "the toes point backwards" in Folder(str(tmp_path)).check()[0]
 
 
 def test_from_ten_motions_on_each_split_has_some(tmp_path: Path):
-    for motions, begin in product((10, 12, 15, 20), range(6)):
+    for motions, begin in product((10, 12, 20), range(3)):
         folder = tmp_path / f"{motions}-{begin}"
         folder.mkdir()
         for number in range(motions):

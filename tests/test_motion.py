@@ -1,6 +1,5 @@
 """`Motion`, and every kind of motion file through every command that takes one."""
 
-import json
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -81,7 +80,7 @@ def test_every_kind_is_converted_edited_and_own_data(
 
     (own := tmp_path / "own").mkdir()
     (own / kind).symlink_to(folder / kind)
-    (own / "captions.json").write_text(json.dumps({kind.partition(".")[0]: {"text": "a person walks"}}))
+    (own / "captions.csv").write_text(f"id,text\n{kind.partition('.')[0]},a person walks\n")
     if rate:
         (own / "skeleton.yaml").write_text("fps: 30\n")
     (clip,) = Folder(str(own)).clips(30.0)

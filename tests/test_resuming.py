@@ -238,7 +238,7 @@ def test_options_that_decide_the_data_count_but_paths_do_not():
     source = Folder("here", mirror=True, exclude=("b", "a"))
     assert source.options == {"motion": "joints", "mirror": True, "exclude": ["b", "a"]}
     assert Folder("there", "joints", True, ["b", "a"]).options == source.options
-    assert Synthetic(3).options == {"clips": 3, "seed": 0, "min_seconds": 2.0, "max_seconds": 3.0}
+    assert Synthetic(3).options == {"clips": 3, "seed": 0}
 
 
 def test_a_damaged_checkpoint_gives_way_to_the_one_before(resume, tmp_path, capsys):

@@ -11,8 +11,7 @@ from evaluators.metrics.attributes import ATTRIBUTES, AttributeAccuracy, read_at
 from evaluators.metrics.physics import FootSkating
 from flame_mdm.conditions.vocabulary import words
 from flame_mdm.data import Clip
-from flame_mdm.data.grammar import draw_captions
-from flame_mdm.data.synthetic import Synthetic, prompts
+from flame_mdm.data.synthetic import Synthetic, draw_captions, prompts
 from flame_mdm.formats.faults import find_faults
 from flame_mdm.formats.motion import Motion
 from flame_mdm.representations.skeleton import SMPL22

@@ -173,7 +173,7 @@ def test_links_pipes_and_folders(tmp_path: Path, folder: Callable):
             path = tmp_path / f"{number}.{ending}"
             path.symlink_to(path if target == "loop" else target)
             refuses(str(path), read, path, fps=20)
-    for name in ("b.npz", "a.txt", "captions.csv", "captions.json", "skeleton.yaml"):
+    for name in ("b.npz", "a.txt", "captions.csv", "skeleton.yaml"):
         refuses(f"{name}: a pipe", of_folder, folder(lambda path, name=name: os.mkfifo(path / name)))
     refuses("b.npz: a folder", of_folder, folder(lambda path: (path / "b.npz").mkdir()))
     refuses("b.npz: cannot be read", of_folder, folder(lambda path: (path / "b.npz").symlink_to(path / "b.npz")))
@@ -190,9 +190,7 @@ TABLES: list[tuple[str, bytes, str]] = [
     ("skeleton.yaml", b"joints: [[a], [b]]", "skeleton.yaml: joints"),
     ("skeleton.yaml", b"map: {pelvis: [a]}", "skeleton.yaml: map"),
     ("skeleton.yaml", b"map: {pelvis: {a: x}}", "skeleton.yaml: map"),
-    ("captions.json", b"[" * 10**6, "captions.json"),
-    ("captions.json", b'{"a": {"text": "\xff"}}', "captions.json: not a UTF-8"),
-    ("captions.csv", b"id,text\na," + b"x" * 200_000, "captions.csv, line"),
+    ("captions.csv", b"id,text\na," + b"x" * 200_000, "captions.csv: damaged"),
     ("captions.csv", b"i\0d,text\n", "captions.csv"),
     ("captions.csv", b"id,text\na,\xff\n", "captions.csv: not a UTF-8"),
     ("a.txt", b"\xff\n", "a.txt: not a UTF-8"),
@@ -254,7 +252,7 @@ def archive_cases() -> Iterator[tuple[bytes, str]]:
     yield member("@LongLink", 10**10, tarfile.GNUTYPE_LONGNAME) + bytes(1024), "a header of"
     yield member("x", 10**10, tarfile.XHDTYPE) + bytes(1024), "a header of"
     for kind, values, says in (
-        (tarfile.XGLTYPE, 200, "data.source.exclude="),
+        (tarfile.XGLTYPE, 200, "not a BVH file"),
         (tarfile.XHDTYPE, 10_000, "a header of"),
     ):
         records = b"".join(b"%d k%d=v\n" % (len(f"k{n}=v\n") + 3, n) for n in range(10_000, 10_000 + values))

@@ -4,8 +4,8 @@ import hashlib
 import re
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
@@ -63,11 +63,28 @@ class MotionSource(ABC):
     clips. Saved in the store and in every result."""
     workers: int = 0
     """Number of processes that read and encode; 0 = one per core, 1 = this process only. Most sources take it."""
+    exclude: Collection[str] = ()
+    """Names to leave out."""
 
     @cached_property
     def excluded(self) -> Counter[str]:
         """Number of clips or labels left out, by reason; complete once `clips` is exhausted. Saved in the store."""
         return Counter()
+
+    def leave_out(self, reason: str, count: int = 1) -> None:
+        """Counts clips that are left out."""
+        if count:
+            self.excluded[reason] += count
+
+    def not_excluded(self, named: Mapping[str, Value], path: Path) -> dict[str, Value]:
+        """Returns the values of names that `exclude` lacks, and counts the others; raises `UserError` if it names more.
+
+        A source calls this once.
+        """
+        if unknown := set(self.exclude) - named.keys():
+            raise UserError(f"data.source.exclude: {path} has no {some(unknown)}")
+        self.leave_out("motions by data.source.exclude", len(self.exclude))
+        return {name: value for name, value in named.items() if name not in self.exclude}
 
     def counts(self) -> Mapping[str, float]:
         """Returns the figures of the raw data under the names of `published.yaml`; saved once `clips` is exhausted."""
@@ -127,13 +144,6 @@ def some(names: Iterable[str]) -> str:
     return ", ".join(first[:5]) + (f" and {len(first) - 5} more" if len(first) > 5 else "")
 
 
-def without(named: Mapping[str, Value], exclude: Collection[str], path: Path) -> dict[str, Value]:
-    """Returns the values of names that are not excluded; raises `UserError` if an excluded name is unknown."""
-    if unknown := set(exclude) - named.keys():
-        raise UserError(f"data.source.exclude: {path} has no {some(unknown)}")
-    return {name: value for name, value in named.items() if name not in exclude}
-
-
 def name_hash(name: str) -> int:
     """Returns 160 bits that are a function of a name on any machine."""
     return int(hashlib.sha1(name.encode()).hexdigest(), 16)
@@ -166,3 +176,16 @@ def swap_sides(text: str) -> str:
         return word.capitalize() if match[0][0].isupper() else word
 
     return re.sub(rf"(?<![a-z])({'|'.join(pairs)})(?![a-z])", swap, text, flags=re.IGNORECASE)
+
+
+def mirrored(clip: Clip, motion: np.ndarray, actions: Sequence[str]) -> Clip:
+    """Returns the mirror image of a clip, given its motion: sides are swapped in captions, action and attributes."""
+    action = None if clip.action is None else swap_sides(actions[clip.action])
+    return replace(
+        clip,
+        id=f"M{clip.id}",
+        motion=motion,
+        captions=[swap_sides(caption) for caption in clip.captions],
+        action=actions.index(action) if action in actions else clip.action,
+        attributes={k: swap_sides(value) if isinstance(value, str) else value for k, value in clip.attributes.items()},
+    )

@@ -11,7 +11,7 @@ from scipy.ndimage import minimum_filter1d
 from torch.utils.data import Sampler
 
 from flame_mdm.data import Clip, MotionSource, some
-from flame_mdm.data.clips import Draw
+from flame_mdm.data.crops import Draw
 from flame_mdm.data.datamodule import MotionDataModule, TrainingBatches
 from flame_mdm.data.folder import Folder
 from flame_mdm.data.store import Entry, Store

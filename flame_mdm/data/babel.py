@@ -7,10 +7,9 @@ Language-based Motion Synthesis & Editing", AAAI 2023, appendix "BABEL". `docs/b
 import math
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -21,6 +20,8 @@ from flame_mdm.progress import ProgressBar
 from flame_mdm.safe_io import naming, read_json
 
 FPS = 20.0
+LENGTH, STRIDE = 128, 10  # frames of a clip, and between the windows of a label
+Segment = tuple[str, list[str] | None, float | None, float | None]  # words, categories, start, end
 GET_IT = (
     "BABEL v1.0 is published at https://babel.is.tue.mpg.de: unpack it, then run `make prepare` with "
     "SOURCE=/path/to/babel_v1.0_release"
@@ -30,8 +31,7 @@ PARTS: dict[str, tuple[str, ...]] = {"train": ("train", "extra_train"), "val": (
 """Files of each part. The "extra" files contain labels of several annotators; only the first annotator's are used."""
 
 
-@dataclass(frozen=True)
-class Label:
+class Label(NamedTuple):
     """One text for one segment of a motion."""
 
     motion: str  # key of the AMASS recording, as returned by `amass.key_of`
@@ -41,9 +41,8 @@ class Label:
     kind: Literal["words", "category"]  # the annotator's words or the category of the action
 
 
-@dataclass(frozen=True)
-class Window:
-    """A clip: a fixed number of frames of a motion, beginning at `start`; `id` contains FLAME's number in the part."""
+class Window(NamedTuple):
+    """A clip: frames of a motion, beginning at `start`; `id` contains FLAME's number in the part."""
 
     id: str
     motion: str
@@ -53,9 +52,9 @@ class Window:
 
 
 class Babel(MotionSource):
-    """Clips of `length` frames, as raw motions of the SMPL representations, in AMASS's coordinates.
+    """Clips of `LENGTH` frames, as raw motions of the SMPL representations, in AMASS's coordinates.
 
-    A longer label gives one window every `stride` frames. A shorter one is extended past its end, or left out if the
+    A longer label gives one window every `STRIDE` frames. A shorter one is extended past its end, or left out if the
     motion is too short for that. A label covers frames floor(20 start) to floor(20 end) - 1, as in FLAME's code.
 
     Both splits train on BABEL's entire train part and use 20 % of its val part for testing. Our split uses 20 % of the
@@ -66,24 +65,14 @@ class Babel(MotionSource):
         path: folder with `train.json`, `extra_train.json`, `val.json` and `extra_val.json` (BABEL v1.0).
         amass: folder of AMASS's SMPL+H G release, as archives or unpacked.
         published_split: use FLAME's split, in which clips of val and test overlap.
-        length: frames per clip at 20 frames per second.
-        stride: frames between the windows of a label.
     """
 
     name = "babel"
 
-    def __init__(
-        self,
-        path: str,
-        amass: str,
-        published_split: bool = False,
-        length: int = 128,
-        stride: int = 10,
-        workers: int = 0,
-    ):
+    def __init__(self, path: str, amass: str, published_split: bool = False, workers: int = 0):
         self.path, self.amass, self.published_split = Path(path), Amass(Path(amass)), published_split
-        self.length, self.stride, self.workers = length, stride, workers
-        self.options = {"published_split": published_split, "length": length, "stride": stride}
+        self.workers = workers
+        self.options = {"published_split": published_split}
 
     def counts(self) -> dict[str, int]:
         files = (self.path / f"{name}.json" for part in PARTS for name in PARTS[part])
@@ -106,7 +95,7 @@ class Babel(MotionSource):
                     window.split,
                     window.id if self.published_split else key,
                     attributes={"motion": key, "start": window.start, "label": window.label.kind},
-                    window=(window.start, self.length),
+                    window=(window.start, LENGTH),
                 )
 
     @cached_property
@@ -121,9 +110,11 @@ class Babel(MotionSource):
         for part in PARTS:
             number = 0
             for label in labels[part]:
-                starts = self._starts(label, lengths[label.motion])
+                starts, reason = _starts(label, lengths[label.motion])
                 if starts and part == "val" and label.motion in trained and not self.published_split:
-                    self._exclude("labels of the val part on motions of the train part")
+                    reason = "labels of the val part on motions of the train part"
+                if reason:
+                    self.leave_out(reason)
                 else:
                     for n, start in enumerate(starts, number):
                         split = self._split(part, n, label.motion)
@@ -139,51 +130,27 @@ class Babel(MotionSource):
         labels = []
         for name in PARTS[part]:
             words, categories = [], []
-            for motion, annotation in self._annotations(self.path / f"{name}.json"):
-                segment = annotation["start_t"], annotation["end_t"]
-                kinds = annotation["act_cat"]
+            for motion, (text, kinds, start, end) in self._annotations(self.path / f"{name}.json"):
                 if kinds is None or kinds:  # FLAME's code drops the words if the list of categories is empty
-                    words.append(Label(motion, annotation["proc_label"], *segment, "words"))
-                categories += [Label(motion, kind, *segment, "category") for kind in kinds or ()]
-            once: dict[tuple, Label] = {}
+                    words.append(Label(motion, text, start, end, "words"))
+                categories += [Label(motion, kind, start, end, "category") for kind in kinds or ()]
+            once = {}
             for label in words + categories:
-                once.setdefault((label.motion, label.text, label.start, label.end), label)
+                once.setdefault(label[:4], label)
             labels += [label for label in once.values() if label.text]
         return labels
 
-    def _annotations(self, path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    def _annotations(self, path: Path) -> Iterator[tuple[str, Segment]]:
         data = read_json(required(path, GET_IT))
         key = "frame_anns" if path.stem.startswith("extra_") else "frame_ann"
         with naming(path, AttributeError, KeyError, TypeError, IndexError, what="not in the layout of BABEL v1.0: "):
             for sequence in data.values():
                 annotation = sequence[key][0] if key == "frame_anns" and sequence[key] else sequence[key]
                 for label in annotation["labels"] if annotation else ():
-                    fields = {k: label[k] for k in ("proc_label", "act_cat", "start_t", "end_t")}
-                    _check(fields)
-                    yield self._key(str(sequence["feat_p"])), fields
-
-    def _starts(self, label: Label, frames: int) -> range:
-        """Returns the first frame of each clip of a label in a motion of `frames` frames; counts why there are none."""
-        if label.text == "transition":
-            return self._exclude("transitions")
-        if label.start is None or label.end is None:
-            return self._exclude("labels without a time")
-        first, last = math.floor(label.start * FPS), math.floor(label.end * FPS) - 1
-        if label.end < label.start:
-            return self._exclude("labels that end before they start")
-        if first < 0 or last > frames - 1:
-            return self._exclude("labels that reach past the motion")
-        if last <= first:
-            return self._exclude("labels without a frame")
-        if last - first > self.length:
-            return range(first, last - self.length + 1, self.stride)
-        if first + self.length >= frames:
-            return self._exclude("labels too near to the end of the motion")
-        return range(first, first + 1)
-
-    def _exclude(self, reason: str) -> range:
-        self.excluded[reason] += 1
-        return range(0)
+                    motion = key_of(str(sequence["feat_p"]))
+                    if motion is None:
+                        raise UserError(f"the labels refer to {sequence['feat_p']}, which is in no subset of AMASS")
+                    yield motion, _segment(label)
 
     def _split(self, part: str, number: int, motion: str) -> Split:
         if part == "train":
@@ -192,23 +159,38 @@ class Babel(MotionSource):
             return hashed_split(motion, val=80, test=20)
         return "test" if number % 5 == 0 else "val"
 
-    def _key(self, motion: str) -> str:
-        key = key_of(motion)
-        if key is None:
-            raise UserError(f"{self.path}: the labels refer to {motion}, which is in no subset of AMASS")
-        return key
 
-
-def _check(label: dict[str, Any]) -> None:
-    """Raises `TypeError` if a value of a label has the wrong type."""
-    for key in ("start_t", "end_t"):
-        time = label[key]
+def _segment(label: dict[str, Any]) -> Segment:
+    """Returns the fields of a label that are used; raises `TypeError` if one has the wrong type."""
+    text, kinds, times = label["proc_label"], label["act_cat"], (label["start_t"], label["end_t"])
+    for time in times:
         if time is not None and not (isinstance(time, int | float) and abs(time) < 1e6):
-            raise TypeError(f"{key}: {str(time)[:40]}")
-    kinds = label["act_cat"]
-    texts = [label["proc_label"], *(kinds if isinstance(kinds, list) else [])]
-    if not isinstance(kinds, list | None) or not all(isinstance(text, str | None) for text in texts):
-        raise TypeError(f"act_cat: {str(kinds)[:40]}")
+            raise TypeError(f"start_t or end_t: {time!r:.40}")
+    for value in (text, *(kinds or ())):
+        if not isinstance(value, str | None):
+            raise TypeError(f"proc_label or act_cat: {value!r:.40}")
+    return text, kinds, *times
+
+
+def _starts(label: Label, frames: int) -> tuple[range, str]:
+    """Returns the first frame of each clip of a label in a motion of `frames` frames, or why there are none."""
+    none = range(0)
+    if label.text == "transition":
+        return none, "transitions"
+    if label.start is None or label.end is None:
+        return none, "labels without a time"
+    first, last = math.floor(label.start * FPS), math.floor(label.end * FPS) - 1
+    if label.end < label.start:
+        return none, "labels that end before they start"
+    if first < 0 or last > frames - 1:
+        return none, "labels that reach past the motion"
+    if last <= first:
+        return none, "labels without a frame"
+    if last - first > LENGTH:
+        return range(first, last - LENGTH + 1, STRIDE), ""
+    if first + LENGTH >= frames:
+        return none, "labels too near to the end of the motion"
+    return range(first, first + 1), ""
 
 
 def _measure(_: None, recording: Recording) -> int:

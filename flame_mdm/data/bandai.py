@@ -6,21 +6,20 @@ Stylization", arXiv 2306.08861, 2023; CC BY-NC 4.0. `docs/bandai.md` describes t
 
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import cache, cached_property, partial
+from functools import cached_property, partial
 from pathlib import Path, PurePosixPath
-from typing import Literal, get_args
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from flame_mdm.data import Clip, MotionSource, Split, archives, name_hash, required, split_blocks, swap_sides, without
+from flame_mdm.data import Clip, MotionSource, Split, archives, mirrored, name_hash, required, split_blocks, swap_sides
 from flame_mdm.data.parallel import in_order
 from flame_mdm.errors import UserError
 from flame_mdm.formats import bvh
 from flame_mdm.formats.layouts import LAYOUTS
-from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.representations.skeleton import SMPL22, SMPL24
 from flame_mdm.safe_io import naming, read_yaml
 
 _MAP = LAYOUTS["Bandai-Namco"].map
@@ -74,23 +73,11 @@ TAKES_2: dict[str, list[int]] = WORDS["dataset_2"]["takes"]
 """Published number of takes in data set 2, by content, in the order of STYLES_2. The split is drawn from these numbers,
 not from the files found, so that a missing or excluded file does not move other takes to another split."""
 
-# Takes that turn to the opposite side of what their name says; their labels and captions follow the motion.
-WRONG_SIDE = (
-    "dataset-2_walk-turn-left_masculine_006",
-    "dataset-2_walk-turn-left_masculine_007",
-    "dataset-2_walk-turn-right_masculine_006",
-    "dataset-2_walk-turn-right_masculine_007",
-)
-SIDES = {"bye": "right", "guide": "right", "respond": "left", "byebye": "both"}  # not part of the name
-
-
+WRONG_SIDE, SIDES = WORDS["wrong_side"], WORDS["sides"]
 HELD_OUT = frozenset(
     (content, style) for group in WORDS["held_out"] for content in group["contents"] for style in group["styles"]
 )
 """Combinations of content and style that training never sees with the compositional split."""
-SplitRule = Literal["takes", "compositional"]
-
-
 GET_IT = (
     "the data sets are published at https://github.com/BandaiNamcoResearchInc/Bandai-Namco-Research-Motiondataset (CC "
     "BY-NC 4.0): clone it, then run `make prepare` with SOURCE=/path/to/the/clone"
@@ -98,11 +85,9 @@ GET_IT = (
 FILE = re.compile(r"dataset-([12])_([^_]+)_([^_]+)_(\d+)\.bvh")
 
 
-@dataclass(frozen=True)
-class Take:
+class Take(NamedTuple):
     """One BVH file; `content` is the action performed, which differs from the file name for takes in `WRONG_SIDE`."""
 
-    id: str
     file: Path
     dataset: int
     content: str
@@ -113,13 +98,10 @@ class Take:
 class Bandai(MotionSource):
     """Both data sets on SMPL's skeleton, with captions generated from content and style.
 
-    Mirrored copies belong to the split of their take. Only those of the training split are yielded: validation and test
-    contain originals only.
-
     Args:
         path: a clone of the original repository, any folder above the BVH files, or a zip or tar archive of one.
         motion: "joints" for representations of joint positions, "smpl" for those of SMPL's rotations.
-        mirror: yield a mirrored copy after each clip of the training split.
+        mirror: yield a mirrored copy after each clip of the training split; not of validation and test clips.
         exclude: takes to leave out, by the name of the BVH file without extension.
         split: "takes" holds out takes of combinations of content and style that training sees; "compositional"
             holds out the combinations `HELD_OUT`, whose contents and styles training sees only in others.
@@ -136,18 +118,11 @@ class Bandai(MotionSource):
         mirror: bool = True,
         workers: int = 0,
         exclude: Sequence[str] = (),
-        split: SplitRule = "takes",
+        split: Literal["takes", "compositional"] = "takes",
     ):
-        for name, value, values in (("split", split, get_args(SplitRule)), ("motion", motion, ("joints", "smpl"))):
-            if value not in values:
-                raise UserError(f"data.source.{name}={value}: give {' or '.join(values)}")
         self.path, self.workers, self.exclude = Path(path), workers, tuple(exclude)
-        self.split: SplitRule = split
-        self.motion: Literal["joints", "smpl"] = motion
-        self.mirror = mirror
+        self.motion, self.mirror, self.split = motion, mirror, split
         self.options = {"motion": motion, "mirror": mirror, "exclude": list(exclude), "split": split}
-        if exclude:
-            self.excluded["takes by data.source.exclude"] = len(exclude)
 
     def count(self) -> int:
         return sum(1 + (self.mirror and take.split == "train") for take in self.takes)
@@ -160,56 +135,50 @@ class Bandai(MotionSource):
         convert_one = partial(convert, fps=fps, kind=self.motion)
         motions = in_order(convert_one, [take.file for take in self.takes], self.workers)
         for take, motion in zip(self.takes, motions, strict=True):
-            yield self._clip(take, motion, mirrored=False)
+            clip = self._clip(take, motion)
+            yield clip
             if self.mirror and take.split == "train":
-                yield self._clip(take, motion, mirrored=True)
+                yield mirrored(clip, mirror(motion), self.actions)
 
     @cached_property
     def takes(self) -> list[Take]:
         """The takes that are present and not excluded, sorted by name."""
         files: dict[str, Path] = {}
         folder = archives.as_folder(required(self.path, GET_IT), self, _is_take)
-        for file in filter(lambda path: _is_take(path.name), sorted(folder.rglob("dataset-*.bvh"))):
-            if file.stem in files:
-                raise UserError(f"{self.path}: {file.stem} exists twice, as {files[file.stem]} and {file}; delete one")
-            files[file.stem] = file
+        for file in sorted(folder.rglob("dataset-*.bvh")):
+            if _is_take(file.name):
+                if file.stem in files:
+                    both = f"{files[file.stem]} and {file}"
+                    raise UserError(f"{self.path}: {file.stem} exists twice, as {both}; delete one")
+                files[file.stem] = file
         if not files:
             raise FileNotFoundError(f"{self.path}: no file dataset-1_*.bvh or dataset-2_*.bvh in it; {GET_IT}")
-        return [_take(file, self.split) for _, file in sorted(without(files, self.exclude, self.path).items())]
+        return [_take(file, self.split) for _, file in sorted(self.not_excluded(files, self.path).items())]
 
-    def _clip(self, take: Take, motion: np.ndarray, mirrored: bool) -> Clip:
-        content, side = take.content, side_of(take.content)
-        if mirrored:
-            content, side = swap_sides(content), swap_sides(side)
-            motion = mirror_smpl(motion) if self.motion == "smpl" else SMPL22.mirror(torch.from_numpy(motion)).numpy()
-        attributes: dict[str, str | int | float] = {"content": content, "style": take.style, "dataset": take.dataset}
-        if side:
-            attributes["side"] = side
+    def _clip(self, take: Take, motion: np.ndarray) -> Clip:
+        side, name = side_of(take.content), take.file.stem
+        attributes = {"content": take.content, "style": take.style, "dataset": take.dataset}
         return Clip(
-            id=f"M{take.id}" if mirrored else take.id,
+            id=name,
             motion=motion,
-            captions=captions(content, take.style, side),
+            captions=captions(take.content, take.style, side),
             split=take.split,
-            source=take.id,
-            action=self.actions.index(content),
-            attributes=attributes,
+            source=name,
+            action=self.actions.index(take.content),
+            attributes=attributes | ({"side": side} if side else {}),
         )
 
 
-def convert(file: Path, fps: float, kind: Literal["joints", "smpl"] = "joints") -> np.ndarray:
-    """Converts a BVH file to a motion, float32, at `fps`.
+def convert(file: Path, fps: float, kind: str = "joints") -> np.ndarray:
+    """Converts a BVH file to joints (F, 22, 3) float32 in meters, y up, or to the motion of `smpl_motion`, at `fps`.
 
-    The motion is joints (F, 22, 3) in meters, y up, or the SMPL motion (F, 75) described in `smpl_motion`. Local
-    rotations and the position of the hips are interpolated, so bones keep their length.
+    Local rotations and the position of the hips are interpolated, so bones keep their length.
     """
-    try:
-        with naming(file, ValueError):
-            motion = bvh.read(file)
-            if missing := set(JOINTS.values()) - set(motion.joints):
-                raise UserError(f"not the skeleton of this data set: joint {', '.join(sorted(missing))} missing")
-            rotations, translations = motion.resample(fps)
-    except UserError as error:
-        raise UserError(f"{error}; to continue without it: data.source.exclude=[{file.stem}]") from error
+    with naming(file, ValueError):
+        motion = bvh.read(file)
+        if missing := set(JOINTS.values()) - set(motion.joints):
+            raise UserError(f"not the skeleton of this data set: joint {', '.join(sorted(missing))} missing")
+        rotations, translations = motion.resample(fps)
     if kind == "smpl":
         return smpl_motion(motion, rotations, translations)
     positions, _ = bvh.forward_kinematics(motion.parents, rotations, translations)
@@ -223,14 +192,9 @@ def smpl_motion(skeleton: bvh.Bvh, rotations: np.ndarray, translations: np.ndarr
 
     SMPL's parent of a joint is the parent in the file, except for spine1, which lies between two joints of the file and
     rotates with the pelvis. So a rotation of SMPL is that of the file in the axes of the rest pose:
-    B_parent R B_joint^-1.
+    B_parent R B_joint^-1. `rotations` and `translations` (F, J, ...), in centimeters, are in the frame of the parent.
 
-    Args:
-        skeleton: the file.
-        rotations, translations: (F, J, 3, 3) and (F, J, 3) in centimeters, in the frame of the parent.
-
-    Returns:
-        (F, 3 + 72) float32: position of the pelvis in meters, then rotations. Hands (22 and 23) do not rotate.
+    Returns (F, 3 + 72) float32: position of the pelvis in meters, then rotations. Hands (22 and 23) do not rotate.
     """
     positions, turned = bvh.forward_kinematics(skeleton.parents, rotations, translations)
     local = np.tile(np.eye(3), (len(rotations), 24, 1, 1))
@@ -245,11 +209,11 @@ def smpl_motion(skeleton: bvh.Bvh, rotations: np.ndarray, translations: np.ndarr
     return np.concatenate([positions[:, hips] @ AXES / 100, vectors], 1).astype(np.float32)
 
 
-def mirror_smpl(motion: np.ndarray) -> np.ndarray:
-    """Mirrors an SMPL motion (F, 75): left and right joints swapped, rotations about y and z negated."""
-    names = [*JOINTS, "left_hand", "right_hand"]
-    vectors = motion[:, 3:].reshape(len(motion), len(names), 3)
-    vectors = vectors[:, [names.index(swap_sides(name)) for name in names]] * np.array([1, -1, -1], motion.dtype)
+def mirror(motion: np.ndarray) -> np.ndarray:
+    """Returns the mirror image of joints (F, 22, 3) or of an SMPL motion (F, 75)."""
+    if motion.ndim == 3:
+        return SMPL22.mirror(torch.from_numpy(motion)).numpy()
+    vectors = motion[:, 3:].reshape(len(motion), 24, 3)[:, list(SMPL24.mirrored)] * np.array([1, -1, -1], motion.dtype)
     translation = motion[:, :3] * np.array([-1, 1, 1], motion.dtype)
     return np.concatenate([translation, vectors.reshape(len(motion), -1)], 1)
 
@@ -263,22 +227,18 @@ def side_of(content: str) -> str:
 def captions(content: str, style: str, side: str) -> list[str]:
     """Returns four descriptions in the style of HumanML3D; `side` is left or right if the content contains one."""
     contents, styles = WORDS["contents"], WORDS["styles"]
-    filled = (
-        phrase.format(side=side, other=swap_sides(side), how=how)
-        for phrase, how in zip(contents[re.sub("left|right", "{side}", content)], styles[style], strict=True)
-    )
+    phrases = zip(contents[re.sub("left|right", "{side}", content)], styles[style], strict=True)
+    filled = (phrase.format(side=side, other=swap_sides(side), how=how) for phrase, how in phrases)
     return [" ".join(caption.split()).replace(" ,", ",") for caption in filled]
 
 
-def split_of(dataset: int, content: str, style: str, number: int, rule: SplitRule = "takes") -> Split:
+def split_of(dataset: int, content: str, style: str, number: int, rule: str = "takes") -> Split:
     """Returns the split of a take, determined by its name.
 
     With the rule "compositional", the combinations `HELD_OUT` are the test split, and other test takes are used for
-    training.
-
-    Neighboring takes come from one session and look alike, so blocks of five go to one split. Data set 1 has a single
-    take of most combinations, so there each combination goes to one split. The normal takes of walk-turn-left and
-    -right overlap in time across names and are all used for training.
+    training. Neighboring takes come from one session and look alike, so blocks of five go to one split. Data set 1 has
+    a single take of most combinations, so there each combination goes to one split. The normal takes of walk-turn-left
+    and -right overlap in time across names and are all used for training.
     """
     if rule == "compositional":
         if (content, style) in HELD_OUT:
@@ -289,37 +249,24 @@ def split_of(dataset: int, content: str, style: str, number: int, rule: SplitRul
         return "test" if draw < 2 else "val" if draw == 2 else "train"
     if style == "normal" and content.startswith("walk-turn-"):
         return "train"
-    return _blocks(content, style)[(number - 1) // 5]
-
-
-@cache
-def _blocks(content: str, style: str) -> dict[int, Split]:
     takes = TAKES_2[content][STYLES_2.index(style)]
-    return split_blocks(f"dataset-2_{content}_{style}", takes, 5, val=0.05, test=0.1)
+    return split_blocks(f"dataset-2_{content}_{style}", takes, 5, val=0.05, test=0.1)[(number - 1) // 5]
 
 
 def _is_take(name: str) -> bool:
     return FILE.fullmatch(PurePosixPath(name).name) is not None
 
 
-def _take(file: Path, rule: SplitRule) -> Take:
-    id_ = file.stem
-    name, content, style, number = id_.split("_")
+def _take(file: Path, rule: str) -> Take:
+    name, content, style, number = file.stem.split("_")
     dataset = int(name[-1])
     contents, styles = (CONTENTS_1, STYLES_1) if dataset == 1 else (TAKES_2, STYLES_2)
     if content not in contents or style not in styles:
-        raise UserError(f"{id_}.bvh: data set {dataset} has no content {content} with style {style}")
+        raise UserError(f"{file.name}: data set {dataset} has no content {content} with style {style}")
     split = split_of(dataset, content, style, int(number), rule)
-    return Take(id_, file, dataset, swap_sides(content) if id_ in WRONG_SIDE else content, style, split)
+    return Take(file, dataset, swap_sides(content) if file.stem in WRONG_SIDE else content, style, split)
 
 
 def prompts() -> list[str]:
     """Returns fixed prompts worded like the captions; recipes of this data set use them for dashboard samples."""
-    return [
-        "a person walks forward",
-        "a person walks forward like an old person",
-        "a person runs forward energetically",
-        "a person walks forward, then turns left and walks on",
-        "a person raises the left hand and waves",
-        "a person kicks",
-    ]
+    return WORDS["prompts"]

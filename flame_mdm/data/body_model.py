@@ -1,27 +1,31 @@
-"""The rest pose of SMPL from its licensed model file, which users download at https://smpl.is.tue.mpg.de."""
+"""Rest poses of SMPL and SMPL+H from their licensed model files, which users download."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from scipy.sparse import csc_matrix
 
 from flame_mdm.data import restricted_pickle
-from flame_mdm.representations.skeleton import SMPL24
+from flame_mdm.data.amass import Recording
+from flame_mdm.representations import rotation
+from flame_mdm.representations.skeleton import SMPL22, SMPL24, forward_kinematics
 from flame_mdm.safe_io import naming, read_npz
 
 Offsets = tuple[tuple[float, float, float], ...]
+ARRAYS = ("J_regressor", "v_template", "kintree_table", "shapedirs")
 
 
 def load_offsets(path: Path) -> Offsets:
     """Returns the position of SMPL's 24 joints relative to their parents in the rest pose of the mean shape, meters.
 
-    The first is the pelvis relative to the origin. `path` is SMPL's .pkl as downloaded, of which no code runs, or an
-    .npz with the same arrays.
+    The first is the pelvis relative to the origin. `path` is SMPL's .pkl from https://smpl.is.tue.mpg.de, of which no
+    code runs, or an .npz with the same arrays.
     """
     with naming(path, KeyError, TypeError, IndexError, ValueError, what="not a SMPL model of 24 joints: "):
         if path.suffix == ".npz":
-            model: Any = read_npz(path, only=("J_regressor", "v_template", "kintree_table"))
+            model: Any = read_npz(path, only=ARRAYS)
         else:
             model = restricted_pickle.read(path, opaque=("chumpy.", "scipy.sparse."))
         regressor, template = model["J_regressor"], model["v_template"]
@@ -30,12 +34,59 @@ def load_offsets(path: Path) -> Offsets:
             regressor = csc_matrix(tuple(parts), shape=regressor["_shape"]).toarray()
         if isinstance(template, dict):  # the state of an array of chumpy
             template = template["x"]
-        regressor, template = np.asarray(regressor, np.float64), np.asarray(template, np.float64)
-        parents = np.asarray(model["kintree_table"])[0, 1:].tolist()
-        if regressor.shape != (24, len(template)) or template.shape[1:] != (3,) or parents != list(SMPL24.parents[1:]):
-            raise ValueError(f"J_regressor {regressor.shape}, v_template {template.shape}, or another tree of joints")
-        joints = regressor @ template
-        if not np.isfinite(joints).all():
-            raise ValueError("non-finite numbers")
+        joints = _rest_joints(regressor, template, model["kintree_table"], 24, SMPL24.parents)
     offsets = joints - np.concatenate([np.zeros((1, 3)), joints[list(SMPL24.parents[1:])]])
     return tuple(tuple(offset) for offset in offsets.tolist())
+
+
+def _rest_joints(regressor: Any, vertices: Any, tree: Any, joints: int, parents: tuple[int, ...]) -> np.ndarray:
+    """Returns rest joints (J, 3) of a model of `joints` joints, of which the first ones have these parents."""
+    regressor, vertices = np.asarray(regressor, np.float64), np.asarray(vertices, np.float64)
+    numbers = np.asarray(tree)[0, 1 : len(parents)].tolist()
+    if regressor.shape != (joints, len(vertices)) or vertices.shape[1:] != (3,) or numbers != list(parents[1:]):
+        raise ValueError(f"J_regressor {regressor.shape}, v_template {vertices.shape}, or another tree of joints")
+    rest = regressor @ vertices
+    if not np.isfinite(rest).all():
+        raise ValueError("non-finite numbers")
+    return rest
+
+
+class Body(NamedTuple):
+    """Rest joints of SMPL+H (the first 22), meters: `rest` (22, 3) of the mean shape, `shape` (22, 3, 10) per beta."""
+
+    rest: torch.Tensor
+    shape: torch.Tensor
+
+    def joints(self, recording: Recording) -> np.ndarray:
+        """Returns joints (F, 22, 3) float64 in meters, y up as in HumanML3D: AMASS's (-x, z, y).
+
+        These joints do not depend on the other 30, which are finger joints; soft tissue and pose correctives move
+        only the surface.
+        """
+        betas = torch.from_numpy(recording.betas[:10].astype(np.float64))
+        rest = self.rest + self.shape[..., : len(betas)] @ betas
+        poses = torch.from_numpy(recording.poses[:, :66].astype(np.float64)).unflatten(1, (22, 3))
+        root = torch.from_numpy(recording.translation.astype(np.float64)) + rest[0]
+        turned = rotation.axis_angle_to_matrix(poses)
+        joints = forward_kinematics(SMPL22, turned, SMPL22.bones(rest), root)
+        return (joints[..., [0, 2, 1]] * joints.new_tensor([-1.0, 1.0, 1.0])).numpy()
+
+
+def load_body(folder: Path, gender: str) -> Body:
+    """Loads a body of the extended SMPL+H model: only template, shape and joint regressor.
+
+    It is `male/model.npz`, as in the model's archive, or `SMPLH_MALE.npz`, in the folder or in a subfolder `smplh`.
+    """
+    names = (f"{gender}/model.npz", f"SMPLH_{gender.upper()}.npz")
+    candidates = [folder / inner / name for inner in ("", "smplh") for name in names]
+    path = next((path for path in candidates if path.is_file()), None)
+    if path is None:
+        raise FileNotFoundError(
+            f"{folder}: contains neither {' nor '.join(names)}; download the extended SMPL+H model from "
+            "https://mano.is.tue.mpg.de"
+        )
+    with naming(path, KeyError, TypeError, IndexError, ValueError, what="not a SMPL+H model of 52 joints: "):
+        regressor, template, tree, directions = (read_npz(path, only=ARRAYS)[name] for name in ARRAYS)
+        rest = _rest_joints(regressor, template, tree, 52, SMPL22.parents)[:22]
+        shape = np.einsum("jv,vck->jck", regressor[:22].astype(np.float64), directions[..., :10].astype(np.float64))
+    return Body(torch.from_numpy(rest), torch.from_numpy(shape))

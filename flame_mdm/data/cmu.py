@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import torch
 
-from flame_mdm.data import SPLITS, Clip, MotionSource, Split, archives, hashed_split, required, some, without
+from flame_mdm.data import SPLITS, Clip, MotionSource, Split, archives, hashed_split, required
 from flame_mdm.data.humanml3d import FPS, HumanML3D, IndexedClip, read_index
 from flame_mdm.data.parallel import in_order
 from flame_mdm.data.t2m import MAX_LENGTH, Cut, Description, cuts
@@ -26,14 +26,13 @@ from flame_mdm.formats.motion import amass_parameters
 from flame_mdm.formats.poses import solve
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.representations.smpl import ADULT
-from flame_mdm.safe_io import naming, read_json, read_text, read_yaml, regular_file
+from flame_mdm.safe_io import naming, read_json, read_yaml
 
 FACTS: dict[str, Any] = read_yaml(Path(__file__).with_suffix(".yaml"))
 FILE = re.compile(r"(\d{2,3}_\d{2,3})\.(amc|bvh)", re.IGNORECASE)
 SUFFIXES = (".amc", ".asf", ".bvh", ".csv", ".json", ".txt", ".yaml", ".zip")  # files that are read of an archive
 RATES = (120.0, 60.0)  # frame rates of the recordings, the usual one first
 SLACK = 0.05  # seconds, one frame at 20 fps, by which durations may differ
-LISTED = 20  # failures that are printed
 SHORTEST = 40  # rows of features of a clip, as in HumanML3D
 BLENDED = 3  # frames after the T-pose of a Daz-friendly file that are blended with it
 FASTEST = 15.0  # m/s of the pelvis, above which a conversion is damaged; sprinters reach 12
@@ -56,27 +55,6 @@ class Item(NamedTuple):
     start: int = 0
     end: int | None = None
     mirrored: bool = False
-    any_length: bool = False
-
-    def cuts(self, frames: int) -> list[Cut]:
-        """Returns the clips of a motion of `frames` rows of features, by the rules of HumanML3D unless `any_length`."""
-        if self.any_length:
-            return [Cut(self.id, 0, frames, self.descriptions)] if frames >= SHORTEST else []
-        return cuts(self.id, frames, self.descriptions, SHORTEST)
-
-
-Task = tuple[list[Path], tuple[float | None, int | None, bool], Sequence[tuple[int, int | None, bool]]]
-"""Files of a recording, tried in this order, arguments of `decide_rate`, and parts: start, end, mirrored."""
-
-
-class Outcome(NamedTuple):
-    """The parts of a recording, its frame rate, the file's and what decided; or an error."""
-
-    motions: list[np.ndarray]
-    rate: float = 0.0
-    header: float | None = None
-    reason: str = ""
-    error: str = ""
 
 
 class CMU(MotionSource):
@@ -92,7 +70,6 @@ class CMU(MotionSource):
             KIT-ML's captions of AMASS, kitml*.json, are used if they are in one of the two folders.
         motion: "joints" for representations of joint positions; "smpl" for those of SMPL's rotations, which are
             computed from the positions.
-        descriptions: use CMU's short description of recordings that have no other caption.
         exclude: recordings to leave out, such as 02_01.
     """
 
@@ -103,17 +80,13 @@ class CMU(MotionSource):
         path: str,
         captions: str | None = None,
         motion: Literal["joints", "smpl"] = "joints",
-        descriptions: bool = False,
         exclude: Sequence[str] = (),
         workers: int = 0,
     ):
-        if motion not in ("joints", "smpl"):
-            raise UserError(f"data.source.motion={motion}: give joints or smpl")
-        self.archive, self.workers = Path(path), workers
-        self._captions = captions
-        self.motion, self.descriptions, self.exclude = motion, descriptions, tuple(exclude)
-        self.options = {"motion": motion, "descriptions": descriptions, "exclude": list(exclude)}
-        self._outcomes: dict[str, Outcome] = {}
+        self.archive, self._captions = Path(path), captions
+        self.motion, self.exclude, self.workers = motion, tuple(exclude), workers
+        self.options = {"motion": motion, "exclude": list(exclude)}
+        self._errors: list[str] = []
         self._counts: Counter[str] = Counter()
 
     @cached_property
@@ -136,19 +109,15 @@ class CMU(MotionSource):
         if not files:
             required(self.path, GET_IT)
             raise FileNotFoundError(f"{self.path}: no recording such as 02_01.bvh or 02_01.amc in it; {GET_IT}")
-        kept = without(files, self.exclude, self.path)
+        kept = self.not_excluded(files, self.path)
         good = {name: sorted(kept[name], key=_rank) for name in sorted(kept) if not _is_in("bad", name)}
-        self._exclude("recordings by data.source.exclude", len(files) - len(kept))
-        self._exclude("recordings known to be bad", len(kept) - len(good))
+        self.leave_out("recordings known to be bad", len(kept) - len(good))
         return good
 
     @cached_property
     def humanml3d(self) -> tuple[list[IndexedClip], dict[str, list[Description]], Mapping[str, Split]]:
         """HumanML3D's clips of CMU recordings, captions by name, and splits."""
         required(self.captions, f"it is the folder of the captions: {GET_IT}")
-        for pattern in ("*.csv", "*.json", "*/texts.zip", "texts.zip"):
-            for file in self.captions.glob(pattern):
-                _check_pointer(file)
         if files := sorted(self.captions.glob("humanml3d_test_captions*.json")):
             rows, texts = read_index(self.captions / "humanml3d_index_cmu.csv"), _test_captions(files[0])
             splits: Mapping[str, Split] = dict.fromkeys(texts, SPLITS[2])
@@ -162,13 +131,13 @@ class CMU(MotionSource):
     @cached_property
     def kit(self) -> list[tuple[str, str, str, float]]:
         """Id, recording, text and seconds of KIT-ML's captions of CMU recordings; empty if there is no file of them."""
-        path = next(
-            (file for folder in (self.captions, self.path) for file in sorted(folder.glob("kitml*.json"))), None
-        )
-        with naming(path, AttributeError, KeyError, TypeError, ValueError, what="not KIT-ML's captions of AMASS: "):
+        files = [file for folder in (self.captions, self.path) for file in sorted(folder.glob("kitml*.json"))]
+        if not files:
+            return []
+        with naming(files[0], AttributeError, KeyError, TypeError, ValueError, what="not KIT-ML's captions of AMASS: "):
             return [
                 (f"kit{number}", _recording(entry["path"]), str(text["text"]), float(entry["duration"]))
-                for number, entry in (read_json(path).items() if path else ())
+                for number, entry in read_json(files[0]).items()
                 if entry["path"].startswith("CMU/")
                 for text in entry["annotations"]
             ]
@@ -183,24 +152,20 @@ class CMU(MotionSource):
             trial = _recording(row.key)
             cut_from[trial].add(splits.get(row.name, "train"))
             names = [name for name in (row.name, f"M{row.name}") if name in splits and texts.get(name)]
-            self._exclude("clips of HumanML3D without their recording", trial not in files)
-            self._exclude("clips of HumanML3D without captions", trial in files and not names)
-            for name in names if trial in files else ():
-                items[trial].append(Item(name, splits[name], row.name, texts[name], row.start, row.end, name[0] == "M"))
-
-        def whole(trial: str, id_: str, text: str, any_length: bool) -> Item:
-            of_clips: list[Split] = [split for split in SPLITS if split in cut_from[trial]]
-            split = of_clips[-1] if of_clips else hashed_split(f"CMU subject {trial.partition('_')[0]}", val=5, test=10)
-            return Item(id_, split, f"recording {trial}", [Description(text, [])], any_length=any_length)
-
+            if trial not in files:
+                self.leave_out("clips of HumanML3D without their recording")
+            elif not names:
+                self.leave_out("clips of HumanML3D without captions")
+            else:
+                part = (row.start, row.end)
+                items[trial] += [Item(n, splits[n], row.name, texts[n], *part, n[0] == "M") for n in names]
         for id_, trial, text, _ in self.kit:
             if trial in files:
-                items[trial].append(whole(trial, id_, text, any_length=False))
-        for trial, text in _descriptions(self.path).items() if self.descriptions else ():
-            if trial in files and not items[trial]:
-                items[trial].append(whole(trial, trial, text, any_length=True))
+                by_subject = hashed_split(f"CMU subject {trial.partition('_')[0]}", val=5, test=10)
+                of_clips: list[Split] = [split for split in SPLITS if split in cut_from[trial]] or [by_subject]
+                items[trial].append(Item(id_, of_clips[-1], f"recording {trial}", [Description(text, [])]))
         captioned = {trial: items[trial] for trial in files if items[trial]}
-        self._exclude("recordings without a caption", len(files) - len(captioned))
+        self.leave_out("recordings without a caption", len(files) - len(captioned))
         if not captioned:
             raise UserError(f"{self.captions}: no captions of the recordings in {self.path}; {GET_IT}")
         return captioned
@@ -208,7 +173,7 @@ class CMU(MotionSource):
     def count(self) -> int:
         items = [item for items in self.items.values() for item in items]
         ends = {id_: round(seconds * FPS) for id_, _, _, seconds in self.kit}
-        return sum(len(item.cuts((item.end or ends.get(item.id, SHORTEST + 1)) - item.start - 1)) for item in items)
+        return sum(len(_cuts(item, (item.end or ends[item.id]) - item.start - 1)) for item in items)
 
     def clips(self, fps: float) -> Iterator[Clip]:
         """Yields the clips of all recordings that can be read, sorted by recording; `findings` lists the others."""
@@ -216,42 +181,39 @@ class CMU(MotionSource):
         last = {_recording(row.key): row.end for row in sorted(self.humanml3d[0], key=lambda row: row.end)}
         seconds = {trial: length for _, trial, _, length in self.kit}
         evidence = {trial: (seconds.get(trial), last.get(trial), _is_in("sixty", trial)) for trial in self.items}
-        parts = {trial: [(i.start, i.end, i.mirrored) for i in items] for trial, items in self.items.items()}
-        tasks: list[Task] = [(self.files[trial], evidence[trial], parts[trial]) for trial in self.items]
-        for trial, outcome in zip(self.items, in_order(partial(_read, self.motion), tasks, self.workers), strict=True):
-            self._outcomes[trial] = outcome._replace(motions=[])
-            self._exclude("recordings that cannot be read", outcome.error != "")
-            for item, motion in zip(self.items[trial], outcome.motions, strict=not outcome.error):
-                kept = item.cuts(len(motion) - 1)
-                self._exclude(f"motions shorter than {SHORTEST} frames or of {MAX_LENGTH} or more", not kept)
+        tasks = [(self.files[trial], evidence[trial], items) for trial, items in self.items.items()]
+        for trial, motions in zip(self.items, in_order(partial(_read, self.motion), tasks, self.workers), strict=True):
+            if isinstance(motions, str):
+                self._errors.append(motions)
+                self.leave_out("recordings that cannot be read")
+                continue
+            for item, motion in zip(self.items[trial], motions, strict=True):
+                kept = _cuts(item, len(motion) - 1)
+                if not kept:
+                    self.leave_out(f"motions shorter than {SHORTEST} frames or of {MAX_LENGTH} or more")
                 for cut in kept:
                     if item.end and not item.mirrored:
                         self._counts["clips of HumanML3D"] += cut.id == item.id
                         self._counts["captions of HumanML3D"] += len(cut.descriptions)
                     captions, tokens, *_ = map(list, zip(*cut.descriptions, strict=True))
-                    facts = {"recording": trial} | ({"tokens": tokens} if all(tokens) else {})
                     yield Clip(
-                        cut.id, motion, captions, item.split, item.source, None, facts, "", (cut.start, cut.length)
+                        id=cut.id,
+                        motion=motion,
+                        captions=captions,
+                        split=item.split,
+                        source=item.source,
+                        attributes={"recording": trial} | ({"tokens": tokens} if all(tokens) else {}),
+                        window=(cut.start, cut.length),
                     )
-        if all(outcome.error for outcome in self._outcomes.values()):
-            raise UserError(f"{self.path}: no recording can be read; {self.findings()[0]}")
+        if len(self._errors) == len(tasks):
+            raise UserError(f"{self.path}: no recording can be read; {self._errors[0]}")
 
-    def counts(self) -> dict[str, float]:
-        return dict(self._counts)
+    def counts(self) -> Mapping[str, float]:
+        return self._counts
 
     def findings(self) -> list[str]:
-        """Returns what decided the frame rates, which files have another one, and which recordings failed."""
-        read = {trial: outcome for trial, outcome in self._outcomes.items() if not outcome.error}
-        decided = Counter((outcome.rate, outcome.reason) for outcome in read.values())
-        lines = [f"{count} recordings at {rate:g} fps by {reason}" for (rate, reason), count in sorted(decided.items())]
-        if other := [trial for trial, outcome in read.items() if outcome.header not in (None, outcome.rate)]:
-            lines.append(f"{len(other)} files say another rate, which is ignored: {some(other)}")
-        errors = [f"left out: {outcome.error}" for outcome in self._outcomes.values() if outcome.error]
-        return lines + errors[:LISTED] + [f"left out: {len(errors) - LISTED} more"] * (len(errors) > LISTED)
-
-    def _exclude(self, reason: str, count: int) -> None:
-        if count:
-            self.excluded[reason] += count
+        """Returns why recordings were left out."""
+        return [f"left out: {error}" for error in self._errors]
 
 
 def _is_in(fact: str, trial: str) -> bool:  # or its subject is
@@ -282,51 +244,33 @@ def _test_captions(path: Path) -> dict[str, list[Description]]:
     return texts
 
 
-def _descriptions(path: Path) -> dict[str, str]:
-    """Returns CMU's short descriptions of recordings, from a list in a folder; empty if there is none."""
-    texts: dict[str, str] = {}
-    if (listed := path / "cmu_fps.json").exists():
-        with naming(listed, AttributeError, KeyError, TypeError, what="not a list of recordings: "):
-            texts = {trial: str(entry["desc"]) for trial, entry in read_json(listed).items()}
-    elif (listed := path / "cmu-mocap-index-text.txt").exists():
-        texts = dict(re.findall(r"^(\d+_\d+)\s+(\S.*?)\s*$", read_text(listed), re.MULTILINE))
-    return {trial: text for trial, text in texts.items() if text not in ("", "Unknown")}
-
-
-def _check_pointer(path: Path) -> None:
-    """Raises `UserError` if a file is what Git LFS puts in the place of a large one."""
-    if path.exists() and regular_file(path) < 1024 and path.read_bytes().startswith(b"version https://git-lfs"):
-        raise UserError(f"{path}: a Git LFS pointer, not the file. Run `git lfs pull` in its repository")
+def _cuts(item: Item, frames: int) -> list[Cut]:
+    return cuts(item.id, frames, item.descriptions, SHORTEST)
 
 
 # Motions --------------------------------------------------------------------------------------------------------------
 
 
-def decide_rate(
-    frames: int, header: float | None, seconds: float | None, last: int | None, is_sixty: bool
-) -> tuple[float, str]:
-    """Returns the frame rate of a recording of `frames` frames and what decided it.
+def decide_rate(frames: int, header: float | None, seconds: float | None, last: int | None, is_sixty: bool) -> float:
+    """Returns the frame rate of a recording of `frames` frames.
 
     Durations are trusted first, by KIT-ML in `seconds` and by HumanML3D's `last` frame at 20 fps; then CMU's list;
     then the `header` of the file: conversions say 120 for nearly all recordings.
     """
     rates = RATES if header in (None, *RATES) else (*RATES, header)
     if fitting := [rate for rate in rates if seconds and abs(frames / rate - seconds) < SLACK]:
-        return fitting[0], "KIT-ML's duration"
+        return fitting[0]
     if last and header != RATES[1] and frames / RATES[0] + SLACK < last / FPS <= frames / RATES[1] + SLACK:
-        return RATES[1], "HumanML3D's last frame"
-    if is_sixty or header is None:
-        return RATES[is_sixty], "CMU's list"
-    return header, "the file"
+        return RATES[1]
+    return RATES[1] if is_sixty else header or RATES[0]
 
 
 def standardize(tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
     """Returns a recording with the bones of CMU's own files, and the fields of `Layout` for them.
 
-    The MotionBuilder-friendly conversion lost a bone of the trunk and of each hand: the trunk's three bones are equally
-    long, and the hand's is half as long as the one before. The Daz-friendly one moves another figure, whose bones are
-    replaced by a CMU subject's. Both begin with a T-pose, which is removed. Joints `pelvis` and `face` are added where
-    SMPL has pelvis and head. Other skeletons are returned unchanged, with no fields.
+    The MotionBuilder-friendly conversion lost a bone of the trunk and of each hand. The Daz-friendly one moves another
+    figure, whose bones are replaced by a CMU subject's. Both begin with a T-pose, which is removed. Joints `pelvis` and
+    `face` are added where SMPL has pelvis and head. Other skeletons are returned unchanged, with no fields.
     """
     is_original, unit, blended = "lfemur" in tree.joints, LAYOUTS["CMU ASF"].unit, 0
     if "LHipJoint" in tree.joints:
@@ -363,15 +307,20 @@ def _added(tree: Bvh, **joints: tuple[str, Any]) -> Bvh:
     )
 
 
-def _read(kind: str, task: Task) -> Outcome:
-    """Returns the parts of a recording from the first of its files that can be read, or the first error."""
-    errors, (files, evidence, parts) = [], task
+def _read(
+    kind: str, task: tuple[list[Path], tuple[float | None, int | None, bool], list[Item]]
+) -> list[np.ndarray] | str:
+    """Returns the items of a recording from the first of its files that can be read, or the first error.
+
+    A task contains files, arguments of `decide_rate`, and items.
+    """
+    files, evidence, items = task
+    errors = []
     for file in files:
         try:
-            _check_pointer(file)
-            tree, fields = standardize(read_tree(file, None if _rank(file) else RATES[0]))
-            header = tree.fps if _rank(file) else None
-            rate, reason = decide_rate(len(tree.frames), header, *evidence)
+            is_original = _rank(file) == 0
+            tree, fields = standardize(read_tree(file, RATES[0] if is_original else None))
+            rate = decide_rate(len(tree.frames), None if is_original else tree.fps, *evidence)
             with naming(file):
                 joints, layout = map_bvh(replace(tree, fps=rate), FPS, fields or find_skeleton(file))
                 check_size(joints, layout.unit)
@@ -380,10 +329,9 @@ def _read(kind: str, task: Task) -> Outcome:
                     raise UserError(f"the body jumps, it moves at {speed:.0f} m/s: a damaged conversion")
         except (UserError, OSError) as error:
             errors.append(str(error))
-            continue
-        motions = [_part(joints[start:end], mirrored, kind) for start, end, mirrored in parts]
-        return Outcome(motions, rate, header, reason)
-    return Outcome([], error=errors[0])
+        else:
+            return [_part(joints[item.start : item.end], item.mirrored, kind) for item in items]
+    return errors[0]
 
 
 def _part(joints: np.ndarray, mirrored: bool, kind: str) -> np.ndarray:

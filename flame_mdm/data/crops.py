@@ -1,14 +1,24 @@
-"""Crop rules: which frames of a clip a training sample contains, as in the authors' code."""
+"""Crop rules: which frames of a clip a training sample contains, as in the authors' code; cropped clips of a split."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
 
+from flame_mdm.data import Split
+from flame_mdm.data.store import Store
 from flame_mdm.errors import UserError
+from flame_mdm.representations import Representation
+from flame_mdm.seeds import integers, key
 
+Draw = tuple[int, int]  # (index of a clip, number of the batch that it is drawn for; -1 in evaluation)
+Sample = tuple[str, Tensor, str | None, int | None]  # (id, x (F, D), caption, action), input of `collate`
 Below = Callable[[Any], Any]
 """Draws uniform integers from 0 up to, and not including, its argument: an integer, or one for each of B clips."""
 
@@ -29,10 +39,9 @@ class Crop(ABC):
 
     @abstractmethod
     def draw(self, frames: Any, below: Below | None) -> tuple[Any, Any]:
-        """Draws samples from clips with `frames` (B,) frames, or from one clip; without `below`, they are fixed.
+        """Returns first frame and number of frames (B,) of samples of clips with `frames` (B,) frames, or of one clip.
 
-        Returns:
-            First frame and number of frames (B,) of the samples. Past the end of a clip, its last frame is repeated.
+        They are fixed without `below`. Past the end of a clip, its last frame is repeated.
         """
 
     def __call__(self, frames: int, generator: np.random.Generator | None) -> np.ndarray:
@@ -55,10 +64,7 @@ class Units(Crop):
 
     def __post_init__(self) -> None:
         if not 1 <= self.unit <= self.min_frames <= self.max_frames or self.max_frames % self.unit:
-            raise UserError(
-                f"crop: needs 1 <= unit <= min_frames <= max_frames and whole units, not unit {self.unit}, "
-                f"min_frames {self.min_frames}, max_frames {self.max_frames}"
-            )
+            raise UserError(f"crop: needs 1 <= unit <= min_frames <= max_frames and whole units, not {self}")
 
     def draw(self, frames: Any, below: Below | None) -> tuple[Any, Any]:
         length = np.minimum(frames, self.max_frames) // self.unit * self.unit
@@ -97,3 +103,56 @@ class Fixed(Crop):
         spare = np.maximum(0, frames - self.frames - 1)
         first = np.zeros_like(spare) if below is None else below(spare + 1)
         return first, np.full_like(spare, self.frames)
+
+
+class Clips(Dataset[Sample]):
+    """The clips of a split that are long enough for the crop rule, cropped at every draw, then normalized."""
+
+    def __init__(self, store: Store, split: Split, *, representation: Representation, crop: Crop, seed: int):
+        self.store, self.representation, self.crop, self.seed = store, representation, crop, seed
+        of_split = [clip for clip in store.clips if clip.split == split]
+        self.clips = [clip for clip in of_split if clip.length >= crop.shortest()]
+        self.too_short = len(of_split) - len(self.clips)
+        self.frames = np.array([clip.length for clip in self.clips], np.int64)
+        self.lengths = np.minimum(self.frames, crop.longest())
+        self.captions = np.array([len(clip.captions) for clip in self.clips], np.int64)
+        self.mean, self.std = store.mean.astype(np.float32), store.std.astype(np.float32)
+
+    def __len__(self) -> int:
+        return len(self.clips)
+
+    def __getitem__(self, draw: Draw) -> Sample:
+        return self.__getitems__([draw])[0]
+
+    def __getitems__(self, draws: Sequence[Draw]) -> list[Sample]:
+        """Returns the samples of a batch; the data loader calls this."""
+        samples: list[Sample] = []
+        indices = [index for index, _ in draws]
+        for index, first, length, caption in zip(indices, *self.draw(indices, draws[0][1]), strict=True):
+            clip = self.clips[index]
+            frames = np.minimum(np.arange(length) + first, clip.length - 1)
+            features = self.representation.rebase(self.store.motion(clip)[frames])
+            x = torch.from_numpy((features - self.mean) / self.std)
+            samples.append((clip.id, x, self.caption(index, caption), clip.action))
+        return samples
+
+    def draw(self, indices: Sequence[int], batch: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Returns first frame, number of frames and number of the caption (B,) of clips in a batch.
+
+        They are functions of (seed, batch, index); in evaluation (batch -1), they are always the same.
+        """
+        rows = np.asarray(indices)
+        if batch < 0:
+            return *self.crop.draw(self.frames[rows], None), self.evaluated[rows]
+        below = integers(key("sample", self.seed, batch) + rows)
+        return *self.crop.draw(self.frames[rows], below), below(self.captions[rows])
+
+    @cached_property
+    def evaluated(self) -> np.ndarray:
+        """Number (clips,) of the caption of each clip in evaluation, chosen by the id of the clip."""
+        draws = (key("caption", self.seed, -1, clip.id) % max(1, len(clip.captions)) for clip in self.clips)
+        return np.fromiter(draws, np.int64, len(self.clips))
+
+    def caption(self, index: int, number: int) -> str | None:
+        """Returns a caption of a clip; None if the clip has none."""
+        return self.clips[index].captions[number] if self.captions[index] else None

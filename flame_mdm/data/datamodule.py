@@ -19,8 +19,7 @@ from torch.utils.data import DataLoader, Sampler
 
 from flame_mdm.batch import collate, padded_length
 from flame_mdm.data import MotionSource, Split
-from flame_mdm.data.clips import Clips, Draw, Sample
-from flame_mdm.data.crops import Crop
+from flame_mdm.data.crops import Clips, Crop, Draw, Sample
 from flame_mdm.data.resident import SHARE, ResidentLoader, free_memory, resident_features
 from flame_mdm.data.store import Store, write_store
 from flame_mdm.errors import UserError, say

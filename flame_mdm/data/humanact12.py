@@ -5,21 +5,19 @@ Guo et al., "Action2Motion: Conditioned Generation of 3D Human Motions", ACM MM 
 """
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from flame_mdm.data import Clip, MotionSource, Split, restricted_pickle, split_blocks
+from flame_mdm.data import Clip, MotionSource, restricted_pickle, split_blocks
 from flame_mdm.errors import UserError
 from flame_mdm.safe_io import naming, read_npy
 
 FPS = 20.0  # frames per second at which the authors' code plays the action data sets; frames are not resampled
-
 NO_NUMBERS = (TypeError, ValueError, OverflowError)  # errors that NumPy raises for what does not consist of numbers
-
 BLOCK = 10  # number of consecutive clips in the file that go to one split together: they may be cut from one recording
 
 
@@ -49,45 +47,36 @@ class HumanAct12(MotionSource):
 
     def clips(self, fps: float) -> Iterator[Clip]:
         self.check_fps(fps, FPS)
-        splits = self._splits([action for _, action in self._motions])
-        for number, ((motion, action), (source, split)) in enumerate(zip(self._motions, splits, strict=True)):
-            yield Clip(f"humanact12_{number:04d}", motion, [], split, source, action)
+        clips, seen = Counter(action for _, action in self._motions), Counter[int]()
+        blocks = {a: split_blocks(f"humanact12_{a}", clips[a], BLOCK, val=0.1, test=0.2) for a in clips}
+        for number, (motion, action) in enumerate(self._motions):
+            name, block = f"humanact12_{number:04d}", seen[action] // BLOCK
+            seen[action] += 1
+            if self.published_split:
+                yield Clip(name, motion, [], "train", name, action)
+            else:
+                yield Clip(name, motion, [], blocks[action][block], f"{self.actions[action]} {block}", action)
 
     @cached_property
     def _motions(self) -> list[tuple[np.ndarray, int]]:
-        return read(find(self.path, "humanact12poses.pkl"), len(self.actions))
-
-    def _splits(self, actions: Sequence[int]) -> list[tuple[str, Split]]:
-        if self.published_split:
-            return [(f"humanact12_{number:04d}", "train") for number in range(len(actions))]
-        clips, seen = Counter(actions), Counter[int]()
-        blocks = {a: split_blocks(f"humanact12_{a}", clips[a], BLOCK, val=0.1, test=0.2) for a in clips}
-        splits = []
-        for action in actions:
-            block = seen[action] // BLOCK
-            splits.append((f"{self.actions[action]} {block}", blocks[action][block]))
-            seen[action] += 1
-        return splits
+        return read(find(self.path, "humanact12poses.pkl"))
 
 
-def read(path: Path, actions: int = len(HumanAct12.actions)) -> list[tuple[np.ndarray, int]]:
-    """Reads motion and action of each clip of `humanact12poses.pkl`, in the order of the file.
+def read(path: Path) -> list[tuple[np.ndarray, int]]:
+    """Reads motion (F, 75) float32 and action of each clip of `humanact12poses.pkl`, in the order of the file.
 
-    Returns:
-        Pairs of a motion (F, 75) float32 and a label in [0, `actions`). A motion is the position of the root joint
-        (meters, camera axes), then 24 axis-angle vectors, that of the root in camera axes.
+    A motion is the position of the root joint (meters, camera axes), then 24 axis-angle vectors, that of the root in
+    camera axes.
     """
     clips = []
     for number, columns in enumerate(zip(*read_lists(path, "poses", "joints3D", "y"), strict=True)):
         with naming(f"{path}: clip {number}", *NO_NUMBERS, what="does not consist of numbers: "):
             pose, joint = (np.asarray(column, np.float32) for column in columns[:2])
-            label = int(columns[2])
-        if pose.ndim != 2 or pose.shape[1] != 72 or joint.shape != (len(pose), 24, 3) or not len(pose):
-            raise UserError(
-                f"{path}: clip {number} has poses {pose.shape} and joints {joint.shape}, not (F, 72) and (F, 24, 3)"
-            )
-        if not 0 <= label < actions:
-            raise UserError(f"{path}: clip {number} has the label {label}, not one of 0 to {actions - 1}")
+            label, actions = int(columns[2]), len(HumanAct12.actions)
+            if pose.shape[1:] != (72,) or joint.shape != (len(pose), 24, 3) or not len(pose):
+                raise UserError(f"poses {pose.shape} and joints {joint.shape}, not (F, 72) and (F, 24, 3)")
+            if not 0 <= label < actions:
+                raise UserError(f"label {label}, not one of 0 to {actions - 1}")
         clips.append((np.concatenate([joint[:, 0], pose], 1), label))
     return clips
 
@@ -95,9 +84,8 @@ def read(path: Path, actions: int = len(HumanAct12.actions)) -> list[tuple[np.nd
 def read_unconstrained(path: Path) -> np.ndarray:
     """Reads the reference motions of unconstrained generation (Tevet et al. 2023, section 4.3; Raab et al. 2022).
 
-    Returns:
-        (N, F, 15, 3) float32 of `humanact12_unconstrained_modi_struct.npy`, (N, 15 or more, 3, F): SMPL's joints 15,
-        12, 16, 18, 20, 17, 19, 21, 0, 1, 4, 7, 2, 5, 8.
+    Returns (N, F, 15, 3) float32 of `humanact12_unconstrained_modi_struct.npy`, (N, 15 or more, 3, F): SMPL's joints
+    15, 12, 16, 18, 20, 17, 19, 21, 0, 1, 4, 7, 2, 5, 8.
     """
     data = read_npy(path)
     if data.dtype.kind not in "fiu" or data.ndim != 4 or data.shape[1] < 15 or data.shape[2] != 3:
@@ -122,11 +110,9 @@ def read_lists(path: Path, *names: str) -> list[Any]:
     if not isinstance(data, dict) or not set(names) <= set(data):
         kind = f"keys {', '.join(map(str, data))}" if isinstance(data, dict) else type(data).__name__
         raise UserError(f"{path}: must contain {', '.join(names)}; it contains {kind}")
-    for name in names:
-        values = data[name]
-        if not isinstance(values, list | tuple | np.ndarray) or (isinstance(values, np.ndarray) and not values.ndim):
-            raise UserError(f"{path}: {name} is not a list, but {type(values).__name__}")
-    lengths = {name: len(data[name]) for name in names}
-    if len(set(lengths.values())) > 1:
-        raise UserError(f"{path}: lists differ in length: {lengths}")
-    return [data[name] for name in names]
+    lists = [data[name] for name in names]
+    if not all(isinstance(values, list | tuple) or np.ndim(values) for values in lists):
+        raise UserError(f"{path}: {', '.join(names)} are not all lists")
+    if len(set(map(len, lists))) > 1:
+        raise UserError(f"{path}: lists differ in length: {', '.join(f'{len(values)}' for values in lists)}")
+    return lists

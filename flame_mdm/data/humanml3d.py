@@ -15,19 +15,17 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from flame_mdm.data import Clip, MotionSource, archives, required, restricted_pickle
-from flame_mdm.data.amass import Amass, Body, Recording, key_of, load_bodies, subset_of
+from flame_mdm.data import Clip, MotionSource, archives, required, restricted_pickle, some
+from flame_mdm.data.amass import FACTS, Amass, Recording, key_of
+from flame_mdm.data.body_model import Body, load_body
 from flame_mdm.data.t2m import T2MFolder
 from flame_mdm.errors import UserError
 from flame_mdm.progress import ProgressBar
 from flame_mdm.representations import Frames
 from flame_mdm.representations.humanml import HumanML
-from flame_mdm.safe_io import atomic_write, naming, read_npy, read_text
+from flame_mdm.safe_io import atomic_write, made_folder, naming, read_npy, read_text
 
 FPS = 20
-
-TRIMMED = {"Eyes_Japan_Dataset": 60, "MPI_HDM05": 60, "TotalCapture": 20, "MPI_Limits": 20, "Transitions_mocap": 10}
-"""Frames at 20 fps trimmed from the start of a subset's recordings (T poses); `index.csv` counts from there."""
 
 GET_IT = (
     "clone https://github.com/EricGuo5513/HumanML3D and use its folder HumanML3D; the motions have to be created from "
@@ -48,12 +46,13 @@ class IndexedClip(NamedTuple):
         """Whether the clip is from HumanAct12, whose clips are used whole; `key` is then the name of its file."""
         return "/" not in self.key
 
-    def frames(self, count: int) -> range:
-        """Returns the range of the clip's frames in a recording of `count` frames."""
+    def frames(self, count: int) -> slice:
+        """Returns the clip's frames in a recording of `count` frames."""
         if self.humanact12:
-            return range(count)
-        trimmed = TRIMMED.get(subset_of(self.key), 0)
-        return range(count)[trimmed:][self.start : self.end]
+            return slice(0, count)
+        trimmed = FACTS["trimmed"].get(self.key.partition("/")[0], 0)
+        frames = range(count)[trimmed:][self.start : self.end]
+        return slice(frames.start, frames.stop)
 
 
 def read_index(path: Path) -> list[IndexedClip]:
@@ -61,36 +60,35 @@ def read_index(path: Path) -> list[IndexedClip]:
     required(path, "it is index.csv of https://github.com/EricGuo5513/HumanML3D")
     rows = []
     lines = csv.DictReader(io.StringIO(read_text(path), newline=""))
-    with naming(path, csv.Error):
-        for number, line in enumerate(lines, 2):
-            errors = (KeyError, TypeError, ValueError)
-            with naming(f"{path}, line {number}", *errors, what="not a clip of HumanML3D's index: "):
-                source, name = line["source_path"], PurePosixPath(line["new_name"]).stem
-                key = PurePosixPath(source).stem if "humanact12" in source.lower() else key_of(source)
-                if key is None:
-                    raise UserError(f"{source} is in no subset of AMASS")
-                rows.append(IndexedClip(name, key, int(line["start_frame"]), int(line["end_frame"])))
+    with naming(path, csv.Error, KeyError, TypeError, ValueError, what="not HumanML3D's index of clips: "):
+        for line in lines:
+            source, name = line["source_path"], PurePosixPath(line["new_name"]).stem
+            key = PurePosixPath(source).stem if "humanact12" in source.lower() else key_of(source)
+            if key is None:
+                raise UserError(f"{source} is in no subset of AMASS")
+            rows.append(IndexedClip(name, key, int(line["start_frame"]), int(line["end_frame"])))
     return rows
 
 
-def by_recording(rows: Iterable[IndexedClip]) -> tuple[dict[str, list[IndexedClip]], dict[str, list[IndexedClip]]]:
-    """Returns recording -> its clips, first the recordings of AMASS, then those of HumanAct12."""
-    recordings: tuple[dict[str, list[IndexedClip]], dict[str, list[IndexedClip]]] = defaultdict(list), defaultdict(list)
+def by_recording(rows: Iterable[IndexedClip], *, humanact12: bool) -> dict[str, list[IndexedClip]]:
+    """Returns recording -> its clips, for the recordings of HumanAct12 or for those of AMASS."""
+    recordings = defaultdict(list)
     for row in rows:
-        recordings[row.humanact12][row.key].append(row)
+        if row.humanact12 == humanact12:
+            recordings[row.key].append(row)
     return recordings
 
 
 class HumanML3D(T2MFolder):
     """The processed folder with 263 features; missing motions are first created from AMASS if `amass` is given.
 
-    Args: all but `path` and `exclude` are for creating the folder from AMASS.
+    They are created from `index.csv` and HumanAct12's joints, `humanact12` or `pose_data/humanact12.zip`, which are in
+    the folder or next to it.
+
+    Args:
         path, exclude: as for `T2MFolder`; the folder must contain texts and splits.
         amass: folder of AMASS's SMPL+H G archives, packed or unpacked.
         body_models: folder of the extended SMPL+H model.
-        humanact12: folder or zip of HumanAct12's joints; default `humanact12` or `pose_data/humanact12.zip` next to
-            `path`.
-        index: default `index.csv` in `path` or next to it.
         bone_lengths: 22 bone lengths, in meters, of the skeleton that all motions are retargeted to.
     """
 
@@ -107,17 +105,12 @@ class HumanML3D(T2MFolder):
         *,
         amass: str | None = None,
         body_models: str | None = None,
-        humanact12: str | None = None,
-        index: str | None = None,
         bone_lengths: Sequence[float] | None = None,
         workers: int = 0,
     ):
         super().__init__(path, exclude)
         self.amass = Amass(Path(amass)) if amass else None
         self.body_models = Path(body_models) if body_models else None
-        joints = ("humanact12", "pose_data/humanact12", "pose_data/humanact12.zip")
-        self.humanact12 = Path(humanact12) if humanact12 else _beside(self.path, *joints)
-        self.index = Path(index) if index else _beside(self.path, "index.csv")
         self.bone_lengths, self.workers = bone_lengths, workers
         self.options = {**self.options, "bone_lengths": bone_lengths and list(bone_lengths)}
 
@@ -136,79 +129,74 @@ class HumanML3D(T2MFolder):
     @cached_property
     def rows(self) -> list[IndexedClip]:
         """The clips of the index that are not excluded."""
-        return [row for row in read_index(self.index) if row.name not in self.exclude]
+        return [row for row in read_index(self._beside("index.csv")) if row.name not in self.exclude]
 
     @cached_property
     def humanact12_files(self) -> dict[str, Path]:
         """Files of joints of HumanAct12 by name; empty if they are missing."""
-        folder = archives.as_folder(self.humanact12, self, lambda n: n.endswith(".npy") and "__MACOSX" not in n)
+        path = self._beside("humanact12", "pose_data/humanact12", "pose_data/humanact12.zip")
+        folder = archives.as_folder(path, self, lambda n: n.endswith(".npy") and "__MACOSX" not in n)
         return {file.stem: file for file in folder.rglob("*.npy")}
+
+    def _beside(self, *names: str) -> Path:
+        """Returns the first of these names that exists in the folder or next to it, else the first in the folder."""
+        candidates = [folder / name for name in names for folder in (self.path, self.path.parent)]
+        return next((candidate for candidate in candidates if candidate.exists()), candidates[0])
 
     def _todo(self) -> list[IndexedClip]:
         made = self._motions()
         return [row for row in self.rows if not {row.name, f"M{row.name}"} <= made]
 
-    def _missing(self, amass: Amass, todo: Sequence[IndexedClip]) -> list[str]:
-        missing = []
-        for needed in (lambda: self.names, lambda: self.texts, lambda: amass.files, self._bodies):
-            try:
-                needed()
-            except FileNotFoundError as error:
-                missing.append(str(error))
-        if amass.root.is_dir():
-            missing += amass.missing({row.key for row in todo if not row.humanact12})
-        absent = {row.key for row in todo if row.humanact12} - self.humanact12_files.keys()
-        if absent:
-            missing.append(f"{self.humanact12}: {len(absent)} clips of HumanAct12 are missing, such as {min(absent)}")
-        return missing
-
     def _bodies(self) -> dict[str, Body]:
         if not self.body_models:
             raise FileNotFoundError("data.source.body_models: not set; give the folder of the extended SMPL+H model")
-        return load_bodies(self.body_models)
+        return {gender: load_body(self.body_models, gender) for gender in ("male", "female")}
+
+    def _missing(self, amass: Amass, todo: Sequence[IndexedClip]) -> list[str]:
+        missing = amass.missing({row.key for row in todo if not row.humanact12})
+        if absent := {row.key for row in todo if row.humanact12} - self.humanact12_files.keys():
+            missing.append(f"{len(absent)} clips of HumanAct12, such as {min(absent)}")
+        try:
+            self._bodies()
+        except FileNotFoundError as error:
+            missing.append(str(error))
+        return missing
 
     def _make(self, amass: Amass) -> None:
         """Creates the motions that do not exist yet; an interrupted run thus continues where it stopped."""
-        todo = self._todo()
-        if todo:
-            missing = self._missing(amass, todo)
-            if missing:
-                raise FileNotFoundError(f"{self.name} cannot be created: {'; '.join(missing)}")
-            folder = self.path / "new_joint_vecs"
-            is_new = not folder.exists()
-            folder.mkdir(exist_ok=True)
-            try:
-                self._make_motions(amass, todo, folder)
-            except BaseException:
-                for unfinished in folder.glob(".*.npy"):  # of workers that were stopped
-                    unfinished.unlink(missing_ok=True)
-                if is_new and not any(folder.iterdir()):
-                    folder.rmdir()
-                raise
+        if todo := self._todo():
+            _ = self.names, self.texts  # which may be missing
+            if missing := self._missing(amass, todo):
+                raise FileNotFoundError(f"{self.name} cannot be created. Missing: {'; '.join(missing)}")
+            with made_folder(self.path / "new_joint_vecs"):
+                self._make_motions(amass, todo)
         if not (self.path / "Mean.npy").is_file():
             self._write_statistics()
 
-    def _make_motions(self, amass: Amass, todo: Sequence[IndexedClip], folder: Path) -> None:
-        write = partial(_write_features, folder, HumanML("smpl22", "legacy", bone_lengths=self.bone_lengths))
-        from_amass, from_humanact12 = by_recording(todo)
-        with ProgressBar(desc=f"creating {self.name}", total=len(todo), unit=" motions") as progress:
-            for _, count in amass.map(from_amass, partial(_from_amass, write, self._bodies()), self.workers):
-                progress.update(count)
-            for key, rows in sorted(from_humanact12.items()):
-                for row in rows:
-                    write(row, _read_joints(self.humanact12_files[key]))
-                    progress.update()
+    def _make_motions(self, amass: Amass, todo: Sequence[IndexedClip]) -> None:
+        folder, encoder = self.path / "new_joint_vecs", HumanML("smpl22", "legacy", bone_lengths=self.bone_lengths)
+        write = partial(_write_features, folder, encoder)
+        from_amass, from_humanact12 = (by_recording(todo, humanact12=of) for of in (False, True))
+        try:
+            with ProgressBar(desc=f"creating {self.name}", total=len(todo), unit=" motions") as progress:
+                for _, count in amass.map(from_amass, partial(_from_amass, write, self._bodies()), self.workers):
+                    progress.update(count)
+                for key, rows in sorted(from_humanact12.items()):
+                    for row in rows:
+                        write(row, _read_joints(self.humanact12_files[key]))
+                        progress.update()
+        finally:
+            for unfinished in folder.glob(".*.npy"):  # of workers that were stopped
+                unfinished.unlink(missing_ok=True)
 
     def _write_statistics(self) -> None:
         """Writes mean and std over all motions of any length and split, including mirrored ones."""
         names = sorted(self._motions())
         representation = HumanML("smpl22", "legacy")
-        frames = 0
-        for name in names:
-            length, features = self._load(name, mmap=True).shape
-            if features != representation.features:
-                raise UserError(f"{self.path}: {name} has {features} features; delete it and prepare again")
-            frames += length
+        shapes = {name: self._load(name, mmap=True).shape for name in names}
+        if wrong := [name for name, shape in shapes.items() if shape[1] != representation.features]:
+            raise UserError(f"{self.path}: wrong number of features of {some(wrong)}; delete them and prepare again")
+        frames = sum(shape[0] for shape in shapes.values())
         motions = Frames(lambda: (self._load(name).astype(np.float32) for name in names), frames)
         mean, std = representation.statistics(motions)
         _save(self.path / "Std.npy", std.numpy())
@@ -222,8 +210,7 @@ def _from_amass(
     recording = recording.every(FPS)
     body = bodies["male" if recording.gender == "male" else "female"]
     for row in rows:
-        frames = row.frames(len(recording.poses))
-        part = slice(frames.start, frames.stop)
+        part = row.frames(len(recording.poses))
         cut = recording._replace(poses=recording.poses[part], translation=recording.translation[part])
         write(row, body.joints(cut))
     return len(rows)
@@ -243,19 +230,10 @@ def _save(path: Path, array: np.ndarray) -> None:
         np.save(temporary, array)
 
 
-def _beside(path: Path, *names: str) -> Path:
-    """Returns the first of these names that exists in the folder or next to it, else the first name in the folder."""
-    candidates = [folder / name for name in names for folder in (path, path.parent)]
-    return next((candidate for candidate in candidates if candidate.exists()), candidates[0])
-
-
 def _read_joints(path: Path) -> np.ndarray:
     joints = read_npy(path)
-    with naming(path):
-        if joints.dtype.kind not in "fiu":
-            raise UserError(f"an array of {joints.dtype}, not of real numbers")
-        if joints.ndim != 3 or joints.shape[1] < 22 or joints.shape[2] != 3:
-            raise UserError(f"shape {joints.shape}, not (frames, 22 joints or more, 3)")
+    if joints.dtype.kind not in "fiu" or joints.ndim != 3 or joints.shape[1] < 22 or joints.shape[2] != 3:
+        raise UserError(f"{path}: shape {joints.shape} of {joints.dtype}, not numbers (frames, 22 joints or more, 3)")
     return joints[:, :22]
 
 
@@ -263,15 +241,13 @@ class HumanML3DSMPL(MotionSource):
     """FLAME's form of the data set (Kim et al., AAAI 2023): SMPL parameters, whole clips, one clip per caption.
 
     As in FLAME's code, there are no mirrored copies, no limits of length and no cuts: a caption of a part is used as a
-    caption of the whole motion. Clips are named NAME#0, NAME#1 ...; those of one motion share its frames. Unlike in
-    FLAME's code, the frames trimmed from the start of five subsets are taken into account when `index.csv` is applied,
-    so that motion and caption match.
+    caption of the whole motion. Clips are named NAME#0, NAME#1 ...; those of one motion share its frames. Unlike there,
+    the frames trimmed from the start of five subsets are taken into account, so that motion and caption match.
 
     Args:
-        path: folder with the texts and splits of HumanML3D; no motions are needed.
+        path: folder with HumanML3D's texts and splits and, in it or next to it, `index.csv`; no motions are needed.
         amass: folder of AMASS's SMPL+H G archives, packed or unpacked.
         humanact12: FLAME's `humanact12_processed.pkl`; without it, the clips of HumanAct12 are left out.
-        index: default `index.csv` in `path` or next to it.
         published_split: train on the validation clips as well (FLAME's "final"); none are left for validation.
         exclude: names to leave out.
     """
@@ -283,13 +259,12 @@ class HumanML3DSMPL(MotionSource):
         path: str,
         amass: str,
         humanact12: str | None = None,
-        index: str | None = None,
         *,
         published_split: bool = False,
         exclude: Sequence[str] = (),
         workers: int = 0,
     ):
-        self.folder, self.amass = HumanML3D(path, exclude, index=index), Amass(Path(amass))
+        self.folder, self.amass = HumanML3D(path, exclude), Amass(Path(amass))
         self.humanact12 = Path(humanact12) if humanact12 else None
         self.published_split, self.workers = published_split, workers
         self.options = {"published_split": published_split, "exclude": list(exclude)}
@@ -298,41 +273,31 @@ class HumanML3DSMPL(MotionSource):
     def rows(self) -> list[IndexedClip]:
         """The clips to read, in the order of the index."""
         rows = [row for row in self.folder.rows if row.name in self.folder.names]
-        absent = [row.name for row in rows if not self.folder.texts.get(row.name)]
-        if absent:
+        if absent := [row.name for row in rows if not self.folder.texts.get(row.name)]:
             raise FileNotFoundError(
                 f"{self.folder.path}: {len(absent)} clips have no text, such as {absent[0]}; unpack texts.zip again"
             )
-        return rows if self.humanact12 else [row for row in rows if not row.humanact12]
+        used = [row for row in rows if self.humanact12 or not row.humanact12]
+        listed = sum(not name.startswith("M") for name in self.folder.names)  # without mirrored copies
+        excluded = sum(not name.startswith("M") for name in self.folder.exclude)
+        self.leave_out("motions by data.source.exclude", excluded)
+        self.leave_out("motions that index.csv lacks", listed - len(rows))
+        self.leave_out("motions of HumanAct12, as data.source.humanact12 is not given", len(rows) - len(used))
+        return used
 
     def count(self) -> int:
-        if missing := self._missing():
+        if missing := self.amass.missing({row.key for row in self.rows if not row.humanact12}):
             raise FileNotFoundError(f"{self.amass.root}: {'; '.join(missing)}")
         return sum(len(self.folder.texts[row.name]) for row in self.rows)
 
-    def check(self) -> list[str]:
-        return [f"{len(self.rows)} motions in the index", *(f"missing: {line}" for line in self._missing())]
-
-    def _missing(self) -> list[str]:
-        return self.amass.missing({row.key for row in self.rows if not row.humanact12})
-
     def clips(self, fps: float) -> Iterator[Clip]:
         self.check_fps(fps, FPS)
-        listed = {name for name in self.folder.names if not name.startswith("M")}  # without mirrored copies
-        indexed = [row for row in self.folder.rows if row.name in listed]
-        counts = {
-            "motions by data.source.exclude": sum(not name.startswith("M") for name in self.folder.exclude),
-            "motions that index.csv lacks": len(listed) - len(indexed),
-            "motions of HumanAct12, as data.source.humanact12 is not given": len(indexed) - len(self.rows),
-        }
-        self.excluded.clear()
-        self.excluded.update({reason: count for reason, count in counts.items() if count})
-        from_amass, from_humanact12 = by_recording(self.rows)
+        from_amass = by_recording(self.rows, humanact12=False)
         for key, motions in self.amass.map(from_amass, _parameters, self.workers):
             for row, motion in zip(from_amass[key], motions, strict=True):
                 yield from self._clips(row, motion)
         if self.humanact12:
-            yield from self._from_humanact12(self.humanact12, from_humanact12)
+            yield from self._from_humanact12(self.humanact12, by_recording(self.rows, humanact12=True))
 
     def _from_humanact12(self, path: Path, recordings: dict[str, list[IndexedClip]]) -> Iterator[Clip]:
         """Yields SMPL poses of HumanAct12; the root position is used as SMPL's translation, as in FLAME's code."""
@@ -340,7 +305,7 @@ class HumanML3DSMPL(MotionSource):
         for key in sorted(recordings):
             entry = data.get(f"{key}.npy", data.get(key)) if isinstance(data, dict) else None
             if entry is None:
-                self.excluded[f"motions of HumanAct12 that {path.name} lacks"] += len(recordings[key])
+                self.leave_out(f"motions of HumanAct12 that {path.name} lacks", len(recordings[key]))
                 continue
             errors = (KeyError, TypeError, ValueError, IndexError)
             with naming(path, *errors, what=f"{key} lacks poses (F, 72) or joints3D (F, 24, 3): "):
@@ -351,7 +316,7 @@ class HumanML3DSMPL(MotionSource):
 
     def _clips(self, row: IndexedClip, motion: np.ndarray) -> Iterator[Clip]:
         if not len(motion):
-            self.excluded["motions without a frame"] += 1
+            self.leave_out("motions without a frame")
             return
         split = self.folder.names[row.name]
         for number, description in enumerate(self.folder.texts[row.name]):
@@ -367,5 +332,4 @@ class HumanML3DSMPL(MotionSource):
 def _parameters(rows: Sequence[IndexedClip], recording: Recording) -> list[np.ndarray]:
     recording = recording.every(FPS)
     motion = np.concatenate([recording.translation, recording.poses], 1).astype(np.float32)
-    cuts = [row.frames(len(motion)) for row in rows]
-    return [motion[frames.start : frames.stop] for frames in cuts]
+    return [motion[row.frames(len(motion))] for row in rows]

@@ -7,15 +7,14 @@ from collections.abc import Iterator, Sequence
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from flame_mdm.data import SPLITS, Clip, MotionSource, Split
+from flame_mdm.data import SPLITS, Clip, MotionSource, Split, required
 from flame_mdm.data.parallel import in_order
-from flame_mdm.data.t2m import T2MFolder, read_names, read_splits
+from flame_mdm.data.t2m import T2MFolder, read_splits
 from flame_mdm.errors import UserError
-from flame_mdm.safe_io import TEXT_LIMIT, naming, read_json, regular_file
+from flame_mdm.safe_io import TEXT_LIMIT, naming, read_json, read_text, regular_file
 
 UNITS_PER_METER = 640
 MMM_FPS = 100
@@ -47,6 +46,10 @@ class KITTemos(MotionSource):
     name = "kit-temos"
     shortest, longest = 10, 500
     get_it = "get datasets/kit-splits of https://github.com/Mathux/TEMOS"
+    get_motions = (
+        "download KIT-ML from https://motion-annotation.humanoids.kit.edu/dataset and the joints as described in "
+        "docs/kit.md"
+    )
 
     def __init__(self, path: str, splits: str, exclude: Sequence[str] = (), workers: int = 0):
         self.path, self.splits, self.workers = Path(path), Path(splits), workers
@@ -56,22 +59,24 @@ class KITTemos(MotionSource):
     @cached_property
     def names(self) -> dict[str, Split]:
         """Name of each motion in a split -> its split."""
-        return read_splits(self.splits, "", self.exclude, self.get_it)
+        return self.not_excluded(read_splits(self.splits, "", self.get_it), self.splits)
+
+    @cached_property
+    def ghosh_test(self) -> set[str]:
+        """Names in Ghosh et al.'s test split, if there is a list of them."""
+        file = self.splits / "ghosh-test"
+        return set(read_text(file).split()) if file.is_file() else set()
 
     @cached_property
     def texts(self) -> dict[str, list[str]]:
         """Captions of each motion in the splits, except motions without captions."""
-        needed = [f"{name}_{kind}" for name in self.names for kind in ("fke.csv", "annotations.json", "meta.json")]
-        files = {path.name for path in self.path.glob("*_*")}
-        if absent := [name for name in needed if name not in files]:
-            raise FileNotFoundError(
-                f"{self.path}: {len(absent)} of {len(needed)} files are missing, such as {absent[0]}; download KIT-ML "
-                "from https://motion-annotation.humanoids.kit.edu/dataset and the joints as described in docs/kit.md"
-            )
-        texts = {}
-        for name in self.names:
-            captions, meta = (_json(self.path / f"{name}_{kind}.json") for kind in ("annotations", "meta"))
-            if len(captions) != meta.get("nb_annotations"):
+        names, texts = self.names, {}
+        required(self.path, self.get_motions)
+        for name in names:
+            captions, meta = (read_json(self.path / f"{name}_{kind}.json") for kind in ("annotations", "meta"))
+            if not isinstance(captions, list) or not all(isinstance(text, str) for text in captions):
+                raise UserError(f"{self.path}/{name}_annotations.json: damaged: not a list of texts")
+            if not isinstance(meta, dict) or len(captions) != meta.get("nb_annotations"):
                 raise UserError(f"{self.path}/{name}_meta.json: nb_annotations does not match {name}_annotations.json")
             if captions:
                 texts[name] = captions
@@ -87,17 +92,15 @@ class KITTemos(MotionSource):
 
     def clips(self, fps: float) -> Iterator[Clip]:
         self.check_fps(fps, MMM_FPS / 8)
-        ghosh = set(read_names(self.splits / "ghosh-test", "")) if (self.splits / "ghosh-test").is_file() else set()
-        self.excluded.clear()
-        if self.exclude:
-            self.excluded["motions by data.source.exclude"] = len(self.exclude)
-        self.excluded.update(f"motions of {s} without a caption" for n, s in self.names.items() if n not in self.texts)
-        for name, frames in self.frames.items():
-            if not self._fits(name):
-                limit = f"shorter than {self.shortest}" if frames < self.shortest else f"longer than {self.longest}"
-                self.excluded[f"motions of {self.names[name]} {limit} frames"] += 1
+        for name, split in self.names.items():
+            if name not in self.texts:
+                self.leave_out(f"motions of {split} without a caption")
+            elif not self._fits(name):
+                is_short = self.frames[name] < self.shortest
+                limit = f"shorter than {self.shortest}" if is_short else f"longer than {self.longest}"
+                self.leave_out(f"motions of {split} {limit} frames")
         names = [name for name in self.frames if self._fits(name)]
-        tasks = ((self.path / f"{name}_fke.csv", 1 if self.names[name] == "test" else 8) for name in names)
+        tasks = [(self.path / f"{name}_fke.csv", 1 if self.names[name] == "test" else 8) for name in names]
         for name, recording in zip(names, in_order(_recording, tasks, self.workers), strict=True):
             split = self.names[name]
             yield Clip(
@@ -106,16 +109,15 @@ class KITTemos(MotionSource):
                 captions=self.texts[name][:1] if split == "test" else self.texts[name],
                 split=split,
                 source=name,
-                attributes={"ghosh_test": name in ghosh},
+                attributes={"ghosh_test": name in self.ghosh_test},
                 reference=recording if split == "test" else None,
             )
 
     def counts(self) -> dict[str, int]:
-        files = [path for path in self.path.glob("*_annotations.json") if _json(path)]
-        texts = sum(len(_json(path)) for path in files)
-        lists = (self.splits / split for split in (*SPLITS, "ghosh-test"))
-        splits = {path.name.replace("-", "_"): len(read_names(path, self.get_it)) for path in lists}
-        return {"motions": len(list(self.path.glob("*_fke.csv"))), "texts": texts, **splits}
+        texts = sum(len(read_json(path)) for path in self.path.glob("*_annotations.json"))
+        splits = list(read_splits(self.splits, "", self.get_it).values())
+        counts = {split: splits.count(split) for split in SPLITS} | {"ghosh_test": len(self.ghosh_test)}
+        return {"motions": len(list(self.path.glob("*_fke.csv"))), "texts": texts, **counts}
 
     def _fits(self, name: str) -> bool:
         return self.names[name] == "test" or self.shortest <= self.frames[name] <= self.longest
@@ -144,11 +146,3 @@ def _rows(path: Path) -> int:
     regular_file(path, TEXT_LIMIT)
     data = path.read_bytes()
     return data.count(b"\n") + (not data.endswith(b"\n")) - 1
-
-
-def _json(path: Path) -> Any:
-    content = read_json(path)
-    kind = list if path.name.endswith("_annotations.json") else dict
-    if not isinstance(content, kind) or (kind is list and not all(isinstance(text, str) for text in content)):
-        raise UserError(f"{path}: damaged: not {'a list of texts' if kind is list else 'an object'}")
-    return content

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from flame_mdm.batch import MotionBatch, padded_length, sent
-from flame_mdm.data.clips import Clips, Draw
+from flame_mdm.data.crops import Clips, Draw
 from flame_mdm.data.store import Store
 from flame_mdm.representations import Representation
 

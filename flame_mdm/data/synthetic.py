@@ -4,25 +4,111 @@
 motion in `synthetic_motions`, a line in `ACTIONS`, and its captions in `synthetic.yaml`.
 """
 
+import re
 from collections.abc import Callable, Iterator, Mapping
-from functools import partial
-from typing import NamedTuple
+from functools import cache, partial
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from flame_mdm.data import Clip, MotionSource, hashed_split
-from flame_mdm.data.grammar import content, draw_captions
 from flame_mdm.data.parallel import in_order
 from flame_mdm.data.synthetic_motions import gestures, locomotion, postures
 from flame_mdm.data.synthetic_motions.body import Attributes, Body
 from flame_mdm.errors import UserError
+from flame_mdm.safe_io import read_yaml
 
 WAYS = {"forward": 0.3, **dict.fromkeys(("backward", "left", "right", "clockwise", "counterclockwise"), 0.14)}
-MIN_EVENT_SECONDS = 0.8  # minimum duration of a repetition in seconds; it limits how many fit into a clip
+MIN_SECONDS, MAX_SECONDS = 2.0, 3.0  # durations of clips
 AT_ONCE = 32  # number of clips that a process makes at a time
 CAPTIONS = 8  # captions per clip
 PARTIAL = 0.25
 """Share of the training clips whose captions leave out some attributes; those of val and test state all of them."""
+UNSAID = {"speed": "normal", "amount": "quarter"}  # values that a caption need not state
+TENSES = ("present",) * 5 + ("progressive",) * 3 + ("past", "past", "future")
+CHOICE = re.compile(r"\[([^\[\]]*)\]")
+SLOT = re.compile(r"\{(\w+)(?:\.(\w+))?\}")
+VERB = re.compile(r"((?:\w+ly )?)<([^>]*)>")  # with an adverb before it: "is slowly walking"
+
+
+@cache
+def content() -> dict[str, Any]:
+    """Returns the content of `synthetic.yaml`; the captions by single keys, the forms of verbs by their infinitive."""
+    grammar = read_yaml(Path(__file__).with_name("synthetic.yaml"))
+    grammar["captions"] = {key: value for keys, value in grammar["captions"].items() for key in keys.split(", ")}
+    grammar["verbs"] = {line.split()[0]: line.split() for line in grammar["verbs"]}
+    grammar["subjects"] = [group for group in grammar["subjects"] for _ in range(group["share"])]
+    return grammar
+
+
+def draw_captions(
+    rng: np.random.Generator, attributes: Attributes, count: int, incomplete: bool = False
+) -> tuple[list[str], Attributes]:
+    """Draws `count` different captions of a clip with these attributes, and returns them with those that they state.
+
+    If `incomplete`, they leave out some attributes, all of them the same ones, if the grammar has such captions.
+    """
+    everything = {name for name, value in attributes.items() if name != "action" and UNSAID.get(name) != value}
+    captions: list[str] = []
+    stated = everything
+    for _ in range(30 if incomplete else 0):  # the first caption that leaves something out decides what is left out
+        caption, said = _sentence(rng, attributes)
+        if said != everything:
+            captions, stated = [caption], said
+            break
+    while len(captions) < count:
+        caption, said = _sentence(rng, attributes)
+        if said == stated and caption not in captions:
+            captions.append(caption)
+    if stated == everything:
+        return captions, dict(attributes)
+    return captions, {name: value for name, value in attributes.items() if name == "action" or name in stated}
+
+
+def _sentence(rng: np.random.Generator, attributes: Attributes) -> tuple[str, set[str]]:
+    """Returns a sentence and the names of the attributes that it states."""
+    grammar = content()
+    action = attributes["action"]
+    keys = (key for value in attributes.values() if (key := f"{action} {value}") in grammar["captions"])
+    template = _one(rng, grammar["captions"][next(keys, action)])
+    subject = _one(rng, grammar["subjects"])
+    who = "" if template.startswith("=") else _one(rng, subject["who"])
+    text = template.lstrip("= ") if template.startswith("=") or "{who}" in template else f"{{who}} {template}"
+    said: set[str] = set()
+
+    def fill(slot: re.Match[str]) -> str:
+        name, kind = slot.groups()
+        if kind is None:
+            return {"who": who, "whose": subject["whose"]}.get(name) or grammar["phrases"].get(name, "")
+        said.add(name)
+        return f"[{grammar['stated'][f'{name}.{kind}'][attributes[name]]}]"
+
+    while CHOICE.search(text) or SLOT.search(text):
+        while CHOICE.search(text):
+            text = CHOICE.sub(lambda choice: _one(rng, choice[1].split("|")), text)
+        text = SLOT.sub(fill, text)
+    text = _conjugated(rng, text, who, bool(subject.get("plural")))
+    return " ".join(text.split()), {name for name in said if UNSAID.get(name) != attributes[name]}
+
+
+def _conjugated(rng: np.random.Generator, text: str, who: str, plural: bool) -> str:
+    """Returns the text with its verbs in one tense; without a subject, as imperatives or participles."""
+    tense = _one(rng, TENSES if who else ("present", "present", "progressive"))
+    words = {"present": 0 if plural or not who else 1, "progressive": 2, "past": 3, "future": 0}
+    auxiliaries = {"progressive": "are " if plural else "is ", "future": "will "}
+    auxiliary = auxiliaries.get(tense, "") if who else ""
+
+    def form(verb: re.Match[str]) -> str:
+        nonlocal auxiliary
+        before, auxiliary = auxiliary, ""
+        return before + verb[1] + content()["verbs"][_one(rng, verb[2].split("/"))][words[tense]]
+
+    return re.sub(r"\ba (?=[aeio])", "an ", VERB.sub(form, text))
+
+
+def _one(rng: np.random.Generator, choices: Any) -> Any:
+    return choices[int(rng.integers(len(choices)))]
 
 
 class Action(NamedTuple):
@@ -32,20 +118,19 @@ class Action(NamedTuple):
     motion: Callable[[np.random.Generator, np.ndarray, Attributes], Body]
     share: int = 1  # how often the action occurs, relative to the others
     sides: tuple[str, ...] = ()  # sides that move, equally often
-    max_count: int = 0  # maximum number of repetitions; 0 = the action is not repeated
+    max_count: int = 0  # maximum number of repetitions, at most 3; 0 = the action is not repeated
     directions: tuple[str, ...] | Mapping[str, float] = ()  # directions, equally often, or with their probabilities
     speeds: tuple[str, ...] = ()  # speeds of the direction forward, equally often
     amounts: tuple[str, ...] = ()  # how far the body turns, equally often
     seconds: float = 0.0  # minimum duration
 
-    def draw(self, rng: np.random.Generator, name: str, max_seconds: float) -> Attributes:
-        """Draws the attributes of a clip of at most `max_seconds`."""
+    def draw(self, rng: np.random.Generator, name: str) -> Attributes:
+        """Draws the attributes of a clip."""
         drawn: Attributes = {"action": name}
         if self.sides:
             drawn["side"] = str(rng.choice(self.sides))
         if self.max_count:
-            most = min(self.max_count, int((max_seconds - 0.35) / MIN_EVENT_SECONDS))
-            drawn["count"] = int(rng.integers(1, most + 1))
+            drawn["count"] = int(rng.integers(1, self.max_count + 1))
         if isinstance(self.directions, Mapping):
             drawn["direction"] = str(rng.choice(list(self.directions), p=list(self.directions.values())))
         elif self.directions:
@@ -95,19 +180,11 @@ class Synthetic(MotionSource):
     actions = tuple(ACTIONS)
     verbs = tuple(sorted({form for forms in content()["verbs"].values() for form in forms}))
 
-    def __init__(
-        self, clips: int = 5000, seed: int = 0, min_seconds: float = 2.0, max_seconds: float = 3.0, workers: int = 0
-    ):
-        """Defines `clips` motions of `min_seconds` to `max_seconds`, made by `workers` processes (0 = one per core)."""
+    def __init__(self, clips: int = 5000, seed: int = 0, workers: int = 0):
         if clips < 1 or seed < 0:
             raise UserError(f"synthetic: clips={clips}, seed={seed}: give at least one clip and a seed from 0 on")
-        if not 2 <= min_seconds <= max_seconds:
-            raise UserError(
-                f"synthetic: min_seconds={min_seconds}, max_seconds={max_seconds}: give 2 <= min_seconds <= max_seconds"
-            )
-        self.size, self.seed, self.min_seconds, self.max_seconds = clips, seed, min_seconds, max_seconds
-        self.workers = workers
-        self.options = {"clips": clips, "seed": seed, "min_seconds": min_seconds, "max_seconds": max_seconds}
+        self.size, self.seed, self.workers = clips, seed, workers
+        self.options = {"clips": clips, "seed": seed}
 
     def count(self) -> int:
         return self.size
@@ -125,10 +202,9 @@ class Synthetic(MotionSource):
         rng = np.random.default_rng((self.seed, index))
         shares = np.array([action.share for action in ACTIONS.values()], float)
         action = str(rng.choice(list(ACTIONS), p=shares / shares.sum()))
-        attributes = ACTIONS[action].draw(rng, action, self.max_seconds)
-        repeating = 0.35 + MIN_EVENT_SECONDS * int(attributes.get("count", 0))
-        shortest = max(self.min_seconds, repeating, ACTIONS[action].seconds)
-        seconds = rng.uniform(min(shortest, self.max_seconds), self.max_seconds)
+        attributes = ACTIONS[action].draw(rng, action)
+        repeating = 0.35 + 0.8 * int(attributes.get("count", 0))
+        seconds = rng.uniform(max(MIN_SECONDS, repeating, ACTIONS[action].seconds), MAX_SECONDS)
         name = f"synthetic_{self.seed}_{index:06d}"
         split = hashed_split(name, val=5, test=10)
         words = np.random.default_rng((self.seed, index, 1))  # so that motions do not depend on the grammar
@@ -153,7 +229,8 @@ def prompts() -> list[tuple[str, Attributes]]:
 
 def example(attributes: Attributes, fps: float = 20.0) -> np.ndarray:
     """Returns the joints (F, 22, 3) of a motion of three seconds with at least these attributes, such as a prompt's."""
-    action, name = ACTIONS[str(attributes["action"])], str(attributes["action"])
-    draws = (action.draw(np.random.default_rng(seed), name, 3.0) for seed in range(1000))
+    name = str(attributes["action"])
+    action = ACTIONS[name]
+    draws = (action.draw(np.random.default_rng(seed), name) for seed in range(1000))
     drawn = next(drawn for drawn in draws if attributes.items() <= drawn.items())
     return action.motion(np.random.default_rng(0), np.arange(0, 3, 1 / fps), drawn).joints().astype(np.float32)

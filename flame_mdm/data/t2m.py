@@ -9,21 +9,19 @@ Mean.npy Std.npy            (D,)
 import math
 import re
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 import numpy as np
 
-from flame_mdm.data import SPLITS, Clip, MotionSource, Split, archives, required, some, without
+from flame_mdm.data import SPLITS, Clip, MotionSource, Split, archives, required, some
 from flame_mdm.errors import UserError
-from flame_mdm.safe_io import read_npy, read_text
+from flame_mdm.safe_io import naming, read_npy, read_text
 
 TAG_FPS = 20  # frames per second of the tags `from` and `to`, also in KIT-ML, whose motions have 12.5
-
 MAX_LENGTH = 200  # motions and cuts of this many frames or more are left out
-
 MAX_TOKENS = 20
 
 
@@ -48,15 +46,12 @@ class Cut(NamedTuple):
 def parse(text: str, where: str) -> list[Description]:
     """Parses the descriptions in a text file, which `where` names in errors; a NaN tag means 0, as published."""
     descriptions = []
-    for number, line in enumerate(text.splitlines(), 1):
-        if not line.strip():
-            continue
-        try:
-            caption, tokens, *tags = line.strip().rsplit("#", 3)
-            begin, end = (0.0 if math.isnan(float(tag)) else float(tag) for tag in tags)
-        except ValueError:
-            raise UserError(f"{where}, line {number}: not caption#words#from#to: {line.strip()[:60]!r}") from None
-        descriptions.append(Description(caption, tokens.split(" "), begin, end))
+    for number, line in enumerate(map(str.strip, text.splitlines()), 1):
+        if line:
+            with naming(f"{where}, line {number}", ValueError, what=f"not caption#words#from#to: {line[:60]!r}: "):
+                caption, tokens, *tags = line.rsplit("#", 3)
+                begin, end = (0.0 if math.isnan(float(tag)) else float(tag) for tag in tags)
+            descriptions.append(Description(caption, tokens.split(" "), begin, end))
     return descriptions
 
 
@@ -94,34 +89,25 @@ def frame_tokens(tokens: Sequence[str]) -> tuple[list[str], int]:
     return framed + ["unk/OTHER"] * (MAX_TOKENS + 2 - len(framed)), len(framed)
 
 
-def read_names(path: Path, get_it: str) -> list[str]:
-    """Returns the names in a list; `get_it` says where it is published."""
-    return read_text(required(path, get_it)).split()
+def read_splits(folder: Path, ending: str, get_it: str) -> dict[str, Split]:
+    """Returns name -> split, in the order of the lists train, val and test; `get_it` says where these are published.
 
-
-def read_splits(folder: Path, ending: str, exclude: Collection[str], get_it: str) -> dict[str, Split]:
-    """Returns name -> split, in the order of the lists train, val and test in a folder, without excluded names.
-
-    Raises:
-        FileNotFoundError, UserError: If a list is missing, a name is in two splits, or `exclude` has an unknown name.
+    Raises `UserError` if a name is in two splits.
     """
     splits: dict[str, Split] = {}
     for split in SPLITS:
         file = required(folder, get_it) / f"{split}{ending}"
-        for name in read_names(file, get_it):
+        for name in read_text(required(file, get_it)).split():
             if splits.setdefault(name, split) != split:
                 raise UserError(f"{file}: {name} is also in {splits[name]}{ending}")
-    return without(splits, exclude, folder)
+    return splits
 
 
 class T2MFolder(MotionSource):
     """A processed folder. Cuts and mirrored copies have the split of their motion, which is also their source.
 
-    The attribute `tokens` contains the words with their parts of speech, one list per caption.
-
-    Args:
-        path: the folder.
-        exclude: names to leave out; a mirrored copy has its own name.
+    The attribute `tokens` contains the words with their parts of speech, one list per caption. `exclude` leaves out
+    names; a mirrored copy has its own.
     """
 
     representation: str  # name of the representation of the features in the folder
@@ -136,7 +122,7 @@ class T2MFolder(MotionSource):
     @cached_property
     def names(self) -> dict[str, Split]:
         """Name in a list of the splits -> its split, in the order of the lists."""
-        return read_splits(self.path, ".txt", self.exclude, self.get_it)
+        return self.not_excluded(read_splits(self.path, ".txt", self.get_it), self.path)
 
     @cached_property
     def texts(self) -> dict[str, list[Description]]:
@@ -155,8 +141,8 @@ class T2MFolder(MotionSource):
         for files, kind in ((self._motions(), "new_joint_vecs/*.npy"), (self.texts, "texts/*.txt")):
             if absent := names.keys() - files:
                 raise FileNotFoundError(
-                    f"{self.path}: {kind} lacks {len(absent)} of the names in the splits: {some(absent)}; process "
-                    f"them again, or leave them out with {_exclusion(absent)}"
+                    f"{self.path}: {kind} lacks {len(absent)} of the names in the splits: {some(absent)}; process them "
+                    f"again, or leave them out with 'data.source.exclude=[{','.join(sorted(absent))}]'"
                 )
         return {name: len(self._load(name, mmap=True)) for name in names}
 
@@ -166,21 +152,14 @@ class T2MFolder(MotionSource):
         return total
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        """Yields all items, at the frame rate of the folder; motions that are not finite are all named at the end."""
+        """Yields all items, at the frame rate of the folder."""
         self.check_fps(fps, self.fps)
-        self.excluded.clear()
-        if self.exclude:
-            self.excluded["names by data.source.exclude"] = len(self.exclude)
-        if orphans := self.texts.keys() - self._motions() - self.exclude:
-            self.excluded[f"texts without a motion ({some(orphans)})"] = len(orphans)
-        damaged = []
+        orphans = self.texts.keys() - self._motions() - set(self.exclude)
+        self.leave_out(f"texts without a motion ({some(orphans)})", len(orphans))
         for name, length in self.frames.items():
             items = cuts(name, length, self.texts[name], self.shortest)
             self._account(name, length, items)
             motion = self._load(name) if items else np.zeros(0)
-            if not np.isfinite(motion).all():
-                damaged.append(name)
-                continue
             for cut in items:
                 yield Clip(
                     id=cut.id,
@@ -192,20 +171,13 @@ class T2MFolder(MotionSource):
                     encoded=self.representation,
                     window=(cut.start, cut.length),
                 )
-        if damaged:
-            raise UserError(
-                f"{self.path}: {len(damaged)} motions contain non-finite numbers: {some(damaged)}; process them "
-                f"again, or leave them out with {_exclusion(damaged)}"
-            )
 
     def statistics(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns the published mean and std, which are over all motions of all splits."""
-        mean, std = (self._array(self.path / f"{name}.npy") for name in ("Mean", "Std"))
-        if {mean.dtype.kind, std.dtype.kind} - set("fiu"):
-            raise UserError(f"{self.path}: Mean.npy and Std.npy are not arrays of real numbers")
-        if mean.shape != std.shape or mean.ndim != 1 or not np.isfinite(mean).all() or not (std > 0).all():
+        mean, std = (self._array(f"{name}.npy", 1).astype(np.float32) for name in ("Mean", "Std"))
+        if mean.shape != std.shape or not np.isfinite(mean).all() or not (std > 0).all():
             raise UserError(f"{self.path}: Mean.npy {mean.shape} or Std.npy {std.shape} is not a mean or positive std")
-        return mean.astype(np.float32), std.astype(np.float32)
+        return mean, std
 
     def counts(self) -> dict[str, float]:
         """Returns the figures of the folder under the names of `published.yaml`, of which mirrored copies give none."""
@@ -227,18 +199,18 @@ class T2MFolder(MotionSource):
         return {path.stem for path in files if not path.name.startswith(".")}  # unfinished, of a killed process
 
     def _load(self, name: str, mmap: bool = False) -> np.ndarray:
-        motion = self._array(self.path / "new_joint_vecs" / f"{name}.npy", mmap)
-        if motion.ndim != 2 or motion.dtype.kind not in "fiu":
-            what = f"shape {motion.shape} of {motion.dtype}"
-            raise UserError(f"{self.path}/new_joint_vecs/{name}.npy: {what}, not numbers (frames, features)")
-        return motion
+        return self._array(f"new_joint_vecs/{name}.npy", 2, mmap)
 
-    def _array(self, path: Path, mmap: bool = False) -> np.ndarray:
-        return read_npy(required(path, self.get_it), mmap=mmap)
+    def _array(self, name: str, dimensions: int, mmap: bool = False) -> np.ndarray:
+        path = self.path / name
+        array = read_npy(required(path, self.get_it), mmap=mmap)
+        if array.ndim != dimensions or array.dtype.kind not in "fiu":
+            kind = "(frames, features)" if dimensions == 2 else "(features,)"
+            raise UserError(f"{path}: shape {array.shape} of {array.dtype}, not numbers {kind}")
+        return array
 
     def _account(self, name: str, frames: int, items: Sequence[Cut]) -> None:
-        lost = len(self.texts[name]) - sum(len(cut.descriptions) for cut in items)
-        reason = ""
+        """Counts why a motion gives no item, or which of its captions are left out."""
         if frames < self.shortest:
             reason = f"shorter than {self.shortest} frames"
         elif frames >= MAX_LENGTH:
@@ -247,16 +219,12 @@ class T2MFolder(MotionSource):
             reason = "without a caption"
         elif not items:
             reason = "with captions of unfit parts only"
-        elif lost:
-            self.excluded["captions of parts that are too short or too long"] += lost
-        if reason:
-            self.excluded[f"names of {self.names[name]} {reason}"] += 1
+        else:
+            lost = len(self.texts[name]) - sum(len(cut.descriptions) for cut in items)
+            self.leave_out("captions of parts that are too short or too long", lost)
+            return
+        self.leave_out(f"names of {self.names[name]} {reason}")
 
 
 def _is_text(member: str) -> bool:
     return member.endswith(".txt") and "__MACOSX" not in PurePosixPath(member).parts
-
-
-def _exclusion(names: Collection[str]) -> str:
-    """Returns the override that leaves these names out; only its key if there are more than 100."""
-    return f"'data.source.exclude=[{','.join(sorted(names))}]'" if len(names) <= 100 else "data.source.exclude"

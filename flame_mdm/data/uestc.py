@@ -7,9 +7,9 @@ et al., "Action-Conditioned 3D Human Motion Synthesis with Transformer VAE", ICC
 import math
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -24,18 +24,14 @@ TRAIN_SUBJECTS = (
     *(64, 67, 69, 70, 71, 73, 77, 81, 84, 86, 87, 88, 90, 91, 93, 96, 99, 102, 103, 104, 107, 108, 112, 113),
 )
 """Training subjects of the cross-subject protocol: 51 of 118; the other 67 are for testing."""
-
 VAL_SUBJECTS = 5  # number of training subjects that our split uses for validation
-
+MIN_FRAMES = 45  # minimum length of a training clip: three quarters of 60
 ROOT = 8  # index of the middle of the hips among VIBE's 49 joints, which ACTOR uses as the root
-
 FOCAL_LENGTH, IMAGE_SIZE = 500.0, 540.0  # camera in pixels that ACTOR assumes, since VIBE estimates only a scale
+NAME = re.compile(r"(a(\d+)_d(\d+)_p(\d+)_c(\d+))(_.*)?")
 
-NAME = re.compile(r"a(\d+)_d(\d+)_p(\d+)_c(\d+)(_.*)?")
 
-
-@dataclass(frozen=True)
-class Video:
+class Video(NamedTuple):
     """Fields of a video's file name; `index` is its position in the lists."""
 
     index: int
@@ -49,19 +45,18 @@ class Video:
 class UESTC(MotionSource):
     """The clips of `vibe_cache_refined.pkl`, rotated to the front view, as raw motions of the SMPL representations.
 
-    As published, training clips of fewer than `min_frames` frames are left out and all test clips are kept.
+    As published, training clips of fewer than 45 frames are left out and all test clips are kept.
 
     Args:
         path: the folder that contains `vibe_cache_refined.pkl` and `info`.
         published_split: train on all 51 training subjects; otherwise 5 of them are used for validation.
-        min_frames: minimum length of a training clip; published: three quarters of 60.
     """
 
     name = "uestc"
 
-    def __init__(self, path: str, published_split: bool = False, min_frames: int = 45):
-        self.path, self.published_split, self.min_frames = Path(path), published_split, min_frames
-        self.options = {"published_split": published_split, "min_frames": min_frames}
+    def __init__(self, path: str, published_split: bool = False):
+        self.path, self.published_split = Path(path), published_split
+        self.options = {"published_split": published_split}
 
     @cached_property
     def actions(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -69,8 +64,7 @@ class UESTC(MotionSource):
         return tuple(self._lines("action_classes.txt"))
 
     def count(self) -> int:
-        """Returns the number of videos, including the few left out when their poses are read."""
-        return len(self.used)
+        return len(self.used)  # including the few that are left out when their poses are read
 
     def counts(self) -> dict[str, int]:
         return {"videos": len(self.videos), "subjects": len({video.subject for video in self.used})}
@@ -86,16 +80,15 @@ class UESTC(MotionSource):
         videos = []
         for index, name in enumerate(self._lines("names.txt")):
             match = NAME.fullmatch(name)
-            if match is None or int(match[1]) >= len(self.actions):
+            if match is None or int(match[2]) >= len(self.actions):
                 raise UserError(
                     f"{self.poses.parent}/info/names.txt, line {index + 1}: {name!r} is not the name of a video with "
                     f"one of the {len(self.actions)} actions, such as a0_d0_p001_c1_color.avi"
                 )
-            action, view, subject, side = (int(match[k]) for k in range(1, 5))
-            videos.append(Video(index, name.removesuffix(match[5] or ""), action, view, subject, side))
+            videos.append(Video(index, match[1], *(int(match[k]) for k in range(2, 6))))
         return videos
 
-    @property
+    @cached_property
     def used(self) -> list[Video]:
         """The videos that are used: of side 2, only views 0 to 7."""
         return [video for video in self.videos if video.side == 1 or video.view < 8]
@@ -106,18 +99,16 @@ class UESTC(MotionSource):
 
     def clips(self, fps: float) -> Iterator[Clip]:
         self.check_fps(fps, FPS)
-        path, videos = self.poses, self.used
+        path, count = self.poses, len(self.videos)
         columns = read_lists(path, "pose", "joints3d", "orig_cam")
-        frames, numbers = self._lines("num_frames_min.txt"), (len(self.videos), len(columns[0]))
-        if {*numbers} != {len(frames)}:
+        frames = self._lines("num_frames_min.txt")
+        if not count == len(frames) == len(columns[0]):
             raise UserError(
-                f"{path.parent}: names.txt has {numbers[0]} lines, num_frames_min.txt {len(frames)} and {path.name} "
-                f"{numbers[1]} clips; the numbers must be equal"
+                f"{path.parent}: names.txt has {count} lines, num_frames_min.txt {len(frames)} and {path.name} "
+                f"{len(columns[0])} clips; the numbers must be equal"
             )
-        self.excluded.clear()
-        if len(videos) < len(self.videos):
-            self.excluded["videos of view 8, side 2"] = len(self.videos) - len(videos)
-        for video in videos:
+        self.leave_out("videos of view 8, side 2", count - len(self.used))
+        for video in self.used:
             with naming(f"{path}: {video.id}", *NO_NUMBERS, what="does not consist of numbers: "):
                 pose, joint, camera = (np.asarray(column[video.index], np.float64) for column in columns)
                 limit = int(frames[video.index])
@@ -127,17 +118,17 @@ class UESTC(MotionSource):
                     "(F, 72), (F, 49, 3), (F, 4)"
                 )
             split, length = self.split(video.subject), min(len(pose), limit)
-            if length < (1 if split == "test" else self.min_frames):
-                self.excluded[f"{'test' if split == 'test' else 'training'} clips that are too short"] += 1
+            if length < (1 if split == "test" else MIN_FRAMES):
+                self.leave_out(f"{'test' if split == 'test' else 'training'} clips that are too short")
                 continue
             yield Clip(
-                video.id,
-                front_view(pose[:length], joint[:length, ROOT], camera[:length], video),
-                [],
-                split,
-                f"subject {video.subject}",
-                video.action,
-                {"subject": video.subject, "view": video.view, "side": video.side},
+                id=video.id,
+                motion=front_view(pose[:length], joint[:length, ROOT], camera[:length], video),
+                captions=[],
+                split=split,
+                source=f"subject {video.subject}",
+                action=video.action,
+                attributes={"subject": video.subject, "view": video.view, "side": video.side},
             )
 
     def split(self, subject: int) -> Split:
@@ -153,13 +144,9 @@ def front_view(pose: np.ndarray, root: np.ndarray, camera: np.ndarray, video: Vi
 
     VIBE's camera is weak-perspective: a scale s and a shift. ACTOR's code places the body at x, y = the shift and at
     the depth z at which a camera of focal length f shows it in that size: z = f / (s w / 2) in an image w pixels wide.
-
-    Args:
-        pose, root: (F, 72) axis-angle, and (F, 3) position of the root joint relative to the body.
-        camera: (F, 4) scales sx and sy, of which only the first is used, then the shift.
-
-    Returns:
-        (F, 75) float32: translation relative to the first frame and pose, in camera axes.
+    `pose` (F, 72) is axis-angle, `root` (F, 3) relative to the body; `camera` (F, 4) has the scales sx and sy, of which
+    only the first is used, then the shift. Returns (F, 75) float32: translation relative to the first frame and pose,
+    in camera axes.
     """
     depth = FOCAL_LENGTH / (np.abs(camera[:, 0]) * IMAGE_SIZE / 2)
     shift = np.concatenate([camera[:, 2:], depth[:, None]], 1)

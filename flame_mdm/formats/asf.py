@@ -50,7 +50,7 @@ def read(path: Path, fps: float | None) -> Bvh:
     for name, bone in bones.items():
         values = dict(zip(bone.freedoms, angles[name].T, strict=True))
         if name == "root":
-            columns.append(np.stack([values.get(move, np.zeros(len(angles[name]))) for move in MOVES], 1))
+            columns += [values.get(move, np.zeros(len(angles[name])))[:, None] for move in MOVES]
         if turns := [f"R{axis}" for axis in bone.order if f"R{axis}" in values]:
             order = "".join(turn[1] for turn in turns).lower()  # lower case: about fixed axes
             turned = Rotation.from_euler(order, np.stack([values[turn] for turn in turns], 1), degrees=True)

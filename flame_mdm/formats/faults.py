@@ -22,7 +22,7 @@ LIMITS = {
     "floating": (
         LOW,
         "m",
-        "no joint is within 5 cm of the floor for 0.8 s, longer than a jump, or for 0.3 s of standstill",
+        "no joint is within 5 cm of the floor for 0.8 s, longer than a jump, or 0.3 s at rest",
     ),
     "limit": (15.0, "degrees", "a knee bends forward by more than 15 degrees, or a knee or elbow is folded to less"),
     "frozen": (0.02, "m/s", "no joint moves faster than 2 cm/s for a second or more"),
@@ -145,9 +145,8 @@ def _bends(joints: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.nda
 def depths(joints: np.ndarray, names: Sequence[str], side: str) -> tuple[np.ndarray, np.ndarray]:
     """Measures the left or right arm against capsules about trunk and thighs, whose sizes follow from the bones.
 
-    Returns:
-        Depth (F, 3) in meters of the elbow, the wrist and the middle of the hand, negative outside; and unit vectors
-        (F, 3, 3) from the axis of the part in which a point is deepest; of joints (F, J, 3) in meters.
+    Returns the depth (F, 3) in meters of elbow, wrist and middle of the hand, negative outside, and unit vectors
+    (F, 3, 3) from the axis of the part in which a point is deepest; of joints (F, J, 3) in meters.
     """
     at = {name: joints[:, number] for number, name in enumerate(names)}
     elbow, wrist = at[f"{side}_elbow"], at[f"{side}_wrist"]

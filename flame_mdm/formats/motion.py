@@ -57,8 +57,7 @@ class Motion:
         cleanup: whether `flame_mdm.formats.cleanup` changed the joints.
         parts: text, first and last frame (exclusive) of each part of a sequence; () = one part.
 
-    Raises:
-        UserError: If a shape is wrong, a joint is not finite, or the frame rate is not a positive number.
+    Raises `UserError` if a shape is wrong, a joint is not finite, or the frame rate is not a positive number.
     """
 
     joints: np.ndarray
@@ -128,9 +127,8 @@ class Motion:
                 mannequin.
             facts: additional entries of an `.npz` file, such as the seed.
 
-        Raises `UserError` if the extension, an option or the rig is unknown or does not apply, `.bvh` or `.glb` is
-        requested for another skeleton than SMPL's, the file cannot be written, `.mp4` is requested and the package av
-        is not installed, or the character cannot be used.
+        Raises `UserError` if an argument is unknown, does not apply or does not fit the motion, `.mp4` is requested and
+        the package av is not installed, or the character cannot be used.
         """
         path = Path(path)
         ending = path.suffix.lower()

@@ -22,16 +22,11 @@ REQUIRED = ("hip", "knee", "ankle", "shoulder", "elbow", "wrist")
 """Joints of both sides that a character must have, beside the pelvis."""
 SPINE = ("spine1", "spine2", "spine3")
 TILT = 45  # degrees between trunk and vertical at which a rest pose is refused
-SNAP = 8
-"""Largest angle in degrees between the facing direction and an axis at which the character is assumed to face along
-the axis."""
+SNAP = 8  # largest angle in degrees between the facing direction and an axis that it is taken for
 BEND = 0.15  # minimum sine of the bend of an elbow or knee in the rest pose from which the twist of the limb is read
-GROUND = 0.1
-"""Largest height in meters at which the lowest joint of a clip counts as on the floor: in recordings it is often a
-little above."""
+GROUND = 0.1  # largest height in meters at which the lowest joint of a clip counts as on the floor
 STRAIGHT = 0.05
-"""Distance of the knee from the straight line of the leg, relative to the thigh, at which the bend and the front of the
-thigh have the same weight for where the knee points."""
+"""Distance of the knee from the line of the leg, relative to the thigh, at which bend and thigh weigh the same."""
 REACH = 0.999  # maximum distance from hip to ankle relative to the length of the straight leg
 
 
@@ -48,8 +43,7 @@ class Rig:
     orders: tuple[str, ...]  # of the Euler angles of each joint in BVH files
     unit: float = CENTIMETER  # meters per unit of length in BVH files
     frame: np.ndarray = field(default_factory=lambda: np.eye(3))  # (3, 3), rotation from the world of the file
-    # (J,), units of the world per unit in the frame of each joint; none = 1
-    scales: np.ndarray = field(default_factory=lambda: np.ones(0))
+    scales: np.ndarray = field(default_factory=lambda: np.ones(0))  # (J,), world units per unit of a joint; none = 1
 
     @property
     def hips(self) -> int:
@@ -157,18 +151,14 @@ def rest_pose(
     positions: np.ndarray,
     turned: np.ndarray,
     joints: Mapping[str, int],
-    lowest: Sequence[np.ndarray] | np.ndarray,
+    lowest: np.ndarray,
     vertical: Sequence[int],
 ) -> RestPose:
-    """Returns a rest pose, turned to y up and +z ahead.
+    """Returns a rest pose, turned to y up and +z ahead; `source` names the character in messages.
 
-    Args:
-        source: the character, for messages.
-        names, parents: of the J joints; parents precede their children.
-        positions, turned: (J, 3) and rotations (J, 3, 3) in a world of any unit and direction.
-        joints: SMPL's joint -> index of the character's.
-        lowest: points that include the lowest one.
-        vertical: (3,), up.
+    Positions (J, 3) and rotations `turned` (J, 3, 3) of the J joints are in a world of any unit and direction, in which
+    `vertical` (3,) is up. `joints` maps SMPL's joints to indices of the character's; `lowest` are points that include
+    the lowest one.
     """
     at = {joint: positions[number] for joint, number in joints.items()}
 
@@ -215,7 +205,7 @@ def rest_pose(
         orders=("",) * len(names),
         frame=frame,
     )
-    return RestPose(rig, joints, float(np.min(np.asarray(lowest) @ frame[1])))
+    return RestPose(rig, joints, float((lowest @ frame[1]).min()))
 
 
 # Moving a character ---------------------------------------------------------------------------------------------------
@@ -248,11 +238,8 @@ def follow(
 ) -> tuple[np.ndarray, np.ndarray, Rig]:
     """Moves a character as a body moves; returns rotations (F, J, 3, 3), positions (F, J, 3) and the skeleton for it.
 
-    Args:
-        character: its rest pose.
-        joints: (F, 22, 3), positions of the body's joints in meters.
-        offsets: (22, 3), position of each joint of the body relative to its parent in the rest pose.
-        neutral, world: (22, 3, 3) and (F, 22, 3, 3), rotations of its parts in the rest pose and in the world.
+    The body has joints (F, 22, 3) in meters, with `offsets` (22, 3) from their parents in the rest pose; its parts have
+    rotations `neutral` (22, 3, 3) in the rest pose and `world` (F, 22, 3, 3) in the world.
     """
     rig, neutral = fitted(character, offsets), neutral.copy()
     turned = world @ np.swapaxes(neutral, 1, 2)
@@ -261,9 +248,9 @@ def follow(
     joints = joints.astype(float)
     lowest = joints[..., 1].min()
     joints[..., 1] -= lowest if abs(lowest) <= GROUND else 0
-    size = _leg([offsets[JOINT[f"{s}_{name}"]] for s in SIDES for name in ("knee", "ankle")])
+    legs = [offsets[JOINT[f"{s}_{name}"]] for s in SIDES for name in ("knee", "ankle")]
     own = [character.position(f"{s}_{b}") - character.position(f"{s}_{a}") for s in SIDES for a, b in LEGS]
-    scale = _leg(own) / size
+    scale = float(np.linalg.norm(own, axis=1).sum() / np.linalg.norm(legs, axis=1).sum())
     # heights of the ankles above the floor while the feet are flat
     flat = {s: (neutral[JOINT[f"{s}_ankle"]].T @ offsets[JOINT[f"{s}_foot"]])[1] for s in SIDES}
     higher = {s: character.position(f"{s}_ankle")[1] - character.floor + scale * flat[s] for s in SIDES}
@@ -289,10 +276,6 @@ def follow(
             turned[:, number] = shortest_turns(positions[:, end] - positions[:, start], bone) @ turned[:, number]
     world = rig.turned(turned)
     return world, rig.assembled(world, pelvis), rig
-
-
-def _leg(bones: Sequence[np.ndarray]) -> float:
-    return float(np.sum([np.linalg.norm(bone) for bone in bones])) / 2
 
 
 def _bent(hip: np.ndarray, knee: np.ndarray, ankle: np.ndarray, target: np.ndarray, forward: np.ndarray) -> np.ndarray:

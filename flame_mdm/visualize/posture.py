@@ -21,16 +21,9 @@ def complete(joints: np.ndarray, offsets: np.ndarray, world: np.ndarray) -> tupl
     """Completes rotations solved from positions, which determine neither the head's pitch nor the toes.
 
     The median pitch of the head while the chest is upright is taken as level, and the toes stay flat on the floor while
-    the heel rises.
-
-    Args:
-        joints: (F, 22, 3), positions in meters, y up.
-        offsets: (22, 3), position of each joint relative to its parent in the rest pose.
-        world: (F, 22, 3, 3), rotations of the joints in the world.
-
-    Returns:
-        Rotation (22, 3, 3) of each part of the body in the rest pose; rotations (F, 22, 3, 3) of these parts in the
-        world; offsets (22, 3) of a body that stands on flat feet.
+    the heel rises. Takes joints (F, 22, 3), offsets (22, 3) from their parents in the rest pose, and rotations in the
+    world (F, 22, 3, 3). Returns the rotation (22, 3, 3) of each part of the body in the rest pose, the rotations
+    (F, 22, 3, 3) of these parts in the world, and offsets (22, 3) of a body that stands on flat feet.
     """
     neutral, offsets = np.tile(np.eye(3), (len(SMPL22), 1, 1)), offsets.copy()
     for side in ("left", "right"):

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from flame_mdm.commands.tables import sizes
 from flame_mdm.config import EXPERIMENTS, recipes
-from flame_mdm.reporting.settings import LABELS, setting_text, values
+from flame_mdm.reporting.tables.build import HYPERPARAMETERS, hyperparameters, setting_text
 from flame_mdm.reporting.tables.specs import PUBLISHED, load_spec
 from flame_mdm.safe_io import read_yaml
 
@@ -105,20 +105,20 @@ in the papers; most are those of the authors' code. "–": the recipe has no suc
 of a text encoder (MFM: CLIP, T5; MDM: sentence-BERT), the checkpoint is our choice.
 """
     for table in TABLES:
-        columns = {name: values(name, sizes) for name in table.columns}
-        rows = [key for key in LABELS if any(key in papers for papers in table.columns.values())]
+        columns = {name: hyperparameters(name, sizes) for name in table.columns}
+        rows = [key for key in HYPERPARAMETERS if any(key in papers for papers in table.columns.values())]
         cells = {
             key: [_cell(ours.get(key), table.columns[name].get(key)) for name, ours in columns.items()] for key in rows
         }
         equal = [key for key in rows if all(cell.startswith("**") for cell in cells[key])]
-        shared = (LABELS[key] + f" {cells[key][0]}" * (len(set(cells[key])) == 1) for key in equal)
+        shared = (HYPERPARAMETERS[key] + f" {cells[key][0]}" * (len(set(cells[key])) == 1) for key in equal)
         page += f"\n## {table.title}\n\n" + f"As in the paper: {'; '.join(shared)}.\n" * bool(equal)
         if equal != rows:
             page += f"\n| | {' | '.join(f'`{name}`' for name in columns)} |\n|---|{'---|' * len(columns)}\n"
-        page += "".join(f"| {LABELS[key]} | {' | '.join(cells[key])} |\n" for key in rows if key not in equal)
+        page += "".join(f"| {HYPERPARAMETERS[key]} | {' | '.join(cells[key])} |\n" for key in rows if key not in equal)
     page += "\n## Deviations from the papers\n\n"
     for (name, key), reason in DEVIATIONS.items():
-        page += f"- `{name}`, {LABELS[key]}: {reason}.\n"
+        page += f"- `{name}`, {HYPERPARAMETERS[key]}: {reason}.\n"
     return page + "\n[Recipes](recipes.md) lists deviations that the tables of the papers do not cover.\n"
 
 

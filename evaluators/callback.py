@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-from hydra.utils import get_class
 from lightning import Callback, LightningModule, Trainer
 
 from evaluators.evaluation import Evaluation
@@ -10,10 +9,9 @@ from evaluators.plan import sampling_options
 from evaluators.protocol import open_protocol
 from evaluators.sources import Generator
 from flame_mdm.data.datamodule import MotionDataModule
-from flame_mdm.errors import UserError, say
+from flame_mdm.errors import UserError
 from flame_mdm.runs import made_by
 from flame_mdm.task import MotionGeneration
-from flame_mdm.training.callbacks import explain_metrics
 from flame_mdm.training.loggers import log_table
 
 
@@ -56,7 +54,6 @@ class Evaluate(Callback):
         self.samples, self.replications, self.batch_size = samples, replications, batch_size
         self.next = 0
         self.values: dict[str, float] = {}
-        self.latest: tuple[int, dict[str, float]] = (0, {})
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         assert isinstance(pl_module, MotionGeneration)
@@ -86,7 +83,6 @@ class Evaluate(Callback):
         values = self.evaluation.run(source, ground_truth=False).values or {}
         numbers = {name: v.mean for name, v in values.items() if v is not None and v.mean is not None}
         widths = {f"{name}/ci": v.ci for name, v in values.items() if v is not None and v.ci is not None}
-        self.latest = (trainer.global_step, numbers)
         logged = numbers | (widths if self.replications > 1 else {})
         self.values = {f"val/{protocol.name}/{name}": value for name, value in logged.items()}
         if trainer.is_global_zero:
@@ -98,13 +94,3 @@ class Evaluate(Callback):
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         pl_module.log_dict(self.values)  # computed at the start, since averaged weights are swapped out by now
         self.values = {}
-
-    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        step, values = self.latest
-        if not values:
-            return
-        protocol, measured = self.evaluation.protocol, self.evaluation.run(None)  # by all processes together
-        if trainer.is_global_zero:
-            real = {name: value.mean for name, value in (measured.ground_truth or {}).items() if value is not None}
-            say(f"evaluation after {step} steps, {protocol.name}, validation clips:")
-            say(*explain_metrics(values, real, {k: get_class(v["_target_"]) for k, v in protocol.metrics.items()}))

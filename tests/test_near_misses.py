@@ -3,7 +3,7 @@
 from dataclasses import replace
 from typing import Any
 
-from evaluators.near_misses import near_misses
+from evaluators.perturbations import near_misses
 from flame_mdm.data.bandai import captions as bandai_captions
 from flame_mdm.data.bandai import side_of
 from flame_mdm.data.store import Entry

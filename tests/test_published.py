@@ -17,7 +17,6 @@ from flame_mdm.commands.tables import sizes
 from flame_mdm.config import EXPERIMENTS, Config, instantiate, recipes
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.processes.flow_matching import FlowMatching
-from flame_mdm.reporting.settings import values as recipe_values
 from flame_mdm.reporting.tables import build as builder
 from flame_mdm.reporting.tables.format import ABOUT
 from flame_mdm.reporting.tables.specs import PUBLISHED as PUBLISHED_FILE
@@ -42,7 +41,7 @@ pytestmark = pytest.mark.usefixtures("composed_once")
 @cache
 def settings(name: str) -> dict[str, Any]:
     """Hyperparameters of a recipe."""
-    return recipe_values(name, sizes)
+    return builder.hyperparameters(name, sizes)
 
 
 def models(part: Config) -> list[Config]:

@@ -12,11 +12,11 @@ from flame_mdm.conditions import ConditionEncoder
 from flame_mdm.config import instantiate, recipes
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.processes.flow_matching import FlowMatching
-from flame_mdm.reporting.settings import value
+from flame_mdm.reporting.tables.build import value
 from flame_mdm.task import MotionGeneration
 
 generate = script("docs/generate.py")
-generate.values = cache(generate.values)  # the tables and the pages show the same ones
+generate.hyperparameters = cache(generate.hyperparameters)  # the tables and the pages show the same ones
 pytestmark = pytest.mark.usefixtures("composed_once")
 
 
@@ -24,7 +24,7 @@ def test_recipes_have_the_values_of_their_papers():
     for table in generate.TABLES:
         for name, column in table.columns.items():
             papers = {key: cell for key, cell in column.items() if cell is not None}
-            ours = generate.values(name, generate.sizes) if papers else {}
+            ours = generate.hyperparameters(name, generate.sizes) if papers else {}
             differing = {key for key, cell in papers.items() if not generate.same(ours.get(key), cell)}
             assert differing == {key for row, key in generate.DEVIATIONS if row == name and key in papers}, name
 

@@ -12,7 +12,7 @@ import torch
 from support.motions import synthetic
 
 import flame_mdm
-from evaluators.selection import text_fit
+from evaluators.extractors import MotionCLIPExtractor
 from flame_mdm.__main__ import main
 from flame_mdm.batch import Condition, MotionBatch
 from flame_mdm.checkpoints.model_files import read_checkpoint
@@ -191,7 +191,7 @@ def test_without_a_score_the_fewest_faulty_frames_decide():
 
 def test_bad_words_and_scorers_are_one_line(model, tmp_path, capsys):
     with pytest.raises(FileNotFoundError, match="no such"):
-        text_fit(str(tmp_path / "none.ckpt"), model)
+        MotionCLIPExtractor(str(tmp_path / "none.ckpt"))
     for options, message in (
         ([], "say what to sample: text=..., for example "),
         (["text=walks", "unconditioned=true"], "text and unconditioned exclude each other"),

@@ -17,7 +17,7 @@ class BrowseSettings(BodySettings, DataSettings):
 
     NAME is a data set, as for `prepare`; of your own motions, data=folder data.name=NAME.
     Writes a single web page that opens from disk. It shows clips of a data set with their captions, mirrored copies
-    next to their originals, a search field, a choice of splits, the distribution of clip lengths and other statistics.
+    next to their originals, a search field, a choice of splits, and statistics.
     """
 
     OBJECTS: ClassVar = ("data", "out")

@@ -144,10 +144,12 @@ def main(settings: SampleSettings) -> None:
     check_condition(settings, request, model)
     score = None
     if settings.scorer is not None:
-        from evaluators.selection import text_fit
+        from evaluators.extractors import MotionCLIPExtractor
 
         with about_key("scorer"):
-            score = text_fit(settings.scorer, model, model.device)
+            scorer = MotionCLIPExtractor(settings.scorer, model.device)
+            scorer.check(model.representation, model.facts.get("dataset", ""))
+        score = scorer.fit
     stages = [] if settings.trajectory else None
     motions = sample_request(model, request, score=score, stages=stages)
     digest = sha256(file)

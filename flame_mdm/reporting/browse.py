@@ -8,19 +8,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from markupsafe import Markup
 
 from flame_mdm.reporting.page import render
-from flame_mdm.reporting.plots import Histogram, Panel, standalone, svg
 
 if TYPE_CHECKING:
+    from markupsafe import Markup
+
     from flame_mdm.data.store import Entry, Store
     from flame_mdm.formats.motion import Motion
     from flame_mdm.representations import Representation
     from flame_mdm.visualize.body import Mesh
 
 SECONDS = 15  # seconds shown of a longer clip, to keep the page small
-BARS = 30
 
 
 def find(clips: Sequence[Entry], split: str | None, search: str) -> list[list[Entry]]:
@@ -92,8 +91,7 @@ def describe(store: Store) -> Markup:
     splits = {name: [clip for clip in store.clips if clip.split == name] for name, n in info["clips"].items() if n}
     counts = Counter(info["actions"][clip.action] for clip in store.clips if clip.action is not None)
     rows = [[name, *_row(clips, fps)] for name, clips in splits.items()]
-    plot = _lengths(splits, fps)
-    return render("browse.html", info=info, actions=counts.most_common(), rows=rows, plot=plot)
+    return render("browse.html", info=info, actions=counts.most_common(), rows=rows)
 
 
 def _row(clips: Sequence[Entry], fps: float) -> list[str]:
@@ -102,17 +100,3 @@ def _row(clips: Sequence[Entry], fps: float) -> list[str]:
     words = f"{np.mean([len(caption.split()) for caption in captions]):.1f}" if captions else ""
     cells = [len(clips), f"{lengths.sum() / fps / 60:.1f}", lengths.min(), f"{np.median(lengths):g}", lengths.max()]
     return [f"{cell}" for cell in (*cells, len(captions), len(set(captions)), words)]
-
-
-def _lengths(splits: dict[str, list[Entry]], fps: float) -> Markup:
-    """Draws the distribution of clip lengths, as in Kim et al. 2023 (FLAME), figure 7: a histogram, stacked by split.
-
-    The last bar includes all clips beyond the 99th percentile, since a few very long clips would squeeze the others.
-    """
-    seconds = {name: np.array([clip.length for clip in clips]) / fps for name, clips in splits.items()}
-    last = float(np.percentile(np.concatenate(list(seconds.values())), 99)) or 1
-    bars = {name: np.minimum(BARS * s / last, BARS - 1).astype(int) for name, s in seconds.items()}
-    counts = {name: np.bincount(bar, minlength=BARS).tolist() for name, bar in bars.items()}
-    edges = [k * last / BARS for k in range(BARS + 1)]
-    plot = svg("Clip lengths", [Panel(Histogram(edges, counts, "s"), "seconds", "clips")])
-    return Markup(standalone(plot or ""))

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flame_mdm.reporting.audit import card_of
 from flame_mdm.reporting.page import interval, number, page, render
 from flame_mdm.reporting.plots import Curve, chart
 from flame_mdm.runs import FAULT, HISTORY, Fault, Provenance, Run, read_run
@@ -42,7 +40,7 @@ def write_report(folder: Path, mesh: Mesh | None = None) -> Path:
         faulty=faulty,
         player=_player(run, mesh),
         step=int(run.samples.name.removeprefix("step_")) if run.samples else 0,
-        evaluations=[_evaluation(folder, result) for result in run.results.values()],
+        evaluations=[_evaluation(result) for result in run.results.values()],
         groups=groups,
         history=HISTORY,
         provenance=_provenance(run.provenance) if run.provenance else [],
@@ -58,15 +56,6 @@ def write_report(folder: Path, mesh: Mesh | None = None) -> Path:
 
 def last(curve: Curve) -> float | None:
     return curve[max(curve)] if curve else None
-
-
-def _card(folder: Path, result: Result) -> tuple[str, str]:
-    """Returns the audit of the evaluator of a result, and the link from a run directory; "" if there is none."""
-    card = card_of(result.data.dataset, result.extractor.sha256 if result.extractor else None)
-    if card is None:
-        return "evaluator not audited", ""
-    link = Path(os.path.relpath(card, folder)).as_posix() if card.exists() else ""
-    return "audit of the evaluator" + (f": {card.as_posix()}" if not link else ""), link
 
 
 def _facts(run: Run) -> list[str]:
@@ -110,11 +99,11 @@ def charted(curves: Collection[str]) -> dict[str, dict[str, list[str]]]:
     return {title: {n: sorted(g[n]) for n in sorted(g)} for title, g in groups.items() if g}
 
 
-def _evaluation(folder: Path, result: Result) -> tuple[object, ...]:
+def _evaluation(result: Result) -> tuple[object, ...]:
     values, real = result.values or {}, result.ground_truth or {}
     rows = [[name, printed(real.get(name)), printed(values.get(name))] for name in sorted(values | real)]
-    card = _card(folder, result)
-    return evaluation_title(result), sampling(result), card, marks(result), result.not_computed, rows
+    audit = f"audit of the evaluator: {result.audit}" if result.audit else "evaluator not audited"
+    return evaluation_title(result), f"{sampling(result)}; {audit}", marks(result), result.not_computed, rows
 
 
 def evaluation_title(result: Result) -> str:

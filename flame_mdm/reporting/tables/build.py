@@ -1,22 +1,23 @@
 """Builds tables from existing results, published numbers, recipes and lengths."""
 
 import functools
+import inspect
 import math
 import re
 import string
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from hydra.utils import get_class
 
-from flame_mdm.config import Config
+from flame_mdm.config import Config, compose, parameters
 from flame_mdm.errors import UserError, did_you_mean
 from flame_mdm.reporting.audit import card_of
 from flame_mdm.reporting.plots import Histogram
-from flame_mdm.reporting.settings import LABELS, Sizes, setting_text, values
-from flame_mdm.reporting.tables.format import ABOUT, Cell, Line, Part, Plot, Table, ranks
+from flame_mdm.reporting.tables.format import ABOUT, LABELS, Cell, Line, Part, Plot, Table, ranks
 from flame_mdm.reporting.tables.specs import PUBLISHED, SWEPT, Lengths, as_list, evaluations, load_mapping
 from flame_mdm.runs import made_by
 from flame_mdm.schemas import Result, Value, read_json, read_result
@@ -24,6 +25,9 @@ from flame_mdm.schemas import Result, Value, read_json, read_result
 NOT_VALID = "NOT VALID"  # state of a row that is shown, but not ranked
 PUBLISHED_SPLIT = "published split: test clips are also used for training, or there are no validation clips"
 FORCED = "forced: real motions do not have the values that the protocol expects"
+HYPERPARAMETERS = LABELS["hyperparameters"]
+Sizes = Callable[[str], dict[str, Any]]
+"""Returns the sizes that only a built network has, `features` and `parameters`, by the name of a recipe."""
 
 
 def build(name: str, spec: Config, results: Path, sizes: Sizes | None = None) -> Table:
@@ -333,10 +337,10 @@ def _hyperparameters(name: str, part: Config, reported: Config | None, sizes: Si
     The rows are keys or recipes, whichever are more.
     """
     for key in part["keys"].values():
-        if key not in LABELS:
-            hint = did_you_mean(key, LABELS) or f" There are: {', '.join(LABELS)}"
+        if key not in HYPERPARAMETERS:
+            hint = did_you_mean(key, HYPERPARAMETERS) or f" There are: {', '.join(HYPERPARAMETERS)}"
             raise UserError(f"part {name}: no setting is called '{key}'.{hint}")
-    recipes = {label: values(recipe, sizes) for label, recipe in part["recipes"].items()}
+    recipes = {label: hyperparameters(recipe, sizes) for label, recipe in part["recipes"].items()}
     printed = {row["label"]: row["values"] for row in reported["rows"]} if reported else {}
     ours: dict[tuple[str, str], Cell | None] = {}
     theirs: dict[tuple[str, str], Cell | None] = {}
@@ -359,6 +363,36 @@ def _hyperparameters(name: str, part: Config, reported: Config | None, sizes: Si
     if reported:
         notes += [("", f"reported: {reported['source']}"), *(("", note) for note in reported.get("notes", []))]
     return Part(name, dict.fromkeys(heads, "none"), lines, notes)
+
+
+def hyperparameters(name: str, sizes: Sizes | None = None) -> dict[str, Any]:
+    """Returns the `HYPERPARAMETERS` of a recipe, by key. Unset ones have the default of their class."""
+    config = compose(name)
+    settings = {key: value(config, key) for key in HYPERPARAMETERS if "." in key} | (sizes(name) if sizes else {})
+    return {key: setting for key, setting in settings.items() if setting is not None}
+
+
+def value(config: Config, key: str) -> Any:
+    """Returns the value of a dotted key: from the recipe, or else the default of the class, or else None."""
+    *path, name = key.split(".")
+    node: Any = config
+    for part in path:
+        node = node.get(part) or {}
+    if name in node:
+        return node[name].rpartition(".")[2] if name == "_target_" else node[name]
+    if "_target_" in node and name in parameters(node["_target_"]):
+        return inspect.signature(get_class(node["_target_"])).parameters[name].default
+    return None
+
+
+def setting_text(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, list | tuple):
+        return ", ".join(map(setting_text, value))
+    if isinstance(value, int):
+        return f"{value:,}"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _lengths(name: str, part: Config, results: Path) -> Part:

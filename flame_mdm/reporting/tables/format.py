@@ -15,29 +15,13 @@ from typing import TYPE_CHECKING, Any
 from flame_mdm.errors import one_line, shortened
 from flame_mdm.reporting.page import page, render
 from flame_mdm.reporting.plots import Histogram, Panel, Series, standalone, svg
-from flame_mdm.safe_io import write_text
+from flame_mdm.safe_io import read_yaml, write_text
 
 if TYPE_CHECKING:
     from markupsafe import Markup
 
-ABOUT = {
-    "num_inference_steps": "sampling steps",
-    "guidance_scale": "guidance scale",
-    "sampler": "sampler",
-    "eta": "eta",
-    "spacing": "spacing",
-    "until": "fraction of sampling that is rewritten",
-    "strength": "strength of the variation",
-    "nfe": "network calls per motion",
-    "seconds_per_sample": "seconds per motion",
-    "batch_size": "batch size",
-    "parameters": "parameters, M",
-    "prediction": "prediction",
-    "training_steps": "training steps",
-    "training_hours": "training hours",
-    "training_device": "device of training",
-    "training_memory_gib": "peak memory of training, GiB",
-}
+LABELS: dict[str, dict[str, str]] = read_yaml(Path(__file__).with_name("labels.yaml"))
+ABOUT = LABELS["values"]
 """Labels of the values that a column may show besides metrics, and of the x-axes of figures."""
 ARROWS = {"higher": "↑", "lower": "↓", "real": "→", "none": ""}
 KINDS = {

@@ -9,6 +9,7 @@ import sys
 import tempfile
 from functools import cache
 from pathlib import Path
+from typing import Any
 from unittest.mock import MagicMock
 
 import huggingface_hub
@@ -22,7 +23,7 @@ from flame_mdm.__main__ import main
 from flame_mdm.batch import Condition, MotionBatch
 from flame_mdm.checkpoints import hub, model_files
 from flame_mdm.checkpoints.loading import load
-from flame_mdm.checkpoints.released import import_flame, import_mdm
+from flame_mdm.checkpoints.released import Options, import_flame, import_mdm
 from flame_mdm.errors import UserError
 from flame_mdm.generator import MotionGenerator
 from flame_mdm.sampling.generation import generate
@@ -197,9 +198,9 @@ def test_every_weight_of_the_released_sizes_has_its_target_and_text_encoders_are
         if name.startswith("flame"):
             released = import_flame(state | {"lm.embeddings.word_embeddings.weight": torch.empty(3)})
         else:
-            args = {"arch": next((a for a in ("trans_dec", "gru") if a in name), "trans_enc")}
+            args: dict[str, Any] = {"arch": next((a for a in ("trans_dec", "gru") if a in name), "trans_enc")}
             args |= {"emb_trans_dec": name.endswith("_emb"), "text_encoder_type": "bert" if "bert" in name else "clip"}
-            released = import_mdm(state | {"clip_model.positional_embedding": torch.empty(3)}, args)
+            released = import_mdm(state | {"clip_model.positional_embedding": torch.empty(3)}, Options(**args))
         action = 0 if released.action_embedding is None else released.action_embedding.numel()
         assert sum(x.numel() for x in released.state.values()) + action == manifest[name]["n_params"], name
 
@@ -223,13 +224,12 @@ def test_every_weight_is_used_or_the_import_fails() -> None:
     for weights_, args, message in (
         (state | {"embed_style.weight": torch.ones(1)}, {}, r"unknown keys embed_style\.weight"),
         (state, {"arch": "trans_dec"}, r"unknown keys seqTransEncoder\.layers\.0\.linear1\.bias.* and 7 more"),
-        (state, {"arch": "mamba"}, "arch must be trans_enc, trans_dec or gru, not 'mamba'"),
         (lacking, {}, r"Missing key.*transformer\.layers\.0\.feed_forward\.3\.bias"),
         ({}, {}, r"output\.weight is missing"),
         (short, {}, r"size mismatch for .*feed_forward\.0\.bias: .*\[2\].*\[16\]"),
     ):
         with pytest.raises(ValueError, match=message):
-            import_mdm(weights_, args)
+            import_mdm(weights_, Options(**args))
 
 
 def released_file(folder: Path, state: dict, args: dict | str) -> list[str]:
@@ -292,10 +292,11 @@ def test_imports_that_cannot_be_are_one_line(refused, bad):
     for kind, change, message in (
         ("mdm", {"stats": True}, "model.pt: features of uestc are not normalized. Leave out stats=FOLDER"),
         ("mdm", {"dataset": "humanml"}, "150 features, but humanml-legacy-smpl22"),
-        ("mdm", {"dataset": "amass"}, "dataset=amass of the released model is not supported, only humanml, kit"),
+        ("mdm", {"dataset": "amass"}, "args.json: dataset is \"amass\", not 'humanml', 'kit', 'humanact12' or 'uestc'"),
+        ("mdm", {"arch": "mamba"}, "arch is \"mamba\", not 'trans_enc', 'trans_dec' or 'gru'"),
         ("mdm", {"arch": "trans_dec"}, "unknown keys seqTransEncoder"),
-        ("mfm", {"dynamic": "diffusion"}, "dynamic=diffusion: only the flow models of MFM"),
-        ("mfm", {"text_emebed": "t5-large"}, "only models of MFM with CLIP"),
+        ("mfm", {"dynamic": "diffusion"}, "dynamic is \"diffusion\", not 'flow'"),
+        ("mfm", {"text_emebed": "t5-large"}, "text_emebed is \"t5-large\", not 'clip'"),
         ("flame", {}, "flame takes no file of options"),
     ):
         words = released_file(bad, small_state(150), {"dataset": "uestc"} | change)
@@ -313,6 +314,8 @@ def test_statistics_have_to_fit(refused, bad):
     refused("import", *words, says="Mean.npy: no such file")
     statistics_folder(bad, 251)
     refused("import", *words, says="Mean.npy: shape (251,), expected (263,) finite numbers")
+    np.save(bad / "Mean.npy", np.zeros(263, "c8"))
+    refused("import", *words, says="Mean.npy: shape (263,), expected (263,) finite numbers")
     statistics_folder(bad, 263)
     assert main(["import", *words]) == 0
     assert np.array_equal(load(bad).representation.mean, np.load(bad / "Mean.npy").astype(np.float32))

@@ -30,7 +30,7 @@ from torch import Tensor
 from torchdiffeq import odeint
 
 from flame_mdm.batch import Condition, Denoise, Edit, Noise, length_mask
-from flame_mdm.checkpoints.released import Released, import_flame, import_mdm
+from flame_mdm.checkpoints.released import Options, Released, import_flame, import_mdm
 from flame_mdm.errors import UserError
 from flame_mdm.processes import Process
 from flame_mdm.processes.diffusion import GaussianDiffusion
@@ -192,7 +192,7 @@ def built(released: Released) -> Denoise:
 
 def released_flow() -> tuple[Denoise, Condition]:
     """The fixture's network with its random weights, and its conditions, texts or actions, with their null."""
-    released = import_mdm(weights(MFM), {"arch": "trans_enc"}, num_heads=meta(MFM)["config"]["heads"])
+    released = import_mdm(weights(MFM), Options(num_heads=meta(MFM)["config"]["heads"]))
     if "in/action" in MFM:
         assert released.action_embedding is not None
         pooled = released.action_embedding[torch.from_numpy(MFM["in/action"]).flatten()]

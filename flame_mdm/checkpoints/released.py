@@ -5,15 +5,13 @@ sinusoids are skipped.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal, NamedTuple
 
 import torch
 from hydra.utils import get_class
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 from torch import Tensor
-from typing_extensions import TypedDict
 
 from flame_mdm.checkpoints.model_files import FILE, MOST_FRAMES, check_weights, without_own_paths, write_model_file
 from flame_mdm.checkpoints.released_weights import (
@@ -35,7 +33,7 @@ from flame_mdm.denoisers.mdm import MDMDecoder, MDMEncoder
 from flame_mdm.errors import UserError, first_line
 from flame_mdm.safe_io import read_npy, read_yaml, sha256
 from flame_mdm.sampler_options import MAX_STEPS
-from flame_mdm.schemas import Number, check_shape
+from flame_mdm.schemas import Number, Schema, check_shape
 from flame_mdm.task import MotionGeneration, Task
 
 # Prefixes of the authors' names -> ours.
@@ -67,17 +65,47 @@ DATASETS = {
 }
 """Authors' name of each data set of MDM and MFM -> our name, and the representation."""
 NORMALIZED = ("humanml3d", "kit")
-PADDED_FRAMES = 196
-ACTION_FRAMES = 60
+PADDED_FRAMES, ACTION_FRAMES = 196, 60
 ENCODERS = {"clip": "clip", "bert": "distilbert"}
 POOLER, ACTIONS = "lm.pooler.dense.", "embed_action.action_embedding"
+
+
+class Solver(Schema):
+    """MFM's `ode_kwargs`."""
+
+    method: str = "euler"
+    # JSON is read as YAML 1.1, in which 2e-2 is a text
+    step_size: Annotated[
+        float, BeforeValidator(lambda x: float(x) if isinstance(x, str) else x), Field(ge=1 / MAX_STEPS, le=1)
+    ] = 0.01
+
+
+class Options(Schema):
+    """The options of a released model that the import reads, with the authors' defaults."""
+
+    arch: Literal["trans_enc", "trans_dec", "gru"] = "trans_enc"
+    dataset: Literal["humanml", "kit", "humanact12", "uestc"] = "humanml"
+    dynamic: Literal["flow"] = "flow"
+    text_emebed: Literal["clip"] = "clip"  # spelled like this by the authors
+    text_encoder_type: Literal["clip", "bert"] = "clip"
+    emb_trans_dec: bool = False
+    mask_frames: bool = False
+    sigma_small: bool = True
+    noise_schedule: str = "cosine"
+    cond_mask_prob: Annotated[float, Field(ge=0, le=1)] = 0.1
+    diffusion_steps: Annotated[int, Field(ge=1, le=MAX_STEPS)] = 1000
+    lambda_fc: Number = 0.0
+    lambda_rcxyz: Number = 0.0
+    lambda_vel: Number = 0.0
+    num_frames: Annotated[int, Field(ge=0, le=MOST_FRAMES)] = 0
+    num_heads: Annotated[int, Field(ge=1, le=MAX_STEPS)] = 4
+    ode_kwargs: Solver = Solver()
 
 
 # Networks -------------------------------------------------------------------------------------------------------------
 
 
-@dataclass
-class Released:
+class Released(NamedTuple):
     """A released network: its `experiments/denoiser` mapping, and state dict.
 
     `features` are in_features, out_features and cond_features. `action_embedding` (actions, C) belongs to the condition
@@ -90,23 +118,13 @@ class Released:
     action_embedding: Tensor | None = None
 
 
-def import_mdm(
-    state: Mapping[str, Tensor], args: Mapping[str, Any], *, num_heads: int = 4, time_token: bool = False
-) -> Released:
+def import_mdm(state: Mapping[str, Tensor], args: Options, *, time_token: bool = False) -> Released:
     """Converts an encoder, decoder, decoder + token or GRU of MDM or MFM, for text (CLIP, DistilBERT), actions or none.
 
-    Args:
-        state: see `released_state`.
-        args: the args.json next to the checkpoint. Missing entries have the authors' defaults, so {} is enough for MFM.
-            Sizes are read from the weights.
-        num_heads: number of attention heads, 4 in all released models; it is neither in the weights nor in `args`.
-        time_token: whether the decoder's input token is the time alone, as in the code since February 2025. The
-            released model with an input token is older.
+    `state` is that of `released_state`; sizes are read from the weights. `time_token` says whether the decoder's input
+    token is the time alone, as in the code since February 2025. The released model with an input token is older.
     """
-    arch = args.get("arch", "trans_enc")
-    if arch not in NETWORKS:
-        raise ValueError(f"args.json: arch must be trans_enc, trans_dec or gru, not {arch!r}")
-    network, stack, layer = NETWORKS[arch]
+    network, stack, layer = NETWORKS[args.arch]
     dropped = ("sequence_pos_encoder.pe", "embed_timestep.sequence_pos_encoder.pe", "clip_model.")
     learned = {key: value for key, value in state.items() if not key.startswith(dropped)}
     cond_features = shape_of(learned, ACTIONS)[1] if ACTIONS in learned else 0
@@ -121,19 +139,18 @@ def import_mdm(
         options["project_condition"] = False
     if "condition.projection.weight" in ours:
         cond_features = shape_of(ours, "condition.projection.weight")[1]
-    if arch == "gru":
+    if args.arch == "gru":
         in_features -= latent_dim
         options["num_layers"] = sum(key.startswith("gru.weight_ih_l") for key in ours)
         options["recur_over_batch"] = True
     else:
         options["ff_size"] = shape_of(ours, "transformer.layers.0.feed_forward.0.weight")[0]
-        options["num_heads"] = num_heads
-        options["mask_padding"] = bool(args.get("mask_frames", False))
-    if arch == "trans_dec":
-        distilbert = args.get("text_encoder_type", "clip") == "bert"
+        options["num_heads"] = args.num_heads
+        options["mask_padding"] = args.mask_frames
+    if args.arch == "trans_dec":
+        distilbert = args.text_encoder_type == "bert"
         options["token_memory"] = distilbert
-        if args.get("emb_trans_dec", False):
-            # The code that introduced DistilBERT has a token of the time alone.
+        if args.emb_trans_dec:  # the code that introduced DistilBERT has a token of the time alone
             options["input_token"] = "time" if time_token or distilbert else "condition"
     return _checked(network, (in_features, out_features, cond_features), options, ours, embedding)
 
@@ -180,21 +197,21 @@ def _recipe(name: str, released: Released, representation: str, condition: Confi
         "denoiser": released.config,
         "condition": condition,
         "process": process,
-        "representation": option("representation", representation),
-        "task": option("task", "generation"),
+        "representation": _option("representation", representation),
+        "task": _option("task", "generation"),
         "losses": {},
         "optimizer": {"_target_": "torch.optim.AdamW", "lr": 1e-4},
     }
 
 
-def option(group: str, name: str) -> Config:
+def _option(group: str, name: str) -> Config:
     """Reads a mapping from `experiments/`, without resolving interpolations."""
     return read_yaml(EXPERIMENTS / group / f"{name}.yaml")
 
 
 def _flame_recipe(released: Released) -> tuple[Config, dict[str, Any]]:
-    condition = option("condition", "roberta") | {"features": released.features[2]}
-    config = _recipe("released/flame", released, "smpl", condition, option("process", "flame_code"))
+    condition = _option("condition", "roberta") | {"features": released.features[2]}
+    config = _recipe("released/flame", released, "smpl", condition, _option("process", "flame_code"))
     config["task"] |= {"cond_drop_prob": 0.25, "guidance_scale": 8.0}
     config["optimizer"] |= {"weight_decay": 0.0}
     # The authors' table has one row more than the number of lengths.
@@ -202,43 +219,32 @@ def _flame_recipe(released: Released) -> tuple[Config, dict[str, Any]]:
     return config, {"actions": [], "dataset": "humanml3d-smpl", "fingerprint": None, "max_frames": longest}
 
 
-def _mdm_recipe(kind: str, released: Released, args: Mapping[str, Any]) -> tuple[Config, dict[str, Any]]:
-    theirs = args.get("dataset", "humanml")
-    if theirs not in DATASETS:
-        raise ValueError(f"dataset={theirs} of the released model is not supported, only {', '.join(DATASETS)}")
-    dataset, representation = DATASETS[theirs]
+def _mdm_recipe(kind: str, released: Released, args: Options) -> tuple[Config, dict[str, Any]]:
+    dataset, representation = DATASETS[args.dataset]
     actions: list[str] = []
-    condition: Config = option("condition", "none")
+    condition: Config = _option("condition", "none")
     if released.action_embedding is not None:
         count, width = released.action_embedding.shape
         names = HumanAct12.actions if dataset == "humanact12" else ()
         actions = [*names] if len(names) == count else [f"action {number}" for number in range(count)]
-        condition = option("condition", "action") | {"features": width}
+        condition = _option("condition", "action") | {"features": width}
     elif released.features[2]:
-        encoder = args.get("text_encoder_type", "clip")
-        if encoder not in ENCODERS:
-            only = ", ".join(ENCODERS)
-            raise ValueError(f"text_encoder_type={encoder} of the released model is not supported, only {only}")
-        condition = option("condition", ENCODERS[encoder]) | {"features": released.features[2]}
-    drop = float(args.get("cond_mask_prob", 0.1))
-    process = option("process", "flow_matching" if kind == "mfm" else "diffusion")
+        condition = _option("condition", ENCODERS[args.text_encoder_type]) | {"features": released.features[2]}
+    process = _option("process", "flow_matching" if kind == "mfm" else "diffusion")
     config = _recipe(f"released/{kind}", released, representation, condition, process)
-    config["task"] |= {"cond_drop_prob": drop, "guidance_scale": 2.5 if drop else 1.0}
+    config["task"] |= {"cond_drop_prob": args.cond_mask_prob, "guidance_scale": 2.5 if args.cond_mask_prob else 1.0}
     if kind == "mfm":
-        solver = args.get("ode_kwargs") or {}
-        method = solver.get("method", "euler")
+        solver = args.ode_kwargs
         # All methods other than dopri5 are Euler; "euler" uses torchdiffeq's float32 times, the others i / N.
-        process["odeint_grid"] = method == "euler"
-        config["task"]["sampler"] = "dopri5" if method == "dopri5" else "euler"
-        config["task"]["num_inference_steps"] = int(1 / float(solver.get("step_size", 0.01)))
+        process["odeint_grid"] = solver.method == "euler"
+        config["task"]["sampler"] = "dopri5" if solver.method == "dopri5" else "euler"
+        config["task"]["num_inference_steps"] = int(1 / solver.step_size)
     else:
-        process["num_train_timesteps"] = int(args.get("diffusion_steps", 1000))
-        process["schedule"] = args.get("noise_schedule", "cosine")
-        process["variance"] = "fixed_small" if args.get("sigma_small", True) else "fixed_large"
-        config["task"]["num_inference_steps"] = process["num_train_timesteps"]
-    weights = {"joints": "lambda_rcxyz", "velocity": "lambda_vel", "foot_contact": "lambda_fc"}
-    config["losses"] = {ours: float(args.get(theirs) or 0.0) for ours, theirs in weights.items()}
-    longest = PADDED_FRAMES if dataset in NORMALIZED else int(args.get("num_frames") or ACTION_FRAMES)
+        process["num_train_timesteps"] = config["task"]["num_inference_steps"] = args.diffusion_steps
+        process["schedule"] = args.noise_schedule
+        process["variance"] = "fixed_small" if args.sigma_small else "fixed_large"
+    config["losses"] = {"joints": args.lambda_rcxyz, "velocity": args.lambda_vel, "foot_contact": args.lambda_fc}
+    longest = PADDED_FRAMES if dataset in NORMALIZED else args.num_frames or ACTION_FRAMES
     return config, {"actions": actions, "dataset": dataset, "fingerprint": None, "max_frames": longest}
 
 
@@ -265,10 +271,7 @@ def import_released(
     if (args is None) != (kind in ("flame", "mclip")):
         needs = {"mdm": "the args.json next to the checkpoint", "mfm": "the run's .hydra/config.yaml"}
         raise UserError(f"{kind} needs {needs[kind]}" if kind in needs else f"{kind} takes no file of options")
-    if num_heads is not None and not (type(num_heads) is int and num_heads >= 1):
-        raise UserError(f"num_heads={num_heads}: must be a positive whole number")
-    options = {} if args is None else _options(Path(args))
-    statistics = None if stats is None else _statistics(Path(stats))
+    options = _options(args, {} if num_heads is None else {"num_heads": num_heads})
     checkpoint = read_released(file, run_code=run_code, advice="Add run_code=true if you trust the authors of the file")
     try:
         state = released_state(checkpoint, ema=averaged and kind != "mclip")
@@ -277,8 +280,16 @@ def import_released(
             sizes = [] if num_heads is None else [f"task.network.num_heads={num_heads}"]
             config = compose("motion_clip/humanml3d_smpl", sizes)
             model: Task = get_class(config["task"]["_target_"]).import_released(state, without_own_paths(config))
+        elif kind == "flame":
+            released = import_flame(state, num_heads=num_heads or 8)
+            pooler = {f"condition.pooler_{name}": state.get(POOLER + name) for name in ("weight", "bias")}
+            if None in pooler.values():
+                raise ValueError(f"released weights: {POOLER}weight is missing: FLAME uses RoBERTa's pooler")
+            model = _model(released, *_flame_recipe(released), stats, pooler)
         else:
-            model = _model(kind, state, options, statistics, num_heads, time_token)
+            released = import_mdm(state, options, time_token=time_token)
+            table = {} if released.action_embedding is None else {"condition.table": released.action_embedding}
+            model = _model(released, *_mdm_recipe(kind, released, options), stats, table)
     except (OSError, MemoryError):
         raise
     except ValueError as error:
@@ -288,109 +299,51 @@ def import_released(
         raise UserError(f"{file}: cannot build a model from it and its options: {what}") from error
     out = out if out.suffix == ".safetensors" else out / FILE
     origin: dict[str, Any] = {"made": f"released by the authors of {kind.upper()}", "file": file.name}
-    origin |= {"sha256": sha256(file)}
-    origin |= {"averaged": averaged}
+    origin |= {"sha256": sha256(file), "averaged": averaged}
     write_model_file(out, model.state_dict(), config=model.config, facts=model.facts, origin=origin)
     return out
 
 
+def _options(path: str | Path | None, changes: Mapping[str, Any]) -> Options:
+    options = {} if path is None else read_yaml(Path(path))  # JSON is YAML
+    if not isinstance(options, dict):
+        raise UserError(f"{path}: not a mapping of options")
+    # In a composed configuration of MFM, options of network and training are one level down.
+    groups = [value for name, value in options.items() if name in ("model", "training") and isinstance(value, dict)]
+    flat = {k: v for part in (*groups, options) for k, v in part.items() if isinstance(k, str) and v is not None}
+    try:
+        return check_shape(flat | changes, Options)
+    except ValueError as error:
+        raise UserError(f"{path}: {error}") from error
+
+
 def _model(
-    kind: str,
-    state: Mapping[str, Tensor],
-    args: Mapping[str, Any],
-    statistics: tuple[Tensor, Tensor] | None,
-    num_heads: int | None,
-    time_token: bool,
+    released: Released, config: Config, facts: dict[str, Any], stats: str | Path | None, extra: dict[str, Any]
 ) -> MotionGeneration:
-    if args.get("dynamic", "flow") != "flow":
-        raise ValueError(f"dynamic={args['dynamic']}: only the flow models of MFM can be imported")
-    if kind == "mfm" and args.get("text_emebed", "clip") != "clip":  # spelled like this by the authors
-        raise ValueError(f"text_emebed={args['text_emebed']}: only models of MFM with CLIP can be imported")
-    if kind == "flame":
-        released = import_flame(state, num_heads=num_heads or 8)
-        config, facts = _flame_recipe(released)
-    else:
-        heads = num_heads or args.get("num_heads") or 4
-        released = import_mdm(state, args, num_heads=heads, time_token=time_token)
-        config, facts = _mdm_recipe(kind, released, args)
+    """Builds a model of a recipe with its weights, `extra` those besides the network's, and the statistics in a folder.
+
+    Raises `ValueError` if they do not fit.
+    """
     plain(config, "the options of the released model")
-    representation, width = instantiate(config["representation"]), released.features[0]
+    representation, width, dataset = instantiate(config["representation"]), released.features[0], facts["dataset"]
     if representation.features != width:
         raise ValueError(
             f"released weights: have {width} features, but {representation.name}, the representation of data set "
-            f"{facts['dataset']}, has {representation.features}"
+            f"{dataset}, has {representation.features}"
         )
-    if (statistics is not None) != (facts["dataset"] in NORMALIZED):
-        what, advice = ("normalized", "Give") if statistics is None else ("not normalized", "Leave out")
-        raise ValueError(f"features of {facts['dataset']} are {what}. {advice} stats=FOLDER with Mean.npy and Std.npy")
-    extra: dict[str, Tensor] = {}
-    if released.action_embedding is not None:
-        extra["condition.table"] = released.action_embedding
-    if kind == "flame":
-        for name in ("weight", "bias"):
-            if POOLER + name not in state:
-                raise ValueError(f"released weights: {POOLER}{name} is missing: FLAME uses RoBERTa's pooler")
-            extra[f"condition.pooler_{name}"] = state[POOLER + name]
-    for name, value in zip(("mean", "std"), statistics or (), strict=False):
-        if value.shape != (width,) or not value.isfinite().all() or (name == "std" and (value <= 0).any()):
+    if (stats is not None) != (dataset in NORMALIZED):
+        what, advice = ("normalized", "Give") if stats is None else ("not normalized", "Leave out")
+        raise ValueError(f"features of {dataset} are {what}. {advice} stats=FOLDER with Mean.npy and Std.npy")
+    for name in ("mean", "std") if stats is not None else ():
+        file = f"{name.capitalize()}.npy"
+        value = read_npy(Path(stats or "") / file)
+        numbers = value.dtype.kind in "fiu" and value.shape == (width,) and bool((abs(value) < float("inf")).all())
+        if not numbers or (name == "std" and (value <= 0).any()):
             what = f"shape {tuple(value.shape)}, expected ({width},) finite numbers, positive in Std.npy"
-            raise ValueError(f"{name.capitalize()}.npy: {what}")
-        extra[f"representation.{name}"] = value
+            raise ValueError(f"{file}: {what}")
+        extra[f"representation.{name}"] = torch.from_numpy(value).float()
     model = MotionGeneration.build(config, representation, actions=facts["actions"])
     model.facts = facts
     model.denoiser.load_state_dict(released.state)
     model.load_state_dict(extra, strict=False)
     return model.eval()
-
-
-class _Solver(TypedDict, total=False):
-    method: str
-    step_size: Annotated[float, Field(ge=1 / MAX_STEPS, le=1)]
-
-
-class _Options(TypedDict, total=False):
-    """Types and limits of the options that are read."""
-
-    arch: str
-    dataset: str
-    dynamic: str
-    noise_schedule: str
-    text_emebed: str
-    text_encoder_type: str
-    cond_mask_prob: Annotated[float, Field(ge=0, le=1)]
-    diffusion_steps: Annotated[int, Field(ge=1, le=MAX_STEPS)]
-    lambda_fc: Number | None
-    lambda_rcxyz: Number | None
-    lambda_vel: Number | None
-    num_frames: Annotated[int, Field(ge=0, le=MOST_FRAMES)] | None
-    num_heads: Annotated[int, Field(ge=1, le=MAX_STEPS)] | None
-    ode_kwargs: _Solver | None
-
-
-def _options(path: Path) -> Mapping[str, Any]:
-    options = read_yaml(path)  # JSON is YAML
-    if not isinstance(options, dict):
-        raise UserError(f"{path}: not a mapping of options")
-    # In a composed configuration of MFM, options of network and training are one level down.
-    groups = [value for name, value in options.items() if name in ("model", "training") and isinstance(value, dict)]
-    flat = {name: value for part in (*groups, options) for name, value in part.items() if isinstance(name, str)}
-    try:
-        solver = flat.get("ode_kwargs")
-        if isinstance(solver, dict) and isinstance(solver.get("step_size"), str):  # JSON is read as YAML 1.1: 2e-2
-            flat["ode_kwargs"] = solver | {"step_size": float(solver["step_size"])}
-        check_shape(flat, _Options)
-    except ValueError as error:
-        raise UserError(f"{path}: {error}") from error
-    return flat
-
-
-def _statistics(folder: Path) -> tuple[Tensor, Tensor]:
-    statistics = []
-    for name in ("Mean.npy", "Std.npy"):
-        try:
-            statistics.append(torch.from_numpy(read_npy(folder / name)))
-        except (ValueError, EOFError, TypeError) as error:
-            raise UserError(f"{folder / name}: damaged, or not an array of numbers") from error
-        if statistics[-1].is_complex():
-            raise UserError(f"{folder / name}: not an array of real numbers")
-    return statistics[0].float(), statistics[1].float()

@@ -7,7 +7,6 @@ from flame_mdm.config.building import (
     EXPERIMENTS,
     RUN_DIR,
     flatten,
-    foreign,
     instantiate,
     movable,
     moved,

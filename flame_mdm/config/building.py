@@ -151,24 +151,17 @@ def trust(config: Config) -> None:
     commas, of which any part may name anything. Nothing that the configuration names is imported here.
     """
     added = [name for name in os.environ.get("FLAME_MDM_TRUST", "").split(",") if name]
-    for where, target in foreign(config).items():
-        package = target.partition(".")[0]
+    for path, node in walk(config):
+        target = node.get("_target_", "")
+        if "_target_" not in node or (isinstance(target, str) and _is_of_kind(target, path[0] if path else "")):
+            continue
+        package = str(target).partition(".")[0]
         if package not in added:
             raise UserError(
-                f"the checkpoint's configuration names {target} at {where}. Its code is only run if "
+                f"the checkpoint's configuration names {target} at {'.'.join(path)}. Its code is only run if "
                 f"you trust it: set FLAME_MDM_TRUST={package}"
             )
     check(config)
-
-
-def foreign(config: Config) -> dict[str, str]:
-    """Returns what parts of a configuration name besides the classes of their kind in this framework: place -> name."""
-    named = [(path, node["_target_"]) for path, node in walk(config) if "_target_" in node]
-    return {
-        ".".join(path): str(target)
-        for path, target in named
-        if not (isinstance(target, str) and _is_of_kind(target, path[0] if path else ""))
-    }
 
 
 def _is_of_kind(target: str, kind: str) -> bool:

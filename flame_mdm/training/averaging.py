@@ -15,7 +15,7 @@ class MovingAverage(WeightAveraging):
 
     With the default options it computes the same as Lightning's `EMAWeightAveraging`, but with one call for all
     parameters, which are listed once: that class walks through all modules in every step, and on CUDA waits for the
-    device. Buffers are copied, not averaged.
+    device. Buffers are not averaged.
 
     Args:
         decay: average = decay * average + (1 - decay) * weights, from 0 to 1.
@@ -41,6 +41,8 @@ class MovingAverage(WeightAveraging):
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self.averages = [p.detach() for p in self.averaged().parameters()]
         self.weights = [p.detach() for p in pl_module.parameters()]
+        for copy, module in zip(self.averaged().modules(), pl_module.modules(), strict=True):
+            copy._buffers = module._buffers  # shared, so that both always have the current ones
         assert self._average_model is not None
         self.begun = int(self._average_model.n_averaged) > 0
 
@@ -56,19 +58,3 @@ class MovingAverage(WeightAveraging):
                 average.copy_(weight)
         self._average_model.n_averaged += 1
         self._latest_update_step, self.begun = step, True
-
-    def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._copy_buffers(pl_module)
-        super().on_validation_epoch_start(trainer, pl_module)
-
-    def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
-        self._copy_buffers(pl_module)
-        super().on_save_checkpoint(trainer, pl_module, checkpoint)
-
-    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._copy_buffers(pl_module)
-        super().on_train_end(trainer, pl_module)
-
-    def _copy_buffers(self, pl_module: LightningModule) -> None:
-        for average, buffer in zip(self.averaged().buffers(), pl_module.buffers(), strict=True):
-            average.copy_(buffer)

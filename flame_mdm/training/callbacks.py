@@ -1,12 +1,10 @@
 """Training callbacks: checkpointing, interruption, progress, measurements, samples and the report."""
 
-import os
 import shlex
 import signal
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from importlib.util import find_spec
 from inspect import getdoc, signature
 from itertools import zip_longest
 from pathlib import Path
@@ -21,11 +19,8 @@ from torch.nn.utils import get_total_norm
 from torch.optim import Optimizer
 from torchmetrics import Metric
 
-from flame_mdm.batch import MotionBatch
-from flame_mdm.checkpoints.loading import PARTS
 from flame_mdm.conditions.action import ActionLabels
 from flame_mdm.conditions.vocabulary import plainest
-from flame_mdm.config import Config, foreign
 from flame_mdm.data.datamodule import Clips, MotionDataModule
 from flame_mdm.errors import UserError, say
 from flame_mdm.formats.motion import Motion
@@ -40,6 +35,7 @@ from flame_mdm.training.loggers import log_video
 from flame_mdm.training.provenance import device_name
 
 REAL = 64  # training clips that metrics of samples are compared with
+UNCONDITIONED = 4  # motions without a prompt
 
 
 class Interrupted(Exception):
@@ -111,17 +107,19 @@ class Measurements(Callback):
     """
 
     def __init__(self) -> None:
-        self.step, self.begin = 0, 0.0
-        self._restart()
+        self.begin = self.since = 0.0
+        self.first = 0  # number of steps at the time `since`
         self.earlier: dict[str, float] = {}
 
     def on_load_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
         self.earlier = checkpoint["facts"].get("training", {})
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self.step = trainer.global_step
-        self.begin = time.perf_counter()
-        self._restart()
+        self.begin = self.since = time.perf_counter()
+        self.first = trainer.global_step
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self.since, self.first = time.perf_counter(), trainer.global_step
 
     def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
         if pl_module.device.type == "cuda":
@@ -138,37 +136,25 @@ class Measurements(Callback):
             "precision": trainer.precision,
         }
 
-    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._restart()
-
-    def _restart(self) -> None:
-        self.since, self.steps, self.samples = time.perf_counter(), 0, 0
-
     def on_before_optimizer_step(self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer) -> None:
         if (trainer.global_step + 1) % trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
             gradients = [p.grad for p in pl_module.parameters() if p.grad is not None]
             pl_module.log("train/grad_norm", get_total_norm(gradients))
             pl_module.log("train/lr", optimizer.param_groups[0]["lr"])
 
-    def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: MotionBatch, batch_idx: int
-    ) -> None:
-        self.samples += len(batch) * trainer.world_size
-        if trainer.global_step == self.step:  # gradients are still being accumulated
-            return
-        self.step = trainer.global_step
-        self.steps += 1
-        elapsed = time.perf_counter() - self.since
-        if self.step % trainer.log_every_n_steps or elapsed == 0:  # type: ignore[attr-defined]
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        step, steps = trainer.global_step, trainer.global_step - self.first
+        if step % trainer.log_every_n_steps or not steps:  # type: ignore[attr-defined]  # or gradients are accumulated
             return
         data: MotionDataModule = trainer.datamodule  # type: ignore[attr-defined]
-        size = data.batch_size * trainer.world_size * trainer.accumulate_grad_batches
-        pl_module.log("train/epochs", self.step * size / len(data.train))
-        pl_module.log("train/samples_per_second", self.samples / elapsed, prog_bar=True)
-        pl_module.log("train/seconds_per_step", elapsed / self.steps)
+        seconds = (time.perf_counter() - self.since) / steps
+        samples = data.batch_size * trainer.world_size * trainer.accumulate_grad_batches
+        pl_module.log("train/epochs", step * samples / len(data.train))
+        pl_module.log("train/samples_per_second", samples / seconds, prog_bar=True)
+        pl_module.log("train/seconds_per_step", seconds)
         if pl_module.device.type == "cuda":
             pl_module.log("train/gpu_memory_gib", torch.cuda.max_memory_allocated(pl_module.device) / 2**30)
-        self._restart()
+        self.since, self.first = time.perf_counter(), step
 
 
 class Report(Callback):
@@ -193,27 +179,9 @@ class Report(Callback):
                 "action": ("action", facts["actions"]),
                 "none": ("unconditioned", ("true",)),
             }[kind]
-            example = shlex.quote(next(iter(names), "a person walks"))
-            own = _environment(pl_module.config)
-            say(f"next: {own}{_command('sample', self.folder, f'{key}={example}')}")
-            say(f"      {own}{_command('evaluate', self.folder, 'extractor=none', 'quick=true')}")
-
-
-def _environment(config: Config) -> str:
-    """Returns the variables that a command needs to load a model with classes from outside this framework."""
-    named = foreign({name: config[name] for name in PARTS if name in config}).values()
-    specs = {name: find_spec(name) for name in sorted({target.partition(".")[0] for target in named})}
-    files = [(Path(spec.origin), spec.submodule_search_locations) for spec in specs.values() if spec and spec.origin]
-    folders = {file.parents[inner is not None] for file, inner in files}
-    path = ":".join(sorted(os.path.relpath(folder) for folder in folders if folder.name != "site-packages"))
-    return f"PYTHONPATH={shlex.quote(path)} " * bool(path) + f"FLAME_MDM_TRUST={','.join(specs)} " * bool(specs)
-
-
-def _command(name: str, folder: Path, *words: str) -> str:
-    if "MAKELEVEL" not in os.environ:
-        return " ".join(("flame-mdm", name, str(folder), *words))
-    pairs = (word.partition("=") for word in (f"ckpt={folder}", *words))
-    return " ".join(("make", name, *(f"{key.upper()}={value}" for key, _, value in pairs)))
+            example = f"{key}={next(iter(names), 'a person walks')}"
+            say(f"next: {shlex.join(['flame-mdm', 'sample', str(self.folder), example])}")
+            say(f"      {shlex.join(['flame-mdm', 'evaluate', str(self.folder), 'extractor=none', 'quick=true'])}")
 
 
 def explain_metrics(
@@ -237,6 +205,8 @@ def explain_metrics(
 class Progress(Callback):
     """Progress bar over the steps of a run, with remaining time and losses."""
 
+    bar: ProgressBar | None = None
+
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self.bar = ProgressBar(
             desc="training",
@@ -249,18 +219,20 @@ class Progress(Callback):
         )
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
-        if self.bar.disable or trainer.global_step == self.bar.n:  # gradients are still being accumulated
+        assert self.bar is not None
+        steps = trainer.global_step - self.bar.n
+        if self.bar.disable or not steps:  # gradients are still being accumulated
             return
         if trainer.global_step % trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
             losses = {name: trainer.callback_metrics.get(name) for name in ("train/loss", "val/loss")}
             self.bar.set_postfix({n: f"{v:.4g}" for n, v in losses.items() if v is not None}, refresh=False)
-        self.bar.update(trainer.global_step - self.bar.n)
+        self.bar.update(steps)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self.bar.close()
+        self.on_exception()
 
-    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        if hasattr(self, "bar"):
+    def on_exception(self, *_: Any) -> None:
+        if self.bar is not None:
             self.bar.close()
 
 
@@ -270,10 +242,9 @@ class SampleMotions(Callback):
     Args:
         folder: folder of the samples; those of each step are in a subfolder, such as `step_0001000/player.html`.
         every_n_steps: minimum number of steps between samples, which are drawn at validation and after training.
-        prompts: texts, action names, or (text, requested attributes) pairs; None = unconditioned motions. If a model
+        prompts: texts, action names, or (text, requested attributes) pairs; None = `UNCONDITIONED` motions. If a model
             is conditioned on actions and no prompt is one of them, its first actions are used instead.
         seconds: length of the motions.
-        unconditioned: number of motions if there are no prompts.
         metrics: torchmetrics by name; their `update` takes some of joints (B, F, J, 3), mask (B, F) and requested.
     """
 
@@ -283,15 +254,13 @@ class SampleMotions(Callback):
         every_n_steps: int,
         prompts: Sequence[str | tuple[str, dict[str, Any]]] | None,
         seconds: float,
-        unconditioned: int = 4,
         metrics: dict[str, Metric] | None = None,
     ):
         if not seconds > 0:
             raise UserError(f"callbacks.samples.seconds={seconds}: must be greater than 0")
         self.folder, self.every_n_steps, self.seconds = Path(folder), every_n_steps, seconds
         self.prompts = [(p, {}) if isinstance(p, str) else (p[0], dict(p[1])) for p in prompts or []]
-        self.unconditioned, self.metrics = unconditioned, metrics or {}
-        self.next = every_n_steps
+        self.metrics, self.next = metrics or {}, every_n_steps
         self.written: tuple[int, Path, dict[str, float | None]] = (-1, self.folder, {})
 
     @property
@@ -337,29 +306,28 @@ class SampleMotions(Callback):
             parts: list[Any] = [None] * trainer.world_size
             torch.distributed.all_gather_object(parts, motions)
             motions = [motion for row in zip_longest(*parts) for motion in row if motion is not None]
-        self.written = (step, folder, {})
-        if not trainer.is_global_zero:
-            return
-        write_motions(folder, motions, {"seed": 0, "step": step, "checkpoint": ""})
-        requested = [attributes for _, attributes in self.prompts]
-        values = self.measure([torch.from_numpy(m.joints) for m in motions], requested)
-        for logger in trainer.loggers:
-            # Lightning logs steps from 0: the values of this validation are logged at step - 1
-            log_video(logger, "samples", folder / "motions.gif", step - 1)
-            logger.log_metrics({f"samples/{k}": v for k, v in values.items() if v is not None}, step - 1)
+        values: dict[str, float | None] = {}
+        if trainer.is_global_zero:
+            write_motions(folder, motions, {"seed": 0, "step": step, "checkpoint": ""})
+            requested = [attributes for _, attributes in self.prompts]
+            values = self.measure([torch.from_numpy(motion.joints) for motion in motions], requested)
+            for logger in trainer.loggers:
+                # Lightning logs steps from 0: the values of this validation are logged at step - 1
+                log_video(logger, "samples", folder / "motions.gif", step - 1)
+                logger.log_metrics({f"samples/{k}": v for k, v in values.items() if v is not None}, step - 1)
         self.written = (step, folder, values)
 
     def _sample(self, model: MotionGeneration, rank: int, world: int) -> list[Motion]:
-        """Samples every `world`-th prompt, starting at `rank`; unconditioned motions only on the first process."""
-        texts = self.texts[rank::world]
-        if not texts and (self.texts or rank):
+        """Samples every `world`-th prompt, starting at `rank`; without prompts, all motions on the first process."""
+        texts, kind = self.texts[rank::world], model.conditioned_on
+        count = len(texts) if self.texts else UNCONDITIONED * (rank == 0)
+        if not count:
             return []
-        condition = model.conditioned_on if texts else "none"
         request = SamplingRequest(
-            texts=texts if condition == "text" else None,
-            actions=texts if condition == "action" else None,
+            texts=texts if texts and kind == "text" else None,
+            actions=texts if texts and kind == "action" else None,
             frames=min(round(self.seconds * model.representation.fps), model.facts["max_frames"]),
-            samples=len(texts) if texts and condition == "none" else 1 if texts else self.unconditioned,
+            samples=1 if texts and kind != "none" else count,
             seed=0,
         )
         return sample_request(model, request)

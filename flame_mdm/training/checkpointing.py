@@ -13,7 +13,7 @@ import torch
 from lightning import Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
-from packaging.version import InvalidVersion, Version
+from packaging.version import Version
 from torch import Tensor
 
 from flame_mdm.checkpoints.model_files import FORMAT, FORMAT_KEY, check_weights, read_checkpoint
@@ -21,10 +21,10 @@ from flame_mdm.config import instantiate
 from flame_mdm.errors import UserError, say
 from flame_mdm.safe_io import write_failure
 from flame_mdm.task import Task
+from flame_mdm.training.averaging import MovingAverage
 
 LAST, PREVIOUS = "last.ckpt", "previous.ckpt"
 OLDEST_LIGHTNING = Version("2.6")  # Lightning migrates checkpoints of older versions, by code that trusts them
-SCALAR = torch.tensor(0.0)
 LARGEST = 2**53  # numbers of steps and learning rates are smaller
 
 
@@ -102,8 +102,8 @@ def newest(folder: Path) -> Resumed | None:
 def check_training_state(resumed: Resumed, task: Task, trainer: Trainer) -> None:
     """Raises `UserError` unless a checkpoint holds the state of training `task` with `trainer`, before `Trainer.fit`.
 
-    The state of a `ModelCheckpoint` is dropped if it names a path that is not directly in the folder of the
-    checkpoints: the run directory was moved, or the path is an attack on other files.
+    The state of a `ModelCheckpoint` is dropped if it is damaged or names a path that is not directly in the folder of
+    the checkpoints: the run directory was moved, or the path is an attack on other files.
     """
     content, path = resumed.content, resumed.path
     if fault := next(_faults(content, path, task, trainer), None):
@@ -112,13 +112,25 @@ def check_training_state(resumed: Resumed, task: Task, trainer: Trainer) -> None
             "checkpoint"
         )
     for callback in trainer.callbacks:  # type: ignore[attr-defined]
-        state = content["callbacks"].get(callback.state_key)
-        if isinstance(callback, ModelCheckpoint) and state:
-            scores, kth = state["best_k_models"], state["kth_best_model_path"]
-            paths = [state["best_model_path"], state["last_model_path"], kth, *scores]
-            inside = all(directly_in(path.parent, name) for name in paths if name)
-            if not inside or (scores and kth not in scores):
-                del content["callbacks"][callback.state_key]
+        key = callback.state_key
+        if isinstance(callback, ModelCheckpoint) and not _is_of_folder(content["callbacks"].get(key), path.parent):
+            content["callbacks"].pop(key, None)
+
+
+def _is_of_folder(state: Any, folder: Path) -> bool:
+    """Returns whether the state of a `ModelCheckpoint` is complete and only names files directly in a folder."""
+    names = ("best_model_path", "last_model_path", "kth_best_model_path")
+    scores = ("best_model_score", "current_score", "kth_value")
+    if not isinstance(state, dict) or not {*names, *scores} <= state.keys():
+        return False
+    models = state.get("best_k_models")
+    if not isinstance(models, dict) or (models and state["kth_best_model_path"] not in models):
+        return False
+    paths = [*(state[name] for name in names if state[name] != ""), *models]
+    values = [*(state[name] for name in scores if state[name] is not None), *models.values()]
+    return all(isinstance(path, str) and directly_in(folder, path) for path in paths) and all(
+        isinstance(value, Tensor) and value.ndim == 0 for value in values
+    )
 
 
 def directly_in(folder: Path, path: str | Path) -> bool:
@@ -130,95 +142,67 @@ def directly_in(folder: Path, path: str | Path) -> bool:
 
 def _faults(content: dict[str, Any], path: Path, task: Task, trainer: Trainer) -> Iterator[str]:
     """Yields the parts of a checkpoint that Lightning cannot restore; later checks rely on earlier ones."""
-    version = content.get("pytorch-lightning_version")
     try:
-        supported = isinstance(version, str) and Version(version) >= OLDEST_LIGHTNING
-    except InvalidVersion:
+        supported = Version(content["pytorch-lightning_version"]) >= OLDEST_LIGHTNING
+    except (KeyError, TypeError, ValueError):
         supported = False
     if not supported:
         yield "pytorch-lightning_version"
-    weights = {name: value.to("meta") for name, value in task.state_dict().items()}
-    averaged = bool(task.config.get("ema"))
-    for name in ("state_dict", "current_model_state") if averaged else ("state_dict",):
-        saved = content.get(name)
-        try:
-            check_weights(saved if isinstance(saved, dict) else {None: None}, path)
-        except UserError:
-            yield name
-            return
-        assert isinstance(saved, dict)
-        extra = {key: value for key, value in saved.items() if key.endswith("_extra_state")}  # of any shape
-        yield from _differences(weights | extra, saved, name)
-    if averaged:
-        yield from _differences({"n_averaged": torch.tensor(0)}, content.get("averaging_state"), "averaging_state")
-    loops = content.get("loops")
-    progress = loops.get("fit_loop") if isinstance(loops, dict) else None
-    yield from _differences(trainer.fit_loop.state_dict(), progress, "loops.fit_loop")
-    precision = trainer.precision_plugin
-    if scaler := precision.state_dict():
-        name = type(precision).__qualname__
-        yield from _differences(scaler, content.get(name), name)
-    yield from _faults_of_callbacks(content.get("callbacks"), trainer)
-    yield from _faults_of_optimizer(content.get("optimizer_states"), content.get("lr_schedulers"), task, trainer)
-
-
-def _faults_of_callbacks(states: Any, trainer: Trainer) -> Iterator[str]:
-    if not isinstance(states, dict) or not all(isinstance(state, dict) for state in states.values()):
-        yield "callbacks"
-        return
-    for callback in trainer.callbacks:  # type: ignore[attr-defined]
-        key, state = callback.state_key, states.get(callback.state_key)
-        if not state or type(callback).__module__.partition(".")[0] not in ("lightning", "flame_mdm"):
-            continue
-        expected = callback.state_dict()
-        if isinstance(callback, ModelCheckpoint):
-            models = state.get("best_k_models")
-            if not isinstance(models, dict) or not all(isinstance(name, str) for name in models):
-                yield f"callbacks.{key}.best_k_models"
-                return
-            expected |= {"dirpath": "", "best_k_models": dict.fromkeys(models, SCALAR)}
-            for name in ("best_model_score", "current_score", "kth_value"):
-                expected[name] = None if state.get(name) is None else SCALAR
-        yield from _differences(expected, state, f"callbacks.{key}")
-
-
-def _faults_of_optimizer(states: Any, schedulers: Any, task: Task, trainer: Trainer) -> Iterator[str]:
-    """Compares with the state of the recipe's optimizer after a step with one parameter."""
     task.trainer = trainer
     made: Any = task.configure_optimizers()
     optimizer = made["optimizer"] if isinstance(made, dict) else made
-    scheduler = [made["lr_scheduler"]["scheduler"].state_dict()] if isinstance(made, dict) else []
-    yield from _differences(scheduler, schedulers, "lr_schedulers")
     groups = optimizer.state_dict()["param_groups"]
-    saved = states[0] if isinstance(states, list) and len(states) == 1 else None
-    entries = saved.get("state") if isinstance(saved, dict) else None
-    if not isinstance(saved, dict) or not isinstance(entries, dict):
-        yield "optimizer_states"
-        return
-    yield from _differences(groups, saved.get("param_groups"), "optimizer_states.param_groups")
-    learning_rates = {"lr": 0.0, "initial_lr": 0.0}
-    if [g | learning_rates for g in saved["param_groups"]] != [g | learning_rates for g in groups]:
+    precision, states = trainer.precision_plugin, content.get("callbacks")
+    loops = ("fit_loop", "validate_loop", "test_loop", "predict_loop")
+    expected = {
+        "state_dict": task.state_dict(),
+        "loops": {name: getattr(trainer, name).state_dict() for name in loops},
+        "callbacks": states if isinstance(states, dict) else {},
+        "optimizer_states": [{"state": _optimizer_state(content, task), "param_groups": groups}],
+        "lr_schedulers": [made["lr_scheduler"]["scheduler"].state_dict()] if isinstance(made, dict) else [],
+    }
+    if task.config.get("ema"):
+        expected |= {"current_model_state": expected["state_dict"], "averaging_state": {"n_averaged": torch.tensor(0)}}
+    if scaler := precision.state_dict():
+        expected[type(precision).__qualname__] = scaler
+    yield from _differences(expected, {name: content.get(name) for name in expected}, "")
+    for name in expected.keys() & {"state_dict", "current_model_state"}:
+        try:
+            check_weights(content[name], path)
+        except UserError:
+            yield name
+    for callback in trainer.callbacks:  # type: ignore[attr-defined]
+        if isinstance(callback, MovingAverage) and callback.state_key in content["callbacks"]:
+            yield from _differences(callback.state_dict(), content["callbacks"][callback.state_key], "callbacks.ema")
+    rates = {"lr": 0.0, "initial_lr": 0.0}
+    if [g | rates for g in content["optimizer_states"][0]["param_groups"]] != [g | rates for g in groups]:
         yield "optimizer_states.param_groups"
+
+
+def _optimizer_state(content: dict[str, Any], task: Task) -> dict[int, Any]:
+    """Returns the state of the recipe's optimizer after a step, of the parameters of which `content` holds one."""
+    try:
+        saved = content["optimizer_states"][0]["state"].keys()
+    except (KeyError, TypeError, IndexError, AttributeError):
+        return {}
     weight = torch.zeros(2, requires_grad=True)
     trial = instantiate(task.optimizer, params=[weight])
     weight.sum().backward()
     trial.step()
     template = trial.state_dict()["state"].get(0, {})
-    parameters = [parameter for parameter in task.parameters() if parameter.requires_grad]
-    for number, entry in entries.items():
-        if type(number) is not int or not 0 <= number < len(parameters):
-            yield "optimizer_states.state"
-            return
-        like = parameters[number].detach().to("meta")
-        expected = {name: like if getattr(value, "ndim", 0) else value for name, value in template.items()}
-        yield from _differences(expected, entry, f"optimizer_states.state.{number}")
+    return {
+        number: {name: parameter if getattr(value, "ndim", 0) else value for name, value in template.items()}
+        for number, parameter in enumerate(p for p in task.parameters() if p.requires_grad)
+        if number in saved
+    }
 
 
 def _differences(expected: Any, actual: Any, where: str) -> Iterator[str]:
     """Yields the keys whose values have other types or shapes than those in `expected`, which is trusted."""
     if isinstance(expected, dict) and isinstance(actual, dict) and actual.keys() == expected.keys():
         for name, value in expected.items():
-            yield from _differences(value, actual[name], f"{where}.{name}")
+            if not str(name).endswith("_extra_state"):  # of any shape
+                yield from _differences(value, actual[name], f"{where}.{name}".strip("."))
     elif isinstance(expected, list | tuple) and isinstance(actual, list | tuple) and len(actual) == len(expected):
         for number, value in enumerate(expected):
             yield from _differences(value, actual[number], f"{where}.{number}")

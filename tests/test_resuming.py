@@ -300,9 +300,7 @@ def test_out_of_memory_names_the_batch(tmp_path, data_root, monkeypatch, capsys)
 
     break_loss(monkeypatch, 3, fail)
     assert main(["train", *words(tmp_path, data_root), "trainer.max_steps=5"]) == 1
-    message = one_error(capsys)
-    assert message.startswith("error: out of memory at step 2 with a batch of 8 clips, ")
-    assert "263 features. Lower data.batch_size" in message
+    assert one_error(capsys).startswith("error: out of memory at step 2. Lower data.batch_size")
 
 
 def hold(folder: Path, held: Any) -> None:

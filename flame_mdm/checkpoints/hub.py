@@ -12,6 +12,7 @@ from flame_mdm.config import save
 from flame_mdm.errors import UserError, first_line, markdown_text
 from flame_mdm.safe_io import read_text, sha256, write_text
 
+CARD = Path(__file__).with_name("card.md")
 WRITTEN = {"README.md": "library_name: flame-mdm", "config.yaml": "The recipe of this model."}
 """Files that `push` writes next to the model, and a text in each that identifies it as written by `push`."""
 
@@ -33,10 +34,9 @@ def export(source: str | Path, out: str | Path, *, half: bool = False, **adapted
     """Writes the model of a checkpoint as a model file, and returns its path; errors as for `flame_mdm.load`.
 
     Args:
-        source: as for `flame_mdm.load`.
         out: a .safetensors file, or a folder for `model.safetensors`.
-        half: writes the weight matrices in half precision; vectors, such as the statistics of the features, stay as
-            they are. Loaded models compute in single precision either way.
+        half: writes the weight matrices in half precision, but not vectors, such as the statistics of the features.
+            Loaded models compute in single precision either way.
         adapted: adapter and strength, which are merged into the weights.
     """
     source, out = find(source), Path(out)
@@ -49,11 +49,11 @@ def export(source: str | Path, out: str | Path, *, half: bool = False, **adapted
         "averaged": "current_model_state" in checkpoint,
     }
     out = out if out.suffix == ".safetensors" else out / FILE
-    config = without_own_paths(checkpoint["config"])
     state = checkpoint["state_dict"]
     if half:
         state = {name: value.half() if value.ndim > 1 else value for name, value in state.items()}
         origin |= {"half_precision": True}
+    config = without_own_paths(checkpoint["config"])
     write_model_file(out, state, config=config, facts=checkpoint["facts"], origin=origin)
     return out
 
@@ -87,45 +87,25 @@ def push(
 
 
 def card(model: Mapping[str, Any], repository: str) -> str:
-    config, facts, origin = model["config"], model["facts"], model["origin"]
+    """Returns the model card of the content of a model file."""
+    from jinja2 import Template
+
+    config, facts = model["config"], model["facts"]
     license_id, terms = LICENSES.get(facts.get("dataset", ""), OTHER_LICENSE)
     names = [name for name in ("denoiser", "process", "condition", "representation") if name in config]
     parts = {name: config[name]["_target_"].rpartition(".")[2] for name in names}
-    other = {"ActionLabels": f"actions={facts['actions'][:1]}", "Unconditional": ""}
-    request = other.get(parts.get("condition", ""), '"a person walks forward"')
-    weights = sum(value.numel() for value in model["state_dict"].values())
-    rows = [
-        ("experiment", config["experiment"]),
-        *parts.items(),
-        ("parameters", f"{weights:,}"),
-        ("data", facts.get("dataset", "unknown")),
-        ("fingerprint of the data", facts.get("fingerprint") or "unknown"),
-        ("longest motion", f"{facts['max_frames']} frames"),
-        ("actions", ", ".join(facts["actions"]) or "none"),
-        *((f"weights: {name}", value) for name, value in origin.items()),
-    ]
-    table = "\n".join(f"| {markdown_text(str(name))} | {markdown_text(str(value))} |" for name, value in rows)
-    return f"""---
-license: {license_id}
-library_name: flame-mdm
-tags: [human-motion-generation, text-to-motion]
----
-
-# {repository.partition("/")[2]}
-
-A generative model of human motion. It generates joint positions in meters, y up:
-
-    import flame_mdm
-    model = flame_mdm.load("{repository}")
-    motion = flame_mdm.generate(model, {request + ", " if request else ""}seconds=3, seed=0)[0]
-
-| | |
-|---|---|
-{table}
-
-The recipe is in `config.yaml`.
-
-## License
-
-{terms}
-"""
+    other = {"ActionLabels": f"actions={facts['actions'][:1]}, ", "Unconditional": ""}
+    request = other.get(parts.get("condition", ""), '"a person walks forward", ')
+    rows = {
+        "experiment": config["experiment"],
+        **parts,
+        "parameters": f"{sum(value.numel() for value in model['state_dict'].values()):,}",
+        "data": facts.get("dataset", "unknown"),
+        "fingerprint of the data": facts.get("fingerprint") or "unknown",
+        "longest motion": f"{facts['max_frames']} frames",
+        "actions": ", ".join(facts["actions"]) or "none",
+        **{f"weights: {name}": value for name, value in model["origin"].items()},
+    }
+    template = Template(CARD.read_text(encoding="utf-8"), keep_trailing_newline=True)
+    words = {"license": license_id, "terms": terms, "repository": repository, "request": request}
+    return template.render(**words, rows=rows, markdown=markdown_text)

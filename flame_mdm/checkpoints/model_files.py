@@ -11,8 +11,9 @@ import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NotRequired
+from typing import TYPE_CHECKING, Annotated, Any, NotRequired, Required
 
+from pydantic import Field
 from typing_extensions import TypedDict
 
 from flame_mdm.config import moved, plain
@@ -42,12 +43,10 @@ def read_model_file(path: Path) -> dict[str, Any]:
         raise UserError(f"{path}: {what}")
     try:
         content = parse_json(text)
-        check_format(path, content["format"])
-        model = {name: content[name] for name in ("config", "facts", "origin")}
-    except UserError:
-        raise
+        number, model = content["format"], {name: content[name] for name in ("config", "facts", "origin")}
     except (ValueError, TypeError, KeyError) as error:
         raise UserError(f"{path}: damaged: its recipe cannot be read") from error
+    check_format(path, number)
     if metadata.get("sha256") != content_sha256(text, state):
         raise UserError(f"{path}: damaged: it has changed since it was written. Download or export it again")
     return checked(path, model | {"state_dict": state})
@@ -84,18 +83,18 @@ class _Part(TypedDict):
     _target_: str
 
 
-class _Recipe(TypedDict):
-    experiment: str | None
-    data_root: NotRequired[str | None]
-    run: NotRequired[_Folder]
-    seed: NotRequired[int]
-    data: NotRequired[dict[str, Any]]
-    callbacks: NotRequired[dict[str, dict[str, Any] | None] | None]
-    task: NotRequired[_Part]
-    representation: NotRequired[_Part]
-    process: NotRequired[_Part]
-    condition: NotRequired[_Part]
-    denoiser: NotRequired[_Part]
+class _Recipe(TypedDict, total=False):
+    experiment: Required[str | None]
+    data_root: str | None
+    run: _Folder
+    seed: int
+    data: dict[str, Any]
+    callbacks: dict[str, dict[str, Any] | None] | None
+    task: _Part
+    representation: _Part
+    process: _Part
+    condition: _Part
+    denoiser: _Part
 
 
 class _Training(TypedDict, total=False):
@@ -106,26 +105,21 @@ class _Training(TypedDict, total=False):
     precision: str
 
 
-class _Facts(TypedDict):
-    actions: list[str]
-    max_frames: int
-    dataset: NotRequired[str]  # unknown for released extractors
-    fingerprint: NotRequired[str | None]
-    training: NotRequired[_Training]
-    vocabulary: NotRequired[list[str]]
-    verbs: NotRequired[list[str]]
-    captions: NotRequired[list[str]]
+class _Facts(TypedDict, total=False):
+    actions: Required[list[str]]
+    max_frames: Required[Annotated[int, Field(ge=1, le=MOST_FRAMES)]]
+    dataset: str  # unknown for released extractors
+    fingerprint: str | None
+    training: _Training
+    vocabulary: list[str]
+    verbs: list[str]
+    captions: list[str]
 
 
-class _Model(TypedDict):
+class _Metadata(TypedDict):
     config: _Recipe
     facts: _Facts
-    origin: dict[str, str | bool | int | float | None]
-
-
-class _Checkpoint(TypedDict):
-    config: _Recipe
-    facts: _Facts
+    origin: NotRequired[dict[str, str | bool | int | float | None]]
     global_step: NotRequired[int]
 
 
@@ -136,19 +130,16 @@ def checked(path: Path, content: Any) -> dict[str, Any]:
             f"{path}: not a checkpoint of this framework: it holds no recipe. Import released checkpoints with "
             "`flame-mdm import`"
         )
-    names = ("config", "facts", "origin", "global_step")
-    metadata = {name: content[name] for name in names if content.get(name) is not None}
+    metadata = {name: content[name] for name in ("config", "facts", "origin", "global_step") if name in content}
     for name, value in metadata.items():
         plain(value, f"{path}: {name}")
-    facts: Any = metadata.get("facts")
+    facts: Any = metadata["facts"]
     if isinstance(facts, dict) and isinstance(facts.get("actions"), tuple):
         metadata["facts"] = facts | {"actions": list(facts["actions"])}
     try:
-        check_shape(metadata, _Model if "origin" in metadata or path.suffix == ".safetensors" else _Checkpoint)
+        check_shape(metadata, _Metadata)
     except ValueError as error:
         raise UserError(f"{path}: damaged: {error}") from error
-    if not 1 <= facts["max_frames"] <= MOST_FRAMES:
-        raise UserError(f"{path}: damaged: facts.max_frames is {facts['max_frames']}, not 1 to {MOST_FRAMES:,} frames")
     if not isinstance(content["state_dict"], dict):
         raise UserError(f"{path}: damaged: its weights are not a mapping of tensors")
     check_weights(content["state_dict"], path)
@@ -200,9 +191,7 @@ def state_sha256(state: Mapping[str, Tensor]) -> str:
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """Reads a checkpoint or model file; raises `UserError` if it is damaged. Only plain values and tensors are
-    unpickled.
-    """
+    """Reads a checkpoint or model file without running code; raises `UserError` if it is damaged."""
     if path.suffix == ".safetensors":
         return read_model_file(path)
     checkpoint = checked(path, read_torch(path))
@@ -211,10 +200,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def weights_sha256(path: Path) -> str:
-    """Returns the sha256 of names, types, shapes and values of the weights in a checkpoint or model file.
-
-    It depends on nothing else: a model file exported from a checkpoint in full precision has the same one.
-    """
+    """Returns the sha256 of the weights in a file; that of a checkpoint and its model file are the same."""
     return state_sha256(read_checkpoint(path)["state_dict"])
 
 

@@ -15,7 +15,7 @@ from torch.nn import functional
 
 from flame_mdm.batch import Condition, Edit, MotionBatch, length_mask
 from flame_mdm.checkpoints.loading import load
-from flame_mdm.checkpoints.runner import FORMAT, MIN_WORDS
+from flame_mdm.checkpoints.runner import FORMAT, MIN_WORDS, digest
 from flame_mdm.conditions.tokens import LearnedTokens
 from flame_mdm.conditions.vocabulary import FUNCTION_WORDS
 from flame_mdm.denoisers.gru import MDMGRU
@@ -57,7 +57,7 @@ def export_onnx(source: str | Path, out: str | Path, *, half: bool = False, **ad
             path = folder / f"{graph.name}.onnx"
             write_graph(graph, path, half and graph.name == "denoiser")
             content["sha256"][path.name] = sha256(path)
-        write_json(folder / "model.json", content, indent=None)
+        write_json(folder / "model.json", content | {"digest": digest(content)}, indent=None)
         shutil.copy(RUNNER, folder / RUNNER.name)
     return Path(out)
 
@@ -88,11 +88,10 @@ class Probe:
     """Denoiser, noise and `Guide` that record how a sampler combines noise and clean estimates.
 
     Noise number n is unit vector n, clean estimate number k is unit vector `calls` + 1 + k, so that every noisy motion
-    (1, 1, 2 `calls` + 1) lists its coefficients.
+    (1, 1, 2 `calls` + 1) lists its coefficients. `variance` is the network's output for a learned variance.
     """
 
     def __init__(self, process: Process, calls: int, variance: float):
-        """`calls` is the maximum number of calls; `variance` is the network's output for a learned variance."""
         self.process, self.calls, self.variance, self.output = process, calls, variance, variance
         self.time, self.draws = 0.0, 0
         self.records: list[tuple[Tensor, int, list[float]]] = []  # x_t, draws before, (t, p, q) of each call
@@ -182,7 +181,6 @@ class Call(nn.Module):
     """
 
     def __init__(self, model: MotionGenerator):
-        """Raises `UserError` if the condition is encoded by a language model, which is not exported."""
         super().__init__()
         self.condition, self.denoiser = model.condition, model.denoiser
         if model.conditioned_on == "text" and not isinstance(self.condition, LearnedTokens):

@@ -64,8 +64,7 @@ def adapt(
         data_root: folder of the prepared data sets; without the base's, 300 motions are sampled from the base.
         overrides: overrides of `experiments/adapt.yaml`, such as "trainer.max_steps=2000".
 
-    Returns:
-        The adapter or model file, OUT/NAME.safetensors. OUT/adaptation.html compares motions before and after.
+    Returns the adapter or model file, OUT/NAME.safetensors. OUT/adaptation.html compares motions before and after.
     """
     file, out = find(base), Path(out or f"runs/adapt/{name}")
     if not re.fullmatch(r"[^\W_]+", name):
@@ -177,8 +176,9 @@ def _comparison(name: str, data: LessonData, before: MotionGeneration, after: Mo
     own, kept = (rows[:: -(-len(rows) // COMPARED)] for rows in data.halves())
     plain, taught = ({clips[row].captions[0]: clips[row] for row in rows} for rows in (kept, own))
     texts = [*list(taught)[:3], *(styled(text, name) for text in list(plain)[:3]), *list(plain)[:3]]
-    models = {"before": before, "after": after}
-    made = ([replace(motion, id=label) for motion in generate(model, texts)] for label, model in models.items())
+    pairs: list[Motion] = []
+    for motions in zip(generate(before, texts), generate(after, texts), strict=True):
+        pairs += [replace(motion, id=label) for label, motion in zip(("before", "after"), motions, strict=True)]
     beside: list[Motion] = []
     for text, clip in list(taught.items())[:4]:
         joints = made_by.decode(torch.from_numpy(data.store.motion(clip)[: data.crop.longest()].copy())).numpy()
@@ -188,13 +188,7 @@ def _comparison(name: str, data: LessonData, before: MotionGeneration, after: Mo
     for what, chosen in ((f"loss on {len(own)} of your clips", own), (f"loss on {len(kept)} clips it knew", kept)):
         batch = collate(data.train.__getitems__([(int(row), -1) for row in chosen]))
         with torch.no_grad():
-            rows.append([what, *(number(float(model.losses_of(batch)["loss"].mean())) for model in models.values())])
-    runs = [generate(model, list(plain), seed=seed) for model, seed in ((before, 0), (after, 0), (before, 1))]
-    first, *others = (np.concatenate([motion.joints for motion in motions]) for motions in runs)
-    moved = [number(100 * float(np.linalg.norm(joints - first, axis=-1).mean())) for joints in others]
-    rows.append(
-        [f"joints move in {len(plain)} motions without the style, cm", f"{moved[1]} with another seed", moved[0]]
-    )
-    players = {"prompts": [motion for pair in zip(*made, strict=True) for motion in pair], "clips": beside}
-    pages = {part: player_page(motions, "", columns=2) for part, motions in players.items()}
-    return render("adaptation.html", name=name, rows=rows, **pages)
+            losses = [float(model.losses_of(batch)["loss"].mean()) for model in (before, after)]
+        rows.append([what, *map(number, losses)])
+    players = {"prompts": player_page(pairs, "", columns=2), "clips": player_page(beside, "", columns=2)}
+    return render("adaptation.html", name=name, rows=rows, **players)

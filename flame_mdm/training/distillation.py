@@ -1,7 +1,6 @@
 """Training of models that sample in one to four steps, from a teacher that takes more."""
 
 import copy
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -16,7 +15,6 @@ from flame_mdm.errors import UserError
 from flame_mdm.generator import DistilledGenerator, MotionGenerator
 from flame_mdm.processes.consistency import consistency_terms
 from flame_mdm.processes.guidance import classifier_free_guidance
-from flame_mdm.representations import Representation
 from flame_mdm.task import MotionGeneration, Task
 from flame_mdm.training.averaging import MovingAverage
 
@@ -33,8 +31,8 @@ class ConsistencyDistillation(DistilledGenerator, MotionGeneration):
     """
 
     @classmethod
-    def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:
-        task = super().build(config, representation, actions=actions)
+    def of_parts(cls, config: Config, *parts: Any) -> Self:
+        task = super().of_parts(config, *parts)
         task.condition.requires_grad_(False)
         return task.eval()
 
@@ -56,7 +54,7 @@ class ConsistencyDistillation(DistilledGenerator, MotionGeneration):
         teacher = read_teacher(path)
         _check_same(teacher, self)
         self.load_state_dict(teacher.state_dict())
-        self.facts |= {"teacher": weights_sha256(path)}
+        self.facts["teacher"] = weights_sha256(path)
         scale = options["guidance_scale"]
         self.teacher_guidance = teacher.sampler_options.guidance_scale if scale is None else scale
         # In lists, since they are no parts of the student.
@@ -127,14 +125,13 @@ def read_teacher(path: Path) -> MotionGenerator:
 
 def _check_same(teacher: MotionGenerator, student: ConsistencyDistillation) -> None:
     name = student.config["distillation"]["teacher"]
-    for part in PARTS[1:]:
-        theirs, ours = flatten(teacher.config[part]), flatten(student.config[part])
-        for key in theirs.keys() | ours.keys():
-            if theirs.get(key) != ours.get(key):
-                raise UserError(
-                    f"distillation.teacher={name}: has {part}.{key}={theirs.get(key)}, but the student has "
-                    f"{ours.get(key)}. Both need the same parts: use `flame-mdm distill {name}`"
-                )
+    theirs, ours = (flatten({part: task.config[part] for part in PARTS[1:]}) for task in (teacher, student))
+    if differing := [key for key in sorted(theirs.keys() | ours.keys()) if theirs.get(key) != ours.get(key)]:
+        key = differing[0]
+        raise UserError(
+            f"distillation.teacher={name}: has {key}={theirs.get(key)}, but the student has {ours.get(key)}. Both need "
+            f"the same parts: use `flame-mdm distill {name}`"
+        )
     before, now = teacher.facts.get("fingerprint"), student.facts.get("fingerprint")
     if None not in (before, now) and before != now:
         raise UserError(

@@ -37,8 +37,7 @@ def fit(folder: Path, config: Config) -> None:
     torch.set_float32_matmul_precision("high")
     resumed = newest(folder / "checkpoints")
     step = resumed.step if resumed else 0
-    most = config["trainer"]["max_steps"]
-    if 0 <= most <= step:
+    if 0 <= config["trainer"]["max_steps"] <= step:
         say(f"{folder}: already trained for {step} steps. Increase trainer.max_steps, or start a new run: run.name=...")
         return
     seed_everything(config["seed"], verbose=False)
@@ -52,8 +51,9 @@ def fit(folder: Path, config: Config) -> None:
             attach(task, config["adapter"])
         if config.get("base") and not resumed:
             copy_weights(task, config["base"])
-    fast = config["run"].get("speed") == "fast"
-    precision = accelerate(task, data, config) if fast else config["trainer"]["precision"]
+    precision = config["trainer"]["precision"]
+    if config["run"].get("speed") == "fast":
+        precision = accelerate(task, data, config)
     callbacks: list[Callback] = [WriteProvenance(config)]
     if config["ema"]:
         callbacks.append(MovingAverage(**config["ema"]))  # before the callbacks that use averaged weights in validation
@@ -82,8 +82,8 @@ def fit(folder: Path, config: Config) -> None:
         if not trainer.is_global_zero:  # the first process reports it; launchers treat any other exit code as a crash
             return
         say(f"stopped at step {stop.step}. Run the same command to resume")
-        if stop.signum in (signal.SIGUSR1, signal.SIGUSR2):
-            _requeue()
+        if stop.signum in (signal.SIGUSR1, signal.SIGUSR2) and (job := os.environ.get("SLURM_JOB_ID")):
+            _requeue(job)
         raise SystemExit(128 + stop.signum) from None
     except (Exception, SystemExit) as error:
         if trainer.strategy.launcher is not None:  # otherwise its processes wait for this one for half an hour
@@ -91,7 +91,7 @@ def fit(folder: Path, config: Config) -> None:
         if isinstance(error, SystemExit):  # a second signal
             say("stopped immediately. Run the same command to resume from the last checkpoint")
         lost = lost_worker(error) if data.num_workers else None
-        if explained := lost or out_of_memory(error, callbacks, trainer.global_step):
+        if explained := lost or out_of_memory(error, trainer.global_step):
             raise explained from error
         raise
 
@@ -113,15 +113,11 @@ def check_devices(trainer: Config) -> None:
         raise UserError(f"trainer.devices={devices}: {there}. Give at most trainer.devices={most}")
 
 
-def _requeue() -> None:
-    if (job := os.environ.get("SLURM_JOB_ID")) is None:
-        return
-    command = ["scontrol", "requeue", job]
+def _requeue(job: str) -> None:
     try:
-        subprocess.run(command, capture_output=True, text=True, check=True)
+        subprocess.run(["scontrol", "requeue", job], capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError) as error:
-        failure = error.stderr.strip() if isinstance(error, subprocess.CalledProcessError) else error
-        say(f"error: {' '.join(command)}: {failure}. Submit the job again", error=True)
+        say(f"error: job {job} cannot be requeued: {getattr(error, 'stderr', error)}. Submit it again", error=True)
     else:
         say(f"job {job} was requeued")
 

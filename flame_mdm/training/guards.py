@@ -5,7 +5,7 @@ import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import torch
 from lightning import Callback, LightningModule, Trainer
@@ -52,19 +52,12 @@ class BadLoss(Callback):
         self.path, self.factor = Path(folder) / "bad_batch.json", factor
         self.usual = float("inf")
         self.seen: list[tuple[int, int, Sequence[str], Tensor]] = []
-        self.shape: tuple[int, ...] = ()
-
-    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: MotionBatch, *_: Any) -> None:
-        self.shape = tuple(batch.x.shape)
-
-    def on_validation_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, *_: Any) -> None:
-        self.shape = tuple(batch.x.shape)
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: MotionBatch, batch_idx: int
     ) -> None:
         loss = outputs["loss"] if isinstance(outputs, Mapping) else outputs
-        self.seen.append((trainer.global_step, batch_idx, batch.ids, loss.detach()))
+        self.seen.append((trainer.global_step, batch_idx, batch.ids, loss.detach().float()))
         if (batch_idx + 1) % trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
             self.check(trainer)
 
@@ -75,32 +68,34 @@ class BadLoss(Callback):
         """Raises `UserError` if a loss since the last check is bad, on all processes at the same step."""
         if not self.seen:
             return
-        parts = [torch.stack([s[-1].float() for s in self.seen])]
+        own = torch.stack([loss for *_, loss in self.seen])
+        parts = [own]
         if trainer.world_size > 1:
-            mine, parts = parts[0], [torch.empty_like(parts[0]) for _ in range(trainer.world_size)]
-            torch.distributed.all_gather(parts, mine)
-        losses = torch.stack(parts).cpu()
-        bad = ~losses.isfinite() | (losses > self.factor * self.usual)
+            parts = [torch.empty_like(own) for _ in range(trainer.world_size)]
+            torch.distributed.all_gather(parts, own)
+        losses = torch.stack(parts).cpu()  # (processes, steps)
+        bad = (~losses.isfinite() | (losses > self.factor * self.usual)).any(0)
         if bad.any():
-            first = int(bad.any(0).nonzero()[0])
-            step, number, ids, _ = self.seen[first]
-            everyone: list[Any] = [{"rank": trainer.global_rank, "batch": number, "ids": list(ids)}]
-            if trainer.world_size > 1:
-                own, everyone = everyone[0], [None] * trainer.world_size
-                torch.distributed.all_gather_object(everyone, own)
-            values = losses[:, first].tolist()
-            for part, value in zip(everyone, values, strict=True):
-                part["loss"] = str(value)
-            if trainer.is_global_zero:
-                write_json(self.path, {"step": step, "usual_loss": str(self.usual), "batches": everyone})
-            raise UserError(
-                f"the loss of step {step} is {max(values, key=lambda v: v if v == v else float('inf')):g}"
-                + (f" (typical: {self.usual:.3g})" if self.usual < float("inf") else "")
-                + f". The clips of the batch are listed in {self.path}. Lower optimizer.lr, set "
-                "trainer.gradient_clip_val, or inspect these clips. Earlier checkpoints are intact"
-            )
+            self._stop(trainer, int(bad.nonzero()[0]), losses)
         self.usual = float(losses.median())
         self.seen = []
+
+    def _stop(self, trainer: Trainer, first: int, losses: Tensor) -> NoReturn:
+        step, number, ids, _ = self.seen[first]
+        values = losses[:, first].tolist()
+        rank = trainer.global_rank
+        own = {"rank": rank, "batch": number, "ids": list(ids), "loss": str(values[rank])}
+        batches: list[Any] = [own] * trainer.world_size
+        if trainer.world_size > 1:
+            torch.distributed.all_gather_object(batches, own)
+        if trainer.is_global_zero:
+            write_json(self.path, {"step": step, "usual_loss": str(self.usual), "batches": batches})
+        typical = f" (typical: {self.usual:.3g})" if self.usual < float("inf") else ""
+        raise UserError(
+            f"the loss of step {step} is {max(values, key=lambda v: v if v == v else float('inf')):g}{typical}. The "
+            f"clips of the batch are listed in {self.path}. Lower optimizer.lr, set trainer.gradient_clip_val, or "
+            "inspect these clips. Earlier checkpoints are intact"
+        )
 
 
 def lost_worker(error: BaseException) -> UserError | None:
@@ -117,13 +112,11 @@ def lost_worker(error: BaseException) -> UserError | None:
     )
 
 
-def out_of_memory(error: BaseException, callbacks: Sequence[Callback], step: int) -> UserError | None:
+def out_of_memory(error: BaseException, step: int) -> UserError | None:
     """Returns an explanation if an error means that memory is exhausted, otherwise None."""
     if not isinstance(error, torch.OutOfMemoryError) and "can't allocate memory" not in str(error):
         return None
-    shape = next((c.shape for c in callbacks if isinstance(c, BadLoss) and c.shape), None)
-    batch = f" with a batch of {shape[0]} clips, {shape[1]} frames, {shape[2]} features" if shape else ""
     return UserError(
-        f"out of memory at step {step}{batch}. Lower data.batch_size (trainer.accumulate_grad_batches compensates for "
-        "it), set trainer.precision=bf16-mixed, or use shorter crops or a smaller network"
+        f"out of memory at step {step}. Lower data.batch_size (trainer.accumulate_grad_batches compensates for it), "
+        "set trainer.precision=bf16-mixed, or use shorter crops or a smaller network"
     )

@@ -220,6 +220,7 @@ def small_state(features: int = 3) -> dict[str, torch.Tensor]:
 def test_every_weight_is_used_or_the_import_fails() -> None:
     state = small_state()
     lacking = {key: value for key, value in state.items() if key != "seqTransEncoder.layers.0.linear2.bias"}
+    args: dict[str, Any]
     short = state | {"seqTransEncoder.layers.0.linear1.bias": torch.ones(2)}
     for weights_, args, message in (
         (state | {"embed_style.weight": torch.ones(1)}, {}, r"unknown keys embed_style\.weight"),

@@ -19,11 +19,11 @@ from flame_mdm.checkpoints.adapters import attach, copy_weights
 from flame_mdm.checkpoints.loading import NO_GPU
 from flame_mdm.config import Config, instantiate
 from flame_mdm.data.datamodule import MotionDataModule
-from flame_mdm.errors import UserError, say
+from flame_mdm.errors import UserError, first_line, say
 from flame_mdm.task import MotionGeneration, Task
 from flame_mdm.training.averaging import MovingAverage
 from flame_mdm.training.callbacks import Interrupted, Measurements, Progress, Report
-from flame_mdm.training.checkpointing import AtomicCheckpoints, Resumed, check_training_state, newest
+from flame_mdm.training.checkpointing import AtomicCheckpoints, Resumed, newest
 from flame_mdm.training.guards import lost_worker, out_of_memory
 from flame_mdm.training.loggers import History
 from flame_mdm.training.provenance import WriteProvenance
@@ -60,9 +60,11 @@ def fit(folder: Path, config: Config) -> None:
     callbacks += [instantiate(c) for c in config["callbacks"].values() if c]
     if config["trainer"].get("enable_progress_bar", True):
         callbacks.append(Progress())
-    callbacks += [Measurements(), Report(folder)]
+    measurements = Measurements()
+    callbacks += [measurements, Report(folder)]
     loggers = [instantiate(config["logger"])] if config["logger"] else []
-    plugins: list[Any] = [AtomicCheckpoints(folder / "checkpoints", resumed)]
+    checkpoints = AtomicCheckpoints(folder / "checkpoints", resumed)
+    plugins: list[Any] = [checkpoints]
     if SLURMEnvironment.detect() and not TorchElasticEnvironment.detect():
         # Lightning would save during a step, to a file that it then prefers to `last.ckpt`.
         plugins.append(SLURMEnvironment(auto_requeue=False))
@@ -74,8 +76,6 @@ def fit(folder: Path, config: Config) -> None:
         default_root_dir=str(folder),
         enable_model_summary=False,
     )
-    if resumed:
-        check_training_state(resumed, task, trainer)
     try:
         trainer.fit(task, data, ckpt_path=resumed.path if resumed else None, weights_only=True)
     except Interrupted as stop:
@@ -93,6 +93,12 @@ def fit(folder: Path, config: Config) -> None:
         lost = lost_worker(error) if data.num_workers else None
         if explained := lost or out_of_memory(error, trainer.global_step):
             raise explained from error
+        is_restoring = resumed and checkpoints.resumed is None and not measurements.begin
+        if is_restoring and not isinstance(error, UserError | OSError | SystemExit):
+            raise UserError(
+                f"{resumed.path}: damaged: it does not fit the recipe ({first_line(error)}). Delete this file to "
+                "resume from another checkpoint"
+            ) from error
         raise
 
 
@@ -141,6 +147,7 @@ def _quiet() -> None:
         ".*does not have many workers.*",
         ".*module\\(s\\) in eval mode at the start of training.*",  # a student without dropout
         ".*Checkpoint directory .* exists and is not empty.*",
+        "The dirpath has changed.*",  # the run directory was moved: the next validation decides again which is best
         ".*sync_dist=True.*",  # the metrics are means over all processes already
     ):
         warnings.filterwarnings("ignore", message)

@@ -304,7 +304,7 @@ def import_released(
     return out
 
 
-def _options(path: str | Path | None, changes: Mapping[str, Any]) -> Options:
+def _options(path: str | Path | None, changes: dict[str, Any]) -> Options:
     options = {} if path is None else read_yaml(Path(path))  # JSON is YAML
     if not isinstance(options, dict):
         raise UserError(f"{path}: not a mapping of options")

@@ -93,8 +93,8 @@ def fit(folder: Path, config: Config) -> None:
         lost = lost_worker(error) if data.num_workers else None
         if explained := lost or out_of_memory(error, trainer.global_step):
             raise explained from error
-        is_restoring = resumed and checkpoints.resumed is None and not measurements.begin
-        if is_restoring and not isinstance(error, UserError | OSError | SystemExit):
+        is_restoring = checkpoints.resumed is None and not measurements.begin
+        if resumed and is_restoring and not isinstance(error, UserError | OSError | SystemExit):
             raise UserError(
                 f"{resumed.path}: damaged: it does not fit the recipe ({first_line(error)}). Delete this file to "
                 "resume from another checkpoint"

@@ -38,7 +38,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "schemas": GROUND,
     "runs": GROUND | {"schemas"},
     "reporting": GROUND | {"representations", "visualize", "formats", "data", "schemas", "runs"},
-    "sampling": MODELS,
+    "sampling": MODELS | {"schemas"},
     "checkpoints": MODELS | {"schemas"},
     "training": ALL - {"training"},
     "demo": MODELS | {"sampling", "checkpoints"},

@@ -249,7 +249,7 @@ def test_bad_edits_are_one_line(diffusion, flow, motion):
         (diffusion, {"region": "inbetween"}, "region=inbetween is unknown. Did you mean in_between"),
         (diffusion, {"joints": "uper_body"}, "no joint or part 'uper_body'. Did you mean upper_body"),
         (diffusion, suffix | {"method": "mfm"}, "method=mfm is not supported by GaussianDiffusion; .* mdm, flame"),
-        (diffusion, suffix | {"method": "repaint"}, "method=repaint is unknown. Choose from mdm, flame, flame_code"),
+        (diffusion, suffix | {"method": "repaint"}, "method=repaint is unknown. Use mdm, flame, flame_code"),
         (diffusion, suffix | {"until": 0.3}, "until=0.3 is an option of method=mfm, not of mdm"),
         (diffusion, suffix | {"seconds": 3}, "an edit is as long as its motion: omit seconds"),
         (diffusion, suffix | {"texts": "walks | jumps"}, "an edit keeps a single motion"),

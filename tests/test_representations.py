@@ -1,7 +1,6 @@
 import itertools
 import math
 import re
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +22,7 @@ from support.fixtures import (
 from torch import Tensor
 from torch.nn import functional
 
+from flame_mdm.config import check
 from flame_mdm.errors import UserError
 from flame_mdm.representations import Representation, rotation
 from flame_mdm.representations.essential import Essential
@@ -43,11 +43,6 @@ FIXTURES |= {"third_party-hml263": third_party, "third_party-hml263_bandai": thi
 
 def arrays(stem: str) -> Arrays:
     return FIXTURES[stem](stem.removeprefix("third_party-"))
-
-
-stems = pytest.mark.parametrize(
-    "stem", [pytest.param(stem, marks=[needs_third_party] if "third" in stem else []) for stem in FIXTURES]
-)
 
 
 def clips(stem: str, key: str) -> list[str]:
@@ -137,7 +132,9 @@ def test_skeletons_are_trees():
 
 
 @pytest.mark.golden
-@stems
+@pytest.mark.parametrize(
+    "stem", [pytest.param(stem, marks=[needs_third_party] if "third" in stem else []) for stem in FIXTURES]
+)
 def test_published_features_and_the_steps_to_and_from_them(stem: str):
     kit = stem.startswith("kit")
     (representation, lengths), atol = legacy(stem), 5e-3 if kit else 2e-5
@@ -231,8 +228,7 @@ def test_opposite_bones():
 
 def test_many_motions_at_once_are_encoded_as_one_by_one():
     motions = [wander(frames=frames, seed=frames, turns=frames / 30) for frames in (3, 41, 20)]
-    for variant in ("clean", "legacy"):
-        representation = HumanML(variant=variant, bone_lengths=[0.2] * 22)
+    for representation in (HumanML(bone_lengths=[0.2] * 22), HumanML(variant="legacy"), Essential()):
         for many, motion in zip(representation.encode_many(motions), motions, strict=True):
             assert torch.equal(many, representation.encode(motion))
 
@@ -266,14 +262,12 @@ def test_bad_motions_and_options():
         if isinstance(representation, HumanML):
             with pytest.raises(UserError, match=f"motion 1: .*{message}"):
                 representation.encode_many([wander(), motion])
-    options: dict[str, Any]
-    for options, message in (
-        ({"skeleton": "smpl23"}, "smpl23.*smpl22"),
-        ({"variant": "old"}, "old.*legacy"),
-        ({"bone_lengths": [1.0, 2.0]}, "bone_lengths: 2 numbers for the 22 joints"),
-    ):
-        with pytest.raises(UserError, match=message):
-            HumanML(**options)
+    with pytest.raises(UserError, match="bone_lengths: 2 numbers for the 22 joints"):
+        HumanML(bone_lengths=[1.0, 2.0])
+    with pytest.raises(UserError, match=r"smpl23.*smpl22"):
+        HumanML("smpl23")
+    with pytest.raises(UserError, match="must be one of clean, legacy"):
+        check({"_target_": "flame_mdm.representations.humanml.HumanML", "variant": "old"})
 
 
 @golden_case("smpl147")
@@ -346,23 +340,15 @@ def test_every_recipe_builds_decodes_and_passes_gradients():
         assert (owners.sum(0) >= 1).all()
 
 
-TEMOS = "temos64"
-temos = golden_case(TEMOS)
-
-
 def in_kit_units(key: str) -> Tensor:
-    return torch.from_numpy(golden(TEMOS)[key])
+    return torch.from_numpy(golden("temos64")[key])
 
 
-def temos_clips() -> dict[str, Tensor]:
-    """Joints in meters by clip."""
-    return {name: in_kit_units(f"{name}/joints_in").double() / 640 for name in groups(golden(TEMOS), "joints_in")}
-
-
-@temos
+@golden_case("temos64")
 def test_features_floor_heading_and_joints_are_temos(stem: str):
     rifke, atol = Rifke(), 2e-3  # in KIT's unit, about 1.6 mm
-    for name, joints in temos_clips().items():
+    clips = {name: in_kit_units(f"{name}/joints_in").double() / 640 for name in groups(golden(stem), "joints_in")}
+    for name, joints in clips.items():
         close(rifke.encode(joints), in_kit_units(f"{name}/feats"), atol)
         close(rifke.floor(joints * 640)[None], in_kit_units(f"{name}/floor"), atol)
         heading = rifke.heading(joints * 640)
@@ -373,63 +359,51 @@ def test_features_floor_heading_and_joints_are_temos(stem: str):
         close(rifke.decode(in_kit_units(f"{name}/feats").double()) * 640, in_kit_units(f"{name}/joints_back"), atol)
     close(rifke.decode(in_kit_units("gen/feats").double()) * 640, in_kit_units("gen/joints_back"), atol)
     close(upsample(in_kit_units("upsample/in").double()), in_kit_units("upsample/out_12.5_to_100"), 1e-9)
-
-
-@temos
-def test_padding_enters_the_floor_of_a_batch_in_temos(stem: str):
-    features, clips = in_kit_units("batch/feats_padded"), temos_clips().values()
+    # padding enters the floor of a batch in TEMOS
+    features = in_kit_units("batch/feats_padded")
     for row, length in enumerate(in_kit_units("batch/lengths").tolist()):
-        padded = [functional.pad(c, (0, 0, 0, 0, 0, features.shape[1] - length)) for c in clips if len(c) == length]
-        errors = [(Rifke().encode(p)[:length] - features[row, :length]).abs().max() for p in padded]
-        assert min(errors) < 2e-3
-    close(Rifke().decode(features.double()) * 640, in_kit_units("batch/joints_back_padded"), 2e-3)
-
-
-@temos
-def test_normalization_is_temos(stem: str):
-    rifke, x = Rifke(), in_kit_units("norm/feats_clip0")
+        same = [clip for clip in clips.values() if len(clip) == length]
+        padded = [functional.pad(clip, (0, 0, 0, 0, 0, features.shape[1] - length)) for clip in same]
+        assert min((rifke.encode(p)[:length] - features[row, :length]).abs().max() for p in padded) < atol
+    close(rifke.decode(features.double()) * 640, in_kit_units("batch/joints_back_padded"), atol)
+    x = in_kit_units("norm/feats_clip0")
     rifke.mean.copy_(in_kit_units("norm/mean"))
     rifke.std.copy_(in_kit_units("norm/std"))
-    ours = rifke.normalize(rifke.encode(next(iter(temos_clips().values()))))
+    ours = rifke.normalize(rifke.encode(next(iter(clips.values()))))
     close(ours * rifke.std, x * rifke.std, 2e-3)
     close(rifke.to_joints(x) * 640, in_kit_units("norm/joints_back_clip0"), 5e-3)
 
 
-FIXTURE272 = golden("motion272")
-
-
-def array(name: str) -> Tensor:
-    return torch.from_numpy(FIXTURE272[name]).double()
-
-
-def pose(name: str) -> tuple[Tensor, Tensor]:
-    """Translation and rotation matrices of an array of 22 axis-angles, 6 zeros and a translation."""
-    values = array(name)
-    return values[:, 72:75], rotation.axis_angle_to_matrix(values[:, :66].unflatten(1, (22, 3)))
-
-
-def cases272(suffix: str) -> list[str]:
-    return [name.partition("/")[2] for name in groups(FIXTURE272, suffix) if not name.startswith("f64/")]
-
-
 @golden_case("motion272")
 def test_motion272_is_the_authors(stem: str):
-    representation = Motion272()
-    for case in cases272("face_z"):
+    representation, file = Motion272(), golden(stem)
+
+    def array(name: str) -> Tensor:
+        return torch.from_numpy(file[name]).double()
+
+    def pose(name: str) -> tuple[Tensor, Tensor]:
+        """Translation and rotation matrices of an array of 22 axis-angles, 6 zeros and a translation."""
+        values = array(name)
+        return values[:, 72:75], rotation.axis_angle_to_matrix(values[:, :66].unflatten(1, (22, 3)))
+
+    def cases(suffix: str) -> list[str]:
+        return [name.partition("/")[2] for name in groups(file, suffix) if not name.startswith("f64/")]
+
+    for case in cases("face_z"):
         translation, rotations = face_forward(*pose(f"in/{case}/smpl_85"))
         theirs, turned = pose(f"out/{case}/face_z")
         close(translation, theirs, 5e-6)
         close(rotations, turned, 1e-5)
         features = representation.features_of(array(f"in/{case}/joints"), turned)
         close(features, array(f"out/{case}/feats"), 2e-6)
-    for case in cases272("rec_positions"):
-        features = array(f"{'in' if f'in/{case}/feats' in FIXTURE272 else 'out'}/{case}/feats")
+    for case in cases("rec_positions"):
+        features = array(f"{'in' if f'in/{case}/feats' in file else 'out'}/{case}/feats")
         close(representation.decode(features), array(f"out/{case}/rec_positions"), 5e-6)
         pelvis, rotations = representation.poses(features)
         theirs, turned = pose(f"f64/{case}/rec_smpl_85")
         close(pelvis, theirs, 1e-5)
         close(rotations, turned, 1e-5)
-    frames = torch.cat([array(f"out/{case}/feats") for case in meta(FIXTURE272)["config"]["stats_over"]])
+    frames = torch.cat([array(f"out/{case}/feats") for case in meta(file)["config"]["stats_over"]])
     for ours, name in zip(representation.statistics(frames.float()), ("mean", "std"), strict=True):
         close(ours, array(f"out/stats/{name}"), 1e-6)
 
@@ -453,18 +427,14 @@ def test_essential_features_are_the_first_of_humanml_and_the_authors(stem: str):
     assert representation.part_of == whole.name != representation.name
 
 
-def raw(frames: int = 50) -> Tensor:
-    """A raw motion, z up: a body of 24 joints that walks in a circle and bends its joints."""
-    time = torch.linspace(0, 1, frames, dtype=torch.float64)
+def test_cuts_of_motion272_start_like_whole_motions():
+    """A body of 24 joints, z up, walks in a circle and bends its joints."""
+    time = torch.linspace(0, 1, 50, dtype=torch.float64)
     turns = 0.4 * torch.randn(24, 3, generator=torch.Generator().manual_seed(0)) * torch.sin(6 * time)[:, None, None]
     turns[:, 0] = torch.stack([torch.pi / 2 + 0 * time, 5 * time, 0 * time], 1)
     way = torch.stack([3 * torch.sin(5 * time), 3 * torch.cos(5 * time), 1 + 0.1 * torch.sin(20 * time)], 1)
-    return torch.cat([way, turns.flatten(1)], 1)
-
-
-def test_cuts_of_motion272_start_like_whole_motions():
     representation = Motion272()
-    features = representation.encode(raw())
+    features = representation.encode(torch.cat([way, turns.flatten(1)], 1))
     cut = representation.rebase(features[20:])
     close(cut[1:], features[21:], 0)
     assert not cut[0, :2].any()

@@ -11,15 +11,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from flame_mdm.commands import (
-    AdaptedSettings,
-    BodySettings,
-    about_key,
-    device_name,
-    existing,
-    model_source,
-    motion_file,
-)
+from flame_mdm.commands import AdaptedSettings, BodySettings, about_key, device_name, existing, motion_file
 from flame_mdm.errors import UserError, say, shortened
 from flame_mdm.safe_io import MEBIBYTE, read_text
 from flame_mdm.sampler_options import SamplerOptions, option, same_option
@@ -103,8 +95,6 @@ class SampleSettings(OutputSettings):
     split: bool = same_option(SamplingRequest, "split")
     loop: bool = same_option(SamplingRequest, "loop")
     path: str | None = option(None, 'way points on the floor, x,z in meters, instead of targets: "0,1 0.5,2"')
-    candidates: int = same_option(SamplingRequest, "candidates")
-    scorer: str | None = option(None, "a motion-CLIP that chooses the candidate that fits the text best", model_source)
     shared_noise: bool = same_option(SamplingRequest, "shared_noise")
     out: str | None = option(None, "folder; default samples/<experiment>/<text>-<hash>")
 
@@ -128,8 +118,6 @@ GALLERY = 200  # maximum number of motions on the page of a file of prompts, whi
 
 def main(settings: SampleSettings) -> None:
     request = settings.request()
-    if settings.scorer is not None and (request.kind != "text" or settings.candidates == 1):
-        raise UserError(f"scorer={settings.scorer} chooses among motions for a text: give text=... and candidates=8")
     file = settings.model_file()
 
     from flame_mdm.safe_io import sha256
@@ -142,16 +130,8 @@ def main(settings: SampleSettings) -> None:
         if text not in typed:
             say(f"sampled as a sequence: {text}. Add split=false to sample it as one action")
     check_condition(settings, request, model)
-    score = None
-    if settings.scorer is not None:
-        from evaluators.extractors import MotionCLIPExtractor
-
-        with about_key("scorer"):
-            scorer = MotionCLIPExtractor(settings.scorer, model.device)
-            scorer.check(model.representation, model.facts.get("dataset", ""))
-        score = scorer.fit
     stages = [] if settings.trajectory else None
-    motions = sample_request(model, request, score=score, stages=stages)
+    motions = sample_request(model, request, stages=stages)
     digest = sha256(file)
     folders = _folders(settings, request, model, digest, motions)
     for folder, made in folders.items():
@@ -174,7 +154,7 @@ def _folders(
 ) -> dict[Path, list[Motion]]:
     """Returns the folders to write, with the motions of each; a prompt that is listed twice has one folder."""
     shared = replace(request, texts=None, actions=None, seconds=None, frames=None, samples=1)
-    general = (digest, request.kind, shared, settings.scorer, settings.adapter, settings.adapter_strength)
+    general = (digest, request.kind, shared, settings.adapter, settings.adapter_strength)
     lengths = request.lengths(model.representation.fps)
     folders: dict[Path, list[Motion]] = {}
     for number, (prompt, length) in enumerate(zip(request.prompts, lengths, strict=True)):

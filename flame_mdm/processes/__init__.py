@@ -28,6 +28,9 @@ class Process(nn.Module, ABC):
     samplers: Mapping[str, Sampler] = {}
     """Samplers by name."""
 
+    average_padding: bool = False
+    """Whether losses are averaged over the padded length, with noise 0 in the padding."""
+
     @abstractmethod
     def out_features(self, features: int) -> int:
         """Returns the number of output channels of the denoiser for D = `features`: D, or 2D with learned variance."""
@@ -71,7 +74,7 @@ class Process(nn.Module, ABC):
         noise: Tensor | None = None,
         auxiliary: Auxiliary | None = None,
     ) -> dict[str, Tensor]:
-        """Returns training losses (B,) per sample: "mse" of the target, those of `auxiliary`, and "loss", their sum.
+        """Returns training losses (B,) per sample: those of `terms` and of `auxiliary`, and "loss", their sum.
 
         Times t (B,) and noise (B, F, D) are drawn from torch's default generator if not given.
         """
@@ -79,12 +82,21 @@ class Process(nn.Module, ABC):
             t = self.training_times(torch.rand(len(x), device=x.device))
         if noise is None:
             noise = torch.randn_like(x)
+        averaged = mask
+        if self.average_padding:
+            noise, averaged = noise * mask[..., None], torch.ones_like(mask)
         x_t = self.corrupt(x, noise, t)
         output = denoise(x_t, self.table_time(t), mask, cond).to(x_t.dtype)
-        terms = {"mse": masked_mse(output, self.target(x, noise, t), mask)}
+        terms = self.terms(output, x, noise, x_t, t, averaged)
         if auxiliary is not None:
             terms |= auxiliary(self.to_x0(output, x_t, t), x, mask)
         return terms | {"loss": torch.stack(list(terms.values())).sum(0)}
+
+    def terms(
+        self, output: Tensor, x: Tensor, noise: Tensor, x_t: Tensor, t: Tensor, mask: Tensor
+    ) -> dict[str, Tensor]:
+        """Returns the losses (B,) of the denoiser's output over the frames of the mask: "mse", that of the target."""
+        return {"mse": masked_mse(output, self.target(x, noise, t), mask)}
 
     @abstractmethod
     def sample(
@@ -100,18 +112,9 @@ class Process(nn.Module, ABC):
     ) -> Tensor:
         """Samples normalized motion (B, F, D) from noise; frames past the end of a motion are 0.
 
-        Args:
-            denoise: the denoiser, with or without guidance.
-            noise: draw 0 is the start.
-            mask: (B, F).
-            cond: the condition.
-            options: sampler and number of steps, and the options of the sampler; the guidance scale is ignored.
-            edit: parts of a motion to keep, in one of `edit_modes`.
-            trajectory: list to which the clean estimate (B, F, D) of each call is appended.
-
-        Raises:
-            UserError: If the process does not support the sampler, the number of steps or the edit, or the sampler does
-                not have one of the options.
+        Draw 0 of the noise is the start. The guidance scale of the options is ignored: `denoise` is guided or not. The
+        clean estimate (B, F, D) of each call is appended to `trajectory`. Raises `UserError` if the process does not
+        support the sampler, the number of steps or the edit, or the sampler does not have one of the options.
         """
 
     def find_sampler(self, options: SamplerOptions) -> Sampler:
@@ -133,18 +136,6 @@ class Process(nn.Module, ABC):
         if edit.mode not in self.edit_modes:
             modes = ", ".join(self.edit_modes)
             raise UserError(f"edit mode '{edit.mode}' is not supported: {type(self).__name__} has {modes}")
-        if edit.blend not in ("after", "before") or edit.resample < 1:
-            raise UserError(
-                f"edit has blend={edit.blend}, resample={edit.resample}: blend is after or before, resample at least 1"
-            )
-        if edit.strength is not None and not 0 < edit.strength <= 1:
-            raise UserError(f"strength={edit.strength}: choose a number above 0, up to 1")
         if edit.known.shape != edit.keep.shape or edit.known.shape[:2] != mask.shape:
             shapes = f"known {tuple(edit.known.shape)}, keep {tuple(edit.keep.shape)}"
             raise UserError(f"edit does not match the shape of the motions: {shapes}, mask {tuple(mask.shape)}")
-
-
-def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
-    """Raises `UserError` if an option of a process is not one of its choices."""
-    if value not in choices:
-        raise UserError(f"unknown {name} '{value}': choose from {', '.join(choices)}")

@@ -34,13 +34,10 @@ def consistency_terms(
 
     Args:
         process: of student and teacher; predicts the clean motion or the velocity.
-        student: computes f at x_t.
         follower: computes f after the step, the target, without gradient: the student or an average of its weights.
         teacher: guided.
-        x, mask, cond: motions (B, F, D), their real frames (B, F), and conditions.
         times: (N,), from pure noise on; see `Process.grid`.
         index: (B,) int64, the number of the time of each motion.
-        noise: (B, F, D), standard normal.
         auxiliary: geometric losses of the estimate against the target.
     """
     is_last = index == len(times) - 1
@@ -48,9 +45,8 @@ def consistency_terms(
     x_t = process.corrupt(x, noise, t)
     with torch.no_grad():
         guided = process.clean(teacher, x_t, t, mask, cond)
-        left = (x_t - process.corrupt(guided, torch.zeros_like(x), t)) / process.corrupt(
-            torch.zeros_like(x), torch.ones_like(x), t
-        )
+        zero, one = torch.zeros_like(x), torch.ones_like(x)
+        left = (x_t - process.corrupt(guided, zero, t)) / process.corrupt(zero, one, t)
         nearer = process.corrupt(guided, left, end)
         target = torch.where(is_last[:, None, None], guided, process.clean(follower, nearer, end, mask, cond))
     estimate = process.clean(student, x_t, t, mask, cond)

@@ -3,65 +3,17 @@
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Literal, get_args
+from typing import Literal
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from flame_mdm.batch import Condition, Denoise, Edit, Noise
 from flame_mdm.errors import UserError
 from flame_mdm.losses import masked_mean, masked_mse
-from flame_mdm.processes import Auxiliary, Process, check_choice, samplers
-from flame_mdm.processes.schedules import Schedule, ScheduleName, build_schedule, timesteps
+from flame_mdm.processes import Process, samplers
+from flame_mdm.processes.schedules import Schedule, build_schedule, timesteps
 from flame_mdm.sampler_options import SamplerOptions
-
-Prediction = Literal["x0", "epsilon", "velocity"]
-Variance = Literal["fixed_small", "fixed_large", "learned_range"]
-TimestepSampling = Literal["uniform", "loss_aware"]
-UNIFORM_SHARE = 0.001  # probability that `LossAwareTimesteps` draws uniformly, so that every step can be drawn
-
-
-class LossAwareTimesteps(nn.Module):
-    """Draws training steps in proportion to sqrt(E[L_t^2]) (Nichol and Dhariwal 2021, eq. 18).
-
-    E[L_t^2] is the mean over the last 10 losses of a step; until every step has 10, steps are drawn uniformly. The
-    history is stored in buffers: it is saved with the model, and with DDP that of rank 0 is broadcast to all ranks.
-    """
-
-    history: Tensor
-    counts: Tensor
-
-    def __init__(self, num_train_timesteps: int):
-        super().__init__()
-        self.register_buffer("history", torch.zeros(num_train_timesteps, 10))
-        self.register_buffer("counts", torch.zeros(num_train_timesteps, dtype=torch.int64))
-
-    def probabilities(self) -> Tensor:
-        """Returns the probability (T,) of each step."""
-        total, kept = self.history.shape
-        weights = self.history.square().mean(1).sqrt()
-        share = weights / weights.sum().clamp(min=torch.finfo(weights.dtype).tiny)
-        share = (1 - UNIFORM_SHARE) * share + UNIFORM_SHARE / total
-        return torch.where((self.counts >= kept).all(), share, torch.full_like(share, 1 / total))
-
-    def draw(self, batch: int) -> tuple[Tensor, Tensor]:
-        """Returns steps (B,) int64 and weights (B,) that make the expected losses those of uniform drawing."""
-        p = self.probabilities()
-        t = torch.multinomial(p, batch, replacement=True)
-        return t, 1 / (len(p) * p[t])
-
-    def update(self, t: Tensor, losses: Tensor) -> None:
-        """Adds unweighted losses (B,) at steps t (B,) int64, which may repeat, to the history."""
-        kept = self.history.shape[1]
-        order = torch.argsort(t, stable=True)
-        t, losses = t[order], losses.detach()[order].to(self.history)
-        index = torch.arange(len(t), device=t.device)
-        before = index - torch.searchsorted(t, t)
-        behind = torch.searchsorted(t, t, right=True) - 1 - index
-        slot = (self.counts[t] + before) % kept
-        newest = behind < kept
-        self.history[t[newest], slot[newest]] = losses[newest]
-        self.counts.index_add_(0, t, torch.ones_like(t))
 
 
 class GaussianDiffusion(Process):
@@ -80,7 +32,7 @@ class GaussianDiffusion(Process):
         average_padding: average losses over the padded length with noise 0 in the padding, as in FLAME's code, so
             that short motions have less weight. The denoiser must return 0 there.
         clip_x0: clamp the clean estimate to [-1, 1] in sampling, as in FLAME's code.
-        timestep_sampling: how training steps are drawn.
+        timestep_sampling: how training steps are drawn (FLAME, tables 6 and 7).
         skip: only with prediction epsilon: the noise is sqrt(1 - ab) x_t + sqrt(ab) times the output (Karras et al.
             2022, eq. 7, for data of variance 1), so that the network need not carry its input, and the clean
             estimate divides nothing by the signal. The output is then a velocity, trained with the error of the
@@ -95,31 +47,25 @@ class GaussianDiffusion(Process):
     def __init__(
         self,
         num_train_timesteps: int = 1000,
-        schedule: ScheduleName = "cosine",
-        prediction: Prediction = "x0",
-        variance: Variance = "fixed_small",
+        schedule: Literal["cosine", "linear"] = "cosine",
+        prediction: Literal["x0", "epsilon", "velocity"] = "x0",
+        variance: Literal["fixed_small", "fixed_large", "learned_range"] = "fixed_small",
         vlb_weight: float = 0.001,
         average_padding: bool = False,
         clip_x0: bool = False,
-        timestep_sampling: TimestepSampling = "uniform",
+        timestep_sampling: Literal["uniform"] = "uniform",
         skip: bool = False,
         min_snr: float | None = None,
     ):
         super().__init__()
-        check_choice("prediction", prediction, get_args(Prediction))
-        check_choice("variance", variance, get_args(Variance))
-        check_choice("timestep_sampling", timestep_sampling, get_args(TimestepSampling))
         if prediction != "epsilon" and skip:
             raise UserError("skip=true needs prediction epsilon")
         if min_snr is not None and not 0 < min_snr < math.inf:
             raise UserError(f"min_snr={min_snr}: give a number above 0, such as 5, or null")
         self.schedule = build_schedule(schedule, num_train_timesteps)
         self.prediction, self.skip, self.min_snr = prediction, skip, min_snr
-        self.variance = variance
-        self.vlb_weight = vlb_weight
-        self.average_padding = average_padding
-        self.clip_x0 = clip_x0
-        self.timesteps = LossAwareTimesteps(num_train_timesteps) if timestep_sampling == "loss_aware" else None
+        self.variance, self.vlb_weight = variance, vlb_weight
+        self.average_padding, self.clip_x0 = average_padding, clip_x0
 
     def out_features(self, features: int) -> int:
         return 2 * features if self.variance == "learned_range" else features
@@ -162,50 +108,18 @@ class GaussianDiffusion(Process):
         share = (output[..., x_t.shape[-1] :] + 1) / 2
         return share * schedule.at("log_betas", i, x_t) + (1 - share) * small
 
-    def loss(
-        self,
-        denoise: Denoise,
-        x: Tensor,
-        mask: Tensor,
-        cond: Condition,
-        *,
-        t: Tensor | None = None,
-        noise: Tensor | None = None,
-        auxiliary: Auxiliary | None = None,
+    def terms(
+        self, output: Tensor, x: Tensor, noise: Tensor, x_t: Tensor, t: Tensor, mask: Tensor
     ) -> dict[str, Tensor]:
-        """Returns the terms "mse" (FLAME, eq. 3), "vlb" if the variance is learned, those of `auxiliary`, and "loss".
-
-        Loss-aware steps are drawn, and their history updated, only in training mode and if t is not given. All terms
-        are then weighted so that they are unbiased.
-        """
-        weights = None
-        if t is None and self.timesteps is not None and self.training:
-            t, weights = self.timesteps.draw(len(x))
-            t = t.to(torch.float32)
-        elif t is None:
-            t = self.training_times(torch.rand(len(x), device=x.device))
-        if noise is None:
-            noise = torch.randn_like(x)
-        averaged = mask
-        if self.average_padding:
-            noise, averaged = noise * mask[..., None], torch.ones_like(mask)
-        x_t = self.corrupt(x, noise, t)
-        output = denoise(x_t, t, mask, cond).to(x_t.dtype)
+        """Returns the losses "mse" (FLAME, eq. 3) and, if the variance is learned, "vlb"."""
         # With the skip, an error in the output is that in the noise divided by the signal.
         scale = self.schedule.at("signal", t, x) if self.skip else 1.0
-        error = masked_mse(scale * output[..., : x.shape[-1]], scale * self.target(x, noise, t), averaged)
+        error = masked_mse(scale * output[..., : x.shape[-1]], scale * self.target(x, noise, t), mask)
         terms = {"mse": self._snr_weight(t) * error}
         if self.variance == "learned_range" and self.vlb_weight:
-            scale = self.vlb_weight * len(self.schedule)
-            terms["vlb"] = scale * masked_mean(self.vlb(output, x, x_t, t), averaged)
-        if auxiliary is not None:
-            terms |= auxiliary(self.to_x0(output, x_t, t), x, mask)
-        loss = torch.stack(list(terms.values())).sum(0)
-        if weights is not None and self.timesteps is not None:
-            self.timesteps.update(t.long(), loss)
-            terms = {name: weights * term for name, term in terms.items()}
-            loss = weights * loss
-        return terms | {"loss": loss}
+            bound = masked_mean(self.vlb(output, x, x_t, t), mask)
+            terms["vlb"] = self.vlb_weight * len(self.schedule) * bound
+        return terms
 
     def _snr_weight(self, t: Tensor) -> Tensor | float:
         """Returns the weight (B,) of the squared error of the prediction at steps t (B,)."""

@@ -2,17 +2,15 @@
 
 import itertools
 from functools import partial
-from typing import Literal, get_args
+from typing import Literal
 
 import torch
 from torch import Tensor
 
 from flame_mdm.batch import Condition, Denoise, Edit, Noise
 from flame_mdm.errors import UserError
-from flame_mdm.processes import Process, check_choice, samplers
+from flame_mdm.processes import Process, samplers
 from flame_mdm.sampler_options import SamplerOptions
-
-TimeDistribution = Literal["uniform", "logit_normal"]
 
 
 class FlowMatching(Process):
@@ -36,20 +34,15 @@ class FlowMatching(Process):
         self,
         sigma_min: float = 1e-4,
         prediction: Literal["velocity", "x0"] = "velocity",
-        time_distribution: TimeDistribution = "uniform",
+        time_distribution: Literal["uniform", "logit_normal"] = "uniform",
         quantize_time: bool = False,
         odeint_grid: bool = False,
     ):
         super().__init__()
-        check_choice("prediction", prediction, ("velocity", "x0"))
-        check_choice("time_distribution", time_distribution, get_args(TimeDistribution))
         if not 0 <= sigma_min < 1:
             raise UserError(f"sigma_min is {sigma_min}: choose a number in [0, 1)")
-        self.sigma_min = sigma_min
-        self.prediction = prediction
-        self.time_distribution = time_distribution
-        self.quantize_time = quantize_time
-        self.odeint_grid = odeint_grid
+        self.sigma_min, self.prediction, self.time_distribution = sigma_min, prediction, time_distribution
+        self.quantize_time, self.odeint_grid = quantize_time, odeint_grid
 
     def out_features(self, features: int) -> int:
         return features

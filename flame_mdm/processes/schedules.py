@@ -1,15 +1,12 @@
 """Noise schedules of Gaussian diffusion: coefficients, and selection of sampling steps."""
 
 import math
-from typing import Literal
 
 import torch
 from torch import Tensor
 
 from flame_mdm.errors import UserError
-from flame_mdm.sampler_options import MAX_STEPS, SPACINGS
-
-ScheduleName = Literal["cosine", "linear"]
+from flame_mdm.sampler_options import MAX_STEPS
 
 
 def cosine_betas(num_train_timesteps: int) -> Tensor:
@@ -93,14 +90,12 @@ class Schedule:
         return self.at("posterior_x0", i, x_t) * x0 + self.at("posterior_x_t", i, x_t) * x_t
 
 
-def build_schedule(name: ScheduleName, num_train_timesteps: int) -> Schedule:
-    """Returns the schedule of this name with 2 to `MAX_STEPS` steps."""
-    betas = {"cosine": cosine_betas, "linear": linear_betas}
-    if name not in betas:
-        raise UserError(f"unknown schedule '{name}': choose from {', '.join(betas)}")
+def build_schedule(name: str, num_train_timesteps: int) -> Schedule:
+    """Returns the schedule "cosine" or "linear" with 2 to `MAX_STEPS` steps."""
     if not 2 <= num_train_timesteps <= MAX_STEPS:
         raise UserError(f"num_train_timesteps is {num_train_timesteps}: a diffusion has 2 to {MAX_STEPS:,} steps")
-    return Schedule(betas[name](num_train_timesteps))
+    betas = {"cosine": cosine_betas, "linear": linear_betas}[name]
+    return Schedule(betas(num_train_timesteps))
 
 
 def timesteps(num_train_timesteps: int, num_inference_steps: int, spacing: str = "linspace") -> list[int]:
@@ -109,7 +104,7 @@ def timesteps(num_train_timesteps: int, num_inference_steps: int, spacing: str =
     The spacing "linspace" gives evenly spaced steps including both ends, rounded half to even ("N" in the code of MDM
     and FLAME, after Nichol and Dhariwal 2021). "stride" counts from 0 with the smallest integer stride that gives N
     steps, so that the last, noisiest step may be well below T - 1 ("ddimN" there, after Song et al. 2021). Raises
-    `UserError` if N is not in 1 ... T, the spacing is unknown, or no stride gives N steps.
+    `UserError` if N is not in 1 ... T, or no stride gives N steps.
     """
     total, count = num_train_timesteps, num_inference_steps
     if not 1 <= count <= total:
@@ -119,8 +114,6 @@ def timesteps(num_train_timesteps: int, num_inference_steps: int, spacing: str =
             if len(range(0, total, stride)) == count:
                 return list(range(0, total, stride))
         raise UserError(f"no stride gives {count} of {total} steps: choose another number or spacing=linspace")
-    if spacing != "linspace":
-        raise UserError(f"unknown spacing '{spacing}': choose from {', '.join(SPACINGS)}")
     stride = (total - 1) / (count - 1) if count > 1 else 1.0
     # A running sum, not i * stride: its rounding decides ties, and the released models were sampled at those steps.
     steps, position = [], 0.0

@@ -43,14 +43,9 @@ def blended(denoise: Denoise, windows: Windows) -> Denoise:
 def spans(lengths: Sequence[int], longest: int, overlap: int, loop: bool = False) -> list[tuple[int, int, int]]:
     """Covers the consecutive parts of a motion with windows: part, first frame and number of frames of each.
 
-    The windows of a part reach half the overlap into its neighbors. A part that does not fit into one window gets
-    several. A loop has windows that begin before frame 0.
-
-    Args:
-        lengths: frames of each part.
-        longest: maximum number of frames of a window, more than `overlap`.
-        overlap: frames that two windows share, even.
-        loop: whether the first part follows the last one.
+    The windows of a part reach half the overlap, an even number, into its neighbors. A part that does not fit into one
+    window of at most `longest` frames gets several. In a loop, the first part follows the last one, and windows begin
+    before frame 0.
     """
     total, begin, windows = sum(lengths), 0, []
     for part, length in enumerate(lengths):
@@ -63,10 +58,10 @@ def spans(lengths: Sequence[int], longest: int, overlap: int, loop: bool = False
     return windows
 
 
-def window_tensors(
+def cover(
     windows: Sequence[tuple[int, int, int]], totals: Sequence[int], overlap: int, width: int, device: torch.device
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Returns rows, frames, mask (W, L) and weights of `Windows` for motion, first frame and length of each window.
+) -> Windows:
+    """Returns windows, without conditions, by motion, first frame and length of each.
 
     The weight of a window rises over the overlap at its start and falls over the one at its end. Past its end, it holds
     the frames that follow in the motion, which has one of `totals` frames; its first frame follows the last.
@@ -77,4 +72,5 @@ def window_tensors(
     ramp = torch.minimum(position + 0.5, size[:, None] - position - 0.5) / overlap
     weights, index = torch.sin(ramp.clamp(0, 1) * torch.pi / 2) ** 2 * mask, (rows[:, None].expand_as(frames), frames)
     total = weights.new_zeros(len(totals), max(totals)).index_put(index, weights, accumulate=True)
-    return rows, frames, mask, weights / total[index]
+    batch = MotionBatch(torch.zeros(*mask.shape, 0, device=device), mask, [""] * len(windows))
+    return Windows(batch, rows, frames, weights / total[index])

@@ -19,8 +19,7 @@ Features = TypeVar("Features", np.ndarray, Tensor)
 class Frames:
     """The frames (N, D) of a data set, for `Representation.statistics`: they are read in parts, as often as needed."""
 
-    # returns all frames as arrays (F, D) of any length, each time in the same order
-    arrays: Callable[[], Iterable[np.ndarray]]
+    arrays: Callable[[], Iterable[np.ndarray]]  # returns arrays (F, D) of any length, each time in the same order
     count: int  # number of frames
 
     def __len__(self) -> int:

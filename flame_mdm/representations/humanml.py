@@ -48,6 +48,9 @@ class HumanML(Representation):
     each relative to its parent in the skeleton.
     """
 
+    essential: bool = False
+    """Whether the last three columns of the table are left out."""
+
     def __init__(
         self,
         skeleton: str = "smpl22",
@@ -62,20 +65,14 @@ class HumanML(Representation):
         Args:
             skeleton: key in `SKELETONS`.
             variant: "clean" for the intended features, "legacy" for the published ones.
-            fps: frames per second of the motions.
             bone_lengths: J lengths in the features' unit, of the bone that ends in each joint, that all motions are
                 retargeted to; None keeps the lengths of each motion.
             units_per_metre: KIT's features are in units of about 1/640 of a meter.
             contact_threshold: squared displacement of a foot per frame, in the features' unit, below which the foot is
                 in contact: 0.002 for HumanML3D, 0.05 for KIT.
-
-        Raises:
-            UserError: If the skeleton or variant is unknown, or the number of bone lengths is wrong.
         """
         if skeleton not in SKELETONS:
             raise UserError(f"skeleton: {skeleton!r} is unknown; use one of {', '.join(SKELETONS)}")
-        if variant not in ("clean", "legacy"):
-            raise UserError(f"variant: {variant!r} is unknown; use clean or legacy")
         joints = len(SKELETONS[skeleton])
         if bone_lengths is not None and len(bone_lengths) != joints:
             raise UserError(f"bone_lengths: {len(bone_lengths)} numbers for the {joints} joints of {skeleton}")
@@ -88,12 +85,15 @@ class HumanML(Representation):
             "velocities": 3 * joints,
             "contacts": 4,
         }
-        super().__init__(f"humanml-{variant}-{skeleton}", sum(widths.values()), fps, SKELETONS[skeleton])
+        name = f"humanml-{variant}-{skeleton}"
+        if self.essential:
+            widths = {column: widths[column] for column in ("turn", "root_velocity", "root_height", "positions")}
+            self.part_of, name = name, f"essential-{variant}-{skeleton}"
+        super().__init__(name, sum(widths.values()), fps, SKELETONS[skeleton])
         ends = np.cumsum(list(widths.values())).tolist()
         self.slices = {name: slice(end - widths[name], end) for name, end in zip(widths, ends, strict=True)}
-        self.legacy = variant == "legacy"
-        self.bone_lengths, self.units_per_metre = bone_lengths, units_per_metre
-        self.contact_threshold = contact_threshold
+        self.legacy, self.bone_lengths = variant == "legacy", bone_lengths
+        self.units_per_metre, self.contact_threshold = units_per_metre, contact_threshold
 
     def encode(self, motion: Tensor) -> Tensor:
         """Encodes finite joints (T >= 3, J, 3) in meters, y up, as features (T - 1, D) float32."""
@@ -120,7 +120,8 @@ class HumanML(Representation):
         contacts = way[:, list(self.skeleton.feet)].square().sum(-1) < self.contact_threshold
         features = [turn[:, None], root_velocity, joints[:, 0, 1:2]]
         features += [local[:, 1:].flatten(1), rotations.flatten(1), velocities.flatten(1), contacts]
-        return list(torch.cat([part.float() for part in features], 1).split([length - 1 for length in lengths]))
+        rows = torch.cat([part.float() for part in features], 1)[:, : self.features].contiguous()
+        return list(rows.split([length - 1 for length in lengths]))
 
     def canonicalize(self, motion: Tensor) -> Tensor:
         """Returns canonical joints (T, J, 3) float64 of joints (T, J, 3) in meters, `decode(encode(motion))`."""
@@ -141,18 +142,15 @@ class HumanML(Representation):
         """
         part = self.joint_mask(joints)
         feet = part[list(self.skeleton.feet)]
-        return torch.cat(
-            [part[:1].expand(4), *(part[1:].repeat_interleave(n) for n in (3, 6)), part.repeat_interleave(3), feet]
-        )
+        others = [part[1:].repeat_interleave(size) for size in (3, 6)]
+        return torch.cat([part[:1].expand(4), *others, part.repeat_interleave(3), feet])[: self.features]
 
     def _canonical(self, motions: Sequence[Tensor]) -> tuple[Tensor, list[int]]:
         """Returns all frames (N, J, 3) of the canonical motions, float64 in the features' unit, and their lengths."""
         for number, motion in enumerate(motions):
             name = f"motion {number}" if len(motions) > 1 else "motion"
-            if motion.ndim != 3 or motion.shape[1:] != (len(self.skeleton), 3):
-                raise UserError(
-                    f"{name}: shape {tuple(motion.shape)}, but {self.name} takes (frames, {len(self.skeleton)}, 3)"
-                )
+            if motion.ndim != 3 or motion.shape[1:] != (joints := len(self.skeleton), 3):
+                raise UserError(f"{name}: shape {tuple(motion.shape)}, but {self.name} takes (frames, {joints}, 3)")
             if len(motion) < 3:
                 raise UserError(f"{name}: {len(motion)} frames, but encoding needs at least 3; leave the motion out")
             check_finite(motion, name)
@@ -178,13 +176,13 @@ class HumanML(Representation):
 
     def _facing(self, joints: Tensor) -> Tensor:
         """Returns x and z (N, 2) of the direction hips and shoulders face; shorter if the body lies on its side."""
-        right_hip, left_hip, right_shoulder, left_shoulder = (joints[:, joint] for joint in self.skeleton.facing)
+        right_hip, left_hip, right_shoulder, left_shoulder = joints[:, list(self.skeleton.facing)].unbind(1)
         return _turn_forward((right_hip - left_hip) + (right_shoulder - left_shoulder))
 
     def _heading(self, joints: Tensor) -> Tensor:
         """Returns the smoothed heading (T,) of one canonical motion (T, J, 3)."""
         if self.legacy:
-            right_hip, left_hip, right_shoulder, left_shoulder = (joints[:, joint] for joint in self.skeleton.facing)
+            right_hip, left_hip, right_shoulder, left_shoulder = joints[:, list(self.skeleton.facing)].unbind(1)
             forward = _turn_forward((left_hip - right_hip) + (right_shoulder - left_shoulder)).numpy()
             x, z = gaussian_filter1d(forward, LEGACY_SMOOTHING_FRAMES, axis=0, mode="nearest").T
             heading = np.arctan2(x, z)

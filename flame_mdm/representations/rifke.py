@@ -67,7 +67,7 @@ class Rifke(Representation):
 
     def heading(self, joints: Tensor) -> Tensor:
         """Returns the heading (T,) of joints (T, 21, 3) in radians, 0 = +z, positive towards +x, in (-pi, pi]."""
-        left_knee, right_knee, left_elbow, right_elbow = (joints[:, joint] for joint in KNEES_AND_ELBOWS)
+        left_knee, right_knee, left_elbow, right_elbow = joints[:, KNEES_AND_ELBOWS].unbind(1)
         across = right_knee - left_knee + right_elbow - left_elbow
         return torch.atan2(-across[:, 2], across[:, 0])
 

@@ -28,10 +28,7 @@ def read_pose(motion: Tensor) -> tuple[Tensor, Tensor]:
     """Splits a raw SMPL motion (F, 3 + 3 K) into translation (F, 3) and matrices (F, 24, 3, 3), float64.
 
     It is a translation in meters, then K >= 24 axis-angle vectors. Of SMPL+H's 52, the first 24 are used, as in FLAME's
-    code, so that the hands are its left_index1 and left_index2.
-
-    Raises:
-        UserError: If there are no frames, fewer than 24 joints, or non-finite numbers.
+    code, so that the hands are its left_index1 and left_index2. Raises `UserError` if a number is not finite.
     """
     if motion.ndim != 2 or not len(motion) or motion.shape[1] < 75 or motion.shape[1] % 3:
         raise UserError(
@@ -57,7 +54,6 @@ class SMPL(Representation):
         self.offsets = offsets
 
     def encode(self, motion: Tensor) -> Tensor:
-        """Encodes a raw motion (F, 3 + 3 K) as features (F, 147) float32."""
         translation, rotations = read_pose(motion)
         return torch.cat([translation, rotation.matrix_to_rot6d(rotations, "rows").flatten(1)], 1).float()
 
@@ -69,6 +65,5 @@ class SMPL(Representation):
         return joints[..., [0, 2, 1]] * joints.new_tensor([-1.0, 1.0, 1.0])
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
-        """Returns (D,) bool, True for the features of these joints; the translation belongs to joint 0."""
         part = self.joint_mask(joints)
         return torch.cat([part[:1].expand(3), part.repeat_interleave(6)])

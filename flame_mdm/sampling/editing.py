@@ -70,10 +70,8 @@ def edit(
             of `flame_mdm.sampler_options.SamplerOptions`. `cleanup` also changes the kept part, by millimeters as a
             rule; `joint_error` says by how much.
 
-    Raises:
-        UserError: If the request is invalid, the mask keeps everything or nothing, the process does not support the
-            method, or the motion cannot be read or is longer than those in training.
-        FileNotFoundError: If the file or data set does not exist.
+    Raises `UserError` if the request is invalid, the mask keeps everything or nothing, the process does not support the
+    method, or the motion cannot be read or is longer than those in training.
     """
     request = SamplingRequest.of("edit", True, texts=texts, **keywords)
     return edit_request(model, motion, request, fps=fps, stages=stages)
@@ -109,8 +107,6 @@ def edit_request(
             "no part of the motion is kept: choose region=..., region_seconds=... or joints=..., or vary all "
             "of it with strength=0.5"
         )
-    if keep.all():
-        raise UserError("the entire motion is kept: choose a region or joints to resample")
     frames = tuple(_part_length(parts, length, original.fps) for parts in request.parts)
     how, options = method_options(model.process, editing, request.options)
     normalized = representation.normalize(torch.from_numpy(original.features).to(model.device))
@@ -146,34 +142,29 @@ def _part_length(parts: Sequence[Part], length: int, fps: float) -> int:
 
 def kept_parts(representation: Representation, length: int, editing: EditRequest) -> tuple[Tensor, Tensor]:
     """Returns which features (F, D) and joints (F, J) of each frame an edit of a motion with `length` frames keeps."""
-    new_frames, joints = _new_frames(length, representation.fps, editing), editing.joints
-    part = torch.zeros(len(representation.skeleton), dtype=torch.bool)
-    part[list(range(len(part))) if joints is None else find_joints(representation.skeleton, joints)] = True
-    features = torch.tensor([True])
-    if joints is not None:
-        features = representation.joint_features(part.nonzero()[:, 0].tolist())
-    keep = ~(new_frames[:, None] & features).expand(length, representation.features)
-    return keep, ~(new_frames[:, None] & part)
+    new_frames = _new_frames(length, representation.fps, editing)[:, None]
+    if editing.joints is None:
+        return ~new_frames.expand(-1, representation.features), ~new_frames.expand(-1, len(representation.skeleton))
+    joints = find_joints(representation.skeleton, editing.joints)
+    return ~(new_frames & representation.joint_features(joints)), ~(new_frames & representation.joint_mask(joints))
 
 
 def _new_frames(length: int, fps: float, editing: EditRequest) -> Tensor:
     frame = torch.arange(length)
     first, last = int(0.25 * length), int(0.75 * length)
     if isinstance(editing.region, str):
-        kept = {
-            "in_between": (frame < first) | (frame >= last),
-            "prediction": frame < first,
-            "prefix": frame < first,
-            "suffix": frame >= last,
-            "interpolate": frame % 5 == 0,
+        new = {
+            "in_between": (frame >= first) & (frame < last),
+            "prediction": frame >= first,
+            "prefix": frame >= first,
+            "suffix": frame < last,
+            "interpolate": frame % 5 != 0,
         }
-        return ~kept[editing.region]
+        return new[editing.region]
     name, scale = ("region", 1.0) if editing.region_seconds is None else ("region_seconds", fps)
     ranges = editing.ranges(name)
-    if ranges is None:  # no region is chosen: all frames
-        return torch.ones(length, dtype=torch.bool)
-    new = torch.zeros(length, dtype=torch.bool)
-    for begin, end in ranges:
+    new = torch.full((length,), ranges is None)  # by default, all frames
+    for begin, end in ranges or ():
         first, last = round(begin * scale), round(end * scale)
         if not 0 <= first < last <= length:
             raise UserError(
@@ -189,9 +180,8 @@ def method_options(
 ) -> tuple[dict[str, Any], SamplerOptions]:
     """Returns the options of `Edit` for the requested method, by default that of the process, and of the sampler."""
     possible = [name for name, how in METHODS.items() if how["mode"] in process.edit_modes]
-    method = editing.method
-    if method is None:
-        method = next(name for name in possible if METHODS[name]["mode"] == process.edit_modes[0])
+    usual = next(name for name in possible if METHODS[name]["mode"] == process.edit_modes[0])
+    method = editing.method or usual
     if method not in possible:
         raise UserError(
             f"method={method} is not supported by {type(process).__name__}; this model supports: {', '.join(possible)}"

@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,6 @@ from torch import Tensor
 from flame_mdm.batch import Edit, MotionBatch, length_mask, pad_to
 from flame_mdm.errors import UserError
 from flame_mdm.formats.cleanup import cleaned
-from flame_mdm.formats.faults import find_faults
 from flame_mdm.formats.motion import Motion
 from flame_mdm.generator import MotionGenerator
 from flame_mdm.safe_io import atomic_folder
@@ -30,14 +29,11 @@ STAGES = 10  # number of clean estimates shown of one sampling run: one per tent
 REQUEST_FILES = re.compile(r"motion_\d{3,}\.npz|motions\.mp4|trajectory\.png")
 """Files that some requests write and others do not."""
 
-Score = Callable[[Sequence[Motion]], Sequence[float]]  # scores motions; higher is better
-
 
 def generate(
     model: MotionGenerator,
     texts: str | Sequence[str] | None = None,
     *,
-    score: Score | None = None,
     edit: Edit | None = None,
     stages: list[Motion] | None = None,
     **keywords: Any,
@@ -51,38 +47,28 @@ def generate(
     Args:
         model: from `flame_mdm.load`.
         texts: what the person does; one text or several.
-        score: chooses among the candidates without faults; None = the number of faulty frames decides.
         edit: part of a motion of that length to keep in every sample, with `known` and `keep` (1, F, D).
         stages: list that gets the clean estimates along the sampling of the first motion, at equal intervals, and that
             motion itself (MFM, figure 5).
-        keywords: fields of `flame_mdm.sampling.request.SamplingRequest`, such as actions, seconds, samples, candidates,
-            seed, after, loop, targets and cleanup, and of `flame_mdm.sampler_options.SamplerOptions`, such as
+        keywords: fields of `flame_mdm.sampling.request.SamplingRequest`, such as actions, seconds, samples, seed,
+            after, loop, targets and cleanup, and of `flame_mdm.sampler_options.SamplerOptions`, such as
             guidance_scale, sampler and num_inference_steps.
 
-    Raises:
-        UserError: If the request is invalid, the model cannot do what is requested, or knows no word of a text that
-            says what happens.
+    Raises `UserError` if the request is invalid, the model cannot do what is requested, or knows no word of a text that
+    says what happens.
     """
     request = SamplingRequest.of("generate", texts=texts, **keywords)
-    return sample_request(model, understood(request, model), score=score, edit=edit, stages=stages)
+    return sample_request(model, understood(request, model), edit=edit, stages=stages)
 
 
 def sample_request(
     model: MotionGenerator,
     request: SamplingRequest,
     *,
-    score: Score | None = None,
     edit: Edit | None = None,
     stages: list[Motion] | None = None,
 ) -> list[Motion]:
-    """Samples the motions of a request: checks it against the model, plans, samples in batches, and finishes.
-
-    Args and Raises: see `generate`.
-    """
-    if stages is not None and request.candidates > 1:
-        raise UserError("trajectory shows the estimates of a single motion: omit candidates or trajectory")
-    if request.editing is not None:
-        raise UserError("this request edits a motion. Call flame_mdm.edit")
+    """Samples the motions of a request: checks it against the model, plans, and samples in batches; see `generate`."""
     if edit is not None:
         request.check_edit(edit.strength is not None)
     check_model(request, model)
@@ -93,9 +79,6 @@ def sample_request(
         motions += _sample(model, plan, slice(begin, begin + BATCH), trajectory)
         if stages is not None and trajectory:
             stages += _stages(model, trajectory, motions[0])
-    if request.candidates > 1:
-        groups = range(0, len(motions), request.candidates)
-        motions = [best(motions[first : first + request.candidates], score) for first in groups]
     if request.cleanup:
         motions = [cleaned(motion, model.representation.contacts(motion.features)) for motion in motions]
     return motions
@@ -109,28 +92,29 @@ class _Plan:
     """
 
     def __init__(self, model: MotionGenerator, request: SamplingRequest, edit: Edit | None):
-        copies = request.samples * request.candidates
+        copies = range(request.samples)
         self.request, self.edit, self.ids = request, edit, list[str]()
-        self.captions = [prompt for prompt in request.prompts for _ in range(copies)]
+        self.captions = [prompt for prompt in request.prompts for _ in copies]
         counts: Counter[str] = Counter()
         for caption in self.captions:
             self.ids.append(f"{caption}#{counts[caption]}")
             counts[caption] += 1
         self.before: Tensor | None = None
         lengths, shared = motion_lengths(model, request), overlap(model)
-        if request.after is not None:  # its last frames are generated again, but kept
-            after, own = request.after, model.representation
-            motion = with_features(own, after) if isinstance(after, Motion) else read_motion(own, after)
+        representation = model.representation
+        if (after := request.after) is not None:  # its last frames are generated again, but kept
+            motion = after if isinstance(after, Motion) else read_motion(representation, after)
+            motion = with_features(representation, motion)
             if shared > len(motion.features):
-                what = f"{len(motion.features)} frames are too short. Give at least {shared}"
-                raise UserError(f"after={motion.id}: {what}")
+                count = len(motion.features)
+                raise UserError(f"after={motion.id}: {count} frames are too short. Give at least {shared}")
             self.before = torch.from_numpy(motion.features)
             lengths = [[shared + first, *others] for first, *others in lengths]
-            ending = model.representation.normalize(self.before[-shared:].to(model.device))[None]
+            ending = representation.normalize(self.before[-shared:].to(model.device))[None]
             self.edit = Edit(ending, torch.ones_like(ending, dtype=torch.bool))
-        self.lengths = [parts for parts in lengths for _ in range(copies)]
-        self.conditions = [[name for name, _ in parts] for parts in request.parts for _ in range(copies)]
-        self.targets = None if request.targets is None else read_targets(model.representation, request.targets)
+        self.lengths = [parts for parts in lengths for _ in copies]
+        self.conditions = [[name for name, _ in parts] for parts in request.parts for _ in copies]
+        self.targets = None if request.targets is None else read_targets(representation, request.targets)
 
 
 def _sample(model: MotionGenerator, plan: _Plan, rows: slice, trajectory: list[Tensor] | None) -> list[Motion]:
@@ -189,16 +173,6 @@ def _decoded(model: MotionGenerator, plan: _Plan, row: int, x: Tensor) -> Motion
         begins = [0 if plan.before is None else len(plan.before), *ends]
         motion.parts = tuple(zip(plan.conditions[row], begins, ends, strict=False))
     return motion
-
-
-def best(candidates: Sequence[Motion], score: Score | None = None) -> Motion:
-    """Returns the candidate without faults that has the highest score, or the one with the fewest faulty frames."""
-    faulty = [len({frame for f in find_faults(x) for frame in range(f.start, f.end)}) for x in candidates]
-    if score is None:
-        return candidates[faulty.index(min(faulty))]
-    passed = [motion for motion, frames in zip(candidates, faulty, strict=True) if not frames] or candidates
-    scores = list(score(passed))
-    return passed[scores.index(max(scores))]
 
 
 class _First(list[Tensor]):

@@ -32,7 +32,6 @@ def read_motion(
     """Reads a motion to edit and computes the features of a model.
 
     Args:
-        representation: the representation of the model.
         source: a motion file of any kind that `flame_mdm.formats.readers.read` reads; or `dataset:id`, a clip of a
             prepared data set. Features of the same representation and frame rate are kept. Joints are resampled to the
             frame rate of the model and made canonical by its representation.
@@ -41,21 +40,17 @@ def read_motion(
         cut: begin and end, in seconds, of the part to use.
         data_root: folder of the prepared data sets.
 
-    Raises:
-        FileNotFoundError: If the file or data set does not exist.
-        UserError: If the file is damaged, the clip is unknown, `cut` is outside of the motion, or this representation
-            cannot encode the motion.
+    Raises `FileNotFoundError` if the file or data set does not exist, and `UserError` if the file is damaged, the clip
+    is unknown, `cut` is outside of the motion, or this representation cannot encode the motion.
     """
     name = str(source)
     if Path(source).suffix.lower() in ENDINGS:
-        fields = find_skeleton(Path(source), up)
-        motion = replace(read(source, fps, unit, representation.fps, fields), id=name)
-        motion = with_features(representation, motion)
+        motion = read(source, fps, unit, representation.fps, find_skeleton(Path(source), up))
+        motion = with_features(representation, replace(motion, id=name))
     elif ":" in name:
         motion = _read_clip(representation, name, Path(data_root))
     else:
-        kinds = f"Give a {', '.join(ENDINGS)} file, or dataset:id for a clip of a prepared data set"
-        raise UserError(f"{name}: not a motion. {kinds}")
+        raise UserError(f"{name}: not a motion. Give a {', '.join(ENDINGS)} file, or dataset:id for a prepared clip")
     if cut is not None:
         if not is_range(cut):
             raise UserError(f"cut={cut}: write [begin, end], in seconds")
@@ -70,8 +65,7 @@ def read_motion(
 def with_features(representation: Representation, motion: Motion) -> Motion:
     """Returns the motion if it has features of this representation, otherwise computes them from its joints."""
     name = f"{motion.id}: " if motion.id else ""
-    fits = motion.representation == representation.name and math.isclose(motion.fps, representation.fps)
-    if fits:
+    if motion.representation == representation.name and math.isclose(motion.fps, representation.fps):
         shape, size = motion.features.shape, representation.features
         if shape[1:] != (size,) or not np.isfinite(motion.features).all():
             raise UserError(f"{name}features of shape {shape}, not (frames, {size}), or not finite")

@@ -47,8 +47,7 @@ ARRIVAL = 0.2  # seconds before the end of a motion at which the last way point 
 class EditRequest:
     """Which part of a motion to resample: `joints` in the frames of `region`, by default all; and how.
 
-    Raises:
-        UserError: If a value is invalid for every model and motion.
+    Raises `UserError` if a value is invalid for every model and motion.
     """
 
     region: str | Ranges | None = option(
@@ -77,17 +76,12 @@ class EditRequest:
     def __post_init__(self) -> None:
         if self.region is not None and self.region_seconds is not None:
             raise UserError("give region or region_seconds, not both")
-        if isinstance(self.region, str) and self.region not in REGIONS:
-            raise UserError(
-                f"region={self.region} is unknown.{did_you_mean(self.region, REGIONS)} Give ranges [begin, end], or "
-                f"one of: {', '.join(REGIONS)}. Body parts are given by joints="
-            )
+        for name, choices in (("region", REGIONS), ("method", METHODS)):
+            value = getattr(self, name)
+            if isinstance(value, str) and value not in choices:
+                raise UserError(f"{name}={value} is unknown.{did_you_mean(value, choices)} Use {', '.join(choices)}")
         for name in ("region", "region_seconds"):
             self.ranges(name)
-        if self.method is not None and self.method not in METHODS:
-            raise UserError(
-                f"method={self.method} is unknown.{did_you_mean(self.method, METHODS)} Choose from {', '.join(METHODS)}"
-            )
         if type(self.resample) is not int or self.resample < 1:
             raise UserError(f"resample={self.resample}: give a whole number, 1 or more")
         if self.strength is not None and not 0 < self.strength <= 1:
@@ -112,16 +106,14 @@ class EditRequest:
 
     def method_options(self, method: str) -> dict[str, Any]:
         """Returns the options of `flame_mdm.batch.Edit` for a method, which must have those of this request."""
-        options = dict(METHODS[method])
-        if self.until is not None and options["mode"] != "trajectory":
-            raise UserError(f"until={self.until:g} is an option of method=mfm, not of {method}")
+        options = METHODS[method] | {"resample": self.resample, "strength": self.strength}
         if self.resample != 1 and options["mode"] != "x_t":
             raise UserError(f"resample={self.resample} is an option of method=flame and flame_code, not of {method}")
-        if self.until is not None:
-            options["until"] = self.until
-        if self.strength is not None:
-            options["strength"] = self.strength
-        return options | {"resample": self.resample}
+        if self.until is None:
+            return options
+        if options["mode"] != "trajectory":
+            raise UserError(f"until={self.until:g} is an option of method=mfm, not of {method}")
+        return options | {"until": self.until}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,10 +124,8 @@ class SamplingRequest:
     are generated together as one motion, in windows that overlap; see docs/sequences.md. So is a single part with
     seconds, "walks forward @10", which may be longer than the motions in training.
 
-    A single text, action or list of lengths is stored as a tuple.
-
-    Raises:
-        UserError: If a value is invalid for every model, or two values contradict each other.
+    A single text, action or list of lengths is stored as a tuple. Raises `UserError` if a value is invalid for every
+    model, or two values contradict each other.
     """
 
     texts: str | Sequence[str] | None = option(
@@ -150,9 +140,6 @@ class SamplingRequest:
     )
     frames: int | Sequence[int] | None = option(None, "the same in frames, instead of seconds")
     samples: int = option(1, "motions per text or action")
-    candidates: int = option(
-        1, "motions generated for each one that is kept: the best without faults, if there is one without"
-    )
     seed: int = option(0, "seed of the noise")
     after: str | Path | Motion | None = option(None, "FILE or dataset:id: a motion that the result continues")
     split: bool = option(True, 'sentences with several actions, "walks, then sits", become sequences, "walks | sits"')
@@ -170,16 +157,16 @@ class SamplingRequest:
     @classmethod
     def of(cls, function: str, editing: bool = False, /, **keywords: Any) -> SamplingRequest:
         """Returns the request of keywords: fields of this class, `SamplerOptions` and, of edits, `EditRequest`."""
-        names = [entry.name for entry in fields(cls) if entry.name not in ("options", "editing")]
-        sampler = [entry.name for entry in fields(SamplerOptions)]
-        edits = [entry.name for entry in fields(EditRequest)] if editing else []
+        kinds = [cls, SamplerOptions, *([EditRequest] if editing else [])]
+        names = {kind: [entry.name for entry in fields(kind)] for kind in kinds}
+        names[cls] = [name for name in names[cls] if name not in ("options", "editing")]
+        possible = [name for listed in names.values() for name in listed]
         for keyword in keywords:
-            if keyword not in (possible := [*names, *sampler, *edits]):
+            if keyword not in possible:
                 raise UserError(f"{function} has no option {keyword}.{did_you_mean(keyword, possible)}")
-        values = {name: keywords[name] for name in names if name in keywords}
-        options = SamplerOptions(**{name: keywords[name] for name in sampler if name in keywords})
-        edit = EditRequest(**{name: keywords[name] for name in edits if name in keywords}) if editing else None
-        return cls(**values, options=options, editing=edit)
+        keywords_of = {kind: {name: keywords[name] for name in names[kind] if name in keywords} for kind in kinds}
+        edit = EditRequest(**keywords_of[EditRequest]) if editing else None
+        return cls(**keywords_of[cls], options=SamplerOptions(**keywords_of[SamplerOptions]), editing=edit)
 
     def __post_init__(self) -> None:
         for name in ("texts", "actions", "seconds", "frames"):
@@ -188,10 +175,8 @@ class SamplingRequest:
             if isinstance(value, str) and name in ("texts", "actions"):
                 value = (value,)
             object.__setattr__(self, name, tuple(value) if isinstance(value, list | tuple) else value)
-        for name in ("samples", "candidates"):
-            value = getattr(self, name)
-            if not isinstance(value, Integral) or not 1 <= int(value) <= MAX_SAMPLES:
-                raise UserError(f"{name}={value}: give 1 to {MAX_SAMPLES:,}")
+        if not isinstance(self.samples, Integral) or not 1 <= int(self.samples) <= MAX_SAMPLES:
+            raise UserError(f"samples={self.samples}: give 1 to {MAX_SAMPLES:,}")
         if not isinstance(self.seed, Integral):
             raise UserError(f"seed={self.seed!r}: give a whole number")
         self._check_prompts()
@@ -211,13 +196,13 @@ class SamplingRequest:
         for prompt in self.prompts:
             if not isinstance(prompt, str):
                 raise UserError(f"{self.kind}={prompt!r} is not a string. Give a string, such as {self.kind}='walk'")
-            if len(prompt) > MAX_TEXT_LENGTH:
-                long = f"{len(prompt):,} characters are too many. Give at most {MAX_TEXT_LENGTH:,}"
-                raise UserError(f"{shortened(prompt, 60)}: {long}")
+            if (count := len(prompt)) > MAX_TEXT_LENGTH:
+                start = shortened(prompt, 60)
+                raise UserError(f"{start}: {count:,} characters are too many. Give at most {MAX_TEXT_LENGTH:,}")
         if self.texts is not None and not all(text.strip() for text in self.prompts):
             raise UserError("empty text. Omit the text to sample without condition")
-        if len(self.prompts) * self.samples * self.candidates > MAX_SAMPLES:
-            texts = f"{len(self.prompts):,} texts with samples={self.samples * self.candidates}"
+        if len(self.prompts) * self.samples > MAX_SAMPLES:
+            texts = f"{len(self.prompts):,} texts with samples={self.samples}"
             raise UserError(f"{texts}: at most {MAX_SAMPLES:,} motions per request")
         _ = self.parts  # raises if a part is invalid
 
@@ -227,12 +212,11 @@ class SamplingRequest:
         name, value = ("frames", self.frames) if self.seconds is None else ("seconds", self.seconds)
         if value is None:
             return
-        lengths: list[Any] = list(value) if isinstance(value, tuple) else [value] * len(self.prompts)
-        shown = f"{name}={lengths if isinstance(value, tuple) else value}"
-        if len(lengths) != len(self.prompts):
+        shown = f"{name}={list(value) if isinstance(value, tuple) else value}"
+        if len(self._lengths) != len(self.prompts):
             prompts = "1 prompt" if len(self.prompts) == 1 else f"{len(self.prompts)} prompts"
-            raise UserError(f"{shown}: {len(lengths)} lengths for {prompts}. Give one length, or one per prompt")
-        for length in lengths:
+            raise UserError(f"{shown}: {len(self._lengths)} lengths for {prompts}. Give one length, or one per prompt")
+        for length in self._lengths:
             if not issubclass(type(length), Real) or not abs(length) < 1e9 or (name == "frames" and length % 1):
                 raise UserError(f"{shown} is not a valid length")
 
@@ -267,9 +251,13 @@ class SamplingRequest:
 
     def lengths(self, fps: float) -> list[float | None]:
         """Returns the length of each prompt in frames, not rounded; None where the request gives none."""
-        value, scale = (self.frames, 1.0) if self.seconds is None else (self.seconds, fps)
-        values: list[Any] = list(value) if isinstance(value, tuple) else [value] * len(self.prompts)
-        return [None if length is None else length * scale for length in values]
+        scale = 1.0 if self.seconds is None else fps
+        return [None if length is None else length * scale for length in self._lengths]
+
+    @property
+    def _lengths(self) -> list[Any]:
+        value = self.frames if self.seconds is None else self.seconds
+        return list(value) if isinstance(value, tuple) else [value] * len(self.prompts)
 
 
 def understood(request: SamplingRequest, model: MotionGenerator) -> SamplingRequest:

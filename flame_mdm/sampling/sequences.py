@@ -4,10 +4,9 @@ from collections.abc import Sequence
 
 import torch
 
-from flame_mdm.batch import MotionBatch
 from flame_mdm.errors import UserError
 from flame_mdm.generator import MotionGenerator
-from flame_mdm.processes.windows import Windows, spans, window_tensors
+from flame_mdm.processes.windows import Windows, cover, spans
 from flame_mdm.sampling.request import Part, SamplingRequest
 
 OVERLAP = 0.5  # seconds that neighboring windows share; see docs/sequences.md
@@ -76,12 +75,9 @@ def windows(
     # A denoiser that attends to its padding sees as many frames as in training.
     width = max(size for *_, size in covering) if model.denoiser.mask_padding else longest
     positions = [(row, first, size) for row, _, first, size in covering]
-    rows, frames, mask, weights = window_tensors(positions, [sum(parts) for parts in lengths], shared, width, device)
-    batch = MotionBatch(
-        x=torch.zeros(*mask.shape, 0, device=device),
-        mask=mask,
-        ids=names,
-        text=names if actions is None else None,
-        action=None if actions is None else torch.tensor([actions.index(name) for name in names], device=device),
-    )
-    return Windows(batch, rows, frames, weights)
+    covered = cover(positions, [sum(parts) for parts in lengths], shared, width, device)
+    if actions is None:
+        covered.batch.text = names
+    else:
+        covered.batch.action = torch.tensor([actions.index(name) for name in names], device=device)
+    return covered

@@ -1,14 +1,14 @@
 """Targets in the world: way points of the root, joint positions, and whole poses at given times."""
 
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
+from pydantic import Field
 from torch import Tensor
 
 from flame_mdm.batch import Edit
@@ -16,19 +16,46 @@ from flame_mdm.errors import UserError, did_you_mean
 from flame_mdm.formats.motion import Motion
 from flame_mdm.processes.guidance import Positions, reach, steer
 from flame_mdm.representations import Representation, rotation
-from flame_mdm.safe_io import MEBIBYTE, read_text
 from flame_mdm.sampling.reading import read_motion
+from flame_mdm.schemas import ClosedSchema, check_shape, read_json
 
 SMOOTHNESS = 0.2  # seconds over which a correction fades; see docs/targets.md
 MAX_SPEED = 8.0  # meters per second that way points may require
 REACH = 2.5  # maximum height of a joint above the floor, and its maximum distance from where the body stands, in meters
 MAX_COORDINATES = 600  # maximum number of coordinates; they are solved for together in every step
-KEYS = {
-    "root": ({"time", "position"}, set[str]()),
-    "joints": ({"time", "joint", "position"}, set[str]()),
-    "poses": ({"time", "file"}, {"frame", "position", "heading"}),
-}
-"""Kinds of targets, with the keys that each entry must have and those that it may have."""
+Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)] | None  # meters; None = free
+OnFloor = Annotated[Sequence[Coordinate], Field(min_length=2, max_length=2)]  # x and z
+
+
+class WayPoint(ClosedSchema):
+    """A place of the root over the floor."""
+
+    time: Annotated[float, Field(ge=0, le=1e4)]  # seconds
+    position: OnFloor
+
+
+class JointTarget(WayPoint):
+    """A place of a joint."""
+
+    joint: str
+    position: Annotated[Sequence[Coordinate], Field(min_length=3, max_length=3)]
+
+
+class PoseTarget(WayPoint):
+    """A frame of a motion, at a place or anywhere; `heading` is in degrees."""
+
+    file: str
+    frame: Annotated[int, Field(ge=0)] = 0
+    position: OnFloor | None = None
+    heading: Annotated[float, Field(ge=-1e4, le=1e4)] | None = None
+
+
+class TargetFile(ClosedSchema):
+    """Content of a JSON file of targets; see docs/targets.md."""
+
+    root: Sequence[WayPoint] = ()
+    joints: Sequence[JointTarget] = ()
+    poses: Sequence[PoseTarget] = ()
 
 
 class Goal(NamedTuple):
@@ -44,8 +71,8 @@ class Goal(NamedTuple):
 class PositionGuide:
     """Leads motions to positions in the world; a `flame_mdm.batch.Guide`."""
 
-    representation: Representation  # decodes motions as joints
-    positions: Positions  # the goal
+    representation: Representation
+    positions: Positions
     bones: Tensor  # (3, N) frame, parent and child of the bones that keep their lengths
     poses: Tensor  # (1, F, D) features that are imposed in any case
     keep: Tensor  # and where
@@ -99,100 +126,63 @@ def errors(motion: Motion, targets: Targets) -> np.ndarray:
 
 def read_targets(representation: Representation, source: str | Path | Mapping[str, Any]) -> Targets:
     """Reads targets from a JSON file, or from its content (docs/targets.md); raises `UserError` if they are invalid."""
-    name, folder = ("targets", Path()) if isinstance(source, Mapping) else (f"targets={source}", Path(source).parent)
-    content = source if isinstance(source, Mapping) else _read(source, name)
-    if not isinstance(content, Mapping) or not content:
-        raise UserError(f"{name}: give an object with {', '.join(KEYS)}, each a list. See docs/targets.md")
-    if unknown := [str(key) for key in content if key not in KEYS]:
-        raise UserError(f"{name}: unknown key '{unknown[0]}'.{did_you_mean(unknown[0], KEYS)} Use {', '.join(KEYS)}")
+    if isinstance(source, Mapping):
+        name, folder = "targets", Path()
+        try:
+            content = check_shape(dict(source), TargetFile)
+        except ValueError as error:
+            raise UserError(f"targets: {error}; see docs/targets.md") from error
+    else:
+        name, folder = f"targets={source}", Path(source).parent
+        content = read_json(Path(source), TargetFile, "see docs/targets.md")
+    fps, names = representation.fps, representation.skeleton.joints
     goals: list[Goal] = []
     poses = []
-    for kind, entries in content.items():
-        if not isinstance(entries, list | tuple):
-            raise UserError(f"{name}: {kind} is {entries}, not a list. See docs/targets.md")
-        for number, entry in enumerate(entries):
-            where = f"{name}: {kind}[{number}]"
-            frame = _frame(kind, entry, where, representation.fps)
-            if kind == "root":
-                x, z = _numbers(entry, "position", where, 2)
-                goals.append(Goal(where, frame, 0, np.array([x, math.nan, z])))
-            elif kind == "joints":
-                joint = _joint(representation, entry["joint"], where)
-                goals.append(Goal(where, frame, joint, np.array(_numbers(entry, "position", where, 3))))
-            elif entry.get("position") is None:
-                pose, features = _pose(representation, entry, folder, where)
-                poses.append((frame, features))
-                goals.append(Goal(where, frame, 0, np.array([math.nan, pose[0, 1], math.nan])))
-            else:
-                x, z = _numbers(entry, "position", where, 2)
-                pose = _pose(representation, entry, folder, where)[0] + np.array([x, 0.0, z])
-                goals += [Goal(where, frame, joint, position) for joint, position in enumerate(pose)]
-    _check_reach(goals, representation.fps)
-    rows = [
-        (goal.frame, goal.joint, axis, float(goal.position[axis]))
-        for goal in goals
-        for axis in np.flatnonzero(~np.isnan(goal.position)).tolist()
-    ]
-    if len(rows) > MAX_COORDINATES:
-        raise UserError(f"{name}: {len(rows)} coordinates are too many. Give at most {MAX_COORDINATES}")
-    frames, joints, axes = torch.tensor([row[:3] for row in rows], dtype=torch.long).reshape(-1, 3).T
-    return Targets(Positions(frames, joints, axes, torch.tensor([row[3] for row in rows])), tuple(poses))
+    for number, point in enumerate(content.root):
+        x, z = point.position
+        position = np.array([x, None, z], dtype=float)
+        goals.append(Goal(f"{name}: root[{number}]", round(point.time * fps), 0, position))
+    for number, entry in enumerate(content.joints):
+        where = f"{name}: joints[{number}]"
+        if entry.joint not in names:
+            near = did_you_mean(entry.joint, names)
+            raise UserError(f"{where}: no joint '{entry.joint}'.{near} Joints: {', '.join(names)}")
+        position = np.array(entry.position, dtype=float)
+        goals.append(Goal(where, round(entry.time * fps), names.index(entry.joint), position))
+    for number, entry in enumerate(content.poses):
+        where, frame = f"{name}: poses[{number}]", round(entry.time * fps)
+        pose, features = _pose(representation, entry, folder, where)
+        if entry.position is None:
+            poses.append((frame, features))
+            goals.append(Goal(where, frame, 0, np.array([math.nan, pose[0, 1], math.nan])))
+        else:
+            x, z = entry.position
+            placed = pose + np.array([x, 0.0, z], dtype=float)
+            goals += [Goal(where, frame, joint, position) for joint, position in enumerate(placed)]
+    _check_reach(goals, fps)
+    positions = np.array([goal.position for goal in goals]).reshape(-1, 3)
+    numbers, axes = np.nonzero(~np.isnan(positions))
+    if len(numbers) > MAX_COORDINATES:
+        raise UserError(f"{name}: {len(numbers)} coordinates are too many. Give at most {MAX_COORDINATES}")
+    frames, joints = np.array([(goal.frame, goal.joint) for goal in goals], dtype=int).reshape(-1, 2)[numbers].T
+    frames, joints, axes = (torch.from_numpy(index) for index in (frames, joints, axes))
+    values = torch.from_numpy(positions[numbers, axes]).float()
+    return Targets(Positions(frames, joints, axes, values), tuple(poses))
 
 
-def _frame(kind: str, entry: Any, where: str, fps: float) -> int:
-    needed, possible = KEYS[kind]
-    if not isinstance(entry, Mapping) or not needed <= entry.keys() <= needed | possible:
-        optional = f", and possibly {', '.join(sorted(possible))}" if possible else ""
-        raise UserError(f"{where} is {entry}. Give an object with {', '.join(sorted(needed))}{optional}")
-    (time,) = _numbers(entry, "time", where)
-    if not time >= 0:
-        raise UserError(f"{where}.time={entry['time']}: give seconds from the start of the motion")
-    return round(time * fps)
-
-
-def _read(source: str | Path, name: str) -> Any:
-    try:
-        return json.loads(read_text(source, MEBIBYTE))
-    except FileNotFoundError:
-        raise UserError(f"{name}: no such file. Give a JSON file of targets, see docs/targets.md") from None
-    except json.JSONDecodeError as error:
-        raise UserError(f"{name}: not JSON: {error}") from None
-
-
-def _numbers(entry: Mapping[str, Any], key: str, where: str, count: int = 1) -> list[float]:
-    listed = entry[key] if isinstance(entry[key], list | tuple) else [entry[key]]
-    values = [math.nan if value is None else value for value in listed]
-    if len(values) != count or not all(isinstance(v, int | float) and not abs(v) > 1e4 for v in values):
-        numbers = f"{count} numbers in meters, null = free" if count > 1 else "a number"
-        raise UserError(f"{where}.{key}={entry[key]!r}: give {numbers}")
-    return values
-
-
-def _joint(representation: Representation, name: Any, where: str) -> int:
-    joints = representation.skeleton.joints
-    if name not in joints:
-        raise UserError(f"{where}: no joint '{name}'.{did_you_mean(str(name), joints)} Joints: {', '.join(joints)}")
-    return joints.index(name)
-
-
-def _pose(
-    representation: Representation, entry: Mapping[str, Any], folder: Path, where: str
-) -> tuple[np.ndarray, Tensor]:
+def _pose(representation: Representation, entry: PoseTarget, folder: Path, where: str) -> tuple[np.ndarray, Tensor]:
     """Returns joints (J, 3) of a pose with the root at x = z = 0, and its features (D,)."""
-    file = str(entry["file"])
-    motion = read_motion(representation, folder / file if Path(file).suffix else file)
-    number = entry.get("frame", 0)
-    if type(number) is not int or not 0 <= number < len(motion.joints):
-        raise UserError(f"{where}.frame={number}: {file} has frames 0 to {len(motion.joints) - 1}")
-    pose = motion.joints[number].astype(float)
+    motion = read_motion(representation, folder / entry.file if Path(entry.file).suffix else entry.file)
+    if entry.frame >= len(motion.joints):
+        raise UserError(f"{where}.frame={entry.frame}: {entry.file} has frames 0 to {len(motion.joints) - 1}")
+    pose = motion.joints[entry.frame].astype(float)
     pose[:, [0, 2]] -= pose[0, [0, 2]]
-    if entry.get("heading") is not None:
-        (degrees,) = _numbers(entry, "heading", where)
+    if entry.heading is not None:
         right_hip, left_hip, right_shoulder, left_shoulder = pose[list(representation.skeleton.facing)]
         left = left_hip - right_hip + left_shoulder - right_shoulder
-        turn = torch.tensor(math.radians(degrees) - math.atan2(-left[2], left[0]))
+        turn = torch.tensor(math.radians(entry.heading) - math.atan2(-left[2], left[0]))
         pose = rotation.rotate_y(torch.from_numpy(pose), turn).numpy()
-    return pose, torch.from_numpy(motion.features[number])
+    return pose, torch.from_numpy(motion.features[entry.frame])
 
 
 def _check_reach(goals: list[Goal], fps: float) -> None:

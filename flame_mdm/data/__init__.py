@@ -100,11 +100,10 @@ class MotionSource(ABC):
 
     @abstractmethod
     def count(self) -> int:
-        """Returns the number of clips that `clips` yields, without reading motions; used by the progress bar.
+        """Returns the number of clips that `clips` yields, without reading motions.
 
-        Raises:
-            FileNotFoundError: If the raw data is not at the path in the recipe; the message says how to get it.
-            UserError: If a file is damaged, or an option does not fit the data.
+        Raises `FileNotFoundError`, which says how to get the raw data, if it is missing, and `UserError` if a file is
+        damaged or an option does not fit the data.
         """
 
     def check(self) -> list[str]:

@@ -27,9 +27,8 @@ _DAMAGE = (*ZIP_ERRORS, tarfile.TarError, lzma.LZMAError, OSError, ValueError)
 def members(path: Path, read: Callable[[str], bool] = lambda name: False) -> Iterator[tuple[str, bytes]]:
     """Yields the name of each member of a zip or tar archive, except folders, and its bytes if `read(name)`, else b"".
 
-    Raises:
-        UserError: If the file is damaged or not an archive, a member that is read is a link, a sparse file or
-            encrypted, or the content expands disproportionately. The message names the archive.
+    Raises `UserError` if the file is damaged or not an archive, a member that is read is a link, a sparse file or
+    encrypted, or the content expands disproportionately.
     """
     size = regular_file(path)
     with path.open("rb") as file:

@@ -7,7 +7,6 @@ batches as an uninterrupted one.
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from typing import Literal
 
@@ -17,7 +16,7 @@ from lightning import LightningDataModule
 from torch import Tensor
 from torch.utils.data import DataLoader, Sampler
 
-from flame_mdm.batch import collate, padded_length
+from flame_mdm.batch import collate
 from flame_mdm.data import MotionSource, Split
 from flame_mdm.data.crops import Clips, Crop, Draw, Sample
 from flame_mdm.data.resident import SHARE, ResidentLoader, free_memory, resident_features
@@ -149,9 +148,8 @@ class MotionDataModule(LightningDataModule):
     def open(self) -> Store:
         """Returns the prepared store and copies its statistics to the representation.
 
-        Raises:
-            FileNotFoundError: If the data set is not prepared.
-            UserError: If the store is damaged, or was prepared with other options or another representation.
+        Raises `FileNotFoundError` if the data set is not prepared, and `UserError` if the store is damaged or was
+        prepared with other options.
         """
         store = Store(self.folder)
         recipe = {
@@ -198,17 +196,6 @@ class MotionDataModule(LightningDataModule):
         """Returns a line if files of the user's own data set were added or changed after it was prepared."""
         return self.source.changed(self.folder / "store.json")
 
-    def padding(self) -> float:
-        """Returns the share of padding in the frames of the first pass over the training clips."""
-        lengths, size = self.train.lengths, self.batch_size
-        batches = TrainingBatches(lengths, size, seed=self.seed, first=0, rank=0, world=1)
-        real = padded = 0
-        for draws in islice(batches, max(1, len(lengths) // size)):
-            _, drawn, _ = self.train.draw([index for index, _ in draws], draws[0][1])
-            real += drawn.sum()
-            padded += len(drawn) * padded_length(int(drawn.max()), self.pad_multiple, self.crop.longest())
-        return float(1 - real / padded)
-
     def captions(self) -> list[str]:
         """Returns all distinct captions of the store, sorted."""
         return sorted({caption for clip in self.open().clips for caption in clip.captions})
@@ -223,11 +210,7 @@ class MotionDataModule(LightningDataModule):
         self.choose_device()
 
     def choose_device(self, more: int = 0) -> torch.device | None:
-        """Returns the device on which the data set is kept, with `more` bytes of the text encoder; None = on none.
-
-        Raises:
-            UserError: `resident` is true, but the device has not enough free memory.
-        """
+        """Returns the device on which the data set is kept, with `more` bytes of the text encoder; None = on none."""
         device = self.trainer.strategy.root_device if self.trainer else torch.device("cpu")
         free, size = free_memory(device), 4 * self.store.features.size + more
         if self.trainer and device.type == "cpu":

@@ -34,8 +34,7 @@ def in_order(function: Callable[[Task], Result], tasks: Iterable[Task], workers:
     Nested calls, in which the results of one are tasks of the other, share their processes. Function, tasks and results
     are picklable. `workers` are processes; 1 = this one only, 0 = one per core as soon as the work takes `PATIENCE`.
 
-    Raises:
-        UserError: If a worker died, for instance because the system ran out of memory.
+    Raises `UserError` if a worker died, for instance because the system ran out of memory.
     """
     workers = 1 if not workers and cores() == 1 else workers
     start, remaining = time.monotonic(), iter(tasks)

@@ -58,11 +58,7 @@ def adapts_cuts(representation: Representation) -> bool:
 class ResidentLoader:
     """Batches of a split, equal bit for bit to those of the data loader, gathered from features on the device.
 
-    Args:
-        clips: the split.
-        batches: the clips of each batch.
-        features: (N + 1, D) of `resident_features`.
-        multiple: batches are padded to multiples of this number of frames.
+    `features` (N + 1, D) are those of `resident_features`; batches are padded to multiples of `multiple` frames.
     """
 
     def __init__(self, clips: Clips, batches: Iterable[list[Draw]], features: Tensor, multiple: int):

@@ -167,10 +167,8 @@ _dispatch |= {pickle.BUILD[0]: _Unpickler._load_build, pickle.BYTEARRAY8[0]: _Un
 def read(path: Path, opaque: tuple[str, ...] = ()) -> Any:
     """Returns the content of a pickle of arrays, numbers, text and plain containers; protocols 0 to 5.
 
-    Objects whose names begin with one of `opaque` may be there, too, and are replaced by their state.
-
-    Raises:
-        FileNotFoundError, UserError: If the file is missing, damaged, or names other globals, as the message says.
+    Objects whose names begin with one of `opaque` may be there, too, and are replaced by their state. Raises
+    `UserError` if the file is damaged or names other globals.
     """
     size = regular_file(path)
     with path.open("rb") as file:

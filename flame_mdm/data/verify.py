@@ -27,14 +27,9 @@ MAX_FRAMES = 500_000
 
 
 def report(data: MotionDataModule) -> dict[str, Any]:
-    """Hashes and scans the store, and writes the report into its folder as `verify.json`.
+    """Hashes and scans the store; writes the report into its folder as `verify.json` and returns it.
 
-    Returns:
-        Plain values: files (SHA-256), figures (name -> found, published or None, state), captions, actions (clips by
-        split), frames, still (ids), duplicates (groups of ids), duplicates_across_splits, statistics, excluded.
-
-    Raises:
-        FileNotFoundError, UserError: If the store is missing, has wrong hashes or numbers.
+    Raises `FileNotFoundError` or `UserError` if the store is missing or has wrong hashes or numbers.
     """
     store = data.open()
     store.verify()
@@ -114,13 +109,12 @@ def lines(content: dict[str, Any]) -> list[str]:
 
 def deviations(content: dict[str, Any]) -> list[str]:
     """Returns which figures of a report differ from the published ones, and by how much."""
-    lines = []
-    for name, figure in content["figures"].items():
-        if figure["state"] == "differs":
-            number, published = figure["found"], figure["published"]
-            off = number - published
-            lines.append(f"{name}: {number:,} found, {published:,} published ({off:+,g}, {off / published:+.2%})")
-    return lines
+    differing = {name: figure for name, figure in content["figures"].items() if figure["state"] == "differs"}
+    numbers = {name: (figure["found"], figure["published"]) for name, figure in differing.items()}
+    return [
+        f"{name}: {counted:,} found, {published:,} published ({counted - published:+,g}, {counted / published - 1:+.2%})"
+        for name, (counted, published) in numbers.items()
+    ]
 
 
 def _figures(store: Store) -> dict[str, dict[str, Any]]:
@@ -131,11 +125,10 @@ def _figures(store: Store) -> dict[str, dict[str, Any]]:
     counted: dict[str, float] = {"clips": len(store.clips), **by_split}
     if of_action:
         counted["actions"] = len(of_action)
-        counted["fewest clips per action"] = min(of_action.values())
-        counted["most clips per action"] = max(of_action.values())
-    if training:
-        counted["fewest training clips per action"] = min(training.values())
-        counted["most training clips per action"] = max(training.values())
+    for kind, counts in (("clips", of_action), ("training clips", training)):
+        if counts:
+            counted[f"fewest {kind} per action"] = min(counts.values())
+            counted[f"most {kind} per action"] = max(counts.values())
     raw: dict[str, float] = store.info.get("counts", {})
     counted = {f"{name} of the store" if name in raw else name: number for name, number in counted.items()} | raw
     published = read_yaml(PUBLISHED).get(store.info["dataset"], {})

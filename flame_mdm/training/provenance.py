@@ -63,8 +63,6 @@ class WriteProvenance(Callback):
         say(f"{self.config['experiment']}: {task.describe()}, {count / 1e6:.2f} M trainable parameters")
         say(f"data: {data['dataset']} as {data['representation']}; {data['hours']} hours")
         say(*module.counts(module.store))
-        if module.pad_multiple > 1:
-            say(f"batches: padded to multiples of {module.pad_multiple} frames; {module.padding():.0%} is padding")
         speed = self.config["run"].get("speed", "reference")
         say(f"device: {facts['device']}, {trainer.precision}, speed={speed}")
         if size > self.config["data"]["batch_size"]:

@@ -507,7 +507,7 @@ def test_latency_is_that_of_one_motion_at_a_time_after_a_first_one(runs, tmp_pat
 def test_edits_keep_what_they_are_to_keep(runs, tmp_path, name):
     evaluation = runs.evaluation(f"editing_{name}", samples=9)
     source = runs.generator(evaluation, tmp_path)
-    assert source.edit == {"mode": "x0", "resample": 1}
+    assert source.edit == {"mode": "x0", "resample": 1, "strength": None}
     assert runs.generator(evaluation, method="flame").edit["mode"] == "x_t"
     values = means(evaluation.run(source))
     assert values["generated displacement/ade"] > 0.01

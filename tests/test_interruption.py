@@ -40,7 +40,7 @@ def words(root: Path) -> list[str]:
 def both(tmp_path) -> Iterator[tuple[subprocess.Popen[str], subprocess.Popen[str]]]:
     """One process that is halted while it prepares, and another that waits for it."""
     first = start("prepare", *words(tmp_path))
-    wait_for(lambda: (tmp_path / f"{STORE}.partial").exists(), first)
+    wait_for(lambda: any(tmp_path.glob(f".{STORE}.*")), first)
     first.send_signal(signal.SIGSTOP)
     second = start("prepare", *words(tmp_path))
     assert second.stdout is not None

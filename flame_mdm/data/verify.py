@@ -112,8 +112,8 @@ def deviations(content: dict[str, Any]) -> list[str]:
     differing = {name: figure for name, figure in content["figures"].items() if figure["state"] == "differs"}
     numbers = {name: (figure["found"], figure["published"]) for name, figure in differing.items()}
     return [
-        f"{name}: {counted:,} found, {published:,} published ({counted - published:+,g}, {counted / published - 1:+.2%})"
-        for name, (counted, published) in numbers.items()
+        f"{name}: {count:,} found, {published:,} published ({count - published:+,g}, {count / published - 1:+.2%})"
+        for name, (count, published) in numbers.items()
     ]
 
 

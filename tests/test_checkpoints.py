@@ -424,6 +424,7 @@ def test_push_writes_a_card_and_uploads_these_files_alone(trained, tmp_path, cap
     assert "not a repository name. Write user/name" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_model_is_sampled_without_importing_lightning_and_the_compiler():
     program = "import sys, flame_mdm; flame_mdm.generate(flame_mdm.load('quickstart'), 'a person walks', seconds=1)"
     slow = "{'lightning', 'torchmetrics', 'transformers', 'torch._dynamo', 'scipy.stats'}"

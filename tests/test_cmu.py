@@ -107,6 +107,7 @@ def source(folder: Path, **options) -> cmu.CMU:
     return cmu.CMU(str(folder / "motions"), str(folder / "clone"), **options)
 
 
+@pytest.mark.slow
 def test_clips_have_their_motion_captions_and_splits(folder):
     humanml = HumanML("smpl22", "legacy")
     data = source(folder)
@@ -131,6 +132,7 @@ def test_clips_have_their_motion_captions_and_splits(folder):
     assert again.fingerprint == store.fingerprint
 
 
+@pytest.mark.slow
 def test_an_archive_gives_the_clips_of_its_folder_and_is_not_left_behind(folder, monkeypatch):
     temporary = folder / "temporary"
     temporary.mkdir()

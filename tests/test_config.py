@@ -54,6 +54,7 @@ WRONG = {
 }
 
 
+@pytest.mark.slow
 def test_a_wrong_override_is_one_line_with_the_nearest_names():
     for override, message in WRONG.items():
         with pytest.raises(UserError) as error:
@@ -290,6 +291,7 @@ prepare
 trian"""
 
 
+@pytest.mark.slow
 def test_help_and_wrong_words_do_not_wait_for_torch():
     program = f"""
         import sys
@@ -345,6 +347,7 @@ MISSING = [
 ]
 
 
+@pytest.mark.slow
 def test_training_names_what_is_missing(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(os, "cpu_count", lambda: 3)
     for gpus, words, message in MISSING:

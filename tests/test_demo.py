@@ -243,6 +243,7 @@ def generated(server: str, query: str, session: str = "") -> list[Any]:
     return last["output"]["data"]
 
 
+@pytest.mark.slow
 def test_a_bad_request_gets_one_clear_line(server):
     wrong = []
     for bad, words in BAD.items():
@@ -367,6 +368,7 @@ def resident(process: int) -> int:
     return int(re.findall(r"VmRSS:\s+(\d+) kB", Path(f"/proc/{process}/status").read_text())[0]) * 1024
 
 
+@pytest.mark.slow
 def test_downloads_are_the_shown_motion(server, studio):
     motion = studio.motions(EDITED)[1]
     generated(server, EDITED.query())

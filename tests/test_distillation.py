@@ -174,6 +174,7 @@ def test_a_student_is_sampled_edited_led_chained_and_exported_without_its_teache
         flame_mdm.generate(model)
 
 
+@pytest.mark.slow
 def test_a_resumed_distillation_ends_in_the_same_weights(trained, data_root, tmp_path, capsys):
     run = tmp_path / "run"
     words = ["distill", str(trained), str(run), *SHORT, f"data.root={data_root}"]
@@ -193,7 +194,7 @@ def test_a_resumed_distillation_ends_in_the_same_weights(trained, data_root, tmp
     assert "weights have changed since this run began" in error(capsys, *words, "trainer.max_steps=6")
 
 
-@pytest.mark.slow
+@pytest.mark.robustness
 def test_two_processes_are_one_with_both_batches(student, tmp_path):
     config, run = str(student / "config.yaml"), tmp_path / "run"
     parts = ("speed=reference", "logger=csv", "callbacks.best=null")
@@ -422,7 +423,7 @@ def test_the_demo_offers_a_model_with_and_without_an_adapter(taught):
     assert f"flame_mdm.load({base!r}, adapter={adapter!r})" in request.python("text", "cpu")
 
 
-@pytest.mark.slow
+@pytest.mark.robustness
 def test_two_processes(trained, clips, tmp_path, data_root):
     words = ["adapt", str(trained), str(tmp_path / "run"), f"source={clips}", "name=limp", *STEPS]
     words.append("trainer.max_steps=2")

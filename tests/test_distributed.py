@@ -57,7 +57,7 @@ def test_two_processes_are_one_with_both_batches(tiny, tmp_path):
     assert losses[-1] == pytest.approx(float(cast(MeanMetric, task.val_losses["loss"]).compute()), rel=1e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.robustness
 def test_torchrun_starts_a_killed_group_again(tiny, tmp_path):
     """The first process dies at step 3 and leaves its lock; then SIGTERM ends torchrun at step 6."""
     words = [*tiny, *RUN, "callbacks.samples=null"]
@@ -128,7 +128,7 @@ def cluster(tmp_path: Path) -> dict[str, str]:
     return {"CLUSTER": str(tmp_path), "PYTHONPATH": path, "PATH": programs, **address}
 
 
-@pytest.mark.slow
+@pytest.mark.robustness
 def test_a_slurm_job_that_runs_out_of_time_is_requeued_and_ends_as_if_it_had_not(tiny, tmp_path, cluster):
     """Two tasks; SIGUSR2, which submitit asks SLURM for, comes at step 1 of 3."""
     words = [*tiny, *RUN, "callbacks.samples=null", "trainer.max_steps=3"]
@@ -160,7 +160,7 @@ def test_a_slurm_job_that_runs_out_of_time_is_requeued_and_ends_as_if_it_had_not
         assert linted.returncode == 0, linted.stdout + linted.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.robustness
 def test_jobs_of_a_sweep_run_in_processes_and_folders_of_their_own(tiny, tmp_path):
     """On this machine; the second one is refused."""
     (tmp_path / "sweep" / "seed=2").mkdir(parents=True)

@@ -131,6 +131,7 @@ def resolved_once(monkeypatch):
         monkeypatch.setattr(module, "resolve", once)
 
 
+@pytest.mark.slow
 def test_links_names_paths_and_commands_exist(tmp_path, monkeypatch, resolved_once):
     wrong = {}
     for number, page in enumerate(PAGES):

@@ -101,6 +101,7 @@ def test_the_protocol_compares_with_the_recordings_of_520_clips_at_100_fps(mmm, 
     assert "the split has no clip with at least 1 frames and ghosh_test=True" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_stores_without_recordings_are_prepared_again(mmm, tmp_path, capsys):
     assert evaluated(mmm, tmp_path / "a.json", "reconstruction_kit") == 0
     store = Store(mmm.parent / "data" / "kit-temos-rifke")

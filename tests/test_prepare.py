@@ -198,6 +198,7 @@ WHERE = {
 }
 
 
+@pytest.mark.slow
 def test_a_missing_source_or_another_set_is_refused_with_where_to_get_it(
     takes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):

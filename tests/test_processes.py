@@ -65,6 +65,12 @@ def test_schedules_sampling_steps_and_their_betas(stem):
         np.testing.assert_allclose(betas.numpy(), expected, rtol=1e-9, err_msg=key)
 
 
+def test_the_linear_schedule_has_the_ends_of_ho_et_al():
+    for total, first, last in ((1000, 1e-4, 0.02), (500, 2e-4, 0.04), (10, 0.01, 0.999)):
+        betas = build_schedule("linear", total).tables["betas"]
+        assert (float(betas[0]), float(betas[-1])) == pytest.approx((first, last))
+
+
 @pytest.mark.golden
 @pytest.mark.parametrize("dtype", DTYPES, ids=["gaussian-f32", "gaussian-f64"])
 def test_corrupt_and_posterior(dtype):

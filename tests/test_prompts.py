@@ -31,6 +31,7 @@ def folders(root: Path) -> dict[str, Path]:
     return {read(path).text: path.parent for path in sorted(root.rglob("motion_000.npz"))}
 
 
+@pytest.mark.slow
 def test_each_prompt_of_a_file_is_sampled_as_if_alone(here, trained, capsys):
     Path("p.txt").write_bytes(b"\xef\xbb\xbf" + "\r\n\r\n".join(f" {text} " for text in PROMPTS).encode())
     assert main(["sample", str(trained), "prompts=p.txt", "seconds=[1,1.5,1]", "samples=2"]) == 0
@@ -51,6 +52,7 @@ def test_each_prompt_of_a_file_is_sampled_as_if_alone(here, trained, capsys):
     assert len(folders(here / "samples")) == 3
 
 
+@pytest.mark.slow
 def test_a_chosen_folder_gets_a_folder_per_prompt(here, trained, monkeypatch):
     Path("p.txt").write_text("a person walks\na person jumps\na person walks\n")
     words = ["prompts=p.txt", "seconds=1", "samples=1", "trajectory=true", "out=mine", "open=true"]
@@ -105,6 +107,7 @@ def test_each_prompt_has_a_length_of_its_own(trained):
             flame_mdm.generate(model, PROMPTS[0], seconds=seconds)  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_a_video_is_written_when_asked_for(here, trained, monkeypatch, capsys):
     words = ["sample", str(trained), "text=a person walks", "samples=2", "seconds=1", "out=out"]
     if importlib.util.find_spec("av"):

@@ -101,6 +101,7 @@ def test_euler_gimbal_lock():
         rotation.matrix_to_euler(torch.eye(3), "XYX")
 
 
+@pytest.mark.slow
 @given(axis_angle=vectors)
 @settings(max_examples=30)
 def test_round_trips(axis_angle: Tensor):

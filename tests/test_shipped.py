@@ -17,6 +17,7 @@ from flame_mdm.errors import UserError
 from flame_mdm.safe_io import read_yaml, sha256
 
 
+@pytest.mark.slow
 def test_the_model_follows_its_prompts():
     model = flame_mdm.load("quickstart")
     assert all(value.dtype == torch.float32 for value in model.parameters())

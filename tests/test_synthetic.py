@@ -170,6 +170,7 @@ def generated(motion: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return motion * rng.uniform(0.95, 1.05) + 0.015 * drift / drift.std() + 0.025 * slide / slide.std() + jitter
 
 
+@pytest.mark.slow
 def test_the_ground_truth_and_noisy_motions_are_read_right(clips: list[Clip]):
     rng, requested = np.random.default_rng(0), [dict(clip.attributes) for clip in clips]
     for motions, least in (

@@ -51,6 +51,7 @@ def tensorboard_tags(folder: Path) -> set[str]:
     return set(events.Tags()["scalars"])
 
 
+@pytest.mark.slow
 def test_a_run_leaves_what_a_user_looks_for(tiny, tmp_path):
     checkpoint, folder = read_checkpoint(run([*tiny, "trainer.val_check_interval=1"], 2)), tmp_path / "run"
     files = ("config.yaml", "provenance.json", "metrics.jsonl", "report.html", "checkpoints/best.ckpt")
@@ -79,6 +80,7 @@ def test_training_learns(tiny):
     assert np.mean(losses[-10:]) < 0.7 * np.mean(losses[:5])
 
 
+@pytest.mark.slow
 def test_a_resumed_run_is_the_uninterrupted_one_and_adds_up_what_it_cost(tiny, tmp_path):
     overrides = [*tiny, *STEPS, "denoiser.dropout=0.1", "trainer.log_every_n_steps=2"]
     parts = run(overrides, 5, tmp_path / "parts")
@@ -118,6 +120,7 @@ def test_a_decaying_learning_rate_resumes_where_it_was(tiny, tmp_path):
     assert same_weights(parts, whole)
 
 
+@pytest.mark.slow
 def test_progress_counts_all_steps_and_shows_losses(tiny, capfd, monkeypatch):
     """Also after a resume; in a log file as plain lines, here one per step."""
     monkeypatch.setattr(ProgressBar, "SECONDS", 0.0)
@@ -144,6 +147,7 @@ def test_waiting_threads_soon_sleep():
         assert done.stdout.strip() == expected
 
 
+@pytest.mark.slow
 def test_a_finished_run_says_so_another_configuration_is_refused_and_a_saved_one_repeats_it(tiny, tmp_path, capsys):
     for _ in range(2):
         first = run([*tiny, *STEPS], 2)

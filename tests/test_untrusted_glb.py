@@ -151,6 +151,7 @@ def test_faults_of_the_parts_of_a_file_are_named(heroes: list[Path], tmp_path: P
         assert message in outcome(path, tmp_path / "out.glb"), content[:40]
 
 
+@pytest.mark.slow
 def test_many_nodes_are_read_in_time(heroes: list[Path], tmp_path: Path):
     path = tmp_path / "mixamo.glb"
     file = Glb(heroes[0])

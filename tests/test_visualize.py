@@ -163,6 +163,7 @@ def test_mp4_has_the_frames_of_the_motion(tmp_path):
         assert (frames[0].width, frames[0].height % 2) == (2 * size, 0)
 
 
+@pytest.mark.slow
 @MP4
 def test_mp4_shows_what_the_gif_shows_in_its_colors(tmp_path):
     motions = [sway(8, text="walks"), sway(16)]

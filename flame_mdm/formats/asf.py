@@ -8,18 +8,16 @@ M, a bone turns by C M C^-1 relative to its parent. Orders such as XYZ mean that
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
-from typing import NamedTuple, NoReturn
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flame_mdm.errors import UserError
-from flame_mdm.formats.bvh import CHANNELS, LARGEST, Bvh
+from flame_mdm.formats.bvh import CHANNELS, Bvh, Lines, read_lines
 from flame_mdm.formats.resampling import check_frames, frame_rate
-from flame_mdm.safe_io import read_text
 
 MOVES = ("TX", "TY", "TZ")
 TURNS = ("RX", "RY", "RZ")
@@ -40,7 +38,7 @@ def read(path: Path, fps: float | None) -> Bvh:
 
     AMC files do not contain `fps`: it is 120 for most of CMU's recordings.
     """
-    lines = _Lines(path)
+    lines = read_lines(path)
     bones, parents = read_skeleton(skeleton_of(path))
     if fps is None:
         raise UserError(f"{path}: AMC files contain no frame rate: give fps=120, or `fps: 120` in skeleton.yaml")
@@ -83,27 +81,27 @@ def skeleton_of(path: Path) -> Path:
 
 def read_skeleton(path: Path) -> tuple[dict[str, Bone], dict[str, str]]:
     """Returns the bones of an ASF file, parents before their children, and the parent of each bone but the root."""
-    lines = _Lines(path)
+    lines = read_lines(path)
     root = Bone(np.zeros(3), Rotation.identity(), "XYZ", (*MOVES, *TURNS))
     read: dict[str, Bone] = {"root": root}
     parents: dict[str, str] = {}
-    section, degrees, fields = "", True, dict[str, list[str]]()
+    section, fields = "", dict[str, list[str]]()
     for words in lines:
         word = words[0].lower()
         if word.startswith(":"):
             section = word
-        elif section == ":units" and word == "angle":
-            degrees = words[1:] != ["rad"]
+        elif section == ":units" and words == ["angle", "rad"]:
+            lines.fail("angles in radians are not supported")
         elif section == ":root" and word == "order":
             read["root"] = root._replace(freedoms=tuple(word.upper() for word in words[1:]))
         elif section == ":root" and word == "axis":
-            read["root"] = read["root"]._replace(order=lines.order(words[1:]))
+            read["root"] = read["root"]._replace(order=_order(lines, words[1:]))
         elif section == ":root" and word in ("position", "orientation") and any(lines.numbers(words[1:], 3)):
             lines.fail(f"a root whose {word} is not 0 0 0 is not supported")
         elif section == ":bonedata" and word == "begin":
             fields = {}
         elif section == ":bonedata" and word == "end":
-            read[fields.get("name", [""])[0]] = _bone(lines, fields, degrees)
+            read[fields.get("name", [""])[0]] = _bone(lines, fields)
         elif section == ":bonedata":
             fields[word] = words[1:]
         elif section == ":hierarchy" and word not in ("begin", "end"):
@@ -116,25 +114,34 @@ def read_skeleton(path: Path) -> tuple[dict[str, Bone], dict[str, str]]:
     return {name: read[name] for name in ("root", *parents)}, parents
 
 
-def _bone(lines: _Lines, fields: dict[str, list[str]], degrees: bool) -> Bone:
+def _bone(lines: Lines, fields: dict[str, list[str]]) -> Bone:
     if missing := [name for name in ("name", "direction", "length", "axis") if not fields.get(name)]:
         lines.fail(f"a bone without {missing[0]}")
     freedoms = tuple(word.upper() for word in fields.get("dof", ()))
     if not set(freedoms) <= set(TURNS) or len(set(freedoms)) < len(freedoms):
         lines.fail(f"degrees of freedom must be among rx, ry and rz, found {' '.join(fields['dof'])[:40]}")
     direction, (length,) = lines.numbers(fields["direction"], 3), lines.numbers(fields["length"], 1)
-    axis, order = lines.numbers(fields["axis"][:3], 3), lines.order(fields["axis"][3:])
-    axes = Rotation.from_euler(order.lower(), [axis["XYZ".index(letter)] for letter in order], degrees)
+    axis, order = lines.numbers(fields["axis"][:3], 3), _order(lines, fields["axis"][3:])
+    axes = Rotation.from_euler(order.lower(), [axis["XYZ".index(letter)] for letter in order], degrees=True)
     return Bone(np.array(direction) * length, axes, order, freedoms)
 
 
-def _angles(lines: _Lines, bones: dict[str, Bone]) -> dict[str, np.ndarray]:
+def _order(lines: Lines, words: list[str]) -> str:
+    order = "".join(words).upper()
+    if sorted(order) != list("XYZ"):
+        lines.fail(f"an order of axes is needed, such as XYZ, found {order[:40]}")
+    return order
+
+
+def _angles(lines: Lines, bones: dict[str, Bone]) -> dict[str, np.ndarray]:
     """Returns the values (F, N) of the N degrees of freedom of each bone; angles in degrees."""
     rows: dict[str, list[list[float]]] = {name: [] for name, bone in bones.items() if bone.freedoms}
-    frames, factor = 0, 1.0
+    frames = 0
     for words in chain(lines, [["0"]]):
-        if words[0].startswith(":"):
-            factor = np.degrees(1) if words[0].upper() == ":RADIANS" else factor
+        if words[0].upper() == ":RADIANS":
+            lines.fail("angles in radians are not supported")
+        elif words[0].startswith(":"):
+            continue
         elif len(words) == 1 and words[0].isdigit():
             if absent := [name for name, values in rows.items() if len(values) != frames]:
                 lines.fail(f"frame {frames} ends without {', '.join(absent)[:80]}")
@@ -146,37 +153,4 @@ def _angles(lines: _Lines, bones: dict[str, Bone]) -> dict[str, np.ndarray]:
     if frames < 2:
         lines.fail("not an AMC file (no frames)")
     check_frames(frames)
-    factors = {name: [factor if kind in TURNS else 1.0 for kind in bone.freedoms] for name, bone in bones.items()}
-    return {name: np.array(rows.get(name, [[]] * (frames - 1)), float) * factors[name] for name in bones}
-
-
-class _Lines:
-    """The lines of a file as words, without comments; tracks the line number for error messages."""
-
-    def __init__(self, path: Path):
-        self.path, self.text, self.line = path, read_text(path), 1
-
-    def __iter__(self) -> Iterator[list[str]]:
-        for number, line in enumerate(self.text.removeprefix("\ufeff").splitlines(), 1):
-            self.line = number
-            if (words := line.split()) and not line.startswith("#"):
-                yield words
-
-    def fail(self, what: str) -> NoReturn:
-        raise UserError(f"{self.path}, line {self.line}: {what}")
-
-    def numbers(self, words: list[str], count: int) -> list[float]:
-        """Returns the words as `count` finite numbers."""
-        try:
-            values = [float(word) for word in words]
-        except ValueError as error:
-            self.fail(str(error)[:80])
-        if len(values) != count or not all(abs(value) <= LARGEST for value in values):
-            self.fail(f"expected {count} numbers, found {' '.join(words)[:40]}")
-        return values
-
-    def order(self, words: list[str]) -> str:
-        order = "".join(words).upper()
-        if sorted(order) != list("XYZ"):
-            self.fail(f"an order of axes is needed, such as XYZ, found {order[:40]}")
-        return order
+    return {name: np.array(rows.get(name, [[]] * (frames - 1)), float) for name in bones}

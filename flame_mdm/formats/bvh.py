@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal
 from pathlib import Path
@@ -25,7 +25,7 @@ from flame_mdm.safe_io import TEXT_LIMIT, regular_file, write_text
 
 CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "XYZ")
 MAX_JOINTS = 4096  # maximum number of joints and end sites of a file
-LARGEST = 1e9  # largest number that is read
+LARGEST = 1e9  # largest number that is read, and largest sum of the numbers in a line
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,19 +61,12 @@ class Bvh:
 
     def rotations(self) -> np.ndarray:
         """Returns the rotation (F, J, 3, 3) of each joint in its parent's frame."""
-        columns_of: dict[str, list[list[int]]] = {}
-        joints_of: dict[str, list[int]] = {}
+        rotations = np.tile(np.eye(3), (len(self.frames), len(self.joints), 1, 1))
         for joint, (names, column) in enumerate(zip(self.channels, self.columns(), strict=True)):
             turning = [k for k, name in enumerate(names) if name.endswith("rotation")]
-            order = "".join(names[k][0] for k in turning)
-            columns_of.setdefault(order, []).append([column.start + k for k in turning])
-            joints_of.setdefault(order, []).append(joint)
-        rotations = np.tile(np.eye(3), (len(self.frames), len(self.joints), 1, 1))
-        for order, joints in joints_of.items():
-            if order:
-                angles = self.frames[:, columns_of[order]]
-                turned = Rotation.from_euler(order, angles.reshape(-1, len(order)), degrees=True).as_matrix()
-                rotations[:, joints] = turned.reshape(len(angles), len(joints), 3, 3)
+            if turning:
+                order, angles = "".join(names[k][0] for k in turning), self.frames[:, column][:, turning]
+                rotations[:, joint] = Rotation.from_euler(order, angles, degrees=True).as_matrix()
         return rotations
 
     def translations(self) -> np.ndarray:
@@ -122,37 +115,39 @@ def forward_kinematics(
     return positions, turned
 
 
+def read_lines(path: str | Path) -> Lines:
+    """Reads a text file; raises `UserError` if it is not UTF-8 or too large."""
+    regular_file(path, TEXT_LIMIT)
+    return Lines(Path(path).read_bytes(), str(path))
+
+
 def read(path: str | Path) -> Bvh:
     """Reads a BVH file; raises `UserError`, with file and line, if it is not complete and valid."""
-    regular_file(path, TEXT_LIMIT)
-    return parse(Path(path).read_bytes(), str(path))
-
-
-def parse(data: bytes, name: str) -> Bvh:
-    """Reads the bytes of a BVH file, called `name` in errors."""
-    source = _Source(data, name)
+    source = read_lines(path)
+    if [word.upper() for word in next(iter(source), [])] != ["HIERARCHY"]:
+        source.fail("not a BVH file (it must begin with HIERARCHY)")
     joints: list[_Node] = []
     ends: list[_Node] = []
     blocks: list[_Node] = []  # those whose braces are open
 
-    while (keyword := source.token().upper()) != "MOTION":
+    while (keyword := source.word().upper()) != "MOTION":
         node = blocks[-1] if blocks else None
         inside = node is not None and node.number >= 0
         if len(joints) + len(ends) > MAX_JOINTS:
             source.fail(f"more than {MAX_JOINTS} joints and end sites")
         if keyword == ("ROOT" if node is None else "JOINT") and (node is None or inside):
-            blocks.append(_Node(len(joints), node.number if node else -1, source.token()))
+            blocks.append(_Node(len(joints), node.number if node else -1, source.word()))
             joints.append(blocks[-1])
-            source.token("{")
+            source.word("{")
         elif keyword == "END" and node is not None and inside:
-            source.token("SITE")
+            source.word("SITE")
             blocks.append(_Node(-1, node.number))
             ends.append(blocks[-1])
-            source.token("{")
+            source.word("{")
         elif keyword == "OFFSET" and node is not None:
-            node.offset = [source.number() for _ in range(3)]
+            node.offset = source.numbers([source.word() for _ in range(3)], 3)
         elif keyword == "CHANNELS" and node is not None and inside:
-            node.channels = tuple(source.token().capitalize() for _ in range(int(source.number())))
+            node.channels = tuple(source.word().capitalize() for _ in range(int(source.numbers([source.word()], 1)[0])))
             if len(set(node.channels)) < len(node.channels) or not set(node.channels) <= set(CHANNELS):
                 names = " ".join(node.channels)[:80]
                 source.fail(f"channels must be distinct and among {', '.join(CHANNELS)}, found {names}")
@@ -175,6 +170,10 @@ def parse(data: bytes, name: str) -> Bvh:
     # a rounded time (0.0333333 for 1/30) means the integer, or resampling could move the last frame past the end
     whole, last_digit = max(round(1 / time), 1), 10.0 ** int(Decimal(seconds).as_tuple().exponent)
     fps = float(whole) if abs(1 / whole - time) < min(last_digit, 0.01 * time) else 1 / time
+    width = sum(len(node.channels) for node in joints)
+    frames = [source.numbers(words, width) for words in source]
+    if len(frames) != count or not frames:
+        source.fail(f"the file ends after {len(frames)} frames, but must have {max(count, 1)}")
     return Bvh(
         tuple(node.name for node in joints),
         tuple(node.parent for node in joints),
@@ -182,7 +181,7 @@ def parse(data: bytes, name: str) -> Bvh:
         tuple(node.channels for node in joints),
         tuple(node.parent for node in ends),
         np.array([node.offset for node in ends], float).reshape(-1, 3),
-        source.table(count, sum(len(node.channels) for node in joints)),
+        np.array(frames),
         fps,
     )
 
@@ -198,8 +197,8 @@ class _Node:
     channels: tuple[str, ...] = ()
 
 
-class _Source:
-    """Lines of a BVH file, read one after the other; tracks the line number for error messages."""
+class Lines:
+    """Lines of a text file as words, without blank lines and comments (#); tracks the line number for error messages."""
 
     def __init__(self, data: bytes, name: str):
         self.name, self.line = name, 1
@@ -207,63 +206,44 @@ class _Source:
             lines = data.decode("utf-8-sig").splitlines()
         except UnicodeDecodeError as error:
             self.line = data.count(b"\n", 0, error.start) + 1
-            self.fail("not a BVH file (not UTF-8 text)")
-        self.lines = ((number, line.strip()) for number, line in enumerate(lines, 1) if line.strip())
-        self.line, first = next(self.lines, (1, ""))
-        if first.upper() != "HIERARCHY":
-            self.fail("not a BVH file (it must begin with HIERARCHY)")
-        self.tokens = ((number, token) for number, line in self.lines for token in line.split())
+            self.fail("not UTF-8 text")
+        self.lines = ((number, line.split()) for number, line in enumerate(lines, 1) if not line.startswith("#"))
+        self.words = (word for words in self for word in words)
+
+    def __iter__(self) -> Iterator[list[str]]:
+        for number, words in self.lines:
+            if words:
+                self.line = number
+                yield words
 
     def fail(self, what: str) -> NoReturn:
         raise UserError(f"{self.name}, line {self.line}: {what}")
 
-    def token(self, expected: str = "") -> str:
-        """Returns the next word of the hierarchy; it must be `expected` (case-insensitive) if that is given."""
-        self.line, token = next(self.tokens, (self.line, ""))
-        if not token:
+    def word(self, expected: str = "") -> str:
+        """Returns the next word of the hierarchy; it must be `expected` (case-insensitive) if that is not empty."""
+        word = next(self.words, "")
+        if not word:
             self.fail("the file ends inside the hierarchy")
-        if expected and token.upper() != expected:
-            self.fail(f"expected {expected}, found {token[:40]}")
-        return token
+        if expected and word.upper() != expected:
+            self.fail(f"expected {expected}, found {word[:40]}")
+        return word
 
-    def number(self) -> float:
-        token = self.token()
+    def numbers(self, words: Sequence[str], count: int) -> list[float]:
+        """Returns the words as `count` finite numbers."""
         try:
-            value = float(token)
+            values = [float(word) for word in words]
         except ValueError:
-            value = math.nan
-        if not abs(value) <= LARGEST:
-            self.fail(f"expected a number, found {token[:40]}")
-        return value
+            values = [math.nan]
+        if len(values) != count or not sum(map(abs, values)) <= LARGEST:
+            self.fail(f"expected {count} finite number(s), found {' '.join(words)[:40]}")
+        return values
 
     def labeled(self, pattern: str, expected: str) -> str:
         """Returns the value on the next line, the first group of `pattern`."""
-        self.line, line = next(self.lines, (self.line, ""))
+        line = " ".join(next(iter(self), []))
         if not (match := re.fullmatch(pattern, line, re.IGNORECASE)):
             self.fail(f"expected {expected}, found {line[:40] or 'the end of the file'}")
         return match[1]
-
-    def table(self, count: int, width: int) -> np.ndarray:
-        """Returns the numbers (count, width) float64 in all remaining lines."""
-        rows, numbers = [], []
-        for number, line in self.lines:
-            self.line = number
-            try:
-                row = list(map(float, line.split()))
-            except ValueError as error:
-                self.fail(str(error))
-            if len(row) != width:
-                self.fail(f"{len(row)} numbers, but the joints have {width} channels")
-            rows.append(row)
-            numbers.append(number)
-        if len(rows) != count or not rows:
-            self.fail(f"the file ends after {len(rows)} frames, but must have {max(count, 1)}")
-        table = np.array(rows)
-        valid = (np.abs(table) <= LARGEST).all(1)
-        if not valid.all():
-            self.line = numbers[int(np.argmin(valid))]
-            self.fail("number is not finite, or too large")
-        return table
 
 
 def write(bvh: Bvh, path: str | Path) -> None:

@@ -1,4 +1,4 @@
-"""Runs the benchmark and writes docs/benchmarks/speed.md: `python benchmarks/run.py [only=steps] [device=cuda]`.
+"""Runs the benchmark and writes docs/benchmarks/speed.md: `python benchmarks/run.py [cuda]`.
 
 The section of a GPU is next to that of the CPU. Sections that were measured once, by a script of an earlier commit,
 keep their figures.
@@ -58,11 +58,6 @@ def table(rows: list[Row]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def body(section: Section) -> str:
-    tables = (f"{caption[:1].upper()}{caption[1:]}:\n\n{table(rows)}" for caption, rows in section["tables"].items())
-    return "\n\n".join([section["text"], *tables])
-
-
 def render(sections: dict[str, Any]) -> str:
     order = sorted(sections, key=lambda name: ("script" in sections[name], name.endswith("_cuda")))
     machines = list(dict.fromkeys(json.dumps(sections[name]["machine"]) for name in order))
@@ -74,25 +69,20 @@ def render(sections: dict[str, Any]) -> str:
         where = machines.index(json.dumps(section["machine"])) + 1
         script = section.get("script", "benchmarks/steps.py")
         title = section["title"] + (" on a GPU" if name.endswith("_cuda") else "")
-        lines += [f"\n## {title}\n", body(section), f"\n`{script}`, {section['date']}, machine {where}."]
+        lines += [f"\n## {title}\n", section["text"]]
+        lines += [f"\n{name[:1].upper()}{name[1:]}:\n\n{table(rows)}" for name, rows in section["tables"].items()]
+        lines.append(f"\n`{script}`, {section['date']}, machine {where}.")
     return "\n".join(lines) + "\n"
 
 
-def main(*words: str) -> None:
+def main(device: str = "cpu") -> None:
     import steps
 
-    options = dict(word.split("=", 1) for word in words)
-    device = options.get("device") or "cpu"
-    if device not in ("cpu", "cuda"):
-        raise SystemExit(f"DEVICE={device}: give cpu or cuda")
-    if device == "cuda" and not torch.cuda.is_available():
-        raise SystemExit("DEVICE=cuda: torch finds no CUDA GPU on this machine")
-    if options.get("only") not in (None, "", "steps"):
-        raise SystemExit(f"ONLY={options['only']}: give steps, the only benchmark")
+    if device not in ("cpu", "cuda") or (device == "cuda" and not torch.cuda.is_available()):
+        raise SystemExit(f"DEVICE={device}: give cpu, or cuda on a machine with a CUDA GPU")
     data = PAGE.with_suffix(".json")
     sections: dict[str, Any] = json.loads(data.read_text()) if data.exists() else {}
-    section = steps.measure("--device", device)
-    section |= {"date": datetime.date.today().isoformat(), "machine": machine()}
+    section = steps.measure(device) | {"date": datetime.date.today().isoformat(), "machine": machine()}
     sections["steps_cuda" if device == "cuda" else "steps"] = section
     data.write_text(json.dumps(sections, indent=1) + "\n")
     PAGE.write_text(render(sections))

@@ -1,15 +1,12 @@
-"""Training steps in both speeds, compared to plain PyTorch: `python benchmarks/steps.py [--device cuda] [--quick]`.
+"""Training steps in both speeds, compared to plain PyTorch.
 
 The full-size step is that of humanml3d/mdm with lengths as in HumanML3D. A plain PyTorch loop trains
 `nn.TransformerEncoder` of the same size on the same clips, padded to 196 frames, as the published codes do. Then follow
 a step of every network in its size for CPU runs, and on the CPU the quickstart by the complete framework. All take
-turns in one run. On CUDA, the section also has the memory.
+turns in one run.
 """
 
-import argparse
-import itertools
 import statistics
-import sys
 import tempfile
 import time
 import warnings
@@ -22,15 +19,15 @@ from typing import Any
 
 import numpy as np
 import torch
-from lightning import Callback
-from run import Row, Section, body
+from run import Row, Section
 from torch import Tensor, nn
 
 from flame_mdm.batch import Condition, MotionBatch, padded_length
 from flame_mdm.config import compose, instantiate
 from flame_mdm.data.datamodule import TrainingBatches
+from flame_mdm.runs import read_history
 from flame_mdm.task import MotionGeneration
-from flame_mdm.training import fit as training
+from flame_mdm.training.fit import fit
 from flame_mdm.training.speed import accelerate
 
 WIDTH, LONGEST = 263, 196
@@ -53,8 +50,7 @@ QUIET = [
 
 def training_step(task: MotionGeneration, batch: MotionBatch) -> Tensor:
     """Returns the loss of a step, with a condition of the right shape instead of an encoded text."""
-    features = task.condition.features
-    rows = len(batch)
+    rows, features = len(batch), task.condition.features
     real = torch.ones(rows, TOKENS, dtype=torch.bool)
     null = Condition(torch.zeros(1, features), torch.zeros(1, TOKENS, features), real[:1])
     cond = Condition(torch.zeros(rows, features), torch.zeros(rows, TOKENS, features), real, null)
@@ -95,7 +91,7 @@ def build_task(config: dict[str, Any]) -> MotionGeneration:
 
 
 def recipe_step(config: dict[str, Any], speed: str, device: str) -> tuple[Callable[[MotionBatch], None], int]:
-    """Returns a training step of a recipe, with zeros in place of the text, and the multiple of frames it pads to."""
+    """Returns a training step of a recipe, and the multiple of frames to which it pads."""
     config = deepcopy(config)
     config["trainer"]["accelerator"] = device
     task = build_task(config).to(device).train()
@@ -145,31 +141,29 @@ def full_size(size: list[str], batches: int, device: str) -> tuple[list[Row], st
     world = TrainingBatches.BUCKETS // batches
     sampler = iter(TrainingBatches(lengths, rows, seed=0, first=0, rank=0, world=world))
     drawn = [lengths[[index for index, _ in next(sampler)]] for _ in range(batches)]
-
-    def batches_of(multiple: int) -> list[MotionBatch]:
-        return [batch_of(chosen, padded_length(int(chosen.max()), multiple, LONGEST), device) for chosen in drawn]
-
-    bucketed = batches_of(1)
     real = sum(int(chosen.sum()) for chosen in drawn)
+    padded = [padded_length(int(chosen.max()), 1, LONGEST) for chosen in drawn]
+
+    def on_batches(step: Callable[[MotionBatch], None], multiple: int) -> Callable[[], None]:
+        """Returns a function that trains on all batches, padded to a multiple of frames."""
+        ready = [batch_of(c, padded_length(int(c.max()), multiple, LONGEST), device) for c in drawn]
+
+        def run() -> None:
+            for batch in ready:
+                step(batch)
+
+        return run
+
     width, layers = config["denoiser"]["latent_dim"], config["denoiser"]["num_layers"]
-    ways: dict[str, tuple[Callable[[MotionBatch], None], list[MotionBatch]]] = {
-        "plain PyTorch, padded to 196": (peer_step(width, layers, device), batches_of(LONGEST)),
-    }
-    for speed in SPEEDS:
-        step, multiple = recipe_step(config, speed, device)
-        ways[f"speed={speed}"] = step, batches_of(multiple)
-
-    def run(step: Callable[[MotionBatch], None], all_batches: list[MotionBatch]) -> None:
-        for batch in all_batches:
-            step(batch)
-
-    times = take_turns({name: partial(run, *way) for name, way in ways.items()}, 3, device)
+    runs = {"plain PyTorch, padded to 196": on_batches(peer_step(width, layers, device), LONGEST)}
+    runs |= {f"speed={speed}": on_batches(*recipe_step(config, speed, device)) for speed in SPEEDS}
+    times = take_turns(runs, 3, device)
     slowest = next(iter(times.values()))
     table: list[Row] = []
     for name, taken in times.items():
         row: Row = {"training": name, "ms per step": 1000 * taken / batches, "times as fast": slowest / taken}
         table.append(row | {"frames per second": real / taken})
-    mean = sum(batch.x.shape[1] for batch in bucketed) / batches
+    mean = sum(padded) / batches
     text = f"{rows} clips of {real / rows / batches:.0f} frames on average, padded to {mean:.0f} by the framework"
     return table, text
 
@@ -182,8 +176,8 @@ def backbones(names: Sequence[str], rounds: int, device: str) -> list[Row]:
         config = compose(BACKBONES[name][0], ["condition=none", *BACKBONES[name][1:]])
         batch = batch_of(lengths, int(lengths.max()), device)
         parameters = sum(p.numel() for p in build_task(config).parameters() if p.requires_grad)
-        runs = {speed: partial(recipe_step(config, speed, device)[0], batch) for speed in SPEEDS}
-        times = take_turns(runs, rounds, device)
+        steps = {speed: recipe_step(config, speed, device)[0] for speed in SPEEDS}
+        times = take_turns({speed: partial(step, batch) for speed, step in steps.items()}, rounds, device)
         row: Row = {"network": name, "parameters, M": parameters / 1e6}
         row |= {f"ms, {speed}": 1000 * taken for speed, taken in times.items()}
         row["times as fast"] = times["reference"] / times["fast"]
@@ -192,45 +186,24 @@ def backbones(names: Sequence[str], rounds: int, device: str) -> list[Row]:
     return rows
 
 
-class Clock(Callback):
-    """Records the time after every step."""
-
-    def __init__(self) -> None:
-        self.times: list[float] = []
-
-    def on_train_batch_end(self, *_: Any) -> None:
-        self.times.append(time.perf_counter())
-
-
-def framework(steps: int, folder: Path, *words: str) -> float:
-    """Returns the median milliseconds per step of the quickstart, trained by the framework with other settings."""
-    run, clock = Path(tempfile.mkdtemp(dir=folder)), Clock()
-    words = (*QUIET, f"data_root={folder / 'data'}", f"run.dir={run}", f"trainer.max_steps={steps}", *words)
-    config = compose("quickstart", words)
-    config["callbacks"]["clock"] = {"_target_": f"{__name__}.clock"}
-    globals()["clock"] = lambda: clock
-    training.fit(run, config)
-    times = clock.times[min(50, steps // 2) :]  # the first ones warm up
-    return 1000 * statistics.median(b - a for a, b in itertools.pairwise(times))
-
-
 def quickstart(clips: int, steps: int, rounds: int) -> list[Row]:
     """Returns a row per speed of the quickstart's step, trained by the complete framework; the speeds take turns."""
     times: dict[str, list[float]] = {speed: [] for speed in SPEEDS}
     with tempfile.TemporaryDirectory() as name:
+        words = [*QUIET, f"data_root={name}/data", f"data.source.clips={clips}", f"trainer.max_steps={steps}"]
+        words.append(f"trainer.log_every_n_steps={max(1, steps // 15)}")
         for speed in SPEEDS * rounds:
-            times[speed].append(framework(steps, Path(name), f"data.source.clips={clips}", f"speed={speed}"))
+            folder = Path(tempfile.mkdtemp(dir=name))
+            fit(folder, compose("quickstart", [*words, f"run.dir={folder}", f"speed={speed}"]))
+            taken = read_history(folder)["train/seconds_per_step"]
+            times[speed] += [1000 * value for step, value in taken.items() if step >= steps // 3]  # the first warm up
     medians = {speed: statistics.median(taken) for speed, taken in times.items()}
     slow = medians["reference"]
     return [{"training": f"speed={s}", "ms per step": t, "times as fast": slow / t} for s, t in medians.items()]
 
 
-def measure(*words: str) -> Section:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
-    parser.add_argument("--quick", action="store_true", help="tiny sizes, which show only that everything runs")
-    args = parser.parse_args(words)
-    quick, device = args.quick, args.device
+def measure(device: str = "cpu", quick: bool = False) -> Section:
+    """Returns the section of a device, cpu or cuda; `quick` takes tiny sizes, which show only that everything runs."""
     warnings.filterwarnings("ignore")
     torch.manual_seed(0)
     torch.set_float32_matmul_precision("high")  # as in training
@@ -257,7 +230,3 @@ def measure(*words: str) -> Section:
         f"and `speed=fast` {fast:.1f} times.",
         "tables": tables,
     }
-
-
-if __name__ == "__main__":
-    print(body(measure(*sys.argv[1:])))

@@ -1,8 +1,4 @@
-"""Settings of the docs site, which `make docs` builds in build/docs.
-
-The pages are plain Markdown, so they read the same on a code host. The start page is the README; the sidebar follows
-docs/index.md.
-"""
+"""Settings of the docs site, which `make docs` builds. The start page is the README; docs/index.md lists the pages."""
 
 import re
 from dataclasses import fields, is_dataclass
@@ -52,6 +48,5 @@ def add_help(app: Any, what: str, name: str, documented: Any, options: Any, line
 
 
 def setup(app: Any) -> None:
-    """Registers the start page and the help texts."""
     app.connect("source-read", start_page)
     app.connect("autodoc-process-docstring", add_help)

@@ -1,10 +1,9 @@
 """Writes recipes.md and hyperparameters.md from the recipes: `make docs`."""
 
 import re
-from collections.abc import Mapping
 from itertools import takewhile
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from flame_mdm.commands.tables import sizes
 from flame_mdm.config import EXPERIMENTS, recipes
@@ -13,8 +12,6 @@ from flame_mdm.reporting.tables.specs import PUBLISHED, load_spec
 from flame_mdm.safe_io import read_yaml
 
 HEAD = "<!-- Written by docs/generate.py; do not edit. -->\n"
-
-# Recipes --------------------------------------------------------------------------------------------------------------
 
 
 def head(name: str) -> tuple[str, str]:
@@ -26,7 +23,6 @@ def head(name: str) -> tuple[str, str]:
 
 
 def recipes_page() -> str:
-    """Returns the page of all recipes, with the paper, table and row that each reproduces."""
     page = f"""# Recipes
 
 {HEAD}
@@ -49,20 +45,13 @@ about the same length, every sample of a batch has the same weight, and checkpoi
     return page
 
 
-# Hyperparameters ------------------------------------------------------------------------------------------------------
+def published_tables() -> dict[str, dict[str, dict[str, Any]]]:
+    """Returns the hyperparameters of the papers, from published.yaml: title -> recipe -> dotted key -> value.
 
-
-class Table(NamedTuple):
-    """Hyperparameters that a paper gives: values by dotted key, by recipe; None = shown, but not in the paper."""
-
-    title: str
-    columns: Mapping[str, Mapping[str, Any]]
-
-
-def published_tables() -> list[Table]:
-    """Returns the hyperparameters of the papers, from published.yaml."""
+    None = the value is shown, but not in the paper.
+    """
     published = read_yaml(PUBLISHED)
-    tables = []
+    tables = {}
     for page in published["hyperparameters"]["pages"]:
         columns = {name: dict(values) for name, values in page["recipes"].items()}
         for table in page.get("tables", []):
@@ -70,7 +59,7 @@ def published_tables() -> list[Table]:
                 for row in published[table][part_name]["rows"]:
                     for column, text in row["values"].items():
                         columns[part["recipes"][column]][part["keys"][row["label"]]] = printed(text)
-        tables.append(Table(page["title"], columns))
+        tables[page["title"]] = columns
     return tables
 
 
@@ -96,7 +85,6 @@ def same(ours: Any, papers: Any) -> bool:
 
 
 def hyperparameters_page() -> str:
-    """Returns the page of the papers' hyperparameter tables, filled from the recipes."""
     page = f"""# Hyperparameters
 
 {HEAD}
@@ -104,15 +92,15 @@ Values of the recipes. Bold: the paper gives the same value. If the two differ, 
 in the papers; most are those of the authors' code. "–": the recipe has no such value. Where a paper names only the kind
 of a text encoder (MFM: CLIP, T5; MDM: sentence-BERT), the checkpoint is our choice.
 """
-    for table in TABLES:
-        columns = {name: hyperparameters(name, sizes) for name in table.columns}
-        rows = [key for key in HYPERPARAMETERS if any(key in papers for papers in table.columns.values())]
+    for title, published in TABLES.items():
+        columns = {name: hyperparameters(name, sizes) for name in published}
+        rows = [key for key in HYPERPARAMETERS if any(key in papers for papers in published.values())]
         cells = {
-            key: [_cell(ours.get(key), table.columns[name].get(key)) for name, ours in columns.items()] for key in rows
+            key: [_cell(ours.get(key), published[name].get(key)) for name, ours in columns.items()] for key in rows
         }
         equal = [key for key in rows if all(cell.startswith("**") for cell in cells[key])]
         shared = (HYPERPARAMETERS[key] + f" {cells[key][0]}" * (len(set(cells[key])) == 1) for key in equal)
-        page += f"\n## {table.title}\n\n" + f"As in the paper: {'; '.join(shared)}.\n" * bool(equal)
+        page += f"\n## {title}\n\n" + f"As in the paper: {'; '.join(shared)}.\n" * bool(equal)
         if equal != rows:
             page += f"\n| | {' | '.join(f'`{name}`' for name in columns)} |\n|---|{'---|' * len(columns)}\n"
         page += "".join(f"| {HYPERPARAMETERS[key]} | {' | '.join(cells[key])} |\n" for key in rows if key not in equal)

@@ -1,8 +1,8 @@
 """Atomic writes, hashes, locks, and reading files of others.
 
-Every file that may come from other people is read here or checked here first: it must be a regular file of limited
-size, and the sizes that it declares must match its actual bytes. All functions that read a path raise
-`FileNotFoundError` if it does not exist, and `UserError` if it is no regular file or its content is refused.
+Every file that may come from other people is read or checked here first: it must be a regular file of limited size,
+and the sizes that it declares must match its bytes. Functions that read a path raise `FileNotFoundError` if it does not
+exist, and `UserError` if it is no regular file or its content is refused.
 """
 
 from __future__ import annotations
@@ -44,6 +44,7 @@ INFLATION = 20
 
 ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError)
 """Errors that `zipfile` raises for damaged, encrypted and unusually compressed archives."""
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # numbers of errors of a full disk
 
 
 # Writing --------------------------------------------------------------------------------------------------------------
@@ -57,51 +58,53 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
     `UserError` if the file cannot be written, for instance because the disk is full.
     """
     path = Path(path)
-    temporary = path.with_name(f".{path.stem[:80]}.{os.getpid()}-{secrets.token_hex(4)}{path.suffix}")
-    with writing(path, temporary), made_folder(path.parent):
-        try:
-            yield temporary
-            temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
+    with _temporary(path) as temporary:
+        yield temporary
+        temporary.replace(path)
 
 
 @contextmanager
 def atomic_folder(path: str | Path) -> Iterator[Path]:
-    """Yields a temporary folder next to `path` that is renamed to `path` at the end; a failure leaves no files behind.
+    """Does the same as `atomic_write` for a folder.
 
     If the folder `path` exists, the new files replace files of the same name, and other files are kept.
     """
     path = Path(path)
     if path.exists() and not path.is_dir():
         raise UserError(f"{path}: a file, not a folder. Choose another folder")
-    temporary = path.with_name(f".{path.name[:80]}.{os.getpid()}-{secrets.token_hex(4)}")
-    try:
-        with writing(path, temporary), made_folder(path.parent):
-            try:
-                temporary.mkdir()
-                yield temporary
-                try:
-                    temporary.rename(path)
-                except OSError:
-                    if not path.is_dir():
-                        raise
-                    for file in sorted(temporary.iterdir()):
-                        file.replace(path / file.name)
-            finally:
-                shutil.rmtree(temporary, ignore_errors=True)
-    except UserError as error:
-        raise UserError(str(error).replace(str(temporary), str(path))) from error
+    with _temporary(path) as temporary:
+        temporary.mkdir()
+        yield temporary
+        try:
+            temporary.rename(path)
+        except OSError:
+            if not path.is_dir():
+                raise
+            for file in sorted(temporary.iterdir()):
+                file.replace(path / file.name)
 
 
 @contextmanager
-def writing(path: Path, temporary: Path) -> Iterator[None]:
-    """Converts every `OSError` raised while `path` is written as `temporary` to a `UserError` that names `path`.
+def _temporary(path: Path) -> Iterator[Path]:
+    """Yields a unique path next to `path`, and removes what is there at the end.
 
-    Errors that name neither of the two nor a folder above `path`, and errors without `errno`, pass unchanged.
+    Errors that name it name `path` instead, and an `OSError` that names either of them or a folder above becomes a
+    `UserError`.
     """
+    temporary = path.with_name(f".{path.stem[:80]}.{os.getpid()}-{secrets.token_hex(4)}{path.suffix}")
     try:
-        yield
+        with made_folder(path.parent):
+            try:
+                yield temporary
+            finally:
+                if temporary.is_dir():
+                    shutil.rmtree(temporary, ignore_errors=True)
+                else:
+                    temporary.unlink(missing_ok=True)
+    except UserError as error:
+        if str(temporary) not in str(error):
+            raise
+        raise UserError(str(error).replace(str(temporary), str(path))) from error
     except OSError as error:
         name = Path(str(error.filename or temporary))
         within = name.is_relative_to(temporary) or name.is_relative_to(path) or path.is_relative_to(name)
@@ -113,7 +116,7 @@ def writing(path: Path, temporary: Path) -> Iterator[None]:
 def write_failure(error: BaseException, path: Path) -> str:
     """Returns why a file could not be written, and the free space if the disk may be full."""
     reason = getattr(error, "strerror", None) or first_line(error)
-    if getattr(error, "errno", None) not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO):
+    if getattr(error, "errno", None) not in FULL:
         return reason
     folder = next(parent for parent in path.absolute().parents if parent.exists())
     return f"{reason}. {_size(shutil.disk_usage(folder).free)} are free on the disk of {folder}"
@@ -144,10 +147,7 @@ def write_json(path: str | Path, content: Any, indent: int | None = 2) -> None:
 
 @contextmanager
 def naming(name: object, *errors: type[Exception], what: str = "") -> Iterator[None]:
-    """Adds the name of a file to every `UserError` about its content that does not contain it.
-
-    Errors of other kinds that this content may cause become a `UserError` that says `what` is wrong.
-    """
+    """Adds the name of a file to every `UserError` that does not contain it, and turns `errors` into such errors."""
     try:
         yield
     except UserError as error:
@@ -163,14 +163,11 @@ def naming(name: object, *errors: type[Exception], what: str = "") -> Iterator[N
 
 @contextmanager
 def locked(path: Path, busy: Callable[[str], object], advice: str) -> Iterator[str]:
-    """Holds a lock file, with process and host in it, that no other process holds, here or on other hosts.
-
-    The operating system releases the lock when a process ends in any way, so a free lock in a file that still names a
-    process was left behind by one that died; yields that name, or "". POSIX record locks also hold between hosts on NFS
-    and Lustre, unlike the locks of `filelock`. Windows has neither.
+    """Holds a lock file that names process and host; yields the process that died and left the file behind, or "".
 
     If another process holds the lock, calls `busy` with its name, which raises, or returns to wait. `advice` is for
-    file systems without locks.
+    file systems without locks. The operating system releases the lock when a process ends in any way. POSIX record
+    locks also hold between hosts on NFS and Lustre, unlike the locks of `filelock`. Windows has neither.
     """
     while True:
         with made_folder(path.parent), path.open("a+") as file:
@@ -260,10 +257,7 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def read_yaml(path: str | Path) -> Any:
-    """Returns the plain content of a YAML file, limited in size after its aliases are expanded.
-
-    Interpolations such as `${a}` are kept as texts.
-    """
+    """Returns the plain content of a YAML file; interpolations such as `${a}` are kept as texts."""
     import yaml
     from omegaconf import OmegaConf
 
@@ -303,8 +297,7 @@ def read_npz(
 ) -> dict[str, np.ndarray]:
     """Returns the arrays of an .npz file, or seekable open file, by name, without those in `skip`, or `only` some.
 
-    Raises `UserError` if the file is damaged or encrypted, contains objects, declares wrong sizes, or expands to more
-    than `ARRAYS_LIMIT` bytes and more than `INFLATION` times its size.
+    Raises `UserError` if the file is damaged or encrypted, contains objects, or expands disproportionately.
     """
     from numpy.lib import format as npy
 
@@ -347,10 +340,7 @@ def _opened(source: Path | IO[bytes]) -> Iterator[tuple[IO[bytes], int]]:
 
 
 def _check_array(file: IO[bytes], size: int, name: str) -> int:
-    """Checks that the header of an .npy file declares its `size` in bytes, before memory is allocated.
-
-    Returns the number of its elements.
-    """
+    """Returns the number of elements of an .npy file, whose header must declare its `size` in bytes."""
     from numpy.lib import format as npy
 
     try:

@@ -1,6 +1,5 @@
 """Command lines: a dataclass per command declares its keys; signals, errors and exit codes."""
 
-import errno
 import os
 import re
 import shlex
@@ -16,6 +15,7 @@ from typing import Any, TypeVar, get_type_hints
 from flame_mdm.config.composition import parse
 from flame_mdm.config.signatures import check_kind
 from flame_mdm.errors import UserError, did_you_mean, first_line, say
+from flame_mdm.safe_io import FULL
 from flame_mdm.signals import stoppable
 
 Settings = TypeVar("Settings")
@@ -29,7 +29,6 @@ STOP = (signal.SIGINT, signal.SIGTERM)  # signals that end a command after it ha
 
 BUG = 70  # exit code of a bug, as in sysexits.h
 REPORT = "this is a bug in flame_mdm. Please report it with the lines above and the command that you ran"
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
 NO_MEMORY = re.compile("allocate memory|out of memory|bad_alloc|start new thread|create a primitive|failed to map")
 """Messages of errors caused by a lack of memory: from torch, from threads, and from libraries that fail to load."""

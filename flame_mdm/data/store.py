@@ -12,11 +12,10 @@ Verification adds a report to the folder, `verify.json`.
 """
 
 import hashlib
-import io
 import json
+import os
 import shutil
 import zipfile
-from array import array
 from collections import Counter, deque
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
@@ -24,7 +23,7 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from itertools import groupby
 from pathlib import Path
-from typing import Annotated, Any
+from typing import IO, Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -46,9 +45,8 @@ from flame_mdm.safe_io import (
     regular_file,
     sha256,
 )
-from flame_mdm.schemas import ClosedSchema, Int, Schema, check_shape
+from flame_mdm.schemas import Int, Schema, check_shape
 
-FORMAT = 1
 BLOCK = 8192  # frames that are read together for the statistics
 Count = Annotated[int, Field(ge=0, lt=2**63)]
 
@@ -67,24 +65,17 @@ class Entry:
     attributes: dict[str, Any] = field(default_factory=dict)
 
 
-class Splits(ClosedSchema):
-    """Number of clips of each split."""
-
-    train: Int
-    val: Int
-    test: Int
-
-
 class Contents(Schema):
     """The values of store.json that commands rely on."""
 
+    format: Literal[1]
     dataset: str
     representation: str
     fingerprint: str
     published_split: bool
     actions: list[str]
     shape: Annotated[list[Count], Field(min_length=2, max_length=2)]
-    clips: Splits
+    clips: Annotated[dict[Split, Int], Field(min_length=len(SPLITS))]
     excluded: dict[str, Int]
     sha256: dict[str, str]
     fps: Annotated[float, Field(ge=0, lt=1e9)]
@@ -100,7 +91,12 @@ class Store:
 
     def __init__(self, folder: Path):
         self.folder = Path(folder)
-        self.info: dict[str, Any] = _read_info(self.folder)
+        contents = self.folder / "store.json"
+        if not contents.exists():
+            raise FileNotFoundError(f"{folder}: no prepared data set; run `make prepare`")
+        with _intact(contents):
+            self.info: dict[str, Any] = read_json(contents)
+            check_shape(self.info, Contents)
         self._check("clips.jsonl", "statistics.npz")
         frames, width = self.info["shape"]
         with _intact(self.folder / "features.npy") as path:
@@ -115,7 +111,7 @@ class Store:
             if not self.mean.shape == self.std.shape == (width,) or kinds != {"f"}:
                 raise ValueError(f"not a mean and std of {width} features")
         name, fps = self.info["representation"], self.info["fps"]
-        with _intact(self.folder / "store.json"):
+        with _intact(contents):
             if _fingerprint(self.folder, name, fps, self.mean, self.std) != self.fingerprint:
                 raise ValueError("its fingerprint does not match the clips")
 
@@ -168,16 +164,19 @@ def write_store(folder: Path, source: MotionSource, representation: Representati
 
 def _write(folder: Path, source: MotionSource, representation: Representation, total: int) -> None:
     bar = ProgressBar(source.clips(representation.fps), f"preparing {source.name}", total, unit=" clips")
-    with bar as clips, _Writer(folder, representation.features) as writer:
-        with closing(_encoded(clips, representation, source.workers)) as encoded:
-            for clip, features in encoded:
-                writer.add(source.name, clip, features)
-        writer.finish(source.name)
-    mean, std = source.statistics() or writer.statistics(representation)
+    with bar as clips, closing(_encoded(clips, representation, source.workers)) as encoded:
+        entries, frames = _pack(folder, source.name, encoded, representation.features)
+    splits = Counter(entry.split for entry in entries)
+    if not splits["train"]:
+        advice = "For your own data, add a `split` column to captions.csv"
+        raise UserError(f"{source.name}: no clip is in the training split. {advice}")
+    index = (json.dumps(asdict(entry), ensure_ascii=False, sort_keys=True) + "\n" for entry in entries)
+    (folder / "clips.jsonl").write_text("".join(index), encoding="utf-8")
+    mean, std = source.statistics() or training_statistics(folder, entries, frames, representation)
     mean, std = mean[: representation.features], std[: representation.features]
     np.savez(folder / "statistics.npz", mean=mean, std=std)
     info = {
-        "format": FORMAT,
+        "format": 1,
         "dataset": source.name,
         "source": dict(source.options),
         "actions": list(source.actions),
@@ -186,85 +185,75 @@ def _write(folder: Path, source: MotionSource, representation: Representation, t
         "counts": source.counts(),
         "representation": representation.name,
         "fps": representation.fps,
-        "clips": {split: writer.splits[split] for split in SPLITS},
-        "shape": [writer.frames, representation.features],
-        "hours": round(writer.frames / representation.fps / 3600, 3),
+        "clips": {split: splits[split] for split in SPLITS},
+        "shape": [frames, representation.features],
+        "hours": round(frames / representation.fps / 3600, 3),
         "fingerprint": _fingerprint(folder, representation.name, representation.fps, mean, std),
         "sha256": {path.name: sha256(path) for path in sorted(folder.iterdir())},
     }
     (folder / "store.json").write_text(json.dumps(info, indent=2) + "\n")
 
 
-class _Writer(ExitStack):
-    """Writes the files of a store into `folder` clip by clip; keeps a few numbers per clip."""
+def _pack(
+    folder: Path, name: str, encoded: Iterable[tuple[Clip, np.ndarray]], features: int
+) -> tuple[list[Entry], int]:
+    """Writes the features and references of the data set `name` clip by clip; returns its clips and number of frames.
 
-    def __init__(self, folder: Path, features: int):
-        super().__init__()
-        self.folder, self.features = folder, features
-        self.splits: Counter[str] = Counter()
-        self.frames, self._begin, self._motion = 0, 0, None
-        self._split_of: dict[str, str] = {}  # source -> split
-        self._ids: set[str] = set()
-        self._training = array("q")  # start and end of each training clip
-        self._references: zipfile.ZipFile | None = None
-        self._packed = self.enter_context((folder / "features.npy").open("wb"))
-        self._index = self.enter_context((folder / "clips.jsonl").open("w", encoding="utf-8"))
-        self._packed.seek(len(_header(0, features)))  # the header is written at the end
+    Consecutive clips with the same motion share its frames. Raises `UserError` if a clip exceeds its motion, or its id
+    or split contradicts that of another clip.
+    """
+    entries: dict[str, Entry] = {}
+    split_of: dict[str, Split] = {}  # by source
+    begin, frames, motion, references = 0, 0, None, None
+    with ExitStack() as stack:
+        packed = stack.enter_context((folder / "features.npy").open("wb"))
+        _write_header(packed, 0, features)
+        for clip, values in encoded:
+            if clip.motion is not motion:
+                motion, begin = clip.motion, frames
+                frames += len(values)
+                packed.write(values.tobytes())  # through a memory map, a full disk would kill the process (SIGBUS)
+            first, length = clip.window or (0, len(values))
+            if first < 0 or length < 1 or first + length > len(values):
+                raise UserError(f"clip {clip.id}: window {clip.window} exceeds {len(values)} frames")
+            if (other := split_of.setdefault(clip.source, clip.split)) != clip.split:
+                raise UserError(f"{name}: clips of {clip.source} are in both {other} and {clip.split}")
+            if clip.id in entries:
+                raise UserError(f"{name}: two clips have the same id, {clip.id}")
+            start, attributes = begin + first, dict(clip.attributes)
+            entry = Entry(clip.id, start, length, clip.split, clip.source, clip.captions, clip.action, attributes)
+            entries[clip.id] = entry
+            if clip.reference is not None:
+                references = references or stack.enter_context(zipfile.ZipFile(folder / "references.npz", "w"))
+                with references.open(f"{clip.id}.npy", "w", force_zip64=True) as file:
+                    np.lib.format.write_array(file, np.asarray(clip.reference, np.float32))
+        packed.seek(0)
+        _write_header(packed, frames, features)
+    return list(entries.values()), frames
 
-    def add(self, name: str, clip: Clip, features: np.ndarray) -> None:
-        """Writes a clip of the data set `name`, and the features of its motion unless the previous clip has the same.
 
-        Raises `UserError` if the clip exceeds its motion, or its id or split contradicts that of another clip.
-        """
-        if clip.motion is not self._motion:
-            self._motion, self._begin = clip.motion, self.frames
-            self.frames += len(features)
-            self._packed.write(features.tobytes())  # through a memory map, a full disk would kill the process (SIGBUS)
-        first, length = clip.window or (0, len(features))
-        if first < 0 or length < 1 or first + length > len(features):
-            raise UserError(f"clip {clip.id}: window {clip.window} exceeds {len(features)} frames")
-        if (other := self._split_of.setdefault(clip.source, clip.split)) != clip.split:
-            raise UserError(f"{name}: clips of {clip.source} are in both {other} and {clip.split}")
-        if clip.id in self._ids:
-            raise UserError(f"{name}: two clips have the same id, {clip.id}")
-        self._ids.add(clip.id)
-        self.splits[clip.split] += 1
-        start, attributes = self._begin + first, dict(clip.attributes)
-        if clip.split == "train":
-            self._training.extend((start, start + length))
-        entry = Entry(clip.id, start, length, clip.split, clip.source, clip.captions, clip.action, attributes)
-        self._index.write(json.dumps(asdict(entry), ensure_ascii=False, sort_keys=True) + "\n")
-        if clip.reference is not None:
-            if self._references is None:
-                self._references = self.enter_context(zipfile.ZipFile(self.folder / "references.npz", "w"))
-            with self._references.open(f"{clip.id}.npy", "w", force_zip64=True) as file:
-                np.lib.format.write_array(file, np.asarray(clip.reference, np.float32))
+def _write_header(file: IO[bytes], frames: int, features: int) -> None:
+    """Writes the header of features.npy. NumPy pads it to the same size for any number of frames."""
+    np.lib.format.write_array_header_1_0(file, {"descr": "<f4", "fortran_order": False, "shape": (frames, features)})
 
-    def finish(self, name: str) -> None:
-        """Completes the files; raises `UserError` if no clip of the data set `name` is in the training split."""
-        if not self.splits["train"]:
-            advice = "For your own data, add a `split` column to captions.csv"
-            raise UserError(f"{name}: no clip is in the training split. {advice}")
-        self._packed.seek(0)
-        self._packed.write(_header(self.frames, self.features))
-        self.close()
 
-    def statistics(self, representation: Representation) -> tuple[np.ndarray, np.ndarray]:
-        """Returns mean and std of the training frames, which are read from the file."""
-        training = np.zeros(self.frames, bool)  # cuts may overlap; each frame counts once
-        for start, end in zip(self._training[::2], self._training[1::2], strict=True):
-            training[start:end] = True
+def training_statistics(
+    folder: Path, clips: Iterable[Entry], frames: int, representation: Representation
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns mean and std (D,) of the training frames of a store, which are read from its file in blocks."""
+    training = np.zeros(frames, bool)  # cuts may overlap; each frame counts once
+    for clip in clips:
+        training[clip.start : clip.start + clip.length] |= clip.split == "train"
 
-        def frames() -> Iterator[np.ndarray]:
-            with (self.folder / "features.npy").open("rb") as file:
-                file.seek(len(_header(0, self.features)))
-                for begin in range(0, self.frames, BLOCK):
-                    used = training[begin : begin + BLOCK]
-                    block = np.fromfile(file, np.float32, len(used) * self.features)
-                    yield block.reshape(len(used), self.features)[used]
+    def blocks() -> Iterator[np.ndarray]:
+        with (folder / "features.npy").open("rb") as file:
+            file.seek(-4 * frames * representation.features, os.SEEK_END)
+            for begin in range(0, frames, BLOCK):
+                block = np.fromfile(file, np.float32, BLOCK * representation.features)
+                yield block.reshape(-1, representation.features)[training[begin : begin + BLOCK]]
 
-        mean, std = representation.statistics(Frames(frames, int(training.sum())))
-        return mean.numpy(), std.numpy()
+    mean, std = representation.statistics(Frames(blocks, int(training.sum())))
+    return mean.numpy(), std.numpy()
 
 
 def _encoded(clips: Iterable[Clip], representation: Representation, workers: int) -> Generator[tuple[Clip, np.ndarray]]:
@@ -303,15 +292,6 @@ def _encode(encoder: Representation, named: tuple[str, str, np.ndarray]) -> np.n
     return features
 
 
-def _header(frames: int, features: int) -> bytes:
-    """Returns the header of features.npy. NumPy pads it to the same size for any number of frames."""
-    header = io.BytesIO()
-    array = np.empty((0, features), np.float32)
-    content = np.lib.format.header_data_from_array_1_0(array) | {"shape": (frames, features)}
-    np.lib.format.write_array_header_1_0(header, content)
-    return header.getvalue()
-
-
 def _fingerprint(folder: Path, representation: str, fps: float, mean: np.ndarray, std: np.ndarray) -> str:
     digest = hashlib.sha256((folder / "clips.jsonl").read_bytes())
     # Features differ in their last bits between processors and thread counts, so the fingerprint depends on them only
@@ -329,19 +309,6 @@ def _intact(path: Path) -> Iterator[Path]:
     except (OSError, ValueError, KeyError) as error:
         what = f"{path}: damaged: {first_line(error)}"
         raise UserError(f"{what}. Delete {path.parent} and prepare the data set again") from error
-
-
-def _read_info(folder: Path) -> dict[str, Any]:
-    path = folder / "store.json"
-    if not path.exists():
-        raise FileNotFoundError(f"{folder}: no prepared data set; run `make prepare`")
-    with _intact(path):
-        info = read_json(path)
-    if not isinstance(info, dict) or info.get("format") != FORMAT:
-        raise UserError(f"{folder}: not a store of format {FORMAT}. Prepare the data set again")
-    with _intact(path):
-        check_shape(info, Contents)
-    return info
 
 
 def _entries(path: Path, frames: int, actions: int) -> list[Entry]:

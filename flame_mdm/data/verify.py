@@ -12,7 +12,7 @@ import torch
 
 from flame_mdm.data import SPLITS, some
 from flame_mdm.data.datamodule import MotionDataModule
-from flame_mdm.data.store import Entry, Store
+from flame_mdm.data.store import Entry, Store, training_statistics
 from flame_mdm.data.t2m import words_of
 from flame_mdm.errors import UserError
 from flame_mdm.progress import ProgressBar
@@ -21,9 +21,6 @@ from flame_mdm.safe_io import read_yaml, write_text
 
 PUBLISHED = Path(__file__).with_name("published.yaml")
 STILL_DISTANCE = 0.01  # meters; a clip in which no joint moves farther from its first position counts as still
-
-MAX_FRAMES = 500_000
-"""Maximum number of training frames from which statistics are recomputed, so that they fit in memory."""
 
 
 def report(data: MotionDataModule) -> dict[str, Any]:
@@ -181,12 +178,7 @@ def _duplicates(store: Store) -> list[list[str]]:
 
 def _deviation(store: Store, representation: Representation) -> dict[str, float]:
     """Returns how far the statistics, which may be published with the data set, deviate from the training frames."""
-    training = np.zeros(len(store.features), bool)
-    for clip in store.clips:
-        training[clip.start : clip.start + clip.length] |= clip.split == "train"
-    frames = np.flatnonzero(training)
-    frames = frames[:: -(-len(frames) // MAX_FRAMES)]
-    mean, std = (part.double().numpy() for part in representation.statistics(torch.from_numpy(store.features[frames])))
+    mean, std = training_statistics(store.folder, store.clips, len(store.features), representation)
     return {
         "largest difference of a mean, in std": float((np.abs(store.mean - mean) / std).max()),
         "largest relative difference of a std": float(np.abs(store.std / std - 1).max()),

@@ -6,12 +6,11 @@ Mahmood et al., "AMASS: Archive of Motion Capture as Surface Shapes", ICCV 2019;
 from __future__ import annotations
 
 import io
-import os
 import re
-from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
+from itertools import groupby
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple, TypeVar
 
@@ -27,8 +26,8 @@ FACTS = read_yaml(Path(__file__).with_suffix(".yaml"))
 SUBSETS: dict[str, list[str]] = FACTS["subsets"]
 Argument = TypeVar("Argument")
 Result = TypeVar("Result")
-ARCHIVE_ENDINGS = (".tar.bz2", ".tar.xz", ".tar.gz", ".tar")
-CHUNK = 32
+ARCHIVE = re.compile(r"(.+)\.tar(\.bz2|\.xz|\.gz)?")
+CHUNK = 32  # number of unpacked recordings that a process reads at a time
 RELEASE = "not a motion of AMASS's SMPL+H G release, which is the one to download"
 GET_IT = "register at https://amass.is.tue.mpg.de, download the SMPL+H G archives and put them there"
 
@@ -54,7 +53,14 @@ class Recording(NamedTuple):
         step = int(self.fps / fps)
         if step < 1:
             raise UserError(f"recorded at {self.fps:g} frames per second, fewer than the requested {fps:g}")
-        return self._replace(poses=self.poses[::step], translation=self.translation[::step])
+        return self.cut(slice(None, None, step))
+
+    def cut(self, frames: slice) -> Recording:
+        return self._replace(poses=self.poses[frames], translation=self.translation[frames])
+
+    def parameters(self) -> np.ndarray:
+        """Returns (F, 75) float32: translation, and rotations of the 24 joints that FLAME uses."""
+        return np.concatenate([self.translation, self.poses[:, :72]], 1).astype(np.float32)
 
 
 def key_of(path: str) -> str | None:
@@ -96,37 +102,33 @@ class Amass:
     @cached_property
     def files(self) -> dict[str, Path]:
         """Key of each unpacked recording -> its file."""
-        files = {}
-        for folder, _, names in os.walk(required(self.root, GET_IT)):
-            inside = Path(folder).relative_to(self.root).as_posix()
-            for name in names:
-                if name.endswith(".npz") and (key := key_of(f"{inside}/{name}")):
-                    files[key] = Path(folder, name)
-        return files
+        paths = required(self.root, GET_IT).rglob("*.npz")
+        return {key: path for path in paths if (key := key_of(str(path.relative_to(self.root))))}
 
     @cached_property
     def archives(self) -> dict[str, Path]:
         """Subset -> its archive, recognized by file name."""
-        archives = {}
-        for ending in ARCHIVE_ENDINGS:
-            for path in sorted(self.root.rglob(f"*{ending}")):
-                if subset := _BY_NAME.get(_plain(path.name.removesuffix(ending))):
-                    archives[subset] = path
-        return archives
+        paths = ((path, ARCHIVE.fullmatch(path.name)) for path in sorted(self.root.rglob("*.tar*")))
+        return {subset: path for path, match in paths if match and (subset := _BY_NAME.get(_plain(match[1])))}
 
     def missing(self, keys: Collection[str]) -> list[str]:
         """Returns one line per subset with missing recordings; archives are not opened, so not checked."""
         lines = []
-        for subset, members in sorted(_by_subset(keys).items()):
+        for subset, of_subset in groupby(sorted(keys), _subset_of):
+            members = list(of_subset)
             absent = [key for key in members if key not in self.files]
             if subset in self.archives or not absent:
                 continue
             if len(absent) < len(members):
-                lines.append(f"{subset}: {len(absent)} of {len(members)} recordings are missing, such as {min(absent)}")
+                lines.append(f"{subset}: {len(absent)} of {len(members)} recordings are missing, such as {absent[0]}")
             else:
                 names = " or ".join((subset, *SUBSETS[subset]))
                 lines.append(f"{subset}: missing ({len(members)} recordings); the archive is called {names}")
         return lines
+
+    def check(self, keys: Collection[str]) -> None:
+        if absent := self.missing(keys):
+            raise FileNotFoundError(f"{self.root}: {'; '.join(absent)}")
 
     def map(
         self, arguments: Mapping[str, Argument], function: Callable[[Argument, Recording], Result], workers: int = 0
@@ -135,34 +137,31 @@ class Amass:
 
         Function and arguments are picklable; the file name is prepended to its `UserError`s.
         """
-        if absent := self.missing(arguments):
-            raise FileNotFoundError(f"{self.root}: {'; '.join(absent)}")
-        tasks: list[tuple[Path | None, dict[str, Path], dict[str, Argument]]] = []  # archive, files, arguments
-        for subset, keys in sorted(_by_subset(arguments).items()):
-            keys = sorted(keys)
-            archive = None if all(key in self.files for key in keys) else self.archives[subset]
-            step = len(keys) if archive else CHUNK
-            for chunk in (keys[begin : begin + step] for begin in range(0, len(keys), step)):
-                files = {} if archive else {key: self.files[key] for key in chunk}
-                tasks.append((archive, files, {key: arguments[key] for key in chunk}))
+        self.check(arguments)
+        tasks: list[tuple[Path | dict[str, Path], dict[str, Argument]]] = []  # archive or files, and arguments
+        for subset, of_subset in groupby(sorted(arguments), _subset_of):
+            keys = list(of_subset)
+            is_unpacked = all(key in self.files for key in keys)
+            size = CHUNK if is_unpacked else len(keys)
+            for chunk in (keys[begin : begin + size] for begin in range(0, len(keys), size)):
+                source = {key: self.files[key] for key in chunk} if is_unpacked else self.archives[subset]
+                tasks.append((source, {key: arguments[key] for key in chunk}))
         # An archive takes minutes: this process must not begin with one alone.
         for results in in_order(partial(_run, function), tasks, min(workers or cores(), len(tasks))):
             yield from results
 
 
-def _by_subset(keys: Collection[str]) -> dict[str, list[str]]:
-    groups = defaultdict(list)
-    for key in keys:
-        groups[key.partition("/")[0]].append(key)
-    return groups
+def _subset_of(key: str) -> str:
+    return key.partition("/")[0]
 
 
 def _run(
-    function: Callable[[Argument, Recording], Result], task: tuple[Path | None, dict[str, Path], dict[str, Argument]]
+    function: Callable[[Argument, Recording], Result], task: tuple[Path | dict[str, Path], dict[str, Argument]]
 ) -> list[tuple[str, Result]]:
-    archive, files, arguments = task
+    source, arguments = task
     results = {}
-    contents = _members(archive, arguments) if archive else ((key, str(path), path) for key, path in files.items())
+    is_archive = isinstance(source, Path)
+    contents = _members(source, arguments) if is_archive else ((key, str(path), path) for key, path in source.items())
     for key, name, content in contents:
         with naming(name):
             results[key] = function(arguments[key], read(content, name))

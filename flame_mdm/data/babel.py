@@ -87,16 +87,10 @@ class Babel(MotionSource):
         for window in self.windows:
             windows[window.motion].append(window)
         for key, motion in self.amass.map(dict.fromkeys(windows), _motion, self.workers):
-            for window in windows[key]:
-                yield Clip(
-                    window.id,
-                    motion,
-                    [window.label.text],
-                    window.split,
-                    window.id if self.published_split else key,
-                    attributes={"motion": key, "start": window.start, "label": window.label.kind},
-                    window=(window.start, LENGTH),
-                )
+            for id_, _, split, start, label in windows[key]:
+                source = id_ if self.published_split else key
+                attributes = {"motion": key, "start": start, "label": label.kind}
+                yield Clip(id_, motion, [label.text], split, source, None, attributes, window=(start, LENGTH))
 
     @cached_property
     def windows(self) -> list[Window]:
@@ -198,6 +192,4 @@ def _measure(_: None, recording: Recording) -> int:
 
 
 def _motion(_: None, recording: Recording) -> np.ndarray:
-    """Returns (F, 75) float32: translation and the rotations of the 24 joints that FLAME uses."""
-    kept = recording.every(FPS)
-    return np.concatenate([kept.translation, kept.poses[:, :72]], 1).astype(np.float32)
+    return recording.every(FPS).parameters()

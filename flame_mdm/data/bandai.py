@@ -158,15 +158,9 @@ class Bandai(MotionSource):
     def _clip(self, take: Take, motion: np.ndarray) -> Clip:
         side, name = side_of(take.content), take.file.stem
         attributes = {"content": take.content, "style": take.style, "dataset": take.dataset}
-        return Clip(
-            id=name,
-            motion=motion,
-            captions=captions(take.content, take.style, side),
-            split=take.split,
-            source=name,
-            action=self.actions.index(take.content),
-            attributes=attributes | ({"side": side} if side else {}),
-        )
+        attributes |= {"side": side} if side else {}
+        texts, action = captions(take.content, take.style, side), self.actions.index(take.content)
+        return Clip(name, motion, texts, take.split, name, action, attributes)
 
 
 def convert(file: Path, fps: float, kind: str = "joints") -> np.ndarray:

@@ -195,16 +195,7 @@ class CMU(MotionSource):
                     if item.end and not item.mirrored:
                         self._counts["clips of HumanML3D"] += cut.id == item.id
                         self._counts["captions of HumanML3D"] += len(cut.descriptions)
-                    captions, tokens, *_ = map(list, zip(*cut.descriptions, strict=True))
-                    yield Clip(
-                        id=cut.id,
-                        motion=motion,
-                        captions=captions,
-                        split=item.split,
-                        source=item.source,
-                        attributes={"recording": trial} | ({"tokens": tokens} if all(tokens) else {}),
-                        window=(cut.start, cut.length),
-                    )
+                    yield cut.clip(motion, item.split, item.source, recording=trial)
         if len(self._errors) == len(tasks):
             raise UserError(f"{self.path}: no recording can be read; {self._errors[0]}")
 
@@ -246,9 +237,6 @@ def _test_captions(path: Path) -> dict[str, list[Description]]:
 
 def _cuts(item: Item, frames: int) -> list[Cut]:
     return cuts(item.id, frames, item.descriptions, SHORTEST)
-
-
-# Motions --------------------------------------------------------------------------------------------------------------
 
 
 def decide_rate(frames: int, header: float | None, seconds: float | None, last: int | None, is_sixty: bool) -> float:

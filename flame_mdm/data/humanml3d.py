@@ -210,9 +210,7 @@ def _from_amass(
     recording = recording.every(FPS)
     body = bodies["male" if recording.gender == "male" else "female"]
     for row in rows:
-        part = row.frames(len(recording.poses))
-        cut = recording._replace(poses=recording.poses[part], translation=recording.translation[part])
-        write(row, body.joints(cut))
+        write(row, body.joints(recording.cut(row.frames(len(recording.poses)))))
     return len(rows)
 
 
@@ -286,8 +284,7 @@ class HumanML3DSMPL(MotionSource):
         return used
 
     def count(self) -> int:
-        if missing := self.amass.missing({row.key for row in self.rows if not row.humanact12}):
-            raise FileNotFoundError(f"{self.amass.root}: {'; '.join(missing)}")
+        self.amass.check(by_recording(self.rows, humanact12=False))
         return sum(len(self.folder.texts[row.name]) for row in self.rows)
 
     def clips(self, fps: float) -> Iterator[Clip]:
@@ -319,17 +316,13 @@ class HumanML3DSMPL(MotionSource):
             self.leave_out("motions without a frame")
             return
         split = self.folder.names[row.name]
+        if self.published_split and split == "val":
+            split = "train"
         for number, description in enumerate(self.folder.texts[row.name]):
-            yield Clip(
-                id=f"{row.name}#{number}",
-                motion=motion,
-                captions=[description.caption.removesuffix(".") + "."],
-                split="train" if self.published_split and split == "val" else split,
-                source=row.name,
-            )
+            caption = description.caption.removesuffix(".") + "."
+            yield Clip(f"{row.name}#{number}", motion, [caption], split, row.name)
 
 
 def _parameters(rows: Sequence[IndexedClip], recording: Recording) -> list[np.ndarray]:
-    recording = recording.every(FPS)
-    motion = np.concatenate([recording.translation, recording.poses], 1).astype(np.float32)
+    motion = recording.every(FPS).parameters()
     return [motion[row.frames(len(motion))] for row in rows]

@@ -4,6 +4,7 @@ Plappert, Mandery, Asfour, "The KIT Motion-Language Dataset", Big Data 2016. `do
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
@@ -102,16 +103,11 @@ class KITTemos(MotionSource):
         names = [name for name in self.frames if self._fits(name)]
         tasks = [(self.path / f"{name}_fke.csv", 1 if self.names[name] == "test" else 8) for name in names]
         for name, recording in zip(names, in_order(_recording, tasks, self.workers), strict=True):
-            split = self.names[name]
-            yield Clip(
-                id=name,
-                motion=recording[::8] if split == "test" else recording,
-                captions=self.texts[name][:1] if split == "test" else self.texts[name],
-                split=split,
-                source=name,
-                attributes={"ghosh_test": name in self.ghosh_test},
-                reference=recording if split == "test" else None,
-            )
+            attributes = {"ghosh_test": name in self.ghosh_test}
+            clip = Clip(name, recording, self.texts[name], self.names[name], name, None, attributes)
+            if clip.split == "test":
+                clip = replace(clip, motion=recording[::8], captions=clip.captions[:1], reference=recording)
+            yield clip
 
     def counts(self) -> dict[str, int]:
         texts = sum(len(read_json(path)) for path in self.path.glob("*_annotations.json"))

@@ -42,6 +42,13 @@ class Cut(NamedTuple):
     length: int
     descriptions: list[Description]
 
+    def clip(self, motion: np.ndarray, split: Split, source: str, encoded: str = "", **facts: str) -> Clip:
+        """Returns the clip of a motion; `facts` are attributes beside the tokens, which are left out if empty."""
+        captions, tokens, *_ = map(list, zip(*self.descriptions, strict=True))
+        attributes = facts | ({"tokens": tokens} if all(tokens) else {})
+        window = (self.start, self.length)
+        return Clip(self.id, motion, captions, split, source, None, attributes, encoded, window)
+
 
 def parse(text: str, where: str) -> list[Description]:
     """Parses the descriptions in a text file, which `where` names in errors; a NaN tag means 0, as published."""
@@ -161,16 +168,7 @@ class T2MFolder(MotionSource):
             self._account(name, length, items)
             motion = self._load(name) if items else np.zeros(0)
             for cut in items:
-                yield Clip(
-                    id=cut.id,
-                    motion=motion,
-                    captions=[description.caption for description in cut.descriptions],
-                    split=self.names[name],
-                    source=name.removeprefix("M"),
-                    attributes={"tokens": [description.tokens for description in cut.descriptions]},
-                    encoded=self.representation,
-                    window=(cut.start, cut.length),
-                )
+                yield cut.clip(motion, self.names[name], name.removeprefix("M"), self.representation)
 
     def statistics(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns the published mean and std, which are over all motions of all splits."""

@@ -121,15 +121,9 @@ class UESTC(MotionSource):
             if length < (1 if split == "test" else MIN_FRAMES):
                 self.leave_out(f"{'test' if split == 'test' else 'training'} clips that are too short")
                 continue
-            yield Clip(
-                id=video.id,
-                motion=front_view(pose[:length], joint[:length, ROOT], camera[:length], video),
-                captions=[],
-                split=split,
-                source=f"subject {video.subject}",
-                action=video.action,
-                attributes={"subject": video.subject, "view": video.view, "side": video.side},
-            )
+            motion = front_view(pose[:length], joint[:length, ROOT], camera[:length], video)
+            attributes = {"subject": video.subject, "view": video.view, "side": video.side}
+            yield Clip(video.id, motion, [], split, f"subject {video.subject}", video.action, attributes)
 
     def split(self, subject: int) -> Split:
         """Returns the split of a subject's clips."""

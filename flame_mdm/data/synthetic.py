@@ -5,7 +5,7 @@ motion in `synthetic_motions`, a line in `ACTIONS`, and its captions in `synthet
 """
 
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,7 +19,6 @@ from flame_mdm.data.synthetic_motions.body import Attributes, Body
 from flame_mdm.errors import UserError
 from flame_mdm.safe_io import read_yaml
 
-WAYS = {"forward": 0.3, **dict.fromkeys(("backward", "left", "right", "clockwise", "counterclockwise"), 0.14)}
 MIN_SECONDS, MAX_SECONDS = 2.0, 3.0  # durations of clips
 AT_ONCE = 32  # number of clips that a process makes at a time
 CAPTIONS = 8  # captions per clip
@@ -69,9 +68,7 @@ def draw_captions(
 def _sentence(rng: np.random.Generator, attributes: Attributes) -> tuple[str, set[str]]:
     """Returns a sentence and the names of the attributes that it states."""
     grammar = content()
-    action = attributes["action"]
-    keys = (key for value in attributes.values() if (key := f"{action} {value}") in grammar["captions"])
-    template = _one(rng, grammar["captions"][next(keys, action)])
+    template = _one(rng, _entry(grammar["captions"], attributes))
     subject = _one(rng, grammar["subjects"])
     who = "" if template.startswith("=") else _one(rng, subject["who"])
     text = template.lstrip("= ") if template.startswith("=") or "{who}" in template else f"{{who}} {template}"
@@ -107,66 +104,72 @@ def _conjugated(rng: np.random.Generator, text: str, who: str, plural: bool) -> 
     return re.sub(r"\ba (?=[aeio])", "an ", VERB.sub(form, text))
 
 
+def _entry(table: Mapping[str, Any], attributes: Attributes) -> Any:
+    """Returns the entry for the action and one of its attributes, such as "walk left", or for the action, or None."""
+    action = attributes["action"]
+    keys = [f"{action} {value}" for value in attributes.values()] + [action]
+    return next((table[key] for key in keys if key in table), None)
+
+
 def _one(rng: np.random.Generator, choices: Any) -> Any:
     return choices[int(rng.integers(len(choices)))]
 
 
 class Action(NamedTuple):
-    """An action and the attributes that its clips have besides its name, drawn in this order."""
+    """An action and the attributes that its clips have besides its name."""
 
-    # makes the body's curves over times (F,) in seconds, for the attributes
-    motion: Callable[[np.random.Generator, np.ndarray, Attributes], Body]
+    # moves a body at times (F,) in seconds, for the attributes
+    motion: Callable[[Body, np.random.Generator, np.ndarray, Attributes], None]
     share: int = 1  # how often the action occurs, relative to the others
-    sides: tuple[str, ...] = ()  # sides that move, equally often
-    max_count: int = 0  # maximum number of repetitions, at most 3; 0 = the action is not repeated
-    directions: tuple[str, ...] | Mapping[str, float] = ()  # directions, equally often, or with their probabilities
-    speeds: tuple[str, ...] = ()  # speeds of the direction forward, equally often
-    amounts: tuple[str, ...] = ()  # how far the body turns, equally often
+    # attribute -> values, equally often, or with their probabilities; drawn in this order, `speed` for forward only
+    values: Mapping[str, Sequence[str | int] | Mapping[str, float]] = {}
     seconds: float = 0.0  # minimum duration
 
     def draw(self, rng: np.random.Generator, name: str) -> Attributes:
         """Draws the attributes of a clip."""
         drawn: Attributes = {"action": name}
-        if self.sides:
-            drawn["side"] = str(rng.choice(self.sides))
-        if self.max_count:
-            drawn["count"] = int(rng.integers(1, self.max_count + 1))
-        if isinstance(self.directions, Mapping):
-            drawn["direction"] = str(rng.choice(list(self.directions), p=list(self.directions.values())))
-        elif self.directions:
-            one = len(self.directions) == 1
-            drawn["direction"] = self.directions[0] if one else str(rng.choice(self.directions))
-        if self.speeds and drawn["direction"] == "forward":
-            drawn["speed"] = str(rng.choice(self.speeds))
-        if self.amounts:
-            drawn["amount"] = str(rng.choice(self.amounts))
+        for attribute, values in self.values.items():
+            if attribute != "speed" or drawn["direction"] == "forward":
+                shares = list(values.values()) if isinstance(values, Mapping) else None
+                drawn[attribute] = rng.choice(list(values), p=shares).item()
         return drawn
 
 
+SIDE, ANY_SIDE = {"side": ("left", "right")}, {"side": ("left", "right", "both")}
+ONCE_OR_TWICE, UP_TO_THREE = {"count": (1, 2)}, {"count": (1, 2, 3)}
+FORWARD = {"direction": ("forward",)}
+WAYS = {"forward": 0.3, **dict.fromkeys(("backward", "left", "right", "clockwise", "counterclockwise"), 0.14)}
 ACTIONS = {
-    "walk": Action(locomotion.walk, 6, directions=WAYS, speeds=("slow", "normal", "fast")),
-    "run": Action(locomotion.run, directions=("forward",)),
-    "turn": Action(locomotion.turn, 3, directions=("left", "right"), amounts=("quarter", "half")),
-    "jump": Action(postures.jump, 2, max_count=3),
-    "wave": Action(gestures.wave, 2, ("left", "right", "both")),
-    "raise": Action(gestures.raise_arms, 2, ("left", "right", "both")),
-    "kick": Action(postures.kick, 2, ("left", "right"), max_count=2),
-    "punch": Action(gestures.punch, 2, ("left", "right"), max_count=3),
-    "squat": Action(postures.squat, max_count=2),
+    "walk": Action(locomotion.walk, 6, {"direction": WAYS, "speed": ("slow", "normal", "fast")}),
+    "run": Action(locomotion.run, 1, FORWARD),
+    "turn": Action(locomotion.turn, 3, {"direction": ("left", "right"), "amount": ("quarter", "half")}),
+    "jump": Action(postures.jump, 2, UP_TO_THREE),
+    "wave": Action(gestures.wave, 2, ANY_SIDE),
+    "raise": Action(gestures.raise_arms, 2, ANY_SIDE),
+    "kick": Action(postures.kick, 2, SIDE | ONCE_OR_TWICE),
+    "punch": Action(gestures.punch, 2, SIDE | UP_TO_THREE),
+    "squat": Action(postures.squat, 1, ONCE_OR_TWICE),
     "bow": Action(postures.bow),
     "stand": Action(gestures.stand),
     "sit": Action(postures.sit),
     "rise": Action(postures.rise),
     "dance": Action(locomotion.dance),
     "leap": Action(postures.leap),
-    "pick": Action(postures.pick, 2, ("left", "right")),
-    "throw": Action(gestures.throw, 2, ("left", "right")),
-    "crawl": Action(locomotion.crawl, directions=("forward",)),
+    "pick": Action(postures.pick, 2, SIDE),
+    "throw": Action(gestures.throw, 2, SIDE),
+    "crawl": Action(locomotion.crawl, 1, FORWARD),
     "lie": Action(postures.lie, seconds=2.6),
-    "clap": Action(gestures.clap, 2, max_count=3),
-    "salute": Action(gestures.salute, 2, ("left", "right")),
-    "nod": Action(gestures.nod, 2, max_count=3),
+    "clap": Action(gestures.clap, 2, UP_TO_THREE),
+    "salute": Action(gestures.salute, 2, SIDE),
+    "nod": Action(gestures.nod, 2, UP_TO_THREE),
 }
+
+
+def _joints(rng: np.random.Generator, t: np.ndarray, attributes: Attributes) -> np.ndarray:
+    """Returns the joints (F, 22, 3) of a motion with these attributes at times (F,) in seconds."""
+    body = Body(rng, t, _entry(content()["widths"], attributes))
+    ACTIONS[str(attributes["action"])].motion(body, rng, t, attributes)
+    return body.joints().astype(np.float32)
 
 
 class Synthetic(MotionSource):
@@ -210,10 +213,9 @@ class Synthetic(MotionSource):
         words = np.random.default_rng((self.seed, index, 1))  # so that motions do not depend on the grammar
         incomplete = split == "train" and words.random() < PARTIAL
         texts, stated = draw_captions(words, attributes, CAPTIONS, incomplete)
-        t = np.arange(round(seconds * fps) + 1) / fps
         return Clip(
             id=name,
-            motion=ACTIONS[action].motion(rng, t, attributes).joints().astype(np.float32),
+            motion=_joints(rng, np.arange(round(seconds * fps) + 1) / fps, attributes),
             captions=texts,
             split=split,
             source=name,
@@ -230,7 +232,6 @@ def prompts() -> list[tuple[str, Attributes]]:
 def example(attributes: Attributes, fps: float = 20.0) -> np.ndarray:
     """Returns the joints (F, 22, 3) of a motion of three seconds with at least these attributes, such as a prompt's."""
     name = str(attributes["action"])
-    action = ACTIONS[name]
-    draws = (action.draw(np.random.default_rng(seed), name) for seed in range(1000))
+    draws = (ACTIONS[name].draw(np.random.default_rng(seed), name) for seed in range(1000))
     drawn = next(drawn for drawn in draws if attributes.items() <= drawn.items())
-    return action.motion(np.random.default_rng(0), np.arange(0, 3, 1 / fps), drawn).joints().astype(np.float32)
+    return _joints(np.random.default_rng(0), np.arange(0, 3, 1 / fps), drawn)

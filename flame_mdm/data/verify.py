@@ -2,7 +2,7 @@
 
 import json
 from collections import Counter, defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from hashlib import sha1
 from pathlib import Path
 from typing import Any
@@ -30,12 +30,10 @@ def report(data: MotionDataModule) -> dict[str, Any]:
     """
     store = data.open()
     store.verify()
-    _check_frames(store)
     needed = data.crop.shortest()
     lengths = [clip.length for clip in store.clips]
     captions = [caption for clip in store.clips for caption in clip.captions]
-    duplicates = _duplicates(store)
-    split_of = {clip.id: clip.split for clip in store.clips}
+    still, duplicates = _anomalies(store, data.representation)
     content = {
         **{key: store.info[key] for key in ("dataset", "representation", "fps", "fingerprint", "published_split")},
         "files": store.info["sha256"],
@@ -58,9 +56,9 @@ def report(data: MotionDataModule) -> dict[str, Any]:
             "longest clip": max(lengths),
             f"clips below the {needed} frames that cropping needs": sum(length < needed for length in lengths),
         },
-        "still": _still(store, data.representation),
-        "duplicates": duplicates,
-        "duplicates_across_splits": sum(len({split_of[name] for name in group}) > 1 for group in duplicates),
+        "still": [clip.id for clip in still],
+        "duplicates": [[clip.id for clip in group] for group in duplicates],
+        "duplicates_across_splits": sum(len({clip.split for clip in group}) > 1 for group in duplicates),
         "statistics": _deviation(store, data.representation),
         "excluded": store.info["excluded"],
     }
@@ -72,36 +70,42 @@ def lines(content: dict[str, Any]) -> list[str]:
     """Returns the lines of a report as an aligned table."""
     rows: list[tuple[str, ...]] = []
 
-    def section(title: str, table: Iterable[tuple[str, ...]], *head: str) -> None:
-        rows.extend([(), (title, *head), *((f"  {name}", *cells) for name, *cells in table)])
+    def section(title: str, table: Iterable[Sequence[Any]], *head: str) -> None:
+        rows.extend([(), (title, *head), *((f"  {name}", *map(_cell, cells)) for name, *cells in table)])
 
     rows.append(("data set", f"{content['dataset']} as {content['representation']} at {content['fps']:g} fps"))
     rows.append(("fingerprint", content["fingerprint"]))
     split = "as published" if content["published_split"] else "without leaks: each source is in one split only"
     rows.append(("split", split))
     rows.extend((f"sha256 {name}", digest) for name, digest in content["files"].items())
-    figures = []
-    for name, figure in content["figures"].items():
-        numbers = ("-" if figure[key] is None else str(figure[key]) for key in ("found", "published"))
-        figures.append((name, *numbers, "DIFFERS" if figure["state"] == "differs" else figure["state"]))
+    figures = ((name, f["found"], f["published"], f["state"]) for name, f in content["figures"].items())
     section("figures", figures, "found", "published", "")
-    section("captions", ((name, str(number)) for name, number in content["captions"].items()))
+    section("captions", content["captions"].items())
     if content["actions"]:
-        actions = ((name, *map(str, splits.values())) for name, splits in content["actions"].items())
-        section("clips by action", actions, *SPLITS)
-    section("frames", ((name, f"{n:g}" if isinstance(n, float) else str(n)) for name, n in content["frames"].items()))
+        section("clips by action", ((name, *splits.values()) for name, splits in content["actions"].items()), *SPLITS)
+    section("frames", content["frames"].items())
     groups = [" = ".join(group) for group in content["duplicates"]]
     anomalies = [
-        ("non-finite numbers", "0"),
-        ("clips without movement", str(len(content["still"])), some(content["still"])),
-        ("duplicate motions", str(len(groups)), some(groups)),
-        ("duplicates across splits", str(content["duplicates_across_splits"])),
+        ("non-finite numbers", 0),
+        ("clips without movement", len(content["still"]), some(content["still"])),
+        ("duplicate motions", len(groups), some(groups)),
+        ("duplicates across splits", content["duplicates_across_splits"]),
     ]
     section("anomalies", anomalies)
-    statistics = ((name, f"{number:.2g}") for name, number in content["statistics"].items())
-    section("deviation of mean and std from the training frames", statistics)
-    section("left out", [(reason, str(n)) for reason, n in content["excluded"].items()] or [("nothing", "")])
-    return _aligned(rows)
+    section("deviation of mean and std from the training frames", content["statistics"].items())
+    section("left out", content["excluded"].items() or [("nothing", "")])
+    # the last cell of a row, which may be long, does not count for the width of its column
+    widths: Counter[int] = Counter()
+    for row in rows:
+        for column, cell in enumerate(row[:-1]):
+            widths[column] = max(widths[column], len(cell))
+    return [
+        "  ".join([*(cell.ljust(widths[i]) for i, cell in enumerate(row[:-1])), *row[-1:]]).rstrip() for row in rows
+    ]
+
+
+def _cell(value: Any) -> str:
+    return "-" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def deviations(content: dict[str, Any]) -> list[str]:
@@ -143,37 +147,28 @@ def _figures(store: Store) -> dict[str, dict[str, Any]]:
     return figures
 
 
-def _check_frames(store: Store) -> None:
+def _anomalies(store: Store, representation: Representation) -> tuple[list[Entry], list[list[Entry]]]:
+    """Returns the clips without movement, and groups of clips of bit-identical motions.
+
+    Clips that share all their frames are one motion: they differ only in caption. Raises `UserError` if a frame is not
+    finite.
+    """
+    sharing: defaultdict[tuple[int, int], list[Entry]] = defaultdict(list)
     for clip in store.clips:
-        finite = np.isfinite(store.motion(clip)).all(1)
+        sharing[clip.start, clip.length].append(clip)
+    still: list[Entry] = []
+    identical: defaultdict[bytes, list[Entry]] = defaultdict(list)
+    for clips in ProgressBar(sharing.values(), "looking for movement", unit=" motions"):
+        clip, motion = clips[0], np.array(store.motion(clips[0]))
+        finite = np.isfinite(motion).all(1)
         if not finite.all():
             frame = int(np.argmin(finite))
             raise UserError(f"{store.folder}: damaged: frame {frame} of clip {clip.id} is not finite; prepare it again")
-
-
-def _motions(store: Store) -> list[list[Entry]]:
-    """Returns the clips grouped by motion: clips that share all their frames differ only in caption."""
-    groups: defaultdict[tuple[int, int], list[Entry]] = defaultdict(list)
-    for clip in store.clips:
-        groups[clip.start, clip.length].append(clip)
-    return list(groups.values())
-
-
-def _still(store: Store, representation: Representation) -> list[str]:
-    still = []
-    for group in ProgressBar(_motions(store), "looking for movement", unit=" motions"):
-        joints = representation.decode(torch.from_numpy(np.array(store.motion(group[0]))))
+        joints = representation.decode(torch.from_numpy(motion))
         if float((joints - joints[:1]).norm(dim=-1).max()) < STILL_DISTANCE:
-            still += [clip.id for clip in group]
-    return still
-
-
-def _duplicates(store: Store) -> list[list[str]]:
-    """Returns groups of ids of bit-identical motions; several captions of one motion are not duplicates."""
-    groups: defaultdict[bytes, list[str]] = defaultdict(list)
-    for group in _motions(store):
-        groups[sha1(np.ascontiguousarray(store.motion(group[0])).tobytes()).digest()].append(group[0].id)
-    return [ids for ids in groups.values() if len(ids) > 1]
+            still += clips
+        identical[sha1(motion.tobytes()).digest()].append(clip)
+    return still, [group for group in identical.values() if len(group) > 1]
 
 
 def _deviation(store: Store, representation: Representation) -> dict[str, float]:
@@ -183,14 +178,3 @@ def _deviation(store: Store, representation: Representation) -> dict[str, float]
         "largest difference of a mean, in std": float((np.abs(store.mean - mean) / std).max()),
         "largest relative difference of a std": float(np.abs(store.std / std - 1).max()),
     }
-
-
-def _aligned(rows: list[tuple[str, ...]]) -> list[str]:
-    """Returns aligned rows; the last cell of a row, which may be long, does not count for the width of its column."""
-    widths: Counter[int] = Counter()
-    for row in rows:
-        for column, cell in enumerate(row[:-1]):
-            widths[column] = max(widths[column], len(cell))
-    return [
-        "  ".join([*(cell.ljust(widths[i]) for i, cell in enumerate(row[:-1])), *row[-1:]]).rstrip() for row in rows
-    ]

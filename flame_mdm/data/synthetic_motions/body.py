@@ -51,8 +51,10 @@ class Body:
     Angles are in radians. The first axis of feet and arms is the side: 0 = left, 1 = right.
     """
 
-    def __init__(self, rng: np.random.Generator, t: np.ndarray, width: float | None = None):
+    def __init__(self, rng: np.random.Generator, t: np.ndarray, width: float | Sequence[float] | None = None):
+        """`width` is half the distance between the feet in meters, or its range; None = that of a relaxed stance."""
         self.t = t
+        half = rng.uniform(width[0], width[1]) if isinstance(width, Sequence) else width
         self.position = np.zeros((len(t), 3))
         self.heading = np.zeros(len(t))
         self.pelvis = self._drift(rng, 0.015, 3)  # pitch forward, yaw to the left, roll to the left
@@ -63,9 +65,8 @@ class Body:
         self.arms += np.array([rng.normal(0.03, 0.05), rng.uniform(0.14, 0.24), -0.4, rng.uniform(0.2, 0.4)])[:, None]
         self.reaches: list[tuple[int, np.ndarray, np.ndarray, str]] = []
 
-        half = rng.uniform(0.085, 0.12) if width is None else width
         self.ankles = np.zeros((2, len(t), 3))
-        self.ankles[..., 0] = half * SIGN[:, None]
+        self.ankles[..., 0] = (rng.uniform(0.085, 0.12) if half is None else half) * SIGN[:, None]
         self.ankles[..., 1] = ANKLE_HEIGHT
         self.ankles[..., 2] = -0.03 + rng.normal(0, 0.012, (2, 1))
         self.foot_yaw = np.repeat((rng.uniform(0.05, 0.2, 2) * SIGN)[:, None], len(t), 1)

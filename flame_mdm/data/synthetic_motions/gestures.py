@@ -5,8 +5,7 @@ import numpy as np
 from flame_mdm.data.synthetic_motions.body import SIDES, SIGN, Attributes, Body, ease, events, pulse
 
 
-def wave(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Body:
-    body = Body(rng, t)
+def wave(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
     start, end = rng.uniform(0.1, 0.3), t[-1]
     weight = pulse(t, start, start + 0.5, end - 0.45, end + 0.05)
     swing = 2 * np.pi * rng.uniform(1.4, 1.7) * (t - start)
@@ -15,11 +14,9 @@ def wave(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Body
         pose = (forward, sideways + 0.1 * np.sin(swing), np.pi / 2, rng.uniform(1.3, 1.5) + size * np.sin(swing))
         body.move_arm(side, weight, pose)
         body.spine[2] -= 0.03 * SIGN[side] * weight
-    return body
 
 
-def raise_arms(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Body:
-    body = Body(rng, t)
+def raise_arms(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
     start = rng.uniform(0.15, 0.5)
     weight = ease(t, start, start + rng.uniform(0.7, 1.0))
     over_front, high = rng.random() < 0.5, rng.uniform(2.7, 3.0)
@@ -27,11 +24,9 @@ def raise_arms(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -
         pose = (high, 0.05, -0.2, 0.15) if over_front else (0.1, high, 1.2, 0.15)
         body.move_arm(side, weight, pose)
         body.spine[2] -= 0.05 * SIGN[side] * weight
-    return body
 
 
-def punch(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Body:
-    body = Body(rng, t, 0.13)
+def punch(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
     (side,) = SIDES[str(requested["side"])]
     body.ankles[..., 2] += rng.uniform(0.04, 0.1) * rng.choice([-1, 1]) * SIGN[:, None]
     body.position[:, 1] -= 0.03
@@ -49,12 +44,11 @@ def punch(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Bod
         body.pelvis[1] -= 0.25 * SIGN[side] * out
         body.head[1] += 0.7 * SIGN[side] * out
         body.position[:, 2] += 0.1 * out
-    return body
 
 
-def throw(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Body:
+def throw(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
     """Draws the arm back above the shoulder, steps forward with the opposite foot, and throws."""
-    body, (side,) = Body(rng, t), SIDES[str(requested["side"])]
+    (side,) = SIDES[str(requested["side"])]
     other, sign, stretch = 1 - side, SIGN[side], min(1.15, t[-1] / 2.2)
     at = rng.uniform(0.1, 0.2) + stretch * np.array([0.0, 0.75, 0.9, 1.08, 1.2, 1.75])
     back, out = pulse(t, at[0], at[1], at[2], at[3]), pulse(t, at[2], at[3], at[4], at[5])
@@ -70,11 +64,9 @@ def throw(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Bod
     body.ankles[other, :, 1] += 0.4 * step * (1 - step)
     body.position[:, 2] += 0.2 * ease(t, at[1] - 0.2, at[3]) - 0.06 * pulse(t, at[0], at[1], at[1], at[3])
     body.foot_pitch[side] += 0.25 * ease(t, at[2], at[3])
-    return body
 
 
-def clap(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Body:
-    body = Body(rng, t)
+def clap(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
     claps = events(rng, t, int(requested["count"]), 0.85)
     first, last = claps[0][0], claps[-1][0] + claps[-1][1]
     ready = pulse(t, first - 0.1, first + 0.3, last - 0.2, last + 0.35)
@@ -84,29 +76,25 @@ def clap(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Body
         body.move_arm(side, ready, (0.55, 0.3, -0.4, 1.4))
         target = np.stack([sign * (0.055 + wide * open_), height + 0 * t, ahead - 0.04 * open_], 1)
         body.reach(side, ready, target, "chest")
-    return body
 
 
-def salute(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Body:
+def salute(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
     """Brings a hand to the brow, holds it and lowers it."""
-    body, (side,) = Body(rng, t), SIDES[str(requested["side"])]
+    (side,) = SIDES[str(requested["side"])]
     start = rng.uniform(0.1, 0.3)
     up = pulse(t, start, start + rng.uniform(0.45, 0.6), t[-1] - 0.6, t[-1])
     body.move_arm(side, up, (0.5, 1.2, 0.3, 2.2))
     body.reach(side, up, (SIGN[side] * rng.uniform(0.15, 0.17), rng.uniform(0.02, 0.05), 0.09), "head")
     body.spine[0] -= 0.05 * up
-    return body
 
 
-def nod(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Body:
-    body = Body(rng, t)
+def nod(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
     deep = rng.uniform(0.8, 0.95)
     for start, seconds in events(rng, t, int(requested["count"]), 0.9):
         down = pulse(t, start, start + 0.4 * seconds, start + 0.5 * seconds, start + 0.9 * seconds)
         body.head[0] += deep * down
         body.spine[0] += 0.12 * down
-    return body
 
 
-def stand(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Body:
-    return Body(rng, t)
+def stand(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+    """Leaves the body as it is: it stands and breathes."""

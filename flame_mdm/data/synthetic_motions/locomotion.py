@@ -93,15 +93,13 @@ def _straight(x: float, z: float) -> Path:
     return lambda share, length: (x * share * length, z * share * length, 0 * share)
 
 
-def walk(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Body:
+def walk(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
     direction = requested["direction"]
     sign = 1 if direction in ("left", "counterclockwise") else -1
-    sideways = direction in ("left", "right")
-    body = Body(rng, t, 0.15 if sideways else None)
-    if sideways:
+    if direction in ("left", "right"):
         speed, first = rng.uniform(0.45, 0.6), LEFT if sign > 0 else RIGHT
         _walk_along(body, rng, Gait(0.46, 0.82, 0.15, 0.25, 0.05, 0.16), speed, _straight(sign, 0), first)
-        return body
+        return
     if direction == "backward":
         speed = rng.uniform(0.6, 0.9)
         gait = Gait(0.54, 0.78, 0.12, -0.2, -0.4, rng.uniform(0.08, 0.1))
@@ -126,11 +124,9 @@ def walk(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Body
         gait = Gait(0.5, 0.82, 0.11, 0.6, 0.25, 0.085)
         apart = _walk_along(body, rng, gait, rng.uniform(1.0, 1.2), circle, LEFT if sign > 0 else RIGHT)
     _swing_arms(body, apart, rng.uniform(0.5, 0.75))
-    return body
 
 
-def run(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Body:
-    body = Body(rng, t)
+def run(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
     gait = Gait(rng.uniform(0.34, 0.38), 1.3, rng.uniform(0.2, 0.26), 1.1, 0.15, 0.07, 0.06, 0.035, behind=0.12)
     apart = _walk_along(body, rng, gait, rng.uniform(2.4, 3.0), _straight(0, 1), RIGHT)
     speed = np.gradient(body.position[:, 2], t)
@@ -139,7 +135,6 @@ def run(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Body:
     for side in (0, 1):
         body.move_arm(side, np.clip(speed / 1.5, 0, 1), (-0.1, 0.3, -0.15, rng.uniform(1.4, 1.7)))
     _swing_arms(body, apart, rng.uniform(0.7, 0.9))
-    return body
 
 
 def _swing_arms(body: Body, apart: np.ndarray, size: float) -> None:
@@ -151,8 +146,8 @@ def _swing_arms(body: Body, apart: np.ndarray, size: float) -> None:
         body.arms[side, 3] += 0.35 * np.maximum(SIGN[side] * apart, 0)
 
 
-def turn(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Body:
-    body, sign = Body(rng, t), 1 if requested["direction"] == "left" else -1
+def turn(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+    sign = 1 if requested["direction"] == "left" else -1
     low, high = (160, 195) if requested["amount"] == "half" else (75, 110)
     angle = sign * np.radians(rng.uniform(low, high))
     gait = Gait(0.36, 0.82, 0.09, 0.3, 0.0, 0.1)
@@ -160,12 +155,10 @@ def turn(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Body
     ahead = np.gradient(body.heading, t)
     body.head[1] += 0.2 * ahead  # the head looks in the direction of the turn
     body.spine[1] += 0.08 * ahead
-    return body
 
 
-def dance(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Body:
+def dance(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
     """Steps from side to side on the beat, with hips and arms that swing along."""
-    body = Body(rng, t, 0.13)
     beat, start, first = rng.uniform(0.44, 0.54), rng.uniform(0.1, 0.2), rng.choice(SIGN)
     going = pulse(t, start - 0.1, start + 0.4, t[-1] - 0.45, t[-1])
     phase = np.pi * (t - start) / beat
@@ -182,12 +175,10 @@ def dance(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Bod
         body.ankles[side, :, 2] += 0.08 * light
         body.foot_pitch[side] += 0.35 * light
         body.move_arm(side, going, (high + 0.6 * sign * swing, 0.35 + 0.25 * bounce, -0.1, 1.5 + 0.4 * sign * swing))
-    return body
 
 
-def crawl(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Body:
+def crawl(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
     """Crawls on hands and knees; each hand moves with the opposite knee."""
-    body = Body(rng, t)
     body.pelvis[0] += rng.uniform(1.32, 1.4)
     body.head[0] -= rng.uniform(0.5, 0.8)
     body.position[:, 1] = rng.uniform(0.465, 0.48)
@@ -202,4 +193,3 @@ def crawl(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Bod
         hand = np.stack([0 * t + apart[side], foot[:, 1] + 0.03, foot[:, 2] + ahead], 1)
         body.move_arm(side, np.ones_like(t), (1.3, 0.1, -0.9, 0.4))
         body.reach(side, np.ones_like(t), hand)
-    return body

@@ -5,8 +5,7 @@ import numpy as np
 from flame_mdm.data.synthetic_motions.body import HIP, SHIN, SIDES, SIGN, THIGH, Attributes, Body, ease, events, pulse
 
 
-def jump(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Body:
-    body = Body(rng, t)
+def jump(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
     depth, reach = rng.uniform(0.16, 0.24), rng.uniform(0.8, 1.6)
     for start, seconds in events(rng, t, int(requested["count"]), 1.05):
         up = start + 0.4 * seconds
@@ -23,12 +22,11 @@ def jump(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Body
         body.spine[0] += 0.45 * crouch + 0.25 * absorb
         body.pelvis[0] += 0.2 * crouch + 0.1 * absorb
         body.arms[:, 0] += reach * pulse(t, up - 0.15, up + 0.15, up + 0.15, land + 0.2) - 0.7 * crouch
-    return body
 
 
-def leap(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Body:
+def leap(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
     """Jumps forward with both feet."""
-    body, length, air = Body(rng, t), rng.uniform(0.75, 1.1), rng.uniform(0.4, 0.46)
+    length, air = rng.uniform(0.75, 1.1), rng.uniform(0.4, 0.46)
     up = rng.uniform(0.65, max(0.7, t[-1] - 1.3))
     land = up + air
     crouch = pulse(t, up - 0.6, up - 0.25, up - 0.25, up + 0.02)
@@ -45,11 +43,9 @@ def leap(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Body
     body.spine[0] += 0.5 * crouch + 0.35 * absorb
     body.head[0] -= 0.4 * crouch
     body.arms[:, 0] += 1.5 * pulse(t, up - 0.2, up + 0.12, up + 0.2, land + 0.5) - 0.9 * crouch
-    return body
 
 
-def kick(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Body:
-    body = Body(rng, t)
+def kick(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
     (side,) = SIDES[str(requested["side"])]
     high = rng.uniform(1.15, 1.45)
     kicks = events(rng, t, int(requested["count"]), 1.25)
@@ -77,11 +73,9 @@ def kick(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Body
         body.spine[1] += 0.25 * SIGN[side] * out
         body.arms[1 - side, 0] += 0.6 * out
         body.arms[side, 0] -= 0.6 * out
-    return body
 
 
-def squat(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Body:
-    body = Body(rng, t, rng.uniform(0.12, 0.15))
+def squat(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
     depth, reach = rng.uniform(0.34, 0.44), rng.uniform(1.0, 1.9)
     for start, seconds in events(rng, t, int(requested["count"]), 1.9):
         down = pulse(t, start, start + 0.45 * seconds, start + 0.5 * seconds, start + seconds)
@@ -91,11 +85,9 @@ def squat(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Bod
         body.spine[0] += 0.35 * down
         body.head[0] -= 0.4 * down
         body.arms[:, 0] += (reach + 0.3) * down
-    return body
 
 
-def bow(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Body:
-    body = Body(rng, t)
+def bow(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
     start, end = rng.uniform(0.15, 0.35), t[-1] - rng.uniform(0.1, 0.25)
     middle, half = (start + end) / 2, rng.uniform(0.1, 0.25)
     down = pulse(t, start, middle - half, middle + half, end)
@@ -105,12 +97,11 @@ def bow(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Body:
     body.head[0] += 0.2 * down
     body.position[:, 2] -= 0.13 * deep * down
     body.arms[:, 0] += 0.75 * deep * down
-    return body
 
 
-def pick(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Body:
+def pick(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
     """Bends down, takes something from the floor and holds it in front of the body."""
-    body, (side,) = Body(rng, t, rng.uniform(0.11, 0.14)), SIDES[str(requested["side"])]
+    (side,) = SIDES[str(requested["side"])]
     start, end = rng.uniform(0.1, 0.2), t[-1] - rng.uniform(0.15, 0.3)
     low, rise = start + 0.42 * (end - start), start + 0.54 * (end - start)
     down, holds = pulse(t, start, low, rise, end), ease(t, start, low)
@@ -123,7 +114,6 @@ def pick(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Body
     body.move_arm(1 - side, down, (0.2, 0.6, -0.3, 0.5))
     spot = (SIGN[side] * rng.uniform(0.24, 0.28), rng.uniform(0.11, 0.14), rng.uniform(0.22, 0.28))
     body.reach(side, pulse(t, start + 0.1, low, rise, rise + 0.6 * (end - rise)), spot)
-    return body
 
 
 CHAIR = 0.54  # height of the pelvis on a chair whose seat is 45 cm high
@@ -143,26 +133,23 @@ def _seat(body: Body, seated: np.ndarray, bent: np.ndarray) -> None:
         body.reach(side, seated**3, thigh)
 
 
-def sit(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Body:
-    body, start, seconds = Body(rng, t, rng.uniform(0.1, 0.13)), rng.uniform(0.1, 0.25), rng.uniform(1.25, 1.5)
+def sit(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+    start, seconds = rng.uniform(0.1, 0.25), rng.uniform(1.25, 1.5)
     end = start + seconds
     _seat(body, ease(t, start, end), pulse(t, start, start + 0.5 * seconds, start + 0.6 * seconds, end + 0.25))
-    return body
 
 
-def rise(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Body:
-    body, start, seconds = Body(rng, t, rng.uniform(0.1, 0.13)), rng.uniform(0.35, 0.5), rng.uniform(1.25, 1.45)
+def rise(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+    start, seconds = rng.uniform(0.35, 0.5), rng.uniform(1.25, 1.45)
     end = start + seconds
     _seat(body, 1 - ease(t, start + 0.1, end), pulse(t, start - 0.3, start + 0.4 * seconds, start + 0.5 * seconds, end))
     for path in (body.position, *body.ankles):
         path[:, 2] += 0.36
     body.reaches = [(side, weight, goal + np.array([0, 0, 0.36]), frame) for side, weight, goal, frame in body.reaches]
-    return body
 
 
-def lie(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Body:
+def lie(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
     """Sits down on the floor, with the hands behind the hips, and lies down on the back."""
-    body = Body(rng, t, rng.uniform(0.11, 0.13))
     start, stretch = rng.uniform(0.05, 0.12), (t[-1] - 0.25) / 2.4
     a, b, c, d = start + stretch * np.array([0.0, 1.05, 1.35, 2.2])
     down, back = ease(t, a, b), ease(t, b - 0.2, d)
@@ -182,4 +169,3 @@ def lie(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Body:
         body.ankles[side, :, 1] += 0.28 * out * (1 - out)
         body.foot_pitch[side] -= 0.9 * ease(t, c + 0.12 * side - 0.3, c + 0.12 * side + 0.2)
         body.foot_yaw[side] += 0.25 * sign * out
-    return body

@@ -167,7 +167,7 @@ def test_samples_are_those_of_actor(stem: str, tmp_path: Path):
 
 def test_another_humanact12_file_is_named(tmp_path: Path):
     columns = {
-        r"humanact12poses\.pkl: lists differ in length": {"y": [0]},
+        r"humanact12poses\.pkl: poses, joints3D, y are not lists of equal length": {"y": [0]},
         "clip 0: label 12, not one of 0 to 11": {"y": [12] * 24},
         r"clip 0: poses \(20, 72\) and joints \(9, 18, 3\)": {"joints3D": [np.zeros((9, 18, 3))] * 24},
         "clip humanact12_00": {"poses": [np.full((20 + 7 * (k % 15), 72), np.nan) for k in range(24)]},

@@ -172,9 +172,9 @@ def _members(archive: Path, keys: Collection[str]) -> Iterator[tuple[str, str, b
     """Yields key, name and content of recordings in an archive."""
     left = set(keys)
     for name, content in archives.members(archive, lambda name: name.endswith(".npz") and key_of(name) in left):
-        if content and (key := key_of(name)):
-            left.remove(key)
-            yield key, f"{archive}/{name}", content
+        key = str(key_of(name))
+        left.remove(key)
+        yield key, f"{archive}/{name}", content
         if not left:
             return
     raise UserError(f"{archive}: {len(left)} recordings are missing in the archive, such as {min(left)}")

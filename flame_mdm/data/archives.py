@@ -24,11 +24,11 @@ _HEADERS += (tarfile.GNUTYPE_LONGLINK,)
 _DAMAGE = (*ZIP_ERRORS, tarfile.TarError, lzma.LZMAError, OSError, ValueError)
 
 
-def members(path: Path, read: Callable[[str], bool] = lambda name: False) -> Iterator[tuple[str, bytes]]:
-    """Yields the name of each member of a zip or tar archive, except folders, and its bytes if `read(name)`, else b"".
+def members(path: Path, is_wanted: Callable[[str], bool]) -> Iterator[tuple[str, bytes]]:
+    """Yields names and contents of the files in a zip or tar archive whose names are wanted.
 
-    Raises `UserError` if the file is damaged or not an archive, a member that is read is a link, a sparse file or
-    encrypted, or the content expands disproportionately.
+    Raises `UserError` if the archive is damaged or none, a wanted member is a link, a sparse file or encrypted, or the
+    content expands disproportionately.
     """
     size = regular_file(path)
     with path.open("rb") as file:
@@ -37,16 +37,16 @@ def members(path: Path, read: Callable[[str], bool] = lambda name: False) -> Ite
         unpack: Any = next((opener for magic, opener in _UNPACKERS.items() if head.startswith(magic)), None)
         with naming(path, *_DAMAGE, what="damaged archive, download it again: "):
             if head.startswith(b"PK") or zipfile.is_zipfile(path):
-                yield from _zip_members(file, size, read)
+                yield from _zip_members(file, size, is_wanted)
                 return
             with unpack(file) if unpack else file as unpacked:
-                yield from _tar_members(path, _Bounded(unpacked, size), read)
+                yield from _tar_members(path, _Bounded(unpacked, size), is_wanted)
 
 
 def as_folder(path: Path, owner: object, is_wanted: Callable[[str], bool]) -> Path:
-    """Returns a folder unchanged; unpacks some members of an archive into one that is removed together with `owner`.
+    """Returns a folder unchanged; unpacks the `members` of an archive into one that is removed together with `owner`.
 
-    Returns the deepest folder that contains them all; raises `UserError` as `members`, and if a name leads out.
+    Returns the deepest folder that contains them all; also raises `UserError` if a name leads out.
     """
     if not path.is_file():
         return path
@@ -55,45 +55,39 @@ def as_folder(path: Path, owner: object, is_wanted: Callable[[str], bool]) -> Pa
     folder = temporary / path.name
     folder.mkdir()
     for name, content in members(path, is_wanted):
-        if is_wanted(name):
-            if ".." in PurePosixPath(name).parts or PurePosixPath(name).is_absolute():
-                raise UserError(f"{path}: {name[:80]} leads out of the archive")
-            with naming(path, OSError, ValueError, what="cannot be unpacked: "):
-                (folder / name).parent.mkdir(parents=True, exist_ok=True)
-                (folder / name).write_bytes(content)
+        if ".." in PurePosixPath(name).parts or PurePosixPath(name).is_absolute():
+            raise UserError(f"{path}: {name[:80]} leads out of the archive")
+        with naming(path, OSError, ValueError, what="cannot be unpacked: "):
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_bytes(content)
     while len(inside := list(folder.iterdir())) == 1 and inside[0].is_dir():
         folder = inside[0]
     return folder
 
 
-def _zip_members(file: IO[bytes], size: int, read: Callable[[str], bool]) -> Iterator[tuple[str, bytes]]:
+def _zip_members(file: IO[bytes], size: int, is_wanted: Callable[[str], bool]) -> Iterator[tuple[str, bytes]]:
     with zipfile.ZipFile(file) as archive:
-        infos = [info for info in archive.infolist() if not info.is_dir()]
-        check_expansion(sum(info.file_size for info in infos), size)
-        for info in infos:
-            content = b""
-            if read(info.filename):
+        check_expansion(sum(info.file_size for info in archive.infolist()), size)
+        for info in archive.infolist():
+            name = info.filename
+            if not info.is_dir() and "__MACOSX" not in name and is_wanted(name):  # macOS keeps attributes there
                 check_member(info)
-                _check_size(info.filename, info.file_size)
-                content = archive.read(info)
-            yield info.filename, content
+                _check_size(name, info.file_size)
+                yield name, archive.read(info)
 
 
-def _tar_members(path: Path, stream: Any, read: Callable[[str], bool]) -> Iterator[tuple[str, bytes]]:
+def _tar_members(path: Path, stream: Any, is_wanted: Callable[[str], bool]) -> Iterator[tuple[str, bytes]]:
     try:
         archive: Any = tarfile.open(mode="r|", fileobj=stream, bufsize=MEBIBYTE // 4, tarinfo=_Member)  # noqa: SIM115
     except tarfile.ReadError as error:
         raise UserError(f"{path}: neither a folder nor a zip or tar archive: {error}") from error
     with archive:
         while (member := archive.next()) is not None:
-            if not member.isdir():
-                content = b""
-                if read(member.name):
-                    if not member.isreg() or member.issparse():
-                        raise UserError(f"{member.name}: a link or another special file, not a regular file")
-                    _check_size(member.name, member.size)
-                    content = archive.extractfile(member).read()
-                yield member.name, content
+            if not member.isdir() and is_wanted(member.name):
+                if not member.isreg() or member.issparse():
+                    raise UserError(f"{member.name}: a link or another special file, not a regular file")
+                _check_size(member.name, member.size)
+                yield member.name, archive.extractfile(member).read()
             archive.members = []  # a million empty members take a gigabyte
             archive.pax_headers = {}  # values for all members, which each of them would copy
 

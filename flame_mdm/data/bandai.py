@@ -7,7 +7,7 @@ Stylization", arXiv 2306.08861, 2023; CC BY-NC 4.0. `docs/bandai.md` describes t
 import re
 from collections.abc import Iterator, Sequence
 from functools import cached_property, partial
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -135,7 +135,11 @@ class Bandai(MotionSource):
         convert_one = partial(convert, fps=fps, kind=self.motion)
         motions = in_order(convert_one, [take.file for take in self.takes], self.workers)
         for take, motion in zip(self.takes, motions, strict=True):
-            clip = self._clip(take, motion)
+            side, name = side_of(take.content), take.file.stem
+            attributes = {"content": take.content, "style": take.style, "dataset": take.dataset}
+            attributes |= {"side": side} if side else {}
+            texts, action = captions(take.content, take.style, side), self.actions.index(take.content)
+            clip = Clip(name, motion, texts, take.split, name, action, attributes)
             yield clip
             if self.mirror and take.split == "train":
                 yield mirrored(clip, mirror(motion), self.actions)
@@ -144,23 +148,13 @@ class Bandai(MotionSource):
     def takes(self) -> list[Take]:
         """The takes that are present and not excluded, sorted by name."""
         files: dict[str, Path] = {}
-        folder = archives.as_folder(required(self.path, GET_IT), self, _is_take)
+        folder = archives.as_folder(required(self.path, GET_IT), self, lambda name: name.endswith(".bvh"))
         for file in sorted(folder.rglob("dataset-*.bvh")):
-            if _is_take(file.name):
-                if file.stem in files:
-                    both = f"{files[file.stem]} and {file}"
-                    raise UserError(f"{self.path}: {file.stem} exists twice, as {both}; delete one")
-                files[file.stem] = file
+            if FILE.fullmatch(file.name) and files.setdefault(file.stem, file) != file:
+                raise UserError(f"{self.path}: {file.stem} exists twice, as {files[file.stem]} and {file}; delete one")
         if not files:
             raise FileNotFoundError(f"{self.path}: no file dataset-1_*.bvh or dataset-2_*.bvh in it; {GET_IT}")
         return [_take(file, self.split) for _, file in sorted(self.not_excluded(files, self.path).items())]
-
-    def _clip(self, take: Take, motion: np.ndarray) -> Clip:
-        side, name = side_of(take.content), take.file.stem
-        attributes = {"content": take.content, "style": take.style, "dataset": take.dataset}
-        attributes |= {"side": side} if side else {}
-        texts, action = captions(take.content, take.style, side), self.actions.index(take.content)
-        return Clip(name, motion, texts, take.split, name, action, attributes)
 
 
 def convert(file: Path, fps: float, kind: str = "joints") -> np.ndarray:
@@ -182,13 +176,12 @@ def convert(file: Path, fps: float, kind: str = "joints") -> np.ndarray:
 
 
 def smpl_motion(skeleton: bvh.Bvh, rotations: np.ndarray, translations: np.ndarray) -> np.ndarray:
-    """Converts a take to SMPL parameters in the convention of AMASS: z up, pelvis and axis-angle vectors of 24 joints.
+    """Converts a take to (F, 75) float32 in AMASS's axes, z up: pelvis in meters, axis-angle vectors of 24 joints.
 
     SMPL's parent of a joint is the parent in the file, except for spine1, which lies between two joints of the file and
     rotates with the pelvis. So a rotation of SMPL is that of the file in the axes of the rest pose:
     B_parent R B_joint^-1. `rotations` and `translations` (F, J, ...), in centimeters, are in the frame of the parent.
-
-    Returns (F, 3 + 72) float32: position of the pelvis in meters, then rotations. Hands (22 and 23) do not rotate.
+    Hands (22 and 23) do not rotate.
     """
     positions, turned = bvh.forward_kinematics(skeleton.parents, rotations, translations)
     local = np.tile(np.eye(3), (len(rotations), 24, 1, 1))
@@ -219,7 +212,7 @@ def side_of(content: str) -> str:
 
 
 def captions(content: str, style: str, side: str) -> list[str]:
-    """Returns four descriptions in the style of HumanML3D; `side` is left or right if the content contains one."""
+    """Returns four descriptions in the style of HumanML3D."""
     contents, styles = WORDS["contents"], WORDS["styles"]
     phrases = zip(contents[re.sub("left|right", "{side}", content)], styles[style], strict=True)
     filled = (phrase.format(side=side, other=swap_sides(side), how=how) for phrase, how in phrases)
@@ -230,9 +223,9 @@ def split_of(dataset: int, content: str, style: str, number: int, rule: str = "t
     """Returns the split of a take, determined by its name.
 
     With the rule "compositional", the combinations `HELD_OUT` are the test split, and other test takes are used for
-    training. Neighboring takes come from one session and look alike, so blocks of five go to one split. Data set 1 has
-    a single take of most combinations, so there each combination goes to one split. The normal takes of walk-turn-left
-    and -right overlap in time across names and are all used for training.
+    training. Neighboring takes look alike, so blocks of five go to one split. Data set 1 has a single take of most
+    combinations, so there each combination goes to one split. The normal takes of walk-turn-left and -right overlap in
+    time across names and are all used for training.
     """
     if rule == "compositional":
         if (content, style) in HELD_OUT:
@@ -245,10 +238,6 @@ def split_of(dataset: int, content: str, style: str, number: int, rule: str = "t
         return "train"
     takes = TAKES_2[content][STYLES_2.index(style)]
     return split_blocks(f"dataset-2_{content}_{style}", takes, 5, val=0.05, test=0.1)[(number - 1) // 5]
-
-
-def _is_take(name: str) -> bool:
-    return FILE.fullmatch(PurePosixPath(name).name) is not None
 
 
 def _take(file: Path, rule: str) -> Take:

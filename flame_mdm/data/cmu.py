@@ -92,7 +92,7 @@ class CMU(MotionSource):
     @cached_property
     def path(self) -> Path:
         """The folder of the recordings."""
-        return archives.as_folder(self.archive, self, _is_read)
+        return archives.as_folder(self.archive, self, lambda name: name.lower().endswith(SUFFIXES))
 
     @property
     def captions(self) -> Path:
@@ -209,10 +209,6 @@ class CMU(MotionSource):
 
 def _is_in(fact: str, trial: str) -> bool:  # or its subject is
     return not {trial, trial.partition("_")[0]}.isdisjoint(FACTS[fact])
-
-
-def _is_read(name: str) -> bool:
-    return PurePosixPath(name).suffix.lower() in SUFFIXES and "__MACOSX" not in name
 
 
 def _rank(path: Path) -> int:

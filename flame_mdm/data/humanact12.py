@@ -25,11 +25,11 @@ class HumanAct12(MotionSource):
     """The clips of `humanact12poses.pkl`, as raw motions of the SMPL representations.
 
     The file names neither subjects nor recordings. Our split (70 % train, 10 % val, 20 % test of each action) keeps
-    neighboring clips together. The papers use no split: every clip is used for training and for testing.
+    neighboring clips together.
 
     Args:
         path: `humanact12poses.pkl`, or the folder that contains it.
-        published_split: use all clips for training and for testing.
+        published_split: use all clips for training and for testing, as the papers do.
     """
 
     name = "humanact12"
@@ -52,33 +52,27 @@ class HumanAct12(MotionSource):
         for number, (motion, action) in enumerate(self._motions):
             name, block = f"humanact12_{number:04d}", seen[action] // BLOCK
             seen[action] += 1
+            split, source = blocks[action][block], f"{self.actions[action]} {block}"
             if self.published_split:
-                yield Clip(name, motion, [], "train", name, action)
-            else:
-                yield Clip(name, motion, [], blocks[action][block], f"{self.actions[action]} {block}", action)
+                split, source = "train", name
+            yield Clip(name, motion, [], split, source, action)
 
     @cached_property
     def _motions(self) -> list[tuple[np.ndarray, int]]:
-        return read(find(self.path, "humanact12poses.pkl"))
+        """Motion (F, 75) float32 and action of each clip, in the order of the file.
 
-
-def read(path: Path) -> list[tuple[np.ndarray, int]]:
-    """Reads motion (F, 75) float32 and action of each clip of `humanact12poses.pkl`, in the order of the file.
-
-    A motion is the position of the root joint (meters, camera axes), then 24 axis-angle vectors, that of the root in
-    camera axes.
-    """
-    clips = []
-    for number, columns in enumerate(zip(*read_lists(path, "poses", "joints3D", "y"), strict=True)):
-        with naming(f"{path}: clip {number}", *NO_NUMBERS, what="does not consist of numbers: "):
-            pose, joint = (np.asarray(column, np.float32) for column in columns[:2])
-            label, actions = int(columns[2]), len(HumanAct12.actions)
-            if pose.shape[1:] != (72,) or joint.shape != (len(pose), 24, 3) or not len(pose):
-                raise UserError(f"poses {pose.shape} and joints {joint.shape}, not (F, 72) and (F, 24, 3)")
-            if not 0 <= label < actions:
-                raise UserError(f"label {label}, not one of 0 to {actions - 1}")
-        clips.append((np.concatenate([joint[:, 0], pose], 1), label))
-    return clips
+        A motion is the position of the root joint (meters, camera axes), then 24 axis-angle vectors.
+        """
+        path, motions = find(self.path, "humanact12poses.pkl"), []
+        for number, (poses, joints, action) in enumerate(zip(*read_lists(path, "poses", "joints3D", "y"), strict=True)):
+            with naming(f"{path}: clip {number}", *NO_NUMBERS, what="does not consist of numbers: "):
+                pose, joint, label = np.asarray(poses, np.float32), np.asarray(joints, np.float32), int(action)
+                if pose.shape[1:] != (72,) or joint.shape != (len(pose), 24, 3) or not len(pose):
+                    raise UserError(f"poses {pose.shape} and joints {joint.shape}, not (F, 72) and (F, 24, 3)")
+                if not 0 <= label < len(self.actions):
+                    raise UserError(f"label {label}, not one of 0 to {len(self.actions) - 1}")
+            motions.append((np.concatenate([joint[:, 0], pose], 1), label))
+        return motions
 
 
 def read_unconstrained(path: Path) -> np.ndarray:
@@ -111,8 +105,7 @@ def read_lists(path: Path, *names: str) -> list[Any]:
         kind = f"keys {', '.join(map(str, data))}" if isinstance(data, dict) else type(data).__name__
         raise UserError(f"{path}: must contain {', '.join(names)}; it contains {kind}")
     lists = [data[name] for name in names]
-    if not all(isinstance(values, list | tuple) or np.ndim(values) for values in lists):
-        raise UserError(f"{path}: {', '.join(names)} are not all lists")
-    if len(set(map(len, lists))) > 1:
-        raise UserError(f"{path}: lists differ in length: {', '.join(f'{len(values)}' for values in lists)}")
+    are_lists = all(isinstance(values, list | tuple) or np.ndim(values) for values in lists)
+    if not are_lists or len(set(map(len, lists))) > 1:
+        raise UserError(f"{path}: {', '.join(names)} are not lists of equal length")
     return lists

@@ -27,14 +27,9 @@ from flame_mdm.safe_io import atomic_write, made_folder, naming, read_npy, read_
 
 FPS = 20
 
-GET_IT = (
-    "clone https://github.com/EricGuo5513/HumanML3D and use its folder HumanML3D; the motions have to be created from "
-    "AMASS: docs/humanml3d.md"
-)
-
 
 class IndexedClip(NamedTuple):
-    """A clip in `index.csv`: frames `start` to `end` of a recording at 20 fps; `key` as returned by `key_of`."""
+    """A clip in `index.csv`: frames `start` to `end` of a recording at 20 fps; `key` is that of `key_of`."""
 
     name: str
     key: str
@@ -43,7 +38,7 @@ class IndexedClip(NamedTuple):
 
     @property
     def humanact12(self) -> bool:
-        """Whether the clip is from HumanAct12, whose clips are used whole; `key` is then the name of its file."""
+        """Whether the clip is a file of HumanAct12, named by `key` and used whole."""
         return "/" not in self.key
 
     def frames(self, count: int) -> slice:
@@ -70,11 +65,11 @@ def read_index(path: Path) -> list[IndexedClip]:
     return rows
 
 
-def by_recording(rows: Iterable[IndexedClip], *, humanact12: bool) -> dict[str, list[IndexedClip]]:
-    """Returns recording -> its clips, for the recordings of HumanAct12 or for those of AMASS."""
+def by_recording(rows: Iterable[IndexedClip]) -> dict[str, list[IndexedClip]]:
+    """Returns recording of AMASS -> its clips."""
     recordings = defaultdict(list)
     for row in rows:
-        if row.humanact12 == humanact12:
+        if not row.humanact12:
             recordings[row.key].append(row)
     return recordings
 
@@ -96,7 +91,10 @@ class HumanML3D(T2MFolder):
     representation = "humanml-legacy-smpl22"
     fps = 20.0
     shortest = 40
-    get_it = GET_IT
+    get_it = (
+        "clone https://github.com/EricGuo5513/HumanML3D and use its folder HumanML3D; the motions have to be created "
+        "from AMASS: docs/humanml3d.md"
+    )
 
     def __init__(
         self,
@@ -135,7 +133,7 @@ class HumanML3D(T2MFolder):
     def humanact12_files(self) -> dict[str, Path]:
         """Files of joints of HumanAct12 by name; empty if they are missing."""
         path = self._beside("humanact12", "pose_data/humanact12", "pose_data/humanact12.zip")
-        folder = archives.as_folder(path, self, lambda n: n.endswith(".npy") and "__MACOSX" not in n)
+        folder = archives.as_folder(path, self, lambda name: name.endswith(".npy"))
         return {file.stem: file for file in folder.rglob("*.npy")}
 
     def _beside(self, *names: str) -> Path:
@@ -153,7 +151,7 @@ class HumanML3D(T2MFolder):
         return {gender: load_body(self.body_models, gender) for gender in ("male", "female")}
 
     def _missing(self, amass: Amass, todo: Sequence[IndexedClip]) -> list[str]:
-        missing = amass.missing({row.key for row in todo if not row.humanact12})
+        missing = amass.missing(by_recording(todo))
         if absent := {row.key for row in todo if row.humanact12} - self.humanact12_files.keys():
             missing.append(f"{len(absent)} clips of HumanAct12, such as {min(absent)}")
         try:
@@ -176,14 +174,14 @@ class HumanML3D(T2MFolder):
     def _make_motions(self, amass: Amass, todo: Sequence[IndexedClip]) -> None:
         folder, encoder = self.path / "new_joint_vecs", HumanML("smpl22", "legacy", bone_lengths=self.bone_lengths)
         write = partial(_write_features, folder, encoder)
-        from_amass, from_humanact12 = (by_recording(todo, humanact12=of) for of in (False, True))
         try:
             with ProgressBar(desc=f"creating {self.name}", total=len(todo), unit=" motions") as progress:
-                for _, count in amass.map(from_amass, partial(_from_amass, write, self._bodies()), self.workers):
+                write_all = partial(_from_amass, write, self._bodies())
+                for _, count in amass.map(by_recording(todo), write_all, self.workers):
                     progress.update(count)
-                for key, rows in sorted(from_humanact12.items()):
-                    for row in rows:
-                        write(row, _read_joints(self.humanact12_files[key]))
+                for row in todo:
+                    if row.humanact12:
+                        write(row, _read_joints(self.humanact12_files[row.key]))
                         progress.update()
         finally:
             for unfinished in folder.glob(".*.npy"):  # of workers that were stopped
@@ -191,14 +189,14 @@ class HumanML3D(T2MFolder):
 
     def _write_statistics(self) -> None:
         """Writes mean and std over all motions of any length and split, including mirrored ones."""
-        names = sorted(self._motions())
         representation = HumanML("smpl22", "legacy")
-        shapes = {name: self._load(name, mmap=True).shape for name in names}
-        if wrong := [name for name, shape in shapes.items() if shape[1] != representation.features]:
+        shapes = {name: self._load(name, mmap=True).shape for name in sorted(self._motions())}
+        if wrong := [name for name, (_, features) in shapes.items() if features != representation.features]:
             raise UserError(f"{self.path}: wrong number of features of {some(wrong)}; delete them and prepare again")
-        frames = sum(shape[0] for shape in shapes.values())
-        motions = Frames(lambda: (self._load(name).astype(np.float32) for name in names), frames)
-        mean, std = representation.statistics(motions)
+        frames = sum(count for count, _ in shapes.values())
+        mean, std = representation.statistics(
+            Frames(lambda: (self._load(name).astype(np.float32) for name in shapes), frames)
+        )
         _save(self.path / "Std.npy", std.numpy())
         _save(self.path / "Mean.npy", mean.numpy())
 
@@ -238,9 +236,9 @@ def _read_joints(path: Path) -> np.ndarray:
 class HumanML3DSMPL(MotionSource):
     """FLAME's form of the data set (Kim et al., AAAI 2023): SMPL parameters, whole clips, one clip per caption.
 
-    As in FLAME's code, there are no mirrored copies, no limits of length and no cuts: a caption of a part is used as a
-    caption of the whole motion. Clips are named NAME#0, NAME#1 ...; those of one motion share its frames. Unlike there,
-    the frames trimmed from the start of five subsets are taken into account, so that motion and caption match.
+    As in FLAME's code, there are no mirrored copies, no limits of length and no cuts: a caption of a part is used for
+    the whole motion. Clips are named NAME#0, NAME#1 ... Unlike there, the frames trimmed from the start of five subsets
+    are taken into account, so that motion and caption match.
 
     Args:
         path: folder with HumanML3D's texts and splits and, in it or next to it, `index.csv`; no motions are needed.
@@ -284,32 +282,31 @@ class HumanML3DSMPL(MotionSource):
         return used
 
     def count(self) -> int:
-        self.amass.check(by_recording(self.rows, humanact12=False))
+        self.amass.check(by_recording(self.rows))
         return sum(len(self.folder.texts[row.name]) for row in self.rows)
 
     def clips(self, fps: float) -> Iterator[Clip]:
         self.check_fps(fps, FPS)
-        from_amass = by_recording(self.rows, humanact12=False)
+        from_amass = by_recording(self.rows)
         for key, motions in self.amass.map(from_amass, _parameters, self.workers):
             for row, motion in zip(from_amass[key], motions, strict=True):
                 yield from self._clips(row, motion)
         if self.humanact12:
-            yield from self._from_humanact12(self.humanact12, by_recording(self.rows, humanact12=True))
+            yield from self._from_humanact12(self.humanact12)
 
-    def _from_humanact12(self, path: Path, recordings: dict[str, list[IndexedClip]]) -> Iterator[Clip]:
+    def _from_humanact12(self, path: Path) -> Iterator[Clip]:
         """Yields SMPL poses of HumanAct12; the root position is used as SMPL's translation, as in FLAME's code."""
         data = restricted_pickle.read(path)
-        for key in sorted(recordings):
-            entry = data.get(f"{key}.npy", data.get(key)) if isinstance(data, dict) else None
+        for row in sorted((row for row in self.rows if row.humanact12), key=lambda row: row.key):
+            entry = data.get(f"{row.key}.npy", data.get(row.key)) if isinstance(data, dict) else None
             if entry is None:
-                self.leave_out(f"motions of HumanAct12 that {path.name} lacks", len(recordings[key]))
+                self.leave_out(f"motions of HumanAct12 that {path.name} lacks")
                 continue
             errors = (KeyError, TypeError, ValueError, IndexError)
-            with naming(path, *errors, what=f"{key} lacks poses (F, 72) or joints3D (F, 24, 3): "):
+            with naming(path, *errors, what=f"{row.key} lacks poses (F, 72) or joints3D (F, 24, 3): "):
                 poses = np.asarray(entry["poses"], np.float32)
                 motion = np.concatenate([np.asarray(entry["joints3D"], np.float32)[:, 0], poses.reshape(-1, 72)], 1)
-            for row in recordings[key]:
-                yield from self._clips(row, motion)
+            yield from self._clips(row, motion)
 
     def _clips(self, row: IndexedClip, motion: np.ndarray) -> Iterator[Clip]:
         if not len(motion):

@@ -11,7 +11,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from functools import cached_property
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -138,7 +138,7 @@ class T2MFolder(MotionSource):
         if not folder.is_dir():
             if not archive.is_file():
                 raise FileNotFoundError(f"{self.path}: contains neither a folder texts nor texts.zip")
-            folder = archives.as_folder(archive, self, _is_text)
+            folder = archives.as_folder(archive, self, lambda name: name.endswith(".txt"))
         return {file.stem: parse(read_text(file), str(file)) for file in sorted(folder.rglob("*.txt"))}
 
     @cached_property
@@ -222,7 +222,3 @@ class T2MFolder(MotionSource):
             self.leave_out("captions of parts that are too short or too long", lost)
             return
         self.leave_out(f"names of {self.names[name]} {reason}")
-
-
-def _is_text(member: str) -> bool:
-    return member.endswith(".txt") and "__MACOSX" not in PurePosixPath(member).parts

@@ -12,7 +12,7 @@ from flame_mdm.errors import UserError
 from flame_mdm.formats.motion import Motion
 from flame_mdm.representations.skeleton import KIT21, SMPL22
 from flame_mdm.visualize import player_page, render
-from flame_mdm.visualize.body import ANCHORS, fit_body, load_body, mannequin, rasterize, sides, try_fit
+from flame_mdm.visualize.body import ANCHORS, fit_body, load_body, mannequin, sides, try_fit
 from flame_mdm.visualize.posture import JOINT
 
 
@@ -96,11 +96,11 @@ def test_the_nearest_triangle_is_drawn():
     square = np.array([[2.0, 18], [18, 18], [18, 2], [2, 2]])
     at, triangles = np.concatenate([square, square]), np.array([[0, 1, 2], [0, 2, 3]])
     colors = np.repeat([[10.0, 20, 30], [200, 100, 0]], 4, axis=0)
-    rasterize(image, at, np.repeat([1.0, 2.0], 4), colors, np.concatenate([triangles, triangles + 4]))
+    render._rasterize(image, at, np.repeat([1.0, 2.0], 4), colors, np.concatenate([triangles, triangles + 4]))
     assert (image[2:18, 2:18] == [10, 20, 30]).all()
     assert (image[:, :2] == 255).all()
     assert (image[18:] == 255).all()
-    rasterize(image, at, np.repeat([3.0, 0.5], 4), colors, triangles[:, ::-1])  # seen from inside
+    render._rasterize(image, at, np.repeat([3.0, 0.5], 4), colors, triangles[:, ::-1])  # seen from inside
     assert (image[2:18, 2:18] == [10, 20, 30]).all()
 
 

@@ -135,8 +135,8 @@ def test_nothing_to_inspect_is_an_error(tmp_path, capsys):
     (tmp_path / "empty").mkdir()
     for words, message in (
         ([], "no motion given. Write flame-mdm inspect MOTION|FOLDER|DATASET"),
-        ([str(tmp_path / "empty")], "the folder has no motion files"),
-        ([str(tmp_path / "absent.npz")], "absent.npz: no such file. Give a motion file (.npz"),
+        ([str(tmp_path / "empty")], "empty: no motion files (.npz, "),
+        ([str(tmp_path / "absent.npz")], "absent.npz: no such file"),
         (["bandia"], "bandia"),
         ([str(tmp_path / "absent.npz"), "clips=0"], "clips=0: must be at least 1"),
     ):

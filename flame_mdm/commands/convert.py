@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from flame_mdm.commands import BodySettings, FileSettings, existing, motion_file
 from flame_mdm.errors import UserError, say
-from flame_mdm.formats import ENDINGS, WRITTEN
+from flame_mdm.formats import motion_files
 from flame_mdm.progress import ProgressBar
 from flame_mdm.sampler_options import option, required
 
@@ -25,8 +25,7 @@ class ConvertSettings(BodySettings, FileSettings):
 
     Converts a motion file, or all motion files in a folder and the folders below it. The nearest skeleton.yaml in its
     folder or above applies (docs/own-data.md).
-    Inputs: .npz written by `make sample`, .npz of AMASS, .bvh, .amc with its .asf, .json, and .npy with joint
-    positions.
+    Inputs: .npz of `make sample` and of AMASS, .bvh, .amc with its .asf, .json, and .npy with joint positions.
     Outputs: .bvh and .glb for Blender and game engines, .npz in the layout of AMASS, and .json and .npy with joint
     positions; .mp4 and .gif to look at. Units, axes and joint names: docs/formats.md
     """
@@ -37,13 +36,11 @@ class ConvertSettings(BodySettings, FileSettings):
     format: str | None = option(None, "if MOTION is a folder: ending of the files that are written to the folder OUT")
     rest_pose: bool = option(False, "true = .bvh begins with a frame of the rest pose, arms out")
     rig: str | None = option(None, "skeleton: mixamo, unreal, unity, rigify, lafan1, soma, cmu or 100style")
-    character: str | None = option(
-        None, "your own .glb file with a skin, written with the motion: docs/characters.md", existing
-    )
+    character: str | None = option(None, "your own .glb file with a skin to move: docs/characters.md", existing)
 
 
 def main(settings: ConvertSettings) -> None:
-    path, out, hero = Path(settings.motion), Path(settings.out), settings.character
+    path, out = Path(settings.motion), Path(settings.out)
     if path.is_dir():
         targets = _targets(settings, path, out)
     elif settings.format is not None:
@@ -51,13 +48,10 @@ def main(settings: ConvertSettings) -> None:
     else:
         motion_file("motion", settings.motion)
         targets = {out: path}
-    if wrong := [target for target in targets if target.suffix.lower() not in WRITTEN]:
-        raise UserError(f"{wrong[0]}: unknown kind of motion file. Use one of {', '.join(WRITTEN)}")
-
     from flame_mdm.formats import characters
 
     try:
-        character = None if hero is None else characters.read(hero)
+        character = None if settings.character is None else characters.read(settings.character)
     except characters.UnknownJoints as error:
         say(*error.template)
         raise
@@ -69,9 +63,7 @@ def _targets(settings: ConvertSettings, folder: Path, out: Path) -> dict[Path, P
     ending = settings.format or (Path(settings.character).suffix[1:].lower() if settings.character else None)
     if ending is None:
         raise UserError(f"{folder} is a folder: name the format of the files too, such as format=glb")
-    files = sorted(file for file in folder.rglob("*") if file.suffix.lower() in ENDINGS and file.is_file())
-    if not files:
-        raise UserError(f"{folder}: no motion files ({', '.join(ENDINGS)})")
+    files = motion_files(folder)
     targets = {out / file.relative_to(folder).with_suffix(f".{ending}"): file for file in files}
     if double := [file for file in files if file not in targets.values()]:
         raise UserError(f"{double[0]}: another motion has the same name, so both would become one file. Rename one")

@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from flame_mdm.commands import BodySettings, DataSettings, FileSettings, above_zero
+from flame_mdm.commands import BodySettings, DataSettings, FileSettings, above_zero, existing
 from flame_mdm.config import instantiate
 from flame_mdm.errors import UserError, say
-from flame_mdm.formats import ENDINGS
+from flame_mdm.formats import motion_files
 from flame_mdm.progress import ProgressBar
 from flame_mdm.sampler_options import option, required
 
@@ -26,10 +26,8 @@ MOST_LINES = 20  # faults that are printed per motion; the player shows all
 class InspectSettings(BodySettings, FileSettings, DataSettings):
     """usage: flame-mdm inspect MOTION|FOLDER|DATASET [OUT.html] [split=train] [clips=24] [fps=20] [unit=0.01] [up=z]
 
-    Finds physical faults of a motion file, of all motion files in a folder, or of a prepared data set: sliding feet,
-    jumps, bones that change their length, joints below the floor, arms in the body, bodies that float or freeze, and
-    impossible bends.
-    Limits, and how many real clips each flags: docs/motion-faults.md
+    Finds physical faults of a motion file, of all motion files in a folder, or of a prepared data set, such as sliding
+    feet and jumps; their limits: docs/motion-faults.md
     Prints the faults per frame and joint, and writes a player whose time line marks them; of a data set or a large
     folder, it shows the worst motions, at most `clips`. Exits with 3 if there are faults.
     """
@@ -39,7 +37,6 @@ class InspectSettings(BodySettings, FileSettings, DataSettings):
     out: str | None = option(None, "HTML file; default runs/inspect/<name>.html")
     clips: int = option(24, "maximum number of motions in the player, the worst ones", above_zero)
     split: str | None = option(None, "train, val or test of a data set; default: all")
-    source: str | None = option(None, "folder or archive of a data set that is not prepared yet")
 
     def __post_init__(self) -> None:
         name = self.motion
@@ -50,8 +47,6 @@ class InspectSettings(BodySettings, FileSettings, DataSettings):
 
 def main(settings: InspectSettings) -> None:
     files = [] if settings.data is not None else _files(settings.motion)
-    if not files:
-        settings.data_node(settings.source)
     from flame_mdm.formats.faults import LIMITS, find_faults
     from flame_mdm.visualize import write_player
     from flame_mdm.visualize.body import load_body
@@ -80,13 +75,8 @@ def main(settings: InspectSettings) -> None:
 
 
 def _files(name: str) -> list[Path]:
-    path, kinds = Path(name), ", ".join(ENDINGS)
-    if not path.exists():
-        raise UserError(f"{path}: no such file. Give a motion file ({kinds}), a folder of them, or a data set")
-    below = sorted(file for file in path.rglob("*") if file.suffix.lower() in ENDINGS and not file.is_dir())
-    if path.is_dir() and not below:
-        raise UserError(f"{path}: the folder has no motion files ({kinds})")
-    return below or [path]
+    existing("motion", name)
+    return motion_files(Path(name)) if Path(name).is_dir() else [Path(name)]
 
 
 def _read(settings: InspectSettings, files: Sequence[Path]) -> tuple[str, int, Iterator[Motion]]:
@@ -105,9 +95,8 @@ def _read(settings: InspectSettings, files: Sequence[Path]) -> tuple[str, int, I
 def _clips(settings: InspectSettings) -> tuple[str, int, Iterator[Motion]]:
     from flame_mdm.reporting.browse import motion
 
-    node = settings.data_node(settings.source)
     representation = instantiate(settings.nodes["representation"])
-    data = instantiate(node, representation=representation)
+    data = instantiate(settings.nodes["data"], representation=representation)
     store = data.open()
     if settings.split not in (None, *store.info["clips"]):
         raise UserError(f"no split is called {settings.split}. Available: {', '.join(store.info['clips'])}")

@@ -198,7 +198,7 @@ class _Node:
 
 
 class Lines:
-    """Lines of a text file as words, without blank lines and comments (#); tracks the line number for error messages."""
+    """Lines of a text file as words, without blank lines and comments (#); tracks the line number for errors."""
 
     def __init__(self, data: bytes, name: str):
         self.name, self.line = name, 1

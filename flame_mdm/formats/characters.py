@@ -1,10 +1,9 @@
 """Motions on a user's own character: the skeleton of the skin of a .glb file.
 
-The character may have other proportions, units, axes, names and another rest pose than SMPL's body. Bones of arms and
-legs take the directions of those of the motion. Trunk, head, hands and feet are turned as in the motion, starting from
-the character's rest pose, which must be upright with flat feet. The path of the hips is scaled by the length of the
-legs. Then both legs are bent: the toes reach the scaled positions of the motion's toes, at the height above the floor
-that they have in the rest pose.
+It may have other proportions, units, axes, names and another rest pose than SMPL's body. Bones of arms and legs take
+the directions of the motion's. Trunk, head, hands and feet are turned as in the motion, starting from the rest pose,
+which must be upright with flat feet. The path of the hips is scaled by the length of the legs, which are then bent: the
+toes reach the scaled positions of the motion's toes, at the height above the floor that they have in the rest pose.
 """
 
 import copy
@@ -39,17 +38,13 @@ def read(path: str | Path) -> Character:
     Raises `UserError` if the file is damaged, or has no skin, known joints (`UnknownJoints`) or usable rest pose.
     """
     path = Path(path)
-    if path.suffix.lower() != ".glb":
-        raise UserError(f"character={path}: not a character. Use a .glb file")
     file = glb.read(path)
     skeletons: list[set[int]] = []
     for skin in file.skins:
         shared = [skeleton for skeleton in skeletons if skeleton & set(skin.joints)]
         skeletons = [skeleton for skeleton in skeletons if skeleton not in shared] + [set(skin.joints).union(*shared)]
     if len(skeletons) != 1:
-        raise UserError(
-            f"{path}: {len(skeletons)} skeletons with a skin. A character has one: export one mesh with its armature"
-        )
+        raise UserError(f"{path}: {len(skeletons)} skeletons with a skin, not one. Export one mesh with its armature")
     joints = identify(path, {joint: file.names[joint] for joint in sorted(skeletons[0])})
     worlds, corners = _rest(file, joints["pelvis"])
     if not (np.abs(worlds) <= glb.LARGEST).all() or not (np.abs(corners) <= glb.LARGEST).all():
@@ -58,10 +53,8 @@ def read(path: str | Path) -> Character:
     for joint, number in joints.items():
         sizes = np.linalg.svd(worlds[number, :3, :3], compute_uv=False)
         if scales[number] <= 0 or sizes[0] > 1.01 * sizes[2]:
-            raise UserError(
-                f"{path}: {file.names[number]} ({joint}) is mirrored or scaled unevenly in the rest pose. Apply the "
-                "scale of the armature and export it again"
-            )
+            name = f"{file.names[number]} ({joint})"
+            raise UserError(f"{path}: {name} is mirrored or scaled unevenly. Apply the scale of the armature")
     turned = worlds[:, :3, :3] / np.where(scales == 0, 1, scales)[:, None, None]
     pose = rest_pose(path, file.names, file.parents, worlds[:, :3, 3], turned, joints, corners, (0, 1, 0))
     return Character(replace(pose.rig, scales=scales), pose.map, pose.floor, file)
@@ -97,12 +90,9 @@ def _rest(file: glb.Glb, pelvis: int) -> tuple[np.ndarray, np.ndarray]:
 
 def moved(character: Character, motion: Shown) -> tuple[np.ndarray, np.ndarray, Rig]:
     """Moves a character as in a motion; see `follow`."""
-    poses, body = motion.posed(), fit_body(motion)
+    body = fit_body(motion)
     joints, world = motion.joints[:, : len(SMPL22)], world_rotations(body.local()) @ body.neutral
-    return follow(character, joints, poses.offsets.numpy(), body.neutral, world)
-
-
-# Names of joints ------------------------------------------------------------------------------------------------------
+    return follow(character, joints, motion.posed().offsets.numpy(), body.neutral, world)
 
 
 class UnknownJoints(UserError):
@@ -114,14 +104,10 @@ class UnknownJoints(UserError):
 
 
 def identify(path: Path, names: Mapping[int, str]) -> dict[str, int]:
-    """Returns the numbers of the joints that correspond to SMPL's, among numbers -> names of a character.
-
-    They are those of a known skeleton, or are listed in a file of the character's name that ends in .yaml. Raises
-    `UnknownJoints` if required joints are missing.
-    """
+    """Returns SMPL's joints -> numbers, among numbers -> names of a character; raises `UnknownJoints` if some lack."""
     listed = path.with_suffix(".yaml")
     chosen = read_yaml(listed) if listed.exists() else None
-    candidates = _listed(path, listed, chosen, names) if chosen else recognized(names, known_skeletons())
+    candidates = _listed(listed, chosen, names) if chosen else recognized(names, known_skeletons())
     numbers, missing = matched(path, names, candidates)
     if twice := next((joint for joint, number in numbers.items() if list(numbers.values()).count(number) > 1), None):
         raise UserError(f"{listed}: {names[numbers[twice]]} is listed for {twice} and for another joint. Remove one")
@@ -137,7 +123,7 @@ def identify(path: Path, names: Mapping[int, str]) -> dict[str, int]:
     return numbers
 
 
-def _listed(path: Path, listed: Path, chosen: object, names: Mapping[int, str]) -> dict[str, list[int]]:
+def _listed(listed: Path, chosen: object, names: Mapping[int, str]) -> dict[str, list[int]]:
     if not isinstance(chosen, dict):
         raise UserError(f"{listed}: not a list of names, each on a line such as `left_knee: Calf L`")
     candidates = {}
@@ -147,8 +133,7 @@ def _listed(path: Path, listed: Path, chosen: object, names: Mapping[int, str]) 
         if name is not None:
             candidates[joint] = [number for number, own in names.items() if own == name]
             if not candidates[joint]:
-                similar = did_you_mean(str(name), names.values())
-                raise UserError(f"{listed}: {joint}: {path} has no joint {name}.{similar}")
+                raise UserError(f"{listed}: {joint}: no joint {name}.{did_you_mean(str(name), names.values())}")
     return candidates
 
 
@@ -156,9 +141,6 @@ def known_skeletons() -> list[dict[str, str]]:
     """Returns the joints of known skeletons: `plain` name -> joint of SMPL."""
     skeletons = [*map(joint_names, presets().values()), LAYOUTS["SMPL"].map, LAYOUTS["Bandai-Namco"].map]
     return [{plain(name): joint for joint, name in map.items() if isinstance(name, str)} for map in skeletons]
-
-
-# Writing --------------------------------------------------------------------------------------------------------------
 
 
 def write(path: Path, character: Character, motion: Shown, name: str) -> str:

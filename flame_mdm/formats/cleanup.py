@@ -15,24 +15,19 @@ from flame_mdm.representations.skeleton import Skeleton
 SMOOTHNESS = 0.034  # weight of the squared third differences of a joint's path, relative to its squared change
 OUTLIER = 0.03  # distance in meters from the smooth path at which a position has half its weight
 LOW = 0.07  # height in meters above the floor at which a toe counts as in the air
-SLOW = 0.5
-"""Horizontal speed in meters per second at which a low toe counts as off the ground, while the body stands still."""
+SLOW = 0.5  # horizontal speed in m/s at which a low toe counts as off the ground while the body stands still
 SHARE, SHARE_PINNED = 0.5, 0.4
 """Fraction of the body's speed added to `SLOW`, before and after the body follows its feet. In generated motion, a foot
 on the floor may slide along with the body; a swinging foot is faster than the body."""
 DRIFT = 0.2
-"""Speed in meters per second up to which the body may slide over its feet; the legs compensate for the difference.
-Above 1.5 times this speed, the body follows its feet entirely."""
+"""Speed in m/s up to which the body may slide over its feet, for which the legs compensate. Above 1.5 times this speed,
+the body follows its feet entirely."""
 CLEAR = 0.15  # seconds in which a hand that would be inside the body starts to avoid it
-REACH = 0.999
-"""Maximum distance from hip to ankle relative to the length of the straight leg, unless it was longer before."""
+REACH = 0.999  # maximum distance from hip to ankle relative to the straight leg, unless it was longer before
 
 
 def cleaned(motion: Motion, contacts: np.ndarray | None = None) -> Motion:
-    """Returns the motion with joints from `cleanup`.
-
-    Features, rotations and contacts no longer fit and are dropped; exports compute rotations from the new joints.
-    """
+    """Returns the motion with joints from `cleanup`, without features, rotations and contacts, which no longer fit."""
     joints = cleanup(motion.joints, motion.fps, motion.skeleton, contacts)
     none = np.zeros((0, 0), np.float32)
     return replace(motion, joints=joints, features=none, representation="", poses=None, contacts=None, cleanup=True)
@@ -41,13 +36,12 @@ def cleaned(motion: Motion, contacts: np.ndarray | None = None) -> Motion:
 def cleanup(joints: np.ndarray, fps: float, skeleton: Skeleton, contacts: np.ndarray | None = None) -> np.ndarray:
     """Removes pops, changes of bone lengths, sliding feet and hands inside the body from joints (F, J, 3), y up.
 
-    In this order: paths of the joints are smoothed, bones get their median lengths, the body moves over the ground so
-    that its feet in contact stand still on average, and two-bone inverse kinematics keeps each toe in place during its
-    contacts and moves hands out of the trunk and the thighs. Motions of fewer than 4 frames are returned unchanged.
+    Paths of joints are smoothed, bones get their median lengths, the body moves over the ground so that its feet in
+    contact stand still on average, and two-bone inverse kinematics keeps each toe in place during its contacts and
+    moves hands out of the trunk and the thighs. Motions of fewer than 4 frames are returned unchanged.
 
-    `contacts` (F, N) are the probabilities that each of `skeleton.feet` stands on the floor from this frame to the
-    next, as models predict them for some representations. Otherwise contacts are estimated from height and speed of the
-    toes, which is less reliable if they slide.
+    `contacts` (F, N) are the probabilities that each of `skeleton.feet` stands on the floor until the next frame, as
+    models predict them for some representations; None = estimated from height and speed of the toes.
     """
     if len(joints) < 4:
         return np.array(joints, np.float32)

@@ -9,30 +9,23 @@ from scipy.ndimage import binary_opening
 
 from flame_mdm.formats.motion import Motion
 
-LOW = 0.05
-"""Height in meters above the floor, y = 0, below which a toe joint touches it. Also for the foot skating ratio."""
-STANDSTILL = 0.2
-"""Speed of the root in m/s below which the body does not jump: it is slower for only 0.04 s at the top of a jump."""
+LOW = 0.05  # height in meters above the floor, y = 0, below which a toe joint touches it; also of foot skating
+STANDSTILL = 0.2  # speed of the root in m/s below which the body does not jump, except for 0.04 s at the top
 LIMITS = {
     "skating": (0.5, "m/s", "a toe below 5 cm moves faster than 0.5 m/s for 0.4 s or more, longer than a step takes"),
     "pop": (200.0, "m/s^2", "a joint jumps: it accelerates by more than 200 m/s^2 and stops within two frames"),
     "bone length": (0.1, "of its median", "the length of a bone differs from its median by more than 10 % and 1 cm"),
     "penetration": (0.05, "m", "a joint is more than 5 cm below the floor, y = 0"),
     "inside": (0.035, "m", "an elbow, a wrist or the middle of a hand is more than 3.5 cm inside the trunk or a thigh"),
-    "floating": (
-        LOW,
-        "m",
-        "no joint is within 5 cm of the floor for 0.8 s, longer than a jump, or 0.3 s at rest",
-    ),
+    "floating": (LOW, "m", "no joint is within 5 cm of the floor for 0.8 s, longer than a jump, or 0.3 s at rest"),
     "limit": (15.0, "degrees", "a knee bends forward by more than 15 degrees, or a knee or elbow is folded to less"),
     "frozen": (0.02, "m/s", "no joint moves faster than 2 cm/s for a second or more"),
 }
 """Fault -> limit, its unit, and what it is. docs/motion-faults.md has the share of real clips that each flags."""
-PALM = 0.3
-"""Distance from the wrist to the middle of the hand, relative to the forearm, whose direction the hand continues."""
-TRUNK, WIDTH, THIGH = 0.18, 1.4, 0.17
-"""Radius of the trunk from front to back, relative to its length from pelvis to neck; how many times as wide as deep
-the trunk is; and radius of a thigh, relative to its length."""
+PALM = 0.3  # distance from the wrist to the middle of the hand, which continues the forearm, relative to the forearm
+TRUNK = 0.18  # radius of the trunk from front to back, relative to its length from pelvis to neck
+WIDTH = 1.4  # width of the trunk relative to its depth
+THIGH = 0.17  # radius of a thigh, relative to its length
 
 
 class Fault(NamedTuple):
@@ -114,7 +107,8 @@ def _inside(joints: np.ndarray, names: Sequence[str]) -> np.ndarray:
     depth = np.zeros(joints.shape[:2])
     for side in ("left", "right"):
         elbow, wrist, hand = depths(joints, names, side)[0].T
-        depth[:, names.index(f"{side}_elbow")], depth[:, names.index(f"{side}_wrist")] = elbow, np.maximum(wrist, hand)
+        depth[:, names.index(f"{side}_elbow")] = elbow
+        depth[:, names.index(f"{side}_wrist")] = np.maximum(wrist, hand)
     return depth
 
 
@@ -137,9 +131,6 @@ def _bends(joints: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.nda
                 flags[:, at] |= forward
                 worst[:, at] = np.where(forward, tilt, worst[:, at])
     return worst, flags
-
-
-# Arms inside the body -------------------------------------------------------------------------------------------------
 
 
 def depths(joints: np.ndarray, names: Sequence[str], side: str) -> tuple[np.ndarray, np.ndarray]:

@@ -20,20 +20,15 @@ from flame_mdm.representations import rotation
 from flame_mdm.safe_io import MEBIBYTE, atomic_write, parse_json, regular_file
 
 UNSIGNED_BYTE, UNSIGNED_SHORT, FLOAT = 5121, 5123, 5126
-WHOLE = {5120: 127, UNSIGNED_BYTE: 255, 5122: 32767, UNSIGNED_SHORT: 65535}
-"""Component type of a normalized accessor -> the integer that means 1."""
+WHOLE = {5120: 127, UNSIGNED_BYTE: 255, 5122: 32767, UNSIGNED_SHORT: 65535}  # integers that mean 1, if normalized
 KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
-LIMIT, DOCUMENT_LIMIT = 512 * MEBIBYTE, 16 * MEBIBYTE
-"""Maximum size of a file that is read, and of its JSON part, which takes many times its size in memory."""
-MAX_NODES, MAX_ITEMS = 4096, 65_536
-"""Maximum number of nodes, and of all other items of one list. Characters have some hundreds of nodes."""
+LIMIT = 512 * MEBIBYTE  # maximum size of a file that is read
+DOCUMENT_LIMIT = 16 * MEBIBYTE  # maximum size of its JSON part, which takes many times its size in memory
+MAX_NODES, MAX_ITEMS = 4096, 65_536  # maximum number of nodes, and of all other items of one list
 LARGEST = 1e9  # largest coordinate or matrix entry that is read
 
-# The parts of the document that are read; all others are copied as they are -------------------------------------------
-
 Item = TypeVar("Item")
-Index = Annotated[int, Field(ge=0, lt=2**40)]
-"""Index into another list of the document, or a number of bytes. Optional ones are -1 if they are missing."""
+Index = Annotated[int, Field(ge=0, lt=2**40)]  # into another list, or a number of bytes; -1 if it is missing
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
 Items = Annotated[list[Item], Field(max_length=MAX_ITEMS), FailFast()]
 NodeItems = Annotated[list[Item], Field(max_length=MAX_NODES), FailFast()]
@@ -41,7 +36,7 @@ Vector = Annotated[list[Number], Field(min_length=3, max_length=3)]
 
 
 class _Object(BaseModel):
-    """A part of the document. Types are strict, and other keys are ignored."""
+    """A part of the document that is read. Types are strict; other keys are ignored, and copied unchanged."""
 
     model_config = ConfigDict(strict=True)
 
@@ -133,9 +128,6 @@ def _ordered(nodes: Sequence[_Node]) -> tuple[list[int], dict[int, int]]:
     if len(order) != len(nodes):
         raise ValueError("a node is its own parent")
     return order, above
-
-
-# Reading --------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,16 +242,12 @@ def _binds(parts: _Document, skin: _Skin, data: bytes) -> np.ndarray:
     return binds
 
 
-# Writing --------------------------------------------------------------------------------------------------------------
-
-
 class Binary:
     """The binary part of the file: concatenated arrays, with buffer views and accessors that describe them."""
 
     def __init__(self, data: bytes = b"", views: Sequence[Any] = (), accessors: Sequence[Any] = ()) -> None:
         self.data = bytearray(data) + b"\0" * (-len(data) % 4)
-        self.views: list[dict[str, int]] = list(views)
-        self.accessors: list[dict[str, Any]] = list(accessors)
+        self.views, self.accessors = list(views), list(accessors)
 
     def add(self, array: np.ndarray, target: int | None = None, bounds: bool = False, normalized: bool = False) -> int:
         """Appends numbers (N,) or (N, K) and returns the index of their accessor; `normalized`: bytes mean 0 to 1."""
@@ -281,14 +269,10 @@ class Binary:
     def animation(self, name: str, fps: float, curves: Sequence[tuple[str, int, np.ndarray]]) -> dict[str, Any]:
         """Appends an animation of properties of nodes and returns it: property, node, values (F, K) in frames."""
         times = self.add(np.arange(len(curves[0][2]), dtype=np.float32) / np.float32(fps), bounds=True)
-        return {
-            "name": name,
-            "samplers": [{"input": times, "output": self.add(values)} for _, _, values in curves],
-            "channels": [
-                {"sampler": sampler, "target": {"node": node, "path": kind}}
-                for sampler, (kind, node, _) in enumerate(curves)
-            ],
-        }
+        samplers = [{"input": times, "output": self.add(values)} for _, _, values in curves]
+        targets = [{"node": node, "path": kind} for kind, node, _ in curves]
+        channels = [{"sampler": sampler, "target": target} for sampler, target in enumerate(targets)]
+        return {"name": name, "samplers": samplers, "channels": channels}
 
     def save(self, path: Path, document: dict[str, Any]) -> None:
         """Writes a .glb file with this binary part; adds the accessors, the views and the buffer to the document."""

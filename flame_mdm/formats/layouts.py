@@ -30,11 +30,10 @@ LEG = (0.6, 1.2)  # shortest and longest leg of an adult, in meters: hip to knee
 CHILD = 0.25  # shortest leg of a child in meters, at about one year
 USUAL_LEG = 0.83
 FOOT = 0.02  # shortest foot in meters, ankle to toes
-UNITS = {
+UNITS = {  # in meters
     **{"meters": 1.0, "centimeters": 0.01, "millimeters": 0.001, "inches": 0.0254, "feet": 0.3048},
     **{"the unit of CMU's recordings": 0.0564444},
 }
-"""Units of motion files, in meters."""
 
 Source = str | Annotated[dict[str, FiniteFloat], Field(min_length=1)]
 """A joint of a file, or weights of several joints whose weighted mean is the position."""
@@ -59,7 +58,7 @@ class Layout(BaseModel):
 
     def without_toes(self) -> Layout:
         """Returns the layout of the same skeleton with the end sites of the ankles instead of toes."""
-        ends = {f"{side}_foot": f"{next(iter(_shares(self.map[f'{side}_ankle'])))}.end" for side in ("left", "right")}
+        ends = {f"{side}_foot": f"{self.map[f'{side}_ankle']}.end" for side in ("left", "right")}
         return self.model_copy(update={"map": {**self.map, **ends}})
 
     def apply(self, positions: np.ndarray, names: Sequence[str]) -> np.ndarray:
@@ -105,13 +104,11 @@ def read_tree(path: Path, rate: float | None = None) -> bvh.Bvh:
 
 
 def map_bvh(file: bvh.Bvh, fps: float | None, fields: Mapping[str, Any]) -> tuple[np.ndarray, Layout]:
-    """Returns the joints of SMPL, (F, 22, 3) float32 in meters, y up, in a file with a known skeleton, and its layout.
+    """Returns the joints of SMPL, (F, 22, 3) float32 in meters, y up, in a file of `read_tree`, and their layout.
 
-    Args:
-        file: what `read_tree` read.
-        fps: target frames per second; None = those of the file. Rotations are interpolated, so bones keep their length.
-        fields: fields of `Layout` that override the known ones. Known skeletons whose arrays are in meters are in
-            centimeters in BVH files, as written by `flame_mdm.formats`.
+    They are resampled to `fps` by interpolating rotations, so bones keep their length; None = the rate of the file.
+    `fields` of `Layout` override the known ones. Known skeletons whose arrays are in meters are in centimeters in BVH
+    files, as written by `flame_mdm.formats`.
     """
     ended = file.with_end_joints()
     names = [name.rpartition(":")[2] for name in ended.joints]
@@ -148,7 +145,7 @@ def layout_name(layout: Layout) -> str:
 
 
 def find_layout(names: Sequence[str], fields: Mapping[str, Any]) -> Layout:
-    """Returns the known layout for joints with these names, overridden by `fields`; errors begin with missing ones."""
+    """Returns the known layout for joints with these names, overridden by `fields`."""
     candidates = {"the map": Layout(map=fields["map"])} if "map" in fields else LAYOUTS | _TOELESS
     name, nearest = min(candidates.items(), key=lambda item: len(item[1].used - set(names)))
     if missing := sorted(nearest.used - set(names)):
@@ -156,16 +153,11 @@ def find_layout(names: Sequence[str], fields: Mapping[str, Any]) -> Layout:
         which = f"unknown skeleton. {name} is the nearest known one; missing: {lacking}"
         if "map" in fields:
             which = f"the map in skeleton.yaml uses joints that the file lacks: {lacking}"
-        elif len(missing) > len(SMPL22) / 2:
-            which = f"unknown skeleton, like none of {', '.join(LAYOUTS)}"
         raise UserError(
             f"{which}. Map the joints of SMPL in skeleton.yaml (docs/own-data.md) to those of the file: "
             f"{', '.join(names)[:1000]}"
         )
     return nearest.model_copy(update=dict(fields))
-
-
-# skeleton.yaml --------------------------------------------------------------------------------------------------------
 
 
 def skeleton_file(path: Path) -> Path | None:
@@ -202,9 +194,6 @@ def read_skeleton(path: Path) -> dict[str, Any]:
     return fields
 
 
-# Size and feet --------------------------------------------------------------------------------------------------------
-
-
 def leg_length(joints: np.ndarray) -> float:
     """Returns the mean length in meters of the left leg, hip to knee to ankle, of joints (F, 22, 3) of SMPL."""
     return _bone(joints, "left_hip", "left_knee") + _bone(joints, "left_knee", "left_ankle")
@@ -216,10 +205,7 @@ def head_height(joints: np.ndarray) -> float:
 
 
 def check_size(joints: np.ndarray, unit: float, children: bool = False) -> None:
-    """Raises `UserError` if legs are too short or too long; the message says which unit would fit.
-
-    `unit` is that of the file, in meters; `children` accepts their legs, too.
-    """
+    """Raises `UserError` if legs are no person's, and says which unit would fit; `unit` of the file is in meters."""
     leg, shortest = leg_length(joints), CHILD if children else LEG[0]
     if shortest <= leg <= LEG[1]:
         return

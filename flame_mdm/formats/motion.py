@@ -22,7 +22,7 @@ from flame_mdm.formats import WRITTEN, bvh, characters
 from flame_mdm.formats.characters import Character
 from flame_mdm.formats.glb import Binary, quaternions
 from flame_mdm.formats.poses import Poses, solve
-from flame_mdm.formats.retarget import continuous_euler, preset, retarget, smpl
+from flame_mdm.formats.retarget import continuous_euler, preset, retarget
 from flame_mdm.formats.rig import CENTIMETER, Rig
 from flame_mdm.representations import rotation
 from flame_mdm.representations.skeleton import SMPL22, Skeleton
@@ -114,21 +114,15 @@ class Motion:
     ) -> str:
         """Writes a motion file and returns a line that describes it.
 
-        `.npz` contains joints, frame rate, text and features, and AMASS's keys if rotations are known. `.bvh` and
-        `.glb` contain rotations, `.json` and `.npy` joints. `.gif` and `.mp4` are animations.
-
         Args:
-            path: the file; its extension selects the format.
+            path: the file; its extension selects the format (docs/formats.md).
             rest_pose: begin a `.bvh` file with a frame of the rest pose, arms out, which some programs expect.
             rig: the skeleton of a `.bvh` or `.glb` file, one of `flame_mdm.formats.retarget.presets`; default: SMPL's.
-            character: a `.glb` file with a skin, or what `flame_mdm.formats.characters.read` returned; it is written
-                with this motion.
-            body: the body in `.glb`, `.gif` and `.mp4` files, from `flame_mdm.visualize.body.load_body`; default: the
-                mannequin.
+            character: a `.glb` file with a skin, or what `characters.read` returned, to be written with this motion.
+            body: the body in `.glb`, `.gif` and `.mp4` files, from `visualize.body.load_body`; default: the mannequin.
             facts: additional entries of an `.npz` file, such as the seed.
 
-        Raises `UserError` if an argument is unknown, does not apply or does not fit the motion, `.mp4` is requested and
-        the package av is not installed, or the character cannot be used.
+        Raises `UserError` if an argument is unknown, or does not fit the file or the motion, or if `.mp4` needs av.
         """
         path = Path(path)
         ending = path.suffix.lower()
@@ -187,9 +181,6 @@ def motion_of_poses(poses: Poses, fps: float, text: str = "", id: str = "") -> M
     return Motion(poses.joints().float().numpy(), fps, SMPL22, text, id, poses)
 
 
-# Writing --------------------------------------------------------------------------------------------------------------
-
-
 def _write_npz(motion: Motion, path: Path, facts: dict[str, Any]) -> str:
     content: dict[str, Any] = {"joints": motion.joints, "features": motion.features, "fps": motion.fps}
     content |= {"text": motion.text, "representation": motion.representation, "cleanup": motion.cleanup}
@@ -213,13 +204,9 @@ def _write_npz(motion: Motion, path: Path, facts: dict[str, Any]) -> str:
     return what
 
 
-def _rig(poses: Poses, rig: str | None) -> Rig:
-    return smpl(poses) if rig is None else preset(rig, poses)
-
-
 def _write_bvh(motion: Motion, path: Path, rest_pose: bool, rig: str | None) -> str:
     poses = motion.posed()
-    skeleton = _rig(poses, rig)
+    skeleton = preset(rig, poses)
     turns, root = retarget(poses, skeleton)
     offsets = np.round(skeleton.offsets() / skeleton.unit, 5)
     if rest_pose:
@@ -254,15 +241,13 @@ def _write_bvh(motion: Motion, path: Path, rest_pose: bool, rig: str | None) -> 
 
 
 def _write_glb(motion: Motion, path: Path, rig: str | None, body: Mesh | None) -> str:
-    """Writes a .glb file of the motion in meters, y up; the rest pose faces +z, as the format requires.
+    """Writes a .glb file in meters, y up, facing +z at rest, with a node per joint and a skinned body, if one fits.
 
-    It contains one node per joint, one animation that rotates all nodes and moves the hips, with one key per frame in
-    seconds, and a body skinned to the joints, stored in an A-pose, if one fits. The node above the joints lifts it by
-    the thickness of its soles; its toes bend as in pictures.
+    The node above the joints lifts the body by the thickness of its soles; its toes bend as in pictures.
     """
     poses = motion.posed()
     fitted, reason = try_fit(motion, body)
-    skeleton = _rig(poses, rig)
+    skeleton = preset(rig, poses)
     binary = Binary()
     moved = poses if fitted is None else Poses(poses.offsets, torch.from_numpy(fitted.local()), poses.root)
     turns, root = retarget(moved, skeleton)
@@ -295,21 +280,17 @@ def _write_glb(motion: Motion, path: Path, rig: str | None, body: Mesh | None) -
 
 
 def _skin(binary: Binary, body: FittedBody, rig: Rig) -> dict[str, Any]:
-    """Appends a body in its stored pose, lifted onto the floor, and returns the document's parts that describe it.
-
-    Helper bones of the body join their joints.
-    """
+    """Appends a body in its stored pose, lifted onto the floor, and returns the document's parts that describe it."""
     mesh, floor = body.mesh, np.array([0, body.points[:, 1].min(), 0])
-    weights = mesh.weights[:, : len(SMPL22)].copy()
+    weights = mesh.weights[:, : len(SMPL22)].copy()  # helper bones join their joints
     np.add.at(weights.T, list(ANCHORS[len(SMPL22) :]), mesh.weights[:, len(SMPL22) :].T)
     joint, weight = largest_weights(weights)
-    light = np.rint(255 * (np.asarray(mesh.colors) / 255) ** 2.2)  # colors of screens to linear ones
+    light = np.rint(255 * (mesh.colors / 255) ** 2.2)  # colors of screens to linear ones
+    light = np.pad(light, ((0, 0), (0, 1)), constant_values=255).astype("u1")
     attributes = {
         "POSITION": binary.add((body.points - floor).astype("<f4"), VERTICES, bounds=True),
         "NORMAL": binary.add(mesh.normals.astype("<f4"), VERTICES),
-        "COLOR_0": binary.add(
-            np.pad(light, ((0, 0), (0, 1)), constant_values=255).astype("u1"), VERTICES, normalized=True
-        ),
+        "COLOR_0": binary.add(light, VERTICES, normalized=True),
         "JOINTS_0": binary.add(joint, VERTICES),
         "WEIGHTS_0": binary.add(weight, VERTICES, normalized=True),
     }
@@ -344,12 +325,13 @@ def _write_video(motion: Motion, path: Path, body: Mesh | None) -> str:
     from flame_mdm.visualize import write_gif, write_mp4
 
     _, reason = try_fit(motion, body)
-    without = reason and f"; without a body: {reason}"
     if path.suffix.lower() == ".mp4":
         write_mp4(path, [motion], body=body)
-        return f"H.264 video{without}"
-    write_gif(path, [motion], body=body)
-    return f"animated GIF of at most 50 frames per second{without}"
+        what = "H.264 video"
+    else:
+        write_gif(path, [motion], body=body)
+        what = "animated GIF of at most 50 frames per second"
+    return what + (reason and f"; without a body: {reason}")
 
 
 def _error(motion: Motion, poses: Poses) -> str:

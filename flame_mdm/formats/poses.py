@@ -21,12 +21,10 @@ FORWARD = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 BENDS = {1: -FORWARD, 2: -FORWARD, 16: FORWARD, 17: FORWARD}
 """Hips and shoulders -> direction in which the knee or elbow bends the limb in the rest pose."""
 STRAIGHT = 0.15
-"""Sine of the bend of a knee or elbow at which the bend and the parent's rotation have the same weight for the twist of
-the limb. Weights are squared, so that a clear bend dominates."""
+"""Sine of the bend of a knee or elbow at which bend and parent's rotation have the same weight for the limb's twist.
+Weights are squared, so that a clear bend dominates."""
 FOOT = 0.3  # weight of the foot relative to the shin in the twist of a thigh: it determines the twist of a straight leg
-SMOOTH = 0.1
-"""Seconds over which the bend is averaged before it determines the twist, so that an arm does not spin when it passes
-through the straight position. Joint positions do not depend on the twist."""
+SMOOTH = 0.1  # seconds over which bends are averaged, so that an arm does not spin while it is nearly straight
 SQUARINGS = 12  # squarings that isolate an eigenvector; others shrink by the power 4,096
 
 
@@ -35,9 +33,7 @@ class Poses:
     """A body in motion, in meters, y up; the rest pose is SMPL's: arms out to the sides, facing +z, left at +x."""
 
     offsets: Tensor  # (22, 3) float64, position of each joint of `SMPL22` relative to its parent in the rest pose
-    # (F, 22, 3, 3) float64, of the root in the world and of each other joint relative to its parent. A joint's rotation
-    # applies to the bones that leave it.
-    rotations: Tensor
+    rotations: Tensor  # (F, 22, 3, 3) float64, relative to parents; they apply to the bones that leave a joint
     root: Tensor  # (F, 3) float64, position of the pelvis
 
     def joints(self) -> Tensor:
@@ -46,8 +42,7 @@ class Poses:
 
     def rest(self) -> Tensor:
         """Returns joint positions (22, 3) of the rest pose, with the lowest joint on the floor."""
-        identity = torch.eye(3, dtype=self.offsets.dtype).expand(1, len(SMPL22), 3, 3)
-        joints = forward_kinematics(SMPL22, identity, self.offsets, self.offsets.new_zeros(1, 3))[0]
+        joints = SMPL22.assemble(self.offsets, self.offsets.new_zeros(3))
         return joints - joints.new_tensor([0, 1, 0]) * joints[:, 1].min()
 
 
@@ -59,13 +54,12 @@ def solve(joints: Tensor, fps: float) -> Poses:
     twist of a bone about its own axis: thighs and upper arms are twisted so that knees and elbows bend like hinges, the
     spine twists evenly from pelvis to chest, and all other joints, also head, hands and toes, follow their parent.
 
-    Joints (F, 22, 3) are in meters, y up, in the order of `SMPL22`. Raises `UserError` if they are of another skeleton,
-    or a bone has no length.
+    Joints (F, 22, 3) are those of `SMPL22` in meters, y up. Raises `UserError` if not, or if a bone has no length.
     """
     if joints.ndim != 3 or not len(joints) or joints.shape[1:] != (len(SMPL22), 3):
         raise UserError(
-            f"joint rotations are computed only for the {len(SMPL22)} joints of SMPL, (frames, {len(SMPL22)}, 3); "
-            f"these joints have shape {tuple(joints.shape)}: write them as .json or .npy"
+            "joint rotations are computed only for the 22 joints of SMPL, (frames, 22, 3); these joints have shape "
+            f"{tuple(joints.shape)}: write them as .json or .npy"
         )
     joints = joints.double()
     lengths = torch.linalg.vector_norm(SMPL22.bones(joints), dim=-1).mean(0)

@@ -21,10 +21,8 @@ from flame_mdm.representations.skeleton import SKELETONS, SMPL22, Skeleton
 from flame_mdm.representations.smpl import ADULT, read_pose
 from flame_mdm.safe_io import MEBIBYTE, naming, read_json, read_npy, read_npz, regular_file
 
-CAMERA_AXES = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))
-"""Rotates the camera coordinates of the action data sets, y down, to y up."""
-ROTATED = {"smpl147": 147, "rot6d-25": 150, "motion272": 272}
-"""Representations that contain SMPL's rotations -> number of features."""
+CAMERA_AXES = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))  # of the action data sets: y down to y up
+ROTATED = {"smpl147": 147, "rot6d-25": 150, "motion272": 272}  # with SMPL's rotations -> number of features
 KIMODO_FPS = 30.0
 JSON_LIMIT = 128 * MEBIBYTE  # maximum size of a `.json` motion; parsed, it takes many times its size
 
@@ -41,15 +39,13 @@ def read(
     Args:
         path: the file.
         fps: frames per second, overrides the rate in the file; .npy and .amc files have none.
-        unit: meters per unit of length in the file, for .bvh and .amc (default: that of its skeleton, mostly
-            centimeters) and .npy (default 1).
-        resample_to: target frame rate; joints are interpolated with cubic splines, the rotations of .bvh and AMASS on
-            the sphere. Default: frames are not resampled.
+        unit: meters per unit of length in .bvh, .amc (default: that of the skeleton) and .npy (default 1) files.
+        resample_to: target frame rate, None = that of the file; rotations of .bvh and AMASS files are interpolated on
+            the sphere, joints with cubic splines.
         fields: fields of `Layout` that override those of a known skeleton, as from `find_skeleton`; `fps` and `unit`
-            override them in turn. Not for .json and .npz files written by this project, nor for AMASS.
+            override them in turn. Not for files written by this project, nor for AMASS.
 
-    Raises `FileNotFoundError` if the file does not exist, and `UserError` if it is damaged, of another kind or in a
-    wrong unit, or has no frame rate.
+    Raises `FileNotFoundError`, or `UserError` if the file is damaged, of another kind, in a wrong unit or without rate.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -91,7 +87,16 @@ def _of_arrays(path: Path, rate: float | None, resample_to: float | None, fields
         data["joints"] = data["joints"] * fields["unit"]
     if fields and data["joints"].shape[1:] == (len(SMPL22), 3):
         check_size(data["joints"], fields.get("unit", 1.0), fields.get("children", False))
-    return _of_joints(path, data, text, resample_to)
+    joints, fps = data["joints"], data["fps"]
+    skeleton = _skeleton(joints)
+    if resample_to is not None and not math.isclose(fps, resample_to):
+        joints = resample(joints.astype(float), fps, resample_to, cubic=True)
+        return Motion(joints, resample_to, skeleton, text, path.stem)
+    motion = Motion(joints, fps, skeleton, text, path.stem, _poses(data))
+    if "features" in data:
+        motion.features = data["features"].astype(np.float32)
+        motion.representation = str(data.get("representation", ""))
+    return motion
 
 
 def from_array(joints: Any, fps: float | None) -> Motion:
@@ -110,27 +115,26 @@ def from_array(joints: Any, fps: float | None) -> Motion:
 def read_arrays(path: Path) -> dict[str, Any]:
     """Reads the arrays of an .npz, .json or .npy motion: joints, or poses and trans as in AMASS; and fps if present."""
     suffix = path.suffix.lower()
-    with naming(path):
-        if suffix == ".npz":
-            data: dict[str, Any] = read_npz(path, skip=("dmpls",))
-        elif suffix == ".npy":
-            data = {"joints": read_npy(path)}
-        else:
-            data = _read_json(path)
-        if "posed_joints" in data:  # of NVIDIA's Kimodo, whose files do not contain their rate
-            data = {"fps": KIMODO_FPS, **data, "joints": data["posed_joints"]}
-        if not {"joints", "poses"} & set(data):
-            names = ", ".join(data) or "nothing"
-            raise UserError(f"contains {names}; a motion has joints and fps, or poses, trans and mocap_framerate")
-        for name in {"joints", "poses", "trans"} & set(data):
-            _check_numbers(name, data[name])
-        if "features" in data and (not _is_real(data["features"]) or data["features"].ndim != 2):
-            raise UserError("features are not an array (frames, features) of real numbers")
-        if "poses" in data and data.get("trans", np.zeros(0)).shape != (len(data["poses"]), 3):
-            raise UserError("AMASS files have poses (F, 3 K), trans (F, 3) and mocap_framerate")
-        for key in ("fps", "mocap_framerate", "mocap_frame_rate"):
-            if key in data:
-                data["fps"] = frame_rate(data[key], key)
+    if suffix == ".npz":
+        data: dict[str, Any] = read_npz(path, skip=("dmpls",))
+    elif suffix == ".npy":
+        data = {"joints": read_npy(path)}
+    else:
+        data = _read_json(path)
+    if "posed_joints" in data:  # of NVIDIA's Kimodo, whose files do not contain their rate
+        data = {"fps": KIMODO_FPS, **data, "joints": data["posed_joints"]}
+    if not {"joints", "poses"} & set(data):
+        names = ", ".join(data) or "nothing"
+        raise UserError(f"contains {names}; a motion has joints and fps, or poses, trans and mocap_framerate")
+    for name in {"joints", "poses", "trans"} & set(data):
+        _check_numbers(name, data[name])
+    if "features" in data and (not _is_real(data["features"]) or data["features"].ndim != 2):
+        raise UserError("features are not an array (frames, features) of real numbers")
+    if "poses" in data and data.get("trans", np.zeros(0)).shape != (len(data["poses"]), 3):
+        raise UserError("AMASS files have poses (F, 3 K), trans (F, 3) and mocap_framerate")
+    for key in ("fps", "mocap_framerate", "mocap_frame_rate"):
+        if key in data:
+            data["fps"] = frame_rate(data[key], key)
     return data
 
 
@@ -199,19 +203,6 @@ def _poses(data: dict[str, Any]) -> Poses | None:
     else:
         translation, rows, axes = x[:, 144:147], x[:, :144], CAMERA_AXES
     return _smpl_poses(translation, rotation.rot6d_to_matrix(rows.unflatten(1, (24, 6)), "rows"), axes)
-
-
-def _of_joints(path: Path, data: dict[str, Any], text: str, resample_to: float | None) -> Motion:
-    joints, fps = data["joints"], data["fps"]
-    skeleton = _skeleton(joints)
-    if resample_to is not None and not math.isclose(fps, resample_to):
-        joints = resample(joints.astype(float), fps, resample_to, cubic=True)
-        return Motion(joints, resample_to, skeleton, text, path.stem)
-    motion = Motion(joints, fps, skeleton, text, path.stem, _poses(data))
-    if "features" in data:
-        motion.features = data["features"].astype(np.float32)
-        motion.representation = str(data.get("representation", ""))
-    return motion
 
 
 def _skeleton(joints: np.ndarray) -> Skeleton:

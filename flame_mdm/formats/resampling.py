@@ -1,7 +1,4 @@
-"""Frame rates, lengths and resampling of motions.
-
-Rates and lengths are limited, because a file of a few bytes can declare any value.
-"""
+"""Frame rates, lengths and resampling of motions; limited, because a file of a few bytes can declare any value."""
 
 import math
 from typing import Any
@@ -12,8 +9,7 @@ from flame_mdm.errors import UserError
 
 RATES = (0.1, 1000.0)  # lowest and highest frame rate of a motion file, in frames per second
 MAX_FRAMES = 500_000  # maximum number of frames of a motion: 70 minutes at 120 frames per second
-MAX_RESAMPLED = 1_000_000
-"""Maximum number of joint positions after upsampling: 38 minutes of 22 joints at 20 frames per second."""
+MAX_RESAMPLED = 1_000_000  # maximum number of joint positions after upsampling: 38 minutes of 22 joints at 20 fps
 
 
 def frame_rate(value: Any, name: str = "fps") -> float:
@@ -36,8 +32,8 @@ def frame_pairs(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns the frames before and after each new frame, and its position between them, 0 to 1.
 
-    New frames are at times 0, 1/fps, 2/fps, ... up to the last frame of the motion, or past it by `slack` of a frame.
-    Raises `UserError` if there are more than `MAX_FRAMES` frames before, or more than `MAX_RESAMPLED` positions after.
+    New frames are at times 0, 1/fps, 2/fps, ... up to the last frame, or past it by `slack` of a frame. Raises
+    `UserError` if there are more than `MAX_FRAMES` frames before, or more than `MAX_RESAMPLED` positions after.
     """
     check_frames(frames)
     count = math.floor((frames - 1) * fps / rate + slack) + 1
@@ -52,10 +48,7 @@ def frame_pairs(
 
 
 def resample(values: np.ndarray, rate: float, fps: float, cubic: bool = False) -> np.ndarray:
-    """Resamples positions (F, ...) from `rate` to `fps` frames per second, within the limits of `frame_pairs`.
-
-    Cubic splines preserve bone lengths to about 0.1 %; otherwise, it is linear.
-    """
+    """Resamples positions (F, ...) from `rate` to `fps`, linearly, or `cubic`: bones keep their length to 0.1 %."""
     before, after, share = frame_pairs(len(values), rate, fps, math.prod(values.shape[1:-1]))
     if cubic and len(values) > 1:
         from scipy.interpolate import CubicSpline  # here, because few motions need it

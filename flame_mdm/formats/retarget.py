@@ -20,8 +20,7 @@ from flame_mdm.visualize.posture import JOINT, world_rotations
 
 DIRECTIONS = {"up": (0, 1, 0), "down": (0, -1, 0), "forward": (0, 0, 1), "back": (0, 0, -1)}
 SMPL_ORDERS = tuple("YXZ" if name.endswith("shoulder") else "YZX" for name in SMPL22.joints)
-"""Euler order of each of SMPL's joints, chosen to keep gimbal lock (middle angle at 90 degrees) away from common poses:
-bent knees, elbows and hips, a hanging arm, a body that turns or bows."""
+"""Euler orders that keep gimbal lock away from common poses: bent limbs, a hanging arm, a body that turns or bows."""
 
 
 @cache
@@ -46,14 +45,11 @@ def _parts(skeleton: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
         yield from (("leg", side, mark), ("arm", side, mark))
 
 
-def smpl(poses: Poses) -> Rig:
-    """Returns a body's own skeleton."""
-    same = np.tile(np.eye(3), (len(SMPL22), 1, 1))
-    return Rig(SMPL22.joints, SMPL22.parents, poses.rest().numpy(), same, tuple(range(len(SMPL22))), same, SMPL_ORDERS)
-
-
-def preset(name: str, poses: Poses) -> Rig:
-    """Returns a skeleton of `rigs.yaml` with the bone lengths of a body; raises `UserError` if the name is unknown."""
+def preset(name: str | None, poses: Poses) -> Rig:
+    """Returns a skeleton of `rigs.yaml` with the bone lengths of a body; None = SMPL's own skeleton."""
+    if name is None:
+        same, sources = np.tile(np.eye(3), (len(SMPL22), 1, 1)), tuple(range(len(SMPL22)))
+        return Rig(SMPL22.joints, SMPL22.parents, poses.rest().numpy(), same, sources, same, SMPL_ORDERS)
     if name not in presets():
         raise UserError(f"rig={name}: unknown.{did_you_mean(name, presets())} Use one of {', '.join(presets())}")
     data = presets()[name]
@@ -136,8 +132,8 @@ def retarget(poses: Poses, rig: Rig) -> tuple[np.ndarray, np.ndarray]:
 def continuous_euler(matrices: Tensor, orders: Sequence[str] = SMPL_ORDERS) -> Tensor:
     """Converts rotations (F, J, 3, 3) to Euler angles (F, J, 3) in the joints' `orders`, radians, without jumps.
 
-    A rotation has two triples of angles, and full turns may be added to each angle. The angles nearest to the previous
-    frame are used, so that programs can interpolate; two full turns of the body end at 720 degrees.
+    Of the two triples of angles of a rotation, and full turns added to each angle, those nearest to the previous frame
+    are used, so that programs can interpolate.
     """
     turn = 2 * torch.pi
     first = torch.stack([rotation.matrix_to_euler(matrices[:, j], order) for j, order in enumerate(orders)], 1)

@@ -99,9 +99,6 @@ class Rig:
         return positions
 
 
-# Names of joints ------------------------------------------------------------------------------------------------------
-
-
 def plain(name: str) -> str:
     """Returns a name in lower case, without signs, Mixamo's prefix and the part before a colon."""
     return re.sub(r"[\W_]", "", re.sub(r"^mixamorig\d*[_:]?", "", name.rpartition(":")[2])).lower()
@@ -126,9 +123,6 @@ def matched(
     required = ["pelvis", *(f"{side}_{name}" for name in REQUIRED for side in SIDES)]
     missing = [joint for joint in JOINT if joint in required and joint not in candidates]
     return {joint: number for joint, (number,) in candidates.items()}, missing
-
-
-# Characters -----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,9 +200,6 @@ def rest_pose(
         frame=frame,
     )
     return RestPose(rig, joints, float((lowest @ frame[1]).min()))
-
-
-# Moving a character ---------------------------------------------------------------------------------------------------
 
 
 def fitted(character: RestPose, offsets: np.ndarray) -> Rig:

@@ -17,10 +17,10 @@ Features = TypeVar("Features", np.ndarray, Tensor)
 
 @dataclass(frozen=True)
 class Frames:
-    """The frames (N, D) of a data set, for `Representation.statistics`: they are read in parts, as often as needed."""
+    """The frames (N, D) of a data set, read in parts, as often as needed."""
 
     arrays: Callable[[], Iterable[np.ndarray]]  # returns arrays (F, D) of any length, each time in the same order
-    count: int  # number of frames
+    count: int
 
     def __len__(self) -> int:
         return self.count
@@ -43,12 +43,9 @@ class Representation(nn.Module, ABC):
 
     mean: Tensor
     std: Tensor
-    part_of: str = ""
-    """Name of a representation whose first features these are, so that its published features can be cut."""
-    relative: bool = True
-    """Whether the root trajectory is that from frame to frame, so that a part of the features is a motion, too."""
-    slices: Mapping[str, slice] = {}
-    """Columns of the features by name."""
+    part_of: str = ""  # name of a representation whose first features these are, so that its features can be cut
+    relative: bool = True  # whether the root trajectory is that from frame to frame: a part of the features is a motion
+    slices: Mapping[str, slice] = {}  # columns of the features by name
 
     def __init__(self, name: str, features: int, fps: float, skeleton: Skeleton):
         """`name` is saved in stores and checkpoints; features with different names are never mixed."""
@@ -64,7 +61,6 @@ class Representation(nn.Module, ABC):
         """Encodes a raw motion as features (F', D) float32 in the data's units, not normalized."""
 
     def encode_many(self, motions: Sequence[Tensor]) -> list[Tensor]:
-        """Encodes several motions."""
         return [self.encode(motion) for motion in motions]
 
     @abstractmethod
@@ -97,11 +93,9 @@ class Representation(nn.Module, ABC):
         return features
 
     def normalize(self, features: Tensor) -> Tensor:
-        """Normalizes features (..., D) in the data's units."""
         return (features - self.mean) / self.std
 
     def denormalize(self, x: Tensor) -> Tensor:
-        """Converts normalized features (..., D) to the data's units."""
         return x * self.std + self.mean
 
     def to_joints(self, x: Tensor) -> Tensor:

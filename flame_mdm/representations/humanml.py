@@ -13,8 +13,7 @@ from flame_mdm.errors import UserError
 from flame_mdm.representations import Representation, check_finite, rotation
 from flame_mdm.representations.skeleton import SKELETONS
 
-LEGACY_SMOOTHING_FRAMES = 20
-SMOOTHING_SECONDS = 1.0
+LEGACY_SMOOTHING_FRAMES, SMOOTHING_SECONDS = 20, 1.0
 """Standard deviation of the Gaussian that removes arm swing from the heading: 20 frames at 20 fps, as published."""
 
 
@@ -48,8 +47,7 @@ class HumanML(Representation):
     each relative to its parent in the skeleton.
     """
 
-    essential: bool = False
-    """Whether the last three columns of the table are left out."""
+    essential: bool = False  # whether the last three columns of the table are left out
 
     def __init__(
         self,
@@ -76,19 +74,12 @@ class HumanML(Representation):
         joints = len(SKELETONS[skeleton])
         if bone_lengths is not None and len(bone_lengths) != joints:
             raise UserError(f"bone_lengths: {len(bone_lengths)} numbers for the {joints} joints of {skeleton}")
-        widths = {
-            "turn": 1,
-            "root_velocity": 2,
-            "root_height": 1,
-            "positions": 3 * (joints - 1),
-            "rotations": 6 * (joints - 1),
-            "velocities": 3 * joints,
-            "contacts": 4,
-        }
+        widths = {"turn": 1, "root_velocity": 2, "root_height": 1, "positions": 3 * (joints - 1)}
         name = f"humanml-{variant}-{skeleton}"
         if self.essential:
-            widths = {column: widths[column] for column in ("turn", "root_velocity", "root_height", "positions")}
             self.part_of, name = name, f"essential-{variant}-{skeleton}"
+        else:
+            widths |= {"rotations": 6 * (joints - 1), "velocities": 3 * joints, "contacts": 4}
         super().__init__(name, sum(widths.values()), fps, SKELETONS[skeleton])
         ends = np.cumsum(list(widths.values())).tolist()
         self.slices = {name: slice(end - widths[name], end) for name, end in zip(widths, ends, strict=True)}
@@ -100,7 +91,7 @@ class HumanML(Representation):
         return self.encode_many([motion])[0]
 
     def encode_many(self, motions: Sequence[Tensor]) -> list[Tensor]:
-        """Encodes several motions; one pass over all their frames is faster than one pass per motion."""
+        """Encodes several motions in one pass over all their frames, which is faster."""
         joints, lengths = self._canonical(motions)
         heading = torch.cat([self._heading(clip) for clip in joints.split(lengths)])
         last = torch.tensor(lengths).cumsum(0) - 1
@@ -136,10 +127,7 @@ class HumanML(Representation):
         return torch.cat([root[..., None, :], turned + ground[..., None, :]], -2) / self.units_per_metre
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
-        """Returns (D,) bool, True for the features of these joints; the root features belong to joint 0.
-
-        For the lower body, including the root, this equals MDM's `HML_LOWER_BODY_MASK`.
-        """
+        """Of the lower body, including the root, equals MDM's `HML_LOWER_BODY_MASK`."""
         part = self.joint_mask(joints)
         feet = part[list(self.skeleton.feet)]
         others = [part[1:].repeat_interleave(size) for size in (3, 6)]
@@ -174,16 +162,19 @@ class HumanML(Representation):
         scale = target[leg].sum() / bones[first][:, leg].norm(dim=-1).sum(-1)
         return self.skeleton.assemble(F.normalize(bones, dim=-1) * target[:, None], joints[:, 0] * scale[clip, None])
 
-    def _facing(self, joints: Tensor) -> Tensor:
-        """Returns x and z (N, 2) of the direction hips and shoulders face; shorter if the body lies on its side."""
+    def _facing(self, joints: Tensor, hips: float = 1.0) -> Tensor:
+        """Returns x and z (N, 2) of the direction hips and shoulders face; shorter if the body lies on its side.
+
+        It is the cross product of the vertical and the direction to the right, in which `hips` is the hips' factor.
+        """
         right_hip, left_hip, right_shoulder, left_shoulder = joints[:, list(self.skeleton.facing)].unbind(1)
-        return _turn_forward((right_hip - left_hip) + (right_shoulder - left_shoulder))
+        right = F.normalize(hips * (right_hip - left_hip) + (right_shoulder - left_shoulder), dim=-1)
+        return torch.stack([right[:, 2], -right[:, 0]], -1)
 
     def _heading(self, joints: Tensor) -> Tensor:
         """Returns the smoothed heading (T,) of one canonical motion (T, J, 3)."""
         if self.legacy:
-            right_hip, left_hip, right_shoulder, left_shoulder = joints[:, list(self.skeleton.facing)].unbind(1)
-            forward = _turn_forward((left_hip - right_hip) + (right_shoulder - left_shoulder)).numpy()
+            forward = self._facing(joints, hips=-1.0).numpy()
             x, z = gaussian_filter1d(forward, LEGACY_SMOOTHING_FRAMES, axis=0, mode="nearest").T
             heading = np.arctan2(x, z)
             heading[0] = 0
@@ -214,9 +205,3 @@ class HumanML(Representation):
         way = rotation.rotate_y(way, heading[..., 1:] if self.legacy else heading[..., :-1])
         ground = F.pad(way.cumsum(-2), (0, 0, 1, 0))
         return heading, torch.stack([ground[..., 0], features[..., 3], ground[..., 2]], -1)
-
-
-def _turn_forward(right: Tensor) -> Tensor:
-    """Returns x and z (N, 2) of the cross product of the vertical and the direction of `right` (N, 3)."""
-    right = F.normalize(right, dim=-1)
-    return torch.stack([right[:, 2], -right[:, 0]], -1)

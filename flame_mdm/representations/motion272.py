@@ -31,13 +31,11 @@ class Motion272(Representation):
     def __init__(self, fps: float = 30.0, offsets: Sequence[Sequence[float]] = ADULT):
         """`offsets` (24, 3) of the body, like `ADULT`; the first is from translation to pelvis."""
         super().__init__("motion272", 272, fps, SMPL22)
-        ends = (0, 2, 8, 74, 140, 272)
-        names = ("root_velocity", "turn", "positions", "velocities", "rotations")
-        self.slices = {name: slice(*ends[i : i + 2]) for i, name in enumerate(names)}
+        self.slices = {"root_velocity": slice(0, 2), "turn": slice(2, 8), "positions": slice(8, 74)}
+        self.slices |= {"velocities": slice(74, 140), "rotations": slice(140, 272)}
         self.offsets = offsets
 
     def encode(self, motion: Tensor) -> Tensor:
-        """Encodes a raw motion (F >= 2, 3 + 3 K) as features (F, 272) float32; see `read_pose`."""
         translation, rotations = read_pose(motion)
         if len(motion) < 2:
             raise UserError("motion: 1 frame, but encoding needs at least 2; leave the motion out")
@@ -45,14 +43,13 @@ class Motion272(Representation):
         rotations = torch.cat([(axes @ rotations[:, :1]), rotations[:, 1:22]], 1)
         translation, rotations = face_forward(translation @ axes.T, rotations)
         offsets = torch.tensor(self.offsets, dtype=torch.float64)[:22]
-        return self.features_of(
-            forward_kinematics(self.skeleton, rotations, offsets, translation + offsets[0]), rotations
-        )
+        joints = forward_kinematics(self.skeleton, rotations, offsets, translation + offsets[0])
+        return self.features_of(joints, rotations)
 
     def features_of(self, joints: Tensor, rotations: Tensor) -> Tensor:
         """Returns features (F, 272) float32 of joints (F, 22, 3) and rotations (F, 22, 3, 3), y up, facing +z."""
         joints = joints.double() - torch.stack([joints[0, 0, 0], joints[..., 1].min(), joints[0, 0, 2]])
-        inverse = _about_y(-_heading(rotations))
+        inverse = _to_body(rotations)
         velocity = torch.zeros(len(joints), 3, dtype=torch.float64)
         velocity[1:] = (inverse[:-1] @ joints[:, 0].diff(dim=0)[..., None])[..., 0]
         turn = torch.eye(3, dtype=torch.float64).repeat(len(joints), 1, 1)
@@ -76,9 +73,8 @@ class Motion272(Representation):
         inverse, ground = self._root(features)
         turned = rotation.rot6d_to_matrix(features[..., self.slices["rotations"]].unflatten(-1, (22, 6)), "rows")
         height = features[..., self.slices["positions"]][..., 1:2] * features.new_tensor([0.0, 1.0, 0.0])
-        return ground + height, torch.cat(
-            [inverse.mT[..., None, :, :] @ turned[..., :1, :, :], turned[..., 1:, :, :]], -3
-        )
+        root = inverse.mT[..., None, :, :] @ turned[..., :1, :, :]
+        return ground + height, torch.cat([root, turned[..., 1:, :, :]], -3)
 
     def _root(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Returns rotations to body coordinates (..., F, 3, 3), and the root's x and z as vectors (..., F, 3)."""
@@ -102,22 +98,17 @@ class Motion272(Representation):
         return cut
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
-        """Returns (D,) bool, True for the features of these joints; velocity and turn of the root belong to joint 0."""
         part = self.joint_mask(joints)
         return torch.cat([part[:1].expand(8), *(part.repeat_interleave(n) for n in (3, 3, 6))])
 
 
 def face_forward(translation: Tensor, rotations: Tensor) -> tuple[Tensor, Tensor]:
     """Turns translation (F, 3) and rotations (F, J, 3, 3) about y, so that the root faces +z in the first frame."""
-    turn = _about_y(-_heading(rotations[:1]))
+    turn = _to_body(rotations[:1])
     return translation @ turn[0].T, torch.cat([(turn @ rotations[:, 0])[:, None], rotations[:, 1:]], 1)
 
 
-def _heading(rotations: Tensor) -> Tensor:
-    """Returns the angle (F,) from +z towards +x of the z axis of the root, of rotations (F, J, 3, 3)."""
-    return torch.atan2(rotations[:, 0, 0, 2], rotations[:, 0, 2, 2])
-
-
-def _about_y(angle: Tensor) -> Tensor:
-    """(F,) -> rotations (F, 3, 3) about y."""
-    return rotation.axis_angle_to_matrix(angle[:, None] * angle.new_tensor([0.0, 1.0, 0.0]))
+def _to_body(rotations: Tensor) -> Tensor:
+    """Returns rotations (F, 3, 3) about y that turn the z axis of the root, in rotations (F, J, 3, 3), to +z."""
+    heading = torch.atan2(rotations[:, 0, 0, 2], rotations[:, 0, 2, 2])
+    return rotation.axis_angle_to_matrix(-heading[:, None] * heading.new_tensor([0.0, 1.0, 0.0]))

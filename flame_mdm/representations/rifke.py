@@ -11,7 +11,7 @@ from flame_mdm.representations import Frames, Representation, check_finite, mome
 from flame_mdm.representations.skeleton import KIT21
 
 KNEES_AND_ELBOWS = [KIT21.joints.index(f"{side}_{part}") for part in ("knee", "elbow") for side in ("left", "right")]
-"""Joints that the published code uses as hips and shoulders: it applies their indices after removing the root."""
+"""Used as hips and shoulders by the published code, which applies their indices after removing the root."""
 
 
 class Rifke(Representation):

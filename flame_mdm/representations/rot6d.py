@@ -27,7 +27,6 @@ class Rot6D(Representation):
         self.offsets = offsets
 
     def encode(self, motion: Tensor) -> Tensor:
-        """Encodes a raw motion (F, 3 + 3 K) as features (F, 150) float32."""
         translation, rotations = read_pose(motion)
         rows = rotation.matrix_to_rot6d(rotations, "rows").flatten(1)
         return torch.cat([rows, F.pad(translation - translation[:1], (0, 3))], 1).float()
@@ -47,6 +46,5 @@ class Rot6D(Representation):
         return joints * joints.new_tensor([1.0, -1.0, -1.0])
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
-        """Returns (D,) bool, True for features of these joints; the last row, the translation, belongs to joint 0."""
         part = self.joint_mask(joints)
         return torch.cat([part, part[:1]]).repeat_interleave(6)

@@ -89,7 +89,9 @@ def rot6d_to_matrix(rot6d: Tensor, convention: SixD) -> Tensor:
 
 def matrix_to_euler(matrix: Tensor, order: str) -> Tensor:
     """(..., 3, 3) -> (..., 3), the middle angle in [-pi/2, pi/2]; in gimbal lock the third angle is 0."""
-    i, j, k = _axes(order)
+    if sorted(order) != ["X", "Y", "Z"]:
+        raise UserError(f"Euler order {order!r} is not supported; use the letters X, Y and Z once each, as in 'ZXY'")
+    i, j, k = ("XYZ".index(axis) for axis in order)
     sign = 1.0 if (j - i) % 3 == 1 else -1.0
     cosine = torch.hypot(matrix[..., i, i], matrix[..., i, j])
     locked = cosine < torch.finfo(matrix.dtype).eps ** 0.5
@@ -141,8 +143,7 @@ def _scaled(vectors: Tensor) -> Tensor:
 def between(a: Tensor, b: Tensor) -> Tensor:
     """Returns the shortest rotation from the direction of `a` to that of `b`: (..., 3), (..., 3) -> (..., 4), w >= 0.
 
-    For opposite directions, it is one of the half turns about a perpendicular axis. If a vector is 0, it is the
-    identity.
+    For opposite directions, it is a half turn about a perpendicular axis; if a vector is 0, the identity.
     """
     a, b = torch.broadcast_tensors(_scaled(a), _scaled(b))
     lengths = torch.linalg.vector_norm(a, dim=-1, keepdim=True) * torch.linalg.vector_norm(b, dim=-1, keepdim=True)
@@ -184,9 +185,3 @@ def rotate_y(vector: Tensor, angle: Tensor) -> Tensor:
     x, y, z = vector.unbind(-1)
     cosine, sine = torch.cos(angle), torch.sin(angle)
     return torch.stack([cosine * x + sine * z, y.expand_as(cosine * x), cosine * z - sine * x], -1)
-
-
-def _axes(order: str) -> list[int]:
-    if sorted(order) != ["X", "Y", "Z"]:
-        raise UserError(f"Euler order {order!r} is not supported; use the letters X, Y and Z once each, as in 'ZXY'")
-    return ["XYZ".index(axis) for axis in order]

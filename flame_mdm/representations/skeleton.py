@@ -23,12 +23,9 @@ class Skeleton:
     joints: tuple[str, ...]  # names in the order of the data; the prefixes `left_` and `right_` mark the sides
     parents: tuple[int, ...]  # parent of each joint, -1 for the root
     chains: tuple[tuple[int, ...], ...]  # paths followed by HumanML3D's inverse kinematics
-    # (J, 3) unit direction, in the rest pose, of the bone that ends in a joint, 0 for the root; from HumanML3D's
-    # `paramUtil.py`
+    # (J, 3) unit direction at rest of the bone that ends in a joint, 0 for the root; from HumanML3D's `paramUtil.py`
     raw_offsets: tuple[tuple[int, int, int], ...]
-    # right hip, left hip, right shoulder, left shoulder: the heading is the cross product of the vertical and the
-    # direction from left to right
-    facing: tuple[int, int, int, int]
+    facing: tuple[int, int, int, int]  # right hip, left hip, right shoulder, left shoulder, which define the heading
     feet: tuple[int, ...]  # joints that touch the ground, in the order of HumanML3D's contact features
     leg: tuple[int, int]  # (knee, ankle), whose bones measure the size of a body
 
@@ -72,14 +69,11 @@ class Skeleton:
 def forward_kinematics(skeleton: Skeleton, rotations: Tensor, offsets: Tensor, root: Tensor) -> Tensor:
     """Computes joint positions (..., J, 3) from rotations and root (..., 3), in the unit of `offsets`. Differentiable.
 
-    Args:
-        rotations: (..., J, 3, 3), the root's in the world and each other joint's relative to its parent. A joint's
-            rotation applies to the bones that leave it, as in SMPL and BVH.
-        offsets: (J, 3), position of each joint relative to its parent in the rest pose; the root's is not used.
+    `rotations` (..., J, 3, 3) are relative to the parents and apply to bones that leave a joint, as in SMPL and BVH;
+    `offsets` (J, 3) are positions relative to the parents in the rest pose, of which the root's is not used.
     """
     turned = global_rotations(rotations, skeleton.parents)
     bones = (turned[..., [max(parent, 0) for parent in skeleton.parents], :, :] @ offsets[..., None])[..., 0]
-    # the root's offset is on no path, so its value does not matter
     return skeleton.assemble(bones, root)
 
 
@@ -153,25 +147,17 @@ SKELETONS: dict[str, Skeleton] = {skeleton.name: skeleton for skeleton in (SMPL2
 
 
 def part_names(skeleton: Skeleton) -> dict[str, list[int]]:
-    """Returns body parts by name, as indices of their joints.
-
-    lower_body is the root and the legs, as in MDM; upper_body is everything else.
-    """
-    sided = {
-        f"{side}_{limb}": [
-            i for i, name in enumerate(skeleton.joints) if name.removeprefix(f"{side}_") in words and side in name
-        ]
-        for side in ("left", "right")
-        for limb, words in (("arm", ARM), ("leg", LEG))
-    }
-    legs = sided["left_leg"] + sided["right_leg"]
-    lower = [0, *legs]
-    return sided | {
-        "arms": sided["left_arm"] + sided["right_arm"],
-        "legs": legs,
-        "lower_body": lower,
-        "upper_body": [joint for joint in range(len(skeleton)) if joint not in lower],
-    }
+    """Returns the joints of body parts: lower_body is the root and the legs, as in MDM, upper_body everything else."""
+    parts: dict[str, list[int]] = {}
+    for side in ("left", "right"):
+        for limb, words in (("arm", ARM), ("leg", LEG)):
+            names = {f"{side}_{word}" for word in words}
+            parts[f"{side}_{limb}"] = [joint for joint, name in enumerate(skeleton.joints) if name in names]
+    parts["arms"] = parts["left_arm"] + parts["right_arm"]
+    parts["legs"] = parts["left_leg"] + parts["right_leg"]
+    parts["lower_body"] = [0, *parts["legs"]]
+    parts["upper_body"] = [joint for joint in range(len(skeleton)) if joint not in parts["lower_body"]]
+    return parts
 
 
 def find_joints(skeleton: Skeleton, names: str | Sequence[str]) -> list[int]:

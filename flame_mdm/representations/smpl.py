@@ -31,9 +31,9 @@ def read_pose(motion: Tensor) -> tuple[Tensor, Tensor]:
     code, so that the hands are its left_index1 and left_index2. Raises `UserError` if a number is not finite.
     """
     if motion.ndim != 2 or not len(motion) or motion.shape[1] < 75 or motion.shape[1] % 3:
+        shape = tuple(motion.shape)
         raise UserError(
-            f"motion: shape {tuple(motion.shape)}, expected (frames, 3 + 3 x joints), translation first, "
-            "then axis-angle vectors of 24 joints or more"
+            f"motion: shape {shape}, expected (frames, 3 + 3 x joints): translation, 24 or more axis-angles"
         )
     check_finite(motion)
     motion = motion.double()

@@ -20,34 +20,32 @@ if TYPE_CHECKING:  # drawing needs numpy and Pillow, not torch
     from torch import Tensor
 
 TWISTED = {"hip": 0.4, "shoulder": 0.4, "elbow": 0.55}
-"""Joints whose limb has a helper bone, and how much of the twist about the limb this has: of the joint's own twist, and
-for the elbow of the twist of the wrist."""
+"""Joints whose limb has a helper bone, and its share of the twist about the limb: the joint's own, or the wrist's."""
 HELPERS = tuple((JOINT[f"{side}_{name}"], share) for side in ("left", "right") for name, share in TWISTED.items())
 """Joint and share of the twist of each bone after the 22 joints."""
-ANCHORS = (*range(len(SMPL22)), *(joint for joint, _ in HELPERS))
-"""The joint at which each bone begins."""
+ANCHORS = (*range(len(SMPL22)), *(joint for joint, _ in HELPERS))  # the joint at which each bone begins
 MANNEQUIN = Path(__file__).with_name("mannequin.npz")
 TRUNK = {"pelvis": 0.0, "spine1": 0.35, "spine2": 0.75, "spine3": 1.0}
 """Joints of the trunk -> how much their width follows the shoulders rather than the hips."""
-WIDER, LONGER = (0.8, 1.25), (0.4, 2.5)
-"""Limits of the width of hips and shoulders relative to that of the limbs, and of the length of a limb."""
+WIDER = (0.8, 1.25)  # limits of the width of hips and shoulders relative to that of the limbs
+LONGER = (0.4, 2.5)  # limits of the length of a limb relative to the mesh's
+TALLER = (0.6, 1.6)  # limits of the length of other parts relative to that of the limbs
 LIMBS = tuple(JOINT[f"{side}_{name}"] for side in ("left", "right") for name in ("knee", "ankle", "elbow", "wrist"))
 SKIN, HAIR, SHIRT, TROUSERS, SHOES = MATERIALS = (
     *((222, 186, 160), (96, 80, 70), (132, 164, 196)),
     *((98, 106, 124), (64, 62, 66)),
 )
-"""Colors of the figure."""
 
 
 class Posed(Protocol):
-    """A body in motion, such as `flame_mdm.formats.poses.Poses`, which describes the attributes."""
+    """A body in motion: `flame_mdm.formats.poses.Poses`."""
 
     offsets: Tensor
     rotations: Tensor
 
 
 class Shown(Protocol):
-    """A motion to draw, such as `flame_mdm.formats.motion.Motion`, which describes the attributes."""
+    """A motion to draw: `flame_mdm.formats.motion.Motion`."""
 
     joints: np.ndarray
     fps: float
@@ -85,12 +83,10 @@ def radii(skeleton: Skeleton) -> list[float]:
 
 
 class Mesh:
-    """A closed mesh in its stored pose, an A-pose with the pelvis at 0.
-
-    `stored` are the arrays of its file, which tools/mannequin.py and tools/human.py write; `points` (V, 3) and `joints`
-    (22, 3) are in meters, `colors` 0 to 255.
+    """A closed mesh in its stored pose, an A-pose with the pelvis at 0; tools/mannequin.py and tools/human.py write it.
 
     Attributes:
+        points: (V, 3) in meters; `normals` (V, 3), `colors` (V, 3) from 0 to 255.
         weights: (V, 28), of the 22 joints of SMPL and `HELPERS`; at most four are not 0.
         triangles: (T, 3), counterclockwise seen from outside.
         turns: (28, 3, 3), rotation of each bone in the world from the rest pose of SMPL to the stored pose.
@@ -139,8 +135,8 @@ class FittedBody:
     Attributes:
         fit: (22, 3, 3), linear map of each joint's part of the stored mesh to the clip's proportions.
         joints: (22, 3) of the stored pose with the clip's bone lengths, pelvis at 0; `points` (V, 3) of the mesh in it.
-        neutral: (22, 3, 3), rotation of each part of the mesh in the rest pose: of feet until their soles are flat, of
-            the head until it is upright.
+        neutral: (22, 3, 3), rotation of each part of the mesh in the rest pose, so that soles are flat and the head
+            upright.
         turns: (F, B, 3, 3), rotation of each bone from the stored pose to each frame.
         starts: (F, B, 3), where each bone begins: at the motion's joints, lifted.
         lift: height of a joint of the body above that of the motion: the thickness of the sole.
@@ -178,9 +174,8 @@ class FittedBody:
 def fit_body(motion: Shown, body: Mesh | None = None) -> FittedBody:
     """Fits a body (None = the mannequin) to a clip and computes the rotations of its bones.
 
-    The body's joints are the motion's, but higher by the thickness of the sole: in motions, the lowest joint is on the
-    floor. Rotations that are solved for are completed. Raises `UserError` if the skeleton is not SMPL's, or a limb is
-    much longer or shorter than people's.
+    The body's joints are the motion's, but higher by the thickness of the sole. Rotations that are solved for are
+    completed. Raises `UserError` if the skeleton is not SMPL's, or a limb is much longer or shorter than people's.
     """
     poses, body = motion.posed(), body or mannequin()
     joints = motion.joints[:, : len(SMPL22)].astype(float)
@@ -193,9 +188,8 @@ def fit_body(motion: Shown, body: Mesh | None = None) -> FittedBody:
     lift = wide * body.sole
     for toe in (JOINT["left_foot"], JOINT["right_foot"]):
         _, high, long = body.rest[toe]
-        fit[SMPL22.parents[toe]] = np.diag(
-            [wide, (lift - offsets[toe, 1]) / (body.sole - high), offsets[toe, 2] / long]
-        )
+        tall = (lift - offsets[toe, 1]) / (body.sole - high)
+        fit[SMPL22.parents[toe]] = np.diag([wide, tall, offsets[toe, 2] / long])
     turns, rest = body.turns, np.zeros((len(SMPL22), 3))
     for parent, joint in SMPL22.edges:
         rest[joint] = rest[parent] + turns[parent] @ offsets[joint]
@@ -209,26 +203,15 @@ def fit_body(motion: Shown, body: Mesh | None = None) -> FittedBody:
 
 
 def try_fit(motion: Shown, body: Mesh | None = None) -> tuple[FittedBody | None, str]:
-    """Returns what `fit_body` returns, or None and the reason why this motion is drawn as a skeleton."""
+    """Returns the body of `fit_body` and "", or None and the reason why this motion is drawn as a skeleton."""
     try:
         return fit_body(motion, body), ""
     except UserError as error:
         return None, str(error)
 
 
-def shaded(normals: np.ndarray, colors: np.ndarray, toward: np.ndarray) -> np.ndarray:
-    """Returns colors (V, 3) lit from above left of the camera, which looks against `toward` (3,)."""
-    right = np.array([toward[2], 0, -toward[0]]) / np.hypot(toward[0], toward[2])
-    light = toward - 0.7 * right + [0, 1.2, 0]
-    lit = np.maximum(normals @ (light / np.linalg.norm(light)), 0)
-    return np.clip(colors * (0.5 + 0.12 * normals[:, 1] + 0.52 * lit)[:, None], 0, 255)
-
-
 def proportions(body: Mesh, offsets: np.ndarray) -> tuple[np.ndarray, float]:
-    """Returns the linear map (22, 3, 3) of each joint's part to a clip's proportions, and the ratio of widths.
-
-    `offsets` (22, 3) are the positions of the clip's joints relative to their parents in the rest pose.
-    """
+    """Returns the map (22, 3, 3) of each part of a body to a clip's `offsets` (22, 3) at rest, and that of widths."""
     lengths, usual = np.linalg.norm(offsets, axis=1), np.linalg.norm(body.rest, axis=1)
     ratio = np.divide(lengths, usual, out=np.ones_like(lengths), where=usual > 0)
     for joint in LIMBS:
@@ -241,9 +224,8 @@ def proportions(body: Mesh, offsets: np.ndarray) -> tuple[np.ndarray, float]:
 
     def width(*names: str) -> float:
         chosen = [JOINT[f"{side}_{name}"] for side in ("left", "right") for name in names]
-        return float(
-            np.clip(np.abs(offsets[chosen, 0]).sum() / np.abs(body.rest[chosen, 0]).sum(), *np.multiply(WIDER, wide))
-        )
+        share = np.abs(offsets[chosen, 0]).sum() / np.abs(body.rest[chosen, 0]).sum()
+        return float(np.clip(share, *np.multiply(WIDER, wide)))
 
     hips, shoulders = width("hip"), width("collar", "shoulder")
     fit = np.tile(wide * np.eye(3), (len(SMPL22), 1, 1))
@@ -251,11 +233,11 @@ def proportions(body: Mesh, offsets: np.ndarray) -> tuple[np.ndarray, float]:
         children = [child for child, parent in enumerate(SMPL22.parents) if parent == joint]
         if name in TRUNK:
             above = children[-1] if name == "pelvis" else children[0]
-            tall = np.clip(ratio[above], *np.multiply((0.6, 1.6), wide))
+            tall = np.clip(ratio[above], *np.multiply(TALLER, wide))
             fit[joint] = np.diag([hips + TRUNK[name] * (shoulders - hips), tall, wide])
         elif children and not name.endswith("ankle"):
             along = body.rest[children[0]] / usual[children[0]]
-            long = np.clip(ratio[children[0]], *np.multiply((0.6, 1.6), wide))
+            long = np.clip(ratio[children[0]], *np.multiply(TALLER, wide))
             fit[joint] += (long - wide) * np.outer(along, along)
     return fit, wide
 
@@ -274,44 +256,3 @@ def _with_helpers(world: np.ndarray, offsets: np.ndarray) -> np.ndarray:
         back = Rotation.from_rotvec(np.outer((share if of_wrist else share - 1) * twist, axis)).as_matrix()
         helpers.append(world[:, joint] @ back)
     return np.concatenate([world, np.stack(helpers, 1)], 1)
-
-
-def rasterize(image: np.ndarray, at: np.ndarray, depth: np.ndarray, colors: np.ndarray, triangles: np.ndarray) -> None:
-    """Draws triangles into an image, the nearest one at each pixel, with colors interpolated between their corners.
-
-    The image is (height, width, 3) uint8; `at` (V, 2) are pixel coordinates, y down; `depth` (V,) distances from the
-    camera; `colors` (V, 3) from 0 to 255. Triangles (T, 3) seen from inside, clockwise, are not drawn.
-    """
-    lowest = np.clip(np.floor(at.min(0)), 0, image.shape[1::-1]).astype(int)
-    highest = np.clip(np.ceil(at.max(0)), lowest, image.shape[1::-1]).astype(int)
-    width, height = highest - lowest
-    a, b, c = (at - lowest)[triangles.T]
-    (bx, by), (cx, cy) = (b - a).T, (c - a).T
-    twice = bx * cy - by * cx
-    seen = twice < -1e-9
-    low = np.clip(np.ceil(np.minimum(np.minimum(a, b), c) - 0.5), 0, [width, height]).T
-    high = np.clip(np.floor(np.maximum(np.maximum(a, b), c) + 0.5), 0, [width, height]).T
-    wide, tall = np.maximum(high - low, 0).astype(int)
-    count = np.where(seen, wide * tall, 0)
-    # shares of the second and third corner at a pixel: linear functions of its column and row in the bounding box
-    twice = np.where(seen, twice, 1)
-    right, down = low + 0.5 - a.T
-    table = [right * cy - down * cx, cy, -cx, down * bx - right * by, -by, bx]
-    table = np.stack([row / twice for row in table] + [wide, low[0] + low[1] * width]).astype(np.float32)
-    second, second_x, second_y, third, third_x, third_y, wide, first = np.repeat(table, count, axis=1)
-    step = np.arange(len(wide)) - np.repeat(np.cumsum(count) - count, count)
-    y, x = np.divmod(step.astype(np.float32), wide)
-    second += x * second_x + y * second_y
-    third += x * third_x + y * third_y
-    inside = np.flatnonzero((second >= 0) & (third >= 0) & (second + third <= 1))
-    corners = triangles[np.repeat(np.arange(len(triangles)), count)[inside]].T
-    second, third = second[inside], third[inside]
-    pixel = (first[inside] + x[inside] + y[inside] * width).astype(int)
-    shares = np.stack([1 - second - third, second, third])
-    near = (shares * depth.astype(np.float32)[corners]).sum(0)
-    nearest = np.full(width * height, np.inf, np.float32)
-    np.minimum.at(nearest, pixel, near)
-    seen = np.flatnonzero(near == nearest[pixel])
-    mixed = (shares[:, seen, None] * colors.astype(np.float32)[corners[:, seen]]).sum(0)
-    y, x = np.divmod(pixel[seen], width)
-    image[lowest[1] + y, lowest[0] + x] = mixed

@@ -19,7 +19,7 @@ MILLIMETER = 0.001
 
 
 def write_player(path: str | Path, motions: Sequence[Shown], title: str = "Motions", **options: Any) -> None:
-    """Writes the page of `player_page` to a file; the options are those of `player_page`."""
+    """Writes the page of `player_page`, with its options, to a file."""
     path = Path(path)
     check_any(motions, path)
     write_text(path, player_page(motions, title, **options))
@@ -37,11 +37,11 @@ def player_page(
 ) -> str:
     """Returns a self-contained HTML page that plays motions side by side in 3D, with a shared clock and camera.
 
-    It shows a body, or the skeleton at the push of a button. Motions that no body fits are shown as skeletons, with the
-    reason in their caption. Positions are rounded to millimeters, or to 1/65534 of the span of a motion.
+    Motions that no body fits are shown as skeletons, with the reason in their caption. Positions are rounded to
+    millimeters, or to 1/65534 of the span of a motion.
 
     Args:
-        motions: motions to show; skeletons, lengths and frame rates may differ.
+        motions: of any skeletons, lengths and frame rates.
         title: heading of the page.
         about: HTML of a collapsible section below the heading; its texts must be escaped.
         columns: motions per row; 0 = as many as fit into the window.
@@ -98,8 +98,7 @@ def _packed(
 def _packed_body(body: FittedBody) -> dict[str, Any]:
     """Returns proportions, and for each frame and bone a quaternion in 32 bits, exact to about 0.1 degrees.
 
-    The two highest bits tell which number of x, y, z, w is largest; the others follow, 10 bits each. They lie between
-    -0.71 and 0.71, and the largest one follows from them.
+    The two highest bits tell which of x, y, z, w is largest; the others, from -0.71 to 0.71, follow in 10 bits each.
     """
     quaternions = Rotation.from_matrix(body.turns.reshape(-1, 3, 3)).as_quat()
     largest = np.abs(quaternions).argmax(1)

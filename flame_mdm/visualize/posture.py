@@ -8,22 +8,19 @@ import numpy as np
 from flame_mdm.representations.skeleton import SMPL22
 
 JOINT = {name: number for number, name in enumerate(SMPL22.joints)}
-UPRIGHT = np.cos(np.radians(30))
-"""The head is level on average in frames in which the chest is tilted by less than this angle, given as its cosine."""
-STANDING = 0.02
-"""A foot stands flat in frames in which it is at most this many meters above its lowest position."""
+UPRIGHT = np.cos(np.radians(30))  # cosine of the largest tilt of the chest at which the head is level on average
+STANDING = 0.02  # largest height in meters of a flat foot above its lowest position
 TOES = (0.02, 0.09, np.radians(60))
-"""The toes stay flat while their joint is lower than the first height; above the second one they follow the foot. The
-last number is the largest bend."""
+"""Heights of the toe joint below which toes stay flat, and above which they follow the foot; and the largest bend."""
 
 
 def complete(joints: np.ndarray, offsets: np.ndarray, world: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Completes rotations solved from positions, which determine neither the head's pitch nor the toes.
 
-    The median pitch of the head while the chest is upright is taken as level, and the toes stay flat on the floor while
-    the heel rises. Takes joints (F, 22, 3), offsets (22, 3) from their parents in the rest pose, and rotations in the
-    world (F, 22, 3, 3). Returns the rotation (22, 3, 3) of each part of the body in the rest pose, the rotations
-    (F, 22, 3, 3) of these parts in the world, and offsets (22, 3) of a body that stands on flat feet.
+    The median pitch of the head while the chest is upright is level, and the toes stay flat while the heel rises. Takes
+    joints (F, 22, 3), offsets (22, 3) from their parents in the rest pose, and rotations in the world (F, 22, 3, 3).
+    Returns the rotation (22, 3, 3) of each part of the body in the rest pose, rotations (F, 22, 3, 3) of these parts in
+    the world, and offsets (22, 3) of a body that stands on flat feet.
     """
     neutral, offsets = np.tile(np.eye(3), (len(SMPL22), 1, 1)), offsets.copy()
     for side in ("left", "right"):

@@ -14,41 +14,26 @@ from PIL import Image, ImageDraw, ImageFilter, ImageFont
 
 from flame_mdm.errors import UserError, shortened
 from flame_mdm.safe_io import atomic_write
-from flame_mdm.visualize.body import (
-    MATERIALS,
-    FittedBody,
-    Mesh,
-    Shown,
-    check_any,
-    head,
-    radii,
-    rasterize,
-    shaded,
-    sides,
-    try_fit,
-)
+from flame_mdm.visualize.body import MATERIALS, FittedBody, Mesh, Shown, check_any, head, radii, sides, try_fit
 
 Color = tuple[int, int, int]
 SIDE_COLORS: dict[int, Color] = {1: (47, 127, 209), -1: (226, 112, 42), 0: (140, 149, 163)}
 RIM_COLORS: dict[int, Color] = {1: (26, 70, 115), -1: (124, 62, 23), 0: (77, 82, 90)}
 PAPER, GROUND, LINE, TEXT, FAINT = (255, 255, 255), (243, 245, 247), (205, 211, 219), (28, 36, 48), (102, 112, 133)
 SHADOW, TRAIL, CONTACT = (212, 216, 222), (122, 91, 208), (15, 157, 107)
-NEAR = 0.3
-"""Distance from the camera in meters below which nothing is drawn."""
-YAW, PITCH = 0.6, 0.24
+NEAR = 0.3  # distance from the camera in meters below which nothing is drawn
+YAW, PITCH = 0.6, 0.24  # of the camera, which is in front of the body, to the left and above
 TOWARD = np.array([math.sin(YAW) * math.cos(PITCH), math.sin(PITCH), math.cos(YAW) * math.cos(PITCH)])
-"""Direction from the body to the camera, which is in front, to the left and above."""
-BT709 = 1
-"""Number of the color space of HD video, which players assume where a large video does not name one."""
-SMOOTH = 2
-"""Images are drawn this many times larger and then reduced."""
+RIGHT = np.array([math.cos(YAW), 0, -math.sin(YAW)])
+BT709 = 1  # number of the color space of HD video, which players assume where a large video does not name one
+SMOOTH = 2  # images are drawn this many times larger and then reduced
 
 
 def write_gif(path: str | Path, motions: Sequence[Shown], size: int = 256, body: Mesh | None = None) -> None:
     """Writes a looping animation of motions side by side, with captions below, in panels of `size` pixels.
 
-    It has the highest frame rate of the motions, but at most 50 per second, the limit of the format: frames of faster
-    motions are dropped. A motion that ends earlier stays at its last frame. `body` None = the mannequin.
+    It has the highest frame rate of the motions, but at most 50 per second, the limit of the format. A motion that ends
+    earlier stays at its last frame. `body` None = the mannequin.
     """
     path = Path(path)
     check_any(motions, path)
@@ -58,15 +43,9 @@ def write_gif(path: str | Path, motions: Sequence[Shown], size: int = 256, body:
     images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in _video(motions, fps, size, body)]
     # GIF counts in hundredths of a second: round the times, not the durations, so that errors do not add up
     times = np.rint(100 * np.arange(len(images) + 1) / fps).astype(int)
+    options = {"append_images": images[1:], "duration": (10 * np.diff(times)).tolist(), "loop": 0}
     with atomic_write(path) as temporary:
-        images[0].save(
-            temporary,
-            format="GIF",
-            save_all=True,
-            append_images=images[1:],
-            duration=(10 * np.diff(times)).tolist(),
-            loop=0,
-        )
+        images[0].save(temporary, format="GIF", save_all=True, **options)
 
 
 def write_mp4(path: str | Path, motions: Sequence[Shown], size: int = 384, body: Mesh | None = None) -> None:
@@ -76,9 +55,7 @@ def write_mp4(path: str | Path, motions: Sequence[Shown], size: int = 384, body:
     try:
         av = import_module("av")
     except ImportError:
-        raise UserError(
-            f'{path}: MP4 needs the package av. Run pip install "flame-mdm[video]", or write a GIF'
-        ) from None
+        raise UserError(f'{path}: MP4 needs the package av. Run pip install "flame-mdm[video]", or write GIF') from None
     fps = max(motion.fps for motion in motions)
     with atomic_write(path) as temporary, av.open(str(temporary), "w", "mp4", {"movflags": "+faststart"}) as file:
         stream = file.add_stream("libx264", Fraction(fps).limit_denominator(1001), {"crf": "20"})
@@ -97,10 +74,7 @@ def write_mp4(path: str | Path, motions: Sequence[Shown], size: int = 384, body:
 def contact_sheet(
     path: str | Path, motions: Sequence[Shown], frames: int = 6, size: int = 192, body: Mesh | None = None
 ) -> None:
-    """Writes one PNG with a row per motion: its poses at equally spaced times from first to last, and its caption.
-
-    `frames` is the number of poses per row, `size` their width and height in pixels.
-    """
+    """Writes one PNG with a row per motion: `frames` poses of `size` pixels, equally spaced in time, and a caption."""
     path = Path(path)
     check_any(motions, path)
     rows = []
@@ -175,9 +149,7 @@ def _video(motions: Sequence[Shown], fps: float, size: int, mesh: Mesh | None) -
 
 
 def _figure(motion: Shown, body: FittedBody | None, frame: int, size: int) -> Image.Image:
-    """Draws one pose (without a body, the skeleton) on the ground; the camera follows the root smoothed over one
-    second.
-    """
+    """Draws one pose (without a body, the skeleton) on the ground; the camera follows the smoothed root."""
     side = size * SMOOTH
     image = Image.new("RGB", (side, side), PAPER)
     pen = ImageDraw.Draw(image)
@@ -220,28 +192,71 @@ def _figure(motion: Shown, body: FittedBody | None, frame: int, size: int) -> Im
     if body is not None:
         points, normals = body.skinned(frame)
         at, pixels = project(points), np.array(image)
-        rasterize(pixels, at[:, :2], at[:, 3], shaded(normals, body.mesh.colors, TOWARD), body.mesh.triangles)
+        _rasterize(pixels, at[:, :2], at[:, 3], _shaded(normals, body.mesh.colors), body.mesh.triangles)
         return Image.fromarray(pixels).reduce(SMOOTH)
     _draw_skeleton(pen, motion, joints, project, pixel)
     return image.reduce(SMOOTH)
 
 
 def _camera(target: np.ndarray, side: int) -> Callable[[np.ndarray], np.ndarray]:
-    """Returns the projection of a camera in front, to the left and above.
-
-    It maps points (N, 3) in meters to (N, 4): x, y, pixels per meter and depth.
-    """
-    toward, distance = TOWARD, 5.0
-    right = np.array([math.cos(YAW), 0, -math.sin(YAW)])
-    up = np.cross(toward, right)
+    """Returns the projection of points (N, 3) in meters to (N, 4): x, y, pixels per meter and depth."""
 
     def project(points: np.ndarray) -> np.ndarray:
         offset = points - target
-        depth = np.maximum(distance - offset @ toward, NEAR)
+        depth = np.maximum(5.0 - offset @ TOWARD, NEAR)
         scale = 2.05 * side / depth
-        return np.stack([side / 2 + offset @ right * scale, side / 2 - offset @ up * scale, scale, depth], 1)
+        up = np.cross(TOWARD, RIGHT)
+        return np.stack([side / 2 + offset @ RIGHT * scale, side / 2 - offset @ up * scale, scale, depth], 1)
 
     return project
+
+
+def _shaded(normals: np.ndarray, colors: np.ndarray) -> np.ndarray:
+    """Returns colors (V, 3) lit from above left of the camera."""
+    light = TOWARD - 0.7 * RIGHT + [0, 1.2, 0]
+    lit = np.maximum(normals @ (light / np.linalg.norm(light)), 0)
+    return np.clip(colors * (0.5 + 0.12 * normals[:, 1] + 0.52 * lit)[:, None], 0, 255)
+
+
+def _rasterize(image: np.ndarray, at: np.ndarray, depth: np.ndarray, colors: np.ndarray, triangles: np.ndarray) -> None:
+    """Draws triangles into an image, the nearest one at each pixel, with colors interpolated between their corners.
+
+    The image is (height, width, 3) uint8; `at` (V, 2) are pixel coordinates, y down; `depth` (V,) distances from the
+    camera; `colors` (V, 3) from 0 to 255. Triangles (T, 3) seen from inside, clockwise, are not drawn.
+    """
+    lowest = np.clip(np.floor(at.min(0)), 0, image.shape[1::-1]).astype(int)
+    highest = np.clip(np.ceil(at.max(0)), lowest, image.shape[1::-1]).astype(int)
+    width, height = highest - lowest
+    a, b, c = (at - lowest)[triangles.T]
+    (bx, by), (cx, cy) = (b - a).T, (c - a).T
+    twice = bx * cy - by * cx
+    seen = twice < -1e-9
+    low = np.clip(np.ceil(np.minimum(np.minimum(a, b), c) - 0.5), 0, [width, height]).T
+    high = np.clip(np.floor(np.maximum(np.maximum(a, b), c) + 0.5), 0, [width, height]).T
+    wide, tall = np.maximum(high - low, 0).astype(int)
+    count = np.where(seen, wide * tall, 0)
+    # shares of the second and third corner at a pixel: linear functions of its column and row in the bounding box
+    twice = np.where(seen, twice, 1)
+    right, down = low + 0.5 - a.T
+    table = [right * cy - down * cx, cy, -cx, down * bx - right * by, -by, bx]
+    table = np.stack([row / twice for row in table] + [wide, low[0] + low[1] * width]).astype(np.float32)
+    second, second_x, second_y, third, third_x, third_y, wide, first = np.repeat(table, count, axis=1)
+    step = np.arange(len(wide)) - np.repeat(np.cumsum(count) - count, count)
+    y, x = np.divmod(step.astype(np.float32), wide)
+    second += x * second_x + y * second_y
+    third += x * third_x + y * third_y
+    inside = np.flatnonzero((second >= 0) & (third >= 0) & (second + third <= 1))
+    corners = triangles[np.repeat(np.arange(len(triangles)), count)[inside]].T
+    second, third = second[inside], third[inside]
+    pixel = (first[inside] + x[inside] + y[inside] * width).astype(int)
+    shares = np.stack([1 - second - third, second, third])
+    near = (shares * depth.astype(np.float32)[corners]).sum(0)
+    nearest = np.full(width * height, np.inf, np.float32)
+    np.minimum.at(nearest, pixel, near)
+    seen = np.flatnonzero(near == nearest[pixel])
+    mixed = (shares[:, seen, None] * colors.astype(np.float32)[corners[:, seen]]).sum(0)
+    y, x = np.divmod(pixel[seen], width)
+    image[lowest[1] + y, lowest[0] + x] = mixed
 
 
 def _points(projected: np.ndarray) -> list[tuple[float, float]]:
@@ -251,7 +266,7 @@ def _points(projected: np.ndarray) -> list[tuple[float, float]]:
 def _draw_skeleton(
     pen: ImageDraw.ImageDraw, motion: Shown, joints: np.ndarray, project: Callable[[np.ndarray], np.ndarray], rim: float
 ) -> None:
-    """Draws joints (J, 3) and the head, the farthest limb first, each with a dark rim of `rim` pixels."""
+    """Draws joints (J, 3) and the head, the farthest limb first, with dark rims of `rim` pixels."""
     at, skeleton = project(joints), motion.skeleton
     thickness, side_of, top = radii(skeleton), sides(skeleton), head(skeleton)
     limbs = []
@@ -271,7 +286,7 @@ def _draw_skeleton(
 def _capsule(
     pen: ImageDraw.ImageDraw, a: np.ndarray, b: np.ndarray, radius: float, color: Color | int, grow: float = 0
 ) -> None:
-    """Draws a line with round ends, whose radius is `radius` meters and `grow` pixels."""
+    """Draws a line with round ends of radius `radius` meters plus `grow` pixels."""
     (ax, ay, per_meter_a, *_), (bx, by, per_meter_b, *_) = a, b
     size_a, size_b = radius * per_meter_a + grow, radius * per_meter_b + grow
     pen.line([(ax, ay), (bx, by)], color, round(size_a + size_b))
@@ -284,10 +299,7 @@ def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 
 
 def _lines(motion: Shown, body: FittedBody | None, width: int, size: int) -> list[str]:
-    """Returns the lines of a motion's caption; a third one ends in an ellipsis if text is left.
-
-    A last line says so if the motion is drawn as a skeleton.
-    """
+    """Returns at most three lines of a motion's caption, and one more if it is drawn as a skeleton."""
     lines, font = [""], _font(size)
     for word in shortened(motion.text or motion.id, width).split():  # more does not fit into three lines
         longer = f"{lines[-1]} {word}".strip()

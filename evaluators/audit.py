@@ -20,7 +20,7 @@ from evaluators.metrics import alignment, make_metrics, physics, update_metrics
 from evaluators.metrics.attributes import AttributeAccuracy, read_attributes, right_attributes
 from evaluators.metrics.distribution import FrechetMotionDistance, frechet_distance
 from evaluators.metrics.diversity import Diversity
-from evaluators.metrics.published_physics import MeanOverMotions
+from evaluators.metrics.published_physics import PublishedPhysics
 from evaluators.perturbations import BASE, REAL, Inputs, Perturbation, Scene, Text, text_of
 from evaluators.plan import open_data
 from evaluators.protocol import digest, open_protocol
@@ -34,11 +34,8 @@ from flame_mdm.schemas import AuditCard, check_shape
 from flame_mdm.training.provenance import environment
 
 FORMAT = 1
-TOTALS: dict[type[Metric], tuple[str, str]] = {
-    **dict.fromkeys((physics.FootSkating, physics.StaticShare), ("hits", "total")),
-    **dict.fromkeys((physics.Penetration, physics.Floating, physics.Jitter), ("total", "frames")),
-}
-"""States of metrics of joints: their value is the sum of the first over motions, divided by that of the second."""
+TOTALS = (physics.FootSkating, physics.StaticShare, physics.Penetration, physics.Floating, physics.Jitter)
+"""Metrics of joints: their value is the sum over motions of `sums`, divided by that of `counts`."""
 TRUTH = "attributes/all"  # share of motions that show every requested attribute
 
 
@@ -133,7 +130,7 @@ def _inputs(evaluator: Evaluator, path: Path, ids: list[str], make: Callable[[],
     for name, metric in make_metrics(evaluator.metrics).items():
         if type(metric) in TOTALS:
             inputs[name] = np.array([_totals(metric, joints) for joints in extracted["joints"]])
-        elif isinstance(metric, MeanOverMotions):
+        elif isinstance(metric, PublishedPhysics):
             inputs |= _values(name, metric, extracted)
         elif isinstance(metric, AttributeAccuracy):
             inputs["seen"] = np.array([json.dumps(read_attributes(x.numpy(), metric.fps)) for x in extracted["joints"]])
@@ -147,17 +144,16 @@ def _totals(metric: Metric, joints: Tensor) -> list[float]:
     metric.reset()
     mask = torch.ones(1, len(joints), dtype=torch.bool)
     update_metrics({"": metric}, joints=joints[None], mask=mask, keys=torch.zeros(1, dtype=torch.long))
-    states = [getattr(metric, state) for state in TOTALS[type(metric)]]
-    return [float(sum(x.sum() for x in state) if isinstance(state, list) else state) for state in states]
+    return [float(torch.cat(getattr(metric, state)).sum()) for state in ("sums", "counts")]
 
 
 def _higher_is_better(metrics: Mapping[str, Metric], name: str, part: str) -> bool | None:
     metric = metrics[name]
-    other = metric.DIRECTIONS if isinstance(metric, MeanOverMotions) else {}
+    other = metric.DIRECTIONS if isinstance(metric, PublishedPhysics) else {}
     return other.get(part, metric.higher_is_better)
 
 
-def _values(name: str, metric: MeanOverMotions, extracted: Rows) -> Inputs:
+def _values(name: str, metric: PublishedPhysics, extracted: Rows) -> Inputs:
     """Returns the value, or 0, and whether it is defined, for each motion; nothing if no motion may have one."""
     if metric.required_fps not in (None, metric.fps):
         return {}
@@ -165,8 +161,8 @@ def _values(name: str, metric: MeanOverMotions, extracted: Rows) -> Inputs:
         rows = {row: extracted[row][i : i + 1] for row in ("keys", "contacts") if row in extracted}
         rows |= {"contacts": rows["contacts"][0][None]} if "contacts" in rows else {}
         update_metrics({name: metric}, joints=joints[None], mask=torch.ones(1, len(joints), dtype=torch.bool), **rows)
-    values, defined = (torch.cat(getattr(metric, state)).double().numpy() for state in ("values", "defined"))
-    parts = zip(metric.NAMES, values.T, defined.T, strict=True)
+    values, defined = (torch.cat(getattr(metric, state)).numpy() for state in ("sums", "counts"))
+    parts = zip(metric.parts, values.T, defined.T, strict=True)
     return {f"{name}/{part}": np.stack([value, weight], 1) for part, value, weight in parts if weight.any()}
 
 

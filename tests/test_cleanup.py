@@ -28,8 +28,9 @@ def clips() -> list:
 
 def skating(motions: list[np.ndarray]) -> float:
     metric = FootSkating(FPS)
-    for motion in motions:
-        metric.update(torch.from_numpy(motion)[None], torch.ones(1, len(motion), dtype=torch.bool))
+    for number, motion in enumerate(motions):
+        mask = torch.ones(1, len(motion), dtype=torch.bool)
+        metric.update(torch.from_numpy(motion)[None], mask, torch.tensor([number]))
     share = metric.compute()
     assert share is not None
     return share

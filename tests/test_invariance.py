@@ -275,8 +275,9 @@ def validate(rank: int, world: int) -> tuple[float, ...]:
     task.on_validation_epoch_start()
     mine = slice(rank, None, world)
     mask = torch.ones(10, 8, dtype=torch.bool)
+    ids = [str(number) for number in range(10)][mine]
     with torch.no_grad():
-        task.validation_step(MotionBatch(x[mine], mask[mine], ["a"] * len(x[mine]), action=labels[mine]), 0)
+        task.validation_step(MotionBatch(x[mine], mask[mine], ids, action=labels[mine]), 0)
     return tuple(float(metric.compute()) for metric in task.val_metrics.values())  # type: ignore[operator]
 
 

@@ -99,8 +99,8 @@ def test_sides_are_read_from_the_motion():
     metric = SideAccuracy(fps=20)
     joints = torch.from_numpy(np.stack([left, left, right, right]))
     hands = {"bye": "left", "walk-turn-right": "right", "raise-up-right-hand": "right", "wave-both-hands": "both"}
-    metric.update(joints, torch.ones(4, 40, dtype=torch.bool), list(hands.items()))
+    metric.update(joints, torch.ones(4, 40, dtype=torch.bool), list(hands.items()), torch.arange(4))
     assert metric.compute() == {"hand": 1.0, "path": 0.0, "hand_or_path": pytest.approx(2 / 3)}
     metric = SideAccuracy(fps=20)
-    metric.update(joints[:1], torch.ones(1, 40, dtype=torch.bool), [("walk", "")])
+    metric.update(joints[:1], torch.ones(1, 40, dtype=torch.bool), [("walk", "")], torch.arange(1))
     assert metric.compute() == {"hand": None, "path": None, "hand_or_path": None}

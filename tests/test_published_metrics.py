@@ -55,7 +55,7 @@ def y_up(joints: np.ndarray) -> Tensor:
     return torch.from_numpy(joints).double()[..., [0, 2, 1]] * torch.tensor([1.0, 1.0, -1.0])
 
 
-MBENCH_NAMES = dict(zip(MBenchQuality.NAMES, ("jitter", "dynamic", "penetration", "sliding", "floating"), strict=True))
+MBENCH_NAMES = dict(zip(MBenchQuality.parts, ("jitter", "dynamic", "penetration", "sliding", "floating"), strict=True))
 
 
 def mean_over(metric: Metric, fixture: dict[str, np.ndarray], names: list[str]) -> dict[str, float]:
@@ -128,7 +128,7 @@ def test_kimodos_skating_equals_the_authors(stem: str):
 @pytest.mark.parametrize("case", cases(KIMODO, "c", "kimodo_metrics"))
 def test_kimodos_constraints_equal_the_authors(case: str):
     errors = kimodo_errors(case)
-    for name in KimodoConstraints.NAMES:
+    for name in KimodoConstraints.parts:
         expected = float(KIMODO.get(f"f64/{case}/constraint_{name}", math.nan))
         assert float(errors[name]) == pytest.approx(expected, abs=1e-7, nan_ok=True)
 

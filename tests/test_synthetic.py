@@ -157,8 +157,9 @@ def test_prompts_cover_actions_and_sides():
 
 def accuracy(motions: list[np.ndarray], requested: list[dict]) -> dict[str, float | None]:
     metric = AttributeAccuracy(FPS)
-    for motion, attributes in zip(motions, requested, strict=True):
-        metric.update(torch.tensor(motion)[None], torch.ones(1, len(motion), dtype=torch.bool), [attributes])
+    for number, (motion, attributes) in enumerate(zip(motions, requested, strict=True)):
+        mask, key = torch.ones(1, len(motion), dtype=torch.bool), torch.tensor([number])
+        metric.update(torch.tensor(motion)[None], mask, [attributes], key)
     return metric.compute()
 
 
@@ -235,7 +236,7 @@ def test_padding_and_batching_do_not_matter(clips: list[Clip]):
     for row, clip in enumerate(few):
         joints[row, : len(clip.motion)], mask[row, : len(clip.motion)] = torch.tensor(clip.motion), True
     metric = AttributeAccuracy(FPS)
-    metric.update(joints, mask, [clip.attributes for clip in few])
+    metric.update(joints, mask, [clip.attributes for clip in few], torch.arange(8))
     assert metric.compute() == accuracy([clip.motion for clip in few], [dict(clip.attributes) for clip in few])
 
 
@@ -248,7 +249,7 @@ def skating(toe: np.ndarray, fps: float = FPS, real: int | None = None) -> float
     joints = torch.zeros(1, len(toe), 22, 3)
     joints[0, :, 10] = torch.tensor(toe, dtype=torch.float32)
     metric = FootSkating(fps)
-    metric.update(joints, torch.arange(len(toe))[None] < (len(toe) if real is None else real))
+    metric.update(joints, torch.arange(len(toe))[None] < (len(toe) if real is None else real), torch.tensor([0]))
     return metric.compute()
 
 

@@ -74,7 +74,6 @@ class ClassifierTask(ExtractorTask):
                 torch.distributed.broadcast(buffer, 0)
 
     def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:
-        """Adds the clips of a batch; with fewer clips than processes, each has all of them, which changes no value."""
         logits, labels = self._classified(batch)
         self.val_metrics["loss"].update(F.cross_entropy(logits, labels, reduction="none"))  # type: ignore[operator]
-        self.val_metrics["accuracy"].update(logits, labels)  # type: ignore[operator]
+        self.update_samples(batch, logits=logits, labels=labels)

@@ -210,7 +210,7 @@ class MotionCLIPTask(ExtractorTask):
     def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:
         motion = F.normalize(self.network(batch.x, batch.mask), dim=-1)
         text = F.normalize(self.text_features(batch), dim=-1)
-        self.update_pairs(batch, motion, text, scale=self.network.logit_scale.exp())
+        self.update_samples(batch, generated=motion, text=text, scale=self.network.logit_scale.exp())
 
 
 _MCLIP = {

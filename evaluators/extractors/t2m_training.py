@@ -229,6 +229,7 @@ class T2MTask(ExtractorTask):
         return self(self.representation.denormalize(batch.x), batch.mask), self.text(tokens)
 
     def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:
-        self.update_pairs(batch, *self._embed(batch))
+        motion, text = self._embed(batch)
+        self.update_samples(batch, generated=motion, text=text)
         errors = reconstruction_terms(self.network, self.decoder, batch)["reconstruction"]
         self.val_metrics["reconstruction"].update(errors)  # type: ignore[operator]

@@ -68,20 +68,17 @@ class ExtractorTask(Task):
         """Makes the random draws of a training step a function of (seed, batch number, rank)."""
         torch.manual_seed(key("step", self.seed, batch_idx, self.global_rank))
 
-    def update_pairs(self, batch: MotionBatch, motion: Tensor, text: Tensor, **more: Tensor) -> None:
-        """Updates the metrics of samples with the pairs of a batch, each on one process; features are (B, E).
+    def update_samples(self, batch: MotionBatch, **inputs: Tensor) -> None:
+        """Updates the metrics of samples with those of a batch.
 
-        With fewer clips than processes, every process has all clips, and only the first one counts.
+        With fewer clips than processes, every process has all clips, and only the first process counts.
         """
-        data = self.trainer.datamodule  # type: ignore[attr-defined]
-        if self.global_rank and len(data.val) < self.trainer.world_size:
+        if self.global_rank and len(self.trainer.datamodule.val) < self.trainer.world_size:  # type: ignore[attr-defined]
             return
-        keys, text_keys = (
-            torch.tensor([key(kind, name) for name in names], device=self.device)
-            for kind, names in (("motion", batch.ids), ("caption", batch.text or ()))
-        )
-        of_pairs = {name: metric for name, metric in self.val_metrics.items() if isinstance(metric, SampleMetric)}
-        update_metrics(of_pairs, generated=motion, text=text, keys=keys, text_keys=text_keys, **more)
+        for name, kind, names in (("keys", "motion", batch.ids), ("text_keys", "caption", batch.text or ())):
+            inputs[name] = torch.tensor([key(kind, value) for value in names], device=self.device)
+        of_samples = {name: metric for name, metric in self.val_metrics.items() if isinstance(metric, SampleMetric)}
+        update_metrics(of_samples, **inputs)
 
     def on_validation_epoch_end(self) -> None:
         """Logs the metrics of a validation over all processes, and resets them.

@@ -2,16 +2,14 @@
 
 from torch import Tensor
 
-from evaluators.metrics.samples import Share
+from evaluators.metrics.samples import SampleMetric
 
 
-class ActionAccuracy(Share):
+class ActionAccuracy(SampleMetric):
     """Fraction of motions whose largest logit is that of their label (Guo et al. 2020), in [0, 1]."""
 
     higher_is_better = True
+    states = ("logits", "labels")
 
-    def update(self, logits: Tensor, labels: Tensor) -> None:
-        if not logits.isfinite().all():
-            raise self.error("class scores are not finite. Look for motions that are not finite")
-        self.hits += (logits.argmax(1) == labels).sum()
-        self.total += len(labels)
+    def value(self, logits: Tensor, labels: Tensor) -> float:
+        return (logits.argmax(1) == labels).double().mean().item()

@@ -13,10 +13,8 @@ TOP = (1, 2, 3)  # k of R-precision
 def retrieval_ranks(queries: Tensor, candidates: Tensor, pools: Tensor, own: Tensor) -> Tensor:
     """Returns (N,) how many candidates are closer than the correct one, or equally close and earlier in the pool.
 
-    Args:
-        queries, candidates: (N, E) and (M, E) features.
-        pools: (N, P) indices of the candidates of each query.
-        own: (N,) position of the correct candidate in each pool.
+    `pools` (N, P) are the indices of the candidates (M, E) of each query (N, E), `own` (N,) is the position of the
+    correct one in each pool.
     """
     pools, own = pools.to(queries.device), own.to(queries.device)
     ranks = []
@@ -51,10 +49,10 @@ class RPrecision(SampleMetric):
 class TextsForMotion(RPrecision):
     """R-precision, texts for a motion: is the motion's text among the k nearest of 32?
 
-    This is the definition of the papers (FLAME, "Evaluation Metrics"; MDM, B.2; MFM, 9.1) and of FLAME's code. Each
-    generated motion ranks its own text and 31 others, drawn without replacement from captions that differ from it, by
-    Euclidean distance. In FLAME's code, a pool is as large as the batch, so the last pools are smaller; here, all pools
-    have 32 texts. The own text is at a random position, so that an extractor that cannot tell texts apart gets k / 32.
+    The definition of the papers (FLAME, "Evaluation Metrics"; MDM, B.2; MFM, 9.1) and of FLAME's code. A motion ranks
+    its own text and 31 others, drawn without replacement from captions that differ from it, by Euclidean distance. In
+    FLAME's code, the last pools are smaller, since a pool is a batch. The own text is at a random position, so that an
+    extractor that cannot tell texts apart gets k / 32.
     """
 
     def ranks(self, generated: Tensor, text: Tensor, text_keys: Tensor) -> Tensor:
@@ -73,12 +71,11 @@ class TextsForMotion(RPrecision):
 class MotionsForText(RPrecision):
     """R-precision, motions for a text: is the text's motion among the k nearest of 32?
 
-    This is the definition of the code of Guo et al. 2022, which the tables of MDM and MFM use. Test pairs in random
-    order are split into pools of 32; each text ranks the motions of its pool by Euclidean distance. Equal captions may
-    be in the same pool. In that code, a pool is a batch of the data loader, and an incomplete last batch is dropped.
-    Distances are float32, so a motion whose features equal those of its text may rank last (square root of a negative
-    number). Here, pools are drawn at random, and the texts of an incomplete last pool rank the last 32 motions, so that
-    every text counts once.
+    The definition of the code of Guo et al. 2022, which the tables of MDM and MFM use. Test pairs in random order are
+    split into pools of 32, in which each text ranks the motions by Euclidean distance; equal captions may be in the
+    same pool. In that code, an incomplete last pool is dropped, and distances are float32, so that a motion whose
+    features equal those of its text may rank last (square root of a negative number). Here, the texts of an incomplete
+    last pool rank the last 32 motions, so that every text counts once.
 
     `normalize` scales features to length 1 first, which ranks by cosine. An extractor trained with cosines, such as
     motion-CLIP, does not constrain lengths; the motions with the shortest features would be nearest to every text.
@@ -104,10 +101,10 @@ def own_pools(count: int, pool: int, seed: int) -> tuple[Tensor, Tensor, Tensor]
 
 
 class MultimodalDistance(SampleMetric):
-    """MM-Dist, "matching score" in the code of Guo et al. 2022: mean Euclidean distance of motions and their texts.
+    """MM-Dist (MFM, eq. 10), "matching score" of Guo et al. 2022: mean Euclidean distance of motions and their texts.
 
-    MFM, eq. 10. The authors' code computes distances in float32 and drops an incomplete last batch. `normalize` is as
-    for `MotionsForText`; the value is then in [0, 2].
+    That code computes in float32 and drops an incomplete last batch. With `normalize`, as for `MotionsForText`, the
+    value is in [0, 2].
     """
 
     higher_is_better = False
@@ -136,19 +133,15 @@ class MotionCLIPScore(SampleMetric):
 def pointwise_mutual_information(
     real: Tensor, text: Tensor, generated: Tensor, requested: Tensor, eps: float
 ) -> Tensor:
-    """Computes the terms (M,) whose mean is MID, in float64.
+    """Computes the terms (M,) whose mean is MID, of motions (M, E) generated for texts (M, T), in float64.
 
     Kim et al. 2022, "Mutual Information Divergence": the mean pointwise mutual information of generated motions and
-    their texts under a normal distribution fitted to the real pairs,
+    their texts under a normal distribution fitted to real motions (N, E) and their texts (N, T),
 
         (log det S_x + log det S_y - log det S_z) / 2 + (tr S_x^-1 S_x' + tr S_y^-1 S_y - tr S_z^-1 S_z') / 2
 
     where x is real, y is text, and z is both; covariances of generated motions (') are about the means of the real
     ones; inverses are those of S + eps I. The denominators are N - 1 and M - 1.
-
-    Args:
-        real, text: (N, E) features of real motions, and (N, T) of their texts.
-        generated, requested: (M, E) features of generated motions, and (M, T) of the texts they were generated for.
     """
     both, fake = torch.cat([real, text], 1), torch.cat([generated, requested], 1)
     value = real.new_zeros(len(generated))
@@ -165,9 +158,8 @@ def pointwise_mutual_information(
 class MutualInformationDivergence(SampleMetric):
     """MID, in nats: mean `pointwise_mutual_information` of generated motions, their texts and the real motions.
 
-    It needs the real motion of each generated one, and more samples than motion and text have features together. With
-    fewer, the joint covariance is singular and the value arbitrary (the authors' code requires half as many). `eps` is
-    5e-4 in FLAME, 0 in the authors' release.
+    It needs more samples than motion and text have features together. With fewer, the joint covariance is singular and
+    the value arbitrary (the authors' code requires half as many). `eps` is 5e-4 in FLAME, 0 in the authors' release.
     """
 
     higher_is_better = True

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
-from evaluators.metrics.samples import Share, Timed
+from evaluators.metrics.samples import MotionMean, Timed
 
 PELVIS, NECK, HEAD = 0, 12, 15
 HIPS, ANKLES, TOES, COLLARS = (1, 2), (7, 8), (10, 11), (13, 14)
@@ -237,15 +237,17 @@ def right_attributes(seen: Mapping[str, Any], requested: Mapping[str, Any]) -> d
     return right | {"action_and_side": right["action"] and right.get("side", True), "all": all(right.values())}
 
 
-class AttributeAccuracy(Timed, Share):
+class AttributeAccuracy(Timed, MotionMean):
     """Fraction of motions that show the requested value, by attribute; see `right_attributes`."""
 
     higher_is_better = True
     names = (*ATTRIBUTES, "action_and_side", "all")
 
-    def update(self, joints: Tensor, mask: Tensor, requested: Sequence[Mapping[str, str | int | float]]) -> None:
+    def update(self, joints: Tensor, mask: Tensor, requested: Sequence[Mapping[str, Any]], keys: Tensor) -> None:
+        rows = []
         for motion, real, attributes in zip(joints.detach().cpu(), mask.cpu(), requested, strict=True):
-            self.count(right_attributes(read_attributes(motion[real].numpy(), self.fps), attributes))
+            rows.append(right_attributes(read_attributes(motion[real].numpy(), self.fps), attributes))
+        self.add(keys, rows)
 
 
 def read_side(joints: np.ndarray, content: str, fps: float) -> str:
@@ -265,7 +267,7 @@ def read_side(joints: np.ndarray, content: str, fps: float) -> str:
     return "left" if toward > 0 else "right"
 
 
-class SideAccuracy(Timed, Share):
+class SideAccuracy(Timed, MotionMean):
     """Share of motions that show the requested side, left or right, on the Bandai set; see `read_side`.
 
     `hand` is about gestures, `path` about turns and sideways walks, `hand_or_path` about both; chance is 0.5.
@@ -274,9 +276,11 @@ class SideAccuracy(Timed, Share):
     higher_is_better = True
     names = ("hand", "path", "hand_or_path")
 
-    def update(self, joints: Tensor, mask: Tensor, sides: Sequence[tuple[str, str]]) -> None:
-        """Adds motions; those requested with another side than left and right are ignored."""
+    def update(self, joints: Tensor, mask: Tensor, sides: Sequence[tuple[str, str]], keys: Tensor) -> None:
+        """Adds motions; those requested with another side than left and right do not count."""
+        rows = []
         for motion, real, (content, side) in zip(joints.detach().cpu(), mask.cpu(), sides, strict=True):
-            if side in SIDES:
-                right = read_side(motion[real].numpy(), content, self.fps) == side
-                self.count({"path" if content.startswith("walk") else "hand": right, "hand_or_path": right})
+            right = read_side(motion[real].numpy(), content, self.fps) == side
+            kind = "path" if content.startswith("walk") else "hand"
+            rows.append({kind: right, "hand_or_path": right} if side in SIDES else {})
+        self.add(keys, rows)

@@ -24,9 +24,9 @@ def frechet_distance(a: Tensor, b: Tensor) -> Tensor:
 class FrechetMotionDistance(TwoSets):
     """Fréchet distance of motion features, "FID" (Heusel et al. 2017) or "FD" (FLAME): `frechet_distance`.
 
-    Covariances have N - 1 in the denominator, as in the authors' code (numpy.cov). That code computes means in float32
-    and scipy's `sqrtm` of the product, and adds 1e-6 to the diagonals if that fails; the relative difference is 1e-8.
-    The value is biased upwards, and more so with fewer samples: compare only values for equal N.
+    Covariances have N - 1 in the denominator, as in the authors' code. That code computes means in float32 and scipy's
+    `sqrtm` of the product, and adds 1e-6 to the diagonals if that fails; the relative difference is 1e-8. The value is
+    biased upwards, and more so with fewer samples: compare only values for equal N.
     """
 
     higher_is_better = False
@@ -52,10 +52,8 @@ def polynomial_mmd2(a: Tensor, b: Tensor) -> Tensor:
 class KernelMotionDistance(TwoSets):
     """Kernel distance of motion features, "KID" (Bińkowski et al. 2018): mean `polynomial_mmd2` of random subsets.
 
-    Args:
-        subsets, subset_size: number of subsets, and samples per subset from either set.
-        replace: whether to draw with replacement, as the code of MoDi and MDM does if there are more real motions than
-            `subset_size`. Samples that are drawn twice then increase the value.
+    Each of the `subsets` has `subset_size` samples of either set. `replace` draws them with replacement, as the code of
+    MoDi and MDM does if there are more real motions than that; samples that are drawn twice increase the value.
     """
 
     higher_is_better = False
@@ -68,12 +66,11 @@ class KernelMotionDistance(TwoSets):
     def value(self, generated: Tensor, real: Tensor) -> dict[str, float | None]:
         for name, features in (("generated", generated), ("real", real)):
             self.need(len(features), self.subset_size, f"{name} motions for subsets of {self.subset_size}")
-        generator = np.random.default_rng(self.seed)
-
-        def subset(x: Tensor) -> Tensor:
-            return x[torch.from_numpy(generator.choice(len(x), self.subset_size, replace=self.replace)).to(x.device)]
-
-        mmd2 = torch.stack([polynomial_mmd2(subset(generated), subset(real)) for _ in range(self.subsets)])
+        draw, values = np.random.default_rng(self.seed).choice, []
+        for _ in range(self.subsets):
+            subsets = (x[draw(len(x), self.subset_size, replace=self.replace)] for x in (generated, real))
+            values.append(polynomial_mmd2(*subsets))
+        mmd2 = torch.stack(values)
         return {"mean": mmd2.mean().item(), "std": mmd2.std(unbiased=False).item()}
 
 
@@ -94,10 +91,9 @@ def _squared_distances(a: Tensor, b: Tensor) -> Tensor:
 class PrecisionRecall(TwoSets):
     """Precision and recall of generated motions (Kynkäänniemi et al. 2019), in [0, 1].
 
-    Precision is the fraction of generated motions within the manifold of the real ones; recall is the fraction of real
-    motions within that of the generated ones (see `manifold_coverage`). Since neighbor distances shrink with the number
-    of samples, both sets are cut to the size of the smaller one, in the order of the keys; the authors' code cuts in
-    the order of the files.
+    Precision is the `manifold_coverage` of generated motions by the real ones, recall that of the real motions by the
+    generated ones. Since neighbor distances shrink with the number of samples, both sets are cut to the size of the
+    smaller one, in the order of the keys; the authors' code cuts in the order of the files.
     """
 
     higher_is_better = True

@@ -14,17 +14,15 @@ def pair_distance(a: Tensor, b: Tensor) -> float:
 
 def _random_pairs(count: int, pairs: int, replace: bool, seed: int) -> tuple[Tensor, Tensor]:
     """Draws both sides (pairs,) of pairs of `count` motions, each with or without replacement."""
-    generator = np.random.default_rng(seed)
-    first, second = (torch.from_numpy(generator.choice(count, pairs, replace=replace)) for _ in range(2))
-    return first, second
+    draw = np.random.default_rng(seed).choice
+    return torch.from_numpy(draw(count, pairs, replace)), torch.from_numpy(draw(count, pairs, replace))
 
 
 class Diversity(SampleMetric):
     """Mean distance of random pairs of motions (Guo et al. 2020; MDM, eq. 6). Best if equal to that of real motions.
 
-    Published values use 300 pairs, drawn as two sets without replacement, for text-to-motion, and 200 pairs with
-    replacement for action-to-motion and unconstrained synthesis. In both cases, a motion may be paired with itself,
-    which counts as 0.
+    Published are 300 pairs, drawn as two sets without replacement, for text-to-motion, and 200 pairs with replacement
+    for action-to-motion and unconstrained synthesis. In both cases, a motion may be paired with itself.
     """
 
     higher_is_better = None
@@ -45,10 +43,7 @@ class TextMultimodality(SampleMetric):
 
     As in their code, two sets of 10 are drawn without replacement from the 30, with the same indices for all texts; a
     motion that is in both may be paired with itself. Published for 100 texts; the code of MDM and MFM uses whole
-    batches, that is 128 texts.
-
-    Args:
-        samples, pairs: motions and pairs per text.
+    batches, that is 128 texts. `samples` and `pairs` are per text.
     """
 
     higher_is_better = None
@@ -65,10 +60,9 @@ class TextMultimodality(SampleMetric):
 
 
 class PairedMultimodality(SampleMetric):
-    """Multimodality of FLAME (eq. 19): two sets of 10 motions per text, compared one by one.
+    """Multimodality of FLAME (eq. 19): two sets of `samples` motions per text, compared one by one.
 
-    FLAME published no code for it. Its Table 3 has 10 motions per text, but eq. 19 uses two sets of 10. This is the
-    latter, with 20 motions per text: `samples` motions in each of the two sets.
+    FLAME published no code for it. Its Table 3 has 10 motions per text, but eq. 19 uses two sets of 10.
     """
 
     higher_is_better = None
@@ -87,8 +81,7 @@ class ActionMultimodality(SampleMetric):
     """Multimodality of Guo et al. 2020 (MDM, eq. 7): 20 random pairs of the same class, for each class.
 
     As in the authors' code, a motion may be drawn repeatedly and be paired with itself. The authors divide the sum by
-    the number of all classes, including those without motions; here, it is divided by the number of classes that have
-    motions.
+    the number of all classes; here, it is divided by the number of classes that have motions.
     """
 
     higher_is_better = None
@@ -113,10 +106,9 @@ class ActionMultimodality(SampleMetric):
 class JointVariance(SampleMetric):
     """Variance of joint positions among the motions of a text, in square meters.
 
-    FLAME (Table 3) averages "the variance of joints for the 10 generated motions" and says that eq. 18, a variance over
-    the frames of one motion, is used; it published no code. Here, the variance over the motions of a text (n - 1 in the
-    denominator) is computed for each frame and joint, summed over x, y and z, and averaged over joints, frames and
-    texts. It is not comparable with FLAME's numbers. The `samples` motions of a text must have the same length.
+    The variance over the `samples` motions of a text, of equal length (n - 1 in the denominator), is summed over x, y
+    and z, and averaged over joints, frames and texts. It is not comparable with FLAME's numbers: Table 3 averages "the
+    variance of joints for the 10 generated motions", by eq. 18, a variance over the frames of one motion, without code.
     """
 
     higher_is_better = None

@@ -15,8 +15,7 @@ CLOSE = 0.01  # share of the held-out real motions that are closer to a training
 def poses(joints: Tensor, facing: Sequence[int]) -> Tensor:
     """Returns joints (F, J, 3) relative to the pelvis on the ground, turned to face z in every frame, as (F, 3J).
 
-    Two motions with the same poses differ only in the path and the direction in which they move. `facing` is that of
-    `Skeleton`.
+    Motions with the same poses differ only in the path and the direction in which they move. `facing` is of `Skeleton`.
     """
     right_hip, left_hip, right_shoulder, left_shoulder = facing
     left = joints[:, left_hip] - joints[:, right_hip] + joints[:, left_shoulder] - joints[:, right_shoulder]
@@ -39,9 +38,8 @@ class TrainingMotions:
     def nearest(self, joints: Sequence[Tensor], features: Tensor | None) -> Tensor:
         """Returns the distances (B, 2), without features (B, 1), of motions (F, J, 3) from the nearest training motion.
 
-        The first is the root mean square distance of the joints in meters, over all joints and every fourth frame, from
-        the best window of the same length; infinite if no training motion is as long. The second is the distance of the
-        features (B, E).
+        First, the root mean square distance of the joints in every fourth frame, in meters, from the best window of the
+        same length; infinite if no training motion is as long. Second, the distance of the features (B, E).
         """
         squares = self.poses.square().sum(-1)
         left = torch.cat([torch.arange(int(length), 0, -1) for length in self.lengths])  # frames to the motion's end
@@ -73,8 +71,7 @@ class NearestTraining(SampleMetric):
     """Distance from the nearest training motion, and the share of motions that are closer than held-out real motions.
 
     A motion counts as a copy if its joints are closer to a training motion than those of all but `CLOSE` of the
-    held-out real motions. So about 1 % of the real motions count as copies, and all motions of a model that repeats the
-    training set.
+    held-out real motions: about 1 % of the real motions are, and all motions of a model that repeats the training set.
     """
 
     states = ("nearest", "real_nearest")

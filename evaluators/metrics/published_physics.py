@@ -1,7 +1,6 @@
-"""Physics metrics of published benchmarks, each with its own units, thresholds, frame rate and floor.
+"""Physics metrics of published benchmarks, each with its own units, thresholds and frame rate; the floor is y = 0.
 
-Values of different benchmarks are not comparable with one another, nor with those of `evaluators.metrics.physics`. The
-floor is y = 0 in all of them: motions are not moved.
+Values of different benchmarks are not comparable with one another, nor with those of `evaluators.metrics.physics`.
 """
 
 import math
@@ -11,67 +10,48 @@ import torch
 from scipy.signal import find_peaks
 from torch import Tensor
 
-from evaluators.metrics.samples import SampleMetric
+from evaluators.metrics.samples import MotionMean, SampleMetric, Timed
 
 FEET = (7, 10, 8, 11)  # left ankle or heel, left toe, right ankle or heel and right toe of the 22 SMPL joints
 JERK_OF_REAL_MOTIONS: dict[float, float] = {20: 0.033031363, 30: 0.016383045}
 """Mean jerk of FlowMDM by frame rate: of HumanML3D at 20 frames per second, and of BABEL at 30."""
 
-Values = Mapping[str, Tensor | float]
+Values = dict[str, Tensor | float]
 
 
-class MeanOverMotions(SampleMetric):
-    """Means over motions of values that each motion has, or does not have if they are undefined for it.
-
-    `measured` is the fraction of motions that have all values.
-    """
+class PublishedPhysics(Timed, MotionMean):
+    """Means over motions of values by name; `measured` is the fraction of motions that have all of them."""
 
     higher_is_better = False
-    states = ("values", "defined")
-    NAMES: tuple[str, ...]  # names of the values of a motion
     DIRECTIONS: Mapping[str, bool | None] = {}  # values for which higher is better (True), or neither (None)
     required_fps: float | None = None  # the only frame rate at which the values are defined; None = any
 
     def __init__(self, fps: float, feet: Sequence[int] = FEET):
-        super().__init__()
-        self.fps, self.feet, self.names = fps, list(feet), (*self.NAMES, "measured")
+        super().__init__(fps)
+        self.feet = list(feet)
 
-    def update(self, joints: Tensor, mask: Tensor, keys: Tensor) -> None:
-        self.keep_values(keys, [self.measure(motion) for motion in self.real_frames(joints, mask)])
-
-    def measure(self, motion: Tensor) -> Values:
-        """Computes the values of a motion (F, J, 3); NaN = undefined."""
-        raise NotImplementedError
-
-    def keep_values(self, keys: Tensor, motions: Sequence[Values]) -> None:
-        """Adds the values of motions; NaN = undefined."""
-        if motions:
-            values = torch.tensor([[float(m[name]) for name in self.NAMES] for m in motions], dtype=torch.float64)
-            super().update(keys=keys, values=values.nan_to_num(), defined=~values.isnan())
-
-    def value(self, values: Tensor, defined: Tensor) -> dict[str, float | None]:
+    def value(self, sums: Tensor, counts: Tensor) -> dict[str, float | None]:
         """Returns the mean of each value, and `measured`; raises `UserError` at any but the required frame rate."""
         if self.required_fps and self.fps != self.required_fps:
             raise self.error(f"defined at {self.required_fps:g} frames per second, but the motions have {self.fps:g}")
-        sums = zip(values.sum(0).tolist(), defined.sum(0).tolist(), strict=True)
-        means = [total / count if count else None for total, count in sums]
-        return dict(zip(self.names, (*means, defined.all(1).double().mean().item()), strict=True))
+        return super().value(sums, counts) | {"measured": (counts > 0).all(1).double().mean().item()}
 
 
-class MBenchQuality(MeanOverMotions):
+class MBenchQuality(PublishedPhysics):
     """Motion quality of MBench (ViMoGen, bf891de), in meters per frame, only at 20 frames per second.
 
     `jitter_degree`: mean length of the second difference of joint positions, plus the same relative to the root;
     `dynamic_degree`: the same of the first difference, higher = more motion; `ground_penetration`: mean depth of the
-    toes that are deeper than 5 mm, 0 if there are none; `foot_sliding`: mean step over the ground of toes in contact;
-    `foot_floating`: frames in which the body moves without a foot that carries it, per frame; it can exceed 1. A toe is
-    in contact if it moves less than 1 cm per frame or is lower than 2 cm, so a foot held still in the air is, too.
+    toes that are deeper than 5 mm, or 0; `foot_sliding`: mean step over the ground of toes in contact; `foot_floating`:
+    frames in which the body moves without a foot that carries it, per frame; it can exceed 1. A toe is in contact if it
+    moves less than 1 cm per frame, also in the air, or is lower than 2 cm.
 
-    The code takes z as height. Its published pipeline passes motions in which y is height; here, the height is that
-    which the functions are meant to read. `toes` are the indices of the left and the right toe.
+    The code takes z as height, although its published pipeline passes motions in which y is height. Here, it is y.
+    `toes` are the indices of the left and the right toe.
     """
 
-    NAMES = ("jitter_degree", "dynamic_degree", "ground_penetration", "foot_sliding", "foot_floating")
+    parts = ("jitter_degree", "dynamic_degree", "ground_penetration", "foot_sliding", "foot_floating")
+    names = (*parts, "measured")
     DIRECTIONS: Mapping[str, bool | None] = {"dynamic_degree": None}
     required_fps = 20
 
@@ -109,72 +89,67 @@ def _speed(points: Tensor) -> Tensor:
 def mbench_floating(motion: Tensor, feet: Tensor, contact: Tensor) -> tuple[int, int, int]:
     """Counts the frames of `foot_floating` of a motion (F, J, 3) with two feet (F, 2, 3) in contact or not (F, 2).
 
-    Returns:
-        Frames in which the feet on the ground move unlike the body; frames of feet in the air that move much less than
-        the body, which count half; and frames in which both feet swing to and fro in the air.
+    They are those in which the feet on the ground move unlike the body; those of feet in the air that move much less
+    than the body, which count half; and those in which both feet swing to and fro in the air.
     """
     root = _speed(motion[:, 0])
     rate = _speed(feet - motion[:, :1]) / (root[:, None] + 1e-6)
     bad = (_speed(feet) > 1.2e-4) & ((rate < 0.6) | ((rate > 1.75) & (root[:, None] > 1.2e-4)))
     resting = root < 0.001
     carried = (contact.any(1) & (bad | ~contact).all(1) & ~resting).sum()
-    runs = [_runs(~contact[:, foot]) for foot in range(contact.shape[1])]
-    lagging = 0
-    for foot, in_the_air in enumerate(runs):
-        for begin, end in in_the_air:
-            part = slice(begin, end)
-            if end - begin >= 4 and 2 * int(resting[part].sum()) <= end - begin:
-                lagging += int((rate[part, foot] < 0.4).sum())
-    swinging = 0
-    for begin, end in ((max(a, c), min(b, d)) for a, b in runs[0] for c, d in runs[1]):
-        if end - begin >= 4:
-            path = feet[begin + 1 : end, 0] - feet[begin, 0]
-            path = path / (path.norm(dim=-1, keepdim=True) + 1e-6)
-            angles = torch.rad2deg(torch.acos((path @ path[-1]).clamp(-1, 1)))
-            swinging += end - begin if len(find_peaks(angles.numpy())[0]) > 2 else 0
+    lagging = swinging = 0
+    for foot in (0, 1):
+        for begin, end in _runs(~contact[:, foot]):
+            if 2 * int(resting[begin:end].sum()) <= end - begin:
+                lagging += int((rate[begin:end, foot] < 0.4).sum())
+    for begin, end in _runs(~contact.any(1)):  # both feet
+        path = feet[begin + 1 : end, 0] - feet[begin, 0]
+        path = path / (path.norm(dim=-1, keepdim=True) + 1e-6)
+        angles = torch.rad2deg(torch.acos((path @ path[-1]).clamp(-1, 1)))
+        swinging += end - begin if len(find_peaks(angles.numpy())[0]) > 2 else 0
     return int(carried), lagging, swinging
 
 
-def _runs(true: Tensor) -> list[tuple[int, int]]:
-    """Returns begin and end (exclusive) of the maximal runs of True in (F,)."""
-    edges = torch.nn.functional.pad(true.int(), (1, 1)).diff().nonzero()[:, 0].tolist()
-    return list(zip(edges[::2], edges[1::2], strict=True))
+def _runs(aloft: Tensor) -> list[tuple[int, int]]:
+    """Returns begin and end (exclusive) of the runs of at least four True in (F,)."""
+    runs = torch.nn.functional.pad(aloft.int(), (1, 1)).diff().nonzero().view(-1, 2).tolist()
+    return [(begin, end) for begin, end in runs if end - begin >= 4]
 
 
-class KimodoQuality(MeanOverMotions):
+class KimodoQuality(PublishedPhysics):
     """Foot skating of Kimodo (7330e7e), in m/s, from joints and from the contacts that the model predicts.
 
     `skate_from_height`: mean speed of toes that are lower than 5 cm; `skate_ratio`: fraction of their steps with more
-    than 0.2 m/s, among steps that begin and end lower than 5 cm; `low`: mean fraction of steps that begin there,
-    without which the two say nothing, since a motion that never touches the floor gets 0, the best value. If the
-    representation has contacts: `skate_from_contacts` and `skate_max` are mean and largest speed of heels and toes in
-    contact; `contact_consistency` is the fraction of contacts that agree with a heuristic (slower than 0.15 m/s and
-    lower than 10 cm), higher is better.
+    than 0.2 m/s, among steps that begin and end lower than 5 cm; `low`: mean fraction of steps that begin there: if it
+    is 0, so are the two. If the representation has contacts: `skate_from_contacts` and `skate_max` are mean and largest
+    speed of heels and toes in contact; `contact_consistency` is the fraction of contacts that agree with a heuristic
+    (slower than 0.15 m/s and lower than 10 cm), higher is better.
 
-    All speeds are in three dimensions. A motion of one frame has no values. `feet` are the indices of left heel, left
-    toe, right heel and right toe.
+    Speeds are in three dimensions; a motion of one frame has none. `feet` are left heel and toe, right heel and toe.
     """
 
-    NAMES = ("skate_from_height", "skate_ratio", "low", "skate_from_contacts", "skate_max", "contact_consistency")
+    parts = ("skate_from_height", "skate_ratio", "low", "skate_from_contacts", "skate_max", "contact_consistency")
+    names = (*parts, "measured")
     DIRECTIONS: Mapping[str, bool | None] = {"low": None, "contact_consistency": True}
 
     def update(self, joints: Tensor, mask: Tensor, keys: Tensor, contacts: Tensor | None = None) -> None:
         motions = self.real_frames(joints, mask)
         labels = [None] * len(motions) if contacts is None else contacts[mask].split(mask.sum(1).tolist())
-        self.keep_values(keys, [self.measure(*pair) for pair in zip(motions, labels, strict=True)])
+        self.add(keys, [self.measure(*pair) for pair in zip(motions, labels, strict=True)])
 
     def measure(self, motion: Tensor, contacts: Tensor | None = None) -> Values:
-        """Computes the values of a motion (F, J, 3) with contacts (F, 4) bool of its feet; NaN = undefined."""
-        values: dict[str, Tensor | float] = dict.fromkeys(self.NAMES, math.nan)
+        """Computes the values of a motion (F, J, 3) with contacts (F, 4) bool of its feet, as far as it has them."""
         if len(motion) < 2:
-            return values
+            return {}
         feet = motion[:, self.feet]
         speed = feet.double().diff(dim=0).norm(dim=-1) * self.fps
         low, toes = feet[:, 1::2, 1] < 0.05, speed[:, 1::2]
         first, both = low[:-1], low[:-1] & low[1:]
-        values["skate_from_height"] = (toes * first).sum() / (first.sum() + 1e-6)
-        values["skate_ratio"] = ((toes > 0.2) & both).sum() / (both.sum() + 1e-6)
-        values["low"] = first.double().mean()
+        values: Values = {
+            "skate_from_height": (toes * first).sum() / (first.sum() + 1e-6),
+            "skate_ratio": ((toes > 0.2) & both).sum() / (both.sum() + 1e-6),
+            "low": first.double().mean(),
+        }
         if contacts is not None:
             on = contacts[:-1]
             values["skate_from_contacts"] = (speed * on).sum() / (on.sum() + 1e-6)
@@ -184,20 +159,18 @@ class KimodoQuality(MeanOverMotions):
         return values
 
 
-class KimodoConstraints(MeanOverMotions):
+class KimodoConstraints(MotionMean):
     """Constraint errors of Kimodo (7330e7e), for edits: distance of kept parts from the real motion, in meters.
 
-    `root2d_err`: over the ground, of the root in frames that keep it, with its 95th percentile over motions,
-    `root2d_err_p95`; `root2d_acc`: fraction of those frames with at most 10 cm; `fullbody_keyframe`: of all joints in
-    frames that keep all; `end_effector`: of the kept joints in other frames. The code compares the root with a smoothed
-    trajectory that the user draws; here, it is that of the real motion.
+    `root2d_err`: over the ground, of the root in frames that keep it; `root2d_err_p95`: its 95th percentile over
+    motions; `root2d_acc`: fraction of those frames with at most 10 cm; `fullbody_keyframe`: of all joints in frames
+    that keep all; `end_effector`: of the kept joints in other frames. In the code, the user draws the trajectory of the
+    root; here, it is that of the real motion.
     """
 
-    NAMES = ("root2d_err", "root2d_acc", "fullbody_keyframe", "end_effector")
-
-    def __init__(self):
-        super().__init__(fps=0)
-        self.names = (*self.NAMES, "root2d_err_p95")
+    higher_is_better = False
+    parts = ("root2d_err", "root2d_acc", "fullbody_keyframe", "end_effector")
+    names = (*parts, "root2d_err_p95")
 
     def update(self, joints: Tensor, real_joints: Tensor, mask: Tensor, kept: Tensor, keys: Tensor) -> None:
         motions = self.real_frames(joints, mask)
@@ -206,34 +179,32 @@ class KimodoConstraints(MeanOverMotions):
         for motion, real, part in zip(motions, real_joints, parts, strict=True):
             off, full = motion.double() - real[: len(motion)], part.all(1)
             errors.append(constraint_errors(off[part[:, 0], 0][:, [0, 2]], off[full], off[part & ~full[:, None]]))
-        self.keep_values(keys, errors)
+        self.add(keys, errors)
 
-    def value(self, values: Tensor, defined: Tensor) -> dict[str, float | None]:
-        """Returns the means and the percentile; few edits have all kinds of constraints, so there is no `measured`."""
-        means = list(super().value(values, defined).values())[:-1]
-        roots = values[defined[:, 0], 0]
-        percentile = roots.quantile(0.95).item() if len(roots) else None
-        return dict(zip(self.names, (*means, percentile), strict=True))
+    def value(self, sums: Tensor, counts: Tensor) -> dict[str, float | None]:
+        roots = sums[counts[:, 0] > 0, 0]
+        return super().value(sums, counts) | {"root2d_err_p95": roots.quantile(0.95).item() if len(roots) else None}
 
 
 def constraint_errors(root: Tensor, full: Tensor, parts: Tensor) -> dict[str, Tensor]:
     """Computes the values of `KimodoConstraints` from offsets of a motion, (N, 2) or (..., 3); NaN without any."""
     root, full, parts = (offset.norm(dim=-1) for offset in (root, full, parts))
-    near = (root <= 0.1).double().mean()
-    return dict(zip(KimodoConstraints.NAMES, (root.mean(), near, full.mean(), parts.mean()), strict=True))
+    near = (root <= 0.1).double()
+    values = (root.mean(), near.mean(), full.mean(), parts.mean())
+    return dict(zip(KimodoConstraints.parts, values, strict=True))
 
 
-class PhysicalFootContact(MeanOverMotions):
+class PhysicalFootContact(PublishedPhysics):
     """Physical foot contact score (PFC) of EDGE (17c3428), x 10^4: acceleration of the root without a planted foot.
 
-    Mean over frames of the product of both feet's steps over the ground and the root's acceleration, which is divided
-    by its largest value; downward accelerations count as 0. A foot's step is that of its ankle or toe, whichever is
-    smaller. It has no value for motions without acceleration, which the code averages as NaN, and none at other rates
-    than 30 frames per second: steps are in meters per frame, so that half the rate would give about four times the
-    score. `feet` are the indices of left ankle, left toe, right ankle and right toe.
+    Mean over frames of the product of both feet's steps over the ground, in meters per frame, and the root's
+    acceleration, divided by its largest value; downward accelerations count as 0. A foot's step is the smaller one of
+    its ankle and toe. Motions without acceleration, which the code averages as NaN, have no value, and none has one at
+    other rates than 30 frames per second. `feet` are left ankle and toe, right ankle and toe.
     """
 
-    NAMES = ("pfc",)
+    parts = ("pfc",)
+    names = (*parts, "measured")
     required_fps = 30
 
     def measure(self, motion: Tensor) -> Values:
@@ -254,12 +225,10 @@ class TransitionJerk(SampleMetric):
     """Peak jerk and area under the jerk of transitions between kept and generated frames, of FlowMDM (e81c67f).
 
     The jerk of a frame is the largest L1 norm of the third difference of a joint's position, in meters per frame^3.
-    Windows of `window` frames are centered at the first frame after each change from kept to generated frames or back;
-    windows that the motion does not contain are left out. The published windows have 60 frames at 20 frames per second
-    and 30 at 30. `peak` is the maximum of the mean over windows, frame by frame; `area` is the sum of its distances
-    from the jerk of real motions, which is also large for motions smoother than those, and grows with the window;
-    `windows` is the number of windows. The published jerk of real motions is of HumanML3D at 20 frames per second and
-    of BABEL at 30; at other rates there is no area.
+    Windows of `window` frames (published: 60 at 20 frames per second, 30 at 30) are centered at the first frame after
+    each change from kept to generated frames or back, if the motion contains them. `peak` is the maximum of the mean
+    over windows, frame by frame; `area` is the sum of its distances from `JERK_OF_REAL_MOTIONS`, also if it is smaller,
+    and grows with the window; `windows` is the number of windows. At other frame rates there is no area.
     """
 
     higher_is_better = False
@@ -272,15 +241,15 @@ class TransitionJerk(SampleMetric):
 
     def update(self, joints: Tensor, mask: Tensor, kept: Tensor, keys: Tensor) -> None:
         parts = kept[mask].split(mask.sum(1).tolist())
-        totals, counts = [], []
-        for motion, part in zip(self.real_frames(joints, mask), parts, strict=True):
+        total = torch.zeros(len(keys), self.window - 3, dtype=torch.float64)
+        count = torch.zeros(len(keys), 1, dtype=torch.long)
+        for row, (motion, part) in enumerate(zip(self.real_frames(joints, mask), parts, strict=True)):
             seams = (part[1:] != part[:-1]).any(1).nonzero()[:, 0] + 1
-            starts = [int(seam) - self.window // 2 for seam in seams]
-            windows = [motion[s : s + self.window] for s in starts if 0 <= s <= len(motion) - self.window]
-            totals.append(sum(map(transition_jerk, windows), torch.zeros(self.window - 3, dtype=torch.float64)))
-            counts.append([len(windows)])
-        if totals:
-            super().update(keys=keys, total=torch.stack(totals), windows=torch.tensor(counts))
+            for start in (seams - self.window // 2).tolist():
+                if 0 <= start <= len(motion) - self.window:
+                    total[row] += transition_jerk(motion[start : start + self.window])
+                    count[row] += 1
+        super().update(keys=keys, total=total, windows=count)
 
     def value(self, total: Tensor, windows: Tensor) -> dict[str, float | None]:
         count = int(windows.sum())

@@ -5,12 +5,11 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from evaluators.metrics.samples import SampleMetric
+from evaluators.metrics.samples import MotionMean, SampleMetric
 from flame_mdm.representations import rotation
 from flame_mdm.representations.rifke import Rifke, upsample
 
 PARTS = ("root", "trajectory", "mean_local", "mean_global")
-
 RIFKE = Rifke()
 
 
@@ -18,8 +17,8 @@ def temos_parts(joints: Tensor) -> dict[str, Tensor]:
     """Returns root (F, 3), trajectory (F, 2), local (F, 20, 3) and global (F, 21, 3) positions, as compared by TEMOS.
 
     The motion (F, 21, 3), in KIT units, is placed on the floor, with its first root at x = z = 0 and its first heading
-    along +z. Local positions are those of all joints except the root, relative to the body in each frame: root at
-    x = z = 0, heading along +z, y above the floor. Floor and heading are those of `Rifke`, with their peculiarities.
+    along +z. Local positions, of all joints except the root, have the root at x = z = 0 and the heading along +z in
+    each frame. Floor and heading are those of `Rifke`, with their peculiarities.
     """
     ground = joints[:, :1] * joints.new_tensor([1.0, 0.0, 1.0])
     floor = joints.new_tensor([0.0, 1.0, 0.0]) * RIFKE.floor(joints)
@@ -42,11 +41,9 @@ def flame_parts(joints: Tensor, root: Tensor, parents: Sequence[int]) -> dict[st
 class PositionErrors(SampleMetric):
     """APE and AVE by part. Each clip adds a sum of position errors, its number of frames, and its variance errors.
 
-    Args:
-        samples: motions per text. If there are several, the best and the worst are used, as in TEMOS: those with the
-            smallest and the largest APE of the root, which also provide all other values.
-        upsampling: frames of a recording per frame of a motion. Above 1, motions are interpolated and compared with
-            the recordings.
+    With several `samples` per text, the values are those of the best and the worst one, as in TEMOS: those with the
+    smallest and the largest APE of the root. `upsampling` is the number of frames of a recording per frame of a motion;
+    above 1, motions are interpolated and compared with the recordings.
     """
 
     higher_is_better = False
@@ -80,23 +77,17 @@ class PositionErrors(SampleMetric):
                 missing = "the store has no recordings at their own frame rate"
                 raise self.error(f"{missing}. Prepare the data set again with force=true")
             motions, real_motions = [upsample(motion, self.upsampling) for motion in motions], list(references)
-        position, variance, frames = [], [], []
+        rows = []
         for motion, real in zip(motions, real_motions, strict=True):
             a, b = self.parts(motion.double()), self.parts(real.double())
             length = min(len(a["root"]), len(b["root"]))
             self.need(length, 2, "frames of a motion")
-            errors = self.errors(*({part: values[:length] for part, values in x.items()} for x in (a, b)))
-            position.append(errors[0])
-            variance.append(errors[1])
-            frames.append([length])
-        if frames:
-            super().update(
-                keys=keys,
-                groups=keys if groups is None or self.samples == 1 else groups,
-                position=torch.stack(position),
-                variance=torch.stack(variance),
-                frames=position[0].new_tensor(frames),
-            )
+            position, variance = self.errors(*({part: x[:length] for part, x in side.items()} for side in (a, b)))
+            rows.append((position, variance, position.new_tensor([length])))
+        if rows:
+            position, variance, frames = map(torch.stack, zip(*rows, strict=True))
+            groups = keys if groups is None or self.samples == 1 else groups
+            super().update(keys=keys, groups=groups, position=position, variance=variance, frames=frames)
 
     def value(self, groups: Tensor, position: Tensor, variance: Tensor, frames: Tensor) -> dict[str, float | None]:
         """Returns "ape" and "ave" of each of `PARTS`, such as `ape_root`; of several per text, `best_ape_root` ..."""
@@ -127,8 +118,8 @@ class TemosPositionErrors(PositionErrors):
 
     APE is the distance of `temos_parts`, averaged over joints, and over all frames of all clips. AVE is the distance of
     the variances over time (n - 1 in the denominator) of each coordinate, averaged over joints, then over clips. Both
-    are in units of 1000 KIT units, which the tables call meters and which are 1.56 m. TEMOS compares at 100 frames per
-    second: `upsampling=8`.
+    are in 1000 KIT units, which are 1.56 m and which the tables call meters. TEMOS compares at 100 frames per second:
+    `upsampling=8`.
     """
 
     units_per_meter = 640.0  # KIT units per meter of `joints`, as in the KIT representations
@@ -136,7 +127,7 @@ class TemosPositionErrors(PositionErrors):
     def parts(self, joints: Tensor) -> dict[str, Tensor]:
         if joints.shape[1] != 21:
             raise self.error(f"{joints.shape[1]} joints, but defined only for KIT's 21 (MMM)")
-        return {part: values / 1000 for part, values in temos_parts(joints * self.units_per_meter).items()}
+        return {part: x / 1000 for part, x in temos_parts(joints * self.units_per_meter).items()}
 
     def errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         distance = [(a[part] - b[part]).norm(dim=-1) for part in PARTS]
@@ -145,12 +136,12 @@ class TemosPositionErrors(PositionErrors):
 
 
 class FlamePositionErrors(PositionErrors):
-    """APE and AVE as in FLAME's code, which its tables do not use. In meters and square meters.
+    """APE and AVE of `flame_parts` as in FLAME's code, which its tables do not use. In meters and square meters.
 
-    Compares `flame_parts`. The error of the trajectory is the sum of the distances along its two axes; the local error
-    is that of bones. Variances of global positions are averaged over joints before they are compared. Each clip has the
-    same weight. FLAME's joints lack the orientation of the root and start from its translation; here, `joints` are
-    compared unchanged, and the first one is the root. `parents` are those of the skeleton's joints, -1 for the root.
+    The error of the trajectory is the sum of the distances along its two axes; the local error is that of bones.
+    Variances of global positions are averaged over joints before they are compared. Each clip has the same weight.
+    FLAME's joints lack the orientation of the root and start from its translation; here, `joints` are compared
+    unchanged, and the first one is the root. `parents` are those of the skeleton's joints, -1 for the root.
     """
 
     equal_clips = True
@@ -171,11 +162,10 @@ class FlamePositionErrors(PositionErrors):
         return position, torch.stack(variance)
 
 
-class EditErrors(SampleMetric):
+class EditErrors(MotionMean):
     """Distances of the joints from those of real motions, of the part that an edit kept or generated."""
 
     higher_is_better = False
-    states = ("errors",)
 
     def update(
         self,
@@ -187,51 +177,42 @@ class EditErrors(SampleMetric):
         kept: Tensor | None = None,
     ) -> None:
         motions = zip(self.real_frames(joints, mask), self.real_frames(real_joints, real_mask), strict=True)
-        rows, errors = [], []
+        errors = []
         for row, (motion, real) in enumerate(motions):
             length = min(len(motion), len(real))  # motions are compared up to the end of the shorter one
             distance = (motion[:length].double() - real[:length].double()).norm(dim=-1)
             old = torch.zeros_like(distance, dtype=torch.bool) if kept is None else kept[row][mask[row]][:length]
-            error = self.errors_of(distance, old)
-            if error:
-                rows.append(row)
-                errors.append(torch.stack(error))
-        if rows:
-            super().update(keys=keys[rows], errors=torch.stack(errors))
+            errors.append(self.errors_of(distance, old))
+        self.add(keys, errors)
 
-    def errors_of(self, distance: Tensor, kept: Tensor) -> list[Tensor]:
-        """Returns the errors of a motion from distances (F, J) and kept joints (F, J) bool; [] if it has none."""
+    def errors_of(self, distance: Tensor, kept: Tensor) -> dict[str, Tensor]:
+        """Returns the errors of a motion from distances (F, J) and kept joints (F, J) bool; {} if it has none."""
         raise NotImplementedError
 
 
 class DisplacementErrors(EditErrors):
     """ADE and FDE: mean distance of the joints in all predicted frames, and in the last of them, in meters.
 
-    This is the usual definition in motion prediction (Yuan and Kitani 2020): the average over joints and frames of a
-    clip, then over clips. Frames and joints that an edit kept are ignored; without `kept`, there are none. Raises
-    `UserError` if nothing of a motion was generated. MFM (Table 3) gives no formula, code or unit for its numbers,
-    which are too large for meters: they are not comparable.
+    As usual in motion prediction (Yuan and Kitani 2020), averaged over joints and frames of a clip, then over clips.
+    What an edit `kept` is ignored. Raises `UserError` if nothing of a motion was generated. MFM (Table 3) gives no
+    formula, code or unit for its numbers, which are too large for meters: they are not comparable.
     """
 
     names = ("ade", "fde")
 
-    def errors_of(self, distance: Tensor, kept: Tensor) -> list[Tensor]:
+    def errors_of(self, distance: Tensor, kept: Tensor) -> dict[str, Tensor]:
         new = ~kept
         if not new.any():
             raise self.error("a motion has no generated frame to compare")
         last = int(new.any(1).nonzero()[-1])
-        return [distance[new].mean(), distance[last][new[last]].mean()]
-
-    def value(self, errors: Tensor) -> dict[str, float | None]:
-        return dict(zip(self.names, errors.mean(0).tolist(), strict=True))
+        return {"ade": distance[new].mean(), "fde": distance[last][new[last]].mean()}
 
 
 class KeptDrift(EditErrors):
     """Distance in the world, in meters, by which the kept part of an edit has moved. A metric of this project.
 
-    `mean` is over the kept joints and frames of a motion and then over motions, `largest` over all. With features
-    relative to the root, an edit can keep steps and poses exactly, and still move a kept ending to where the new part
-    before it leads.
+    `mean` is over the kept joints and frames of a motion, then over motions, `largest` over all. With features relative
+    to the root, an edit can keep steps and poses exactly, and still move a kept ending to where the new part leads.
     """
 
     names = ("mean", "largest")
@@ -241,8 +222,10 @@ class KeptDrift(EditErrors):
     ) -> None:
         super().update(joints, mask, real_joints, real_mask, keys, kept)
 
-    def errors_of(self, distance: Tensor, kept: Tensor) -> list[Tensor]:
-        return [distance[kept].mean(), distance[kept].max()] if kept.any() else []
+    def errors_of(self, distance: Tensor, kept: Tensor) -> dict[str, Tensor]:
+        return {"mean": distance[kept].mean(), "largest": distance[kept].max()} if kept.any() else {}
 
-    def value(self, errors: Tensor) -> dict[str, float | None]:
-        return {"mean": errors[:, 0].mean().item(), "largest": errors[:, 1].max().item()}
+    def value(self, sums: Tensor, counts: Tensor) -> dict[str, float | None]:
+        drift = sums[counts[:, 0] > 0]
+        values = (drift[:, 0].mean().item(), drift[:, 1].max().item()) if len(drift) else (None, None)
+        return dict(zip(self.names, values, strict=True))

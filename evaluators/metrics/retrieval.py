@@ -47,8 +47,7 @@ def plain_caption(caption: str) -> str:
 def whole_set_retrieval(similarity: Tensor, correct: Tensor | None = None) -> dict[str, float]:
     """Computes recall and median rank of TMR from similarities (N, N) of texts (rows) and motions (columns).
 
-    `correct` (N, N) bool, symmetric: pairs that count as correct, of which the best one sets the rank; None = the
-    diagonal.
+    The rank is that of the best pair that is `correct` (N, N) bool, symmetric; None = the diagonal.
     """
     values: dict[str, float] = {}
     for way, table in (("t2m", similarity), ("m2t", similarity.T)):
@@ -68,10 +67,9 @@ def best_ranks(similarity: Tensor, correct: Tensor) -> Tensor:
 
 
 class CaptionMetric(SampleMetric):
-    """A metric of motions and captions, some of which are the same.
+    """A metric of motions and captions, some of which are the same: those equal but for case, punctuation and spaces.
 
-    `encoder` is a mapping with the `_target_` of a text encoder: captions with a cosine above `SAME` are the same. None
-    = only captions equal but for case, punctuation and spaces.
+    With `encoder`, a mapping with the `_target_` of a text encoder, so are captions with a cosine above `SAME`.
     """
 
     higher_is_better = True
@@ -92,15 +90,12 @@ class CaptionMetric(SampleMetric):
 
 
 class MultiPositiveRPrecision(CaptionMetric):
-    """R-precision, motions for a text, where the motions of the same captions are correct, too.
+    """R-precision, motions for a text, where the motions of the same captions are correct, too: our definition.
 
-    This is our definition; no paper has one. Pools are those of `MotionsForText`, to which `single_top1`, ... are equal
-    up to ties. In each pool, the motions of a text are its own and those whose captions are the same. `top1`, ... is
-    the fraction of texts with one of their motions among the k nearest, ties sharing their mean rank; `proper` is
-    R-precision of information retrieval: the fraction of their R motions among the R nearest. Since similar captions
-    raise all values, `chance_top1`, ... are those of a random order, and `positives` is the mean of R.
-
-    `normalize` ranks by cosine instead of Euclidean distance, as for `MotionsForText`.
+    Pools and `normalize` are those of `MotionsForText`, to which `single_top1`, ... are equal up to ties. `top1`, ...
+    is the fraction of texts with one of their correct motions among the k nearest, ties sharing their mean rank;
+    `proper` is R-precision of information retrieval: the fraction of their R correct motions among the R nearest. Since
+    similar captions raise all values, `chance_top1`, ... are those of a random order, and `positives` is the mean of R.
     """
 
     names = (*(f"{kind}top{k}" for kind in ("", "single_", "chance_") for k in TOP), "proper", "positives")
@@ -145,11 +140,11 @@ class TMRRetrieval(CaptionMetric):
     `all`: all motions, the own one is correct; `threshold`: motions of the same captions are correct, too;
     `dissimilar`: only among 100 motions with different captions, at most half of all, and none without an encoder;
     `batches`: in batches of 32, the rest is left out; their medians are averaged. Each has recall `t2m_top1`, ... in
-    [0, 1] and median rank `t2m_median` (1 = best) of motions for texts, and `m2t_` of texts for motions. TMR's encoder
-    of captions is all-mpnet-base-v2.
+    [0, 1] and median rank `t2m_median` (1 = best) of motions for texts, and `m2t_` of texts for motions.
 
-    TMR's lists of dissimilar motions and of batches are for HumanML3D and KIT; here, batches are drawn, and each
-    dissimilar motion is that whose caption is the least similar to those taken before it, after the first by key.
+    TMR's encoder of captions is all-mpnet-base-v2; its dissimilar motions and batches are lists for HumanML3D and KIT.
+    Here, batches are drawn, and each dissimilar motion is that whose caption is the least similar to those before it,
+    after the first by key.
     """
 
     names = tuple(

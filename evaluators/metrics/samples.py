@@ -1,6 +1,6 @@
-"""Base classes of metrics: shares of events, and values computed from all samples, sorted by key."""
+"""Base classes of metrics, which compute their values from all samples, sorted by key."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -14,88 +14,31 @@ Value = float | dict[str, float | None] | None
 """What `compute` returns: a number, or numbers by name; None without samples."""
 
 
-class MotionMetric(Metric):
-    """Base class of all metrics. Several take `seed`, that of their random draws."""
-
-    full_state_update = False
-    names: Sequence[str] = ()  # names of the values; empty if there is only one
-
-    @property
-    def update_called(self) -> bool:
-        """Always True: a metric without samples returns None, without a warning."""
-        return True
-
-    def error(self, message: str) -> UserError:
-        return UserError(f"{type(self).__name__}: {message}")
-
-    def need(self, count: int, least: int, what: str) -> None:
-        """Raises `UserError` if `count` is less than `least`."""
-        if count < least:
-            raise self.error(f"got {count} {what}, needs at least {least}")
-
-    def real_frames(self, joints: Tensor, mask: Tensor) -> list[Tensor]:
-        """Splits joints (B, F, J, 3) with mask (B, F) into motions (F, J, 3), whose sums are the same in every batch.
-
-        Raises `UserError` if a motion contains NaN or infinity.
-        """
-        frames = joints.detach()[mask]
-        motions = list(frames.split(mask.sum(1).tolist()))
-        # A sum is finite only if all numbers are, and is faster to compute.
-        bad = 0 if frames.sum().isfinite() else sum(not bool(motion.isfinite().all()) for motion in motions)
-        if bad:
-            raise self.error(f"{bad} of {len(motions)} motions are not finite. Did the model diverge?")
-        return motions
-
-
-class Timed(MotionMetric):
-    """A metric that depends on `fps`, the frame rate of the motions."""
-
-    def __init__(self, fps: float):
-        super().__init__()
-        self.fps = fps
-
-
-class Share(MotionMetric):
-    """A share of events, or one share per name. Counts are whole numbers, so sums do not depend on their order."""
-
-    hits: Tensor
-    total: Tensor
-
-    def __init__(self):
-        super().__init__()
-        for state in ("hits", "total"):
-            self.add_state(state, torch.zeros(len(self.names) or 1, dtype=torch.long), dist_reduce_fx="sum")
-
-    def count(self, events: Mapping[str, bool]) -> None:
-        """Counts one event for some of the names: True = a hit."""
-        for name, hit in events.items():
-            self.hits[self.names.index(name)] += int(hit)
-            self.total[self.names.index(name)] += 1
-
-    def compute(self) -> Any:
-        """Returns the share in [0, 1], or one by name; None for what was never counted."""
-        counts = zip(self.hits.tolist(), self.total.tolist(), strict=True)
-        shares = [hits / total if total else None for hits, total in counts]
-        return dict(zip(self.names, shares, strict=True)) if self.names else shares[0]
-
-
-class SampleMetric(MotionMetric):
-    """A metric that keeps one row per sample and computes its value from all rows, sorted by key.
+class SampleMetric(Metric):
+    """Base class of all metrics: keeps one row per sample and computes its value from all rows, sorted by key.
 
     The value therefore does not depend on the batches, their order or the number of processes. Processes may hold any
-    number of samples, including none. `value` is the formula.
+    number of samples, including none. `value` is the formula. Several metrics take `seed`, that of their random draws.
 
     Attributes:
         states: names of the kept rows, in the order of the arguments of `value`. Each row also has a key. Unless
             `update` is overridden, they are its inputs.
+        names: names of the values; empty if there is only one.
     """
 
+    full_state_update = False
     states: tuple[str, ...]
+    names: Sequence[str] = ()
 
     def __init__(self):
         super().__init__()
         for name in ("keys", *self.states):
             self.add_state(name, [], dist_reduce_fx="cat")
+
+    @property
+    def update_called(self) -> bool:
+        """Always True: a metric without samples returns None, without a warning."""
+        return True
 
     def update(self, **rows: Any) -> None:
         """Adds equally many rows by the names of their states, which include the keys; `ValueError` otherwise."""
@@ -159,6 +102,27 @@ class SampleMetric(MotionMetric):
             )
         return groups.argsort(stable=True).unflatten(0, (len(names), samples))
 
+    def error(self, message: str) -> UserError:
+        return UserError(f"{type(self).__name__}: {message}")
+
+    def need(self, count: int, least: int, what: str) -> None:
+        """Raises `UserError` if `count` is less than `least`."""
+        if count < least:
+            raise self.error(f"got {count} {what}, needs at least {least}")
+
+    def real_frames(self, joints: Tensor, mask: Tensor) -> list[Tensor]:
+        """Splits joints (B, F, J, 3) with mask (B, F) into motions (F, J, 3), whose sums are the same in every batch.
+
+        Raises `UserError` if a motion contains NaN or infinity.
+        """
+        frames = joints.detach()[mask]
+        motions = list(frames.split(mask.sum(1).tolist()))
+        # A sum is finite only if all numbers are, and is faster to compute.
+        bad = 0 if frames.sum().isfinite() else sum(not bool(motion.isfinite().all()) for motion in motions)
+        if bad:
+            raise self.error(f"{bad} of {len(motions)} motions are not finite. Did the model diverge?")
+        return motions
+
     def _sync_dist(self, dist_sync_fn: Any = None, process_group: Any | None = None) -> None:
         """Gathers the rows of all processes. The default of torchmetrics fails if a process has none."""
         states = {name: [rows.cpu() for rows in getattr(self, name)] for name in self._reductions}
@@ -167,6 +131,46 @@ class SampleMetric(MotionMetric):
         torch.distributed.all_gather_object(gathered, states, group=group)
         for name in states:
             setattr(self, name, [rows.to(self.device) for part in gathered for rows in part[name]])
+
+
+class Timed(SampleMetric):
+    """A metric that depends on `fps`, the frame rate of the motions."""
+
+    def __init__(self, fps: float):
+        super().__init__()
+        self.fps = fps
+
+
+class MotionMean(SampleMetric):
+    """Means of values of motions. A motion adds any number of values to a mean, such as one, or one per frame."""
+
+    states = ("sums", "counts")
+    parts: Sequence[str] = ()  # names of the values of a motion, if `names` has more
+
+    def update(self, joints: Tensor, mask: Tensor, keys: Tensor) -> None:
+        self.add(keys, [self.measure(motion) for motion in self.real_frames(joints, mask)])
+
+    def measure(self, motion: Tensor) -> Any:
+        """Computes the values of a motion (F, J, 3), by name if the metric has `names`; NaN or missing = undefined."""
+        raise NotImplementedError
+
+    def add(self, keys: Tensor, motions: Sequence[Any]) -> None:
+        """Adds motions, given as the results of `measure`; undefined values do not count."""
+        names, rows = self.parts or self.names, []
+        for motion in motions:
+            values = [motion.get(name, torch.nan) for name in names] if names else [motion]
+            numbers = [torch.as_tensor(value, dtype=torch.float64) for value in values]
+            defined = [x[~x.isnan()] for x in numbers]
+            rows.append([[float(x.sum()) for x in defined], [len(x) for x in defined]])
+        if rows:
+            sums, counts = torch.tensor(rows, dtype=torch.float64).unbind(1)
+            super().update(keys=keys, sums=sums, counts=counts)
+
+    def value(self, sums: Tensor, counts: Tensor) -> Any:
+        """Returns the mean of all values, by name if the metric has `names`; None for what has no value."""
+        totals = zip(sums.sum(0).tolist(), counts.sum(0).tolist(), strict=True)
+        means = [total / count if count else None for total, count in totals]
+        return dict(zip(self.parts or self.names, means, strict=True)) if self.names else means[0]
 
 
 class TwoSets(SampleMetric):

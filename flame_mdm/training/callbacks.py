@@ -245,7 +245,7 @@ class SampleMotions(Callback):
         prompts: texts, action names, or (text, requested attributes) pairs; None = `UNCONDITIONED` motions. If a model
             is conditioned on actions and no prompt is one of them, its first actions are used instead.
         seconds: length of the motions.
-        metrics: torchmetrics by name; their `update` takes some of joints (B, F, J, 3), mask (B, F) and requested.
+        metrics: torchmetrics by name; their `update` takes some of joints (B, F, J, 3), mask (B, F), keys, requested.
     """
 
     def __init__(
@@ -351,9 +351,9 @@ class SampleMotions(Callback):
         for name, metric in self.metrics.items():
             metric.reset()
             metric.distributed_available_fn = bool  # returns False: no synchronization, this process has all motions
-            for motion, attributes in zip(motions, requested, strict=True):
+            for key, (motion, attributes) in enumerate(zip(motions, requested, strict=True)):
                 mask = torch.ones(1, len(motion), dtype=torch.bool)
-                inputs = {"joints": motion[None], "mask": mask, "requested": [attributes]}
+                inputs = {"joints": motion[None], "mask": mask, "requested": [attributes], "keys": torch.tensor([key])}
                 metric.update(**{k: v for k, v in inputs.items() if k in signature(metric.update).parameters})
             result = metric.compute()
             parts = result if isinstance(result, dict) else {"": result}

@@ -130,7 +130,7 @@ def test_every_eighth_frame_is_kept(stem, tmp_path):
     ("damage", "message"),
     [
         (lambda f: (f / "00003_fke.csv").unlink(), r"00003_fke\.csv: no such file"),
-        (lambda f: (f / "00001_annotations.json").write_text("[]"), r"00001_meta\.json: nb_annotations does not match"),
+        (lambda f: (f / "00001_annotations.json").write_text("[]"), r"00001_meta\.json does not match"),
         (lambda f: (f / "00001_fke.csv").write_text("head\n" + "a,b\n" * 99), r"00001_fke\.csv: damaged"),
         (lambda f: np.savetxt(f / "00001_fke.csv", np.zeros((90, 63)), delimiter=","), "63 columns, not a row number"),
         (lambda f: np.savetxt(f / "00001_fke.csv", np.full((90, 64), math.nan), delimiter=","), "non-finite"),

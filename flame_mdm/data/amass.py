@@ -27,7 +27,6 @@ SUBSETS: dict[str, list[str]] = FACTS["subsets"]
 Argument = TypeVar("Argument")
 Result = TypeVar("Result")
 ARCHIVE = re.compile(r"(.+)\.tar(\.bz2|\.xz|\.gz)?")
-CHUNK = 32  # number of unpacked recordings that a process reads at a time
 RELEASE = "not a motion of AMASS's SMPL+H G release, which is the one to download"
 GET_IT = "register at https://amass.is.tue.mpg.de, download the SMPL+H G archives and put them there"
 
@@ -69,10 +68,10 @@ def key_of(path: str) -> str | None:
     All names of a subset give the same key, in index files, archives and folders, nested or not. Case is ignored, and
     spaces are underscores, as in later releases. Files of the SMPL-X release have the keys of SMPL+H.
     """
-    *folders, file = PurePosixPath(path).parts
-    for depth in range(len(folders) - 1, -1, -1):
-        if subset := _BY_NAME.get(_plain(folders[depth])):
-            rest = "/".join([*folders[depth + 1 :], PurePosixPath(file).stem])
+    whole = PurePosixPath(path).with_suffix("")
+    for folder in whole.parents:
+        if subset := _BY_NAME.get(_plain(folder.name)):
+            rest = str(whole.relative_to(folder))
             return f"{subset}/{rest.replace(' ', '_').lower()}".replace("_stageii", "_poses")
     return None
 
@@ -117,13 +116,10 @@ class Amass:
         for subset, of_subset in groupby(sorted(keys), _subset_of):
             members = list(of_subset)
             absent = [key for key in members if key not in self.files]
-            if subset in self.archives or not absent:
-                continue
-            if len(absent) < len(members):
-                lines.append(f"{subset}: {len(absent)} of {len(members)} recordings are missing, such as {absent[0]}")
-            else:
+            if absent and subset not in self.archives:
                 names = " or ".join((subset, *SUBSETS[subset]))
-                lines.append(f"{subset}: missing ({len(members)} recordings); the archive is called {names}")
+                line = f"{subset}: {len(absent)} of {len(members)} recordings are missing, such as {absent[0]}"
+                lines.append(f"{line}; the archive is called {names}")
         return lines
 
     def check(self, keys: Collection[str]) -> None:
@@ -138,14 +134,13 @@ class Amass:
         Function and arguments are picklable; the file name is prepended to its `UserError`s.
         """
         self.check(arguments)
-        tasks: list[tuple[Path | dict[str, Path], dict[str, Argument]]] = []  # archive or files, and arguments
-        for subset, of_subset in groupby(sorted(arguments), _subset_of):
-            keys = list(of_subset)
-            is_unpacked = all(key in self.files for key in keys)
-            size = CHUNK if is_unpacked else len(keys)
-            for chunk in (keys[begin : begin + size] for begin in range(0, len(keys), size)):
-                source = {key: self.files[key] for key in chunk} if is_unpacked else self.archives[subset]
-                tasks.append((source, {key: arguments[key] for key in chunk}))
+        tasks: list[tuple[Path, dict[str, Argument]]] = []  # a recording or an archive, and arguments
+        for subset, keys in groupby(sorted(arguments), _subset_of):
+            of_subset = {key: arguments[key] for key in keys}
+            if of_subset.keys() <= self.files.keys():
+                tasks += [(self.files[key], {key: argument}) for key, argument in of_subset.items()]
+            else:
+                tasks.append((self.archives[subset], of_subset))
         # An archive takes minutes: this process must not begin with one alone.
         for results in in_order(partial(_run, function), tasks, min(workers or cores(), len(tasks))):
             yield from results
@@ -156,12 +151,12 @@ def _subset_of(key: str) -> str:
 
 
 def _run(
-    function: Callable[[Argument, Recording], Result], task: tuple[Path | dict[str, Path], dict[str, Argument]]
+    function: Callable[[Argument, Recording], Result], task: tuple[Path, dict[str, Argument]]
 ) -> list[tuple[str, Result]]:
-    source, arguments = task
+    path, arguments = task
     results = {}
-    is_archive = isinstance(source, Path)
-    contents = _members(source, arguments) if is_archive else ((key, str(path), path) for key, path in source.items())
+    is_archive = ARCHIVE.fullmatch(path.name)
+    contents = _members(path, arguments) if is_archive else zip(arguments, [str(path)], [path], strict=True)
     for key, name, content in contents:
         with naming(name):
             results[key] = function(arguments[key], read(content, name))

@@ -55,11 +55,10 @@ class Babel(MotionSource):
     """Clips of `LENGTH` frames, as raw motions of the SMPL representations, in AMASS's coordinates.
 
     A longer label gives one window every `STRIDE` frames. A shorter one is extended past its end, or left out if the
-    motion is too short for that. A label covers frames floor(20 start) to floor(20 end) - 1, as in FLAME's code.
+    motion ends before. A label covers frames floor(20 start) to floor(20 end) - 1, as in FLAME's code.
 
-    Both splits train on BABEL's entire train part and use 20 % of its val part for testing. Our split uses 20 % of the
-    motions, so that no motion is in two splits. FLAME's split uses every fifth clip, so that overlapping windows of one
-    label are in both val and test.
+    Both splits train on BABEL's entire train part and test on 20 % of its val part: ours on 20 % of the motions, so
+    that no motion is in two splits, FLAME's on every fifth clip, so that overlapping windows are in both val and test.
 
     Args:
         path: folder with `train.json`, `extra_train.json`, `val.json` and `extra_val.json` (BABEL v1.0).
@@ -99,8 +98,7 @@ class Babel(MotionSource):
         keys = dict.fromkeys(label.motion for part in PARTS for label in labels[part])
         measured = self.amass.map(keys, _measure, self.workers)
         lengths = dict(ProgressBar(measured, "measuring the motions of AMASS", len(keys), unit=" motions"))
-        windows = []
-        trained = {label.motion for label in labels["train"]}
+        windows, trained = [], {label.motion for label in labels["train"]}
         for part in PARTS:
             number = 0
             for label in labels[part]:
@@ -137,7 +135,8 @@ class Babel(MotionSource):
     def _annotations(self, path: Path) -> Iterator[tuple[str, Segment]]:
         data = read_json(required(path, GET_IT))
         key = "frame_anns" if path.stem.startswith("extra_") else "frame_ann"
-        with naming(path, AttributeError, KeyError, TypeError, IndexError, what="not in the layout of BABEL v1.0: "):
+        errors = (AttributeError, KeyError, TypeError, IndexError, ValueError)
+        with naming(path, *errors, what="not in the layout of BABEL v1.0: "):
             for sequence in data.values():
                 annotation = sequence[key][0] if key == "frame_anns" and sequence[key] else sequence[key]
                 for label in annotation["labels"] if annotation else ():
@@ -149,20 +148,16 @@ class Babel(MotionSource):
     def _split(self, part: str, number: int, motion: str) -> Split:
         if part == "train":
             return "train"
-        if not self.published_split:
-            return hashed_split(motion, val=80, test=20)
-        return "test" if number % 5 == 0 else "val"
+        flames: Split = "test" if number % 5 == 0 else "val"
+        return flames if self.published_split else hashed_split(motion, val=80, test=20)
 
 
 def _segment(label: dict[str, Any]) -> Segment:
-    """Returns the fields of a label that are used; raises `TypeError` if one has the wrong type."""
+    """Returns the fields of a label that are used; raises `TypeError` if one is of another kind."""
     text, kinds, times = label["proc_label"], label["act_cat"], (label["start_t"], label["end_t"])
-    for time in times:
-        if time is not None and not (isinstance(time, int | float) and abs(time) < 1e6):
-            raise TypeError(f"start_t or end_t: {time!r:.40}")
-    for value in (text, *(kinds or ())):
-        if not isinstance(value, str | None):
-            raise TypeError(f"proc_label or act_cat: {value!r:.40}")
+    are_texts = all(isinstance(value, str | None) for value in (text, *(kinds or ())))
+    if not are_texts or not all(time is None or -1e6 < time < 1e6 for time in times):
+        raise TypeError(f"{label!r:.200}")
     return text, kinds, *times
 
 

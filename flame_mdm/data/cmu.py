@@ -36,6 +36,7 @@ SLACK = 0.05  # seconds, one frame at 20 fps, by which durations may differ
 SHORTEST = 40  # rows of features of a clip, as in HumanML3D
 BLENDED = 3  # frames after the T-pose of a Daz-friendly file that are blended with it
 FASTEST = 15.0  # m/s of the pelvis, above which a conversion is damaged; sprinters reach 12
+Evidence = tuple[float | None, int | None, bool]  # arguments of `decide_rate` that the captions give
 MAP = {**LAYOUTS["CMU ASF"].map, "pelvis": "pelvis", "neck": {"lowerneck": 0.5, "head": 0.5}, "head": "face"}
 _HIP, _KNEE, _ANKLE, _HEAD = (ADULT[SMPL22.joints.index(n)] for n in ("left_hip", "left_knee", "left_ankle", "head"))
 ADULT_LEG = float(np.linalg.norm(_KNEE) + np.linalg.norm(_ANKLE))
@@ -56,6 +57,9 @@ class Item(NamedTuple):
     end: int | None = None
     mirrored: bool = False
 
+    def cuts(self, frames: int) -> list[Cut]:
+        return cuts(self.id, frames, self.descriptions, SHORTEST)
+
 
 class CMU(MotionSource):
     """Clips of HumanML3D, and recordings with captions of KIT-ML, on the 22 joints of SMPL.
@@ -64,12 +68,10 @@ class CMU(MotionSource):
     clip of HumanML3D's test (val) split is cut from them, and are split by subject if HumanML3D has no clip of them.
 
     Args:
-        path: folder with recordings such as 02_01.bvh, or 02_01.amc and 02.asf, in any subfolders; or a zip or tar
-            archive of one, which is unpacked into a temporary folder.
+        path: folder with recordings such as 02_01.bvh, or 02_01.amc and 02.asf, in any subfolders; or an archive of it.
         captions: clone of HumanML3D's repository, or a folder with texts, splits and index; default: `path`.
             KIT-ML's captions of AMASS, kitml*.json, are used if they are in one of the two folders.
-        motion: "joints" for representations of joint positions; "smpl" for those of SMPL's rotations, which are
-            computed from the positions.
+        motion: "joints" for representations of joint positions; "smpl" for SMPL's rotations, computed from these.
         exclude: recordings to leave out, such as 02_01.
     """
 
@@ -173,10 +175,10 @@ class CMU(MotionSource):
     def count(self) -> int:
         items = [item for items in self.items.values() for item in items]
         ends = {id_: round(seconds * FPS) for id_, _, _, seconds in self.kit}
-        return sum(len(_cuts(item, (item.end or ends[item.id]) - item.start - 1)) for item in items)
+        return sum(len(item.cuts((item.end or ends[item.id]) - item.start - 1)) for item in items)
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        """Yields the clips of all recordings that can be read, sorted by recording; `findings` lists the others."""
+        """Yields the clips of all recordings that can be read; `findings` lists the others."""
         self.check_fps(fps, FPS)
         last = {_recording(row.key): row.end for row in sorted(self.humanml3d[0], key=lambda row: row.end)}
         seconds = {trial: length for _, trial, _, length in self.kit}
@@ -188,8 +190,7 @@ class CMU(MotionSource):
                 self.leave_out("recordings that cannot be read")
                 continue
             for item, motion in zip(self.items[trial], motions, strict=True):
-                kept = _cuts(item, len(motion) - 1)
-                if not kept:
+                if not (kept := item.cuts(len(motion) - 1)):
                     self.leave_out(f"motions shorter than {SHORTEST} frames or of {MAX_LENGTH} or more")
                 for cut in kept:
                     if item.end and not item.mirrored:
@@ -203,7 +204,6 @@ class CMU(MotionSource):
         return self._counts
 
     def findings(self) -> list[str]:
-        """Returns why recordings were left out."""
         return [f"left out: {error}" for error in self._errors]
 
 
@@ -231,15 +231,11 @@ def _test_captions(path: Path) -> dict[str, list[Description]]:
     return texts
 
 
-def _cuts(item: Item, frames: int) -> list[Cut]:
-    return cuts(item.id, frames, item.descriptions, SHORTEST)
-
-
 def decide_rate(frames: int, header: float | None, seconds: float | None, last: int | None, is_sixty: bool) -> float:
     """Returns the frame rate of a recording of `frames` frames.
 
-    Durations are trusted first, by KIT-ML in `seconds` and by HumanML3D's `last` frame at 20 fps; then CMU's list;
-    then the `header` of the file: conversions say 120 for nearly all recordings.
+    Durations are trusted first, KIT-ML's `seconds` and HumanML3D's `last` frame at 20 fps; then CMU's list; then the
+    `header` of the file: conversions say 120 for nearly all recordings.
     """
     rates = RATES if header in (None, *RATES) else (*RATES, header)
     if fitting := [rate for rate in rates if seconds and abs(frames / rate - seconds) < SLACK]:
@@ -253,8 +249,8 @@ def standardize(tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
     """Returns a recording with the bones of CMU's own files, and the fields of `Layout` for them.
 
     The MotionBuilder-friendly conversion lost a bone of the trunk and of each hand. The Daz-friendly one moves another
-    figure, whose bones are replaced by a CMU subject's. Both begin with a T-pose, which is removed. Joints `pelvis` and
-    `face` are added where SMPL has pelvis and head. Other skeletons are returned unchanged, with no fields.
+    figure, whose bones are replaced. Both begin with a T-pose, which is removed. Joints `pelvis` and `face` are added
+    where SMPL has pelvis and head. Other skeletons are returned unchanged, with no fields.
     """
     is_original, unit, blended = "lfemur" in tree.joints, LAYOUTS["CMU ASF"].unit, 0
     if "LHipJoint" in tree.joints:
@@ -291,13 +287,8 @@ def _added(tree: Bvh, **joints: tuple[str, Any]) -> Bvh:
     )
 
 
-def _read(
-    kind: str, task: tuple[list[Path], tuple[float | None, int | None, bool], list[Item]]
-) -> list[np.ndarray] | str:
-    """Returns the items of a recording from the first of its files that can be read, or the first error.
-
-    A task contains files, arguments of `decide_rate`, and items.
-    """
+def _read(kind: str, task: tuple[list[Path], Evidence, list[Item]]) -> list[np.ndarray] | str:
+    """Returns the items of a recording from the first of its files that can be read, or the first error."""
     files, evidence, items = task
     errors = []
     for file in files:

@@ -5,7 +5,6 @@ download and how the data set is prepared.
 """
 
 import csv
-import io
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from functools import cached_property, partial
@@ -54,9 +53,8 @@ def read_index(path: Path) -> list[IndexedClip]:
     """Reads the clips of HumanML3D's `index.csv`."""
     required(path, "it is index.csv of https://github.com/EricGuo5513/HumanML3D")
     rows = []
-    lines = csv.DictReader(io.StringIO(read_text(path), newline=""))
     with naming(path, csv.Error, KeyError, TypeError, ValueError, what="not HumanML3D's index of clips: "):
-        for line in lines:
+        for line in csv.DictReader(read_text(path).splitlines()):
             source, name = line["source_path"], PurePosixPath(line["new_name"]).stem
             key = PurePosixPath(source).stem if "humanact12" in source.lower() else key_of(source)
             if key is None:
@@ -75,14 +73,12 @@ def by_recording(rows: Iterable[IndexedClip]) -> dict[str, list[IndexedClip]]:
 
 
 class HumanML3D(T2MFolder):
-    """The processed folder with 263 features; missing motions are first created from AMASS if `amass` is given.
-
-    They are created from `index.csv` and HumanAct12's joints, `humanact12` or `pose_data/humanact12.zip`, which are in
-    the folder or next to it.
+    """The processed folder with 263 features.
 
     Args:
         path, exclude: as for `T2MFolder`; the folder must contain texts and splits.
-        amass: folder of AMASS's SMPL+H G archives, packed or unpacked.
+        amass: folder of AMASS's SMPL+H G archives, packed or unpacked, from which missing motions are created. This
+            also takes `index.csv` and HumanAct12's joints, `pose_data/humanact12.zip`, in the folder or next to it.
         body_models: folder of the extended SMPL+H model.
         bone_lengths: 22 bone lengths, in meters, of the skeleton that all motions are retargeted to.
     """

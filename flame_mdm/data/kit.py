@@ -75,10 +75,9 @@ class KITTemos(MotionSource):
         required(self.path, self.get_motions)
         for name in names:
             captions, meta = (read_json(self.path / f"{name}_{kind}.json") for kind in ("annotations", "meta"))
-            if not isinstance(captions, list) or not all(isinstance(text, str) for text in captions):
-                raise UserError(f"{self.path}/{name}_annotations.json: damaged: not a list of texts")
-            if not isinstance(meta, dict) or len(captions) != meta.get("nb_annotations"):
-                raise UserError(f"{self.path}/{name}_meta.json: nb_annotations does not match {name}_annotations.json")
+            are_texts = isinstance(captions, list) and all(isinstance(text, str) for text in captions)
+            if not are_texts or not isinstance(meta, dict) or len(captions) != meta.get("nb_annotations"):
+                raise UserError(f"{self.path}: {name}_annotations.json is damaged, or {name}_meta.json does not match")
             if captions:
                 texts[name] = captions
         return texts

@@ -138,9 +138,8 @@ def front_view(pose: np.ndarray, root: np.ndarray, camera: np.ndarray, video: Vi
 
     VIBE's camera is weak-perspective: a scale s and a shift. ACTOR's code places the body at x, y = the shift and at
     the depth z at which a camera of focal length f shows it in that size: z = f / (s w / 2) in an image w pixels wide.
-    `pose` (F, 72) is axis-angle, `root` (F, 3) relative to the body; `camera` (F, 4) has the scales sx and sy, of which
-    only the first is used, then the shift. Returns (F, 75) float32: translation relative to the first frame and pose,
-    in camera axes.
+    `pose` (F, 72) is axis-angle, `root` (F, 3) relative to the body; `camera` (F, 4) has scales sx (used) and sy, then
+    the shift. Returns (F, 75) float32: translation relative to the first frame and pose, in camera axes.
     """
     depth = FOCAL_LENGTH / (np.abs(camera[:, 0]) * IMAGE_SIZE / 2)
     shift = np.concatenate([camera[:, 2:], depth[:, None]], 1)

@@ -194,7 +194,7 @@ def test_bad_recordings_are_listed_and_the_good_ones_prepared(folder, capsys):
     (motions / "18_01.bvh").write_text("known to be bad")
     (motions / "02/02_02.bvh").write_text("not read, the original is there")
     words = ["data=cmu", f"source={motions}", f"data_root={folder}", "data.source.workers=1"]
-    assert main(["prepare", *words, f"captions={folder / 'clone'}"]) == 0
+    assert main(["prepare", *words, f"data.source.captions={folder / 'clone'}"]) == 0
     output = capsys.readouterr().out
     assert re.search(r"left out: \S*/02_01\.amc", output)
     assert "lshin is no moving bone of the skeleton" in output

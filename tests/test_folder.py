@@ -175,7 +175,7 @@ def test_the_table_gives_captions_actions_splits_and_sources(tmp_path: Path):
 HEADLESS = {joint: f"{joint}?" for joint in SMPL22.joints}
 LYING = WALK[..., [0, 2, 1]] * [1, -1, 1]
 BAD = {
-    "no motion": (lambda f: [p.unlink() for p in f.rglob("*.np*")], "no motion in it; give a folder"),
+    "no motion": (lambda f: [p.unlink() for p in f.rglob("*.np*")], "no motions in it; give a folder"),
     "twice": (lambda f: np.savez(f / "one.npz", joints=WALK, fps=30), r"one\.npz: has the same name as one\.npy"),
     "no caption": (lambda f: (f / "one.txt").unlink(), "1 of 3 motions have no caption, such as one"),
     "unknown id": (lambda f: write_table(f, [{"id": "once", "text": "a"}]), r"captions\.csv, line 2: .*'once'"),

@@ -7,7 +7,6 @@ from typing import ClassVar
 from flame_mdm.commands import STORE, BodySettings, DataSettings, above_zero
 from flame_mdm.config import instantiate
 from flame_mdm.errors import UserError, say
-from flame_mdm.reporting.browse import choose, find, write_page
 from flame_mdm.sampler_options import option
 
 
@@ -34,6 +33,7 @@ def main(settings: BrowseSettings) -> None:
     node = settings.data_node(settings.source)
 
     from flame_mdm.data.store import Store
+    from flame_mdm.reporting.browse import choose, find, write_page
     from flame_mdm.visualize.body import load_body
 
     body = load_body(settings.body)

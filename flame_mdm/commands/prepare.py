@@ -5,13 +5,13 @@ from typing import ClassVar
 
 from flame_mdm.commands import STORE, DataSettings
 from flame_mdm.config import instantiate
-from flame_mdm.errors import UserError, say
+from flame_mdm.errors import say
 from flame_mdm.sampler_options import option
 
 
 @dataclass(frozen=True, kw_only=True)
 class PrepareSettings(DataSettings):
-    """usage: flame-mdm prepare data=NAME [source=PATH] [captions=PATH] [representation=NAME] [check|verify|force=true]
+    """usage: flame-mdm prepare data=NAME [source=PATH] [representation=NAME] [check|verify|force=true]
 
     Converts a data set, as distributed by its owners, into a packed store under data/. `check=true` only lists the
     files that exist and those that are missing; `verify=true` checks an existing store; `force=true` rewrites it.
@@ -19,7 +19,6 @@ class PrepareSettings(DataSettings):
 
     OBJECTS: ClassVar = ("data",)
     source: str | None = option(None, "folder or archive, if the data set needs one")
-    captions: str | None = option(None, "folder of the captions, if the data set keeps them apart from the motions")
     check: bool = option(False, "list the files that exist and those that are missing, prepare nothing")
     verify: bool = option(False, "check and report on an existing store, write nothing")
     force: bool = option(False, "rewrite an existing store")
@@ -27,10 +26,6 @@ class PrepareSettings(DataSettings):
 
 def main(settings: PrepareSettings) -> None:
     node = settings.data_node(settings.source)
-    if settings.captions is not None:
-        if "captions" not in node["source"]:
-            raise UserError(f"captions={settings.captions}: {node['name']} takes none. Drop captions=")
-        node["source"]["captions"] = settings.captions
 
     from flame_mdm.data.store import write_store
     from flame_mdm.data.verify import deviations, lines, report
@@ -49,7 +44,8 @@ def main(settings: PrepareSettings) -> None:
         return
     if (data.folder / STORE).exists() and not settings.force:
         store = data.open()
-        say(f"{data.folder}: already prepared (force=true rewrites it, verify=true checks it)", *data.changed())
+        say(f"{data.folder}: already prepared (force=true rewrites it, verify=true checks it)")
+        say(*data.source.changed(data.folder / STORE))
     else:
         store = write_store(data.folder, data.source, representation)
         say(*data.source.findings())

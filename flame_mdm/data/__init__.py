@@ -48,23 +48,18 @@ class MotionSource(ABC):
     """A data set in the form in which it is published."""
 
     name: str
-    named_by_recipe: bool = False
-    """Whether the name of the data set is `data.name` of the recipe, because the files are the user's own."""
+    named_by_recipe: bool = False  # whether its name is `data.name` of the recipe: the files are the user's own
     options: Mapping[str, Any] = {}
     """Arguments of the constructor that define the data, as JSON values; not those that say where files are and how to
     read them. They are saved in the store, and commands compare them with the recipe's."""
-    actions: tuple[str, ...] = ()
-    """Names of the action labels, in the order of their numbers; empty for sets without labels."""
-    verbs: tuple[str, ...] = ()
-    """All forms of the verbs in the captions, if they are known: sentences of several actions are split at them."""
+    actions: tuple[str, ...] = ()  # names of the action labels, in the order of their numbers
+    verbs: tuple[str, ...] = ()  # all forms of the verbs in the captions, at which sentences are split, or none
     captions_may_be_shared: bool = False  # whether the license allows checkpoints to contain captions
     published_split: bool = False
     """Whether the split is the one used in papers although it tests on clips seen in training or leaves no validation
     clips. Saved in the store and in every result."""
-    workers: int = 0
-    """Number of processes that read and encode; 0 = one per core, 1 = this process only. Most sources take it."""
-    exclude: Collection[str] = ()
-    """Names to leave out."""
+    workers: int = 0  # processes that read and encode; 0 = one per core, 1 = this process only
+    exclude: Collection[str] = ()  # names to leave out
 
     @cached_property
     def excluded(self) -> Counter[str]:
@@ -77,10 +72,7 @@ class MotionSource(ABC):
             self.excluded[reason] += count
 
     def not_excluded(self, named: Mapping[str, Value], path: Path) -> dict[str, Value]:
-        """Returns the values of names that `exclude` lacks, and counts the others; raises `UserError` if it names more.
-
-        A source calls this once.
-        """
+        """Returns the values of names that `exclude` lacks; counts the others, or raises `UserError` if it has more."""
         if unknown := set(self.exclude) - named.keys():
             raise UserError(f"data.source.exclude: {path} has no {some(unknown)}")
         self.leave_out("motions by data.source.exclude", len(self.exclude))
@@ -125,9 +117,6 @@ class MotionSource(ABC):
                 f"{self.name} has {published:g} frames per second, but representation.fps is {fps:g}. Set "
                 f"representation.fps={published:g}"
             )
-
-
-# What the readers of data sets share ----------------------------------------------------------------------------------
 
 
 def required(path: Path, get_it: str) -> Path:

@@ -133,10 +133,10 @@ class Clips(Dataset[Sample]):
             frames = np.minimum(np.arange(length) + first, clip.length - 1)
             features = self.representation.rebase(self.store.motion(clip)[frames])
             x = torch.from_numpy((features - self.mean) / self.std)
-            samples.append((clip.id, x, self.caption(index, caption), clip.action))
+            samples.append((clip.id, x, clip.captions[caption] if clip.captions else None, clip.action))
         return samples
 
-    def draw(self, indices: Sequence[int], batch: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def draw(self, indices: Sequence[int] | np.ndarray, batch: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns first frame, number of frames and number of the caption (B,) of clips in a batch.
 
         They are functions of (seed, batch, index); in evaluation (batch -1), they are always the same.
@@ -152,7 +152,3 @@ class Clips(Dataset[Sample]):
         """Number (clips,) of the caption of each clip in evaluation, chosen by the id of the clip."""
         draws = (key("caption", self.seed, -1, clip.id) % max(1, len(clip.captions)) for clip in self.clips)
         return np.fromiter(draws, np.int64, len(self.clips))
-
-    def caption(self, index: int, number: int) -> str | None:
-        """Returns a caption of a clip; None if the clip has none."""
-        return self.clips[index].captions[number] if self.captions[index] else None

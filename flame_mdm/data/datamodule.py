@@ -72,14 +72,6 @@ def evaluation_batches(lengths: np.ndarray, batch_size: int, *, rank: int, world
     return [[(int(i), -1) for i in mine[b : b + batch_size]] for b in range(0, len(mine), batch_size)]
 
 
-def _check_crop(crop: Crop) -> None:
-    if not isinstance(crop, Crop):
-        raise UserError(f"data.crop={crop!s:.80}: not a crop rule; give one such as those in flame_mdm.data.crops")
-    for name, frames in (("shortest", crop.shortest()), ("longest", crop.longest())):
-        if type(frames) is not int or not 1 <= frames <= MAX_FRAMES:
-            raise UserError(f"data.crop: its {name} sample has {frames!s:.20} frames; give 1 to {MAX_FRAMES:,}")
-
-
 class MotionDataModule(LightningDataModule):
     """Prepares a data set if it is not prepared yet, and serves its batches.
 
@@ -91,10 +83,10 @@ class MotionDataModule(LightningDataModule):
         num_workers: number of loading processes; 0 loads in the training process.
         crop: rule for the frames of a sample and the minimum length of a clip.
         seed: of the random draws.
-        resident: whether the data set is kept on the training device, where batches are gathered without workers. The
-            batches are the same. "auto": yes, if it takes at most a quarter of the free memory.
-        pad_multiple: batches are padded to multiples of this number of frames, at most to the longest sample of the
-            crop rule, so that compiled networks see few shapes.
+        resident: whether the data set is kept on the training device, where the same batches are gathered without
+            workers. "auto": if it takes at most a quarter of the free memory.
+        pad_multiple: batches are padded to multiples of this number of frames, so that compiled networks see few
+            shapes, at most to the longest sample of the crop rule.
     """
 
     def __init__(
@@ -112,16 +104,18 @@ class MotionDataModule(LightningDataModule):
         pad_multiple: int = 1,
     ):
         super().__init__()
+        frames = (crop.shortest(), crop.longest()) if isinstance(crop, Crop) else (None,)
+        is_crop = all(type(number) is int and 1 <= number <= MAX_FRAMES for number in frames)
         for key, value, is_valid, remedy in (
             ("batch_size", batch_size, batch_size >= 1, "a batch has at least one clip"),
             ("num_workers", num_workers, num_workers >= 0, "give 0 or more"),
             ("name", name, bool(name), "give the data set a name"),
             ("resident", resident, isinstance(resident, bool) or resident == "auto", "give true, false or auto"),
             ("pad_multiple", pad_multiple, 1 <= pad_multiple <= MAX_FRAMES, f"give 1 to {MAX_FRAMES:,}"),
+            ("crop", crop, is_crop, f"give a rule of flame_mdm.data.crops, of 1 to {MAX_FRAMES:,} frames"),
         ):
             if not is_valid:
-                raise UserError(f"data.{key}={value}: {remedy}")
-        _check_crop(crop)
+                raise UserError(f"data.{key}={value!s:.80}: {remedy}")
         if source.named_by_recipe:
             source.name = name
         self.source, self.representation = source, representation
@@ -135,7 +129,7 @@ class MotionDataModule(LightningDataModule):
     def prepare_data(self) -> None:
         """Writes the store if there is none; Lightning calls this in one process only."""
         if (self.folder / "store.json").exists():
-            say(*self.changed())
+            say(*self.source.changed(self.folder / "store.json"))
         else:
             write_store(self.folder, self.source, self.representation)
 
@@ -192,10 +186,6 @@ class MotionDataModule(LightningDataModule):
             )
         return ["clips: " + ", ".join(counts), *(() if store.info["published_split"] else advice)]
 
-    def changed(self) -> list[str]:
-        """Returns a line if files of the user's own data set were added or changed after it was prepared."""
-        return self.source.changed(self.folder / "store.json")
-
     def captions(self) -> list[str]:
         """Returns all distinct captions of the store, sorted."""
         return sorted({caption for clip in self.open().clips for caption in clip.captions})
@@ -221,8 +211,7 @@ class MotionDataModule(LightningDataModule):
                 f"{free / 2**30:.1f} GiB free. Set data.resident=auto"
             )
         automatic = self.resident == "auto" and device.type in ("cpu", "cuda") and size <= free / SHARE
-        fits = self.resident is True or automatic
-        self.device = device if fits else None
+        self.device = device if self.resident is True or automatic else None
         return self.device
 
     def clips(self, split: Split) -> Clips:

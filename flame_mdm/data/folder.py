@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -54,13 +54,6 @@ class Note:
     source: str | None = None
 
 
-class Facts(NamedTuple):
-    """Skeleton of a motion with unit and frame rate, and the mean vertical component of the direction of its trunk."""
-
-    skeleton: str
-    upright: float = math.nan  # unknown for rotations of SMPL
-
-
 class Folder(MotionSource):
     """Motions and captions in a folder, as SMPL's 22 joints or as raw motions of the SMPL representation.
 
@@ -100,8 +93,8 @@ class Folder(MotionSource):
     def clips(self, fps: float) -> Iterator[Clip]:
         self.actions = tuple(sorted({note.action for note in self.notes.values() if note.action is not None}))
         read = in_order(partial(_read, self.motion, fps), self.files.values(), self.workers)
-        for name, (motion, facts) in zip(self.files, read, strict=True):
-            self._upright[facts.skeleton].append(facts.upright)
+        for name, (motion, skeleton, upright) in zip(self.files, read, strict=True):
+            self._upright[skeleton].append(upright)
             note, split = self.notes[name], self.splits[name]
             action = None if note.action is None else self.actions.index(note.action)
             clip = Clip(name.replace("/", "_"), motion, note.texts, split, note.source or name, action)
@@ -117,11 +110,11 @@ class Folder(MotionSource):
     def check(self) -> list[str]:
         """Reads all captions and motions; returns lines on skeletons and failures."""
         errors = []
-        for facts in in_order(partial(_look, self.motion), self.files.values(), self.workers):
-            if isinstance(facts, str):
-                errors.append(f"error: {facts}")
+        for error, skeleton, upright in in_order(partial(_look, self.motion), self.files.values(), self.workers):
+            if error:
+                errors.append(f"error: {error}")
             else:
-                self._upright[facts.skeleton].append(facts.upright)
+                self._upright[skeleton].append(upright)
         if errors:
             summary = f"error: {len(errors)} of {len(self.files)} motions of {self.path} cannot be prepared"
             return [*self.findings(), *errors, summary]
@@ -152,8 +145,9 @@ class Folder(MotionSource):
                     raise UserError(f"{path}: has the same name as {files[name].name}; each motion needs its own name")
                 files[name] = path
         if not files:
-            what = "no motion in it" if self.path.is_dir() else "a file" if self.path.exists() else "no such folder"
-            raise FileNotFoundError(f"{self.path}: {what}; give a folder of {', '.join(ENDINGS)} files")
+            raise FileNotFoundError(
+                f"{self.path}: no such folder, or no motions in it; give a folder of {', '.join(ENDINGS)} files"
+            )
         return self.not_excluded(dict(sorted(files.items())), self.path)
 
     def changed(self, store: Path) -> list[str]:
@@ -232,16 +226,20 @@ def _add(notes: dict[str, Note], cells: dict[str, str]) -> None:
             setattr(note, key, value)
 
 
-def _look(kind: str, path: Path) -> Facts | str:
-    """Returns the facts about a motion, or what is wrong with it."""
+def _look(kind: str, path: Path) -> tuple[str, str, float]:
+    """Returns what is wrong with a motion, or "", and what `_read` returns beside it."""
     try:
-        return _read(kind, LOOK_FPS, path)[1]
+        return "", *_read(kind, LOOK_FPS, path)[1:]
     except ValueError as error:
-        return str(error)
+        return str(error), "", math.nan
 
 
-def _read(kind: str, fps: float, path: Path) -> tuple[np.ndarray, Facts]:
-    """Reads and checks joints or, if `kind` is "smpl", a raw motion."""
+def _read(kind: str, fps: float, path: Path) -> tuple[np.ndarray, str, float]:
+    """Reads and checks joints or, if `kind` is "smpl", a raw motion.
+
+    Also returns its skeleton with unit and frame rate, and the mean vertical component of the direction of its trunk,
+    which is NaN for rotations of SMPL.
+    """
     skeleton = skeleton_file(path)
     fields = read_skeleton(skeleton) if skeleton else {}
     where = f" ({os.path.relpath(skeleton)})" if skeleton else ""
@@ -256,19 +254,16 @@ def _read(kind: str, fps: float, path: Path) -> tuple[np.ndarray, Facts]:
             if rate is None:
                 raise UserError("no frame rate in the file. Write it into skeleton.yaml, for example `fps: 30`")
             if "poses" in data:
-                return _from_smpl(kind, data, fps), Facts(f"AMASS, {rate:g} fps{where}")
+                return _from_smpl(kind, data, fps), f"AMASS, {rate:g} fps{where}", math.nan
             layout, names = array_layout(data["joints"], fields)
             joints = layout.apply(resample(data["joints"].astype(float), rate, fps), names)
         if kind == "smpl":
             raise UserError("contains no SMPL rotations; use AMASS .npz files, or set motion=joints")
-        if not np.isfinite(joints).all():
-            frame = int(np.argmin(np.isfinite(joints).all((1, 2))))
-            raise UserError(f"numbers in frame {frame} are not finite")
         check_size(joints, layout.unit, layout.children)
         check_feet(joints)
     trunk = joints[:, SMPL22.joints.index("neck")] - joints[:, 0]
     upright = float((trunk[:, 1] / np.linalg.norm(trunk, axis=1)).mean())
-    return joints, Facts(f"{layout_name(layout)}, unit {layout.unit:.4g}, {rate:g} fps{where}", upright)
+    return joints, f"{layout_name(layout)}, unit {layout.unit:.4g}, {rate:g} fps{where}", upright
 
 
 def _from_smpl(kind: str, data: dict[str, Any], fps: float) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Data sets that are kept on the training device, where batches are gathered without workers and copies."""
 
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -73,11 +73,11 @@ class ResidentLoader:
 
     def __iter__(self) -> Iterator[MotionBatch]:
         for draws in self.batches:
-            yield self._batch([index for index, _ in draws], draws[0][1])
+            yield self._batch(draws)
 
-    def _batch(self, indices: Sequence[int], number: int) -> MotionBatch:
-        rows = np.asarray(indices)
-        first, length, caption = self.clips.draw(indices, number)
+    def _batch(self, draws: list[Draw]) -> MotionBatch:
+        rows = np.array([index for index, _ in draws])
+        first, length, caption = self.clips.draw(rows, draws[0][1])
         begin = self.begin[rows]
         values = np.stack([begin + first, begin + self.clips.frames[rows] - 1, length, self.actions[rows]])
         start, last, lengths, action = sent(torch.from_numpy(values), self.features.device)[..., None]
@@ -87,7 +87,7 @@ class ResidentLoader:
         x = F.embedding(rows_of_frames, self.features)
         if adapts_cuts(self.clips.representation):
             x = ((self.clips.representation.rebase(x) - self.mean) / self.std).masked_fill(~mask[..., None], 0)
-        entries = [self.clips.clips[index] for index in indices]
+        entries = [self.clips.clips[index] for index in rows]
         has_text = bool(self.clips.captions[rows].all())
         return MotionBatch(
             x=x,

@@ -25,7 +25,6 @@ CAPTIONS = 8  # captions per clip
 PARTIAL = 0.25
 """Share of the training clips whose captions leave out some attributes; those of val and test state all of them."""
 UNSAID = {"speed": "normal", "amount": "quarter"}  # values that a caption need not state
-TENSES = ("present",) * 5 + ("progressive",) * 3 + ("past", "past", "future")
 CHOICE = re.compile(r"\[([^\[\]]*)\]")
 SLOT = re.compile(r"\{(\w+)(?:\.(\w+))?\}")
 VERB = re.compile(r"((?:\w+ly )?)<([^>]*)>")  # with an adverb before it: "is slowly walking"
@@ -91,22 +90,20 @@ def _sentence(rng: np.random.Generator, attributes: Attributes) -> tuple[str, se
 
 def _conjugated(rng: np.random.Generator, text: str, who: str, plural: bool) -> str:
     """Returns the text with its verbs in one tense; without a subject, as imperatives or participles."""
-    tense = _one(rng, TENSES if who else ("present", "present", "progressive"))
-    words = {"present": 0 if plural or not who else 1, "progressive": 2, "past": 3, "future": 0}
-    auxiliaries = {"progressive": "are " if plural else "is ", "future": "will "}
-    auxiliary = auxiliaries.get(tense, "") if who else ""
+    kind = "plural" if plural else "singular"
+    auxiliary, column = _one(rng, content()["tenses"][kind if who else "bare"])
 
     def form(verb: re.Match[str]) -> str:
         nonlocal auxiliary
         before, auxiliary = auxiliary, ""
-        return before + verb[1] + content()["verbs"][_one(rng, verb[2].split("/"))][words[tense]]
+        return before + verb[1] + content()["verbs"][_one(rng, verb[2].split("/"))][column]
 
     return re.sub(r"\ba (?=[aeio])", "an ", VERB.sub(form, text))
 
 
 def _entry(table: Mapping[str, Any], attributes: Attributes) -> Any:
     """Returns the entry for the action and one of its attributes, such as "walk left", or for the action, or None."""
-    action = attributes["action"]
+    action = str(attributes["action"])
     keys = [f"{action} {value}" for value in attributes.values()] + [action]
     return next((table[key] for key in keys if key in table), None)
 

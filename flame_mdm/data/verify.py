@@ -2,13 +2,13 @@
 
 import json
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Sequence
 from hashlib import sha1
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+import yaml
 
 from flame_mdm.data import SPLITS, some
 from flame_mdm.data.datamodule import MotionDataModule
@@ -67,74 +67,38 @@ def report(data: MotionDataModule) -> dict[str, Any]:
 
 
 def lines(content: dict[str, Any]) -> list[str]:
-    """Returns the lines of a report as an aligned table."""
-    rows: list[tuple[str, ...]] = []
-
-    def section(title: str, table: Iterable[Sequence[Any]], *head: str) -> None:
-        rows.extend([(), (title, *head), *((f"  {name}", *map(_cell, cells)) for name, *cells in table)])
-
-    rows.append(("data set", f"{content['dataset']} as {content['representation']} at {content['fps']:g} fps"))
-    rows.append(("fingerprint", content["fingerprint"]))
-    split = "as published" if content["published_split"] else "without leaks: each source is in one split only"
-    rows.append(("split", split))
-    rows.extend((f"sha256 {name}", digest) for name, digest in content["files"].items())
-    figures = ((name, f["found"], f["published"], f["state"]) for name, f in content["figures"].items())
-    section("figures", figures, "found", "published", "")
-    section("captions", content["captions"].items())
-    if content["actions"]:
-        section("clips by action", ((name, *splits.values()) for name, splits in content["actions"].items()), *SPLITS)
-    section("frames", content["frames"].items())
+    """Returns the lines of a report as YAML, with the first of many still clips and duplicates."""
     groups = [" = ".join(group) for group in content["duplicates"]]
-    anomalies = [
-        ("non-finite numbers", 0),
-        ("clips without movement", len(content["still"]), some(content["still"])),
-        ("duplicate motions", len(groups), some(groups)),
-        ("duplicates across splits", content["duplicates_across_splits"]),
-    ]
-    section("anomalies", anomalies)
-    section("deviation of mean and std from the training frames", content["statistics"].items())
-    section("left out", content["excluded"].items() or [("nothing", "")])
-    # the last cell of a row, which may be long, does not count for the width of its column
-    widths: Counter[int] = Counter()
-    for row in rows:
-        for column, cell in enumerate(row[:-1]):
-            widths[column] = max(widths[column], len(cell))
-    return [
-        "  ".join([*(cell.ljust(widths[i]) for i, cell in enumerate(row[:-1])), *row[-1:]]).rstrip() for row in rows
-    ]
-
-
-def _cell(value: Any) -> str:
-    return "-" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
+    shown = content | {"still": some(content["still"]) or "none", "duplicates": some(groups) or "none"}
+    return yaml.safe_dump(shown, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120).splitlines()
 
 
 def deviations(content: dict[str, Any]) -> list[str]:
     """Returns which figures of a report differ from the published ones, and by how much."""
-    differing = {name: figure for name, figure in content["figures"].items() if figure["state"] == "differs"}
-    numbers = {name: (figure["found"], figure["published"]) for name, figure in differing.items()}
+    differing = [
+        (name, f["found"], f["published"]) for name, f in content["figures"].items() if f["state"] == "differs"
+    ]
     return [
         f"{name}: {count:,} found, {published:,} published ({count - published:+,g}, {count / published - 1:+.2%})"
-        for name, (count, published) in numbers.items()
+        for name, count, published in differing
     ]
 
 
 def _figures(store: Store) -> dict[str, dict[str, Any]]:
     """Returns figures of the store and of the raw data when it was prepared; the raw data keeps names in both."""
-    by_split = store.info["clips"]
-    of_action = Counter(clip.action for clip in store.clips if clip.action is not None)
-    training = Counter(clip.action for clip in store.clips if clip.action is not None and clip.split != "test")
-    counted: dict[str, float] = {"clips": len(store.clips), **by_split}
-    if of_action:
-        counted["actions"] = len(of_action)
-    for kind, counts in (("clips", of_action), ("training clips", training)):
-        if counts:
+    labeled = [clip for clip in store.clips if clip.action is not None]
+    counted: dict[str, float] = {"clips": len(store.clips), **store.info["clips"]}
+    if labeled:
+        counted["actions"] = len({clip.action for clip in labeled})
+    for kind, splits in (("clips", SPLITS), ("training clips", ("train", "val"))):
+        if counts := Counter(clip.action for clip in labeled if clip.split in splits):
             counted[f"fewest {kind} per action"] = min(counts.values())
             counted[f"most {kind} per action"] = max(counts.values())
     raw: dict[str, float] = store.info.get("counts", {})
     counted = {f"{name} of the store" if name in raw else name: number for name, number in counted.items()} | raw
     published = read_yaml(PUBLISHED).get(store.info["dataset"], {})
     figures = {}
-    for name in [*published, *(name for name in counted if name not in published)]:
+    for name in published | counted:
         figure, number = published.get(name), counted.get(name)
         expected, tolerance = figure if isinstance(figure, list) else (figure, 0)
         if expected is None:

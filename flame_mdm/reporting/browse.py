@@ -1,23 +1,19 @@
 """Single-page view of a prepared data set: `flame-mdm browse data=bandai search="waves left"`"""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
+from markupsafe import Markup
 
+from flame_mdm.data.store import Entry, Store
+from flame_mdm.formats.motion import Motion
 from flame_mdm.reporting.page import render
-
-if TYPE_CHECKING:
-    from markupsafe import Markup
-
-    from flame_mdm.data.store import Entry, Store
-    from flame_mdm.formats.motion import Motion
-    from flame_mdm.representations import Representation
-    from flame_mdm.visualize.body import Mesh
+from flame_mdm.representations import Representation
+from flame_mdm.visualize import write_player
+from flame_mdm.visualize.body import Mesh
 
 SECONDS = 15  # seconds shown of a longer clip, to keep the page small
 
@@ -49,10 +45,6 @@ def choose(families: Sequence[list[Entry]], most: int) -> list[list[Entry]]:
 
 
 def motion(store: Store, representation: Representation, clip: Entry) -> Motion:
-    import torch
-
-    from flame_mdm.formats.motion import Motion
-
     shown = round(SECONDS * representation.fps)
     joints = representation.decode(torch.from_numpy(store.motion(clip)[:shown].copy())).numpy()
     below = joints[..., 1].min()
@@ -73,8 +65,6 @@ def write_page(
     title: str,
     body: Mesh | None = None,
 ) -> None:
-    from flame_mdm.visualize import write_player
-
     write_player(
         path,
         [motion(store, representation, clip) for clip in clips],
@@ -90,13 +80,11 @@ def describe(store: Store) -> Markup:
     info, fps = store.info, store.info["fps"]
     splits = {name: [clip for clip in store.clips if clip.split == name] for name, n in info["clips"].items() if n}
     counts = Counter(info["actions"][clip.action] for clip in store.clips if clip.action is not None)
-    rows = [[name, *_row(clips, fps)] for name, clips in splits.items()]
+    rows = []
+    for name, clips in splits.items():
+        lengths = np.array([clip.length for clip in clips])
+        captions = [caption for clip in clips for caption in clip.captions]
+        words = f"{np.mean([len(caption.split()) for caption in captions]):.1f}" if captions else ""
+        cells = [len(clips), f"{lengths.sum() / fps / 60:.1f}", lengths.min(), f"{np.median(lengths):g}", lengths.max()]
+        rows.append([name, *cells, len(captions), len(set(captions)), words])
     return render("browse.html", info=info, actions=counts.most_common(), rows=rows)
-
-
-def _row(clips: Sequence[Entry], fps: float) -> list[str]:
-    lengths = np.array([clip.length for clip in clips])
-    captions = [caption for clip in clips for caption in clip.captions]
-    words = f"{np.mean([len(caption.split()) for caption in captions]):.1f}" if captions else ""
-    cells = [len(clips), f"{lengths.sum() / fps / 60:.1f}", lengths.min(), f"{np.median(lengths):g}", lengths.max()]
-    return [f"{cell}" for cell in (*cells, len(captions), len(set(captions)), words)]

@@ -8,7 +8,7 @@ import unicodedata
 from collections.abc import Iterable
 
 MAX_LINE = 2_000
-"""Maximum number of characters shown of an error line. The framework's own messages are shorter."""
+"""Maximum length of an error line, whose middle is left out beyond; the framework's own messages are shorter."""
 DIRECTIONS = re.compile("[\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]")  # bidirectional control characters of Unicode
 
 
@@ -33,17 +33,14 @@ def did_you_mean(name: str, names: Iterable[str]) -> str:
 def shortened(text: str, most: int = MAX_LINE) -> str:
     r"""Returns a text of at most `most` characters; a longer one ends in an ellipsis.
 
-    Characters that change the direction of the text after them are escaped (`\u202e`), so that a caption cannot
-    rearrange a page.
+    Direction characters are escaped (`\u202e`), so that a caption cannot rearrange a page.
     """
     text = DIRECTIONS.sub(lambda match: _escaped(match[0]), text[: most + 1])
     return text if len(text) <= most else f"{text[: most - 1]}…"
 
 
 def printable(text: str) -> str:
-    r"""Returns the text with control and direction characters escaped (`\x1b`, `\u202e`), so that a file name or
-    a message from an untrusted file cannot control the terminal.
-    """
+    r"""Returns the text with control and direction characters escaped (`\x1b`); it cannot control a terminal."""
     return "".join(
         char if char == "\t" or unicodedata.category(char) not in ("Cc", "Cf", "Cs", "Zl", "Zp") else _escaped(char)
         for char in text
@@ -63,8 +60,7 @@ def markdown_text(text: str) -> str:
 def say(*lines: object, error: bool = False) -> None:
     """Prints each argument as one `printable` line, to standard output or, with `error`, to standard error.
 
-    Commands use it instead of `print`, because any name or text may come from an untrusted file. Error lines longer
-    than `MAX_LINE` characters are shortened in the middle.
+    Commands use it instead of `print`, because any name or text may come from an untrusted file.
     """
     for line in lines:
         text = str(line)

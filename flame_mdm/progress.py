@@ -25,7 +25,6 @@ class ProgressBar(tqdm):
             yield item
 
     def update(self, n: float | None = 1) -> bool | None:
-        """See tqdm; raises the exception of a signal that a library has swallowed."""
         raise_received()
         return super().update(n)
 

@@ -47,9 +47,6 @@ ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, Run
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # numbers of errors of a full disk
 
 
-# Writing --------------------------------------------------------------------------------------------------------------
-
-
 @contextmanager
 def atomic_write(path: str | Path) -> Iterator[Path]:
     """Yields a temporary path next to `path` that is renamed to `path` at the end; a failure leaves no files behind.
@@ -158,9 +155,6 @@ def naming(name: object, *errors: type[Exception], what: str = "") -> Iterator[N
         raise UserError(f"{name}: {what}{first_line(error)}") from error
 
 
-# Locks ----------------------------------------------------------------------------------------------------------------
-
-
 @contextmanager
 def locked(path: Path, busy: Callable[[str], object], advice: str) -> Iterator[str]:
     """Holds a lock file that names process and host; yields the process that died and left the file behind, or "".
@@ -194,9 +188,6 @@ def locked(path: Path, busy: Callable[[str], object], advice: str) -> Iterator[s
             finally:
                 path.unlink(missing_ok=True)
             return
-
-
-# Reading --------------------------------------------------------------------------------------------------------------
 
 
 def sha256(path: str | Path) -> str:
@@ -287,9 +278,6 @@ def _nodes(node: Any, counted: dict[int, float]) -> float:
         parts = [part for pair in content for part in (pair if isinstance(pair, tuple) else [pair])]
         counted[id(node)] = 1 + sum(_nodes(part, counted) for part in parts if hasattr(part, "value"))
     return counted[id(node)]
-
-
-# Arrays, archives and checkpoints -------------------------------------------------------------------------------------
 
 
 def read_npz(

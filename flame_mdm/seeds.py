@@ -82,9 +82,6 @@ def normal(keys: Tensor, frames: int, features: int) -> Tensor:
 
 
 def seeded_noise(ids: Sequence[str], frames: int, features: int, *, seed: int, replication: int, like: Tensor) -> Noise:
-    """Returns the noise of a sampling run for the motions named `ids`, on the device of `like`.
-
-    Draw n is a function of seed, replication, id, n and the position in the motion only.
-    """
+    """Returns the noise of a sampling run for the motions named `ids`, on the device of `like`."""
     keys = torch.tensor([key("noise", seed, replication, name) for name in ids], device=like.device)
     return lambda draw: normal(_hash(keys + draw), frames, features).to(like.dtype)

@@ -51,8 +51,7 @@ def raise_received() -> None:
 class StopRequest:
     """Notes a signal, `signum`, that asks training to stop at the end of a step; 0 = none.
 
-    A second SIGINT stops immediately. So does a second SIGTERM, if it comes more than one second after the first, since
-    `timeout` sends two at once.
+    A second SIGINT stops immediately. So does a second SIGTERM more than one second later: `timeout` sends two at once.
     """
 
     SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
@@ -62,8 +61,7 @@ class StopRequest:
         self.handlers: dict[int, Any] = {}
 
     def install(self) -> None:
-        for signum in self.SIGNALS:
-            self.handlers[signum] = signal.signal(signum, self.note)
+        self.handlers = {signum: signal.signal(signum, self.note) for signum in self.SIGNALS}
 
     def restore(self) -> None:
         for signum, handler in self.handlers.items():

@@ -151,8 +151,6 @@ class MotionGeneration(MotionGenerator, Task):
             self.facts |= {"verbs": list(data.source.verbs)} if data.source.verbs else {}
             self.condition.seen = frozenset(self.facts["vocabulary"])
 
-    # Training ---------------------------------------------------------------------------------------------------------
-
     def on_fit_start(self) -> None:
         """Runs the sampler with a denoiser that returns 0, so that invalid sampling options fail at the start."""
         like = torch.zeros(1, 2, self.representation.features, device=self.device)

@@ -12,7 +12,7 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from flame_mdm.config.signatures import Config, check, definition, walk
-from flame_mdm.errors import UserError, first_line
+from flame_mdm.errors import UserError, first_line, shortened
 from flame_mdm.safe_io import read_yaml, write_text
 
 _PACKAGE = Path(__file__).parent.parent
@@ -37,11 +37,11 @@ RUN_DIR = "${run.dir}"
 
 
 def plain(config: Any, where: str | Path, *, but: str = "") -> None:
-    """Checks that the content of an untrusted file has only plain values and text keys, and no interpolations.
+    """Checks that the content of the untrusted file `where` has only plain values and no interpolations.
 
     Hydra and OmegaConf resolve interpolations (`${...}`), which can run any code and read any environment variable. The
-    one in `but` is allowed at the beginning of a text. Raises `UserError`, which names the file `where`, also if the
-    content is nested too deeply, or contains itself.
+    one in `but` is allowed at the beginning of a text. Raises `UserError`, also if the content is nested too deeply, or
+    contains itself.
     """
     count = 0
 
@@ -50,33 +50,25 @@ def plain(config: Any, where: str | Path, *, but: str = "") -> None:
         count += 1
         if count > MOST_VALUES or len(path) > MOST_LEVELS:
             raise UserError(f"{where}: not a configuration: too many values, or nested too deeply")
-        if isinstance(value, dict):
-            for name, child in value.items():
+        if isinstance(value, dict | list | tuple):
+            for name, child in value.items() if isinstance(value, dict) else enumerate(value):
                 if not isinstance(name, str | int):
-                    raise UserError(f"{where}: {'.'.join(path)} has a key that is a {type(name).__name__}, not text")
-                check_value(name, path)
+                    raise UserError(f"{where}: {'.'.join(path)} has a key that is no text")
                 check_value(child, (*path, str(name)))
-        elif isinstance(value, list | tuple):
-            for number, child in enumerate(value):
-                check_value(child, (*path, str(number)))
-        elif isinstance(value, str):
-            text = value.removeprefix(but)
-            if "${" in text:
-                text = text if len(text) < 60 else f"{text[:56]} ..."
-                raise UserError(
-                    f"{where}: {'.'.join(path) or 'a key'} holds an interpolation, {text}. Such files may only hold "
-                    "plain values: write the value itself"
-                )
-        elif not isinstance(value, int | float | None):
+                check_value(name, path)
+        elif isinstance(value, str) and "${" in value.removeprefix(but):
+            raise UserError(
+                f"{where}: {'.'.join(path) or 'a key'} holds an interpolation, {shortened(value, 60)}. Write the value "
+                "itself: such files may only hold plain values"
+            )
+        elif not isinstance(value, str | int | float | None):
             raise UserError(f"{where}: {'.'.join(path)} is a {type(value).__name__}, not a plain value")
 
     check_value(config, ())
 
 
 def read_saved(path: Path) -> Config:
-    """Returns the saved configuration of a run, with `RUN_DIR` for its directory; raises `UserError` if it is no such
-    file.
-    """
+    """Returns the saved configuration of a run, with `RUN_DIR` for its directory."""
     config = read_yaml(path)
     if not isinstance(config, dict) or not isinstance(config.get("run"), dict):
         raise UserError(f"{path}: not the configuration of a run: it has no key `run`")
@@ -105,16 +97,14 @@ def instantiate(node: Config, **derived: Any) -> Any:
     are passed as plain copies, as with Hydra's `_convert_: all`. `derived` are further arguments, from other parts of
     the recipe. Raises `UserError` if the class or function does not exist, or refuses its arguments.
     """
-    if not isinstance(node, Mapping) or not isinstance(node.get("_target_"), str):
+    name = node.get("_target_") if isinstance(node, Mapping) else None
+    if not isinstance(name, str):
         raise UserError(f"no _target_, the name of a class, in {str(node)[:80]}")
-    name: str = node["_target_"]
     build = _instances if node.get("_recursive_", True) else copy.deepcopy
     skipped = ("_target_", "_recursive_", *derived)
     arguments: dict[str, Any] = {key: build(value) for key, value in node.items() if key not in skipped}
     try:
         module, _, attribute = name.rpartition(".")
-        if not module:
-            raise UserError(f"_target_={name}: not the name of a module and a class, such as torch.nn.Linear")
         return getattr(importlib.import_module(module), attribute)(**arguments, **derived)
     except (UserError, FileNotFoundError):
         raise
@@ -134,13 +124,15 @@ def flatten(config: Any, prefix: str = "") -> dict[str, Any]:
     """Flattens nested mappings to dotted keys; lists are leaves."""
     if not isinstance(config, Mapping) or not config:
         return {prefix: config}
-    return {k: v for name, c in config.items() for k, v in flatten(c, f"{prefix}.{name}" if prefix else name).items()}
+    flat: dict[str, Any] = {}
+    for name, child in config.items():
+        flat |= flatten(child, f"{prefix}.{name}" if prefix else name)
+    return flat
 
 
 def save(config: Config, path: Path, head: str = "") -> None:
-    """Writes the configuration as YAML, atomically, after the comment lines of `head`."""
-    comment = "".join(f"# {line}\n" for line in head.splitlines())
-    write_text(path, comment + OmegaConf.to_yaml(OmegaConf.create(config)))
+    """Writes the configuration as YAML, atomically, after the comment line `head`."""
+    write_text(path, f"# {head}\n" * bool(head) + OmegaConf.to_yaml(OmegaConf.create(config)))
 
 
 def trust(config: Config) -> None:
@@ -148,7 +140,7 @@ def trust(config: Config) -> None:
 
     A class is of the kind of a part if it is defined in a module that `MODULES` lists for this part, or named by a file
     in the folder of `experiments/` for this part. The environment variable FLAME_MDM_TRUST adds packages, separated by
-    commas, of which any part may name anything. Nothing that the configuration names is imported here.
+    commas. Nothing that the configuration names is imported here.
     """
     added = [name for name in os.environ.get("FLAME_MDM_TRUST", "").split(",") if name]
     for path, node in walk(config):

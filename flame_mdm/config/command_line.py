@@ -8,7 +8,8 @@ import textwrap
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, fields
-from inspect import cleandoc
+from inspect import cleandoc, formatannotation
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
@@ -28,7 +29,6 @@ A field `composed` receives the words for Hydra: keys with a dot, such as `data.
 STOP = (signal.SIGINT, signal.SIGTERM)  # signals that end a command after it has cleaned up
 
 BUG = 70  # exit code of a bug, as in sysexits.h
-REPORT = "this is a bug in flame_mdm. Please report it with the lines above and the command that you ran"
 
 NO_MEMORY = re.compile("allocate memory|out of memory|bad_alloc|start new thread|create a primitive|failed to map")
 """Messages of errors caused by a lack of memory: from torch, from threads, and from libraries that fail to load."""
@@ -55,8 +55,8 @@ def run(command: Callable[[Settings], None], kind: type[Settings], argv: Sequenc
 def read_settings(kind: type[Settings], words: Sequence[str]) -> Settings:
     """Returns the settings of a command from its words; raises `UserError` for unknown keys and wrong types.
 
-    Values of keys of type `str` are taken literally; lists of texts are split like words of a shell; other values are
-    read with Hydra's grammar.
+    Values of type `str` are taken literally; lists of texts are split like words of a shell; others have Hydra's
+    grammar.
     """
     annotations = _annotations(kind)
     values: dict[str, Any] = {}
@@ -84,10 +84,7 @@ def read_settings(kind: type[Settings], words: Sequence[str]) -> Settings:
 def _annotations(kind: type[Any]) -> Mapping[str, str]:
     """Returns the annotation of each key, such as "int | None"."""
     hints = get_type_hints(kind)
-    names = [entry.name for entry in fields(kind) if "help" in entry.metadata]
-    return {
-        name: getattr(hints[name], "__name__", "") if type(hints[name]) is type else str(hints[name]) for name in names
-    }
+    return {entry.name: formatannotation(hints[entry.name]) for entry in fields(kind) if "help" in entry.metadata}
 
 
 def _value(key: str, text: str, annotation: str) -> Any:
@@ -113,10 +110,8 @@ def _value(key: str, text: str, annotation: str) -> Any:
 
 def _with_keys(words: Sequence[str], objects: Sequence[str], annotations: Mapping[str, str]) -> list[str]:
     """Adds the keys of `objects` to the leading words that have no key."""
-    count = 0
-    while count < len(words) and not words[count].startswith("-") and _is_object(words[count]):
-        count += 1
-    leading, rest = list(words[:count]), list(words[count:])
+    leading = list(takewhile(_is_object, words))
+    rest = list(words[len(leading) :])
     if objects and annotations[objects[-1]].startswith("list[str]") and len(leading) >= len(objects):
         leading[len(objects) - 1 :] = [shlex.join(leading[len(objects) - 1 :])]
     for key in objects[: len(leading)]:
@@ -128,8 +123,8 @@ def _with_keys(words: Sequence[str], objects: Sequence[str], annotations: Mappin
 
 
 def _is_object(word: str) -> bool:
-    path = "/" in word.partition("=")[0] and len(word) < 1000 and Path(word).exists()  # a path may hold "="
-    return "=" not in word or path
+    is_path = "/" in word.partition("=")[0] and len(word) < 1000 and Path(word).exists()  # which may contain "="
+    return not word.startswith("-") and ("=" not in word or is_path)
 
 
 def _help(kind: type[Any]) -> list[str]:
@@ -165,8 +160,8 @@ def make_variables() -> list[str]:
 def guarded(action: Callable[[], None], signums: Sequence[int] = ()) -> int:
     """Runs `action` and returns the exit code; a signal of `signums` ends it after it has cleaned up.
 
-    For an error that the user can fix, it prints one line and returns 1; FLAME_MDM_TRACEBACK=1 adds the traceback. For
-    any other exception, a bug, it prints the traceback and how to report it, and returns `BUG`.
+    An error that the user can fix is one line, with FLAME_MDM_TRACEBACK=1 after the traceback, and 1 is returned. Any
+    other exception is a bug: the traceback, how to report it, and `BUG`.
     """
     try:
         with stoppable(signums):
@@ -183,16 +178,16 @@ def guarded(action: Callable[[], None], signums: Sequence[int] = ()) -> int:
         line = explanation(error)
         if line is None or verbose:
             traceback.print_exc()
-        say(f"error: {line}" if line is not None else REPORT, error=True)
-        return BUG if line is None else 1
+        if line is None:
+            say("this is a bug in flame_mdm. Please report it with the lines above and your command", error=True)
+            return BUG
+        say(f"error: {line}", error=True)
+        return 1
     return 0
 
 
 def explanation(error: Exception) -> str | None:
-    """Returns the line for an error that the user can fix, or None for a bug.
-
-    The user can fix a `UserError`, a file that cannot be found, read or written, and a lack of memory.
-    """
+    """Returns the line for an error that the user can fix: a `UserError`, a file or a lack of memory. None = a bug."""
     if isinstance(error, UserError):
         return first_line(error)
     if isinstance(error, MemoryError) or NO_MEMORY.search(str(error)):

@@ -21,9 +21,6 @@ from flame_mdm.safe_io import read_yaml
 
 LAUNCH = "launch"  # the folder of `experiments/` with launchers, which start jobs on a cluster
 
-LONGEST_WORD = 2**17
-"""Maximum length of a `key=value` argument in characters, as in Linux. Hydra parses longer ones slowly."""
-
 
 def groups() -> list[str]:
     """Returns the replaceable parts of a recipe: folders of `experiments/` whose files are options, not recipes."""
@@ -40,8 +37,7 @@ def recipes() -> list[str]:
 def compose(name: str, overrides: Sequence[str] = ()) -> Config:
     """Composes a recipe with overrides such as `trainer.max_steps=10` or `denoiser=mdm_encoder`, and checks it.
 
-    `name` is a file in `experiments/` without its suffix, or the path of a recipe or of a saved `config.yaml`. Raises
-    `UserError` if an experiment, group, option or key is unknown (with the nearest names), or a value is malformed.
+    `name` is a file in `experiments/` without its suffix, or the path of a recipe or of a saved `config.yaml`.
     """
     source = find_recipe(name)
     config = resolve(source, *prepare_overrides(source, overrides))
@@ -52,8 +48,7 @@ def compose(name: str, overrides: Sequence[str] = ()) -> Config:
 def compose_data(name: str, overrides: Sequence[str] = (), *, data_root: str = "data", seed: int = 0) -> Config:
     """Composes a file in experiments/data and its representation: a mapping with the keys `data` and `representation`.
 
-    Overrides are such as `representation=smpl` or `data.source.clips=100`; errors as for `compose`. `data_root` is the
-    folder of the prepared data sets, and `seed` that of generated data.
+    `data_root` is the folder of the prepared data sets, and `seed` that of generated data.
     """
     source, first = ConfigSource(EXPERIMENTS, None), [f"+seed={seed}", quoted(f"+data_root={data_root}")]
     config = resolve(source, *prepare_overrides(source, [f"+data={name}", *overrides], first))
@@ -65,12 +60,8 @@ class ConfigSource(NamedTuple):
     """Location and kind of a configuration."""
 
     folder: Path
-    stem: str | None
-    """Name of the file in `folder` without its suffix; None = an empty configuration."""
-    saved: bool = False
-    """Whether it is a resolved configuration, whose parts cannot be replaced."""
-    experiment: str | None = None
-    """Name of the recipe."""
+    stem: str | None  # name of the file in `folder` without its suffix; None = an empty configuration
+    saved: bool = False  # whether it is a resolved configuration, whose parts cannot be replaced
 
 
 def prepare_overrides(
@@ -84,8 +75,8 @@ def prepare_overrides(
     parsed = parse(overrides)
     _check_groups(parsed, recipe)
     first = [*first, *([f"hydra.searchpath=[file://{EXPERIMENTS}]"] if recipe.folder != EXPERIMENTS else [])]
-    if recipe.experiment:
-        first.append(f"experiment={recipe.experiment}")
+    if recipe.stem and not recipe.saved:
+        first.append(f"experiment={recipe.stem}")
     if not parsed:
         return first, {}  # nothing to compare with the recipe
     parts = [o for o in parsed if _is_group(o)]
@@ -97,11 +88,11 @@ def prepare_overrides(
 def first_choice(override: Override) -> str:
     """Returns the override; for a sweep, the override with its first value."""
     if override.is_sweep_override():
-        return f"{override.get_key_element()}={choices(override)[0]}"
+        return f"{override.get_key_element()}={_choices(override)[0]}"
     return str(override.input_line)
 
 
-def choices(override: Override) -> list[str]:
+def _choices(override: Override) -> list[str]:
     value = override.value()
     if isinstance(value, Glob):
         return value.filter(_options(override.key_or_group)) or [str(value)]
@@ -123,12 +114,12 @@ def find_recipe(name: str) -> ConfigSource:
         saved = "defaults" not in content
         if saved:
             plain(content, name, but=RUN_DIR)
-        return ConfigSource(path.parent, path.stem, saved, None if saved else path.stem)
+        return ConfigSource(path.parent, path.stem, saved)
     if name not in recipes():
         raise UserError(
             f"unknown experiment '{name}'.{did_you_mean(name, recipes())} `flame-mdm train --help` lists them all"
         )
-    return ConfigSource(EXPERIMENTS, name, experiment=name)
+    return ConfigSource(EXPERIMENTS, name)
 
 
 def quoted(word: str) -> str:
@@ -140,15 +131,11 @@ def quoted(word: str) -> str:
 
 
 def parse(overrides: Sequence[str]) -> list[Override]:
-    for word in overrides:
-        if len(word) > LONGEST_WORD:
-            raise UserError(f"{word[:60]}…: {len(word):,} characters are too many. Give at most {LONGEST_WORD:,}")
     try:
         return OverridesParser.create().parse_overrides(list(overrides))
     except HydraException as error:
-        raise UserError(
-            f"cannot read an override: {first_line(error)}. Write key=value, and quote text: 'a b'"
-        ) from error
+        hint = "Write key=value, and quote text: 'a b'"
+        raise UserError(f"cannot read an override: {first_line(error)}. {hint}") from error
 
 
 def _is_group(override: Override) -> bool:
@@ -166,7 +153,7 @@ def _check_groups(overrides: Sequence[Override], recipe: ConfigSource) -> None:
         if not _is_group(override) or override.is_delete():
             continue
         options = _options(group)
-        for option in choices(override):
+        for option in _choices(override):
             if option not in options:
                 raise UserError(
                     f"no {group} is called '{option}'.{did_you_mean(option, options)} Available: {', '.join(options)}"

@@ -11,7 +11,7 @@ import math
 import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from importlib.util import find_spec
+from importlib.util import find_spec, resolve_name
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +25,10 @@ def check(config: Config) -> None:
     for path, node in walk(config):
         if "_target_" not in node:
             continue
-        where = ".".join([*path, "_target_"])
         if not isinstance(node["_target_"], str):
-            raise UserError(f"{where}={node['_target_']}: must be the name of a class or a function")
-        legal = signature(node["_target_"], where)
+            key = ".".join([*path, "_target_"])
+            raise UserError(f"{key}={node['_target_']}: must be the name of a class or a function")
+        legal = _signature(node["_target_"])
         for name, value in node.items():
             if not str(name).startswith("_") and name not in legal and "**" not in legal:
                 raise UserError(unknown_key(config, [*path, str(name)], len(path), node))
@@ -132,35 +132,32 @@ def unknown_key(config: Config, parts: Sequence[str], depth: int, node: Any) -> 
     key = ".".join(parts)
     if parts[0] == "data" and not depth:
         return f"{key} belongs to a data set, and none is named. Add data=NAME, such as data=folder"
-    legal = {".".join([*path, str(name)]) for path, mapping in walk(config) for name in mapping}
-    if isinstance(node, Mapping) and "_target_" in node:
-        legal |= {".".join([*parts[:depth], name]) for name in parameters(node["_target_"]) if name != "**"}
-    legal -= {key}
-    siblings = {name for name in legal if name.rpartition(".")[0] == ".".join(parts[:depth])}
-    near = difflib.get_close_matches(parts[depth], [s.rpartition(".")[2] for s in siblings], 3, 0.6)
-    names = [".".join([*parts[:depth], n]) for n in near] or difflib.get_close_matches(key, legal, 3, 0.6)
-    names = names or [name for name in sorted(legal) if name.endswith(f".{parts[-1]}")][:3]
+    siblings = {str(name) for name in node} if isinstance(node, Mapping) else set()
+    siblings |= parameters(node["_target_"]) if "_target_" in siblings else set()
+    near = difflib.get_close_matches(parts[depth], siblings - {parts[depth]}, 3, 0.6)
+    names = [".".join([*parts[:depth], name]) for name in near]
+    if not names:
+        legal = {".".join([*path, str(name)]) for path, mapping in walk(config) for name in mapping} - {key}
+        names = difflib.get_close_matches(key, legal, 3, 0.6)
+        names = names or [name for name in sorted(legal) if name.endswith(f".{parts[-1]}")][:3]
     return f"unknown config key '{key}'." + (f" Did you mean {', '.join(names)}?" if names else "")
 
 
 def parameters(target: str) -> frozenset[str]:
     """Returns the argument names of a class or function, read from its source; "**" stands for any argument."""
-    return frozenset(signature(target, "_target_"))
+    return frozenset(_signature(target))
 
 
 @functools.cache
-def signature(target: str, where: str) -> dict[str, str]:
+def _signature(target: str) -> dict[str, str]:
     """Returns the arguments of a class or function: name -> annotation, "" without one."""
     module, _, name = target.rpartition(".")
     node = definition(module, name)
-    if node is None and (owner := definition(module.rpartition(".")[0], module.rpartition(".")[2])):  # a method
-        methods = (child for child in ast.iter_child_nodes(owner[1]) if isinstance(child, ast.FunctionDef))
-        node = next(((owner[0], method) for method in methods if method.name == name), None)
     if node is None:
         package = module.partition(".")[0]
         missing = package and find_spec(package) is None
         hint = f". Python finds no {package}: set PYTHONPATH to the folder that contains it" if missing else ""
-        raise UserError(f"{where}={target}: no such class or function{hint}")
+        raise UserError(f"_target_={target}: no such class or function{hint}")
     return _arguments(*node)
 
 
@@ -176,7 +173,9 @@ def definition(module: str, name: str, seen: frozenset[str] = frozenset()) -> tu
         if isinstance(node, ast.ImportFrom):
             for alias in node.names:
                 if alias.name == "*" or (alias.asname or alias.name) == name:
-                    source = _absolute(module, node)
+                    path = source_file(module)
+                    package = module if path and path.name == "__init__.py" else module.rpartition(".")[0]
+                    source = resolve_name(f"{'.' * node.level}{node.module or ''}", package)
                     original = definition(source, name if alias.name == "*" else alias.name, seen | {module})
                     if original:
                         return original
@@ -189,15 +188,6 @@ def _top_level(node: ast.AST) -> Iterator[ast.AST]:
         yield child
         if isinstance(child, ast.If | ast.Try | ast.ExceptHandler | ast.With):
             yield from _top_level(child)
-
-
-def _absolute(module: str, node: ast.ImportFrom) -> str:
-    if not node.level:
-        return node.module or ""
-    path = source_file(module)
-    parts = module.split(".")
-    keep = len(parts) - node.level + (1 if path is not None and path.name == "__init__.py" else 0)
-    return ".".join([*parts[:keep], *([node.module] if node.module else [])])
 
 
 def source_file(module: str) -> Path | None:
@@ -224,27 +214,23 @@ def _tree(module: str) -> ast.Module | None:
 def _arguments(module: str, node: ast.AST) -> dict[str, str]:
     if isinstance(node, ast.FunctionDef):
         listed = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
-        names = {a.arg: ast.unparse(a.annotation) if a.annotation else "" for a in listed}
-        names |= {"**": ""} if node.args.kwarg else {}
-        return {name: kind for name, kind in names.items() if name not in ("self", "cls")}
+        names = {a.arg: ast.unparse(a.annotation) if a.annotation else "" for a in listed if a.arg != "self"}
+        return names | ({"**": ""} if node.args.kwarg else {})
     assert isinstance(node, ast.ClassDef)
     for item in node.body:
         if isinstance(item, ast.FunctionDef) and item.name == "__init__":
             names = _arguments(module, item)
             return names if "**" not in names else _inherited(module, node) | names
-    fields = {
-        i.target.id: ast.unparse(i.annotation)
-        for i in node.body
-        if isinstance(i, ast.AnnAssign) and isinstance(i.target, ast.Name)
-    }
-    dataclass = any("dataclass" in ast.unparse(d) for d in node.decorator_list)
-    return _inherited(module, node) | (fields if dataclass else {})
+    names = _inherited(module, node)
+    if any("dataclass" in ast.unparse(decorator) for decorator in node.decorator_list):
+        items = [item for item in node.body if isinstance(item, ast.AnnAssign)]
+        names |= {ast.unparse(item.target): ast.unparse(item.annotation) for item in items}
+    return names
 
 
 def _inherited(module: str, node: ast.ClassDef) -> dict[str, str]:
+    parents = [definition(module, ast.unparse(base).rpartition(".")[2]) for base in node.bases]
     names: dict[str, str] = {}
-    for base in node.bases:
-        parent = definition(module, ast.unparse(base).rpartition(".")[2])
-        if parent and parent[1] is not node:
-            names |= _arguments(*parent)
+    for parent in parents:
+        names |= _arguments(*parent) if parent and parent[1] is not node else {}
     return names

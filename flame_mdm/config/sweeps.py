@@ -96,29 +96,27 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
     hydra_main(version_base="1.3", config_path=str(recipe.folder), config_name=recipe.stem)(job)()
 
 
-POSITIVE = ("val_check_interval", "log_every_n_steps", "accumulate_grad_batches")
+LATE = ("val_check_interval", "log_every_n_steps", "accumulate_grad_batches")
 """Keys of the trainer that Lightning checks only after data and model are loaded."""
 
 
 def _check_whole(config: Config, name: str) -> None:
+    """Raises `UserError` if a recipe lacks a part, or has a value that training would refuse late."""
     plain(config, name)  # otherwise the checkpoints of the run would be refused
-    values = ("experiment", "seed", "ema", "logger")
-    for key in ("run", "trainer", "data", "representation", "task", "optimizer", "callbacks", *values):
-        node = config.get(key)
-        is_part = isinstance(node, Mapping) and (key in ("run", "callbacks") or "_target_" in node)
-        if not (is_part if key not in values else key in config):
-            raise UserError(f"{name}: no {key}. Begin the recipe with the defaults of another recipe, or with /base")
-    if not config["run"].get("dir"):
-        raise UserError(f"{name}: run.dir is empty. Set it to the directory of the run")
-    if "max_steps" not in config["trainer"]:
-        raise UserError(f"{name}: trainer.max_steps is missing. Set it; -1 trains without end")
-    for key in ("denoiser", "process", "condition"):
-        if key in config and not (isinstance(config[key], Mapping) and "_target_" in config[key]):
-            raise UserError(f"{name}: {key} has no _target_. Replace it with one of experiments/{key}: {key}=...")
+    parts = ["trainer", "data", "representation", "task", "optimizer"]
+    parts += [key for key in ("denoiser", "process", "condition") if key in config]
+    lacking = [key for key in ("experiment", "seed", "ema", "logger") if key not in config]
+    lacking += [key for key in ("run", "callbacks", *parts) if not isinstance(config.get(key), Mapping)]
+    if not lacking:
+        lacking = [f"{key}._target_" for key in parts if "_target_" not in config[key]]
+        lacking += ["run.dir"] * (not config["run"].get("dir"))
+        lacking += ["trainer.max_steps"] * ("max_steps" not in config["trainer"])
+    if lacking:
+        raise UserError(f"{name}: no {lacking[0]}. Begin the recipe with the defaults of another recipe, or with /base")
     for key, value in config.get("denoiser", {}).items():
         if isinstance(value, int) and value < 0:
             raise UserError(f"denoiser.{key}={value}: must not be negative")
-    for key in POSITIVE:
+    for key in LATE:
         value = config["trainer"].get(key)
         if isinstance(value, int | float) and value <= 0:
             raise UserError(f"trainer.{key}={value}: must be above 0")

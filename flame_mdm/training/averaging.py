@@ -13,13 +13,12 @@ from flame_mdm.errors import UserError
 class MovingAverage(WeightAveraging):
     """Exponential moving average of the weights, which replaces them in validation and in the saved model.
 
-    With the default options it computes the same as Lightning's `EMAWeightAveraging`, but with one call for all
-    parameters, which are listed once: that class walks through all modules in every step, and on CUDA waits for the
-    device. Buffers are not averaged.
+    By default it computes the same as Lightning's `EMAWeightAveraging`, but with one call for all parameters: that
+    class walks through all modules in every step, and on CUDA waits for the device. Buffers are not averaged.
 
     Args:
         decay: average = decay * average + (1 - decay) * weights, from 0 to 1.
-        update_every_n_steps: number of steps between updates, which are at its multiples.
+        update_every_n_steps: updates are at the multiples of this number of steps.
         update_starting_at_step: up to this step, updates copy the weights instead of averaging them; so does the first.
     """
 

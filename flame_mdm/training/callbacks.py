@@ -36,6 +36,7 @@ from flame_mdm.training.provenance import device_name
 
 REAL = 64  # training clips that metrics of samples are compared with
 UNCONDITIONED = 4  # motions without a prompt
+Values = Mapping[str, float]  # values by metric, or by metric/part
 
 
 class Interrupted(Exception):
@@ -47,11 +48,10 @@ class Interrupted(Exception):
 
 
 class Checkpoints(Checkpoint):
-    """Writes `last.ckpt` periodically, at the last step and when interrupted, and keeps some checkpoints permanently.
+    """Writes `last.ckpt` periodically, at the last step and when interrupted; keeps a checkpoint `keep_every_n_steps`.
 
     Signals stop training at the end of the current step (`StopRequest`); with several processes, at the end of the next
-    one. Validation is never interrupted, since averaged weights replace the trained ones meanwhile. With
-    `keep_every_n_steps` None, no checkpoint is kept permanently.
+    one. Validation is never interrupted, since averaged weights replace the trained ones meanwhile.
     """
 
     def __init__(self, folder: str, every_n_steps: int, keep_every_n_steps: int | None = None):
@@ -87,23 +87,20 @@ class Checkpoints(Checkpoint):
         if signum:
             raise Interrupted(signum, self.step)
 
-    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_train_end(self, *_: Any) -> None:
         self.stop.restore()
 
-    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        self.stop.restore()
+    def on_exception(self, *_: Any) -> None:
+        self.on_train_end()
 
 
 class Measurements(Callback):
     """Logs gradient norm, learning rate and speed every `trainer.log_every_n_steps`, without slowing other steps.
 
-    Logs `train/grad_norm` (norm of all gradients, before clipping), `train/lr`, `train/epochs` (passes over the
-    training clips), `train/samples_per_second`, `train/seconds_per_step` (without validation) and, on CUDA,
-    `train/gpu_memory_gib` (peak memory allocated by tensors).
-
-    Adds `facts.training` to checkpoints: `hours` of training so far, including validation; `processes`, their number;
-    `device`, their number and its name, or the number of threads of a CPU; `speed` and `precision`; and `memory_gib`,
-    the peak memory of tensors on CUDA, otherwise of the first process.
+    The norm of all gradients is that before clipping, and seconds per step are without validation. Adds
+    `facts.training` to checkpoints: `hours` of training so far, including validation; `processes`, their number;
+    `device`, `speed` and `precision`; and `memory_gib`, the peak memory of tensors on CUDA, otherwise of the first
+    process.
     """
 
     def __init__(self) -> None:
@@ -166,39 +163,32 @@ class Report(Callback):
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if not trainer.is_global_zero:
             return
-        where = {"train/loss": "on the last batch", "val/loss": "on the validation clips"}
-        values = {text: trainer.callback_metrics.get(name) for name, text in where.items()}
-        losses = ", ".join(f"{value:.4g} {text}" for text, value in values.items() if value is not None)
-        if losses:
+        texts = {"train/loss": "on the last batch", "val/loss": "on the validation clips"}
+        values = trainer.callback_metrics
+        if losses := ", ".join(f"{values[name]:.4g} {text}" for name, text in texts.items() if name in values):
             say(f"loss after {trainer.global_step} steps: {losses} (lower is better; comparable within a recipe only)")
         say(f"report: {write_report(self.folder)}")
         if isinstance(pl_module, MotionGeneration):
-            facts, kind = pl_module.facts, pl_module.conditioned_on
-            key, names = {
-                "text": ("text", plainest(facts.get("captions", ()))),
-                "action": ("action", facts["actions"]),
-                "none": ("unconditioned", ("true",)),
-            }[kind]
-            example = f"{key}={next(iter(names), 'a person walks')}"
+            example = {
+                "text": f"text={next(iter(plainest(pl_module.facts.get('captions', ()))), 'a person walks')}",
+                "action": f"action={next(iter(pl_module.facts['actions']), '')}",
+                "none": "unconditioned=true",
+            }[pl_module.conditioned_on]
             say(f"next: {shlex.join(['flame-mdm', 'sample', str(self.folder), example])}")
             say(f"      {shlex.join(['flame-mdm', 'evaluate', str(self.folder), 'extractor=none', 'quick=true'])}")
 
 
-def explain_metrics(
-    values: Mapping[str, float | None], real: Mapping[str, float | None], metrics: Mapping[str, type[Metric]]
-) -> list[str]:
-    """Returns lines that explain metrics by their docstrings, with their values next to those of real motions.
-
-    Values are by metric, or by metric/part; None = no value, and those of real motions may be missing.
-    """
+def explain_metrics(values: Values, real: Values, metrics: Mapping[str, Metric]) -> list[str]:
+    """Returns lines that explain metrics by their docstrings, with their values next to those of real motions."""
     lines = []
     for name, metric in metrics.items():
-        own = {key: value for key, value in values.items() if key.partition("/")[0] == name and value is not None}
-        references = {key: f" (real motions: {number(real[key])})" for key in own if real.get(key) is not None}
+        own = {key: value for key, value in values.items() if key.partition("/")[0] == name}
         if own:
             better = {True: " Higher is better.", False: " Lower is better.", None: ""}[metric.higher_is_better]
-            lines.append(f"{name}: {(getdoc(metric) or '').partition(chr(10))[0]}{better}")
-            lines += [f"  {key}: {number(value)}{references.get(key, '')}" for key, value in own.items()]
+            lines.append(f"{name}: {(getdoc(type(metric)) or '').partition(chr(10))[0]}{better}")
+        for key, value in own.items():
+            reference = f" (real motions: {number(real[key])})" if key in real else ""
+            lines.append(f"  {key}: {number(value)}{reference}")
     return lines
 
 
@@ -221,19 +211,20 @@ class Progress(Callback):
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         assert self.bar is not None
         steps = trainer.global_step - self.bar.n
-        if self.bar.disable or not steps:  # gradients are still being accumulated
+        if self.bar.disable or not steps:  # or gradients are still being accumulated
             return
         if trainer.global_step % trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
-            losses = {name: trainer.callback_metrics.get(name) for name in ("train/loss", "val/loss")}
-            self.bar.set_postfix({n: f"{v:.4g}" for n, v in losses.items() if v is not None}, refresh=False)
+            values = trainer.callback_metrics
+            losses = {name: f"{values[name]:.4g}" for name in ("train/loss", "val/loss") if name in values}
+            self.bar.set_postfix(losses, refresh=False)
         self.bar.update(steps)
 
-    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self.on_exception()
-
-    def on_exception(self, *_: Any) -> None:
+    def on_train_end(self, *_: Any) -> None:
         if self.bar is not None:
             self.bar.close()
+
+    def on_exception(self, *_: Any) -> None:
+        self.on_train_end()
 
 
 class SampleMotions(Callback):
@@ -261,7 +252,7 @@ class SampleMotions(Callback):
         self.folder, self.every_n_steps, self.seconds = Path(folder), every_n_steps, seconds
         self.prompts = [(p, {}) if isinstance(p, str) else (p[0], dict(p[1])) for p in prompts or []]
         self.metrics, self.next = metrics or {}, every_n_steps
-        self.written: tuple[int, Path, dict[str, float | None]] = (-1, self.folder, {})
+        self.written: tuple[int, Path, Values] = (-1, self.folder, {})
 
     @property
     def texts(self) -> list[str]:
@@ -293,7 +284,7 @@ class SampleMotions(Callback):
         _, folder, values = self.written
         if trainer.is_global_zero:
             real = self._measure_real(trainer.datamodule.train, pl_module) if values else {}  # type: ignore[attr-defined]
-            say(*explain_metrics(values, real, {name: type(metric) for name, metric in self.metrics.items()}))
+            say(*explain_metrics(values, real, self.metrics))
             say(f"player: {folder / 'player.html'} (open in any browser), animation: {folder / 'motions.gif'}")
 
     def write(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -306,7 +297,7 @@ class SampleMotions(Callback):
             parts: list[Any] = [None] * trainer.world_size
             torch.distributed.all_gather_object(parts, motions)
             motions = [motion for row in zip_longest(*parts) for motion in row if motion is not None]
-        values: dict[str, float | None] = {}
+        values: Values = {}
         if trainer.is_global_zero:
             write_motions(folder, motions, {"seed": 0, "step": step, "checkpoint": ""})
             requested = [attributes for _, attributes in self.prompts]
@@ -314,7 +305,7 @@ class SampleMotions(Callback):
             for logger in trainer.loggers:
                 # Lightning logs steps from 0: the values of this validation are logged at step - 1
                 log_video(logger, "samples", folder / "motions.gif", step - 1)
-                logger.log_metrics({f"samples/{k}": v for k, v in values.items() if v is not None}, step - 1)
+                logger.log_metrics({f"samples/{name}": value for name, value in values.items()}, step - 1)
         self.written = (step, folder, values)
 
     def _sample(self, model: MotionGeneration, rank: int, world: int) -> list[Motion]:
@@ -332,7 +323,7 @@ class SampleMotions(Callback):
         )
         return sample_request(model, request)
 
-    def _measure_real(self, clips: Clips, task: LightningModule) -> dict[str, float | None]:
+    def _measure_real(self, clips: Clips, task: LightningModule) -> Values:
         """Computes all metrics of up to `REAL` training clips, which have the attributes that all prompts request."""
         assert isinstance(task, MotionGeneration)
         names = [set(requested) for _, requested in self.prompts]
@@ -345,9 +336,9 @@ class SampleMotions(Callback):
         attributes = [{name: v for name, v in clips.clips[k].attributes.items() if name in all_names} for k in chosen]
         return self.measure(joints, attributes) if chosen else {}
 
-    def measure(self, motions: Sequence[Tensor], requested: Sequence[dict[str, Any]]) -> dict[str, float | None]:
-        """Computes all metrics of motions (F, J, 3), in meters; a metric without a value is None."""
-        values: dict[str, float | None] = {}
+    def measure(self, motions: Sequence[Tensor], requested: Sequence[dict[str, Any]]) -> Values:
+        """Computes all metrics of motions (F, J, 3), in meters; leaves out those without a value."""
+        values: dict[str, float] = {}
         for name, metric in self.metrics.items():
             metric.reset()
             metric.distributed_available_fn = bool  # returns False: no synchronization, this process has all motions
@@ -357,5 +348,5 @@ class SampleMotions(Callback):
                 metric.update(**{k: v for k, v in inputs.items() if k in signature(metric.update).parameters})
             result = metric.compute()
             parts = result if isinstance(result, dict) else {"": result}
-            values |= {f"{name}/{k}".rstrip("/"): None if v is None else float(v) for k, v in parts.items()}
+            values |= {f"{name}/{k}".rstrip("/"): float(v) for k, v in parts.items() if v is not None}
         return values

@@ -1,7 +1,7 @@
 """Atomic checkpoints, and resuming from them.
 
 A run directory may come from somebody else. Reading a checkpoint runs no code and takes no more memory than the file,
-and only files directly in the folder of the checkpoints are removed, whatever paths the state of a callback names.
+and only files in the folder of the checkpoints are removed, even if the state of a callback names others.
 """
 
 import os
@@ -31,10 +31,7 @@ class Resumed(NamedTuple):
 
 
 class AtomicCheckpoints(TorchCheckpointIO):
-    """Writes checkpoints atomically: to a temporary file, synced and then renamed; removes files in `folder` alone.
-
-    The former `last.ckpt` is kept as `previous.ckpt`. The checkpoint `resumed` is not read again.
-    """
+    """Writes checkpoints to a temporary file, synced and then renamed; keeps the former last one as `previous.ckpt`."""
 
     def __init__(self, folder: Path, resumed: Resumed | None = None):
         super().__init__()
@@ -44,12 +41,12 @@ class AtomicCheckpoints(TorchCheckpointIO):
         """Returns the content of the checkpoint that the run resumes from, as `newest` checked it."""
         resumed, self.resumed = self.resumed, None  # it needs as much memory as the model and its optimizer
         assert resumed is not None
-        assert resumed.path == Path(path)
         return resumed.content
 
     def remove_checkpoint(self, path: Any) -> None:
-        if directly_in(self.folder, path) and Path(path).is_file():
-            Path(path).unlink()
+        path = Path(path)
+        if path.is_file() and path.parent.resolve() == self.folder.resolve():  # after links and `..` are resolved
+            path.unlink()
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
         """Writes a checkpoint; raises `UserError` if that fails, as on a full disk. Earlier ones stay."""
@@ -83,7 +80,7 @@ def newest(folder: Path) -> Resumed | None:
             if type(step) is not int or step < 0:
                 raise UserError(f"{path}: damaged: its global_step is {str(step)[:40]}, not a number of steps")
             check_weights(dict(_tensors(content, "")), path)
-            check_version(content.get("pytorch-lightning_version"), path)
+            _check_version(content.get("pytorch-lightning_version"), path)
         except UserError as error:
             if path == paths[-1]:
                 raise UserError(f"{error}. There is no other checkpoint. Delete {folder} to start over") from error
@@ -95,20 +92,13 @@ def newest(folder: Path) -> Resumed | None:
     return None
 
 
-def check_version(version: Any, path: Path) -> None:
+def _check_version(version: Any, path: Path) -> None:
     try:
-        supported = Version(version) >= OLDEST_LIGHTNING
-    except (TypeError, ValueError):
+        supported = Version(str(version)) >= OLDEST_LIGHTNING
+    except ValueError:
         supported = False
     if not supported:
         raise UserError(f"{path}: written by version {str(version)[:40]} of Lightning, not {OLDEST_LIGHTNING} or later")
-
-
-def directly_in(folder: Path, path: str | Path) -> bool:
-    """Returns whether a path names an entry of a folder itself, after links and `..` are resolved."""
-    if "\0" in str(path) or Path(path).name in ("", ".."):
-        return False
-    return Path(path).parent.resolve() == folder.resolve()
 
 
 def _tensors(content: Any, name: str) -> Iterator[tuple[str, Tensor]]:
@@ -116,6 +106,5 @@ def _tensors(content: Any, name: str) -> Iterator[tuple[str, Tensor]]:
     if isinstance(content, Tensor):
         yield name, content
     elif isinstance(content, dict | list | tuple):
-        parts = content.items() if isinstance(content, dict) else enumerate(content)
-        for key, value in parts:
+        for key, value in content.items() if isinstance(content, dict) else enumerate(content):
             yield from _tensors(value, f"{name}.{key}")

@@ -54,16 +54,14 @@ def fit(folder: Path, config: Config) -> None:
     precision = config["trainer"]["precision"]
     if config["run"].get("speed") == "fast":
         precision = accelerate(task, data, config)
+    measurements, checkpoints = Measurements(), AtomicCheckpoints(folder / "checkpoints", resumed)
     callbacks: list[Callback] = [WriteProvenance(config)]
     if config["ema"]:
         callbacks.append(MovingAverage(**config["ema"]))  # before the callbacks that use averaged weights in validation
     callbacks += [instantiate(c) for c in config["callbacks"].values() if c]
-    if config["trainer"].get("enable_progress_bar", True):
-        callbacks.append(Progress())
-    measurements = Measurements()
+    callbacks += [Progress()] if config["trainer"].get("enable_progress_bar", True) else []
     callbacks += [measurements, Report(folder)]
     loggers = [instantiate(config["logger"])] if config["logger"] else []
-    checkpoints = AtomicCheckpoints(folder / "checkpoints", resumed)
     plugins: list[Any] = [checkpoints]
     if SLURMEnvironment.detect() and not TorchElasticEnvironment.detect():
         # Lightning would save during a step, to a file that it then prefers to `last.ckpt`.
@@ -90,8 +88,7 @@ def fit(folder: Path, config: Config) -> None:
             trainer.strategy.launcher.kill(signal.SIGKILL)
         if isinstance(error, SystemExit):  # a second signal
             say("stopped immediately. Run the same command to resume from the last checkpoint")
-        lost = lost_worker(error) if data.num_workers else None
-        if explained := lost or out_of_memory(error, trainer.global_step):
+        if explained := (data.num_workers and lost_worker(error)) or out_of_memory(error, trainer.global_step):
             raise explained from error
         is_restoring = checkpoints.resumed is None and not measurements.begin
         if resumed and is_restoring and not isinstance(error, UserError | OSError | SystemExit):
@@ -103,14 +100,10 @@ def fit(folder: Path, config: Config) -> None:
 
 
 def check_devices(trainer: Config) -> None:
-    """Raises `UserError` if this machine does not have the GPUs of a recipe; other accelerators are left to Lightning.
-
-    `accelerator=cpu` may start any number of processes; `auto` starts one per core at most, since users mean GPUs.
-    """
+    """Raises `UserError` if this machine lacks the GPUs of a recipe; `auto` starts at most one process per CPU core."""
     accelerator, devices = trainer.get("accelerator", "auto"), trainer.get("devices", 1)
-    gpus, cores = torch.cuda.device_count(), os.cpu_count() or 1
-    if torch.backends.mps.is_available() and accelerator in ("auto", "gpu"):
-        gpus = 1
+    has_mps = torch.backends.mps.is_available() and accelerator in ("auto", "gpu")
+    gpus, cores = 1 if has_mps else torch.cuda.device_count(), os.cpu_count() or 1
     if accelerator in ("gpu", "cuda") and not gpus:
         raise UserError(f"trainer.accelerator={accelerator}: {NO_GPU}. Drop it to train on the CPU")
     most = gpus if gpus and accelerator != "cpu" else cores

@@ -42,10 +42,10 @@ def only_run(folder: Path) -> Iterator[None]:
 class BadLoss(Callback):
     """Stops training when a loss is not finite or explodes, before it reaches a checkpoint.
 
-    Losses are only copied from the device at the log interval and for a checkpoint, so that steps do not wait for them.
-    The first bad batch is described in `bad_batch.json` in the run directory: the step, and for each process the number
-    of the batch, the ids of its clips and its loss. Batch and random draws are functions of (seed, number), so it can
-    be reproduced. A loss explodes if it exceeds `factor` times the median of the previous interval.
+    A loss explodes if it exceeds `factor` times the median of the previous interval. Losses are only copied from the
+    device at the log interval and for a checkpoint, so that steps do not wait for them. `bad_batch.json` in the run
+    directory describes the first bad batch: the step, and for each process the number of the batch, the ids of its
+    clips and its loss.
     """
 
     def __init__(self, folder: str, factor: float = 1000.0):
@@ -81,10 +81,8 @@ class BadLoss(Callback):
         self.seen = []
 
     def _stop(self, trainer: Trainer, first: int, losses: Tensor) -> NoReturn:
-        step, number, ids, _ = self.seen[first]
-        values = losses[:, first].tolist()
-        rank = trainer.global_rank
-        own = {"rank": rank, "batch": number, "ids": list(ids), "loss": str(values[rank])}
+        step, number, ids, loss = self.seen[first]
+        own = {"rank": trainer.global_rank, "batch": number, "ids": list(ids), "loss": str(float(loss))}
         batches: list[Any] = [own] * trainer.world_size
         if trainer.world_size > 1:
             torch.distributed.all_gather_object(batches, own)
@@ -92,23 +90,21 @@ class BadLoss(Callback):
             write_json(self.path, {"step": step, "usual_loss": str(self.usual), "batches": batches})
         typical = f" (typical: {self.usual:.3g})" if self.usual < float("inf") else ""
         raise UserError(
-            f"the loss of step {step} is {max(values, key=lambda v: v if v == v else float('inf')):g}{typical}. The "
-            f"clips of the batch are listed in {self.path}. Lower optimizer.lr, set trainer.gradient_clip_val, or "
-            "inspect these clips. Earlier checkpoints are intact"
+            f"the loss of step {step} is {float(losses[:, first].max()):g}{typical}. The clips of the batch are listed "
+            f"in {self.path}. Lower optimizer.lr, set trainer.gradient_clip_val, or inspect these clips. Earlier "
+            "checkpoints are intact"
         )
 
 
 def lost_worker(error: BaseException) -> UserError | None:
     """Returns an explanation if an error means that a data loading process died, otherwise None."""
     message = f"{error} {error.__cause__ or ''}"  # the cause, if it happens while a checkpoint is written
-    lost = re.search(r"DataLoader worker \(pid.*?\) (?:is killed by signal: (\w+)|exited unexpectedly)", message)
+    lost = re.search(r"DataLoader worker \(pid.*?\) (is killed by signal|exited unexpectedly)", message)
     if lost is None and not isinstance(error, ConnectionError | EOFError):  # a pipe breaks before torch notices
         return None
-    killed = lost and lost[1]
-    how = f"was killed (signal: {killed}), as happens when memory runs out" if killed else "ended unexpectedly"
     return UserError(
-        f"a data loading process {how}. Checkpoints are intact, and the same command resumes from the last one. Lower "
-        "data.num_workers, or set data.num_workers=0 to load in the main process"
+        "a data loading process was killed, as happens when memory runs out, or ended unexpectedly. Run the same "
+        "command to resume from the last checkpoint. Lower data.num_workers; 0 loads in the main process"
     )
 
 

@@ -19,10 +19,9 @@ from flame_mdm.schemas import read_json
 
 
 class History(Logger):
-    """Appends all logged values to `metrics.jsonl` in the run directory, as lines of JSON with `step`.
+    """Appends all logged values to `metrics.jsonl` in the run directory, from which reports and comparisons are made.
 
-    Reports and comparisons read this file, independent of the dashboard. A run that resumes at `step` drops later
-    lines.
+    A run that resumes at `step` drops later lines.
     """
 
     def __init__(self, folder: str | Path, step: int = 0):
@@ -61,7 +60,7 @@ class TensorBoardRun(TensorBoardLogger):
 
 
 class Kept(TypedDict, total=False):
-    """Content of `wandb.json`."""
+    """Content of `wandb.json`: the id of the run, its last step, and the number of its rows."""
 
     id: str
     step: int | None
@@ -71,9 +70,7 @@ class Kept(TypedDict, total=False):
 class WandbRun(WandbLogger):
     """Weights & Biases logger that continues the same wandb run whenever training is resumed.
 
-    `wandb.json` in the run directory stores the id of the run, its last step, and the number of its rows. Steps that
-    are trained again after a kill have the same values and are not logged twice, so `trainer/global_step` never
-    decreases.
+    Steps that are trained again after a kill have the same values and are not logged twice.
     """
 
     def __init__(self, save_dir: str, **options: Any):
@@ -81,13 +78,11 @@ class WandbRun(WandbLogger):
         kept = read_json(self.path, Kept, "delete it to start a new wandb run") if self.path.exists() else {}
         step = kept.get("step")
         self.logged_step, self.rows = -1 if step is None else step, kept.get("rows", 0)
-        options = {"id": kept.get("id") or secrets.token_hex(4), **options}
-        super().__init__(save_dir=save_dir, **options)
+        super().__init__(save_dir=save_dir, **{"id": kept.get("id") or secrets.token_hex(4), **options})
         self._wandb_init.pop("anonymous")  # wandb warns about it even if it is not set
 
     @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, Any], step: int | None = None) -> None:
-        """Logs numbers, tables and videos at a step, unless a later step was logged before."""
         if step is not None and step < self.logged_step:
             return
         if self.experiment.step < self.rows:  # wandb restarts the row numbers of an offline part from 0

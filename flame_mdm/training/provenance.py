@@ -23,10 +23,7 @@ PACKAGES = ("flame-mdm", "torch", "lightning", "torchmetrics", "transformers", "
 
 
 class WriteProvenance(Callback):
-    """Writes `config.yaml` and `provenance.json` at the start of training, and prints a short summary.
-
-    The loggers also get their contents.
-    """
+    """Writes and logs `config.yaml` and `provenance.json` at the start of training, and prints a short summary."""
 
     def __init__(self, config: Config):
         self.config = config
@@ -37,13 +34,10 @@ class WriteProvenance(Callback):
         assert isinstance(pl_module, Task)
         folder = Path(self.config["run"]["dir"])
         save(movable(self.config), folder / "config.yaml", head="A saved run. EXP=path/to/this/file repeats it.")
-        facts = {
-            **environment(),
+        facts = environment() | {
             "device": device_name(trainer),
             "parameters": sum(p.numel() for p in pl_module.parameters() if p.requires_grad),
-            "data": {
-                name: fact for name, fact in pl_module.facts.items() if name not in ("vocabulary", "verbs", "captions")
-            },
+            "data": {k: v for k, v in pl_module.facts.items() if k not in ("vocabulary", "verbs", "captions")},
         }
         if trainer.global_step and (folder / PROVENANCE).exists():
             before: Provenance = read_json(folder / PROVENANCE, Provenance, "delete it to resume")
@@ -56,18 +50,17 @@ class WriteProvenance(Callback):
         self._introduce(trainer, pl_module, facts)
 
     def _introduce(self, trainer: Trainer, task: Task, facts: dict[str, Any]) -> None:
-        count = facts["parameters"]
-        size = self.config["data"]["batch_size"] * trainer.world_size * trainer.accumulate_grad_batches
+        clips = self.config["data"]["batch_size"]
+        size = clips * trainer.world_size * trainer.accumulate_grad_batches
         module: MotionDataModule = trainer.datamodule  # type: ignore[attr-defined]
-        data = module.store.info
-        say(f"{self.config['experiment']}: {task.describe()}, {count / 1e6:.2f} M trainable parameters")
+        data, speed = module.store.info, self.config["run"].get("speed", "reference")
+        say(f"{self.config['experiment']}: {task.describe()}, {facts['parameters'] / 1e6:.2f} M trainable parameters")
         say(f"data: {data['dataset']} as {data['representation']}; {data['hours']} hours")
         say(*module.counts(module.store))
-        speed = self.config["run"].get("speed", "reference")
         say(f"device: {facts['device']}, {trainer.precision}, speed={speed}")
-        if size > self.config["data"]["batch_size"]:
+        if size > clips:
             times = f"{trainer.world_size} processes x {trainer.accumulate_grad_batches} accumulated"
-            clips, lr = self.config["data"]["batch_size"], self.config["optimizer"].get("lr")
+            lr = self.config["optimizer"].get("lr")
             say(f"batch: {size} clips = {clips} x {times}; optimizer.lr={lr} is not scaled with the batch size")
         passes = trainer.max_steps * size / len(module.train)
         say(f"steps: {trainer.global_step} to {trainer.max_steps}, {size} clips per step, {passes:.0f} epochs")
@@ -76,14 +69,11 @@ class WriteProvenance(Callback):
 def device_name(trainer: Trainer) -> str:
     """Returns the number of processes and the device of each, such as "1 x NVIDIA H200", "1 x AMD EPYC, 2 threads"."""
     where = trainer.strategy.root_device
-    if where.type == "cuda":
-        name = torch.cuda.get_device_name(where)
-    elif where.type == "cpu":
+    name = torch.cuda.get_device_name(where) if where.type == "cuda" else where.type
+    if where.type == "cpu":
         threads = torch.get_num_threads()
         processor = torch.cpu.get_capabilities().get("cpu_name") or platform.machine()
         name = f"{processor}, {threads} thread{'s' if threads > 1 else ''}"
-    else:
-        name = where.type
     return f"{trainer.world_size} x {name}"
 
 

@@ -1,7 +1,4 @@
-"""`speed=fast`: bfloat16, compilation, and cheaper dropout and attention.
-
-The choices for CPUs are measured (docs/benchmarks/speed.md), those for CUDA are not yet.
-"""
+"""`speed=fast`: bfloat16, compilation, and cheaper dropout and attention; see docs/benchmarks/speed.md."""
 
 import torch
 from torch import Tensor, nn
@@ -17,7 +14,6 @@ COMPILED_FROM = 5000
 PAD_MULTIPLE = 32
 """Batches of a compiled network are padded to multiples of this number of frames, since each length is compiled."""
 MOST_SHAPES = 64  # maximum number of lengths and modes for which the network is compiled; torch stops at 8 by default
-BITS = 16
 
 
 def accelerate(task: Task, data: MotionDataModule, config: Config) -> str:
@@ -25,14 +21,12 @@ def accelerate(task: Task, data: MotionDataModule, config: Config) -> str:
 
     On CUDA: bfloat16 if the device supports it, and a compiled denoiser in runs of `COMPILED_FROM` steps or more.
 
-    On a CPU: bfloat16 if it has instructions for products in it; `CheapDropout`; attention by `attention`, without
-    dropout of its weights. On two cores of an AMD EPYC, a step of MDM's encoder is 1.7 times as fast at a width of 128,
-    and 3.6 times at 512 (docs/benchmarks/speed.md). Compilation made no difference there.
+    On a CPU: bfloat16 if it has instructions for products in it; `CheapDropout`; `attention`, without dropout of its
+    weights. Compilation made no difference there.
 
-    A precision other than that of `reference` in the recipe stays.
+    A precision in the recipe other than 32-true stays.
     """
-    trainer = config["trainer"]
-    precision: str = trainer["precision"]
+    trainer, supported = config["trainer"], False
     device = trainer["accelerator"]
     if device in ("auto", "gpu"):
         device = "cuda" if torch.cuda.is_available() else "mps" if torch.backends.mps.is_available() else "cpu"
@@ -48,9 +42,7 @@ def accelerate(task: Task, data: MotionDataModule, config: Config) -> str:
         has = torch.cpu.get_capabilities()
         supported = has.get("avx512_bf16") or has.get("amx_bf16")
         _simplify(task)
-    else:
-        supported = False
-    return "bf16-mixed" if supported and precision == "32-true" else precision
+    return "bf16-mixed" if supported and trainer["precision"] == "32-true" else trainer["precision"]
 
 
 def _simplify(network: nn.Module) -> None:
@@ -72,7 +64,7 @@ class CheapDropout(nn.Module):
     def __init__(self, p: float):
         super().__init__()
         self.p = p
-        self.threshold = round(p * 2**BITS) - 2 ** (BITS - 1)
+        self.threshold = round(p * 2**16) - 2**15
 
     def forward(self, x: Tensor) -> Tensor:
         if not self.training or self.p == 0:

@@ -7,23 +7,10 @@ from flame_mdm.config import Config, flatten, movable, read_saved
 from flame_mdm.errors import UserError
 
 FREE = (
-    "data.num_workers",
-    "data.resident",
-    "data.root",
-    "data.source.path",
-    "data.source.workers",
-    "data_root",
-    "callbacks",
-    "logger",
-    "trainer.max_steps",
-    "trainer.max_time",
-    "trainer.devices",
-    "trainer.num_nodes",
-    "trainer.accelerator",
-    "trainer.strategy",
-    "trainer.log_every_n_steps",
-    "trainer.val_check_interval",
-    "trainer.limit_val_batches",
+    *("callbacks", "logger", "data_root", "data.root", "data.num_workers", "data.resident"),
+    *("data.source.path", "data.source.workers"),
+    *("trainer.max_steps", "trainer.max_time", "trainer.devices", "trainer.num_nodes", "trainer.accelerator"),
+    *("trainer.strategy", "trainer.log_every_n_steps", "trainer.val_check_interval", "trainer.limit_val_batches"),
     "trainer.enable_progress_bar",
 )
 """Keys that may differ when a run is resumed."""
@@ -35,7 +22,8 @@ def train(config: Config) -> None:
     An interruption raises `SystemExit` with 128 + the number of the signal, after a checkpoint is written.
     """
     folder = Path(config["run"]["dir"])
-    _same_run(folder, config)
+    if (folder / "config.yaml").exists():
+        _check_same(folder, config)
 
     from lightning.pytorch.utilities import rank_zero_only
 
@@ -46,9 +34,7 @@ def train(config: Config) -> None:
         fit(folder, config)
 
 
-def _same_run(folder: Path, config: Config) -> None:
-    if not (folder / "config.yaml").exists():
-        return
+def _check_same(folder: Path, config: Config) -> None:
     saved, requested = flatten(movable(read_saved(folder / "config.yaml"))), flatten(movable(config))
     differing = [
         f"{key} ({saved.get(key, 'absent')} there, {requested.get(key, 'absent')} here)"

@@ -5,9 +5,8 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
-from flame_mdm.commands.tables import sizes
 from flame_mdm.config import EXPERIMENTS, recipes
-from flame_mdm.reporting.tables.build import HYPERPARAMETERS, hyperparameters, setting_text
+from flame_mdm.reporting.tables.settings import HYPERPARAMETERS, hyperparameters, setting_text
 from flame_mdm.reporting.tables.specs import PUBLISHED, load_spec
 from flame_mdm.safe_io import read_yaml
 
@@ -93,7 +92,7 @@ in the papers; most are those of the authors' code. "–": the recipe has no suc
 of a text encoder (MFM: CLIP, T5; MDM: sentence-BERT), the checkpoint is our choice.
 """
     for title, published in TABLES.items():
-        columns = {name: hyperparameters(name, sizes) for name in published}
+        columns = {name: hyperparameters(name) for name in published}
         rows = [key for key in HYPERPARAMETERS if any(key in papers for papers in published.values())]
         cells = {
             key: [_cell(ours.get(key), published[name].get(key)) for name, ours in columns.items()] for key in rows

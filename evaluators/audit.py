@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
-from scipy.stats import hypergeom, rankdata
+from scipy.stats import hypergeom, mannwhitneyu, spearmanr
 from torch import Tensor
-from torchmetrics import Metric
 
 from evaluators.evaluator import Evaluator, Motions, Rows
 from evaluators.extractors import OwnExtractor
@@ -21,6 +20,7 @@ from evaluators.metrics.attributes import AttributeAccuracy, read_attributes, ri
 from evaluators.metrics.distribution import FrechetMotionDistance, frechet_distance
 from evaluators.metrics.diversity import Diversity
 from evaluators.metrics.published_physics import PublishedPhysics
+from evaluators.metrics.samples import MotionMean
 from evaluators.perturbations import BASE, REAL, Inputs, Perturbation, Scene, Text, text_of
 from evaluators.plan import open_data
 from evaluators.protocol import digest, open_protocol
@@ -34,9 +34,8 @@ from flame_mdm.schemas import AuditCard, check_shape
 from flame_mdm.training.provenance import environment
 
 FORMAT = 1
-TOTALS = (physics.FootSkating, physics.StaticShare, physics.Penetration, physics.Floating, physics.Jitter)
-"""Metrics of joints: their value is the sum over motions of `sums`, divided by that of `counts`."""
 TRUTH = "attributes/all"  # share of motions that show every requested attribute
+PHYSICS = (physics.FootSkating, physics.StaticShare, physics.Penetration, physics.Jitter, PublishedPhysics)
 
 
 def audit(request: EvaluationRequest, cache: Path, resamples: int) -> AuditCard:
@@ -82,26 +81,21 @@ def audit(request: EvaluationRequest, cache: Path, resamples: int) -> AuditCard:
             inputs[name] = _inputs(evaluator, folder / f"{name.replace(' ', '-')}.npz", [row.id for row in rows], make)
             bar.update()
         measure = _Measure(evaluator, inputs, texts, scene.draws("bootstrap"), resamples)
-        measured = _measured(measure, scene, perturbations, inputs, texts, bar)
+        measured = _measured(measure, scene, perturbations, texts, bar)
     packages = environment()["packages"]
     return check_shape({"format": FORMAT, **facts, "resamples": resamples, "packages": packages, **measured}, AuditCard)
 
 
 def _measured(
-    measure: _Measure,
-    scene: Scene,
-    perturbations: Sequence[Perturbation],
-    inputs: Mapping[str, Inputs],
-    texts: Sequence[Text],
-    bar: ProgressBar,
+    measure: _Measure, scene: Scene, perturbations: Sequence[Perturbation], texts: Sequence[Text], bar: ProgressBar
 ) -> dict[str, Any]:
-    base = measure(inputs[BASE], texts)
-    scores, listed = [measure.scores(inputs[BASE], texts)], []
+    base = measure(measure.inputs[BASE], texts)
+    scores, listed = [measure.scores(measure.inputs[BASE], texts)], []
     for perturbation in perturbations:
         grades = []
-        changed, wrong = inputs[BASE], texts
+        changed, wrong = measure.inputs[BASE], texts
         for grade in perturbation.grades:
-            changed, wrong = scene.condition(perturbation, grade, inputs, texts)
+            changed, wrong = scene.condition(perturbation, grade, measure.inputs, texts)
             grades.append({"grade": float(grade), "values": _differences(measure(changed, wrong), base)})
             bar.update()
         if perturbation.group == "meaning":
@@ -109,15 +103,12 @@ def _measured(
         about = {name: getattr(perturbation, name) for name in ("name", "group", "about", "unit")}
         listed.append({**about, "grades": grades})
     return {
-        "metrics": {name: _higher_is_better(measure.metrics, *name.partition("/")[::2]) for name in base},
+        "metrics": {name: measure.higher_is_better(name) for name in base},
         "real": {name: _interval(values) for name, values in base.items()},
         "perturbations": listed,
         "not_computed": measure.reasons,
         "truth": _agreement(scores, listed),
     }
-
-
-# Measurement ----------------------------------------------------------------------------------------------------------
 
 
 def _inputs(evaluator: Evaluator, path: Path, ids: list[str], make: Callable[[], list[np.ndarray]]) -> Inputs:
@@ -128,42 +119,27 @@ def _inputs(evaluator: Evaluator, path: Path, ids: list[str], make: Callable[[],
     features = extracted.get("generated")
     inputs: Inputs = {} if features is None else {"features": features.double().numpy()}
     for name, metric in make_metrics(evaluator.metrics).items():
-        if type(metric) in TOTALS:
-            inputs[name] = np.array([_totals(metric, joints) for joints in extracted["joints"]])
-        elif isinstance(metric, PublishedPhysics):
-            inputs |= _values(name, metric, extracted)
-        elif isinstance(metric, AttributeAccuracy):
+        if isinstance(metric, AttributeAccuracy):
             inputs["seen"] = np.array([json.dumps(read_attributes(x.numpy(), metric.fps)) for x in extracted["joints"]])
+        elif isinstance(metric, PHYSICS):
+            inputs |= _ratios(name, metric, extracted)
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as temporary:
         np.savez(temporary, allow_pickle=False, **inputs)
     return inputs
 
 
-def _totals(metric: Metric, joints: Tensor) -> list[float]:
-    metric.reset()
-    mask = torch.ones(1, len(joints), dtype=torch.bool)
-    update_metrics({"": metric}, joints=joints[None], mask=mask, keys=torch.zeros(1, dtype=torch.long))
-    return [float(torch.cat(getattr(metric, state)).sum()) for state in ("sums", "counts")]
-
-
-def _higher_is_better(metrics: Mapping[str, Metric], name: str, part: str) -> bool | None:
-    metric = metrics[name]
-    other = metric.DIRECTIONS if isinstance(metric, PublishedPhysics) else {}
-    return other.get(part, metric.higher_is_better)
-
-
-def _values(name: str, metric: PublishedPhysics, extracted: Rows) -> Inputs:
-    """Returns the value, or 0, and whether it is defined, for each motion; nothing if no motion may have one."""
-    if metric.required_fps not in (None, metric.fps):
+def _ratios(name: str, metric: MotionMean, extracted: Rows) -> Inputs:
+    """Returns value and weight (N, 2) of each motion, by metric; nothing if it is defined at another frame rate."""
+    if isinstance(metric, PublishedPhysics) and metric.required_fps not in (None, metric.fps):
         return {}
     for i, joints in enumerate(extracted["joints"]):
-        rows = {row: extracted[row][i : i + 1] for row in ("keys", "contacts") if row in extracted}
-        rows |= {"contacts": rows["contacts"][0][None]} if "contacts" in rows else {}
-        update_metrics({name: metric}, joints=joints[None], mask=torch.ones(1, len(joints), dtype=torch.bool), **rows)
-    values, defined = (torch.cat(getattr(metric, state)).numpy() for state in ("sums", "counts"))
-    parts = zip(metric.parts, values.T, defined.T, strict=True)
-    return {f"{name}/{part}": np.stack([value, weight], 1) for part, value, weight in parts if weight.any()}
+        rows = {"joints": joints[None], "mask": torch.ones(1, len(joints), dtype=torch.bool)}
+        rows |= {"contacts": extracted["contacts"][i][None]} if "contacts" in extracted else {}
+        update_metrics({name: metric}, keys=extracted["keys"][i : i + 1], **rows)
+    pairs = torch.stack([torch.cat(getattr(metric, state)) for state in metric.states], 1).numpy()
+    parts = [f"{name}/{part}" for part in metric.parts or metric.names] or [name]
+    return {part: pairs[..., k] for k, part in enumerate(parts) if pairs[:, 1, k].any()}
 
 
 class _Measure:
@@ -174,26 +150,29 @@ class _Measure:
     """
 
     def __init__(
-        self, evaluator: Evaluator, inputs: Mapping[str, Inputs], texts: Sequence[Text], draws: np.random.Generator,
+        self,
+        evaluator: Evaluator,
+        inputs: Mapping[str, Inputs],
+        texts: Sequence[Text],
+        draws: np.random.Generator,
         resamples: int,
-    ):  # fmt: skip
+    ):
         self.metrics, self.extractor, self.inputs = make_metrics(evaluator.metrics), evaluator.extractor, inputs
         count = len(next(iter(inputs[BASE].values())))
         resampled = draws.multinomial(count, np.full(count, 1 / count), resamples)
         self.weights = np.concatenate([np.ones((1, count), int), resampled])
         self.reasons: dict[str, str] = {} if self.extractor else {"extractor": "metrics that need features"}
         self.encoded: dict[str, Tensor] = {}
-        self.of_base: dict[str, np.ndarray] = {}
-        self.real_texts = texts
+        self.real_texts, self.base_sets = texts, self._sets(inputs[BASE])
 
     def __call__(self, inputs: Inputs, texts: Sequence[Text]) -> dict[str, np.ndarray]:
         """Returns the values (1 + R,) of each metric."""
-        values = {name: self._ratio(pair) for name, pair in self._pairs(inputs, texts).items()}
-        for name, metric in self.metrics.items():
-            if "features" in inputs and isinstance(metric, FrechetMotionDistance | Diversity):
-                base = inputs is self.inputs[BASE]  # as it is for changed captions
-                values[name] = self.of_base[name] if base and name in self.of_base else self._of_set(metric, inputs)
-                self.of_base |= {name: values[name]} if base else {}
+        values = {}
+        for name, pair in self._pairs(inputs, texts).items():
+            weights = self.weights[:, : len(pair)]
+            with np.errstate(invalid="ignore"):
+                values[name] = weights @ pair[:, 0] / (weights @ pair[:, 1])
+        values |= self.base_sets if inputs is self.inputs[BASE] else self._sets(inputs)  # the same for other captions
         order = list(self.metrics)
         return dict(sorted(values.items(), key=lambda item: order.index(item[0].partition("/")[0])))
 
@@ -201,20 +180,26 @@ class _Measure:
         """Returns the values (N,) of single pairs, by metric."""
         return {name: pair[:, 0] for name, pair in self._pairs(inputs, texts).items()}
 
-    def _ratio(self, pair: np.ndarray) -> np.ndarray:
-        weights = self.weights[:, : len(pair)]
-        with np.errstate(invalid="ignore"):
-            return weights @ pair[:, 0] / (weights @ pair[:, 1])
+    def higher_is_better(self, name: str) -> bool | None:
+        metric, _, part = name.partition("/")
+        directions = getattr(self.metrics[metric], "DIRECTIONS", {})
+        return directions.get(part, self.metrics[metric].higher_is_better)
 
-    def _of_set(self, metric: Metric, inputs: Inputs) -> np.ndarray:
-        """Returns the values (1 + R,) of a metric of a set."""
+    def _sets(self, inputs: Inputs) -> dict[str, np.ndarray]:
+        """Returns the values (1 + R,) of metrics of sets, by name."""
+        values: dict[str, np.ndarray] = {}
+        if "features" not in inputs:
+            return values
         x, real = (torch.from_numpy(group["features"]) for group in (inputs, self.inputs[REAL]))
-        weights = self.weights[:, : len(x)]
-        if isinstance(metric, Diversity):
-            return ((weights @ _distances(x, x).numpy()) * weights).sum(1) / weights.sum(1) ** 2
-        repeats = [(torch.from_numpy(w[: len(x)]), torch.from_numpy(w)) for w in self.weights]
-        drawn = ((x.repeat_interleave(a, 0), real.repeat_interleave(b, 0)) for a, b in repeats)
-        return np.array([frechet_distance(*sets).item() for sets in drawn])
+        for name, metric in self.metrics.items():
+            if isinstance(metric, Diversity):
+                weights = self.weights[:, : len(x)]
+                values[name] = ((weights @ _distances(x, x).numpy()) * weights).sum(1) / weights.sum(1) ** 2
+            elif isinstance(metric, FrechetMotionDistance):
+                repeats = [(torch.from_numpy(w[: len(x)]), torch.from_numpy(w)) for w in self.weights]
+                drawn = ((x.repeat_interleave(a, 0), real.repeat_interleave(b, 0)) for a, b in repeats)
+                values[name] = np.array([frechet_distance(*sets).item() for sets in drawn])
+        return values
 
     def _pairs(self, inputs: Inputs, texts: Sequence[Text]) -> dict[str, np.ndarray]:
         """Returns value and weight (N, 2) of each motion or pair, by metric."""
@@ -233,24 +218,24 @@ class _Measure:
         unit = F.normalize(motion, dim=-1), F.normalize(text, dim=-1)
         values: dict[str, np.ndarray | Tensor] = {}
         for name, metric in self.metrics.items():
+            pair = unit if getattr(metric, "normalize", False) else (motion, text)
             if isinstance(metric, alignment.TextsForMotion):
-                first = {text.caption: i for i, text in reversed(list(enumerate(texts)))}
-                column = {caption: number for number, caption in enumerate(first)}
-                own = torch.tensor([column[text.caption] for text in texts])
-                values |= self._top(name, metric, _distances(motion, text[list(first.values())]), own)
+                candidates = {text.caption: text for text in texts}
+                columns = list(candidates)
+                own = torch.tensor([columns.index(text.caption) for text in texts])
+                distance = _distances(motion, self._encoded(list(candidates.values())))
+                values |= self._top(name, metric, distance, own)
             elif isinstance(metric, alignment.MotionsForText):
-                pair = unit if metric.normalize else (motion, text)
                 values |= self._top(name, metric, _distances(pair[1], pair[0]), torch.arange(len(motion)))
             elif isinstance(metric, alignment.MultimodalDistance):
-                pair = unit if metric.normalize else (motion, text)
                 values[name] = torch.linalg.vector_norm(pair[0] - pair[1], dim=-1)
             elif isinstance(metric, alignment.MotionCLIPScore):
                 values[name] = (unit[0] * unit[1]).sum(1)
             elif isinstance(metric, alignment.MutualInformationDivergence):
                 real, real_text = torch.from_numpy(self.inputs["as stored"]["features"]), self._encoded(self.real_texts)
                 if len(real) > real.shape[1] + real_text.shape[1]:
-                    pair = (real, real_text, motion, text)
-                    values[name] = alignment.pointwise_mutual_information(*pair, metric.eps)
+                    sets = (real, real_text, motion, text)
+                    values[name] = alignment.pointwise_mutual_information(*sets, metric.eps)
                 else:
                     self.reasons[name] = f"{len(real)} motions are too few for its covariances"
         return pairs | {name: np.stack([value, np.ones(len(value))], 1) for name, value in values.items()}
@@ -310,9 +295,10 @@ def _agreement(
     for name in scores[0]:
         if name.endswith("/top1") or name in ("mm_dist", "mclip_score", "mid"):
             score = np.concatenate([of_set[name] for of_set in scores]) * (-1 if name == "mm_dist" else 1)
-            ranks, count = rankdata(score)[right], int(right.sum())
-            auc = (ranks.sum() - count * (count + 1) / 2) / (count * (len(right) - count))
-            both = np.array([(grade[name][0], grade[TRUTH][0]) for grade in grades if grade[name][0] is not None])
-            correlation = np.corrcoef(rankdata(both, axis=0).T)[0, 1]
-            agreement[name] = {"auc": float(auc), "correlation": float(correlation)}
+            larger = mannwhitneyu(score[right], score[~right], method="asymptotic").statistic
+            both = [(grade[name][0], grade[TRUTH][0]) for grade in grades if grade[name][0] is not None]
+            agreement[name] = {
+                "auc": float(larger / (right.sum() * (~right).sum())),
+                "correlation": float(spearmanr(both).statistic),
+            }
     return agreement

@@ -19,18 +19,13 @@ class Evaluate(Callback):
     """Evaluates the model on the validation split under a protocol, and logs val/<protocol>/<metric>.
 
     Checkpoints can be selected by these values. With several replications, val/<protocol>/<metric>/ci is the half width
-    of the 95 % interval. A table lists all values.
-
-    The evaluation runs at the first validation and then at multiples of `every_n_steps`, with averaged weights if the
-    recipe averages them. The motions are divided among all processes.
+    of the 95 % interval. The evaluation runs at the first validation and then at multiples of `every_n_steps`, with
+    averaged weights if the recipe averages them. The motions are divided among all processes.
 
     Args:
         protocol: a name in experiments/evaluation, or the path of a file.
         extractor: path from which the protocol's extractor is loaded; "none" skips metrics of features.
-        every_n_steps: interval in training steps; evaluations run at validation.
         samples: motions per replication; None = the protocol's number.
-        replications: number of replications.
-        batch_size: motions per batch.
 
     Raises `UserError` before training begins if the extractor does not exist.
     """
@@ -71,15 +66,8 @@ class Evaluate(Callback):
         assert isinstance(pl_module, MotionGeneration)
         self.next = (trainer.global_step // self.every_n_steps + 1) * self.every_n_steps
         protocol = self.evaluation.protocol
-        source = Generator(
-            pl_module,
-            protocol,
-            self.evaluation.clips,
-            *sampling_options(protocol, pl_module),
-            seed=0,
-            batch_size=self.batch_size,
-            progress=False,
-        )
+        options, size = sampling_options(protocol, pl_module), {"seed": 0, "batch_size": self.batch_size}
+        source = Generator(pl_module, protocol, self.evaluation.clips, *options, **size, progress=False)
         values = self.evaluation.run(source, ground_truth=False).values or {}
         numbers = {name: v.mean for name, v in values.items() if v is not None and v.mean is not None}
         widths = {f"{name}/ci": v.ci for name, v in values.items() if v is not None and v.ci is not None}

@@ -14,7 +14,6 @@ from torch import Tensor
 from evaluators.collectives import is_first, processes, shared
 from evaluators.evaluator import Evaluator, Motions, Rows, keys_of
 from evaluators.extractors import Extractor
-from evaluators.metrics.attributes import ATTRIBUTES
 from evaluators.metrics.distribution import FrechetMotionDistance
 from evaluators.plan import Plan
 from evaluators.protocol import DrawnClip, Protocol
@@ -44,9 +43,14 @@ def evaluate(request: EvaluationRequest) -> None:
     with processes(request.device) as device:
         plan = Plan(request, device)
         result = make_result(request, plan)
-        training, size = plan.data.clips("train"), {"seed": request.seed, "batch_size": plan.batch_size}
         evaluation = Evaluation(
-            plan.protocol, plan.clips, plan.extractor, plan.representation, training=training, **size
+            plan.protocol,
+            plan.clips,
+            plan.extractor,
+            plan.representation,
+            seed=request.seed,
+            batch_size=plan.batch_size,
+            training=plan.data.clips("train"),
         )
         measured = evaluation.run(plan.source, force=request.force)
         if is_first():
@@ -58,10 +62,7 @@ def evaluate(request: EvaluationRequest) -> None:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A protocol on a split of a data set.
-
-    If there are several processes, all create and run it together.
-    """
+    """A protocol on a split of a data set. If there are several processes, all create and run it together."""
 
     protocol: Protocol  # what is measured
     clips: Clips  # the split
@@ -83,7 +84,7 @@ class Evaluation:
             ground_truth: whether real motions are measured.
             force: generate even if real motions do not have the values that the protocol expects.
         """
-        seeds = [self._draws(replication) for replication in range(self.protocol.replications)]
+        seeds = [key("draws", self.seed, replication) for replication in range(self.protocol.replications)]
         measured = Measured(
             ground_truth=None, values=None, not_computed={}, invalid_because=[], cost=Cost(), seeds=seeds
         )
@@ -114,7 +115,10 @@ class Evaluation:
             self.extractor, self.protocol.metrics, self.representation, self.batch_size, skip_features=skips
         )
         if evaluator.reads("nearest") and self.training is not None:
-            evaluator.training = evaluator.training_motions(*self._training(self.training))
+            windows = self.protocol.rows(self.training, self.seed, 0, purpose="training")
+            whole = [replace(row, frames=np.arange(row.clip.length)) for row in windows]
+            motions = [self._motions(rows, real_motions(self.training, rows)) for rows in (whole, windows)]
+            evaluator.training = evaluator.training_motions(*motions)
         return evaluator
 
     @cached_property
@@ -123,14 +127,26 @@ class Evaluation:
         several = self.protocol.multimodality
         return several and replace(self.evaluator, metrics=several.metrics)
 
-    # Real motions -----------------------------------------------------------------------------------------------------
+    def _score(
+        self, evaluator: Evaluator, measured: Measured, motions: Rows, paired: Rows, real: Rows, replication: int
+    ) -> tuple[dict[str, float | None], int]:
+        """Returns the values of motions, and their number; adds the reasons for missing values to `measured`."""
+        values, reasons = evaluator.score(motions, paired, real, key("draws", self.seed, replication))
+        measured.not_computed |= reasons
+        return values, len(motions["keys"])
 
     def _measure_real(self, measured: Measured, source: Source | None, ground_truth: bool) -> list[tuple[Rows, Rows]]:
         """Measures real motions; returns for each replication those that motions of the source are compared with."""
         scores: Scores = []
         real_sets = []
         for replication in range(self.protocol.replications):
-            paired, real = self._real(replication)
+            again = self.protocol.rows(self.clips, self.seed, replication, purpose="real")
+            real = self.evaluator.reference()
+            if real is None:
+                features = real_motions(self.clips, again)
+                real = replace(self.evaluator, training=None).extract(self._motions(again, features))
+            real = _without_joints(real)
+            paired = self._paired(self.protocol.rows(self.clips, self.seed, replication))
             if ground_truth:
                 scores.append(self._score(self.evaluator, measured, paired, paired, real, replication))
             if source is not None:
@@ -141,28 +157,6 @@ class Evaluation:
         if ground_truth:
             measured.ground_truth = averages(scores)
         return real_sets
-
-    def _score(
-        self, evaluator: Evaluator, measured: Measured, motions: Rows, paired: Rows, real: Rows, replication: int
-    ) -> tuple[dict[str, float | None], int]:
-        """Returns the values of motions, and their number; adds the reasons for missing values to `measured`."""
-        values, reasons = evaluator.score(motions, paired, real, self._draws(replication))
-        measured.not_computed |= reasons
-        return values, len(motions["keys"])
-
-    def _training(self, clips: Clips) -> tuple[Motions, Motions]:
-        """Returns the training motions: all frames of each, and a window of each for its features."""
-        windows = self.protocol.rows(clips, self.seed, 0, purpose="training")
-        whole = [replace(row, frames=np.arange(row.clip.length)) for row in windows]
-        return self._motions(whole, real_motions(clips, whole)), self._motions(windows, real_motions(clips, windows))
-
-    def _real(self, replication: int) -> tuple[Rows, Rows]:
-        """Returns the real motions of a replication, and real motions for comparisons of sets."""
-        again = self.protocol.rows(self.clips, self.seed, replication, purpose="real")
-        real = self.evaluator.reference()
-        if real is None:
-            real = replace(self.evaluator, training=None).extract(self._motions(again, real_motions(self.clips, again)))
-        return self._paired(self.protocol.rows(self.clips, self.seed, replication)), _without_joints(real)
 
     def _paired(self, rows: Sequence[DrawnClip]) -> Rows:
         motions = self._motions(rows, real_motions(self.clips, rows))
@@ -176,18 +170,14 @@ class Evaluation:
         info = self.clips.store.info
         if self.protocol.quick or (self.clips.clips[0].split != "test" and info["clips"]["test"]):
             return []
-        names = [info["dataset"], *([self.extractor.sha256] if self.extractor else [])]
         lines = []
-        for metric, (expected, tolerance) in (
-            x for name in names for x in self.protocol.expected.get(name, {}).items()
-        ):
-            value = values.get(metric)
-            mean = value.mean if value else None
-            if mean is not None and not abs(mean - expected) <= tolerance:
-                lines.append(f"real motions have {metric} {mean:.4g}, expected {expected:g} +- {tolerance:g}")
+        for name in (info["dataset"], *([self.extractor.sha256] if self.extractor else [])):
+            for metric, (expected, tolerance) in self.protocol.expected.get(name, {}).items():
+                value = values.get(metric)
+                mean = value.mean if value else None
+                if mean is not None and not abs(mean - expected) <= tolerance:
+                    lines.append(f"real motions have {metric} {mean:.4g}, expected {expected:g} +- {tolerance:g}")
         return lines
-
-    # Motions of the source --------------------------------------------------------------------------------------------
 
     def _measure(self, measured: Measured, source: Source, real_sets: Sequence[tuple[Rows, Rows]]) -> None:
         """Measures the source's motions of each replication, compared with the real ones; fills in `measured`."""
@@ -235,26 +225,17 @@ class Evaluation:
 
     def _warnings(self, generated: Rows, real: Rows) -> list[str]:
         lines = []
-        if "generated" not in generated:
-            return lines
-        count, others, width = len(generated["keys"]), len(real["keys"]), generated["generated"].shape[1]
-        few = min(count, others)
+        count, others = len(generated["keys"]), len(real["keys"])
         for name, config in self.protocol.metrics.items():
-            if not config["_target_"].endswith(FrechetMotionDistance.__name__):
-                continue
-            if few < 2 * width:
-                lines.append(f"{name}: biased upwards: {few} motions are fewer than twice the {width} features")
-            if count != others:
-                lines.append(
-                    f"{name}: {count} generated and {others} real motions. Compare it only with values for the same "
-                    "two numbers"
-                )
+            if "generated" in generated and config["_target_"].endswith(FrechetMotionDistance.__name__):
+                width = generated["generated"].shape[1]
+                if min(count, others) < 2 * width:
+                    few = f"{min(count, others)} motions are fewer than twice the {width} features"
+                    lines.append(f"{name}: biased upwards: {few}")
+                if count != others:
+                    numbers = f"{count} generated and {others} real motions"
+                    lines.append(f"{name}: {numbers}. Compare it only with values for the same two numbers")
         return lines
-
-    # Both -------------------------------------------------------------------------------------------------------------
-
-    def _draws(self, replication: int) -> int:
-        return key("draws", self.seed, replication)
 
     def _motions(
         self, rows: Sequence[DrawnClip], features: list[np.ndarray], captions: list[str] | None = None
@@ -267,23 +248,17 @@ class Evaluation:
         if condition == "action":
             inputs["labels"] = torch.tensor([row.clip.action for row in rows])
         if condition != "none" and all("action" in x for x in attributes):
-            inputs["requested"] = [{k: v for k, v in x.items() if k in ATTRIBUTES} for x in attributes]
+            inputs["requested"] = [row.requested for row in rows]
         if condition != "none" and all("content" in x for x in attributes):
             inputs["sides"] = [(x["content"], x.get("side", "")) for x in attributes]
         return Motions(
             ids=[row.id for row in rows],
             features=features,
             captions=texts,
-            tokens=[_tokens(row, caption) for row, caption in zip(rows, texts, strict=True)] if texts else None,
+            tokens=[row.tokens(caption) for row, caption in zip(rows, texts, strict=True)] if texts else None,
             inputs=inputs,
             edit=self.protocol.edit,
         )
-
-
-def _tokens(row: DrawnClip, caption: str) -> list[str] | None:
-    """Returns the "word/PART" tokens of a caption of the clip, if the data has them."""
-    tagged = row.clip.attributes.get("tokens")
-    return tagged[row.clip.captions.index(caption)] if tagged and caption in row.clip.captions else None
 
 
 def _without_joints(rows: Rows) -> Rows:

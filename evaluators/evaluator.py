@@ -28,9 +28,7 @@ from flame_mdm.sampling.request import EditRequest
 from flame_mdm.seeds import key
 
 CHUNK = 64  # motions per metric update; more do not fit into a processor's cache
-
 FEATURES = {"generated", "real", "text", "logits"}  # inputs of metrics that an extractor provides
-
 PAIRED = {"generated": "real", "joints": "real_joints", "nearest": "real_nearest", "references": "references"}
 """Inputs of paired real motions -> their names among the inputs of the generated motions."""
 
@@ -64,8 +62,7 @@ class Evaluator:
     """Computes metrics of motions.
 
     For the same features, all values are bit-identical for any batch size and order. Several processes share the
-    feature pass: each extracts whole batches, so that features do not depend on the number of processes. The first
-    process computes the metrics, on the CPU.
+    feature pass, in whole batches, so that features do not depend on their number. The first one computes the metrics.
 
     Attributes:
         extractor: computes the features for metrics; None = no features.
@@ -91,8 +88,8 @@ class Evaluator:
         parts = dealt(partial(self._batch, motions), batches)
         texts = [text for indices in batches if (text := self._texts(motions, indices)) is not None]
         back = np.argsort(order, kind="stable")
-        joints = [motion for batch, _ in parts for motion in batch]
-        rows["joints"] = joints = [joints[i] for i in back]
+        unordered = [motion for batch, _ in parts for motion in batch]
+        rows["joints"] = joints = [unordered[i] for i in back]
         if batches:
             rows |= {name: torch.cat([features[name] for _, features in parts])[back] for name in parts[0][1]}
         if texts:
@@ -121,9 +118,8 @@ class Evaluator:
     def reference(self) -> Rows | None:
         """Returns features of the extractor's own real motions; None = sets are compared with motions of the data."""
         features = self.extractor.reference() if self.extractor is not None else None
-        if features is None:
-            return None
-        return {"generated": features, "keys": keys_of([f"reference {number}" for number in range(len(features))])}
+        keys = None if features is None else keys_of([f"reference {number}" for number in range(len(features))])
+        return None if features is None else {"generated": features, "keys": keys}
 
     def _batch(self, motions: Motions, indices: Sequence[int]) -> tuple[list[Tensor], dict[str, Tensor]]:
         for i in indices:

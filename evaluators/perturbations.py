@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from evaluators.metrics.attributes import ATTRIBUTES
 from evaluators.protocol import DrawnClip
 from evaluators.sources import real_motions
 from flame_mdm.config import EXPERIMENTS, instantiate
@@ -371,6 +370,4 @@ class Scene:
 
 def text_of(row: DrawnClip, caption: str) -> Text:
     """Returns a caption of the clip of a row with its attributes."""
-    tagged = row.clip.attributes.get("tokens")
-    requested = {name: value for name, value in row.clip.attributes.items() if name in ATTRIBUTES}
-    return Text(caption, tagged[row.clip.captions.index(caption)] if tagged else None, requested)
+    return Text(caption, row.tokens(caption), row.requested)

@@ -29,14 +29,12 @@ class Plan:
     Raises `UserError` or `FileNotFoundError` if a file is missing, or model, data, protocol and extractor do not match.
 
     Attributes:
-        model, file: the model that generates the motions, and its checkpoint; None without a model.
-        sampling: sampling options of the model.
-        data, clips: the data set, and the evaluated split.
-        representation: of the motions, on the device to compute on.
+        model, file, sampling: the model, its checkpoint and its sampling options; None and {} without a model.
+        data, clips, representation: the data set, the evaluated split, and the representation on its device.
         skeleton: the bones of joints computed from SMPL's rotations; None if the data has joint positions.
-        protocol: in the requested size; `changed` has the options that differ.
+        protocol, changed: the protocol in the requested size, and the options that differ.
         extractor: None = metrics that need features are skipped.
-        source: of the motions; `batch_size` motions per batch.
+        source, batch_size: source of the motions, and motions per batch.
         path: of the result file.
     """
 
@@ -49,9 +47,9 @@ class Plan:
         self.representation = model.representation if model else data.representation.to(device)
         self.skeleton = set_bones(request.smpl, self.representation)
         self.clips = data.clips(request.split)
+        name = request.protocol or (default_protocol(model) if model else "")
         names = ("replications", "samples", "quick", "multimodality", "batch_size")
         size = {name: getattr(request, name) for name in names}
-        name = request.protocol or (default_protocol(model) if model else "")
         protocol, self.changed = open_protocol(name, self.clips, self.representation, model, **size)
         self.extractor = protocol.open_extractor(request.extractor, self.representation, data.store.info["dataset"])
         self.batch_size = protocol.batch_size or request.batch_size or 64
@@ -60,9 +58,8 @@ class Plan:
             options, edit = sampling_options(protocol, model, request.options, request.editing)
             self.sampling = options.chosen() | {"edit": edit}
             folder = self._motions_folder(request, self.file, protocol)
-            self.source = Generator(
-                model, protocol, self.clips, options, edit, seed=request.seed, batch_size=self.batch_size, folder=folder
-            )
+            size = {"seed": request.seed, "batch_size": self.batch_size}
+            self.source = Generator(model, protocol, self.clips, options, edit, **size, folder=folder)
             path = folder / "result"
         elif request.baseline is not None:
             self.source = Baseline(request.baseline, self.clips, protocol.condition, request.seed)
@@ -86,13 +83,8 @@ class Plan:
             run = Path("runs") / str(request.ckpt)
         else:
             run = file.parent.parent if file.parent.name == "checkpoints" else file.parent
-        used = {
-            **self.sampling,
-            "seed": request.seed,
-            "split": request.split,
-            "data": self.data.store.fingerprint,
-            "samples": protocol.samples,
-        }
+        used = self.sampling | {"seed": request.seed, "split": request.split, "samples": protocol.samples}
+        used |= {"data": self.data.store.fingerprint}
         used |= {"batch_size": self.batch_size} if protocol.batch_size else {}
         return run / "evaluation" / protocol.title / f"{sha256(file)[:16]}-{digest(used)[:8]}"
 

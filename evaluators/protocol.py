@@ -13,6 +13,7 @@ from pydantic import ConfigDict, Field
 
 from evaluators.extractors import Extractor
 from evaluators.metrics import make_metrics
+from evaluators.metrics.attributes import ATTRIBUTES
 from flame_mdm.config import EXPERIMENTS, Config, check, instantiate, plain
 from flame_mdm.data.datamodule import Clips
 from flame_mdm.data.store import Entry
@@ -25,6 +26,7 @@ from flame_mdm.seeds import key
 
 FOLDER = EXPERIMENTS / "evaluation"
 QUICK_REPLICATIONS, QUICK_SAMPLES = 2, 64
+Count = Annotated[Int, Field(ge=1)]
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,16 @@ class DrawnClip:
         """The drawn caption."""
         assert self.caption is not None
         return self.clip.captions[self.caption]
+
+    @property
+    def requested(self) -> dict[str, Any]:
+        """Those of the attributes of the clip that can be read from motions."""
+        return {name: value for name, value in self.clip.attributes.items() if name in ATTRIBUTES}
+
+    def tokens(self, caption: str) -> list[str] | None:
+        """Returns the "word/PART" tokens of a caption of the clip, if the data has them."""
+        tagged = self.clip.attributes.get("tokens")
+        return tagged[self.clip.captions.index(caption)] if tagged and caption in self.clip.captions else None
 
 
 class Multimodality(ClosedSchema):
@@ -66,29 +78,18 @@ class Protocol(ClosedSchema):
     name: str  # name of the file, with that of the variant
     version: Int  # raised when the protocol changes; values of different versions are not comparable
     condition: Literal["text", "action", "none"]  # condition of the generated motions
-    # a mapping with the `_target_` of an `Extractor`, and its `path` unless the evaluation has to provide one. None =
-    # not needed.
-    extractor: Config | None
+    extractor: Config | None  # mapping with the `_target_` of an `Extractor`, and its `path` unless it must be given
     metrics: dict[str, Config]  # mappings with the `_target_` of a metric, by name
-    replications: Annotated[Int, Field(ge=1)]  # number of repetitions of the evaluation
-    # motions per replication. Clips are drawn at random, and repeatedly if there are too few. None = each clip of the
-    # split once.
-    samples: Annotated[Int, Field(ge=1)] | None = None
-    # real motions per replication in comparisons of sets, drawn likewise; None = each clip once
-    real_samples: Annotated[Int, Field(ge=1)] | None = None
-    multimodality: Multimodality | None = None  # a second evaluation with several motions per prompt; None = none
-    # `region` and `joints` of `sampling.editing.kept_parts`: motions are edits of real motions; None = motions are
-    # generated from scratch
-    edit: dict[str, Any] | None = None
-    # standard deviation, in frames, of a Gaussian filter over time that is applied to the features of generated motions
-    # before they are measured, with mirrored ends; None = no filter
-    smoothing: Number | None = None
-    # motions per batch, if the protocol measures time; a first batch is not timed. None = the protocol does not measure
-    # time and uses the batch size of the evaluation.
-    batch_size: Annotated[Int, Field(ge=1)] | None = None
+    replications: Count  # number of repetitions of the evaluation
+    samples: Count | None = None  # motions per replication; clips are drawn at random. None = each clip once
+    real_samples: Count | None = None  # real motions in comparisons of sets, drawn likewise; None = each clip once
+    multimodality: Multimodality | None = None  # a second evaluation with several motions per prompt
+    edit: dict[str, Any] | None = None  # motions are edits of real motions: `region` and `joints` of `kept_parts`
+    smoothing: Number | None = None  # deviation, in frames, of a Gaussian filter over time of generated features
+    batch_size: Count | None = None  # motions per batch of a protocol that measures time; a first batch is not timed
     only: dict[str, Any] = Field({})  # attributes that evaluated clips must have; {} = all clips of the split
-    # by data set or sha256 of the extractor, the values that real motions of the test split must have: metric ->
-    # [value, tolerance]. If they differ, nothing is generated.
+    # values of real motions of the test split, by data set or sha256 of the extractor: metric -> [value, tolerance].
+    # If they differ, nothing is generated.
     expected: dict[str, dict[str, Annotated[list[Number], Field(min_length=2, max_length=2)]]] = Field({})
     quick: bool = False  # whether the evaluation is a quick one, set by `resized`
     sha256: str = ""  # hash of the content of the file, set by `load_protocol`
@@ -103,23 +104,22 @@ class Protocol(ClosedSchema):
         quick: bool = False,
         multimodality: bool = True,
     ) -> tuple[Protocol, dict[str, Any]]:
-        """Returns the protocol with another size for a split of `clips`, and the options that changed; None = as it is.
+        """Returns the protocol with another size for a split of `clips`, and the options that changed.
 
         A quick evaluation has few motions and replications. `batch_size` is for protocols that measure time. Raises
         `UserError` if a number is less than 1.
         """
-        if quick:
-            replications = QUICK_REPLICATIONS if replications is None else replications
-            samples = min(QUICK_SAMPLES, clips) if samples is None else samples
+        defaults = {"replications": QUICK_REPLICATIONS, "samples": min(QUICK_SAMPLES, clips)} if quick else {}
         changed: dict[str, Any] = {}
-        for name, value in {"replications": replications, "samples": samples, "batch_size": batch_size}.items():
+        for name, number in {"replications": replications, "samples": samples, "batch_size": batch_size}.items():
+            value = defaults.get(name) if number is None else number
             if value is not None and value < 1:
                 raise UserError(f"{name}={value}: must be at least 1")
             if value not in (None, getattr(self, name)) and (name != "batch_size" or self.batch_size):
                 changed[name] = value
         several = self.multimodality
-        if several and replications is not None:
-            several = several.model_copy(update={"replications": min(replications, several.replications)})
+        if several and "replications" in changed:
+            several = several.model_copy(update={"replications": min(changed["replications"], several.replications)})
         if several and not multimodality:
             several, changed["multimodality"] = None, False
         return self.model_copy(update={**changed, "quick": quick, "multimodality": several}), changed
@@ -144,8 +144,6 @@ class Protocol(ClosedSchema):
     @property
     def title(self) -> str:
         return f"{self.name}-{self.version}"
-
-    # Motions to generate ----------------------------------------------------------------------------------------------
 
     def selected(self, clips: Clips) -> list[Entry]:
         """Returns the clips of a split that the protocol evaluates on."""
@@ -205,9 +203,6 @@ class Protocol(ClosedSchema):
                 f"protocol {self.name} generates motions from {self.condition}, but the checkpoint was trained "
                 f"with condition {model.conditioned_on}. Choose another protocol, such as {default_protocol(model)}"
             )
-
-
-# Files ----------------------------------------------------------------------------------------------------------------
 
 
 def protocol_names(folder: Path = FOLDER) -> list[str]:

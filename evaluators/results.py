@@ -10,8 +10,6 @@ from evaluators.plan import Plan
 from evaluators.protocol import digest
 from evaluators.request import EvaluationRequest
 from evaluators.sources import SampleFolder
-from flame_mdm.data import Split
-from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.errors import say
 from flame_mdm.reporting.audit import card_of
 from flame_mdm.safe_io import sha256
@@ -23,8 +21,7 @@ def mean_ci(values: Sequence[float]) -> tuple[float, float]:
     """Returns the mean of R replications, at least one, and the half width of its 95 % confidence interval.
 
     The half width is 1.96 std / sqrt(R), with R in the denominator of the variance, as in the code of Guo et al. 2022,
-    MDM and MFM. It measures the variation of the evaluation, not of training. ACTOR's tables show 1.96 times the
-    variance instead.
+    MDM and MFM. ACTOR's tables show 1.96 times the variance instead.
     """
     return float(np.mean(values)), float(1.96 * np.std(values) / len(values) ** 0.5)
 
@@ -40,17 +37,18 @@ def averages(scores: Sequence[tuple[Mapping[str, float | None], int]]) -> dict[s
     return table
 
 
-def mean_cost(costs: Sequence[Mapping[str, float]]) -> Cost:
+def mean_cost(costs: Sequence[Cost]) -> Cost:
     """Returns the mean cost over replications; None if one of them used no model."""
-    if not costs or not all(costs):
-        return Cost()
-    return Cost(**{name: float(np.mean([cost[name] for cost in costs])) for name in Cost.model_fields})
+    values = {name: [getattr(cost, name) for cost in costs] for name in Cost.model_fields}
+    return Cost(**{name: None if None in numbers else float(np.mean(numbers)) for name, numbers in values.items()})
 
 
 def make_result(request: EvaluationRequest, plan: Plan) -> Result:
     """Returns a result with the provenance of its values, which are still to be measured."""
     info, extractor, protocol = plan.data.store.info, plan.extractor, plan.protocol
-    device = plan.representation.mean.device
+    device, crop, short = plan.representation.mean.device, plan.data.crop, plan.clips.too_short
+    reason = f"{request.split} clips shorter than {crop.shortest()} frames"
+    excluded = info["excluded"] | ({reason: short} if short else {})
     card = card_of(info["dataset"], extractor.sha256 if extractor else None)
     return Result(
         quick=request.quick,
@@ -62,8 +60,8 @@ def make_result(request: EvaluationRequest, plan: Plan) -> Result:
             dataset=info["dataset"],
             representation=info["representation"],
             fingerprint=info["fingerprint"],
-            frames=[plan.data.crop.shortest(), plan.data.crop.longest()],
-            excluded=_excluded(plan.data, request.split),
+            frames=[crop.shortest(), crop.longest()],
+            excluded=excluded,
         ),
         seed=request.seed,
         extractor=extractor
@@ -104,21 +102,14 @@ def _checkpoint(plan: Plan) -> Checkpoint | None:
     )
 
 
-def _excluded(data: MotionDataModule, split: Split) -> dict[str, int]:
-    short = data.clips(split).too_short
-    reason = f"{split} clips shorter than {data.crop.shortest()} frames"
-    return data.store.info["excluded"] | ({reason: short} if short else {})
-
-
 def _overlaps(request: EvaluationRequest, plan: Plan) -> list[str]:
     """Returns reasons why values are not valid: evaluated clips may be training clips of the model or extractor."""
     evaluated, extractor, reasons = plan.data.store.fingerprint, plan.extractor, []
-    for what, trained in (
-        ("training data", plan.model.facts.get("fingerprint") if plan.model else None),
-        ("training data of the extractor", extractor.fingerprint if extractor else None),
-    ):
-        if trained and trained != evaluated:
-            reasons.append(f"{what} {trained} and evaluated data {evaluated} differ: splits may overlap")
+    trained = {"training data": plan.model.facts.get("fingerprint") if plan.model else None}
+    trained["training data of the extractor"] = extractor.fingerprint if extractor else None
+    for what, fingerprint in trained.items():
+        if fingerprint and fingerprint != evaluated:
+            reasons.append(f"{what} {fingerprint} and evaluated data {evaluated} differ: splits may overlap")
     if extractor is not None and extractor.fingerprint == evaluated and request.split == "train":
         reasons.append("the extractor was trained on the evaluated split, train")
     return reasons

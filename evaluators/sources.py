@@ -24,10 +24,10 @@ from flame_mdm.safe_io import atomic_write, read_npz, regular_file
 from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.sampling.editing import kept_parts
 from flame_mdm.sampling.request import EditRequest
+from flame_mdm.schemas import Cost
 from flame_mdm.seeds import key, normal
 
 NOISE = 0.5  # standard deviation of the noise in noisy baselines, in normalized features
-COST: Sequence[str] = ("nfe", "seconds_per_sample", "batch_size")  # denoiser calls and seconds are per motion
 
 
 @dataclass
@@ -36,7 +36,7 @@ class Samples:
 
     rows: list[DrawnClip]  # what was requested, in order
     features: list[np.ndarray]  # (F, D) float32 each, in the data's units
-    cost: dict[str, float] = field(default_factory=dict)  # by the names in `COST`; empty if no model was used
+    cost: Cost = field(default_factory=Cost)
     captions: list[str] | None = None  # captions of the motions, if they differ from those of the rows
 
 
@@ -44,10 +44,7 @@ class Source(Interface):
     """A source of motions for the rows of a protocol."""
 
     def __call__(self, name: str, rows: list[DrawnClip], replication: int) -> Samples:
-        """Returns the motions of the rows; `name` identifies replication and purpose.
-
-        All processes call it together and get the same motions.
-        """
+        """Returns the motions of the rows, to all processes; `name` identifies replication and purpose."""
         ...
 
 
@@ -67,7 +64,6 @@ class Generator:
         model, clips: the model, on its device, and the split.
         protocol: condition and edit of the motions, and whether they are timed.
         options, edit: of the sampler, and of `Edit`, if motions are edited.
-        seed, batch_size: of the noise, and of the motions.
         folder: cache of the motions, `rep_0.npz` and so on, as `SampleFolder` reads them; None = no cache.
     """
 
@@ -95,11 +91,11 @@ class Generator:
 
         Raises `UserError` if the folder holds other motions or a damaged file, or the model returns NaN or infinity.
         """
-        path = self.folder / f"{name}.npz" if self.folder else None
+        path = self.folder and self.folder / f"{name}.npz"
         if path is not None and shared(path.exists()):
             content = shared(self._read(path, rows) if is_first() else None)
             assert content is not None
-            return Samples(rows, _split(content), {name: float(content[name]) for name in COST})
+            return Samples(rows, _split(content), Cost(**{name: float(content[name]) for name in Cost.model_fields}))
         order = np.argsort([-len(row.frames) for row in rows], kind="stable").tolist()
         batches = [order[first : first + self.batch_size] for first in range(0, len(order), self.batch_size)]
         if self.protocol.batch_size is not None:
@@ -111,9 +107,11 @@ class Generator:
             raise
         motions = [motion for batch, _, _ in parts for motion in batch]
         features = [motions[i] for i in np.argsort(order)]
-        nfe = sum(calls for _, calls, _ in parts) / len(parts)
-        seconds = sum(seconds for _, _, seconds in parts) / len(rows)
-        cost = dict(zip(COST, (nfe, seconds, float(len(batches[0]))), strict=True))
+        cost = Cost(
+            nfe=sum(calls for _, calls, _ in parts) / len(parts),
+            seconds_per_sample=sum(seconds for _, _, seconds in parts) / len(rows),
+            batch_size=len(batches[0]),
+        )
         if path is not None and is_first():
             _write(path, rows, features, cost, self.protocol.condition)
         return Samples(rows, features, cost)
@@ -159,15 +157,14 @@ class Generator:
         return [motion[: len(row.frames)].copy() for row, motion in zip(rows, features, strict=True)]
 
     def _batch(self, rows: Sequence[DrawnClip]) -> MotionBatch:
-        model, condition = self.model, self.protocol.condition
-        mask = length_mask(torch.tensor([len(row.frames) for row in rows], device=model.device))
-        labels = [row.clip.action for row in rows] if condition == "action" else None
+        device, condition = self.model.device, self.protocol.condition
+        mask = length_mask(torch.tensor([len(row.frames) for row in rows], device=device))
         return MotionBatch(
-            x=torch.zeros(*mask.shape, model.representation.features, device=model.device),
+            x=torch.zeros(*mask.shape, self.model.representation.features, device=device),
             mask=mask,
             ids=[row.id for row in rows],
             text=[row.text for row in rows] if condition == "text" else None,
-            action=None if labels is None else torch.tensor(labels, device=model.device),
+            action=torch.tensor([row.clip.action for row in rows], device=device) if condition == "action" else None,
         )
 
     def _edit(self, rows: Sequence[DrawnClip], parts: Mapping[str, Any]) -> Edit:
@@ -216,10 +213,11 @@ class SampleFolder:
         path = self.files[replication]
         content = read_samples(path)
         ids = content["ids"].tolist()
-        unknown = sorted(set(ids) - {row.id for row in rows})
+        index = {name: number for number, name in enumerate(ids)}
+        unknown = sorted(index.keys() - {row.id for row in rows})
         if unknown:
             raise UserError(f"{path}: names {len(unknown)} clips that are not in the split, such as {unknown[0]}")
-        if len(set(ids)) < len(ids):
+        if len(index) < len(ids):
             raise UserError(f"{path}: repeats ids. Give each clip of the split at most once")
         if "joints" in content:
             joints = [torch.from_numpy(np.ascontiguousarray(x, np.float32)) for x in _split(content, "joints")]
@@ -231,7 +229,6 @@ class SampleFolder:
                 f"{path}: {features[0].shape[1]} features per frame, but {self.representation.name} has "
                 f"{self.representation.features}"
             )
-        index = {name: number for number, name in enumerate(ids)}
         requested = [row for row in rows if row.id in index]
         captions = content.get("captions")
         texts = None if captions is None else [str(captions[index[row.id]]) for row in requested]
@@ -251,19 +248,17 @@ class Baseline:
     Raises `UserError` if the kind is unknown, or there is nothing to shuffle.
     """
 
-    KINDS = ("real", "shuffled", "noisy", "static")
-
     def __init__(self, kind: str, clips: Clips, condition: str, seed: int):
-        if kind not in self.KINDS:
-            raise UserError(f"baseline={kind}: unknown baseline. Choose one of {', '.join(self.KINDS)}")
+        kinds = {"real": self._real, "shuffled": self._shuffled, "noisy": self._noisy, "static": self._static}
+        if kind not in kinds:
+            raise UserError(f"baseline={kind}: unknown baseline. Choose one of {', '.join(kinds)}")
         if kind == "shuffled" and condition == "none":
             raise UserError("baseline=shuffled: motions without text or labels cannot be shuffled")
-        self.kind, self.clips, self.condition, self.seed = kind, clips, condition, seed
+        self.make, self.clips, self.condition, self.seed = kinds[kind], clips, condition, seed
 
     def __call__(self, name: str, rows: list[DrawnClip], replication: int) -> Samples:
         """Returns the motions of the rows; see `Source`."""
-        make = {"real": self._real, "shuffled": self._shuffled, "noisy": self._noisy, "static": self._static}
-        return Samples(rows, make[self.kind](rows, replication))
+        return Samples(rows, self.make(rows, replication))
 
     def _real(self, rows: Sequence[DrawnClip], replication: int) -> list[np.ndarray]:
         """Returns random windows of the rows' clips, with the rows' lengths."""
@@ -335,16 +330,10 @@ def _split(content: Mapping[str, np.ndarray], name: str = "features") -> list[np
     return np.split(content[name].astype(np.float32), np.cumsum(content["lengths"])[:-1])
 
 
-def _write(
-    path: Path, rows: Sequence[DrawnClip], features: Sequence[np.ndarray], cost: Mapping[str, float], condition: str
-) -> None:
-    content: dict[str, Any] = {
-        "ids": np.array([row.id for row in rows]),
-        "lengths": np.array([len(x) for x in features]),
-        "features": np.concatenate(list(features)),
-        **{name: np.array(value) for name, value in cost.items()},
-    }
-    if condition == "text":
-        content["captions"] = np.array([row.text for row in rows])
+def _write(path: Path, rows: Sequence[DrawnClip], features: Sequence[np.ndarray], cost: Cost, condition: str) -> None:
+    captions = {"captions": [row.text for row in rows]} if condition == "text" else {}
+    ids, lengths = [row.id for row in rows], [len(x) for x in features]
     with atomic_write(path) as temporary:
-        np.savez(temporary, **content)
+        np.savez(
+            temporary, ids=ids, lengths=lengths, features=np.concatenate(features), **cost.model_dump(), **captions
+        )

@@ -55,8 +55,7 @@ def pool() -> Iterator[GlooPool]:
 @pytest.fixture
 def composed_once(monkeypatch) -> None:
     """What tables and pages read from recipes comes from recipes that are composed once."""
-    for module in ("flame_mdm.reporting.tables.build", "flame_mdm.commands.tables"):
-        monkeypatch.setattr(f"{module}.compose", recipe)
+    monkeypatch.setattr("flame_mdm.reporting.tables.settings.compose", recipe)
 
 
 @pytest.fixture

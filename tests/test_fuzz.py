@@ -23,7 +23,6 @@ from support.runs import TINY, finish, spawn
 
 from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.hub import export
-from flame_mdm.commands.tables import sizes
 from flame_mdm.errors import UserError
 from flame_mdm.reporting.report import write_report
 from flame_mdm.reporting.tables.build import build
@@ -269,9 +268,9 @@ def reader(name: str, folder: Path) -> tuple[Path, Callable[[], object]]:
     if name == "lengths":
         (folder / "lengths").mkdir()
         spec = {"title": "x", "parts": {"A": {"lengths": ["lengths"]}}}
-        return folder / "lengths" / path.name, lambda: build("x", spec, folder, sizes)
+        return folder / "lengths" / path.name, lambda: build("x", spec, folder)
     reads: dict[str, Callable[[], object]] = {
-        "spec": lambda: build("x", load_spec(str(path)), folder, sizes),
+        "spec": lambda: build("x", load_spec(str(path)), folder),
         "result": lambda: read_result(path),
         "wandb": lambda: WandbRun(str(folder), offline=True),
     }

@@ -13,14 +13,13 @@ from support.fixtures import recipe
 
 from evaluators.evaluator import Evaluator, Motions
 from evaluators.protocol import load_protocol
-from flame_mdm.commands.tables import sizes
 from flame_mdm.config import EXPERIMENTS, Config, instantiate, recipes
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.processes.flow_matching import FlowMatching
 from flame_mdm.reporting.tables import build as builder
-from flame_mdm.reporting.tables.format import ABOUT
+from flame_mdm.reporting.tables.settings import hyperparameters as settings
+from flame_mdm.reporting.tables.specs import ABOUT, load_spec, spec_names
 from flame_mdm.reporting.tables.specs import PUBLISHED as PUBLISHED_FILE
-from flame_mdm.reporting.tables.specs import load_spec, spec_names
 
 PUBLISHED: dict[str, dict[str, Any]] = yaml.safe_load(PUBLISHED_FILE.read_text())
 del PUBLISHED["hyperparameters"]  # which tests/test_recipes.py checks
@@ -36,12 +35,6 @@ UNREAD = "humanml3d/mdm_motion272"
 
 
 pytestmark = pytest.mark.usefixtures("composed_once")
-
-
-@cache
-def settings(name: str) -> dict[str, Any]:
-    """Hyperparameters of a recipe."""
-    return builder.hyperparameters(name, sizes)
 
 
 def models(part: Config) -> list[Config]:
@@ -81,7 +74,7 @@ def test_there_is_a_table_for_each_of_the_papers(tmp_path):
     figures = {"flame_figure_4", "flame_figure_7", "mdm_figure_4"} | {f"mfm_figure_{n}" for n in (1, 4, 5, 7)}
     assert set(PAPERS) == tables | figures
     for name in PAPERS:
-        table = builder.build(name, SPECS[name], tmp_path, sizes)
+        table = builder.build(name, SPECS[name], tmp_path)
         assert [part.name for part in table.parts] == list(SPECS[name]["parts"]), name
 
 

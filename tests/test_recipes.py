@@ -1,6 +1,5 @@
 """The recipes against the papers' tables, the pages that are written from them, and a training step of each."""
 
-from functools import cache
 from typing import Any
 
 import pytest
@@ -12,11 +11,10 @@ from flame_mdm.conditions import ConditionEncoder
 from flame_mdm.config import instantiate, recipes
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.processes.flow_matching import FlowMatching
-from flame_mdm.reporting.tables.build import value
+from flame_mdm.reporting.tables.settings import value
 from flame_mdm.task import MotionGeneration
 
 generate = script("docs/generate.py")
-generate.hyperparameters = cache(generate.hyperparameters)  # the tables and the pages show the same ones
 pytestmark = pytest.mark.usefixtures("composed_once")
 
 
@@ -24,7 +22,7 @@ def test_recipes_have_the_values_of_their_papers():
     for columns in generate.TABLES.values():
         for name, column in columns.items():
             papers = {key: cell for key, cell in column.items() if cell is not None}
-            ours = generate.hyperparameters(name, generate.sizes) if papers else {}
+            ours = generate.hyperparameters(name) if papers else {}
             differing = {key for key, cell in papers.items() if not generate.same(ours.get(key), cell)}
             assert differing == {key for row, key in generate.DEVIATIONS if row == name and key in papers}, name
 

@@ -17,13 +17,7 @@ from flame_mdm.commands.tables import outdated
 from flame_mdm.errors import UserError
 from flame_mdm.reporting.tables import build as builder
 from flame_mdm.reporting.tables.build import build
-from flame_mdm.reporting.tables.format import (
-    Cell,
-    Line,
-    Table,
-    markdown,
-    ranks,
-)
+from flame_mdm.reporting.tables.format import Cell, Line, Table, ranks, rendered
 from flame_mdm.reporting.tables.specs import Evaluation, evaluations, load_spec, spec_names
 
 SPEC = """
@@ -147,7 +141,7 @@ def test_cells_ranks_and_real_motions(folder):
     assert ranks_of["measured: MFM"] == [1, 1, 0, 1]
     assert ranks_of["measured: FLAME <b>"] == [0, 2, 1, 1]
     assert lines["measured: missing"].state == "no checkpoint"
-    assert "missing: " in markdown(made(folder))
+    assert "missing: " in rendered(made(folder), "md")
     sources = lines["measured: MDM"].facts
     assert (sources["checkpoint sha256"], sources["guidance"], sources["steps"]) == ("c" * 16, "2.5", "50")
 
@@ -182,7 +176,7 @@ def test_footnotes_tell_what_was_left_out_the_skeleton_and_how_checkpoints_were_
     notes = [note for _, note in made(folder).parts[0].notes]
     assert "MFM: best checkpoint by val/text_to_motion_t2m/fid" in notes
     assert "MDM; FLAME <b>: last checkpoint, not chosen by validation" in notes
-    assert "FID of real motions is 0 by construction: clips are taken whole" in markdown(made(folder))
+    assert "FID of real motions is 0 by construction: clips are taken whole" in rendered(made(folder), "md")
     change(folder, "MDM", data={"excluded": left_out})
     words = "; excluded from the data set: 1,191 motions of HumanAct12, as data.source.humanact12 is not given"
     assert [words in note for _, note in made(folder).parts[0].notes].count(True) == 1
@@ -226,7 +220,7 @@ def test_footnotes_list_what_differs_and_group_rows(folder):
     labels = "MDM (guidance scale 1.0); MDM (guidance scale 2.5)"
     assert ("", f"{labels}: NOT VALID: real motions have fid 3, expected 0.002 +- 0.02") in notes
     assert sum("NOT VALID" in note for _, note in notes) == 1
-    (line,) = [line for line in markdown(table).splitlines() if line.startswith("- Steps: ")]
+    (line,) = [line for line in rendered(table, "md").splitlines() if line.startswith("- Steps: ")]
     assert "steps 5 / 5 / 10 / 10" in line
     assert line.count("recipe synthetic/mdm") == 1
 
@@ -283,7 +277,7 @@ def test_times_are_compared_in_batches_of_the_same_size_alone(folder):
     assert [line.marks for line in lines] == ["a", "b", "a"]
     assert "as a, but timed in batches of 64 on cpu" in [note for _, note in part.notes]
     assert [cell.rank for line in lines if (cell := line.cells[1])] == [1, 0, 1]
-    assert "predicts – / – / velocity" in markdown(Table("timed", "", [part]))
+    assert "predicts – / – / velocity" in rendered(Table("timed", "", [part]), "md")
 
 
 def test_the_batch_size_of_the_command_is_not_that_of_timed_rows(folder, monkeypatch):
@@ -318,7 +312,7 @@ def test_published_numbers_are_marked_and_ranked_among_themselves(folder, monkey
     assert [line.marks for line in reported] == ["†", "†", "††"]
     assert [line.cells[0].rank for line in reported if line.cells[0]] == [2, 1, 0]
     assert reported[0].options == {"nfe": 1000.0}
-    text = markdown(made(folder))
+    text = rendered(made(folder), "md")
     assert "†: as reported: Someone, table 1; measured with an evaluator of theirs" in text
     assert "They print percent." in text
     for wrong, message in (

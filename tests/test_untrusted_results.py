@@ -33,23 +33,13 @@ from flame_mdm.formats.readers import read
 from flame_mdm.reporting.page import POLICY
 from flame_mdm.reporting.plots import Panel, Series, svg
 from flame_mdm.reporting.report import write_report
-from flame_mdm.reporting.tables.format import (
-    Cell,
-    Line,
-    Part,
-    Plot,
-    Table,
-    comma_separated,
-    draw,
-    fragment,
-    latex,
-    markdown,
-    write,
-)
+from flame_mdm.reporting.tables.format import Cell, Line, Part, Table, comma_separated, draw, rendered, write
+from flame_mdm.reporting.tables.specs import Figure
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.safe_io import atomic_folder, atomic_write, write_json
 from flame_mdm.sampling.generation import write_motions
+from flame_mdm.schemas import Cost
 from flame_mdm.visualize import contact_sheet, player_page, write_gif
 
 pytestmark = pytest.mark.slow
@@ -64,6 +54,7 @@ parts:
     rows: [{{label: a, baseline: real, {keys}}}]
 """
 MANY = list(range(1, 41))
+COST = Cost(nfe=1.0, seconds_per_sample=1.0, batch_size=1.0)
 BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"{name}: &{name} [{', '.join([f'*{before}'] * 9)}]\n" for before, name in zip("abcdefgh", "bcdefghi", strict=True)
 )
@@ -178,7 +169,7 @@ def _write_all(folder: Path, table: Table) -> None:
     row: Any = SimpleNamespace(id="000001", text="a person walks")
     for _ in range(30):
         write_json(folder / "results" / "lengths" / "kit.json", {"lengths": list(range(1000))}, indent=None)
-        _write(folder / "rep_0.npz", [row], [np.zeros((40, 263), np.float32)], {"nfe": 1.0}, "text")
+        _write(folder / "rep_0.npz", [row], [np.zeros((40, 263), np.float32)], COST, "text")
     for _ in range(2):
         write(table, folder / "tables")
         write_motions(folder / "samples" / "mine", _made(), {"seed": 0})
@@ -186,7 +177,7 @@ def _write_all(folder: Path, table: Table) -> None:
 
 def test_four_processes_write_the_same_files(tmp_path):
     table = Table("t", "T", [Part("P", {"FID": "lower"}, [Line("a", "measured", [Cell("1", 1.0)])])])
-    table.parts[0].figures.append(Plot("nfe", ["FID"]))
+    table.parts[0].figures.append(Figure(part="P", x="nfe", y=["FID"]))
     table.parts[0].lines[0].options["nfe"] = 3.0
     fork = multiprocessing.get_context("fork")
     processes = [fork.Process(target=_write_all, args=(tmp_path, table)) for _ in range(4)]
@@ -272,14 +263,14 @@ def hostile_table() -> Table:
     line = Line(HOSTILE, "measured", [Cell("-0.5 ±0.1", -0.5, 0.1), Cell("+cmd")], "a", facts=facts)
     line.options["nfe"] = 1.0
     part = Part(HOSTILE, {"=A": "none", HOSTILE: "none"}, [line], [("a", HOSTILE), ("", HOSTILE)])
-    part.figures.append(Plot("nfe", ["=A"]))
+    part.figures.append(Figure(part=HOSTILE, x="nfe", y=["=A"]))
     return Table("t](x) ", HOSTILE, [part, Part("=P", {"x": "none"}, [Line("$\\frac", "measured", [None])])], [HOSTILE])
 
 
 def test_tables_hold_text_not_markup_and_no_formulas():
     table = hostile_table()
     table.parts[0].drawn = [("t](x) -x-heading-b-a-http-b-31m-figure", Markup("<svg/>"))]
-    text, tex, html = markdown(table), latex(table), str(fragment(table))
+    text, tex, html = (str(rendered(table, suffix)) for suffix in ("md", "tex", "html"))
     assert "<b>" not in html
     assert html.count("&lt;b&gt;") > 3
     assert tex.count("{") - tex.count("\\{") == tex.count("}") - tex.count("\\}")

@@ -5,11 +5,10 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from flame_mdm.config import Config, compose, compose_data, instantiate
+from flame_mdm.config import Config, compose_data, instantiate
 from flame_mdm.errors import UserError, first_line, say
 from flame_mdm.safe_io import sha256, write_json, write_text
 from flame_mdm.sampler_options import option
@@ -52,7 +51,7 @@ def main(settings: TablesSettings) -> None:
     results = Path(settings.results)
     failed = evaluate_missing(specs, results, settings) if settings.evaluate else []
     out = Path(settings.out)
-    built = {name: build(name, spec, results, sizes) for name, spec in specs.items()}
+    built = {name: build(name, spec, results) for name, spec in specs.items()}
     counts = {}
     invalid = False
     for name, table in built.items():
@@ -138,23 +137,3 @@ def count_lengths(dataset: str, results: Path, settings: TablesSettings) -> None
         excluded=store.info["excluded"],
     )
     write_json(results / "lengths" / f"{dataset}.json", counted.model_dump(), indent=None)
-
-
-@cache
-def sizes(recipe: str) -> dict[str, float]:
-    """Returns the number of features of a recipe, and of parameters of its denoiser, without the language model."""
-    import torch
-
-    config = compose(recipe)
-    features = instantiate(config["representation"]).features
-    if "denoiser" not in config:
-        return {"features": features}
-    process = instantiate(config["process"])
-    with torch.device("meta"):
-        denoiser = instantiate(
-            config["denoiser"],
-            in_features=features,
-            out_features=process.out_features(features),
-            cond_features=config["condition"].get("features", 0),
-        )
-    return {"features": features, "parameters": sum(p.numel() for p in denoiser.parameters()) / 1e6}

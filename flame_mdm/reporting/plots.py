@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -35,11 +36,10 @@ class Series:
 
 @dataclass
 class Histogram:
-    """Stacked histogram: edges of the bars and their unit, and one count per bar by name."""
+    """Numbers of motions by length: the first bar is for 0 to `step` frames."""
 
-    edges: Sequence[float]
-    counts: Mapping[str, Sequence[int]]
-    unit: str
+    step: int
+    counts: Sequence[int]
 
 
 @dataclass
@@ -102,8 +102,7 @@ def _drawn(panel: Panel) -> dict[str, Any] | None:
     points = {s.name: [(x, y) for x, y in s.points if x > 0 or not panel.log_x] for s in series}
     everything = [point for curve in points.values() for point in curve]
     if histogram is not None:
-        most = max(map(sum, zip(*histogram.counts.values(), strict=True)))
-        everything = [(histogram.edges[0], 0), (histogram.edges[-1], max(1, most))]
+        everything = [(0, 0), (histogram.step * len(histogram.counts), max(histogram.counts))]
     if not everything:
         return None
     xs, ys = zip(*everything, strict=True)
@@ -132,7 +131,7 @@ def _drawn(panel: Panel) -> dict[str, Any] | None:
         shown = _thinned(curve)
         dots = [at(x, y) for x, y in shown] if len(curve) <= 40 or s.kind == "dots" else []
         lines.append((k % COLORS, s.kind, path(shown), path(rim), errors, dots))
-    names = list(histogram.counts) if histogram else [s.name for s in series]
+    names = ["motions"] if histogram else [s.name for s in series]
     legend = [(k % COLORS, HIGH + ROW * (k + bool(panel.x)), name) for k, name in enumerate(names)]
     return {
         "rows": [(at(x_axis.low, tick)[1], _tick(tick)) for tick in y_axis.ticks],
@@ -149,14 +148,10 @@ def _drawn(panel: Panel) -> dict[str, Any] | None:
 
 def _bars(histogram: Histogram, at: Any) -> list[tuple[int, str, str, str, str, str]]:
     bars = []
-    for k, (begin, end) in enumerate(zip(histogram.edges, histogram.edges[1:], strict=False)):
-        base = 0
-        for color, (name, counts) in enumerate(histogram.counts.items()):
-            (left, top), (right, bottom) = at(begin, base + counts[k]), at(end, base)
-            note = f"{begin:.4g} to {end:.4g} {histogram.unit}: {counts[k]} {name}"
-            size = (f"{float(right) - float(left) - 1:.1f}", f"{float(bottom) - float(top):.1f}")
-            bars.append((color % COLORS, left, top, *size, note))
-            base += counts[k]
+    for begin, count in zip(itertools.count(0, histogram.step), histogram.counts, strict=False):
+        (left, top), (right, bottom) = at(begin, count), at(begin + histogram.step, 0)
+        size = (f"{float(right) - float(left) - 1:.1f}", f"{float(bottom) - float(top):.1f}")
+        bars.append((0, left, top, *size, f"{begin} to {begin + histogram.step} frames: {count} motions"))
     return bars
 
 

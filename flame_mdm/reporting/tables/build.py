@@ -1,40 +1,33 @@
 """Builds tables from existing results, published numbers, recipes and lengths."""
 
 import functools
-import inspect
 import math
 import re
 import string
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from hydra.utils import get_class
 
-from flame_mdm.config import Config, compose, parameters
-from flame_mdm.errors import UserError, did_you_mean
+from flame_mdm.config import Config
+from flame_mdm.errors import UserError
 from flame_mdm.reporting.audit import card_of
 from flame_mdm.reporting.plots import Histogram
-from flame_mdm.reporting.tables.format import ABOUT, LABELS, Cell, Line, Part, Plot, Table, ranks
-from flame_mdm.reporting.tables.specs import PUBLISHED, SWEPT, Lengths, as_list, evaluations, load_mapping
+from flame_mdm.reporting.tables.format import Cell, Line, Part, Table, ranks
+from flame_mdm.reporting.tables.settings import settings_table
+from flame_mdm.reporting.tables.specs import ABOUT, PUBLISHED, SWEPT, Figure, Lengths, evaluations, load_mapping
 from flame_mdm.runs import made_by
 from flame_mdm.schemas import Result, Value, read_json, read_result
 
 NOT_VALID = "NOT VALID"  # state of a row that is shown, but not ranked
 PUBLISHED_SPLIT = "published split: test clips are also used for training, or there are no validation clips"
 FORCED = "forced: real motions do not have the values that the protocol expects"
-HYPERPARAMETERS = LABELS["hyperparameters"]
-Sizes = Callable[[str], dict[str, Any]]
-"""Returns the sizes that only a built network has, `features` and `parameters`, by the name of a recipe."""
 
 
-def build(name: str, spec: Config, results: Path, sizes: Sizes | None = None) -> Table:
-    """Builds the table of a spec from existing results and published numbers; raises `UserError` if they do not match.
-
-    `sizes` counts features and parameters of a recipe, for tables of hyperparameters that show them.
-    """
+def build(name: str, spec: Config, results: Path) -> Table:
+    """Builds the table of a spec from existing results and published numbers; `UserError` if they do not match."""
     published = _published(PUBLISHED, PUBLISHED.stat().st_mtime_ns).get(name, {}) if PUBLISHED.exists() else {}
     unknown = published.keys() - spec["parts"].keys()
     if unknown:
@@ -43,16 +36,12 @@ def build(name: str, spec: Config, results: Path, sizes: Sizes | None = None) ->
     for part_name, part in spec["parts"].items():
         reported = published.get(part_name)
         if "recipes" in part:
-            built = _hyperparameters(part_name, part, reported, sizes)
+            built = settings_table(part_name, part, reported)
         elif "lengths" in part:
             built = _lengths(part_name, part, results)
         else:
             built = _measured(part_name, part, reported, results)
-            built.figures = [
-                Plot(f["x"], as_list(f["y"]), f.get("log", False), f.get("points", False))
-                for f in spec.get("figures", [])
-                if f["part"] == part_name
-            ]
+            built.figures = [Figure(**figure) for figure in spec.get("figures", []) if figure["part"] == part_name]
         parts.append(built)
     return Table(name, spec["title"], parts, list(spec.get("notes", [])))
 
@@ -331,70 +320,6 @@ def _leading(text: str) -> float | None:
 # Other kinds of parts -------------------------------------------------------------------------------------------------
 
 
-def _hyperparameters(name: str, part: Config, reported: Config | None, sizes: Sizes | None) -> Part:
-    """Builds a table of hyperparameters, read from recipes, each next to its reported value.
-
-    The rows are keys or recipes, whichever are more.
-    """
-    for key in part["keys"].values():
-        if key not in HYPERPARAMETERS:
-            hint = did_you_mean(key, HYPERPARAMETERS) or f" There are: {', '.join(HYPERPARAMETERS)}"
-            raise UserError(f"part {name}: no setting is called '{key}'.{hint}")
-    recipes = {label: hyperparameters(recipe, sizes) for label, recipe in part["recipes"].items()}
-    printed = {row["label"]: row["values"] for row in reported["rows"]} if reported else {}
-    ours: dict[tuple[str, str], Cell | None] = {}
-    theirs: dict[tuple[str, str], Cell | None] = {}
-    for label, key in part["keys"].items():
-        for recipe, settings in recipes.items():
-            position = (label, recipe) if len(part["keys"]) >= len(recipes) else (recipe, label)
-            ours[position] = Cell(setting_text(settings[key])) if key in settings else None
-            text = printed.get(label, {}).get(recipe)
-            theirs[position] = None if text is None else Cell(text)
-    rows, columns = (list(dict.fromkeys(names)) for names in zip(*ours, strict=True))
-    lines = [Line(row, "measured", []) for row in rows]
-    heads: list[str] = []
-    for column in columns:
-        for head, cells in ((column, ours), (f"{column}, reported", theirs)):
-            if any(cells[row, column] for row in rows):
-                heads.append(head)
-                for line in lines:
-                    line.cells.append(cells[line.label, column])
-    notes = [("", f"{label}: recipe {recipe}") for label, recipe in part["recipes"].items()]
-    if reported:
-        notes += [("", f"reported: {reported['source']}"), *(("", note) for note in reported.get("notes", []))]
-    return Part(name, dict.fromkeys(heads, "none"), lines, notes)
-
-
-def hyperparameters(name: str, sizes: Sizes | None = None) -> dict[str, Any]:
-    """Returns the `HYPERPARAMETERS` of a recipe, by key. Unset ones have the default of their class."""
-    config = compose(name)
-    settings = {key: value(config, key) for key in HYPERPARAMETERS if "." in key} | (sizes(name) if sizes else {})
-    return {key: setting for key, setting in settings.items() if setting is not None}
-
-
-def value(config: Config, key: str) -> Any:
-    """Returns the value of a dotted key: from the recipe, or else the default of the class, or else None."""
-    *path, name = key.split(".")
-    node: Any = config
-    for part in path:
-        node = node.get(part) or {}
-    if name in node:
-        return node[name].rpartition(".")[2] if name == "_target_" else node[name]
-    if "_target_" in node and name in parameters(node["_target_"]):
-        return inspect.signature(get_class(node["_target_"])).parameters[name].default
-    return None
-
-
-def setting_text(value: Any) -> str:
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, list | tuple):
-        return ", ".join(map(setting_text, value))
-    if isinstance(value, int):
-        return f"{value:,}"
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
 def _lengths(name: str, part: Config, results: Path) -> Part:
     formats = {"motions": ",", "hours": ".2f", "shortest": "d", "median": "d", "mean": ".1f", "longest": "d"}
     lines, histograms = [], {}
@@ -413,7 +338,5 @@ def _lengths(name: str, part: Config, results: Path) -> Part:
         if counted.excluded:
             notes.append(("", f"{dataset}; {_left_out(counted.excluded)}"))
         step = max(1, math.ceil(lengths[-1] / 40))
-        counts = np.bincount([length // step for length in lengths]).tolist()
-        edges = [float(i * step) for i in range(len(counts) + 1)]
-        histograms[dataset] = Histogram(edges, {"motions": counts}, "frames")
+        histograms[dataset] = Histogram(step, np.bincount([length // step for length in lengths]).tolist())
     return Part(name, dict.fromkeys(formats, "none"), lines, notes, histograms=histograms)

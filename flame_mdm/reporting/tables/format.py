@@ -15,14 +15,12 @@ from typing import TYPE_CHECKING, Any
 from flame_mdm.errors import one_line, shortened
 from flame_mdm.reporting.page import page, render
 from flame_mdm.reporting.plots import Histogram, Panel, Series, standalone, svg
-from flame_mdm.safe_io import read_yaml, write_text
+from flame_mdm.reporting.tables.specs import ABOUT, Figure
+from flame_mdm.safe_io import write_text
 
 if TYPE_CHECKING:
     from markupsafe import Markup
 
-LABELS: dict[str, dict[str, str]] = read_yaml(Path(__file__).with_name("labels.yaml"))
-ABOUT = LABELS["values"]
-"""Labels of the values that a column may show besides metrics, and of the x-axes of figures."""
 ARROWS = {"higher": "↑", "lower": "↓", "real": "→", "none": ""}
 KINDS = {
     "real": "Real motions, measured here",
@@ -65,29 +63,18 @@ class Line:
 
 
 @dataclass
-class Plot:
-    """A figure that plots columns of a part over an option of its rows; see `draw`."""
-
-    x: str
-    y: list[str]
-    log: bool = False
-    points: bool = False
-
-
-@dataclass
 class Part:
     """One table within the table of a paper.
 
-    `columns` are label -> which values are better, a key of `ARROWS`; `notes` mark (may be empty) and text of each
-    footnote; `histograms` are figures by title; `drawn`, set by `write`, has file name and SVG of each figure, None if
-    it has no points.
+    `columns` are label -> which values are better, a key of `ARROWS`; `notes` are the mark, which may be empty, and
+    the text of each footnote; `drawn`, set by `write`, has file name and SVG of each figure, None if it has no points.
     """
 
     name: str
     columns: dict[str, str]
     lines: list[Line]
     notes: list[tuple[str, str]] = field(default_factory=list)
-    figures: list[Plot] = field(default_factory=list)
+    figures: list[Figure] = field(default_factory=list)
     histograms: dict[str, Histogram] = field(default_factory=dict)
     drawn: list[tuple[str, Markup | None]] = field(default_factory=list)
 
@@ -103,8 +90,8 @@ class Table:
     folder: Path = Path()
 
 
-def write(table: Table, out: Path) -> Markup:
-    """Writes a table in all formats and its figures; returns its HTML, without the head of the page."""
+def write(table: Table, out: Path) -> None:
+    """Writes a table in all formats, and its figures."""
     table.folder = out
     for part in table.parts:
         drawn = [draw(part, figure) for figure in part.figures]
@@ -116,39 +103,21 @@ def write(table: Table, out: Path) -> Markup:
         for name, plot in part.drawn:
             if plot:
                 write_text(out / f"{name}.svg", standalone(plot))
-    for suffix, writer in {"md": markdown, "tex": latex, "csv": comma_separated}.items():
-        write_text(out / f"{table.name}.{suffix}", writer(table))
-    body = fragment(table)
-    write_text(out / f"{table.name}.html", page(table.title, body))
-    return body
+    texts = {"md": rendered(table, "md"), "tex": rendered(table, "tex"), "csv": comma_separated(table)}
+    for suffix, text in (texts | {"html": page(table.title, rendered(table, "html"))}).items():
+        write_text(out / f"{table.name}.{suffix}", text)
 
 
-def markdown(table: Table) -> str:
-    return str(_rendered("table.md", table))
-
-
-def latex(table: Table) -> str:
-    """Returns the table as LaTeX, for the packages booktabs and threeparttable."""
-    return str(_rendered("table.tex", table))
-
-
-def fragment(table: Table) -> Markup:
-    """Returns the table as HTML, without the head of the page."""
-    return _rendered("table.html", table)
-
-
-def _rendered(template: str, table: Table) -> Markup:
+def rendered(table: Table, suffix: str) -> Markup:
+    """Returns a table as "md", "tex" (for booktabs and threeparttable), or "html" without the head of the page."""
+    values = {
+        "several": len(table.parts) > 1,
+        "sources": _sources(table),
+        "ranked": any(better != "none" for part in table.parts for better in part.columns.values()),
+        "bad": NO_RESULTS,
+    }
     functions = {"blocks": _blocks, "head": _head, "label": _label, "linked": _linked, "tex": _tex}
-    ranked = any(better != "none" for part in table.parts for better in part.columns.values())
-    return render(
-        template,
-        table=table,
-        several=len(table.parts) > 1,
-        sources=_sources(table),
-        ranked=ranked,
-        bad=NO_RESULTS,
-        **functions,
-    )
+    return render(f"table.{suffix}", table=table, **values, **functions)
 
 
 # What the templates read ----------------------------------------------------------------------------------------------
@@ -195,7 +164,7 @@ def _tex(text: str) -> str:
     special = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "–": "--"}
     special |= {"±": r"$\pm$", "†": r"$\dagger$", "≥": r"$\geq$", "×": r"$\times$", "λ": r"$\lambda$", "β": r"$\beta$"}
     special |= {c: "\\" + c for c in "&%$#_{}"} | {"[": "{[}", "]": "{]}"}  # brackets after \\\\ are its option
-    return "".join(special.get(c, c) for c in one_line(text))
+    return one_line(text).translate(str.maketrans(special))
 
 
 # CSV ------------------------------------------------------------------------------------------------------------------
@@ -232,7 +201,7 @@ def _inert(text: str) -> str:
 # Plots ----------------------------------------------------------------------------------------------------------------
 
 
-def draw(part: Part, figure: Plot) -> Markup | None:
+def draw(part: Part, figure: Figure) -> Markup | None:
     """Draws a figure of a part as SVG; None if it has no points.
 
     Curves are named after rows; measured ones are solid, reported ones dashed. If closer to real motions is better in
@@ -246,7 +215,7 @@ def draw(part: Part, figure: Plot) -> Markup | None:
     return svg(part.name, panels)
 
 
-def _series(part: Part, figure: Plot, column: str) -> tuple[list[Series], list[float]]:
+def _series(part: Part, figure: Figure, column: str) -> tuple[list[Series], list[float]]:
     """Returns the points of a column by row, and its values for real motions."""
     index = list(part.columns).index(column)
     curves: dict[tuple[str, str], list[tuple[float, float, float]]] = {}

@@ -10,16 +10,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import FailFast, Field, model_validator
+from pydantic import BeforeValidator, FailFast, Field, model_validator
 
 from flame_mdm.config import EXPERIMENTS, Config, plain
 from flame_mdm.errors import UserError, did_you_mean
-from flame_mdm.reporting.tables.format import ABOUT
 from flame_mdm.safe_io import read_yaml
 from flame_mdm.schemas import ClosedSchema, Int, Number, Schema, check_shape
 
 SPECS = EXPERIMENTS / "tables"
 PUBLISHED = SPECS / "published.yaml"
+LABELS: dict[str, dict[str, str]] = read_yaml(Path(__file__).with_name("labels.yaml"))
+ABOUT = LABELS["values"]
+"""Labels of the values that a column may show besides metrics, and of the x-axes of figures."""
 SWEPT = ("sampler", "num_inference_steps", "eta", "spacing", "guidance_scale", "until", "strength", "batch_size")
 """Options of a row that may be lists; each value makes one row."""
 MOST_ROWS, MOST_COLUMNS, MOST_FIGURES = 1_000, 100, 100
@@ -103,12 +105,16 @@ class PartSpec(Options):
         return self
 
 
-class FigureSpec(ClosedSchema):
-    """A figure that plots columns of a part over an option of its rows."""
+def as_list(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else [value]
+
+
+class Figure(ClosedSchema):
+    """A figure that plots columns of a part over an option of its rows; with `points`, a scatter plot."""
 
     part: str
     x: str
-    y: str | list[str]
+    y: Annotated[list[str], BeforeValidator(as_list)]
     log: bool = False
     points: bool = False
 
@@ -119,16 +125,16 @@ class Spec(ClosedSchema):
     title: str
     notes: list[str] = Field([])
     parts: Annotated[dict[str, PartSpec], Field(min_length=1)]
-    figures: list[FigureSpec] = Field([])
+    figures: list[Figure] = Field([])
 
     @model_validator(mode="after")
     def _figures(self) -> Self:
-        _at_most("figures", sum(len(as_list(figure.y)) for figure in self.figures), MOST_FIGURES)
+        _at_most("figures", sum(len(figure.y) for figure in self.figures), MOST_FIGURES)
         for figure in self.figures:
             part = self.parts.get(figure.part)
             if part is None or figure.x not in ABOUT:
                 raise ValueError(f"a figure needs a part of the table and x, one of {', '.join(ABOUT)}")
-            for column in as_list(figure.y):
+            for column in figure.y:
                 if column not in part.columns:
                     raise ValueError(f"figure: y={column} is not a column of {figure.part}")
         return self
@@ -173,10 +179,6 @@ def load_mapping(path: Path) -> Config:
         raise UserError(f"{path}: not a mapping")
     plain(content, path)
     return {str(key): value for key, value in content.items()}
-
-
-def as_list(value: Any) -> list[Any]:
-    return value if isinstance(value, list) else [value]
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,89 @@
+"""Hyperparameters of recipes, and tables of them next to their reported values."""
+
+import inspect
+from functools import cache
+from typing import Any
+
+from hydra.utils import get_class
+
+from flame_mdm.config import Config, compose, instantiate, parameters
+from flame_mdm.errors import UserError, did_you_mean
+from flame_mdm.reporting.tables.format import Cell, Line, Part
+from flame_mdm.reporting.tables.specs import LABELS
+
+HYPERPARAMETERS = LABELS["hyperparameters"]
+
+
+@cache
+def hyperparameters(name: str) -> dict[str, Any]:
+    """Returns the `HYPERPARAMETERS` of a recipe, by key. Unset ones have the default of their class."""
+    config = compose(name)
+    settings = {key: value(config, key) for key in HYPERPARAMETERS if "." in key} | _sizes(config)
+    return {key: setting for key, setting in settings.items() if setting is not None}
+
+
+def value(config: Config, key: str) -> Any:
+    """Returns the value of a dotted key: from the recipe, or else the default of the class, or else None."""
+    *path, name = key.split(".")
+    node: Any = config
+    for part in path:
+        node = node.get(part) or {}
+    if name in node:
+        return node[name].rpartition(".")[2] if name == "_target_" else node[name]
+    if "_target_" in node and name in parameters(node["_target_"]):
+        return inspect.signature(get_class(node["_target_"])).parameters[name].default
+    return None
+
+
+def _sizes(config: Config) -> dict[str, float]:
+    """Returns the number of features, and of parameters of the denoiser in millions, without the language model."""
+    import torch
+
+    features = instantiate(config["representation"]).features
+    if "denoiser" not in config:
+        return {"features": features}
+    out_features = instantiate(config["process"]).out_features(features)
+    sizes = {"in_features": features, "out_features": out_features}
+    with torch.device("meta"):
+        denoiser = instantiate(config["denoiser"], **sizes, cond_features=config["condition"].get("features", 0))
+    return {"features": features, "parameters": sum(p.numel() for p in denoiser.parameters()) / 1e6}
+
+
+def setting_text(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, list | tuple):
+        return ", ".join(map(setting_text, value))
+    if isinstance(value, int):
+        return f"{value:,}"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def settings_table(name: str, part: Config, reported: Config | None) -> Part:
+    """Builds a table of hyperparameters. The rows are keys or recipes, whichever are more."""
+    for key in part["keys"].values():
+        if key not in HYPERPARAMETERS:
+            raise UserError(f"part {name}: no setting is called '{key}'.{did_you_mean(key, HYPERPARAMETERS)}")
+    recipes = {label: hyperparameters(recipe) for label, recipe in part["recipes"].items()}
+    printed = {row["label"]: row["values"] for row in reported["rows"]} if reported else {}
+    ours: dict[tuple[str, str], Cell | None] = {}
+    theirs: dict[tuple[str, str], Cell | None] = {}
+    for label, key in part["keys"].items():
+        for recipe, settings in recipes.items():
+            position = (label, recipe) if len(part["keys"]) >= len(recipes) else (recipe, label)
+            ours[position] = Cell(setting_text(settings[key])) if key in settings else None
+            text = printed.get(label, {}).get(recipe)
+            theirs[position] = None if text is None else Cell(text)
+    rows, columns = (list(dict.fromkeys(names)) for names in zip(*ours, strict=True))
+    lines = [Line(row, "measured", []) for row in rows]
+    heads: list[str] = []
+    for column in columns:
+        for head, cells in ((column, ours), (f"{column}, reported", theirs)):
+            if any(cells[row, column] for row in rows):
+                heads.append(head)
+                for line in lines:
+                    line.cells.append(cells[line.label, column])
+    notes = [("", f"{label}: recipe {recipe}") for label, recipe in part["recipes"].items()]
+    if reported:
+        notes += [("", f"reported: {reported['source']}"), *(("", note) for note in reported.get("notes", []))]
+    return Part(name, dict.fromkeys(heads, "none"), lines, notes)

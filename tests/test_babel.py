@@ -46,7 +46,7 @@ def frames_of(amass: Path, key: str) -> np.ndarray:
 
 def row_of(window: Window) -> list[int]:
     split = ("train", "val", "test").index(window.split)
-    file = int(Path(window.motion).name[:3])
+    file = int(Path(window.label.motion).name[:3])
     return [split, int(window.id.split("_")[1]), file, window.start, int(window.label.text[1:])]
 
 
@@ -72,7 +72,7 @@ def test_clips_are_those_of_flame(stem: str, tmp_path: Path):
 def test_labels_become_texts_and_bad_ones_are_counted(small: tuple[Path, Path]):
     babel, amass = small
     source = open_babel(babel, amass)
-    texts = [(w.label.text, w.start) for w in source.windows if w.motion.endswith("/01_01_poses")]
+    texts = [(w.label.text, w.start) for w in source.windows if w.label.motion.endswith("/01_01_poses")]
     walks = [("walk", 0), ("walk", 10), ("walk", 20), ("walk", 30)]
     moves = [("move", start) for _, start in walks]
     assert sorted(texts) == sorted([*walks, *moves, ("step", 20), ("wave", 40)])
@@ -115,7 +115,7 @@ def test_the_official_training_set_stays_whole_and_val_is_divided_by_motion(tmp_
     splits: dict[str, set[str]] = {"train": set(), "val": set(), "test": set()}
     for window in source.windows:
         assert window.split == "train" if window.id.startswith("train") else window.split in ("val", "test")
-        splits[window.split].add(window.motion)
+        splits[window.split].add(window.label.motion)
     assert {split: len(motions) for split, motions in splits.items()} == {"train": 24, "val": 28, "test": 8}
     assert len(set().union(*splits.values())) == 60, "a motion in two splits"
     assert source.excluded == {"labels of the val part on motions of the train part": 1}

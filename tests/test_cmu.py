@@ -204,8 +204,7 @@ def test_bad_recordings_are_listed_and_the_good_ones_prepared(folder, capsys):
 
 def test_wrong_folders_get_one_line(folder):
     for path, captions, message in [
-        ("none", "clone", "none: not found; clone https"),
-        ("clone", "clone", "no recording such as 02_01.bvh or 02_01.amc in it; clone https"),
+        ("none", "clone", "no recording such as 02_01.bvh or 02_01.amc in it; clone https"),
         ("motions", "none", "none: not found; it is the folder of the captions"),
         ("motions", "motions", "index.csv"),
     ]:

@@ -45,7 +45,6 @@ class Window(NamedTuple):
     """A clip: frames of a motion, beginning at `start`; `id` contains FLAME's number in the part."""
 
     id: str
-    motion: str
     split: Split
     start: int
     label: Label
@@ -84,9 +83,9 @@ class Babel(MotionSource):
         self.check_fps(fps, FPS)
         windows: defaultdict[str, list[Window]] = defaultdict(list)
         for window in self.windows:
-            windows[window.motion].append(window)
+            windows[window.label.motion].append(window)
         for key, motion in self.amass.map(dict.fromkeys(windows), _motion, self.workers):
-            for id_, _, split, start, label in windows[key]:
+            for id_, split, start, label in windows[key]:
                 source = id_ if self.published_split else key
                 attributes = {"motion": key, "start": start, "label": label.kind}
                 yield Clip(id_, motion, [label.text], split, source, None, attributes, window=(start, LENGTH))
@@ -109,8 +108,7 @@ class Babel(MotionSource):
                     self.leave_out(reason)
                 else:
                     for n, start in enumerate(starts, number):
-                        split = self._split(part, n, label.motion)
-                        windows.append(Window(f"{part}_{n:06d}", label.motion, split, start, label))
+                        windows.append(Window(f"{part}_{n:06d}", self._split(part, n, label.motion), start, label))
                 number += len(starts)
         return windows
 

@@ -109,7 +109,6 @@ class CMU(MotionSource):
             if match := FILE.fullmatch(path.name):
                 files[match[1]].append(path)
         if not files:
-            required(self.path, GET_IT)
             raise FileNotFoundError(f"{self.path}: no recording such as 02_01.bvh or 02_01.amc in it; {GET_IT}")
         kept = self.not_excluded(files, self.path)
         good = {name: sorted(kept[name], key=_rank) for name in sorted(kept) if not _is_in("bad", name)}

@@ -6,7 +6,6 @@ Plappert, Mandery, Asfour, "The KIT Motion-Language Dataset", Big Data 2016. `do
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,7 @@ from flame_mdm.data import SPLITS, Clip, MotionSource, Split, required
 from flame_mdm.data.parallel import in_order
 from flame_mdm.data.t2m import T2MFolder, read_splits
 from flame_mdm.errors import UserError
-from flame_mdm.safe_io import TEXT_LIMIT, naming, read_json, read_text, regular_file
+from flame_mdm.safe_io import naming, read_json, read_text
 
 UNITS_PER_METER = 640
 MMM_FPS = 100
@@ -35,8 +34,8 @@ class KITTemos(MotionSource):
     """Joints of the MMM model, every eighth of 100 frames per second, with TEMOS's splits and limits.
 
     Petrovich, Black, Varol, "TEMOS", ECCV 2022, whose rules FLAME follows. Training and validation leave out motions
-    of fewer than 10 or more than 500 frames. The test split keeps all motions, but only their first caption; the clips
-    of Ghosh et al.'s test split have the attribute `ghosh_test`.
+    of fewer than 10 or more than 500 frames. The test split keeps all motions, but only their first caption; Ghosh et
+    al.'s test clips have the attribute `ghosh_test`.
 
     Args:
         path: folder with `NUMBER_fke.csv`, `NUMBER_annotations.json` and `NUMBER_meta.json`.
@@ -85,7 +84,8 @@ class KITTemos(MotionSource):
     @cached_property
     def frames(self) -> dict[str, int]:
         """Number of frames, at 12.5 per second, of each motion with captions."""
-        return {name: -(-_rows(self.path / f"{name}_fke.csv") // 8) for name in self.texts}
+        rows = {name: len(read_text(self.path / f"{name}_fke.csv").splitlines()) - 1 for name in self.texts}
+        return {name: -(-count // 8) for name, count in rows.items()}
 
     def count(self) -> int:
         return sum(self._fits(name) for name in self.frames)
@@ -127,17 +127,11 @@ def read_joints(path: Path, step: int = 8) -> np.ndarray:
 
     A row contains its number and 63 coordinates in KIT's unit, about 1/640 of a meter.
     """
-    regular_file(path, TEXT_LIMIT)
-    with path.open(encoding="utf-8") as file, naming(path, ValueError, what="damaged, exclude it by its number: "):
-        rows = np.loadtxt(islice(file, 1, None, step), delimiter=",", ndmin=2)
+    lines = read_text(path).splitlines()[1::step]
+    with naming(path, ValueError, what="damaged, exclude it by its number: "):
+        rows = np.loadtxt(lines, delimiter=",", ndmin=2)
         if rows.shape[1] != 64 or not len(rows):
             raise UserError(f"{rows.shape[1]} columns, not a row number and 63 coordinates")
         if not np.isfinite(rows).all():
             raise UserError("non-finite numbers")
     return (rows[:, 1:].reshape(-1, 21, 3) / UNITS_PER_METER).astype(np.float32)
-
-
-def _rows(path: Path) -> int:
-    regular_file(path, TEXT_LIMIT)
-    data = path.read_bytes()
-    return data.count(b"\n") + (not data.endswith(b"\n")) - 1

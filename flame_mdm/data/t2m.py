@@ -134,10 +134,9 @@ class T2MFolder(MotionSource):
     @cached_property
     def texts(self) -> dict[str, list[Description]]:
         """Descriptions of each motion, from the folder `texts` or from `texts.zip`."""
-        folder, archive = self.path / "texts", self.path / "texts.zip"
+        folder = self.path / "texts"
         if not folder.is_dir():
-            if not archive.is_file():
-                raise FileNotFoundError(f"{self.path}: contains neither a folder texts nor texts.zip")
+            archive = required(self.path / "texts.zip", f"nor is the folder texts there; {self.get_it}")
             folder = archives.as_folder(archive, self, lambda name: name.endswith(".txt"))
         return {file.stem: parse(read_text(file), str(file)) for file in sorted(folder.rglob("*.txt"))}
 
@@ -178,16 +177,15 @@ class T2MFolder(MotionSource):
         return mean, std
 
     def counts(self) -> dict[str, float]:
-        """Returns the figures of the folder under the names of `published.yaml`, of which mirrored copies give none."""
-        originals = {name.removeprefix("M") for name in self._motions()}
-        captions = [d.caption for name, texts in self.texts.items() if not name.startswith("M") for d in texts]
-        words = [words_of(caption) for caption in captions]
+        """Returns the figures of `published.yaml`, in which motions and texts do not include mirrored copies."""
+        texts = [text for name, texts in self.texts.items() if not name.startswith("M") for text in texts]
+        words = [word for text in texts for word in words_of(text.caption)]
         splits = Counter(self.names.values())
         return {
-            "motions": len(originals),
-            "texts": len(captions),
-            "vocabulary": len({word for caption in words for word in caption}),
-            "words per caption": round(sum(map(len, words)) / max(len(words), 1), 2),
+            "motions": len({name.removeprefix("M") for name in self._motions()}),
+            "texts": len(texts),
+            "vocabulary": len(set(words)),
+            "words per caption": round(len(words) / max(len(texts), 1), 2),
             **{split: splits[split] for split in SPLITS},
             **{f"{split} share, %": round(100 * splits[split] / max(len(self.names), 1), 2) for split in SPLITS},
         }

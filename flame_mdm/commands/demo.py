@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import ClassVar
 
-from flame_mdm.checkpoints.locating import find
 from flame_mdm.errors import UserError
 from flame_mdm.sampler_options import option
 
@@ -33,8 +32,6 @@ def main(settings: DemoSettings) -> None:
         raise UserError(f"port={settings.port}: give a number from 0 to 65535; 0 is any free port")
     if find_spec("gradio") is None:
         raise UserError('the demo needs the package gradio. Run pip install "flame-mdm[demo]"')
-    for name in settings.ckpt:
-        find(name)
 
     from flame_mdm.demo.app import serve
     from flame_mdm.demo.request import PLUS

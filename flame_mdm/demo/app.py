@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import re
 import socket
 import tempfile
 from collections.abc import Callable, Collection, Sequence
@@ -24,11 +25,9 @@ from flame_mdm.demo.request import parse_query
 from flame_mdm.demo.studio import Studio
 from flame_mdm.errors import UserError, first_line, one_line, say
 
-SESSIONS = 64
-"""Number of open pages that gradio remembers; it keeps half a megabyte for each, and the page needs none of it."""
+SESSIONS = 64  # open pages that gradio remembers; it keeps half a megabyte for each, and the page needs none of it
 CONNECTIONS = 256  # maximum number of open connections; further ones get status 503
-WRITERS, WAITING_FILES = 2, 32
-"""Number of motion files that are written at the same time, and of those that wait for it."""
+WRITERS, WAITING_FILES = 2, 32  # motion files that are written at the same time, and those that wait for it
 FONT, MONO = ("system-ui", "sans-serif"), ("ui-monospace", "monospace")
 
 
@@ -39,10 +38,7 @@ def serve(
     device: str | None = None,
     hosts: Collection[str] = (),
 ) -> None:
-    """Serves the page until the process is interrupted; raises `UserError` if the port is in use or a model unusable.
-
-    `sources` are as for `Studio`; the other arguments are the keys of `flame-mdm demo`.
-    """
+    """Serves the page of `Studio(sources)` until interrupted; raises `UserError` if the port or a model is unusable."""
     import torch
 
     try:
@@ -68,10 +64,7 @@ class Server(uvicorn.Server):
 
 
 def web_app(studio: Studio, hosts: Collection[str] = ()) -> Guard:
-    """Returns the application: the page at `/`, files at `/motion.bvh?...` with the query string of a link.
-
-    `hosts` are names of this server, besides localhost and numbers.
-    """
+    """Returns the application: the page at `/`, files at `/motion.bvh?...` with the query string of a link."""
     app = FastAPI(openapi_url=None)
     writers, waiting = asyncio.Semaphore(WRITERS), 0
 
@@ -97,8 +90,8 @@ def web_app(studio: Studio, hosts: Collection[str] = ()) -> Guard:
             return PlainTextResponse(first_line(error), 400)
         finally:
             waiting -= 1
-        name = f"{'-'.join(request.text.lower().split())[:60] or 'motion'}-{int(number) + 1}{extension}"
-        name = "".join(c for c in name if c.isascii() and (c.isalnum() or c in "-."))
+        words = "-".join(re.findall(r"[a-z0-9]+", request.text.lower()))[:60]
+        name = f"{words or 'motion'}-{int(number) + 1}{extension}"
         headers = {"Content-Disposition": f'attachment; filename="{name}"'}
         return Response(content, media_type="application/octet-stream", headers=headers)
 

@@ -10,6 +10,8 @@ from urllib.parse import urlsplit
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 from starlette.datastructures import Headers
+from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -30,13 +32,17 @@ HEADERS = {
 """Of every response. Nothing is loaded from other servers, and only Hugging Face may show the page in a frame."""
 
 Id = Annotated[str, StringConstraints(pattern=r"^\w{1,40}$")]
-RULES = ConfigDict(extra="forbid", strict=True)
 
 
-class Call(BaseModel):
+class Post(BaseModel):
+    """A request's body; values are not converted, and keys that are not listed are refused."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+
+class Call(Post):
     """A call of one of the page's functions; its arguments are texts, never objects that could name a file."""
 
-    model_config = RULES
     data: Annotated[list[Annotated[str, Field(max_length=20_000)]], Field(max_length=1)]
     fn_index: int
     session_hash: Id
@@ -44,23 +50,20 @@ class Call(BaseModel):
     event_data: None = None
 
 
-class Cancellation(BaseModel):
+class Reset(Post):
+    """The page's note that it no longer waits for a call."""
+
+    event_id: Id
+
+
+class Cancellation(Reset):
     """A cancellation of a waiting or running call."""
 
-    model_config = RULES
-    event_id: Id
     session_hash: Id
     fn_index: int
 
 
-class Reset(BaseModel):
-    """The page's note that it no longer waits for a call."""
-
-    model_config = RULES
-    event_id: Id
-
-
-POSTS: dict[str, type[BaseModel]] = {
+POSTS: dict[str, type[Post]] = {
     "/gradio_api/cancel": Cancellation,
     "/gradio_api/reset": Reset,
     "/gradio_api/queue/join": Call,
@@ -69,22 +72,12 @@ POSTS: dict[str, type[BaseModel]] = {
 """What the page sends with POST."""
 
 
-class Refused(Exception):
-    """A request that is not one of this page; with the status and the line of the answer."""
-
-    def __init__(self, status: HTTPStatus, line: str):
-        super().__init__(line)
-        self.status = status
-
-
 class Guard:
     """ASGI middleware that checks host, origin, path, size and content of a request before the application sees it.
 
-    Args:
-        app: The application.
-        hosts: Names of this server, besides localhost and addresses in numbers: another name is one that somebody else
-            pointed at this computer (DNS rebinding).
-        calls: Functions of the page that may be called: number -> path, and whether arguments are accepted.
+    `hosts` are names of this server, besides localhost and addresses in numbers: another name is one that somebody else
+    pointed at this computer (DNS rebinding). `calls` are the functions of the page that may be called: number -> path,
+    and whether arguments are accepted.
     """
 
     def __init__(
@@ -111,11 +104,11 @@ class Guard:
             headers = Headers(scope=scope)
             self._check_sender(headers, scope["path"])
             if scope["method"] == "POST" and headers.get("content-type") != "application/json":
-                raise Refused(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "this is not a request of this page")
-            body = await _body(receive)
+                raise HTTPException(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "this is not a request of this page")
+            body = await _body(Request(scope, receive))
             self._check_content(scope["method"], scope["path"], body)
-        except Refused as refusal:
-            answer = PlainTextResponse(str(refusal), refusal.status, {"Connection": "close"})
+        except HTTPException as refusal:
+            answer = PlainTextResponse(refusal.detail, refusal.status_code, {"Connection": "close"})
             return await answer(scope, receive, send_headers)
         messages: list[Message] = [{"type": "http.request", "body": body, "more_body": False}]
 
@@ -139,43 +132,41 @@ class Guard:
         name = _host_name(f"//{host}")
         if name not in self.hosts | {"localhost"} and not _is_address(name):
             line = "this demo is not served under that name. Start it with hosts=NAME"
-            raise Refused(HTTPStatus.MISDIRECTED_REQUEST, line)
+            raise HTTPException(HTTPStatus.MISDIRECTED_REQUEST, line)
         origin = headers.get("origin", f"http://{host}")
         # a proxy may have replaced the host, but not the origin
         same = urlsplit(origin).netloc.lower() == host.lower() or _host_name(origin) in self.hosts
         if not same or (path != "/" and headers.get("sec-fetch-site", "none") not in ("same-origin", "none")):
-            raise Refused(HTTPStatus.FORBIDDEN, "this request comes from a page of another site")
+            raise HTTPException(HTTPStatus.FORBIDDEN, "this request comes from a page of another site")
 
     def _check_content(self, method: str, path: str, body: bytes) -> None:
         if method in ("GET", "HEAD") and READ.fullmatch(path) and not body:
             return
         if method != "POST" or path not in POSTS:
-            raise Refused(HTTPStatus.NOT_FOUND, "this page has nothing at that address")
+            raise HTTPException(HTTPStatus.NOT_FOUND, "this page has nothing at that address")
         try:
             content = POSTS[path].model_validate_json(body)
         except ValidationError as error:
-            raise Refused(HTTPStatus.BAD_REQUEST, "this is not a request of this page") from error
+            raise HTTPException(HTTPStatus.BAD_REQUEST, "this is not a request of this page") from error
         if isinstance(content, Call):
             address, accepts = self.calls.get(content.fn_index, ("", bool))
             if address != path or not accepts(content.data):
-                raise Refused(HTTPStatus.BAD_REQUEST, "this is not a request of this page")
+                raise HTTPException(HTTPStatus.BAD_REQUEST, "this is not a request of this page")
 
 
-async def _body(receive: Receive) -> bytes:
+async def _body(request: Request) -> bytes:
     body = bytearray()
     try:
         async with asyncio.timeout(BODY_TIME):
-            while True:
-                message = await receive()
-                if message["type"] == "http.disconnect":
-                    raise Refused(HTTPStatus.BAD_REQUEST, "the request is incomplete")
-                body += message.get("body", b"")
+            async for part in request.stream():
+                body += part
                 if len(body) > MAX_BODY:
-                    raise Refused(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "this request is too large")
-                if not message.get("more_body"):
-                    return bytes(body)
+                    raise HTTPException(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "this request is too large")
+    except ClientDisconnect as error:
+        raise HTTPException(HTTPStatus.BAD_REQUEST, "the request is incomplete") from error
     except TimeoutError as error:
-        raise Refused(HTTPStatus.REQUEST_TIMEOUT, "the request took too long to arrive") from error
+        raise HTTPException(HTTPStatus.REQUEST_TIMEOUT, "the request took too long to arrive") from error
+    return bytes(body)
 
 
 def _host_name(address: str) -> str:

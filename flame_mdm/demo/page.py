@@ -25,6 +25,8 @@ from flame_mdm.visualize import player_page
 from flame_mdm.visualize.render import thumbnail
 
 QUEUE = 64  # maximum number of waiting requests; further ones are told to come back
+FORM = ["model", "text", "seconds", "seed", "samples", "guidance_scale", "num_inference_steps", "sampler"]
+FORM += ["cleanup", "split", "path"]
 PARTS = ("left_arm", "right_arm", "left_leg", "right_leg", "upper_body", "lower_body")
 RIGGED = (".bvh", ".glb")
 PROGRAMS = {"Blender": "", "Unreal": "&amp;rig=unreal", "Unity": "&amp;rig=unity", "Mixamo": "&amp;rig=mixamo"}
@@ -76,12 +78,10 @@ def build_page(studio: Studio) -> gr.Blocks:
 
     with gr.Blocks(title="flame_mdm", analytics_enabled=False) as blocks:
         ui = _layout(studio)
-        form = {"model": ui.model, "text": ui.text, "seconds": ui.seconds, "seed": ui.seed, "samples": ui.samples}
-        form |= {"guidance_scale": ui.guidance, "num_inference_steps": ui.steps, "sampler": ui.sampler}
-        form |= {"cleanup": ui.cleanup, "split": ui.split, "path": ui.path}
-        fields, edit = list(form.values()), [ui.query, ui.chosen, ui.new, ui.begin, ui.end, ui.parts, ui.again]
+        fields = [vars(ui)[name] for name in FORM]
+        edit = [ui.query, ui.chosen, ui.new, ui.begin, ui.end, ui.parts, ui.again]
         quick: dict[str, Any] = {"queue": False, "show_progress": "hidden", "api_visibility": "private"}
-        read, compose = (f"(...values) => links.{name}({list(form)}, values)" for name in ("read", "compose"))
+        read, compose = (f"(...values) => links.{name}({FORM}, values)" for name in ("read", "compose"))
         calls = ("links.change", "links.vary", "editor")
         change, vary, sketch = (f"(...values) => {name}(...values)" for name in calls)
         first = [
@@ -137,8 +137,9 @@ def _layout(studio: Studio) -> SimpleNamespace:
             with gr.Accordion("Model and sampling", open=len(names) > 1):
                 ui.model = gr.Dropdown(names, value=names[0], label="Model")
                 with gr.Row():
-                    ui.guidance = gr.Textbox(label="Guidance", placeholder="model's", max_length=9, min_width=90)
-                    ui.steps = gr.Textbox(label="Steps", placeholder="model's", max_length=9, min_width=90)
+                    number: dict[str, Any] = {"placeholder": "model's", "max_length": 9, "min_width": 90}
+                    ui.guidance_scale = gr.Textbox(label="Guidance", **number)
+                    ui.num_inference_steps = gr.Textbox(label="Steps", **number)
                     ui.sampler = gr.Dropdown(samplers, value=None, label="Sampler", min_width=120)
                 label = "Clean up: smooth motion, feet that do not slide (not with a path)"
                 ui.cleanup = gr.Checkbox(True, label=label)
@@ -174,10 +175,9 @@ def _result(ui: SimpleNamespace, studio: Studio, request: DemoRequest, motions: 
         *before, last = request.edits
         original = studio.motions(request.model_copy(update={"edits": tuple(before)}))[last.motion]
         scene.insert(0, replace(original, id="before", text=f"before: {original.text}"))
-    query = escape(request.query())
     links = ""
     for number in range(len(motions)):
-        address = f"?{query}&amp;motion={number}"
+        address = f"?{escape(request.query())}&amp;motion={number}"
         files = [(f"motion{extension}{address}", name) for extension, name in FORMATS.items()]
         programs = [(f"motion.glb{address}{rig}", name) for name, rig in PROGRAMS.items()]
         rigs = [(f"motion{end}{address}&amp;rig={rig}", f"{rig} {end[1:]}") for rig in presets() for end in RIGGED]

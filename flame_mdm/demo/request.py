@@ -1,7 +1,4 @@
-"""Requests of the demo: the link of a motion, and the Python program that makes the same one.
-
-They are a `SamplingRequest`, which checks the values, and its edits, within the limits of a public page.
-"""
+"""Requests of the demo, within the limits of a public page; links and Python programs that make the same motions."""
 
 import json
 from collections.abc import Iterable
@@ -9,17 +6,15 @@ from typing import Annotated, Any, Literal
 from urllib.parse import urlencode
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, StringConstraints, ValidationError
-from pydantic_core import PydanticCustomError
 
 from flame_mdm.errors import UserError, did_you_mean, one_line, shortened
-from flame_mdm.sampling.request import path_targets, read_parts
+from flame_mdm.sampling.request import path_targets, read_parts, read_path
 
 MAX_TEXT, MAX_SECONDS, MAX_SAMPLES, MAX_STEPS, MAX_EDITS = 300, 30, 4, 1000, 8
 """Limits of a request: characters, seconds, motions, sampling steps, edits."""
 MAX_SEED = 2**31 - 1
-PLUS = " + "  # between the names of a model and of its adapter
 MAX_WAY_POINTS, FAR = 16, 20.0  # a path: way points, and meters along x and z
-
+PLUS = " + "  # between the names of a model and of its adapter
 PLAIN = r"^[^\x00-\x1f\x7f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]*$"
 """Text without control characters, those of writing direction included."""
 
@@ -31,33 +26,20 @@ Coordinate = Annotated[float, Field(ge=-FAR, le=FAR)]
 RULES = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-def _way_points(value: Any) -> Any:
-    if isinstance(value, str):
-        value = [point.split(",") for point in value.split()]
-        if any(len(point) != 2 for point in value):
-            raise PydanticCustomError("path", "give way points as x,z in meters, such as 0,1 0.5,2")
-    return value
-
-
 Path = Annotated[
     tuple[tuple[Coordinate, Coordinate], ...],
     Field(max_length=MAX_WAY_POINTS),
-    BeforeValidator(_way_points),
+    BeforeValidator(lambda value: read_path(value) if isinstance(value, str) else value),
     PlainSerializer(lambda path: " ".join(f"{x},{z}" for x, z in path)),
 ]
 """Way points; in a link and on the page "x,z x,z ..."."""
 
 
 class DemoEdit(BaseModel):
-    """An edit of one of the motions so far: `joints` in `region_seconds` are resampled, the rest is kept.
+    """An edit of one of the motions so far, by number; see `flame_mdm.sampling.request.EditRequest`.
 
-    Attributes:
-        motion: number of the edited motion, from 0.
-        text: what the person does in the new part; "" = unconditioned.
-        region_seconds: begin and end of the new part; None = all of the motion.
-        joints: body parts to resample; none = all.
-        strength: None = from noise; otherwise a variation, as in `flame_mdm.sampling.editing.edit`. One of the entire
-            motion keeps text, parts and path of the request.
+    `text` is what the person does in the new part; "" = unconditioned. A variation of the entire motion keeps text,
+    parts and path of the request.
     """
 
     model_config = RULES
@@ -71,11 +53,7 @@ class DemoEdit(BaseModel):
 
 
 class DemoRequest(BaseModel):
-    """Everything that determines the motions that the demo shows; keys are those of `flame-mdm sample`.
-
-    Attributes:
-        path: way points of the root over the floor, x and z in meters; see `flame_mdm.sampling.request.path_targets`.
-    """
+    """Everything that determines the motions that the demo shows; keys are those of `flame-mdm sample`."""
 
     model_config = RULES
     model: str = "quickstart"
@@ -100,18 +78,13 @@ class DemoRequest(BaseModel):
         return urlencode([*pairs.items(), *(("edit", text) for text in edits)])
 
     def targets(self, kind: str) -> dict[str, Any]:
-        """Returns the targets of `flame_mdm.generate` that lead along the path; `kind` as for `steps`."""
+        """Returns the targets of `flame_mdm.generate` that lead along the path, for a model trained on `kind`."""
         parts = read_parts(self.text) if self.text and kind != "none" else [("", None)]
         return path_targets(self.path, sum(seconds or self.seconds for _, seconds in parts))
 
     def steps(self, kind: str) -> list[tuple[int | None, dict[str, Any]]]:
-        """Returns the number of the motion to edit, None at first, and keywords of `generate` or `edit`, for each step.
-
-        Motions are edited as the model made them and cleaned up at the end. The model was trained on `kind`: text,
-        action, none.
-        """
-        names = ("guidance_scale", "num_inference_steps", "sampler")
-        shared = {name: value for name in names if (value := getattr(self, name)) is not None}
+        """Returns (number of the motion to edit, None at first; keywords of `generate` or `edit`) for each step."""
+        shared = self.model_dump(include={"guidance_scale", "num_inference_steps", "sampler"}, exclude_none=True)
         path = {"targets": self.targets(kind)} if self.path else {}
         split = {} if self.split else {"split": False}
 
@@ -122,9 +95,8 @@ class DemoRequest(BaseModel):
         first = keywords(self, self.text, seconds=self.seconds, **split, **path)
         steps: list[tuple[int | None, dict[str, Any]]] = [(None, first)]
         for part in self.edits:
-            region = None if part.region_seconds is None else list(part.region_seconds)
-            editing = {"region_seconds": region, "joints": list(part.joints) or None, "strength": part.strength}
-            editing = {name: value for name, value in editing.items() if value is not None}
+            options = {"region_seconds", "joints", "strength"}
+            editing = part.model_dump(mode="json", include=options, exclude_defaults=True)
             if editing.keys() == {"strength"}:
                 steps.append((part.motion, keywords(part, part.text or self.text, **editing, **path)))
             else:
@@ -165,7 +137,9 @@ def checked(values: dict[str, Any]) -> DemoRequest:
     try:
         return DemoRequest(**{key: value for key, value in values.items() if value not in (None, "")})
     except ValidationError as error:
-        first = error.errors()[0]
+        first: Any = error.errors()[0]
+        if first["type"] == "value_error":  # of `read_path`
+            raise first["ctx"]["error"] from None
         name = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
             raise UserError(f"unknown option {_shown(name)}.{did_you_mean(name, DemoRequest.model_fields)}") from None

@@ -25,7 +25,7 @@ FORMATS = {".bvh": "BVH", ".glb": "GLB", ".npz": "NPZ", ".mp4": "MP4"}  # files 
 
 
 class Studio:
-    """Makes the motions of requests with a fixed set of models on a device, of which the first is loaded at once.
+    """Makes the motions of requests with a fixed set of models, of which the first is loaded at once.
 
     `sources` are names of models, as for `flame_mdm.load`, or "MODEL + ADAPTER"; requests can choose no other.
     """
@@ -34,7 +34,7 @@ class Studio:
         self.device = device
         self.files = {name: find(name.partition(PLUS)[0]) for name in sources}
         self._models: dict[str, MotionGenerator] = {}
-        self._made: OrderedDict[tuple[Any, ...], list[Motion]] = OrderedDict()
+        self._made: OrderedDict[tuple[Any, ...], Sequence[Motion]] = OrderedDict()
         self._working, self._memory = Lock(), Lock()
         self.model(sources[0])
 
@@ -49,7 +49,7 @@ class Studio:
 
     def motions(
         self, request: DemoRequest, report: Callable[[int], None] = lambda calls: None, stop: Event | None = None
-    ) -> list[Motion]:
+    ) -> Sequence[Motion]:
         """Returns the motions of a request, from memory if they were made before; ends one that takes too long.
 
         Before each call of the network, `report` gets the number of calls so far; `stop` ends the request.
@@ -70,20 +70,17 @@ class Studio:
 
             hook = model.denoiser.register_forward_pre_hook(before)
             try:
-                motions: list[Motion] = []
+                motions: Sequence[Motion] = ()
                 for number, (source, arguments) in enumerate(steps):
                     key = (request.model, repr(steps[: number + 1]))
-                    made: list[Motion]
                     if key in self._made:
-                        made = self._made[key]
+                        motions = self._made[key]
                     elif source is None:
-                        made = generate(model, **arguments)
-                    elif source < len(motions):
-                        made = [*edit(model, motions[source], **arguments)]
+                        motions = generate(model, **arguments)
                     else:
-                        raise UserError(f"motion={source}: there are {len(motions)} motions, numbered from 0")
+                        motions = edit(model, _numbered(motions, source), **arguments)
                     with self._memory:
-                        self._made[key] = motions = made
+                        self._made[key] = motions
                         self._made.move_to_end(key)
                         while len(self._made) > KEPT:
                             self._made.popitem(last=False)
@@ -107,10 +104,7 @@ class Studio:
         return [line for words in parts for line in advice(words, model.facts, model.condition.max_words)]
 
     def file(self, request: DemoRequest, number: int, extension: str, rig: str | None = None) -> bytes:
-        """Returns the bytes of a motion file; `number` counts the motions of the request from 0.
-
-        The motion comes from memory, so that a file costs no work of the model and waits for nobody's request.
-        """
+        """Returns the bytes of a file of motion `number`, from memory, so that it waits for nobody's request."""
         if extension not in FORMATS:
             raise UserError(f"{one_line(extension[:20])}: not a format of this page. Use {', '.join(FORMATS)}")
         motions = None
@@ -120,13 +114,17 @@ class Studio:
                 motions = self._made.get((request.model, repr(steps)))
         if model is None or motions is None:
             raise UserError("this motion is not in memory. Open its link, and download it from there")
-        if not 0 <= number < len(motions):
-            raise UserError(f"motion={number}: there are {len(motions)} motions, numbered from 0")
-        motion = (_cleaned(model, motions) if cleanup else motions)[number]
+        motion = _numbered(_cleaned(model, motions) if cleanup else motions, number)
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder, f"motion{extension}")
             motion.save(path, rig=rig)
             return path.read_bytes()
+
+
+def _numbered(motions: Sequence[Motion], number: int) -> Motion:
+    if number >= len(motions):
+        raise UserError(f"motion={number}: there are {len(motions)} motions, numbered from 0")
+    return motions[number]
 
 
 def _plan(model: MotionGenerator, request: DemoRequest) -> tuple[list[tuple[int | None, dict[str, Any]]], bool]:

@@ -292,7 +292,7 @@ def test_imports_that_cannot_be_are_one_line(refused, bad):
     statistics_folder(bad, 150)
     for kind, change, message in (
         ("mdm", {"stats": True}, "model.pt: features of uestc are not normalized. Leave out stats=FOLDER"),
-        ("mdm", {"dataset": "humanml"}, "150 features, but humanml-legacy-smpl22"),
+        ("mdm", {"dataset": "humanml"}, "150 features, but not the 263 of humanml-legacy-smpl22"),
         ("mdm", {"dataset": "amass"}, "args.json: dataset is \"amass\", not 'humanml', 'kit', 'humanact12' or 'uestc'"),
         ("mdm", {"arch": "mamba"}, "arch is \"mamba\", not 'trans_enc', 'trans_dec' or 'gru'"),
         ("mdm", {"arch": "trans_dec"}, "unknown keys seqTransEncoder"),
@@ -385,7 +385,7 @@ def test_damaged_foreign_and_absent_files_are_one_line(trained, tmp_path):
         save_file({"w": torch.zeros(1)}, tmp_path / f"{name}.safetensors")
     (tmp_path / "empty").mkdir()
     for name, kind, message in (
-        (tmp_path / "a.safetensors", UserError, r"weights without a recipe\. Import released weights of MDM"),
+        (tmp_path / "a.safetensors", UserError, r"weights without a recipe\. Import released weights"),
         (tmp_path / "empty", UserError, r"this folder holds no \.safetensors file"),
         (tmp_path, UserError, r"holds a\.safetensors, b\.safetensors\. Name the file"),
         ("nobody/model.ckpt", FileNotFoundError, "no such checkpoint"),

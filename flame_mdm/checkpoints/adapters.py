@@ -3,10 +3,9 @@
 A weight W (out, in) of attention or feed-forward becomes W + strength * up down, with `up` (out, rank) and `down`
 (rank, in) (Hu et al. 2021, arXiv:2106.09685); in the word table of a learned text encoder, a vector is added to a row
 of each new word. In training, `torch.nn.utils.parametrize` computes the weights, also for code that reads a weight
-without calling its layer, as cross-attention does. Loaded models hold the changed weights.
-
-Training changes all layers. Of a style, only the changes of the second half are kept: the first half learns that the
-clips show few actions, and with it the model would forget which action is requested.
+without calling its layer, as cross-attention does. Training changes all layers. Of a style, only the changes of the
+second half are kept: the first half learns that the clips show few actions, and with it the model would forget which
+action is requested.
 
 An adapter file (.safetensors) has these parts of a weight NAME as NAME.up, NAME.down and NAME.vectors, and `About` as
 JSON in its metadata.
@@ -38,8 +37,7 @@ if TYPE_CHECKING:
     from flame_mdm.generator import MotionGenerator
 
 ORIGINAL, CHANGE = ".parametrizations.weight.original", ".parametrizations.weight.0."
-FARTHER = 10.0
-"""Factor of the vectors of words, which have farther to go than weights: the rows of a table are from N(0, 1)."""
+FARTHER = 10.0  # factor of the vectors of words, which have farther to go than weights: the rows are from N(0, 1)
 Paths = str | Path | Sequence[str | Path]  # one file, or several
 
 
@@ -88,11 +86,11 @@ def attach(model: MotionGenerator, about: About) -> None:
     if not layers:
         raise UserError(f"{model.describe()} has no attention, which adapters change. Train all weights: full=true")
     for number, layer in enumerate(layers):
+        is_kept = about["action"] or number >= len(layers) // 2
         for module in [module for module in layer.modules() if isinstance(module, nn.Linear)]:
             up, size = torch.zeros(module.out_features, about["rank"]), module.in_features
             down = torch.randn(about["rank"], size) * size**-0.5
-            change = Change(up=up, down=down, is_kept=about["action"] or number >= len(layers) // 2)
-            register_parametrization(module, "weight", change)
+            register_parametrization(module, "weight", Change(up=up, down=down, is_kept=is_kept))
     if isinstance(model.condition, LearnedTokens) and (rows := about["rows"]):
         change = Change(rows, vectors=torch.zeros(len(rows), model.condition.features))
         register_parametrization(model.condition.words, "weight", change)
@@ -134,8 +132,7 @@ def read_merged(path: Path, adapter: Paths = (), strength: float | Sequence[floa
     for file, weight in zip(paths, strengths, strict=True):
         about, changes = _read(Path(file))
         if about["base"] != own:
-            which = f"made for the weights {about['base'][:12]}, not {own[:12]}"
-            raise UserError(f"adapter={file}: {which}. Give the model it was made for")
+            raise UserError(f"adapter={file}: made for the weights {about['base'][:12]}, not {own[:12]}. Give its base")
         _merge(plain, changes, about["rows"], weight, file)
         for key, more in (("vocabulary", about["words"]), ("captions", about["captions"])):
             if key in facts and weight:  # the base leaves out words that it does not know

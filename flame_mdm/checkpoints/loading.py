@@ -21,6 +21,13 @@ from flame_mdm.generator import DistilledGenerator, MotionGenerator
 if TYPE_CHECKING:
     from flame_mdm.task import Task
 
+PARTS = ("task", "representation", "process", "condition", "denoiser")  # parts of a recipe from which a model is built
+GENERATORS = {
+    "flame_mdm.task.MotionGeneration": MotionGenerator,
+    "flame_mdm.training.distillation.ConsistencyDistillation": DistilledGenerator,
+}
+"""Classes of the task in recipes of generators, and those that are loaded instead, without Lightning."""
+Trained = TypeVar("Trained", bound="Task | MotionGenerator")
 NO_GPU = "PyTorch finds no GPU" if torch.version.cuda or torch.version.hip else "this PyTorch was built without CUDA"
 """Why no GPU can be used, if PyTorch has none."""
 
@@ -41,22 +48,11 @@ def load(
     return load_task(find(source, which), MotionGenerator, device, adapter=adapter, strength=strength)
 
 
-Trained = TypeVar("Trained", bound="Task | MotionGenerator")
-GENERATORS = {
-    "flame_mdm.task.MotionGeneration": MotionGenerator,
-    "flame_mdm.training.distillation.ConsistencyDistillation": DistilledGenerator,
-}
-"""Classes of the task in recipes of generators, and those that are loaded instead, without Lightning."""
-
-PARTS = ("task", "representation", "process", "condition", "denoiser")  # parts of a recipe from which a model is built
-
-
 def load_task(path: Path, kind: type[Trained], device: str | torch.device = "cpu", **adapted: Any) -> Trained:
     """Loads the task of a .ckpt or .safetensors file in evaluation mode, with averaged weights if its recipe has them.
 
     `kind` is the expected class of the task, `adapted` adapter and strength, as for `load`. Raises `UserError` if the
-    file is not a checkpoint of this framework, holds another kind of task, is damaged, or its weights do not match its
-    recipe.
+    file is damaged, holds another kind of task, or its weights do not match its recipe.
     """
     check_device(device)
     checkpoint = read_merged(path, **adapted)
@@ -90,9 +86,6 @@ def _build(checkpoint: dict[str, Any], kind: type[Trained]) -> Trained:
     config, state = checkpoint["config"], checkpoint["state_dict"]
     parts: Config = {name: config[name] for name in PARTS if name in config}
     trust(parts)
-    for name in ("task", "representation", *parts):
-        if "_target_" not in (config[name] if isinstance(config.get(name), dict) else {}):
-            raise UserError(f"damaged: its recipe has no {name}")
     classes: dict[str, Any] = dict(GENERATORS) if kind is MotionGenerator else {}
     targets = [str(node["_target_"]) for _, node in walk(parts) if "_target_" in node]
     # imports modules here, since tensors that they create must not be on the meta device
@@ -117,8 +110,8 @@ def _build(checkpoint: dict[str, Any], kind: type[Trained]) -> Trained:
     try:
         task.load_state_dict(state, strict=True, assign=own)
     except RuntimeError as error:
-        lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-        raise UserError(f"the weights do not match the recipe saved with them: {lines[1]}") from error
+        what = str(error).splitlines()[1].strip()
+        raise UserError(f"the weights do not match the recipe saved with them: {what}") from error
     task.steps = checkpoint.get("global_step", (checkpoint.get("origin") or {}).get("steps"))
     return task
 

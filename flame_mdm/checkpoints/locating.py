@@ -17,10 +17,8 @@ SHIPPED = {path.stem: path for path in sorted((Path(__file__).parents[1] / "mode
 def find(source: str | Path, which: Which = "last") -> Path:
     """Returns the file of a model; raises `FileNotFoundError` or `UserError` if there is none.
 
-    Args:
-        source: a file; a run directory; a folder with one .safetensors file; the name of a model in this package, such
-            as "quickstart"; or "user/name[@revision]" on the Hugging Face hub. An existing path comes first.
-        which: for a run directory, the last checkpoint or the one with the best validation result.
+    `source` is a file; a run directory, of which `which` names the checkpoint; a folder with one .safetensors file; the
+    name of a model in this package; or "user/name[@revision]" on the Hugging Face hub. An existing path comes first.
     """
     if which not in get_args(Which):
         raise UserError(f"which={which}: write last or best")
@@ -43,10 +41,8 @@ def find(source: str | Path, which: Which = "last") -> Path:
     try:
         return Path(hf_hub_download(match[1], FILE, revision=match[2]))
     except Exception as error:  # the client raises many kinds: no network, no such repository, no permission ...
-        raise UserError(
-            f"{source}: no such file or folder, and {FILE} of a model with this name cannot be downloaded from the "
-            f"hub: {first_line(error)}"
-        ) from error
+        what = f"no such file or folder, and {FILE} of this name cannot be downloaded from the hub"
+        raise UserError(f"{source}: {what}: {first_line(error)}") from error
 
 
 def _find_in_folder(folder: Path, which: Which) -> Path:
@@ -61,8 +57,7 @@ def _find_in_folder(folder: Path, which: Which) -> Path:
     if len(weights) != 1:
         names = ", ".join(file.name for file in weights) or "no .safetensors file"
         runs = ", ".join(str(path.parent) for path in sorted(folder.glob("*/checkpoints"))[:3])
-        raise UserError(
-            f"{folder}: this folder holds {names}. Name {f'a run: {runs}' if runs else 'the file of the model'}"
-        )
+        advice = f"Name a run: {runs}" if runs else "Name the file of the model"
+        raise UserError(f"{folder}: this folder holds {names}. {advice}")
     regular_file(weights[0])
     return weights[0]

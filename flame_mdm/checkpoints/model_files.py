@@ -1,8 +1,8 @@
 """File formats of models: checkpoints (.ckpt) of training, and model files (.safetensors).
 
 A model file holds the (averaged) weights, including the statistics of the features. Its metadata has a key `flame_mdm`
-with the recipe, metadata of the data set, and the origin of the weights, as JSON, and a key `sha256` with the hash of
-that text and the weights. It contains no code.
+with recipe, metadata of the data set and origin of the weights, as JSON, and a key `sha256` with the hash of that text
+and the weights. It contains no code.
 """
 
 from __future__ import annotations
@@ -28,19 +28,17 @@ FORMAT = 2  # format of checkpoints and model files: 2 since version 0.2.0
 FORMAT_KEY = "flame_mdm_format"  # key of the format in a checkpoint
 KEY, ADAPTER = "flame_mdm", "flame_mdm_adapter"  # keys of the metadata of model files and of adapters
 FILE = "model.safetensors"
-MOST_FRAMES = 100_000
-"""Maximum number of frames that a model file may declare: more than an hour at 20 frames per second."""
+MOST_FRAMES = 100_000  # maximum number of frames that a model file may declare: more than an hour at 20 per second
 
 
 def read_model_file(path: Path) -> dict[str, Any]:
     """Reads a model file as `config`, `facts`, `origin` and `state_dict`; raises `UserError` if it is damaged."""
     metadata, state = read_safetensors(path)
     text = metadata.get(KEY)
+    if ADAPTER in metadata:
+        raise UserError(f"{path}: an adapter, which changes a model. Name its base first: BASE adapter={path}")
     if text is None:
-        what = "weights without a recipe. Import released weights of MDM, MFM and FLAME with `flame-mdm import`"
-        if ADAPTER in metadata:
-            what = f"an adapter, which changes a model. Name its base first: BASE adapter={path}"
-        raise UserError(f"{path}: {what}")
+        raise UserError(f"{path}: weights without a recipe. Import released weights with `flame-mdm import`")
     try:
         content = parse_json(text)
         number, model = content["format"], {name: content[name] for name in ("config", "facts", "origin")}
@@ -67,15 +65,13 @@ def read_safetensors(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
 def check_format(path: Path, number: Any) -> None:
     """Raises `UserError` for a format other than `FORMAT`; version 0.1 wrote 1 or, in checkpoints, None."""
     if number in (1, None):
-        raise UserError(
-            f"{path}: written by version 0.1 of flame_mdm, whose files this version does not read. Train or import the "
-            "model again, or use it with version 0.1"
-        )
+        what = "written by version 0.1 of flame_mdm, whose files this version does not read"
+        raise UserError(f"{path}: {what}. Train or import the model again, or use it with version 0.1")
     if number != FORMAT:
         raise UserError(f"{path}: has format {str(number)[:40]}, but this version reads {FORMAT}. Update flame_mdm")
 
 
-class _Folder(TypedDict, total=False):
+class _Run(TypedDict, total=False):
     dir: str
 
 
@@ -86,12 +82,12 @@ class _Part(TypedDict):
 class _Recipe(TypedDict, total=False):
     experiment: Required[str | None]
     data_root: str | None
-    run: _Folder
+    run: _Run
     seed: int
     data: dict[str, Any]
     callbacks: dict[str, dict[str, Any] | None] | None
-    task: _Part
-    representation: _Part
+    task: Required[_Part]
+    representation: Required[_Part]
     process: _Part
     condition: _Part
     denoiser: _Part
@@ -124,18 +120,13 @@ class _Metadata(TypedDict):
 
 
 def checked(path: Path, content: Any) -> dict[str, Any]:
-    """Returns the content of a checkpoint or model file, if it is a recipe of plain values, metadata and weights."""
+    """Returns the content of a checkpoint or model file if it is a recipe of plain values, metadata and weights."""
     if not isinstance(content, dict) or not {"config", "facts", "state_dict"} <= content.keys():
-        raise UserError(
-            f"{path}: not a checkpoint of this framework: it holds no recipe. Import released checkpoints with "
-            "`flame-mdm import`"
-        )
+        what = "not a checkpoint of this framework: it holds no recipe"
+        raise UserError(f"{path}: {what}. Import released checkpoints with `flame-mdm import`")
     metadata = {name: content[name] for name in ("config", "facts", "origin", "global_step") if name in content}
     for name, value in metadata.items():
         plain(value, f"{path}: {name}")
-    facts: Any = metadata["facts"]
-    if isinstance(facts, dict) and isinstance(facts.get("actions"), tuple):
-        metadata["facts"] = facts | {"actions": list(facts["actions"])}
     try:
         check_shape(metadata, _Metadata)
     except ValueError as error:
@@ -154,8 +145,7 @@ def check_weights(weights: Mapping[Any, Any], path: Path) -> None:
     kinds += (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8, torch.bool)
     for name, value in weights.items():
         if not (isinstance(name, str) and isinstance(value, torch.Tensor)):
-            shown = f"{str(name)[:80]} is a {type(value).__name__}"
-            raise UserError(f"{path}: damaged: its weights are not tensors by name: {shown}")
+            raise UserError(f"{path}: damaged: its weights are not tensors by name: {str(name)[:80]}")
         if value.layout != torch.strided or value.device.type != "cpu" or value.dtype not in kinds or value.is_neg():
             shown = f"{name[:80]} is {value.dtype}, {value.layout}, on {value.device.type}"
             raise UserError(f"{path}: damaged: its weights are not dense tensors of real numbers: {shown}")
@@ -164,16 +154,21 @@ def check_weights(weights: Mapping[Any, Any], path: Path) -> None:
 
 
 def write_model_file(
-    path: Path, state: Mapping[str, Tensor], *, config: Mapping[str, Any], facts: Mapping[str, Any], origin: Any
-) -> None:
-    """Writes a model file atomically: weights, recipe, metadata of the data set, and origin of the weights."""
+    out: str | Path, state: Mapping[str, Tensor], *, config: Mapping[str, Any], facts: Mapping[str, Any], origin: Any
+) -> Path:
+    """Writes a model file atomically: weights, recipe, metadata of the data set, and origin of the weights.
+
+    `out` is a .safetensors file, or a folder for `FILE`. Returns the path of the file.
+    """
     from safetensors.torch import save
 
+    path = Path(out) if Path(out).suffix == ".safetensors" else Path(out) / FILE
     tensors = {name: value.detach().cpu().clone().contiguous() for name, value in state.items()}
     text = json.dumps({"format": FORMAT, "config": config, "facts": facts, "origin": origin})
     metadata = {"format": "pt", KEY: text, "sha256": content_sha256(text, tensors)}
     with atomic_write(path) as temporary:
         temporary.write_bytes(save(tensors, metadata))
+    return path
 
 
 def content_sha256(text: str, state: Mapping[str, Tensor]) -> str:
@@ -205,7 +200,7 @@ def weights_sha256(path: Path) -> str:
 
 
 def without_own_paths(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns a recipe with default paths of data and run in place of absolute paths on this machine."""
+    """Returns a recipe with default paths of data and run instead of absolute paths on this machine."""
     own = {config.get("data_root"): "data", config.get("run", {}).get("dir"): f"runs/{config['experiment']}/default"}
     moves = {folder: other for folder, other in own.items() if folder and Path(folder).is_absolute()}
     return moved(dict(config), moves)

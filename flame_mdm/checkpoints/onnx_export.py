@@ -40,10 +40,9 @@ TINY = 1e-6  # probe of `to_x0` that no clipping of the clean estimate changes
 def export_onnx(source: str | Path, out: str | Path, *, half: bool = False, **adapted: Any) -> Path:
     """Writes a model as a folder that `runner.py` in it samples from, with numpy and onnxruntime alone.
 
-    The folder has `denoiser.onnx`, `joints.onnx`, `poses.onnx` (only for SMPL's 22 joints), `model.json` and
-    `runner.py`; docs/export.md describes them. `half` stores weight matrices in half precision. Source, adapters and
-    errors are as for `flame_mdm.load`; raises `UserError` also if a part cannot be exported, or a graph does not
-    compute what PyTorch does.
+    docs/export.md describes its files. `half` stores weight matrices in half precision. Source, adapters and errors are
+    as for `flame_mdm.load`; raises `UserError` also if a part cannot be exported, or a graph does not compute what
+    PyTorch does.
     """
     try:
         import onnxruntime  # noqa: F401
@@ -79,9 +78,6 @@ def description(model: MotionGenerator) -> dict[str, Any]:
         "steps": sampling_plan(model.process, model.sampler_options),
         "sha256": {},
     }
-
-
-# The sampling loop ----------------------------------------------------------------------------------------------------
 
 
 class Probe:
@@ -130,10 +126,8 @@ def sampling_plan(process: Process, options: SamplerOptions) -> list[list[float]
     """
     plans = [np.array(_plan(process, options, variance)) for variance in (0.0, 1.0)]
     if not np.array_equal(plans[0], plans[1]):
-        raise UserError(
-            f"sampler={options.sampler} draws noise with the learned variance of this model, which the graph does not "
-            "have. Set task.sampler to ddim or dpm_solver_pp_2m"
-        )
+        what = "draws noise with the learned variance of this model, which the graph does not have"
+        raise UserError(f"sampler={options.sampler} {what}. Set task.sampler to ddim or dpm_solver_pp_2m")
     return plans[0].tolist()
 
 
@@ -159,9 +153,6 @@ def _plan(process: Process, options: SamplerOptions, variance: float) -> list[li
     return rows
 
 
-# Graphs ---------------------------------------------------------------------------------------------------------------
-
-
 class Graph(NamedTuple):
     """A module to export. `examples` are its inputs by name; `dimensions` names their axes of any length."""
 
@@ -184,10 +175,8 @@ class Call(nn.Module):
         super().__init__()
         self.condition, self.denoiser = model.condition, model.denoiser
         if model.conditioned_on == "text" and not isinstance(self.condition, LearnedTokens):
-            raise UserError(
-                f"{type(self.condition).__name__}: a language model is not exported to ONNX. Export a model with "
-                "condition=learned, action or none"
-            )
+            what = f"{type(self.condition).__name__}: a language model is not exported to ONNX"
+            raise UserError(f"{what}. Export a model with condition=learned, action or none")
         self.features = model.representation.features
         self.scale = model.sampler_options.guidance_scale if model.condition.features else None
 
@@ -210,10 +199,7 @@ class Function(nn.Module):
 
     def __init__(self, function: Callable[..., Any]):
         super().__init__()
-        self.function = function
-
-    def forward(self, x: Tensor) -> Any:
-        return self.function(x)
+        self.forward = function
 
 
 def graphs(model: MotionGenerator) -> list[Graph]:

@@ -1,22 +1,22 @@
 """Import of the checkpoints released by the authors of MDM, MFM and FLAME.
 
-Each learned weight of a released network is used exactly once, or the import fails. Frozen text encoders and tables of
-sinusoids are skipped.
+Each learned weight is used exactly once, or the import fails. Frozen text encoders and sinusoids are skipped.
 """
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import torch
 from hydra.utils import get_class
 from pydantic import BeforeValidator, Field
 from torch import Tensor
 
-from flame_mdm.checkpoints.model_files import FILE, MOST_FRAMES, check_weights, without_own_paths, write_model_file
+from flame_mdm.checkpoints.model_files import MOST_FRAMES, check_weights, without_own_paths, write_model_file
 from flame_mdm.checkpoints.released_weights import (
     DECODER_LAYER,
     ENCODER_LAYER,
+    NAMES,
     layer_names,
     load_strictly,
     read_released,
@@ -36,34 +36,12 @@ from flame_mdm.sampler_options import MAX_STEPS
 from flame_mdm.schemas import Number, Schema, check_shape
 from flame_mdm.task import MotionGeneration, Task
 
-# Prefixes of the authors' names -> ours.
-_MDM = {
-    "input_process.poseEmbedding.": "input.",
-    "output_process.poseFinal.": "output.",
-    "embed_timestep.time_embed.": "condition.time_embedding.",
-    "embed_text.": "condition.projection.",
-    "gru.": "gru.",
-}
-_FLAME = {
-    "motion_length_emb.": "length_embedding.",
-    "input_projection.": "input.",
-    "last_projection.": "output.",
-    "text_pooler_proj.": "pooled_projection.",
-    "text_h_proj.": "token_projection.",
-}
 NETWORKS = {
     "trans_enc": (MDMEncoder, "seqTransEncoder", ENCODER_LAYER),
     "trans_dec": (MDMDecoder, "seqTransDecoder", DECODER_LAYER),
     "gru": (MDMGRU, "", {}),
 }
 """Authors' name of each architecture of MDM -> our network, their name of its transformer, and the names in a layer."""
-DATASETS = {
-    "humanml": ("humanml3d", "humanml_legacy"),
-    "kit": ("kit", "kit_legacy"),
-    "humanact12": ("humanact12", "rot6d"),
-    "uestc": ("uestc", "rot6d"),
-}
-"""Authors' name of each data set of MDM and MFM -> our name, and the representation."""
 NORMALIZED = ("humanml3d", "kit")
 PADDED_FRAMES, ACTION_FRAMES = 196, 60
 ENCODERS = {"clip": "clip", "bert": "distilbert"}
@@ -102,20 +80,21 @@ class Options(Schema):
     ode_kwargs: Solver = Solver()
 
 
-# Networks -------------------------------------------------------------------------------------------------------------
-
-
 class Released(NamedTuple):
-    """A released network: its `experiments/denoiser` mapping, and state dict.
+    """A released network, and its weights by our names."""
 
-    `features` are in_features, out_features and cond_features. `action_embedding` (actions, C) belongs to the condition
-    encoder.
-    """
-
-    config: dict[str, Any]
-    features: tuple[int, int, int]
+    network: type[Denoiser]
+    features: tuple[int, int, int]  # in_features, out_features, cond_features
+    options: dict[str, Any]
     state: dict[str, Tensor]
-    action_embedding: Tensor | None = None
+    action_embedding: Tensor | None = None  # (actions, C), of the condition encoder
+
+    def checked(self) -> Self:
+        """Returns this; raises `UserError` unless the network has these weights and no others."""
+        with torch.device("meta"):
+            network = self.network(*self.features, **self.options)
+        load_strictly(network, self.state, "released weights", assign=True)
+        return self
 
 
 def import_mdm(state: Mapping[str, Tensor], args: Options, *, time_token: bool = False) -> Released:
@@ -130,7 +109,7 @@ def import_mdm(state: Mapping[str, Tensor], args: Options, *, time_token: bool =
     cond_features = shape_of(learned, ACTIONS)[1] if ACTIONS in learned else 0
     embedding = learned.pop(ACTIONS, None)
     names, num_layers = layer_names(learned, stack, layer)
-    ours = renamed(learned, {**_MDM, **names})
+    ours = renamed(learned, NAMES["mdm"] | names)
 
     out_features, latent_dim = shape_of(ours, "output.weight")
     in_features = shape_of(ours, "input.weight")[1]
@@ -141,25 +120,24 @@ def import_mdm(state: Mapping[str, Tensor], args: Options, *, time_token: bool =
         cond_features = shape_of(ours, "condition.projection.weight")[1]
     if args.arch == "gru":
         in_features -= latent_dim
-        options["num_layers"] = sum(key.startswith("gru.weight_ih_l") for key in ours)
-        options["recur_over_batch"] = True
+        num_layers = sum(key.startswith("gru.weight_ih_l") for key in ours)
+        options |= {"num_layers": num_layers, "recur_over_batch": True}
     else:
-        options["ff_size"] = shape_of(ours, "transformer.layers.0.feed_forward.0.weight")[0]
-        options["num_heads"] = args.num_heads
-        options["mask_padding"] = args.mask_frames
+        ff_size = shape_of(ours, "transformer.layers.0.feed_forward.0.weight")[0]
+        options |= {"ff_size": ff_size, "num_heads": args.num_heads, "mask_padding": args.mask_frames}
     if args.arch == "trans_dec":
         distilbert = args.text_encoder_type == "bert"
         options["token_memory"] = distilbert
         if args.emb_trans_dec:  # the code that introduced DistilBERT has a token of the time alone
             options["input_token"] = "time" if time_token or distilbert else "condition"
-    return _checked(network, (in_features, out_features, cond_features), options, ours, embedding)
+    return Released(network, (in_features, out_features, cond_features), options, ours, embedding).checked()
 
 
 def import_flame(state: Mapping[str, Tensor], *, num_heads: int = 8) -> Released:
     """Converts FLAME's network, without its RoBERTa; its 8 attention heads cannot be read from the weights."""
     learned = {key: value for key, value in state.items() if not key.startswith("lm.")}
     names, num_layers = layer_names(learned, "tf_decoder", DECODER_LAYER)
-    ours = renamed(learned, {**_FLAME, **names})
+    ours = renamed(learned, NAMES["flame"] | names)
     latent_dim, in_features = shape_of(ours, "input.weight")
     options = {
         "latent_dim": latent_dim,
@@ -170,31 +148,14 @@ def import_flame(state: Mapping[str, Tensor], *, num_heads: int = 8) -> Released
         "max_frames": shape_of(ours, "length_embedding.weight")[0],
     }
     features = (in_features, shape_of(ours, "output.weight")[0], shape_of(ours, "pooled_projection.weight")[1])
-    return _checked(FLAME, features, options, ours)
-
-
-def _checked(
-    network: type[Denoiser],
-    features: tuple[int, int, int],
-    options: dict[str, Any],
-    state: dict[str, Tensor],
-    action_embedding: Tensor | None = None,
-) -> Released:
-    with torch.device("meta"):
-        expected = network(*features, **options)
-    load_strictly(expected, state, "released weights", assign=True)
-    config = {"_target_": f"{network.__module__}.{network.__qualname__}", **options}
-    return Released(config, features, state, action_embedding)
-
-
-# Recipes --------------------------------------------------------------------------------------------------------------
+    return Released(FLAME, features, options, ours).checked()
 
 
 def _recipe(name: str, released: Released, representation: str, condition: Config, process: Config) -> Config:
     return {
         "experiment": name,
         "seed": 0,
-        "denoiser": released.config,
+        "denoiser": {"_target_": f"{released.network.__module__}.{released.network.__name__}", **released.options},
         "condition": condition,
         "process": process,
         "representation": _option("representation", representation),
@@ -214,13 +175,12 @@ def _flame_recipe(released: Released) -> tuple[Config, dict[str, Any]]:
     config = _recipe("released/flame", released, "smpl", condition, _option("process", "flame_code"))
     config["task"] |= {"cond_drop_prob": 0.25, "guidance_scale": 8.0}
     config["optimizer"] |= {"weight_decay": 0.0}
-    # The authors' table has one row more than the number of lengths.
-    longest = released.config["max_frames"] - 1
+    longest = released.options["max_frames"] - 1  # the authors' table has one row more than the number of lengths
     return config, {"actions": [], "dataset": "humanml3d-smpl", "fingerprint": None, "max_frames": longest}
 
 
 def _mdm_recipe(kind: str, released: Released, args: Options) -> tuple[Config, dict[str, Any]]:
-    dataset, representation = DATASETS[args.dataset]
+    dataset, representation = NAMES["datasets"][args.dataset]
     actions: list[str] = []
     condition: Config = _option("condition", "none")
     if released.action_embedding is not None:
@@ -248,9 +208,6 @@ def _mdm_recipe(kind: str, released: Released, args: Options) -> tuple[Config, d
     return config, {"actions": actions, "dataset": dataset, "fingerprint": None, "max_frames": longest}
 
 
-# Models ---------------------------------------------------------------------------------------------------------------
-
-
 def import_released(
     kind: str,
     file: str | Path,
@@ -267,10 +224,10 @@ def import_released(
 
     The arguments are the keys of `flame-mdm import`. Raises `UserError` if a file is damaged, or of another kind.
     """
-    file, out = Path(file), Path(out)
+    file = Path(file)
     if (args is None) != (kind in ("flame", "mclip")):
-        needs = {"mdm": "the args.json next to the checkpoint", "mfm": "the run's .hydra/config.yaml"}
-        raise UserError(f"{kind} needs {needs[kind]}" if kind in needs else f"{kind} takes no file of options")
+        needs = "takes no" if args else "needs a"
+        raise UserError(f"{kind} {needs} file of options: MDM's args.json, or MFM's .hydra/config.yaml")
     options = _options(args, {} if num_heads is None else {"num_heads": num_heads})
     checkpoint = read_released(file, run_code=run_code, advice="Add run_code=true if you trust the authors of the file")
     try:
@@ -292,20 +249,16 @@ def import_released(
             model = _model(released, *_mdm_recipe(kind, released, options), stats, table)
     except (OSError, MemoryError):
         raise
-    except ValueError as error:
-        raise UserError(f"{file}: {error}") from error
     except Exception as error:  # nonsensical weights and options may fail anywhere
-        what = f"{type(error).__name__}: {first_line(error)}"
-        raise UserError(f"{file}: cannot build a model from it and its options: {what}") from error
-    out = out if out.suffix == ".safetensors" else out / FILE
-    origin: dict[str, Any] = {"made": f"released by the authors of {kind.upper()}", "file": file.name}
-    origin |= {"sha256": sha256(file), "averaged": averaged}
-    write_model_file(out, model.state_dict(), config=model.config, facts=model.facts, origin=origin)
-    return out
+        kind_of_error = "" if isinstance(error, ValueError) else f"cannot build the model: {type(error).__name__}: "
+        raise UserError(f"{file}: {kind_of_error}{first_line(error)}") from error
+    made = f"released by the authors of {kind.upper()}"
+    origin = {"made": made, "file": file.name, "sha256": sha256(file), "averaged": averaged}
+    return write_model_file(out, model.state_dict(), config=model.config, facts=model.facts, origin=origin)
 
 
 def _options(path: str | Path | None, changes: dict[str, Any]) -> Options:
-    options = {} if path is None else read_yaml(Path(path))  # JSON is YAML
+    options = {} if path is None else read_yaml(path)  # JSON is YAML
     if not isinstance(options, dict):
         raise UserError(f"{path}: not a mapping of options")
     # In a composed configuration of MFM, options of network and training are one level down.
@@ -320,17 +273,12 @@ def _options(path: str | Path | None, changes: dict[str, Any]) -> Options:
 def _model(
     released: Released, config: Config, facts: dict[str, Any], stats: str | Path | None, extra: dict[str, Any]
 ) -> MotionGeneration:
-    """Builds a model of a recipe with its weights, `extra` those besides the network's, and the statistics in a folder.
-
-    Raises `ValueError` if they do not fit.
-    """
+    """Builds a model of a recipe with its weights, `extra` besides the network's, and the statistics in a folder."""
     plain(config, "the options of the released model")
     representation, width, dataset = instantiate(config["representation"]), released.features[0], facts["dataset"]
     if representation.features != width:
-        raise ValueError(
-            f"released weights: have {width} features, but {representation.name}, the representation of data set "
-            f"{dataset}, has {representation.features}"
-        )
+        expected = f"{representation.features} of {representation.name}, the representation of data set {dataset}"
+        raise ValueError(f"released weights: have {width} features, but not the {expected}")
     if (stats is not None) != (dataset in NORMALIZED):
         what, advice = ("normalized", "Give") if stats is None else ("not normalized", "Leave out")
         raise ValueError(f"features of {dataset} are {what}. {advice} stats=FOLDER with Mean.npy and Std.npy")

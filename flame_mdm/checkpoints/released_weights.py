@@ -9,29 +9,19 @@ import torch
 from torch import Tensor, nn
 
 from flame_mdm.errors import UserError
-from flame_mdm.safe_io import check_torch
+from flame_mdm.safe_io import check_torch, read_yaml
 
 Network = TypeVar("Network", bound=nn.Module)
 
-_LAYER = {
-    "self_attn.in_proj_": "self_attention.qkv.",
-    "self_attn.out_proj.": "self_attention.out.",
-    "multihead_attn.in_proj_": "cross_attention.qkv.",
-    "multihead_attn.out_proj.": "cross_attention.out.",
-    "linear1.": "feed_forward.0.",
-    "linear2.": "feed_forward.3.",
-    "norm1.": "self_norm.",
-}
-ENCODER_LAYER = {**_LAYER, "norm2.": "feed_forward_norm."}
-"""Prefixes of torch's names in a layer of `nn.TransformerEncoder` -> those in a layer of our `Transformer`."""
-DECODER_LAYER = {**_LAYER, "norm2.": "cross_norm.", "norm3.": "feed_forward_norm."}
-"""The same for `nn.TransformerDecoder`."""
+NAMES: dict[str, Any] = read_yaml(Path(__file__).with_name("released.yaml"))
+"""The authors' names, and ours."""
+ENCODER_LAYER, DECODER_LAYER = NAMES["encoder_layer"], NAMES["decoder_layer"]
 
 
 def read_released(path: Path, *, run_code: bool = False, advice: str = "Save only its state dict") -> Mapping[str, Any]:
     """Reads a released file; with `run_code` also pickles that hold more than weights, which runs any code in them.
 
-    Raises `UserError` if it is damaged, or holds other objects than plain weights, with `advice` what to do about them.
+    Raises `UserError` if it is damaged, or holds other objects than plain weights; `advice` says what to do about them.
     """
     try:
         check_torch(path)
@@ -44,10 +34,8 @@ def read_released(path: Path, *, run_code: bool = False, advice: str = "Save onl
         unsafe = re.search(r"Unsupported global: GLOBAL (\S+)", str(error))
         if unsafe is None:
             raise UserError(f"{path}: damaged, or not a PyTorch file. Download it again") from error
-        raise UserError(
-            f"{path}: holds Python objects ({unsafe[1]}) besides the weights, as old Lightning files do. Reading them "
-            f"can run any code. {advice}"
-        ) from error
+        what = f"holds Python objects ({unsafe[1]}) besides the weights, and reading them can run any code"
+        raise UserError(f"{path}: {what}. {advice}") from error
     if not isinstance(content, Mapping):
         raise UserError(f"{path}: holds a {type(content).__name__}, not the weights of a released model")
     return content
@@ -63,7 +51,7 @@ def read_weights(path: Path, key: str | None = None) -> dict[str, Tensor]:
 
 
 def released_state(checkpoint: Mapping[str, Any], *, ema: bool = True) -> dict[str, Tensor]:
-    """Finds the network's state dict in the content of a released file of MDM, MFM or FLAME.
+    """Returns the network's state dict in the content of a released file.
 
     That is a flat state dict (MDM, MFM), {"model", "model_avg"} (MDM trained with `--use_ema`) or FLAME's Lightning
     checkpoint with "state_dict". `ema` takes averaged weights if the file has them, as in the authors' evaluation.
@@ -78,10 +66,8 @@ def released_state(checkpoint: Mapping[str, Any], *, ema: bool = True) -> dict[s
     inner = [{k.removeprefix(p): v for k, v in state.items() if k.startswith(p)} for p in prefixes]
     state = next(filter(None, inner), state)
     if not state or not all(isinstance(value, Tensor) for value in state.values()):
-        raise ValueError(
-            "not a released checkpoint: expected a state dict, 'model' and 'model_avg', or 'state_dict', but it has "
-            + (_listed(checkpoint) or "nothing")
-        )
+        expected = "expected a state dict, 'model' and 'model_avg', or 'state_dict'"
+        raise ValueError(f"not a released checkpoint: {expected}, but it has {_listed(checkpoint) or 'nothing'}")
     return dict(state)
 
 
@@ -122,8 +108,8 @@ def load_strictly(
     try:
         network.load_state_dict(state, strict=True, assign=assign)
     except RuntimeError as error:
-        lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-        raise UserError(f"{source}: not the weights of {type(network).__name__}: {lines[1]}") from error
+        what = str(error).splitlines()[1].strip()
+        raise UserError(f"{source}: not the weights of {type(network).__name__}: {what}") from error
     return network.eval()
 
 

@@ -25,12 +25,7 @@ MASK = (1 << 64) - 1
 
 
 class Sampler:
-    """A model in a folder.
-
-    Attributes:
-        content: the content of `model.json`.
-        denoiser, joints, poses: sessions of onnxruntime; `poses` is None for other skeletons than SMPL's.
-    """
+    """A model in a folder: `content` of `model.json`, and sessions of onnxruntime; `poses` is None except for SMPL."""
 
     def __init__(self, folder: str | Path, threads: int = 1):
         """Opens a folder; raises `ValueError` if a file is missing, damaged or of another version."""
@@ -69,9 +64,8 @@ class Sampler:
     def generate(self, prompt: str = "", seconds: float | None = None, seed: int = 0, sample: int = 0) -> np.ndarray:
         """Returns normalized features (F, D) of one motion, for a text or an action; "" for an unconditional model.
 
-        `seconds` is None for 3, or the longest motion in training if that is shorter; `sample` numbers the motions of
-        one text. Raises `ValueError` if the length or the action is not one of the model's, or the result is not
-        finite.
+        `seconds` is by default 3, or the longest motion in training if that is shorter; `sample` numbers the motions of
+        one text. Raises `ValueError` if the model has no such length or action, or the result is not finite.
         """
         content = self.content
         longest, fps = content["max_frames"], content["fps"]

@@ -1,10 +1,10 @@
 """`flame-mdm export CKPT OUT`: writes the model of a checkpoint as a model file, or as ONNX graphs."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 from flame_mdm.commands import AdaptedSettings
-from flame_mdm.errors import UserError, say
+from flame_mdm.errors import say
 from flame_mdm.sampler_options import option, required
 
 
@@ -18,13 +18,11 @@ class ExportSettings(AdaptedSettings):
 
     OBJECTS: ClassVar = ("ckpt", "out")
     out: str = required("a .safetensors file, or a folder; for format=onnx, a folder")
-    format: str = option("safetensors", "or onnx: graphs for onnxruntime, with a script that samples from them")
+    format: Literal["safetensors", "onnx"] = option("safetensors", "or onnx: for onnxruntime, with a script")
     half: bool = option(False, "true = weight matrices in half precision")
 
 
 def main(settings: ExportSettings) -> None:
-    if settings.format not in ("safetensors", "onnx"):
-        raise UserError(f"format={settings.format}: unknown. Use safetensors or onnx")
     file = settings.model_file()
     if settings.format == "onnx":
         from flame_mdm.checkpoints.onnx_export import export_onnx as export

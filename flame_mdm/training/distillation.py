@@ -7,7 +7,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from flame_mdm.batch import Condition, Denoise, MotionBatch
+from flame_mdm.batch import Condition, MotionBatch
 from flame_mdm.checkpoints.loading import PARTS, find, load_task
 from flame_mdm.checkpoints.model_files import weights_sha256
 from flame_mdm.config import Config, flatten
@@ -45,7 +45,7 @@ class ConsistencyDistillation(DistilledGenerator, MotionGeneration):
         self.start_from_teacher()
 
     def start_from_teacher(self) -> None:
-        """Reads the teacher, and takes over its weights; raises `UserError` if there is none, or it does not suit."""
+        """Reads the teacher, and takes over its weights; raises `UserError` if there is none or it does not fit."""
         options = self.config["distillation"]
         try:
             path = find(options["teacher"])
@@ -63,10 +63,8 @@ class ConsistencyDistillation(DistilledGenerator, MotionGeneration):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Raises `UserError` if the weights of the teacher have changed since the run began."""
         if checkpoint["facts"].get("teacher") != self.facts["teacher"]:
-            raise UserError(
-                f"distillation.teacher={self.config['distillation']['teacher']}: its weights have changed since this "
-                "run began. Restore them, or start another run with run.name=..."
-            )
+            what = "its weights have changed since this run began"
+            raise UserError(f"distillation.teacher: {what}. Restore them, or start another run with run.name=...")
 
     def on_fit_start(self) -> None:
         super().on_fit_start()
@@ -92,22 +90,14 @@ class ConsistencyDistillation(DistilledGenerator, MotionGeneration):
             progress = trainer.global_step / trainer.max_steps
         times = torch.tensor(self.process.grid(counts[min(int(progress * len(counts)), len(counts) - 1)]))
         u = torch.rand(len(batch), device=self.device) if u is None else u
-        teacher: Denoise = self.teacher[0]
+        index = (u * len(times)).long().clamp(max=len(times) - 1)
+        noise = torch.randn_like(batch.x) if noise is None else noise
+        draws: dict[str, Tensor] = {"times": times.to(self.device), "index": index, "noise": noise}
+        teacher, target = self.teacher[0], self.denoiser if is_validation else self.target[0]
         if cond.null is not None and self.condition.features and self.teacher_guidance is not None:
             teacher = classifier_free_guidance(teacher, self.teacher_guidance, self.representation.features)
-        return consistency_terms(
-            self.process,
-            self.denoiser,
-            self.denoiser if is_validation else self.target[0],
-            teacher,
-            batch.x,
-            batch.mask,
-            cond,
-            times=times.to(self.device),
-            index=(u * len(times)).long().clamp(max=len(times) - 1),
-            noise=torch.randn_like(batch.x) if noise is None else noise,
-            auxiliary=self.losses,
-        )
+        networks = self.denoiser, target, teacher
+        return consistency_terms(self.process, *networks, batch.x, batch.mask, cond, **draws, auxiliary=self.losses)
 
 
 def read_teacher(path: Path) -> MotionGenerator:
@@ -116,10 +106,8 @@ def read_teacher(path: Path) -> MotionGenerator:
     if isinstance(teacher, DistilledGenerator):
         raise UserError(f"{path}: distilled already. Give its teacher, {teacher.config['distillation']['teacher']}")
     if teacher.process.prediction == "epsilon":
-        raise UserError(
-            f"{path}: predicts noise, whose clean estimate is divided by almost nothing at the noisiest times. Give a "
-            "model that predicts the clean motion or the velocity (MDM, MFM)"
-        )
+        what = "predicts noise, whose clean estimate is divided by almost nothing at the noisiest times"
+        raise UserError(f"{path}: {what}. Give a model that predicts the clean motion or the velocity (MDM, MFM)")
     return teacher
 
 
@@ -128,13 +116,9 @@ def _check_same(teacher: MotionGenerator, student: ConsistencyDistillation) -> N
     theirs, ours = (flatten({part: task.config[part] for part in PARTS[1:]}) for task in (teacher, student))
     if differing := [key for key in sorted(theirs.keys() | ours.keys()) if theirs.get(key) != ours.get(key)]:
         key = differing[0]
-        raise UserError(
-            f"distillation.teacher={name}: has {key}={theirs.get(key)}, but the student has {ours.get(key)}. Both need "
-            f"the same parts: use `flame-mdm distill {name}`"
-        )
+        what = f"has {key}={theirs.get(key)}, but the student has {ours.get(key)}. Both need the same parts"
+        raise UserError(f"distillation.teacher={name}: {what}: use `flame-mdm distill {name}`")
     before, now = teacher.facts.get("fingerprint"), student.facts.get("fingerprint")
     if None not in (before, now) and before != now:
-        raise UserError(
-            f"distillation.teacher={name}: trained on data with fingerprint {before}, but {student.facts['dataset']} "
-            f"has {now}. Give the data of the teacher"
-        )
+        what = f"trained on data with fingerprint {before}, but {student.facts['dataset']} has {now}"
+        raise UserError(f"distillation.teacher={name}: {what}. Give the data of the teacher")

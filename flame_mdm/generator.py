@@ -1,7 +1,4 @@
-"""Models that generate motions: the four parts, and sampling. Training is in `flame_mdm.task`.
-
-This module does not import Lightning, whose import takes longer than sampling a motion.
-"""
+"""Models that generate motions, without Lightning, whose import takes longer than sampling; `flame_mdm.task` trains."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -26,14 +23,10 @@ from flame_mdm.seeds import seeded_noise
 class Model:
     """What all models have that checkpoints hold."""
 
-    noun = "a model"
-    """What its checkpoints hold, for messages."""
-    config: Config
-    """The recipe, saved in checkpoints."""
-    facts: dict[str, Any]
-    """Facts about the training data for sampling and evaluation: actions, maximum length, fingerprint."""
-    steps: int | None = None
-    """Number of training steps of the loaded checkpoint; None if unknown."""
+    noun = "a model"  # what its checkpoints hold, for messages
+    config: Config  # the recipe, saved in checkpoints
+    facts: dict[str, Any]  # of the training data: actions, maximum length, fingerprint
+    steps: int | None = None  # number of training steps of the loaded checkpoint; None if unknown
 
 
 class MotionGenerator(Model, nn.Module):
@@ -49,7 +42,7 @@ class MotionGenerator(Model, nn.Module):
 
     @classmethod
     def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:
-        """Builds the parts of a recipe and combines them. Derives sizes that depend on other parts."""
+        """Builds the parts of a recipe, with sizes that depend on other parts, and combines them."""
 
         def part(name: str, **derived: Any) -> Any:
             legal = parameters(config[name]["_target_"])
@@ -127,13 +120,10 @@ class MotionGenerator(Model, nn.Module):
         """Samples motions for the conditions, lengths and ids of `batch`; its `x` is ignored.
 
         Options of the sampler that are None have the values of the recipe. The noise of a motion is a function of
-        (seed, replication, id), so the motion is the same in any batch. `unconditioned` samples a conditional model
-        with its null condition. With `shared_noise`, all motions get the same noise, a function of (seed, replication)
-        only. The normalized clean estimate (B, F, D) of each denoiser call is appended to `trajectory`. With `windows`,
-        motions may be longer than those in training, and the conditions are those of the windows.
-
-        Returns:
-            (B, F, D) normalized, 0 past the end of each motion.
+        (seed, replication, id), so the motion is the same in any batch; with `shared_noise`, of (seed, replication).
+        `unconditioned` samples a conditional model with its null condition. The normalized clean estimate (B, F, D) of
+        each denoiser call is appended to `trajectory`. With `windows`, motions may be longer than those in training,
+        and the conditions are those of the windows. Returns (B, F, D) normalized, 0 past the end of each motion.
         """
         was_training = self.training
         if was_training:  # setting the mode of all modules takes as long as a small network
@@ -170,16 +160,15 @@ class DistilledGenerator(MotionGenerator):
     """A student of `flame_mdm.training.distillation`, with the guidance built in."""
 
     def combine(self, *parts: Any, **options: Any) -> None:
-        """See `MotionGenerator.combine`. Edits cannot rewrite a path, since the sampler of students forgets it."""
+        """See `MotionGenerator`. Edits cannot rewrite a path, since the sampler of students forgets it."""
         super().combine(*parts, **options)
         self.process.edit_modes = tuple(mode for mode in self.process.edit_modes if mode != "trajectory")
 
     def generate(self, batch: MotionBatch, options: SamplerOptions | None = None, **keywords: Any) -> Tensor:
-        """See `MotionGenerator.generate`; a student has learned neither guidance nor motions without condition."""
+        """See `MotionGenerator`; a student has learned neither guidance nor motions without condition."""
         scale = None if options is None else options.guidance_scale
         if scale not in (None, 1):
             raise UserError(f"guidance_scale={scale}: the guidance is built into this distilled model. Omit it")
         if keywords.get("unconditioned") and self.condition.features:
-            needed = self.condition.reads
-            raise UserError(f"this distilled model needs a {needed}: it did not learn to sample without. Add one")
+            raise UserError(f"this distilled model needs a {self.condition.reads}, as in its training. Add one")
         return super().generate(batch, options, **keywords)

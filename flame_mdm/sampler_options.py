@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import MISSING, dataclass, field, fields, replace
 from typing import Any, Self
 
 from flame_mdm.errors import UserError
@@ -10,26 +10,19 @@ from flame_mdm.errors import UserError
 MAX_STEPS = 100_000  # maximum number of steps of a diffusion or sampler
 SPACINGS = ("linspace", "stride")
 """How diffusion places a number of steps; see `flame_mdm.processes.schedules.timesteps`."""
-
-
 Check = Callable[[str, Any], None]
 """Check of the value of a key, by name and value; raises `UserError` or `FileNotFoundError`."""
 
 
 def option(default: Any, help: str, check: Check | None = None) -> Any:
-    """Returns a dataclass field with a help text, which the command line shows; a function `default` computes it.
-
-    The command line also calls `check`, before torch is imported.
-    """
-    metadata = {"help": help, "check": check}
-    if callable(default):
-        return field(default_factory=default, metadata=metadata)
-    return field(default=default, metadata=metadata)
+    """Returns a dataclass field with a help text and a check for the command line; a function `default` computes it."""
+    default = {"default_factory" if callable(default) else "default": default}
+    return field(**default, metadata={"help": help, "check": check})
 
 
 def required(help: str, check: Check | None = None) -> Any:
     """Returns a dataclass field as `option` does, but without a default."""
-    return field(metadata={"help": help, "check": check})
+    return option(MISSING, help, check)
 
 
 def same_option(kind: type[Any], name: str, check: Check | None = None, **default: Any) -> Any:
@@ -43,21 +36,15 @@ class SamplerOptions:
     """How motions are sampled. None = the value of the recipe or, if the recipe has none, of the sampler.
 
     A sampler declares which of the options it has (`flame_mdm.processes.samplers`); `flame_mdm.processes.Process`
-    refuses the others.
-
-    Raises:
-        UserError: If a value is invalid for every model.
+    refuses the others. Raises `UserError` if a value is invalid for every model.
     """
 
     guidance_scale: float | None = option(None, "scale of classifier-free guidance; 1 = off. Default: the recipe's")
     sampler: str | None = option(
-        None,
-        "ancestral, ddim or dpm_solver_pp_2m for diffusion; euler, midpoint, heun, rk4 or dopri5 for flow matching; "
-        "consistency for distilled models. Default: the recipe's",
+        None, "ancestral, ddim, dpm_solver_pp_2m; euler, midpoint, heun, rk4, dopri5; consistency. Default: recipe's"
     )
     num_inference_steps: int | Sequence[int] | None = option(
-        None,
-        "number of sampling steps; for diffusion also the steps themselves, such as [0,2,5,9]. Default: the recipe's",
+        None, "number of sampling steps; for diffusion also a list of steps, [0,2,5,9]. Default: the recipe's"
     )
     eta: float | None = option(None, "randomness of the sampler ddim, from 0 (default) to 1")
     spacing: str | None = option(None, "how diffusion places a number of steps: linspace (default) or stride")
@@ -74,12 +61,10 @@ class SamplerOptions:
         if self.spacing is not None and self.spacing not in SPACINGS:
             raise UserError(f"spacing={self.spacing} is unknown: choose from {', '.join(SPACINGS)}")
         steps = self.num_inference_steps
-        if isinstance(steps, list | tuple):
-            object.__setattr__(self, "num_inference_steps", tuple(steps))
-            if not all(type(step) is int and 0 <= step <= MAX_STEPS for step in steps):
-                raise UserError(f"num_inference_steps={list(steps)}: give a number of steps, or a list of steps from 0")
-        elif steps is not None and not (type(steps) is int and 1 <= steps <= MAX_STEPS):
+        listed, least = (steps, 0) if isinstance(steps, list | tuple) else ([steps], 1)
+        if steps is not None and not all(type(step) is int and least <= step <= MAX_STEPS for step in listed):
             raise UserError(f"num_inference_steps={steps}: give a number from 1 to {MAX_STEPS:,}, or a list of steps")
+        object.__setattr__(self, "num_inference_steps", tuple(steps) if isinstance(steps, list) else steps)
 
     def chosen(self) -> dict[str, Any]:
         """Returns the options that are not None, as plain values."""

@@ -53,13 +53,11 @@ def test_each_prompt_of_a_file_is_sampled_as_if_alone(here, trained, capsys):
 
 
 @pytest.mark.slow
-def test_a_chosen_folder_gets_a_folder_per_prompt(here, trained, monkeypatch):
+def test_a_chosen_folder_gets_a_folder_per_prompt(here, trained):
     Path("p.txt").write_text("a person walks\na person jumps\na person walks\n")
-    words = ["prompts=p.txt", "seconds=1", "samples=1", "trajectory=true", "out=mine", "open=true"]
-    opened: list[str] = []
-    monkeypatch.setattr("webbrowser.open", opened.append)
+    words = ["prompts=p.txt", "seconds=1", "samples=1", "trajectory=true", "out=mine"]
     assert main(["sample", str(trained), *words]) == 0
-    assert opened == [Path("mine/p.html").resolve().as_uri()]
+    assert Path("mine/p.html").is_file()
     jumps, walks, _ = sorted(Path("mine").iterdir())
     assert [jumps.name[:-7], walks.name[:-7]] == ["a-person-jumps", "a-person-walks"]
     twice = [read(path) for path in sorted(walks.glob("motion_*.npz"))]
@@ -76,7 +74,7 @@ def test_a_bad_request_is_one_line_and_writes_nothing(here, trained, capsys):
         (b"a\n" * 2**20, [], "prompts: p.txt: 2 MiB, but such a file may have at most 1 MiB"),
         (b"walks", ["prompts=."], "prompts: .: a folder, not a file"),
         (b"walks", ["text=jumps"], "text and prompts exclude each other. Give only one of them"),
-        (b"walks\njumps", ["seconds=[1,2,3]"], "seconds=[1, 2, 3]: 3 lengths for 2 prompts. Give one length, or one"),
+        (b"walks\njumps", ["seconds=[1,2,3]"], "seconds=[1, 2, 3]: lengths: 3, prompts: 2. Give one length, or one"),
         (b"walks\njumps", ["seconds=[1,30]"], "30 seconds (600 frames) cannot be sampled"),
         (b"walks\n" + b"a" * 3000, [], "3,000 characters are too many"),
     ):
@@ -99,8 +97,8 @@ def test_each_prompt_has_a_length_of_its_own(trained):
     np.testing.assert_allclose(motions[2].joints, alone.joints, atol=1e-4)
     assert [len(m.joints) for m in flame_mdm.generate(model, PROMPTS, frames=np.array([20, 21, 22]))] == [20, 21, 22]  # type: ignore[arg-type]
     for seconds, message in (
-        ([1, 2], r"seconds=\[1, 2\]: 2 lengths for 1 prompt\. Give one length, or one per prompt"),
-        ([], "0 lengths for 1 prompt"),
+        ([1, 2], r"seconds=\[1, 2\]: lengths: 2, prompts: 1\. Give one length, or one per prompt"),
+        ([], "lengths: 0, prompts: 1"),
         *((value, "is not a valid length") for value in ([[1]], ["x"], [float("nan")], 10**400, "3")),
     ):
         with pytest.raises(UserError, match=message):

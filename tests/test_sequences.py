@@ -160,7 +160,7 @@ def test_bad_requests_give_one_clear_line(model):
 
 def test_bad_words_are_one_line(model, capsys):
     for options, message in (
-        ([], "say what to sample: text=..., for example "),
+        ([], "say what to sample: text="),
         (["text=walks", "unconditioned=true"], "text and unconditioned exclude each other"),
     ):
         assert main(["sample", "quickstart", *options]) == 1

@@ -31,8 +31,8 @@ class AdaptSettings(ModelSettings):
 
 def main(settings: AdaptSettings) -> None:
     file = settings.model_file()
-    keys = ("source", "name", "out", "action", "full", "force", "rank", "data_root")
 
     from flame_mdm.training.adaptation import adapt
 
-    adapt(file, overrides=settings.composed, **{key: getattr(settings, key) for key in keys})
+    own = {name: value for name, value in vars(settings).items() if name not in ("ckpt", "which", "composed")}
+    adapt(file, overrides=settings.composed, **own)

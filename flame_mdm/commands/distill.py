@@ -53,8 +53,7 @@ def student_recipe(settings: DistillSettings) -> Config:
     recipe: Any = teacher.config
     if not teacher.steps or not isinstance(recipe.get("data"), dict) or "trainer" not in recipe:
         raise UserError(f"{settings.ckpt}: was not trained by this framework, so that its data and steps are unknown")
-    name = f"{recipe['experiment']}_distilled"
-    root = os.environ.get("FLAME_MDM_DATA", recipe["data_root"])
+    name, root = f"{recipe['experiment']}_distilled", os.environ.get("FLAME_MDM_DATA", recipe["data_root"])
     steps = max(1, round(SHARE_OF_STEPS * teacher.steps))
     own: Config = {
         "experiment": name,

@@ -34,7 +34,7 @@ class EditSettings(OutputSettings, EditRequest, FileSettings):
 
 
 def main(settings: EditSettings) -> None:
-    request = settings.request(editing=True)
+    request = settings.request()
     file = settings.model_file()
 
     from flame_mdm.safe_io import sha256

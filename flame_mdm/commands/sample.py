@@ -4,23 +4,25 @@ from __future__ import annotations
 
 import hashlib
 import re
-import webbrowser
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from importlib.util import find_spec
 from pathlib import Path
+from statistics import mean
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from flame_mdm.commands import AdaptedSettings, BodySettings, about_key, device_name, existing, motion_file
 from flame_mdm.errors import UserError, say, shortened
 from flame_mdm.safe_io import MEBIBYTE, read_text
 from flame_mdm.sampler_options import SamplerOptions, option, same_option
-from flame_mdm.sampling.request import EditRequest, SamplingRequest, path_targets, read_path
+from flame_mdm.sampling.request import TRAINED_ON, EditRequest, SamplingRequest, path_targets, read_path
 
 if TYPE_CHECKING:
     from flame_mdm.formats.motion import Motion
     from flame_mdm.generator import MotionGenerator
     from flame_mdm.visualize.body import Mesh
+
+GALLERY = 200  # maximum number of motions on the page of a file of prompts, which has about 20 kB for each
 
 
 def video(key: str, requested: bool) -> None:
@@ -41,7 +43,6 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
     targets: str | None = same_option(SamplingRequest, "targets", existing)
     trajectory: bool = option(False, "draw the clean estimates along the sampling of the first motion: trajectory.png")
     mp4: bool = option(False, 'also write motions.mp4; needs pip install "flame-mdm[video]"', video)
-    open: bool = option(False, "open the player in the browser")
     device: str | None = option(None, "default: cuda if available", device_name)
 
     def load(self, file: Path) -> tuple[MotionGenerator, Mesh]:
@@ -54,24 +55,20 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
         body = load_body(self.body)
         return load(file, self.device or ("cuda" if torch.cuda.is_available() else "cpu"), **self.adapters()), body
 
-    def show(self, page: Path) -> None:
-        """Opens a page in the browser if requested; the line about it is printed in any case."""
-        if self.open:
-            webbrowser.open(page.resolve().as_uri())
-
-    def texts(self) -> list[str] | None:
-        return None if self.text is None else [self.text]
-
-    def request(self, editing: bool = False) -> SamplingRequest:
+    def request(self) -> SamplingRequest:
         """Returns what is requested of the model; raises `UserError` if it is more than one condition, or invalid."""
         conditions = [name for name in ("text", "prompts", "action") if getattr(self, name, None) is not None]
         conditions += ["unconditioned"] if self.unconditioned else []
         if len(conditions) > 1:
             raise UserError(f"{' and '.join(conditions)} exclude each other. Give only one of them")
-        kinds = [SamplingRequest, SamplerOptions, *([EditRequest] if editing else [])]
-        names = {entry.name for kind in kinds for entry in fields(kind)}
-        values = {entry.name: getattr(self, entry.name) for entry in fields(self) if entry.name in names}
-        return SamplingRequest.of("sample", editing, texts=self.texts(), actions=self.action, **values)
+
+        def values(kind: type) -> dict[str, Any]:
+            return {entry.name: getattr(self, entry.name) for entry in fields(kind) if hasattr(self, entry.name)}
+
+        texts = read_prompts(vars(self)["prompts"]) if "prompts" in conditions else self.text
+        own = values(SamplingRequest) | {"texts": texts, "actions": self.action}
+        editing = EditRequest(**values(EditRequest)) if isinstance(self, EditRequest) else None
+        return SamplingRequest(**own, options=SamplerOptions(**values(SamplerOptions)), editing=editing)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,22 +95,15 @@ class SampleSettings(OutputSettings):
     shared_noise: bool = same_option(SamplingRequest, "shared_noise")
     out: str | None = option(None, "folder; default samples/<experiment>/<text>-<hash>")
 
-    def texts(self) -> list[str] | None:
-        """Returns the text or the lines of the file of prompts; None if there are none."""
-        return super().texts() if self.prompts is None else read_prompts(self.prompts)
-
-    def request(self, editing: bool = False) -> SamplingRequest:
+    def request(self) -> SamplingRequest:
         """See `OutputSettings`; a path becomes targets."""
-        request = super().request(editing)
+        request = super().request()
         if self.path is None:
             return request
         if excess := [name for name in ("targets", "prompts", "frames") if getattr(self, name) is not None]:
             raise UserError(f"path={self.path}: {excess[0]} cannot be given with a path. Give text and seconds")
         way, usual = read_path(self.path), request.lengths(1.0)[0] or 3.0
         return replace(request, targets=path_targets(way, sum(seconds or usual for _, seconds in request.parts[0])))
-
-
-GALLERY = 200  # maximum number of motions on the page of a file of prompts, which has about 20 kB for each
 
 
 def main(settings: SampleSettings) -> None:
@@ -146,11 +136,7 @@ def main(settings: SampleSettings) -> None:
 
 
 def _folders(
-    settings: SampleSettings,
-    request: SamplingRequest,
-    model: MotionGenerator,
-    digest: str,
-    motions: Sequence[Motion],
+    settings: SampleSettings, request: SamplingRequest, model: MotionGenerator, digest: str, motions: Sequence[Motion]
 ) -> dict[Path, list[Motion]]:
     """Returns the folders to write, with the motions of each; a prompt that is listed twice has one folder."""
     shared = replace(request, texts=None, actions=None, seconds=None, frames=None, samples=1)
@@ -166,18 +152,16 @@ def _folders(
     return folders
 
 
-def _distance(targets: Any, model: MotionGenerator, motions: Sequence[Motion]) -> str:
-    import numpy as np
-
+def _distance(source: Any, model: MotionGenerator, motions: Sequence[Motion]) -> str:
     from flame_mdm.sampling.targets import errors, read_targets
 
-    distances = [100 * errors(motion, read_targets(model.representation, targets)) for motion in motions]
-    return f"distance from the targets: mean {np.mean(distances):.1f} cm, max {np.max(distances):.1f} cm"
+    targets = read_targets(model.representation, source)
+    distances = [100 * distance for motion in motions for distance in errors(motion, targets).tolist()]
+    return f"distance from the targets: mean {mean(distances):.1f} cm, max {max(distances):.1f} cm"
 
 
 def summary(folder: Path, motions: Sequence[Motion], settings: OutputSettings) -> str:
-    """Opens the player if requested, and returns the line that tells what was written to a folder."""
-    settings.show(folder / "player.html")
+    """Returns the line that tells what was written to a folder."""
     count = "1 motion" if len(motions) == 1 else f"{len(motions)} motions"
     files = f"{folder / 'player.html'}, motions.gif" + (", motions.mp4" if settings.mp4 else "")
     return f"{count} of {len(motions[0].joints)} frames: {files}"
@@ -189,7 +173,6 @@ def _gallery(settings: SampleSettings, folders: Mapping[Path, list[Motion]], bod
     page = next(iter(folders)).with_name(f"{Path(str(settings.prompts)).stem}.html")
     first = [replace(made[0], id=folder.name) for folder, made in folders.items()][:GALLERY]
     write_player(page, first, f"{len(folders)} prompts", body=body)
-    settings.show(page)
     return f"{sum(map(len, folders.values()))} motions for {len(folders)} prompts, a folder for each: {page}"
 
 
@@ -206,8 +189,8 @@ def read_prompts(path: str) -> list[str]:
 def default_folder(model: MotionGenerator, what: str, *request: object) -> Path:
     """Returns `samples/<experiment>/<what>-<hash>`; the hash is that of `what` and of everything in `request`.
 
-    Requests for different motions thus go to different folders, also where the file system ignores case. The name of
-    the experiment comes from the checkpoint, which may be untrusted; it is cleaned, so the folder is within `samples`.
+    Requests for different motions thus go to different folders, also where the file system ignores case. The folder is
+    within `samples`, whatever an untrusted checkpoint calls its experiment.
     """
     digest = hashlib.sha256(repr((what, request)).encode()).hexdigest()[:6]
     name = re.sub(r"[^\w]+", "-", what.lower()).strip("-")[:40].strip("-")
@@ -220,13 +203,11 @@ def check_condition(settings: OutputSettings, request: SamplingRequest, model: M
         from flame_mdm.conditions.vocabulary import advice
 
         for text in dict.fromkeys(part for parts in request.parts for part, _ in parts):
-            several = len(request.prompts) > 1 or text not in request.prompts
-            of = f"'{shortened(text, 60)}': " if several else ""
+            of = "" if request.prompts == (text,) else f"'{shortened(text, 60)}': "
             for line in advice(text, model.facts, model.condition.max_words):
                 say(f"warning: {of}{line}")
     elif request.kind == "none" and not settings.unconditioned:
-        choices = {"text": model.facts.get("captions", ()), "action": model.facts["actions"], "none": ()}
-        examples = list(choices[model.conditioned_on])
+        examples = list(model.facts["actions"] if model.conditioned_on == "action" else model.facts.get("captions", ()))
         shown = "; ".join(examples[:: max(1, len(examples) // 5)][:5])
-        key = {"none": "unconditioned=true", "text": "text=...", "action": "action=..."}[model.conditioned_on]
-        raise UserError(f"say what to sample: {key}" + (f", for example {shown}" if shown else ""))
+        key = TRAINED_ON[model.conditioned_on][1]
+        raise UserError(f"say what to sample: {key}" + (f". Examples: {shown}" if shown else ""))

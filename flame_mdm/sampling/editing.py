@@ -24,8 +24,7 @@ from flame_mdm.sampling.reading import read_motion, with_features
 from flame_mdm.sampling.request import METHODS, EditRequest, Part, SamplingRequest, understood
 
 MFM_STEPS = 25
-"""Sampling steps of MFM's edits: with `until` = 0.2, the path is overwritten in "the first 6 time steps" (i = 0 ... 5)
-and up to "0.2 time" (i / 25 <= 0.2), as the paper says."""
+"""Sampling steps of MFM's edits: with `until` = 0.2, "the first 6 time steps" are up to "0.2 time" (i / 25 <= 0.2)."""
 
 
 @dataclass(eq=False, repr=False, kw_only=True)
@@ -37,8 +36,8 @@ class Edited(Motion):
         keep: (F, D) bool, True if this feature of this frame was to be kept.
         feature_error: maximum change of kept values in normalized features; 0 if the method is exact.
         joint_error: maximum distance in meters between the world positions of a kept joint before and after. It can be
-            large although features are kept: they are relative to the root, so frames after a resampled part continue
-            from where that part ends.
+            large although features are kept: they are relative to the root, so a kept part continues from where a
+            resampled part ends.
     """
 
     original: Motion
@@ -65,13 +64,12 @@ def edit(
         texts: what the person does in the new part; one text or several.
         fps: frames per second of an array or an .npy file; for other files, it overrides that of the file.
         stages: as in `flame_mdm.generate`.
-        keywords: fields of `flame_mdm.sampling.request.EditRequest`, such as region, region_seconds, joints, method and
-            strength; of `flame_mdm.sampling.request.SamplingRequest`, such as actions, samples, seed and cleanup; and
-            of `flame_mdm.sampler_options.SamplerOptions`. `cleanup` also changes the kept part, by millimeters as a
-            rule; `joint_error` says by how much.
+        keywords: fields of `EditRequest` and `SamplingRequest` in `flame_mdm.sampling.request`, and of
+            `flame_mdm.sampler_options.SamplerOptions`. `cleanup` also changes the kept part, by millimeters as a rule;
+            `joint_error` says by how much.
 
-    Raises `UserError` if the request is invalid, the mask keeps everything or nothing, the process does not support the
-    method, or the motion cannot be read or is longer than those in training.
+    Raises `UserError` if the request is invalid, the process does not support the method, or the motion cannot be read
+    or is longer than those in training.
     """
     request = SamplingRequest.of("edit", True, texts=texts, **keywords)
     return edit_request(model, motion, request, fps=fps, stages=stages)
@@ -97,16 +95,12 @@ def edit_request(
     original = with_features(representation, motion)
     length = len(original.features)
     if length > (longest := model.facts["max_frames"]) and not request.is_sequence:
-        raise UserError(
-            f"{original.id or 'the motion'}: {length} frames, but the model was trained on at most {longest} "
-            f"({longest / original.fps:g} seconds): select a part with cut=[begin, end] in seconds"
-        )
+        what = f"{length} frames, but the model was trained on at most {longest} ({longest / original.fps:g} seconds)"
+        raise UserError(f"{original.id or 'the motion'}: {what}: select a part with cut=[begin, end] in seconds")
     keep, kept_joints = kept_parts(representation, length, editing)
     if not keep.any() and editing.strength is None:
-        raise UserError(
-            "no part of the motion is kept: choose region=..., region_seconds=... or joints=..., or vary all "
-            "of it with strength=0.5"
-        )
+        advice = "choose region=..., region_seconds=... or joints=..., or vary all of it with strength=0.5"
+        raise UserError(f"no part of the motion is kept: {advice}")
     frames = tuple(_part_length(parts, length, original.fps) for parts in request.parts)
     how, options = method_options(model.process, editing, request.options)
     normalized = representation.normalize(torch.from_numpy(original.features).to(model.device))
@@ -133,10 +127,8 @@ def _part_length(parts: Sequence[Part], length: int, fps: float) -> int:
     timed = [round(seconds * fps) for _, seconds in parts if seconds is not None]
     rest, others = length - sum(timed), len(parts) - len(timed)
     if rest < others or (rest % others if others else rest):
-        raise UserError(
-            f"'{' | '.join(words for words, _ in parts)}': the parts are not as long as the motion, which has "
-            f"{length / fps:g} seconds. Give each part its seconds, as in 'walks @2 | sits @1'"
-        )
+        what = f"the parts are not as long as the motion, which has {length / fps:g} seconds"
+        raise UserError(f"{what}. Give each part its seconds, as in 'walks @2 | sits @1'")
     return rest // max(1, others)
 
 
@@ -162,15 +154,12 @@ def _new_frames(length: int, fps: float, editing: EditRequest) -> Tensor:
         }
         return new[editing.region]
     name, scale = ("region", 1.0) if editing.region_seconds is None else ("region_seconds", fps)
-    ranges = editing.ranges(name)
-    new = torch.full((length,), ranges is None)  # by default, all frames
-    for begin, end in ranges or ():
+    new = torch.full((length,), editing.ranges is None)  # by default, all frames
+    for begin, end in editing.ranges or ():
         first, last = round(begin * scale), round(end * scale)
         if not 0 <= first < last <= length:
-            raise UserError(
-                f"{name}=[{begin:g}, {end:g}] is not a range of this motion, which has {length} frames "
-                f"({length / fps:g} seconds)"
-            )
+            frames = f"{length} frames ({length / fps:g} seconds)"
+            raise UserError(f"{name}=[{begin:g}, {end:g}] is not a range of this motion, which has {frames}")
         new[first:last] = True
     return new
 
@@ -183,9 +172,8 @@ def method_options(
     usual = next(name for name in possible if METHODS[name]["mode"] == process.edit_modes[0])
     method = editing.method or usual
     if method not in possible:
-        raise UserError(
-            f"method={method} is not supported by {type(process).__name__}; this model supports: {', '.join(possible)}"
-        )
+        what = f"is not supported by {type(process).__name__}; this model supports: {', '.join(possible)}"
+        raise UserError(f"method={method} {what}")
     if METHODS[method]["mode"] == "trajectory" and options.num_inference_steps is None:
         options = replace(options, num_inference_steps=MFM_STEPS)
     return editing.method_options(method), options

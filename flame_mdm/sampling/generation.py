@@ -17,7 +17,7 @@ from flame_mdm.formats.cleanup import cleaned
 from flame_mdm.formats.motion import Motion
 from flame_mdm.generator import MotionGenerator
 from flame_mdm.safe_io import atomic_folder
-from flame_mdm.sampling.reading import read_motion, with_features
+from flame_mdm.sampling.reading import decoded, read_motion, with_features
 from flame_mdm.sampling.request import SamplingRequest, check_model, understood
 from flame_mdm.sampling.sequences import motion_lengths, overlap, windows
 from flame_mdm.sampling.targets import read_targets
@@ -25,7 +25,7 @@ from flame_mdm.visualize import contact_sheet, write_gif, write_mp4, write_playe
 from flame_mdm.visualize.body import Mesh
 
 BATCH = 32
-STAGES = 10  # number of clean estimates shown of one sampling run: one per tenth of it, as in figure 5 of MFM
+STAGES = 10  # number of clean estimates shown of one sampling run, as in figure 5 of MFM
 REQUEST_FILES = re.compile(r"motion_\d{3,}\.npz|motions\.mp4|trajectory\.png")
 """Files that some requests write and others do not."""
 
@@ -50,9 +50,7 @@ def generate(
         edit: part of a motion of that length to keep in every sample, with `known` and `keep` (1, F, D).
         stages: list that gets the clean estimates along the sampling of the first motion, at equal intervals, and that
             motion itself (MFM, figure 5).
-        keywords: fields of `flame_mdm.sampling.request.SamplingRequest`, such as actions, seconds, samples, seed,
-            after, loop, targets and cleanup, and of `flame_mdm.sampler_options.SamplerOptions`, such as
-            guidance_scale, sampler and num_inference_steps.
+        keywords: fields of `flame_mdm.sampling.request.SamplingRequest` and `flame_mdm.sampler_options.SamplerOptions`.
 
     Raises `UserError` if the request is invalid, the model cannot do what is requested, or knows no word of a text that
     says what happens.
@@ -62,11 +60,7 @@ def generate(
 
 
 def sample_request(
-    model: MotionGenerator,
-    request: SamplingRequest,
-    *,
-    edit: Edit | None = None,
-    stages: list[Motion] | None = None,
+    model: MotionGenerator, request: SamplingRequest, *, edit: Edit | None = None, stages: list[Motion] | None = None
 ) -> list[Motion]:
     """Samples the motions of a request: checks it against the model, plans, and samples in batches; see `generate`."""
     if edit is not None:
@@ -105,10 +99,9 @@ class _Plan:
         if (after := request.after) is not None:  # its last frames are generated again, but kept
             motion = after if isinstance(after, Motion) else read_motion(representation, after)
             motion = with_features(representation, motion)
-            if shared > len(motion.features):
-                count = len(motion.features)
-                raise UserError(f"after={motion.id}: {count} frames are too short. Give at least {shared}")
             self.before = torch.from_numpy(motion.features)
+            if (count := len(self.before)) < shared:
+                raise UserError(f"after={motion.id}: {count} frames are too short. Give at least {shared}")
             lengths = [[shared + first, *others] for first, *others in lengths]
             ending = representation.normalize(self.before[-shared:].to(model.device))[None]
             self.edit = Edit(ending, torch.ones_like(ending, dtype=torch.bool))
@@ -122,12 +115,12 @@ def _sample(model: MotionGenerator, plan: _Plan, rows: slice, trajectory: list[T
     mask = length_mask(torch.tensor([sum(parts) for parts in lengths], device=model.device))
     x = torch.zeros(*mask.shape, model.representation.features, device=model.device)
     batch = MotionBatch(x=x, mask=mask, ids=plan.ids[rows])
-    actions = model.facts["actions"] if request.kind == "action" else None
-    covering = windows(model, conditions, lengths, actions, request.loop) if request.is_sequence else None
+    covering = windows(model, request, conditions, lengths) if request.is_sequence else None
     if request.kind == "text":
         batch.text = plan.captions[rows]
-    elif actions and covering is None:
-        batch.action = torch.tensor([actions.index(name) for (name,) in conditions], device=model.device)
+    elif request.kind == "action" and covering is None:
+        labels = [model.facts["actions"].index(name) for (name,) in conditions]
+        batch.action = torch.tensor(labels, device=model.device)
     edit = plan.edit
     if plan.targets is not None:
         goal = plan.targets.edit(model.representation, batch.lengths.tolist(), model.device)
@@ -156,20 +149,11 @@ def _decoded(model: MotionGenerator, plan: _Plan, row: int, x: Tensor) -> Motion
     if plan.before is not None:
         before = plan.before.to(features)
         features = torch.cat([before, features[min(len(before), overlap(model)) :]])
-    joints = representation.decode(features)
-    if not torch.isfinite(joints).all():
-        raise UserError(f"the model returned non-finite numbers for '{plan.captions[row]}'")
-    motion = Motion(
-        joints.cpu().numpy(),
-        representation.fps,
-        representation.skeleton,
-        plan.captions[row],
-        plan.ids[row],
-        features=features.cpu().numpy(),
-        representation=representation.name,
-    )
+    motion = decoded(representation, features, plan.captions[row], plan.ids[row])
+    if not np.isfinite(motion.joints).all():
+        raise UserError(f"the model returned non-finite numbers for '{motion.text}'")
     if plan.request.is_sequence:
-        ends = np.cumsum([len(joints) - sum(lengths[1:]), *lengths[1:]]).tolist()
+        ends = np.cumsum([len(features) - sum(lengths[1:]), *lengths[1:]]).tolist()
         begins = [0 if plan.before is None else len(plan.before), *ends]
         motion.parts = tuple(zip(plan.conditions[row], begins, ends, strict=False))
     return motion
@@ -203,7 +187,7 @@ def write_motions(
     """Writes `motion_000.npz` ..., `motions.gif`, `motions.png` and `player.html` into a folder, all or none.
 
     Such files of an earlier request that are not written again are removed. The first eight motions are drawn, and the
-    stages of a sampling run in `trajectory.png`; `facts`, such as seed and checkpoint hash, are added to each `.npz`.
+    stages of a sampling run in `trajectory.png`; `facts` are added to each `.npz`.
     """
     scene = [replace(motion, text=motion.text or "unconditioned") for motion in motions]
     with atomic_folder(folder) as made:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from flame_mdm.data.store import Store
 from flame_mdm.errors import UserError, did_you_mean
@@ -32,16 +33,16 @@ def read_motion(
     """Reads a motion to edit and computes the features of a model.
 
     Args:
-        source: a motion file of any kind that `flame_mdm.formats.readers.read` reads; or `dataset:id`, a clip of a
-            prepared data set. Features of the same representation and frame rate are kept. Joints are resampled to the
-            frame rate of the model and made canonical by its representation.
+        source: a motion file, as for `flame_mdm.formats.readers.read`; or `dataset:id`, a clip of a prepared data set.
+            Features of the same representation and frame rate are kept. Joints are resampled to the frame rate of the
+            model and made canonical by its representation.
         fps, unit: of the file, as in `flame_mdm.formats.readers.read`.
         up: the axis of the file that points up (y, z or -y); other facts are those of the nearest `skeleton.yaml`.
         cut: begin and end, in seconds, of the part to use.
         data_root: folder of the prepared data sets.
 
-    Raises `FileNotFoundError` if the file or data set does not exist, and `UserError` if the file is damaged, the clip
-    is unknown, `cut` is outside of the motion, or this representation cannot encode the motion.
+    Raises `FileNotFoundError` or `UserError` if the motion does not exist or is damaged, `cut` is outside of it, or the
+    representation cannot encode it.
     """
     name = str(source)
     if Path(source).suffix.lower() in ENDINGS:
@@ -58,7 +59,8 @@ def read_motion(
         if not 0 <= begin < end <= len(motion.features):
             seconds = len(motion.features) / representation.fps
             raise UserError(f"cut=[{cut[0]:g}, {cut[1]:g}] is not a range of {name}, which lasts {seconds:g} seconds")
-        motion = _decoded(representation, representation.rebase(motion.features[begin:end]), motion.text, name)
+        features = torch.from_numpy(representation.rebase(motion.features[begin:end]))
+        motion = decoded(representation, features, motion.text, name)
     return motion
 
 
@@ -75,21 +77,22 @@ def with_features(representation: Representation, motion: Motion) -> Motion:
         joints = joints[:, : len(skeleton)]  # without the hands
     try:
         joints = resample_joints(joints, motion.fps, representation.fps, cubic=True)
-        features = representation.encode(torch.from_numpy(joints)).numpy()
+        features = representation.encode(torch.from_numpy(joints))
         if len(features) < len(joints):  # one row per step between frames: a further step keeps the number of frames
             longer = np.concatenate([joints, joints[-1:] + [1, 0, 1] * (joints[-1:] - joints[-2:-1])])
-            features = representation.encode(torch.from_numpy(longer)).numpy()
+            features = representation.encode(torch.from_numpy(longer))
         if motion.skeleton.joints[: len(SMPL22)] == SMPL22.joints:
             check_size(joints, 1.0, children=True)
     except ValueError as error:
         raise UserError(f"{name}{error}") from error
-    return _decoded(representation, features, motion.text, motion.id)
+    return decoded(representation, features, motion.text, motion.id)
 
 
-def _decoded(representation: Representation, features: np.ndarray, text: str, name: str) -> Motion:
-    joints = representation.decode(torch.from_numpy(features)).numpy()
-    fps, skeleton = representation.fps, representation.skeleton
-    return Motion(joints, fps, skeleton, text, name, features=features, representation=representation.name)
+def decoded(representation: Representation, features: Tensor, text: str, name: str) -> Motion:
+    """Returns the motion of features (F, D)."""
+    joints, fps, skeleton = representation.decode(features).cpu().numpy(), representation.fps, representation.skeleton
+    array = features.cpu().numpy()
+    return Motion(joints, fps, skeleton, text, name, features=array, representation=representation.name)
 
 
 def _read_clip(representation: Representation, source: str, data_root: Path) -> Motion:
@@ -101,4 +104,5 @@ def _read_clip(representation: Representation, source: str, data_root: Path) -> 
     if clip_id not in clips:
         raise UserError(f"{store.folder} has no clip '{clip_id}'.{did_you_mean(clip_id, list(clips))}")
     clip = clips[clip_id]
-    return _decoded(representation, np.array(store.motion(clip)), next(iter(clip.captions), ""), source)
+    features = torch.from_numpy(np.array(store.motion(clip)))
+    return decoded(representation, features, next(iter(clip.captions), ""), source)

@@ -1,7 +1,4 @@
-"""What a user asks of a model, checked once: by Python, the command line, the demo and evaluation.
-
-This module does not import torch, so that a request can be refused at once.
-"""
+"""What a user asks of a model, checked once, and without importing torch, so that it can be refused at once."""
 
 from __future__ import annotations
 
@@ -14,7 +11,7 @@ from numbers import Integral, Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from flame_mdm.errors import UserError, did_you_mean, shortened
+from flame_mdm.errors import UserError, did_you_mean, one_line, shortened
 from flame_mdm.sampler_options import SamplerOptions, option
 
 if TYPE_CHECKING:
@@ -45,32 +42,22 @@ ARRIVAL = 0.2  # seconds before the end of a motion at which the last way point 
 
 @dataclass(frozen=True, kw_only=True)
 class EditRequest:
-    """Which part of a motion to resample: `joints` in the frames of `region`, by default all; and how.
-
-    Raises `UserError` if a value is invalid for every model and motion.
-    """
+    """Which part of a motion to resample, and how; raises `UserError` if a value is invalid for every motion."""
 
     region: str | Ranges | None = option(
-        None,
-        "frames to resample: in_between (keeps the first and the last quarter), prediction = prefix (keeps the "
-        "first), suffix (keeps the last), interpolate (keeps every fifth frame), or one or more [begin, end]",
+        None, "frames to resample: in_between, prediction (= prefix), suffix, interpolate, or one or more [begin, end]"
     )
     region_seconds: Ranges | None = option(None, "one or more [begin, end] in seconds, instead of region")
     joints: str | Sequence[str] | None = option(
         None, "joints to resample: upper_body, lower_body, legs, arms, left_arm ... or [names]. Default: all"
     )
     method: str | None = option(
-        None,
-        "mdm overwrites the clean estimate (exact); flame blends after each step, as in the paper (exact); "
-        "flame_code blends before each call, as in FLAME's code; mfm overwrites the early part of the path. "
-        "Default: mdm for diffusion, mfm for flow matching",
+        None, "mdm and flame (keep exactly), flame_code, mfm. Default: mdm for diffusion, mfm for flow matching"
     )
     until: float | None = option(None, "for mfm: flow time up to which the path is overwritten, default 0.2")
     resample: int = option(1, "for flame and flame_code: how many times each sampling step is taken")
     strength: float | None = option(
-        None,
-        "starts from the motion with noise added, and takes this fraction of the sampling steps, above 0 and up to "
-        "1: the smaller, the closer to the motion",
+        None, "starts from the noised motion, and takes this fraction of the steps, up to 1: the smaller, the closer"
     )
 
     def __post_init__(self) -> None:
@@ -80,8 +67,7 @@ class EditRequest:
             value = getattr(self, name)
             if isinstance(value, str) and value not in choices:
                 raise UserError(f"{name}={value} is unknown.{did_you_mean(value, choices)} Use {', '.join(choices)}")
-        for name in ("region", "region_seconds"):
-            self.ranges(name)
+        _ = self.ranges  # raises if they are invalid
         if type(self.resample) is not int or self.resample < 1:
             raise UserError(f"resample={self.resample}: give a whole number, 1 or more")
         if self.strength is not None and not 0 < self.strength <= 1:
@@ -94,10 +80,12 @@ class EditRequest:
         """Whether the result is a variation of the entire motion, so that it can have parts and targets."""
         return self.strength is not None and self.region is self.region_seconds is self.joints is None
 
-    def ranges(self, name: str) -> list[tuple[float, float]] | None:
-        """Returns the ranges of the field `name`; None if it has none."""
+    @property
+    def ranges(self) -> list[tuple[float, float]] | None:
+        """The ranges of `region`, or of `region_seconds`; None if they have none."""
+        name = "region" if self.region_seconds is None else "region_seconds"
         value: Any = getattr(self, name)
-        if value is None or isinstance(value, str):
+        if value is None or (name == "region" and isinstance(value, str)):
             return None
         listed = [value] if is_range(value) else value
         if not isinstance(listed, list | tuple) or not listed or not all(map(is_range, listed)):
@@ -122,21 +110,16 @@ class SamplingRequest:
 
     A text or action may have several parts, "walks forward @3 | turns left | sits down @2", with their seconds. They
     are generated together as one motion, in windows that overlap; see docs/sequences.md. So is a single part with
-    seconds, "walks forward @10", which may be longer than the motions in training.
-
-    A single text, action or list of lengths is stored as a tuple. Raises `UserError` if a value is invalid for every
-    model, or two values contradict each other.
+    seconds, "walks forward @10", which may be longer than the motions in training. Raises `UserError` if a value is
+    invalid for every model, or two values contradict each other.
     """
 
     texts: str | Sequence[str] | None = option(
-        None,
-        'what the person does; several actions in a row: "walks forward @3 | turns around | bows @2" (seconds)',
+        None, 'what the person does; several actions in a row: "walks forward @3 | turns around | bows @2" (seconds)'
     )
     actions: str | Sequence[str] | None = option(None, "a label, for models trained on labels")
     seconds: float | Sequence[float] | None = option(
-        None,
-        "length, or a list with one per text or action; of a sequence, the length of each part that gives none. "
-        "Default: 3, or the longest motion in training if that is shorter",
+        None, "length, or a list with one per text; of a sequence, of each part that gives none. Default: up to 3"
     )
     frames: int | Sequence[int] | None = option(None, "the same in frames, instead of seconds")
     samples: int = option(1, "motions per text or action")
@@ -157,16 +140,14 @@ class SamplingRequest:
     @classmethod
     def of(cls, function: str, editing: bool = False, /, **keywords: Any) -> SamplingRequest:
         """Returns the request of keywords: fields of this class, `SamplerOptions` and, of edits, `EditRequest`."""
-        kinds = [cls, SamplerOptions, *([EditRequest] if editing else [])]
-        names = {kind: [entry.name for entry in fields(kind)] for kind in kinds}
-        names[cls] = [name for name in names[cls] if name not in ("options", "editing")]
-        possible = [name for listed in names.values() for name in listed]
+        names = {kind: {entry.name for entry in fields(kind)} for kind in (cls, SamplerOptions, EditRequest)}
+        names[cls] -= {"options", "editing"}
+        possible = names[cls] | names[SamplerOptions] | (names[EditRequest] if editing else set())
         for keyword in keywords:
             if keyword not in possible:
-                raise UserError(f"{function} has no option {keyword}.{did_you_mean(keyword, possible)}")
-        keywords_of = {kind: {name: keywords[name] for name in names[kind] if name in keywords} for kind in kinds}
-        edit = EditRequest(**keywords_of[EditRequest]) if editing else None
-        return cls(**keywords_of[cls], options=SamplerOptions(**keywords_of[SamplerOptions]), editing=edit)
+                raise UserError(f"{function} has no option {keyword}.{did_you_mean(keyword, sorted(possible))}")
+        own, options, edit = ({name: keywords[name] for name in of & keywords.keys()} for of in names.values())
+        return cls(**own, options=SamplerOptions(**options), editing=EditRequest(**edit) if editing else None)
 
     def __post_init__(self) -> None:
         for name in ("texts", "actions", "seconds", "frames"):
@@ -196,37 +177,34 @@ class SamplingRequest:
         for prompt in self.prompts:
             if not isinstance(prompt, str):
                 raise UserError(f"{self.kind}={prompt!r} is not a string. Give a string, such as {self.kind}='walk'")
-            if (count := len(prompt)) > MAX_TEXT_LENGTH:
-                start = shortened(prompt, 60)
-                raise UserError(f"{start}: {count:,} characters are too many. Give at most {MAX_TEXT_LENGTH:,}")
+            if len(prompt) > MAX_TEXT_LENGTH:
+                size = f"{len(prompt):,} characters are too many. Give at most {MAX_TEXT_LENGTH:,}"
+                raise UserError(f"{shortened(prompt, 60)}: {size}")
         if self.texts is not None and not all(text.strip() for text in self.prompts):
             raise UserError("empty text. Omit the text to sample without condition")
         if len(self.prompts) * self.samples > MAX_SAMPLES:
-            texts = f"{len(self.prompts):,} texts with samples={self.samples}"
-            raise UserError(f"{texts}: at most {MAX_SAMPLES:,} motions per request")
+            raise UserError(f"samples={self.samples} of each text: at most {MAX_SAMPLES:,} motions per request")
         _ = self.parts  # raises if a part is invalid
 
     def _check_lengths(self) -> None:
         if self.seconds is not None and self.frames is not None:
             raise UserError("give seconds or frames, not both")
-        name, value = ("frames", self.frames) if self.seconds is None else ("seconds", self.seconds)
+        name = "frames" if self.seconds is None else "seconds"
+        value: Any = getattr(self, name)
         if value is None:
             return
-        shown = f"{name}={list(value) if isinstance(value, tuple) else value}"
-        if len(self._lengths) != len(self.prompts):
-            prompts = "1 prompt" if len(self.prompts) == 1 else f"{len(self.prompts)} prompts"
-            raise UserError(f"{shown}: {len(self._lengths)} lengths for {prompts}. Give one length, or one per prompt")
-        for length in self._lengths:
+        shown, count = f"{name}={list(value) if isinstance(value, tuple) else value}", len(self.prompts)
+        if isinstance(value, tuple) and len(value) != count:
+            raise UserError(f"{shown}: lengths: {len(value)}, prompts: {count}. Give one length, or one per prompt")
+        for length in value if isinstance(value, tuple) else (value,):
             if not issubclass(type(length), Real) or not abs(length) < 1e9 or (name == "frames" and length % 1):
                 raise UserError(f"{shown} is not a valid length")
 
     def check_edit(self, varies: bool) -> None:
         """Raises `UserError` if a request to edit a motion, or to vary all of it, asks for more than that."""
         if self.after is not None or (not varies and (self.is_sequence or self.targets is not None)):
-            raise UserError(
-                "an edit keeps a single motion: give neither parts (|), after, loop nor targets with it. Variations of "
-                "an entire motion (strength=0.5) may have parts, loop and targets"
-            )
+            advice = "Variations of an entire motion (strength=0.5) may have parts, loop and targets"
+            raise UserError(f"an edit keeps a single motion: omit parts (|), after, loop and targets. {advice}")
 
     @property
     def kind(self) -> Literal["text", "action", "none"]:
@@ -251,13 +229,9 @@ class SamplingRequest:
 
     def lengths(self, fps: float) -> list[float | None]:
         """Returns the length of each prompt in frames, not rounded; None where the request gives none."""
-        scale = 1.0 if self.seconds is None else fps
-        return [None if length is None else length * scale for length in self._lengths]
-
-    @property
-    def _lengths(self) -> list[Any]:
-        value = self.frames if self.seconds is None else self.seconds
-        return list(value) if isinstance(value, tuple) else [value] * len(self.prompts)
+        value: Any = self.frames if self.seconds is None else self.seconds
+        lengths = value if isinstance(value, tuple) else [value] * len(self.prompts)
+        return [None if length is None else length * (1.0 if self.seconds is None else fps) for length in lengths]
 
 
 def understood(request: SamplingRequest, model: MotionGenerator) -> SamplingRequest:
@@ -286,10 +260,8 @@ def check_model(request: SamplingRequest, model: MotionGenerator) -> None:
         trained, instead = TRAINED_ON[model.conditioned_on]
         raise UserError(f"{request.kind}={shortened(request.prompts[0], 60)}: this model {trained}. Give {instead}")
     if request.is_sequence and not model.representation.relative:
-        raise UserError(
-            f"representation {model.representation.name} has positions in the world, so that windows of a sequence do "
-            "not fit together. Use a model of humanml3d features"
-        )
+        what = "has positions in the world, so that windows of a sequence do not fit together"
+        raise UserError(f"representation {model.representation.name} {what}. Use a model of humanml3d features")
     for name in [name for parts in request.parts for name, _ in parts] if request.kind == "action" else ():
         if name not in (actions := model.facts["actions"]):
             raise UserError(f"unknown action '{name}'; this model knows: {', '.join(actions) or 'none'}")
@@ -299,18 +271,16 @@ def read_parts(text: str) -> list[Part]:
     """Splits "walks @3 | sits down" into parts, [("walks", 3.0), ("sits down", None)], or raises `UserError`."""
     parts: list[Part] = []
     for part in text.split("|"):
-        words, at, number = (piece.strip() for piece in part.rpartition("@"))
-        if not at:
-            words, number = number, ""
+        words, at, number = part.rpartition("@") if "@" in part else (part, "", "")
         try:
-            seconds = float(number.removesuffix("s")) if at else None
+            seconds = float(number.strip().removesuffix("s")) if at else None
         except ValueError:
             seconds = math.nan
         if seconds is not None and not 0 < seconds < math.inf:
             raise UserError(f"'{part.strip()}': the seconds of a part are a number above 0, as in 'walks forward @3'")
-        if not words:
+        if not words.strip():
             raise UserError(f"'{text}': part {len(parts) + 1} is empty. Say what happens in each: 'walks | sits'")
-        parts.append((words, seconds))
+        parts.append((words.strip(), seconds))
     return parts
 
 
@@ -321,14 +291,15 @@ def is_range(value: Any) -> bool:
 
 
 def read_path(text: str) -> list[tuple[float, float]]:
-    """Returns the way points of "x,z x,z ...", in meters. Raises `UserError` if the text is not of this form."""
+    """Returns the way points of "x,z x,z ...", in meters; raises `UserError` if the text is not of this form."""
     try:
-        points = [tuple(map(float, point.split(","))) for point in text.split()]
+        points = [(float(x), float(z)) for x, z in (point.split(",") for point in text.split())]
     except ValueError:
         points = []
-    if not points or any(len(point) != 2 for point in points):
-        raise UserError(f'path={text}: give way points as x,z in meters, such as path="0,1 0.5,2"')
-    return [(x, z) for x, z in points]
+    if not points:
+        shown = shortened(one_line(text[:500]), 60)
+        raise UserError(f"path={shown}: give way points as x,z in meters, such as 0,1 0.5,2")
+    return points
 
 
 def path_targets(path: Sequence[tuple[float, float]], seconds: float) -> dict[str, Any]:

@@ -27,14 +27,13 @@ def motion_lengths(model: MotionGenerator, request: SamplingRequest) -> list[lis
         return [_part_lengths(model, text, parts, usual, request.loop) for text, parts, usual in rows]
     lengths = [min(round(3 * fps), longest) if length is None else round(length) for length in frames]
     for length in lengths:
+        shown = f"{length / fps:g} seconds ({length} frames)"
         if length < 2:
-            shown = f"{length / fps:g} seconds ({length} frames)"
             raise UserError(f"{shown} are too short: give at least {2 / fps:g} seconds")
         if length > longest:
             raise UserError(
-                f"{length / fps:g} seconds ({length} frames) cannot be sampled: the model was trained on motions of up "
-                f"to {longest / fps:g} seconds ({longest} frames at {fps:g} fps). Overlapping windows make longer "
-                f"ones: write the seconds in the text, 'walks @{length / fps:g}'"
+                f"{shown} cannot be sampled: the model was trained on motions of up to {longest / fps:g} seconds. "
+                f"Overlapping windows make longer ones: write the seconds in the text, 'walks @{length / fps:g}'"
             )
     return [[length] for length in lengths]
 
@@ -49,35 +48,27 @@ def _part_lengths(
     lengths = [round(usual if seconds is None else seconds * fps) for _, seconds in parts]
     for (name, _), length in zip(parts, lengths, strict=True):
         if length < shared:
-            raise UserError(
-                f"'{name}': a part of {length / fps:g} seconds is too short. Give at least {shared / fps:g} seconds, "
-                "which it shares with its neighbors"
-            )
+            short = f"a part of {length / fps:g} seconds is too short"
+            raise UserError(f"'{name}': {short}. Give at least {shared / fps:g}, which it shares with its neighbors")
     if sum(lengths) > MAX_SECONDS * fps:
         raise UserError(f"'{text}': {sum(lengths) / fps:g} seconds are too long. Give at most {MAX_SECONDS}")
     return lengths
 
 
 def windows(
-    model: MotionGenerator,
-    conditions: Sequence[Sequence[str]],
-    lengths: Sequence[Sequence[int]],
-    actions: Sequence[str] | None,
-    loop: bool,
+    model: MotionGenerator, request: SamplingRequest, conditions: Sequence[Sequence[str]], lengths: list[list[int]]
 ) -> Windows:
-    """Returns the windows of several sequences, by text or action and frames of each part.
-
-    `actions` are all names of actions, if the conditions are actions. The end of a loop leads to its start.
-    """
+    """Returns the windows of several sequences, by text or action and frames of each part."""
     longest, shared, device = model.facts["max_frames"], overlap(model), model.device
-    covering = [(row, *span) for row, parts in enumerate(lengths) for span in spans(parts, longest, shared, loop)]
+    spans_of = [spans(parts, longest, shared, request.loop) for parts in lengths]
+    covering = [(row, *span) for row, own in enumerate(spans_of) for span in own]
     names = [conditions[row][part] for row, part, _, _ in covering]
     # A denoiser that attends to its padding sees as many frames as in training.
     width = max(size for *_, size in covering) if model.denoiser.mask_padding else longest
     positions = [(row, first, size) for row, _, first, size in covering]
     covered = cover(positions, [sum(parts) for parts in lengths], shared, width, device)
-    if actions is None:
-        covered.batch.text = names
+    if request.kind == "action":
+        covered.batch.action = torch.tensor([model.facts["actions"].index(name) for name in names], device=device)
     else:
-        covered.batch.action = torch.tensor([actions.index(name) for name in names], device=device)
+        covered.batch.text = names
     return covered

@@ -98,11 +98,9 @@ class Targets:
         """Returns the edit of motions of these lengths: poses are imposed, positions guide the clean estimates."""
         last = max([0, *self.positions.frames.tolist(), *(frame for frame, _ in self.poses)])
         if last >= min(lengths):
-            fps = representation.fps
-            raise UserError(
-                f"targets: {last / fps:g} seconds is after the end of the motion, whose last frame is at "
-                f"{(min(lengths) - 1) / fps:g} seconds. Give an earlier time, or more seconds"
-            )
+            late, end = (f"{frame / representation.fps:g} seconds" for frame in (last, min(lengths) - 1))
+            what = f"{late} is after the end of the motion, whose last frame is at {end}"
+            raise UserError(f"targets: {what}. Give an earlier time, or more seconds")
         imposed = torch.zeros(1, max(lengths), representation.features, device=device)
         keep = torch.zeros_like(imposed, dtype=torch.bool)
         for frame, features in self.poses:
@@ -145,8 +143,7 @@ def read_targets(representation: Representation, source: str | Path | Mapping[st
     for number, entry in enumerate(content.joints):
         where = f"{name}: joints[{number}]"
         if entry.joint not in names:
-            near = did_you_mean(entry.joint, names)
-            raise UserError(f"{where}: no joint '{entry.joint}'.{near} Joints: {', '.join(names)}")
+            raise UserError(f"{where}: no joint '{entry.joint}'.{did_you_mean(entry.joint, names)}")
         position = np.array(entry.position, dtype=float)
         goals.append(Goal(where, round(entry.time * fps), names.index(entry.joint), position))
     for number, entry in enumerate(content.poses):
@@ -190,14 +187,11 @@ def _check_reach(goals: list[Goal], fps: float) -> None:
     for goal in sorted(goals, key=lambda goal: goal.frame):
         height, floor = goal.position[1], goal.position[[0, 2]]
         if not (np.isnan(height) or -0.1 <= height <= REACH):
-            impossible = f"height {height:g} m is impossible. Give 0 to {REACH:g} meters above the floor"
-            raise UserError(f"{goal.source}: {impossible}")
+            raise UserError(f"{goal.source}: height {height:g} m is impossible. Give 0 to {REACH:g} m above the floor")
         if np.isnan(floor).any():
             continue
         distance, seconds = float(np.linalg.norm(floor - start)), (goal.frame - begin) / fps
         if distance > MAX_SPEED * seconds + REACH:
-            raise UserError(
-                f"{goal.source}: {distance:.1f} m from {before} in {seconds:g} seconds is impossible. Give more time, "
-                f"or a nearer position: people run at most {MAX_SPEED:g} m/s"
-            )
+            way = f"{distance:.1f} m from {before} in {seconds:g} seconds"
+            raise UserError(f"{goal.source}: {way} is impossible. Give more time, or a nearer position")
         before, start, begin = goal.source, floor, goal.frame

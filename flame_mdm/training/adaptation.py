@@ -28,6 +28,7 @@ from flame_mdm.formats.motion import Motion
 from flame_mdm.reporting.page import number, page, render
 from flame_mdm.safe_io import write_text
 from flame_mdm.sampling.generation import BATCH, generate
+from flame_mdm.sampling.reading import decoded
 from flame_mdm.task import MotionGeneration
 from flame_mdm.training.start import train
 from flame_mdm.visualize import player_page
@@ -55,8 +56,8 @@ def adapt(
 
     Args:
         base: as for `flame_mdm.load`.
-        source, name: folder of motions with captions, and the word with which prompts ask for them: "in NAME style".
-        out: the run directory; default runs/adapt/NAME.
+        source: folder of motions with captions, for which prompts ask with "in NAME style".
+        out: run directory; default runs/adapt/NAME.
         action: the clips show an action that the model does not know, instead of a style.
         full: train all weights; the result is a model file instead of an adapter.
         force: accept clips that drift upward or float.
@@ -73,8 +74,7 @@ def adapt(
         raise UserError(f"rank={rank}: give 1 or more")
     model = load_task(file, MotionGeneration)
     if "distillation" in model.config:
-        teacher = model.config["distillation"]["teacher"]
-        raise UserError(f"{base}: a distilled model. Adapt its teacher, {teacher}, and distill the result")
+        raise UserError(f"{base}: a distilled model. Adapt its teacher, and distill the result")
     if model.conditioned_on != "text":
         raise UserError(f"{base}: conditioned on {model.conditioned_on}; adapt needs a model conditioned on text")
     captions = sorted({text for note in Folder(str(source)).notes.values() for text in note.texts})
@@ -165,25 +165,24 @@ class _Samples(MotionSource):
         for first in range(0, SAMPLED, BATCH):
             made = generate(self.model, self.captions[first : first + BATCH], frames=frames, seed=first)
             for row, motion in enumerate(made, first):
-                assert motion.features is not None
                 split, name = "train" if row % 10 else "val", f"sample_{row:03d}"
                 yield Clip(name, motion.features, [motion.text], split, name, encoded=encoded)
 
 
 def _comparison(name: str, data: LessonData, before: MotionGeneration, after: MotionGeneration) -> str:
     data.setup("fit")
-    clips, made_by = data.train.clips, before.representation
+    clips = data.train.clips
     own, kept = (rows[:: -(-len(rows) // COMPARED)] for rows in data.halves())
     plain, taught = ({clips[row].captions[0]: clips[row] for row in rows} for rows in (kept, own))
     texts = [*list(taught)[:3], *(styled(text, name) for text in list(plain)[:3]), *list(plain)[:3]]
     pairs: list[Motion] = []
-    for motions in zip(generate(before, texts), generate(after, texts), strict=True):
-        pairs += [replace(motion, id=label) for label, motion in zip(("before", "after"), motions, strict=True)]
+    for old, new in zip(generate(before, texts), generate(after, texts), strict=True):
+        pairs += [replace(old, id="before"), replace(new, id="after")]
     beside: list[Motion] = []
     for text, clip in list(taught.items())[:4]:
-        joints = made_by.decode(torch.from_numpy(data.store.motion(clip)[: data.crop.longest()].copy())).numpy()
-        beside.append(Motion(joints, made_by.fps, made_by.skeleton, text, "your clip"))
-        beside += [replace(motion, id="model") for motion in generate(after, text, frames=len(joints))]
+        features = torch.from_numpy(data.store.motion(clip)[: data.crop.longest()].copy())
+        beside.append(decoded(before.representation, features, text, "your clip"))
+        beside += [replace(motion, id="model") for motion in generate(after, text, frames=len(features))]
     rows: list[list[str]] = []
     for what, chosen in ((f"loss on {len(own)} of your clips", own), (f"loss on {len(kept)} clips it knew", kept)):
         batch = collate(data.train.__getitems__([(int(row), -1) for row in chosen]))

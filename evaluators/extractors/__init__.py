@@ -56,9 +56,6 @@ class Extractor(ABC):
         return None
 
 
-# Networks trained here ------------------------------------------------------------------------------------------------
-
-
 class OwnExtractor(Extractor):
     """A network trained with `make train`, loaded from its checkpoint; raises `UserError` if it holds another one."""
 
@@ -74,23 +71,17 @@ class OwnExtractor(Extractor):
 
     def check(self, representation: Representation, dataset: str) -> None:
         own, learned = self.task.representation, self.task.facts.get("dataset", dataset)
-        if not self.reads(representation):
-            difference = (
-                f"{own.name} at {own.fps:g} frames per second, but the motions are {representation.name} at "
-                f"{representation.fps:g}"
+        if not self.reads(representation) or learned != dataset:
+            raise UserError(
+                f"extractor {self.path}: trained on {own.name} of {learned} at {own.fps:g} frames per second, but the "
+                f"motions are {representation.name} of {dataset} at {representation.fps:g}. Train one with make train "
+                f"EXP={self.recipes}/..."
             )
-        elif learned != dataset:
-            difference = f"the data set {learned}, but the motions are from {dataset}"
-        else:
-            return
-        raise UserError(
-            f"extractor {self.path}: trained on {difference}. Train one with make train EXP={self.recipes}/..."
-        )
 
-    def reads(self, representation: Representation) -> bool:
+    def reads(self, other: Representation) -> bool:
         """Returns whether the network reads motions in a representation."""
         own = self.task.representation
-        return (own.name, own.fps, own.features) == (representation.name, representation.fps, representation.features)
+        return (own.name, own.fps, own.features) == (other.name, other.fps, other.features)
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
         return {"features": self.task(features, mask)}
@@ -119,11 +110,11 @@ class OwnT2MExtractor(OwnExtractor):
     trained, recipes = T2MTask, "t2m"
     task: T2MTask
 
-    def reads(self, representation: Representation) -> bool:
+    def reads(self, other: Representation) -> bool:
         """Returns whether the network reads motions in a representation; it may see only features that both have."""
-        own, used = self.task.representation, self.task.network.used
-        part = (representation.part_of, representation.fps) == (own.name, own.fps) and used <= representation.features
-        return part or super().reads(representation)
+        own = self.task.representation
+        part = (other.part_of, other.fps) == (own.name, own.fps) and self.task.network.used <= other.features
+        return part or super().reads(other)
 
     def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
         return self.task.text(list(map(words, captions)) if self.task.learns_words else _tagged(self.path, tokens))
@@ -140,21 +131,14 @@ class OwnClassifierExtractor(OwnExtractor):
 
 
 def _tagged(path: Path, tokens: Sequence[Sequence[str] | None]) -> list[Sequence[str]]:
-    """Returns the tokens of captions. Raises `UserError` if a caption has no tokens."""
     tagged = [words for words in tokens if words is not None]
     if len(tagged) < len(tokens):
         raise UserError(f"extractor {path}: needs tagged words, but the data set has captions without them")
     return tagged
 
 
-# Networks released by the authors -------------------------------------------------------------------------------------
-
-
 class ReleasedExtractor(Extractor):
-    """A network with the weights that its authors released, from a folder of `FILES`, or from one file.
-
-    Raises `FileNotFoundError` or `UserError` if a file is missing, or has other content.
-    """
+    """A network with the weights that its authors released, from a folder of `FILES`, or from one file."""
 
     FILES: tuple[str, ...] = ()
     network: nn.Module
@@ -171,7 +155,6 @@ class ReleasedExtractor(Extractor):
         self.sha256 = hashes[0] if len(hashes) == 1 else hashlib.sha256("".join(hashes).encode()).hexdigest()
 
     def check(self, representation: Representation, dataset: str) -> None:
-        """Checks that the motions are from the data set of its training, with the features that it reads."""
         names = {representation.name} | ({representation.part_of} if self.used <= representation.features else set())
         if self.made_for[0] not in names or dataset != self.made_for[1]:
             raise UserError(
@@ -186,9 +169,8 @@ class ReleasedExtractor(Extractor):
 class T2MExtractor(ReleasedExtractor):
     """The evaluator of Guo et al. 2022, or MARDM's first evaluator, as released, from a folder with five files.
 
-    The files are finest.tar (from text_mot_match/model), mean.npy and std.npy (t2m_mean.npy and t2m_std.npy in MDM,
-    kit_... for KIT, eval_mean.npy and eval_std.npy in MARDM), our_vab_data.npy and our_vab_idx.pkl (GloVe).
-    `full_length` is a legacy option, see `WordVectors`: captions are treated as filling all 22 slots.
+    They are finest.tar (from text_mot_match/model), mean.npy and std.npy (t2m_... in MDM, kit_... for KIT, eval_... in
+    MARDM), our_vab_data.npy and our_vab_idx.pkl (GloVe). `full_length` is a legacy option, see `WordVectors`.
     """
 
     FILES = ("finest.tar", "mean.npy", "std.npy", "our_vab_data.npy", "our_vab_idx.pkl")
@@ -197,11 +179,10 @@ class T2MExtractor(ReleasedExtractor):
     def __init__(self, path: str, device: str | torch.device = "cpu", *, full_length: bool = False):
         super().__init__(path)
         self.network = load_t2m(self.path).to(device)
-        self.words, self.full_length = WordVectors.read(self.path), full_length
+        self.words, self.full_length, self.used = WordVectors.read(self.path), full_length, self.network.used
         human, kit = ("humanml-legacy-smpl22", "humanml3d"), ("humanml-legacy-kit21", "kit")
         made_for = {263: human, 67: human, 251: kit, 64: kit}
         self.made_for = made_for.get(len(self.network.mean), ("unknown features", "an unknown data set"))
-        self.used = self.network.used
 
     def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
         return self.network.text(self.words(_tagged(self.path, tokens), full_length=self.full_length))
@@ -241,8 +222,7 @@ class ClassifierExtractor(ReleasedExtractor):
     """A released action classifier, one of `CLASSIFIERS`, which reads rotations or joints of 24 SMPL joints.
 
     `random_start` is a legacy option of Guo et al. 2020 and all later work: the initial state of the humanact12 GRU is
-    drawn from a normal distribution, separately for features and scores. Here, the draw is a function of the motion, so
-    it is the same in any batch.
+    drawn from a normal distribution, separately for features and scores; here, as a function of the motion.
     """
 
     network: ActionGRU | UESTC | Unconstrained
@@ -279,7 +259,6 @@ class UnconstrainedExtractor(ClassifierExtractor):
 
     def reference(self) -> Tensor:
         """(N, 256) features of the reference motions."""
-        batches = self.real.split(64)
-        masks = [torch.ones(batch.shape[:2], dtype=torch.bool, device=batch.device) for batch in batches]
-        features = [self.network.published(batch, mask) for batch, mask in zip(batches, masks, strict=True)]
-        return torch.cat(features).float().cpu()
+        mask = torch.ones(self.real.shape[:2], dtype=torch.bool, device=self.real.device)
+        pairs = zip(self.real.split(64), mask.split(64), strict=True)
+        return torch.cat([self.network.published(*pair) for pair in pairs]).float().cpu()

@@ -12,8 +12,7 @@ class ActionGRU(nn.Module):
     """Action classifier with two GRU layers over joint positions; it classifies the state at the last real frame.
 
     The released weights provide the features and the accuracy in every HumanAct12 table. The authors draw the initial
-    state from a normal distribution in every call, so their numbers are random even for fixed motions. Here, the
-    initial `state` (layers, B, hidden) is zero, unless one is given.
+    state from a normal distribution in every call; here, `state` (layers, B, hidden) is zero, unless it is passed.
     """
 
     features = 30

@@ -8,6 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor
 from torchmetrics import MeanMetric, Metric
 
+from evaluators.collectives import world_size
 from evaluators.extractors.action_gru import ActionGRU
 from evaluators.extractors.stgcn import JointSTGCN
 from evaluators.extractors.training import ExtractorTask
@@ -28,7 +29,7 @@ class ClassifierTask(ExtractorTask):
 
     @classmethod
     def parts(cls, config: Config, representation: Representation, actions: Sequence[str]) -> dict[str, Any]:
-        """Builds the network for the skeleton and actions of the data; raises `UserError` with fewer than two."""
+        """Builds the network for the skeleton and the actions of the data, at least two, or raises `UserError`."""
         if len(actions) < 2:
             raise UserError(f"a classifier needs a data set with at least two actions, but this one has {len(actions)}")
         parents = representation.skeleton.parents
@@ -42,15 +43,13 @@ class ClassifierTask(ExtractorTask):
         return {"loss": MeanMetric(), "accuracy": ActionAccuracy()}
 
     def setup(self, stage: str) -> None:
-        """Sets up the task. Raises `UserError` if a clip for training or validation has no label."""
+        """Raises `UserError` if a clip for training or validation has no label."""
         super().setup(stage)
         data: MotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
         bare = [clip.id for clip in (*data.train.clips, *data.val.clips) if clip.action is None]
         if bare:
-            raise UserError(
-                f"{data.folder}: {len(bare)} clips have no action label, such as {bare[0]}. A classifier needs "
-                "labels: prepare the data without these clips"
-            )
+            which = f"{len(bare)} clips have no action label, such as {bare[0]}"
+            raise UserError(f"{data.folder}: {which}. Prepare the data without these clips")
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
         """Returns the cross-entropy of one batch, in nats."""
@@ -69,7 +68,7 @@ class ClassifierTask(ExtractorTask):
 
     def on_validation_epoch_start(self) -> None:
         """Gives all processes the running statistics of the first, which checkpoints contain."""
-        if torch.distributed.is_initialized() and torch.distributed.get_world_size() > 1:
+        if world_size() > 1:
             for buffer in self.network.buffers():
                 torch.distributed.broadcast(buffer, 0)
 

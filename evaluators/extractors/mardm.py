@@ -1,6 +1,6 @@
 """The CLIP-score evaluator of MARDM (Meng et al. 2025, "Rethinking Diffusion for Text-Driven Human Motion Generation").
 
-The networks load the released weights. MARDM's other evaluator is `evaluators.extractors.t2m` for 67 features.
+MARDM's other evaluator is `evaluators.extractors.t2m` for 67 features.
 """
 
 from collections.abc import Sequence
@@ -62,7 +62,6 @@ class MARDMClip(nn.Module):
         super().__init__()
         self.register_buffer("mean", mean.float(), persistent=False)
         self.register_buffer("std", std.float(), persistent=False)
-
         self.motion_encoder = _MotionEncoder(len(mean), width, _transformer(width, heads, hidden, layers))
         self.token_embedding = nn.Embedding(words, width)
         self.positional_embedding = nn.Parameter(torch.zeros(slots, width))

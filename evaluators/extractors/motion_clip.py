@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.distributed.nn.functional import all_gather
 from torchmetrics import Metric
 
+from evaluators.collectives import world_size
 from evaluators.extractors.training import ExtractorTask
 from evaluators.metrics.alignment import MotionsForText, TextsForMotion
 from evaluators.metrics.samples import SampleMetric
@@ -34,11 +35,9 @@ class MotionCLIP(nn.Module):
 
     Args:
         in_features, text_features, embedding_dim: D of the motions, C of the pooled condition, E of the joint space.
-        max_frames: longest motion that the length token supports.
         blind_features: number of features at the beginning of each frame that are set to 0. It is 3 in FLAME's
             code, whose motions begin with the root's translation: scores do not depend on position and height.
-        roughness: whether the absolute second differences of the features over time are inputs, too. They show
-            noise, which is lost in the mean over frames otherwise.
+        roughness: whether absolute second differences over time are inputs, too. They show noise.
     """
 
     def __init__(
@@ -71,9 +70,8 @@ class MotionCLIP(nn.Module):
         """Returns features (B, E) of normalized motions (B, F, D) with mask (B, F), of at most `max_frames`."""
         lengths = mask.sum(1)
         if x.shape[1] > self.max_frames and lengths.max() > self.max_frames:
-            raise UserError(
-                f"a motion has {int(lengths.max())} frames, but this motion-CLIP takes at most {self.max_frames}"
-            )
+            longest = int(lengths.max())
+            raise UserError(f"a motion has {longest} frames, but this motion-CLIP takes at most {self.max_frames}")
         x = F.pad(x[..., self.blind_features :], (self.blind_features, 0))
         if self.roughness:
             x = torch.cat([x, F.pad(x.diff(n=2, dim=1).abs(), (0, 0, 2, 0))[:, : x.shape[1]]], -1)
@@ -89,12 +87,7 @@ class MotionCLIP(nn.Module):
 
 
 def info_nce(
-    motion: Tensor,
-    text: Tensor,
-    logit_scale: Tensor,
-    *,
-    meaning: Tensor | None = None,
-    wrong_text: Tensor | None = None,
+    motion: Tensor, text: Tensor, logit_scale: Tensor, meaning: Tensor | None = None, wrong_text: Tensor | None = None
 ) -> Tensor:
     """Contrastive loss over the pairs of all processes: the mean of both cross-entropies.
 
@@ -124,8 +117,7 @@ def info_nce(
 
 
 def _of_all_processes(x: Tensor) -> Tensor:
-    several = torch.distributed.is_initialized() and torch.distributed.get_world_size() > 1
-    return torch.cat(all_gather(x)) if several else x
+    return torch.cat(all_gather(x)) if world_size() > 1 else x
 
 
 class PooledLoss(SampleMetric):
@@ -170,8 +162,8 @@ class MotionCLIPTask(ExtractorTask):
     def import_released(cls, state: Mapping[str, Tensor], config: Config) -> Self:
         """Imports FLAME's released motion-CLIP, by the authors' names, into the task of a recipe with the same sizes.
 
-        The pooler, with the random weights that the network was trained on, is loaded into the text encoder. Raises
-        `ValueError` if weights or sizes do not match, or there is no pooler.
+        The text encoder takes its pooler, with the random weights of the training. Raises `ValueError` if weights or
+        sizes do not match.
         """
         representation: Representation = instantiate(config["representation"])
         task = cls.build(config, representation)
@@ -187,7 +179,6 @@ class MotionCLIPTask(ExtractorTask):
         return self.network(self.representation.normalize(x), mask)
 
     def text(self, captions: Sequence[str]) -> Tensor:
-        """Returns features (B, E) of captions."""
         x = torch.zeros(len(captions), 1, self.representation.features, device=self.device)
         mask = torch.ones(len(captions), 1, dtype=torch.bool, device=self.device)
         return self.text_features(MotionBatch(x, mask, ids=list(captions), text=list(captions)))
@@ -199,7 +190,6 @@ class MotionCLIPTask(ExtractorTask):
         return self.network.text(cond.pooled)
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
-        """Returns the loss of one batch, with the pairs of the other processes as negatives."""
         self.seed_step(batch_idx)
         text, motion = self.text_features(batch), self.network(batch.x, batch.mask)
         loss = info_nce(motion, text, self.network.logit_scale)

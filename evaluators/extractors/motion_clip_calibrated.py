@@ -21,11 +21,9 @@ from flame_mdm.seeds import key
 
 NEAR_MISSES = 2  # Near-miss captions per motion and step, of different attributes if possible
 JITTER = 0.02  # standard deviation of joint positions, in meters, at which the strength of noise is 1
-FEATURE_NOISE = 0.3
-"""Standard deviation of normalized features at which it is 1; positions of joints then err by about 20 mm, too."""
+FEATURE_NOISE = 0.3  # the same of normalized features; joints then err by about 20 mm, too
 WEIGHT = 5.0  # weight of `calibration_error`, compared with `info_nce`
-LENGTH = 10.0
-"""Length of all features: the FID of noise of strength s, which moves all motions alike, is about (10 s)^2."""
+LENGTH = 10.0  # of all features: the FID of noise of strength s, which moves all motions alike, is about (10 s)^2
 
 
 class CalibratedMotionCLIPTask(MotionCLIPTask):
@@ -33,10 +31,9 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
 
     - Texts: motions of clips with the same captions or attributes are not negatives of each other's captions. Near-miss
       captions (see `near_misses`) are additional negatives.
-    - Motions: half of the motions have a noisy copy. The distance of both, scaled to length 1, is trained to be the
-      strength of the noise, drawn from [0, 1], small values more often. One half of the copies has white noise on the
-      joints and is encoded again, as motions from files are; the other half has white noise on normalized features, as
-      generated motions have. A copy that was only encoded again thus has distance 0.
+    - Motions: half of them have a noisy copy. The distance of both, scaled to length 1, is trained to be the strength
+      of the noise, drawn from [0, 1], small values more often. One half of the copies has white noise on the joints and
+      is encoded again, as motions from files are; the other half on normalized features, as generated motions have.
 
     Features have the same length, since the lengths that cosines leave undetermined would disturb Euclidean distances.
     """
@@ -50,17 +47,15 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
         """Raises `UserError` if the representation does not encode joints."""
         if not isinstance(representation, HumanML):
             raise UserError(
-                f"representation={representation.name}: {cls.__name__} adds noise to joints and encodes them again, "
-                "which takes a representation such as humanml_clean. Train another recipe of motion_clip/..."
+                f"representation={representation.name}: {cls.__name__} adds noise to joints and encodes them again. "
+                "Use a representation such as humanml_clean, or train another recipe of motion_clip/..."
             )
         return super().parts(config, representation, actions)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Returns features (B, E) of length `LENGTH`."""
         return LENGTH * F.normalize(super().forward(x, mask), dim=-1)
 
     def text(self, captions: Sequence[str]) -> Tensor:
-        """Returns features (B, E) of length `LENGTH`."""
         return LENGTH * F.normalize(super().text(captions), dim=-1)
 
     def on_fit_start(self) -> None:
@@ -87,13 +82,8 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
         copies = noisy_copies(self.representation, batch.x[chosen], batch.lengths[chosen], strength)
         motion = self.network(torch.cat([batch.x, copies]), torch.cat([batch.mask, batch.mask[chosen]]))
         motion, copy = motion.tensor_split([len(batch)])
-        contrast = info_nce(
-            motion,
-            text,
-            self.network.logit_scale,
-            meaning=torch.tensor(meaning, device=self.device),
-            wrong_text=wrong_text.unflatten(0, (-1, NEAR_MISSES)),
-        )
+        alike, wrong_text = torch.tensor(meaning, device=self.device), wrong_text.unflatten(0, (-1, NEAR_MISSES))
+        contrast = info_nce(motion, text, self.network.logit_scale, alike, wrong_text)
         error = calibration_error(motion[chosen], copy, strength.to(self.device))
         loss, temperature = contrast + WEIGHT * error, (-self.network.logit_scale).exp()
         values = {"loss": loss, "contrast": contrast, "calibration_error": error, "temperature": temperature}
@@ -102,9 +92,7 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
 
     def near_miss(self, name: str, number: int, step: int) -> str:
         """Returns a near miss of a clip, a function of (seed, step, clip, number); "" if the clip has none."""
-        attributes = self.near_misses[name]
-        if not attributes:
-            return ""
+        attributes = self.near_misses[name] or [[""]]
         draw = key("near miss", self.seed, step, name)
         texts = attributes[(draw + number) % len(attributes)]
         return texts[key("text", draw, number) % len(texts)]

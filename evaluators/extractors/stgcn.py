@@ -8,18 +8,17 @@ from torch import Tensor, nn
 from flame_mdm.representations.skeleton import SMPL24
 
 UNCONSTRAINED_JOINTS = (15, 12, 16, 18, 20, 17, 19, 21, 0, 1, 4, 7, 2, 5, 8)
-"""The 15 of the 24 SMPL joints that MDM's unconstrained evaluation uses; entry 8 is the pelvis."""
 UNCONSTRAINED_PARENTS = (1, -1, 1, 2, 3, 1, 5, 6, 1, 8, 9, 10, 8, 12, 13)
-"""Parents of these joints, with the neck as the root."""
+"""The 15 of the 24 SMPL joints that MDM's unconstrained evaluation uses, and their parents, with the neck as root."""
 TEMPORAL_KERNEL = 9
 
 
 def adjacency(parents: Sequence[int]) -> Tensor:
-    """Returns (3, V, V) matrices that gather from a vertex itself, its neighbors, and its neighbors nearer the center.
+    """Returns (3, V, V) matrices that gather from a vertex itself, its neighbors, and its neighbors nearer the root.
 
-    Entry (v, w) is the weight of v in w, divided by the number of vertices that contribute to w. The center is the root
-    of the tree. As in the authors' code, all vertices beyond distance 1 from the center are equally far, so the spatial
-    partition of Yan et al. 2018 (section 3.3) only affects the vertices next to the center.
+    Entry (v, w) is the weight of v in w, divided by the number of vertices that contribute to w. As in the authors'
+    code, all vertices beyond distance 1 from the root are equally far, so the spatial partition of Yan et al. 2018
+    (section 3.3) only affects the vertices next to it.
     """
     size, root = len(parents), parents.index(-1)
     linked = torch.eye(size)
@@ -37,11 +36,9 @@ def adjacency(parents: Sequence[int]) -> Tensor:
 class STGCN(nn.Module):
     """A stack of graph convolutions and temporal convolutions over 9 frames, averaged over frames and joints.
 
-    The dropout of the published training code is omitted. Past the end of a motion, the convolutions see zeros, as at
-    the end of the longest one, so features do not depend on the other motions of a batch. In the published evaluations,
-    all motions have 60 frames, and short clips repeat their last frame.
-
-    `in_channels` is C; `parents` is -1 for the center; `widths` and `strides` are those of the blocks.
+    The dropout of the published training code is omitted. Past the end of a motion, the convolutions see zeros, so that
+    features do not depend on the other motions of a batch. In the published evaluations, all motions have 60 frames,
+    and short clips repeat their last frame. `widths` and `strides` are those of the blocks.
     """
 
     def __init__(
@@ -79,12 +76,8 @@ class _Block(nn.Module):
         super().__init__()
         self.stride = stride
         self.gcn = nn.ModuleDict({"conv": nn.Conv2d(in_channels, width * partitions, 1)})
-        self.tcn = nn.Sequential(
-            nn.BatchNorm2d(width),
-            nn.ReLU(),
-            nn.Conv2d(width, width, (TEMPORAL_KERNEL, 1), (stride, 1), (TEMPORAL_KERNEL // 2, 0)),
-            nn.BatchNorm2d(width),
-        )
+        over_time = nn.Conv2d(width, width, (TEMPORAL_KERNEL, 1), (stride, 1), (TEMPORAL_KERNEL // 2, 0))
+        self.tcn = nn.Sequential(nn.BatchNorm2d(width), nn.ReLU(), over_time, nn.BatchNorm2d(width))
         self.residual: nn.Module | None = None
         if residual:
             same = in_channels == width and stride == 1
@@ -122,7 +115,7 @@ class Unconstrained(STGCN):
         return self.published(x[:, :, list(UNCONSTRAINED_JOINTS)] * x.new_tensor([1.0, -1.0, -1.0]), mask)
 
     def published(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Returns features (B, 256) of joints (B, F, 15, 3) as in the published reference motions, y down."""
+        """Returns features (B, 256) of joints (B, F, 15, 3) as in the reference motions, y down; 8 is the pelvis."""
         return super().forward(x - x[:, :, 8:9], mask)
 
 

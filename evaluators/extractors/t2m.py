@@ -3,6 +3,7 @@
 The authors' code returns embeddings in the order of descending length; here, they are in the order of the input.
 """
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple, Self
@@ -67,25 +68,20 @@ class WordVectors:
     def __call__(self, captions: Sequence[Sequence[str]], *, full_length: bool = False) -> Words:
         """Returns the text encoder's input for captions.
 
-        Captions are lists of "word/PART" tokens as in the files of the data sets, without start and end marks. Tokens
-        after the 20th are dropped. A word without a vector is unknown, and so is its part of speech. `full_length` is a
-        legacy option of MDM's code before January 2024, and of MFM's: every caption is treated as filling all 22 slots,
-        which lowers R-precision.
+        Captions are lists of "word/PART" tokens, without start and end marks. Tokens after the 20th are dropped. A word
+        without a vector is unknown, and so is its part of speech. `full_length` is a legacy option of MDM's code before
+        January 2024, and of MFM's: every caption is treated as filling all 22 slots, which lowers R-precision.
         """
-        rows = torch.full((len(captions), SLOTS), self.rows["unk"])
-        parts = torch.full((len(captions), SLOTS), PARTS_OF_SPEECH.index("OTHER"))
-        lengths = torch.full((len(captions),), SLOTS)
-        for i, caption in enumerate(captions):
-            tokens, filled = frame_tokens(caption)
-            for j, token in enumerate(tokens):
-                word, _, part = token.rpartition("/")
-                part = SPECIAL.get(word, part)
-                if word in self.rows:
-                    rows[i, j] = self.rows[word]
-                    parts[i, j] = PARTS_OF_SPEECH.index(part if part in PARTS_OF_SPEECH else "OTHER")
-            if not full_length:
-                lengths[i] = filled
-        return Words(self.vectors[rows], F.one_hot(parts, len(PARTS_OF_SPEECH)).float(), lengths)
+        framed, lengths = zip(*map(frame_tokens, captions), strict=True)
+        rows, parts = [], []
+        for token in itertools.chain(*framed):
+            word, _, part = token.rpartition("/")
+            rows.append(self.rows.get(word, self.rows["unk"]))
+            part = SPECIAL.get(word, part) if word in self.rows else "OTHER"
+            parts.append(PARTS_OF_SPEECH.index(part if part in PARTS_OF_SPEECH else "OTHER"))
+        slots, filled = (len(captions), SLOTS), [SLOTS] * len(captions) if full_length else lengths
+        one_hot = F.one_hot(torch.tensor(parts).view(slots), len(PARTS_OF_SPEECH)).float()
+        return Words(self.vectors[torch.tensor(rows).view(slots)], one_hot, torch.tensor(filled))
 
 
 class LearnedWords(nn.Module):
@@ -107,10 +103,10 @@ class LearnedWords(nn.Module):
 class T2MEvaluator(nn.Module):
     """Embeds motions and captions in a joint space, for R-precision, MM-Dist, FID and diversity on HumanML3D and KIT.
 
-    Features are in the data's units, and are normalized with the statistics `mean` and `std` (D,) of the released
-    weights, not with those of the data set. As in the authors' code for real motions, motions are padded to
-    `max_frames` with zeros after normalization; the convolutions see 3 frames past the end. The network sees the first
-    `used_features` (MARDM's 67, KIT: 64); None = all but the contacts.
+    Features are in the data's units, and are normalized with the `mean` and `std` (D,) of the released weights. As in
+    the authors' code for real motions, motions are padded to `max_frames` with zeros after normalization; the
+    convolutions see 3 frames past the end. The network sees the first `used_features` (MARDM's 67, KIT: 64); None = all
+    but the contacts.
     """
 
     mean: Tensor
@@ -141,11 +137,10 @@ class T2MEvaluator(nn.Module):
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
         """Returns embeddings (B, E) of motions (B, F, D) of 4 to `max_frames` frames, with mask (B, F)."""
         lengths = mask.sum(1)
-        if lengths.min() < UNIT or lengths.max() > self.max_frames:
-            raise UserError(
-                f"the T2M evaluator takes motions of {UNIT} to {self.max_frames} frames, "
-                f"but these have {int(lengths.min())} to {int(lengths.max())}"
-            )
+        shortest, longest = int(lengths.min()), int(lengths.max())
+        if shortest < UNIT or longest > self.max_frames:
+            takes = f"the T2M evaluator takes motions of {UNIT} to {self.max_frames} frames"
+            raise UserError(f"{takes}, but these have {shortest} to {longest}")
         used = slice(self.used)
         x = (x[..., used] - self.mean[used]) / self.std[used] * mask[..., None]
         x = pad_to(x[:, : self.max_frames], self.max_frames)
@@ -165,12 +160,8 @@ class _MovementEncoder(nn.Module):
     def __init__(self, in_features: int, hidden: int, latent: int):
         super().__init__()
         self.main = nn.Sequential(
-            nn.Conv1d(in_features, hidden, 4, 2, 1),
-            nn.Dropout(0.2),
-            nn.LeakyReLU(0.2),
-            nn.Conv1d(hidden, latent, 4, 2, 1),
-            nn.Dropout(0.2),
-            nn.LeakyReLU(0.2),
+            *(nn.Conv1d(in_features, hidden, 4, 2, 1), nn.Dropout(0.2), nn.LeakyReLU(0.2)),
+            *(nn.Conv1d(hidden, latent, 4, 2, 1), nn.Dropout(0.2), nn.LeakyReLU(0.2)),
         )
         self.out_net = nn.Linear(latent, latent)
 

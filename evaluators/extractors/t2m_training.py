@@ -28,10 +28,8 @@ class _MovementDecoder(nn.Module):
         super().__init__()
         self.in_net = nn.Linear(latent, latent)
         self.main = nn.Sequential(
-            nn.ConvTranspose1d(latent, hidden, 4, 2, 1),
-            nn.LeakyReLU(0.2),
-            nn.ConvTranspose1d(hidden, out_features, 4, 2, 1),
-            nn.LeakyReLU(0.2),
+            *(nn.ConvTranspose1d(latent, hidden, 4, 2, 1), nn.LeakyReLU(0.2)),
+            *(nn.ConvTranspose1d(hidden, out_features, 4, 2, 1), nn.LeakyReLU(0.2)),
         )
         self.out_net = nn.Linear(out_features, out_features)
 
@@ -57,15 +55,12 @@ def reconstruction_terms(network: T2MEvaluator, decoder: nn.Module, batch: Motio
 
 
 def matching_loss(motion: Tensor, text: Tensor, margin: float, fits: Tensor | None = None) -> Tensor:
-    """Contrastive loss () of Guo et al. 2022 (Hadsell et al. 2006, eq. 4, without its factor 1/2).
+    """Contrastive loss () of Guo et al. 2022 (Hadsell et al. 2006, eq. 4, without its factor 1/2), of B pairs (B, E).
 
-    Each text is compared with its own motion, and with that of the nearest previous pair that it does not fit. The
-    authors shift the motions by a random number of places instead, which also pushes matching pairs apart.
-
-    Args:
-        motion, text: (B, E) embeddings.
-        margin: Euclidean distance beyond which a wrong pair adds no loss.
-        fits: (B, B) bool, True = the text of the row describes the motion of the column; None = only its own.
+    Each text is compared with its own motion, and with that of the nearest previous pair that it does not fit, which
+    adds no loss if it is farther than `margin`. The authors shift the motions by a random number of places instead,
+    which also pushes matching pairs apart. `fits` (B, B) is whether the text of the row describes the motion of the
+    column; None = only its own.
     """
     count = len(motion)
     own = torch.arange(count, device=motion.device)
@@ -95,10 +90,8 @@ class T2MTask(ExtractorTask):
     """Trains the evaluator (`make train EXP=t2m/...`).
 
     Until step `movement_steps`, the movement encoder is trained with a decoder to reconstruct motions. It is then
-    frozen, and the encoders of text and motion are trained to match. Checkpoints contain the word vectors.
-
-    Many clips may share a caption, so a motion is a wrong one for a text only if the text is not among its captions.
-    The last 4 features of the motions are contacts.
+    frozen, and the encoders of text and motion are trained to match. A motion is a wrong one for a text only if the
+    text is not among its captions. Checkpoints contain the word vectors.
 
     Args:
         words: folder of our_vab_data.npy and our_vab_idx.pkl, see `WordVectors`, only read for training; "learned" for
@@ -139,12 +132,8 @@ class T2MTask(ExtractorTask):
         return {"network": instantiate(config["task"]["network"], **statistics), "condition": Unconditional()}
 
     def metrics(self) -> dict[str, Metric]:
-        return {
-            "loss": MatchingLoss(self.margin),
-            "mm_dist": MultimodalDistance(),
-            "motions_for_text": MotionsForText(),
-            "reconstruction": MeanMetric(),
-        }
+        of_pairs = {"mm_dist": MultimodalDistance(), "motions_for_text": MotionsForText()}
+        return {"loss": MatchingLoss(self.margin), **of_pairs, "reconstruction": MeanMetric()}
 
     def setup(self, stage: str) -> None:
         """Sets up the task, reads the word vectors, and collects the tagged words of all captions.
@@ -169,7 +158,7 @@ class T2MTask(ExtractorTask):
             kind = "captions" if self.learns_words else "captions with tagged words"
             raise UserError(
                 f"{data.folder}: {len(bare)} clips have no {kind}, such as {bare[0]}. Choose a data set with captions; "
-                "tagged words, as in HumanML3D and KIT-ML, are not needed with task.words=learned"
+                "tagged words are not needed with task.words=learned"
             )
 
     @property
@@ -195,7 +184,6 @@ class T2MTask(ExtractorTask):
         return self.network.text(self.words(tokens))
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
-        """Returns the loss of one batch: reconstruction until `movement_steps`, then matching."""
         self.seed_step(batch_idx)
         self.network.movement_encoder.train(self._learns_movement)
         if self._learns_movement:

@@ -19,11 +19,7 @@ from flame_mdm.task import Task
 
 
 class ExtractorTask(Task):
-    """Task that trains a network whose features evaluate motions, and the resulting feature extractor.
-
-    The text encoder is independent of that of the evaluated model. An extractor can only measure motions in the
-    representation it was trained on.
-    """
+    """Task that trains a network whose features evaluate motions, independent of the parts of the evaluated model."""
 
     network: nn.Module
 

@@ -1,7 +1,6 @@
 """Metrics of generated motions: torchmetrics classes whose inputs have common names.
 
-Every `update` takes some of these inputs by name. A batch holds B generated and R real motions; B and R may be any
-size.
+Every `update` takes some of these inputs by name. A batch holds B generated and R real motions.
 
 | name | shape | content |
 |---|---|---|
@@ -12,8 +11,8 @@ size.
 | logits | (B, A) | class scores of generated motions |
 | labels | (B,) int64 | classes they were generated for |
 | groups | (B,) int64 | keys of the prompts, if several motions are generated per prompt |
-| requested | B mappings | attributes of the motions as requested, see `attributes` |
-| sides | B pairs of strings | requested content and side of the motions of the Bandai set, see `attributes` |
+| requested | B mappings | requested attributes, see `attributes` |
+| sides | B pairs of strings | requested content and side, in the Bandai set, see `attributes` |
 | joints | (B, F, J, 3) | generated motions in meters, y up, floor at y = 0 |
 | mask | (B, F) bool | True = real frame of a generated motion |
 | contacts | (B, F, 4) bool | contacts of `skeleton.feet` as generated, if the features have them |
@@ -65,13 +64,13 @@ def required_inputs(metric: Metric) -> list[str]:
     return [name for name, is_required in inputs_of(metric).items() if is_required]
 
 
-def update_metrics(metrics: Mapping[str, Metric], **features: Any) -> None:
+def update_metrics(metrics: Mapping[str, Metric], **inputs: Any) -> None:
     """Updates each metric with the inputs that it takes. Raises `UserError` if a required input is missing."""
     for name, metric in metrics.items():
-        missing = [needed for needed in required_inputs(metric) if needed not in features]
-        if missing:
-            raise missing_input(name, metric, missing[0])
-        metric.update(**{name: features[name] for name in inputs_of(metric) if name in features})
+        for needed in required_inputs(metric):
+            if needed not in inputs:
+                raise missing_input(name, metric, needed)
+        metric.update(**{needed: inputs[needed] for needed in inputs_of(metric) if needed in inputs})
 
 
 def missing_input(name: str, metric: Metric, needed: str) -> UserError:

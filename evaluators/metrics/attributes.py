@@ -1,7 +1,7 @@
 """Attributes of a motion, read from its joints by geometric rules: action, side, count, direction, speed, amount.
 
-The rules are independent of how a motion was generated. They read what a person would see in a clip of a few seconds
-that shows one action of the synthetic set; each threshold is stated next to its rule. The joints are the 22 of SMPL.
+They read what a person would see in a clip of a few seconds that shows one action of the synthetic set; each threshold
+is stated next to its rule. The joints are the 22 of SMPL.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,16 +18,14 @@ HIPS, ANKLES, TOES, COLLARS = (1, 2), (7, 8), (10, 11), (13, 14)
 SHOULDERS, ELBOWS, WRISTS = (16, 17), (18, 19), (20, 21)
 SIDES = ("left", "right")
 BONES = [(1, 4), (2, 5), (4, 7), (5, 8), (16, 18), (17, 19), (18, 20), (19, 21)]  # thighs, shins, arms
-
 ATTRIBUTES = ("action", "side", "count", "direction", "speed", "amount")
 
 
 def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
     """Reads one clip (F, 22, 3) of SMPL's joints in meters, y up, with any position and heading.
 
-    Returns:
-        "action", and those of "side", "count", "direction", "speed", "amount" that the action has; empty if no action
-        of the set is recognized, for example in noise, or if the joints do not form a body.
+    Returns "action" and the others of `ATTRIBUTES` that it has; {} if no action of the set is recognized, for example
+    in noise, or if the joints do not form a body.
     """
     joints = np.asarray(joints, np.float64)
     if len(joints) < fps or not np.isfinite(joints).all():
@@ -47,8 +45,7 @@ def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
     stride = ((smooth[:, TOES[0]] - smooth[:, TOES[1]])[:, [0, 2]] * forward).sum(-1)
     if jumps and np.abs(stride).max() < 0.25 and np.linalg.norm((smooth[-1] - smooth[0])[PELVIS, [0, 2]]) > 0.45:
         return {"action": "leap"}
-    walked = _locomotion(smooth, forward, left, turned, fps)
-    if walked:
+    if walked := _locomotion(smooth, forward, left, turned, fps):
         return walked
     if jumps:
         return {"action": "jump", "count": jumps}
@@ -56,16 +53,14 @@ def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
     sway -= gaussian_filter1d(sway, 0.5 * fps, mode="nearest")
     if _count(sway, 0.035, -0.035) + _count(-sway, 0.035, -0.035) >= 3:
         return {"action": "dance"}
-    kicked = _kick(smooth, floor, forward)
-    if kicked:
+    if kicked := _kick(smooth, floor, forward):
         return kicked
     hands = smooth[:, WRISTS, 1] - floor
     side = int(hands.min(0).argmin())
     if hands[:, side].min() < 0.42 and np.ptp(hands[:, side]) > 0.3:
         return {"action": "pick", "side": SIDES[side]}
     pelvis = smooth[:, PELVIS, 1]
-    squats = _count(np.percentile(pelvis, 95) - pelvis, 0.18, 0.1)
-    if squats:
+    if squats := _count(np.percentile(pelvis, 95) - pelvis, 0.18, 0.1):
         return {"action": "squat", "count": squats}
     if _tilt(smooth).max() > 28:
         return {"action": "bow"}
@@ -91,9 +86,8 @@ def _is_a_body(joints: np.ndarray, smooth: np.ndarray) -> bool:
     bones = np.stack([np.linalg.norm(smooth[:, a] - smooth[:, b], axis=-1) for a, b in BONES])
     length = np.median(bones, 1, keepdims=True)
     steady = (np.abs(bones / np.maximum(length, 1e-6) - 1) < 0.25).mean() > 0.9
-    sized = bool(((length > 0.15) & (length < 0.6)).all())
     calm = np.median(np.linalg.norm(joints - smooth, axis=-1)) < 0.02
-    return bool(steady and sized and calm)
+    return bool(steady and calm and length.min() > 0.15 and length.max() < 0.6)
 
 
 def _stands(smooth: np.ndarray) -> bool:
@@ -210,11 +204,10 @@ def _arms(smooth: np.ndarray, forward: np.ndarray, fps: float) -> dict[str, str 
 
     reach = np.linalg.norm(arm[..., [0, 2]], axis=-1) / length
     side = int(reach.max(0).argmax())
-    punches = _count(reach[:, side], 0.8, 0.6)
-    if punches:
+    if punches := _count(reach[:, side], 0.8, 0.6):
         return {"action": "punch", "side": SIDES[side], "count": punches}
-    claps = _count(-np.linalg.norm(smooth[:, WRISTS[0]] - smooth[:, WRISTS[1]], axis=-1), -0.175, -0.28)
-    if claps:
+    apart = np.linalg.norm(smooth[:, WRISTS[0]] - smooth[:, WRISTS[1]], axis=-1)
+    if claps := _count(-apart, -0.175, -0.28):
         return {"action": "clap", "count": claps}
     moved = np.ptp(smooth[:, [*WRISTS, *ANKLES, HEAD]], axis=0)
     return {"action": "stand"} if np.linalg.norm(moved, axis=-1).max() < 0.35 else {}

@@ -17,8 +17,8 @@ Value = float | dict[str, float | None] | None
 class SampleMetric(Metric):
     """Base class of all metrics: keeps one row per sample and computes its value from all rows, sorted by key.
 
-    The value therefore does not depend on the batches, their order or the number of processes. Processes may hold any
-    number of samples, including none. `value` is the formula. Several metrics take `seed`, that of their random draws.
+    The value therefore does not depend on the batches, their order or the number of processes, of which some may have
+    no samples. `value` is the formula. Several metrics take `seed`, that of their random draws.
 
     Attributes:
         states: names of the kept rows, in the order of the arguments of `value`. Each row also has a key. Unless
@@ -71,35 +71,24 @@ class SampleMetric(Metric):
             values = dim_zero_cat(getattr(self, name))[order]
             if values.is_floating_point():
                 values = values.double()
-                bad = int((~values.isfinite().reshape(len(values), -1).all(1)).sum())
-                if bad:
-                    raise self.error(
-                        f"{bad} of {len(values)} rows of {name!r} are not finite. "
-                        "Look for damaged motions in the data, or a model that diverged"
-                    )
+                if bad := int((~values.isfinite().reshape(len(values), -1).all(1)).sum()):
+                    raise self.error(f"{bad} of {len(values)} rows of {name!r} are not finite. Did the model diverge?")
             sorted_rows.append(values)
         return sorted_rows if len(order) else []
 
     def order(self, keys: str) -> Tensor:
         """Returns the indices that sort samples by their keys. Raises `UserError` if two samples have the same key."""
         values, order = dim_zero_cat(getattr(self, keys)).sort()
-        twice = int((values[1:] == values[:-1]).sum())
-        if twice:
-            raise self.error(
-                f"{twice} samples were given twice ({keys}). Evaluate each once: use a sampler that does not pad, and "
-                "a different key for each sample of a prompt"
-            )
+        if twice := int((values[1:] == values[:-1]).sum()):
+            raise self.error(f"{twice} samples were given twice ({keys}). Evaluate each once, with a key of its own")
         return order
 
     def by_group(self, groups: Tensor, samples: int) -> Tensor:
         """Returns the indices (C, S) of the samples of each group; raises `UserError` if one has not S samples."""
         names, sizes = groups.unique(return_counts=True)
-        wrong = int((sizes != samples).sum())
-        if wrong:
-            raise self.error(
-                f"{wrong} of {len(names)} prompts do not have {samples} motions but {int(sizes.min())} to "
-                f"{int(sizes.max())}. Generate {samples} for each"
-            )
+        if wrong := int((sizes != samples).sum()):
+            have = f"{wrong} of {len(names)} prompts do not have {samples} motions"
+            raise self.error(f"{have} but {int(sizes.min())} to {int(sizes.max())}. Generate {samples} for each")
         return groups.argsort(stable=True).unflatten(0, (len(names), samples))
 
     def error(self, message: str) -> UserError:
@@ -118,8 +107,8 @@ class SampleMetric(Metric):
         frames = joints.detach()[mask]
         motions = list(frames.split(mask.sum(1).tolist()))
         # A sum is finite only if all numbers are, and is faster to compute.
-        bad = 0 if frames.sum().isfinite() else sum(not bool(motion.isfinite().all()) for motion in motions)
-        if bad:
+        if not frames.sum().isfinite():
+            bad = sum(not bool(motion.isfinite().all()) for motion in motions)
             raise self.error(f"{bad} of {len(motions)} motions are not finite. Did the model diverge?")
         return motions
 

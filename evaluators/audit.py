@@ -63,7 +63,7 @@ def audit(request: EvaluationRequest, cache: Path, resamples: int) -> AuditCard:
         "extractor": extractor and {"sha256": extractor.sha256, "name": name},
         "protocol": {"name": protocol.name, "version": protocol.version},
         "data": {name: info[name] for name in ("dataset", "fingerprint", "representation")}
-        | {"frames": [data.crop.shortest(), data.crop.longest()]},
+        | {"frames": [data.crop.min_frames, data.crop.longest()]},
         "split": request.split,
         "seed": request.seed,
         "motions": len(rows),

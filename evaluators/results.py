@@ -47,7 +47,7 @@ def make_result(request: EvaluationRequest, plan: Plan) -> Result:
     """Returns a result with the provenance of its values, which are still to be measured."""
     info, extractor, protocol = plan.data.store.info, plan.extractor, plan.protocol
     device, crop, short = plan.representation.mean.device, plan.data.crop, plan.clips.too_short
-    reason = f"{request.split} clips shorter than {crop.shortest()} frames"
+    reason = f"{request.split} clips shorter than {crop.min_frames} frames"
     excluded = info["excluded"] | ({reason: short} if short else {})
     card = card_of(info["dataset"], extractor.sha256 if extractor else None)
     return Result(
@@ -60,7 +60,7 @@ def make_result(request: EvaluationRequest, plan: Plan) -> Result:
             dataset=info["dataset"],
             representation=info["representation"],
             fingerprint=info["fingerprint"],
-            frames=[crop.shortest(), crop.longest()],
+            frames=[crop.min_frames, crop.longest()],
             excluded=excluded,
         ),
         seed=request.seed,

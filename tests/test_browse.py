@@ -67,7 +67,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
 
 def page_of(store: Store, path: Path) -> Page:
     clips = [clip for family in find(store.clips, None, "") for clip in family]
-    write_page(path, store, HumanML(), clips, HOSTILE)
+    write_page(path, store, HumanML(), clips, HOSTILE, None)
     return Page(path)
 
 

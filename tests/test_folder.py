@@ -339,7 +339,7 @@ def test_what_a_folder_lacks_is_reported(tmp_path: Path, monkeypatch, capsys):
     output = prepared()
     assert Store(tmp_path / "data" / "mine-humanml-clean-smpl22").info["dataset"] == "mine"
     assert "all train clips are too short: lower data.crop.min_frames" in output
-    assert "no captions: add captions.csv and prepare again with force=true" in output
+    assert "no captions: add captions.csv and prepare with force=true" in output
     assert "changed since" not in prepared()
     write_table(tmp_path / "mine", [{"id": str(n), "text": "walks"} for n in range(10)])
     future = time.time() + 10

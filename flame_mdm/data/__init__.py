@@ -31,8 +31,7 @@ class Clip:
     split: Split  # mirrored copies and cuts of a take belong to the split of that take
     source: str  # the take the clip comes from; clips of one source are never in two splits
     action: int | None = None  # index into the data set's `actions`, or None
-    # exact facts about the motion, if the data set knows them (side, count, direction, speed, tagged words of the
-    # captions ...); plain values that JSON can hold
+    # exact facts about the motion, such as side, count and direction, or tagged words; values that JSON can hold
     attributes: Mapping[str, Any] = field(default_factory=dict)
     # if the release contains features, the name of the representation that `motion` (F, D) is in; the features are
     # stored unchanged. If empty, `motion` is raw.
@@ -113,10 +112,7 @@ class MotionSource(ABC):
     def check_fps(self, fps: float, published: float) -> None:
         """Raises `UserError` if a set that is not resampled is requested at another frame rate."""
         if fps != published:
-            raise UserError(
-                f"{self.name} has {published:g} frames per second, but representation.fps is {fps:g}. Set "
-                f"representation.fps={published:g}"
-            )
+            raise UserError(f"{self.name} has {published:g} frames per second, not {fps:g}: set representation.fps")
 
 
 def required(path: Path, get_it: str) -> Path:

@@ -105,7 +105,7 @@ class LessonData(MotionDataModule):
         """Returns the indices of the user's training clips, and of the others."""
         is_kept = np.array([clip.id.startswith(KEPT) for clip in self.train.clips])
         if is_kept.all():
-            raise UserError(f"{self.source.name}: all clips are shorter than {self.crop.shortest()} frames")
+            raise UserError(f"{self.source.name}: all clips are shorter than {self.crop.min_frames} frames")
         return [np.flatnonzero(~is_kept), np.flatnonzero(is_kept)]
 
     def counts(self, store: Store) -> list[str]:

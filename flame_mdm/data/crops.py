@@ -19,19 +19,14 @@ from flame_mdm.seeds import integers, key
 
 Draw = tuple[int, int]  # (index of a clip, number of the batch that it is drawn for; -1 in evaluation)
 Sample = tuple[str, Tensor, str | None, int | None]  # (id, x (F, D), caption, action), input of `collate`
-Below = Callable[[Any], Any]
-"""Draws uniform integers from 0 up to, and not including, its argument: an integer, or one for each of B clips."""
+Below = Callable[[Any], Any]  # draws integers from 0 up to, and not including, its argument: one, or (B,)
 
 
 class Crop(ABC):
     """A rule that selects the frames of a training sample from a clip of any length."""
 
-    min_frames: int
-    max_frames: int
-
-    def shortest(self) -> int:
-        """Returns the minimum number of frames of a clip."""
-        return self.min_frames
+    min_frames: int  # of a clip
+    max_frames: int  # of a sample
 
     def longest(self) -> int:
         """Returns the maximum number of frames of a sample."""
@@ -111,7 +106,7 @@ class Clips(Dataset[Sample]):
     def __init__(self, store: Store, split: Split, *, representation: Representation, crop: Crop, seed: int):
         self.store, self.representation, self.crop, self.seed = store, representation, crop, seed
         of_split = [clip for clip in store.clips if clip.split == split]
-        self.clips = [clip for clip in of_split if clip.length >= crop.shortest()]
+        self.clips = [clip for clip in of_split if clip.length >= crop.min_frames]
         self.too_short = len(of_split) - len(self.clips)
         self.frames = np.array([clip.length for clip in self.clips], np.int64)
         self.lengths = np.minimum(self.frames, crop.longest())

@@ -7,6 +7,7 @@ batches as an uninterrupted one.
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Literal
 
@@ -43,14 +44,12 @@ class TrainingBatches(Sampler[list[Draw]]):
 
     def __iter__(self) -> Iterator[list[Draw]]:
         per_pass = max(1, len(self.lengths) // self.batch_size)
-        number = self.first * self.world + self.rank
         current, batches = -1, []
-        while True:
+        for number in count(self.first * self.world + self.rank, self.world):
             if number // per_pass != current:
                 current = number // per_pass
                 batches = self.batches(current, per_pass)
             yield [(int(index), number) for index in batches[number % per_pass]]
-            number += self.world
 
     def batches(self, number: int, per_pass: int) -> list[np.ndarray]:
         """Returns the batches of one pass over the data, as indices of clips."""
@@ -104,7 +103,7 @@ class MotionDataModule(LightningDataModule):
         pad_multiple: int = 1,
     ):
         super().__init__()
-        frames = (crop.shortest(), crop.longest()) if isinstance(crop, Crop) else (None,)
+        frames = (crop.min_frames, crop.longest()) if isinstance(crop, Crop) else (None,)
         is_crop = all(type(number) is int and 1 <= number <= MAX_FRAMES for number in frames)
         for key, value, is_valid, remedy in (
             ("batch_size", batch_size, batch_size >= 1, "a batch has at least one clip"),
@@ -156,17 +155,15 @@ class MotionDataModule(LightningDataModule):
         prepared = store.info | store.info.get("source", {})
         if differing := [name for name in recipe if prepared.get(name) != recipe[name]]:
             there, here = (", ".join(f"{name}={of.get(name)}" for name in differing) for of in (prepared, recipe))
-            raise UserError(
-                f"{self.folder}: prepared with {there}, but the recipe has {here}. Prepare it again with force=true, "
-                "choose another data_root or data.name, or change the recipe"
-            )
+            advice = "Prepare it again with force=true, choose another data_root or data.name, or change the recipe"
+            raise UserError(f"{self.folder}: prepared with {there}, but the recipe has {here}. {advice}")
         self.representation.mean.copy_(torch.from_numpy(store.mean))
         self.representation.std.copy_(torch.from_numpy(store.std))
         return store
 
     def counts(self, store: Store) -> list[str]:
         """Returns lines about the number of clips of each split that are long enough for the crop rule."""
-        shortest = self.crop.shortest()
+        shortest = self.crop.min_frames
         used = Counter(clip.split for clip in store.clips if clip.length >= shortest)
         short = {split: total - used[split] for split, total in store.info["clips"].items()}
         counts = (
@@ -181,9 +178,7 @@ class MotionDataModule(LightningDataModule):
             if not used[split]
         ]
         if not store.info["actions"] and not any(clip.captions for clip in store.clips):
-            advice.append(
-                "no captions: add captions.csv and prepare again with force=true, or train with condition=none"
-            )
+            advice.append("no captions: add captions.csv and prepare with force=true, or train with condition=none")
         return ["clips: " + ", ".join(counts), *(() if store.info["published_split"] else advice)]
 
     def captions(self) -> list[str]:
@@ -195,7 +190,7 @@ class MotionDataModule(LightningDataModule):
         self.store = self.open()
         self.train, self.val, self.test = (self.clips(split) for split in ("train", "val", "test"))
         if not len(self.train):
-            raise UserError(f"{self.folder}: no training clip has {self.crop.shortest()} frames or more")
+            raise UserError(f"{self.folder}: no training clip has {self.crop.min_frames} frames or more")
         self.features = None
         self.choose_device()
 

@@ -4,7 +4,6 @@ import csv
 import io
 import math
 import os
-import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -36,8 +35,6 @@ from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.representations.smpl import SMPL
 from flame_mdm.safe_io import naming, read_text, regular_file
 
-FORBIDDEN_CHARACTERS = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
-"""Characters not allowed in the name of a motion: names are stored as text, one clip per line."""
 LOOK_FPS = 20.0  # frame rate to which `Folder.check` resamples motions
 SPLITTABLE = 10  # number of motions from which on each split has at least one
 TABLE = "captions.csv"
@@ -125,20 +122,17 @@ class Folder(MotionSource):
     def _check_upright(self) -> None:
         for skeleton, motions in self._upright.items():
             if np.median(motions) < 0.3:
-                raise UserError(
-                    f"{self.path}: the body is lying down in most motions ({skeleton}); set the axis `up` in "
-                    "skeleton.yaml"
-                )
+                what = f"the body is lying down in most motions ({skeleton})"
+                raise UserError(f"{self.path}: {what}; set the axis `up` in skeleton.yaml")
 
     @cached_property
     def files(self) -> dict[str, Path]:
         """Path in the folder without extension -> file, sorted."""
         files: dict[str, Path] = {}
-        for path in sorted(self.path.rglob("*")) if self.path.is_dir() else ():
+        for path in sorted(self.path.rglob("*")):
             if path.suffix.lower() in ENDINGS:
                 name = path.relative_to(self.path).with_suffix("").as_posix()
-                if FORBIDDEN_CHARACTERS.search(name):
-                    shown = printable(str(path))
+                if (shown := printable(name)) != name:
                     raise UserError(f"{shown}: its name contains control characters or is not UTF-8. Rename it")
                 regular_file(path)
                 if name in files:
@@ -151,8 +145,9 @@ class Folder(MotionSource):
         return self.not_excluded(dict(sorted(files.items())), self.path)
 
     def changed(self, store: Path) -> list[str]:
-        when, files = store.stat().st_mtime, self.path.rglob("*") if self.path.is_dir() else ()
-        newer = [str(f.relative_to(self.path)) for f in files if f.is_file() and f.stat().st_mtime > when]
+        when = store.stat().st_mtime
+        files = [path for path in self.path.rglob("*") if path.is_file() and path.stat().st_mtime > when]
+        newer = [str(path.relative_to(self.path)) for path in files]
         return [f"{self.path}: {some(newer)} changed since: prepare with force=true to read them"] if newer else []
 
     @cached_property

@@ -19,8 +19,7 @@ from flame_mdm.signals import ignore_interrupts
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
-PATIENCE = 2.0
-"""Seconds of work after which processes are started if their number is not given: starting one takes that long."""
+PATIENCE = 2.0  # seconds of work before processes are started if their number is not given; starting takes as long
 
 
 def cores() -> int:

@@ -14,8 +14,7 @@ from flame_mdm.data.crops import Clips, Draw
 from flame_mdm.data.store import Store
 from flame_mdm.representations import Representation
 
-SHARE = 4
-"""With `data.resident=auto`, data sets that take at most 1 / SHARE of the free memory of the device are kept there."""
+SHARE = 4  # data.resident=auto: data sets that take at most 1 / SHARE of the free memory of the device are kept there
 CHUNK = 1 << 16
 
 
@@ -72,8 +71,7 @@ class ResidentLoader:
         return len(self.batches)  # type: ignore[arg-type]  # those of training have none
 
     def __iter__(self) -> Iterator[MotionBatch]:
-        for draws in self.batches:
-            yield self._batch(draws)
+        return map(self._batch, self.batches)
 
     def _batch(self, draws: list[Draw]) -> MotionBatch:
         rows = np.array([index for index, _ in draws])

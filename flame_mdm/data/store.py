@@ -271,10 +271,7 @@ def _encoded(clips: Iterable[Clip], representation: Representation, workers: int
 
 
 def _encode(encoder: Representation, named: tuple[str, str, np.ndarray]) -> np.ndarray:
-    """Returns the features of a motion, given with its name and the representation it is in, if any.
-
-    Published features are only checked.
-    """
+    """Returns the features of a motion with its name and its representation, if it is published as features."""
     name, encoded, motion = named
     if encoded and encoded not in (encoder.name, encoder.part_of):
         raise UserError(f"clip {name}: published as {encoded}, which cannot be converted to {encoder.name}")

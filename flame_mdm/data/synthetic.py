@@ -14,7 +14,7 @@ import numpy as np
 
 from flame_mdm.data import Clip, MotionSource, hashed_split
 from flame_mdm.data.parallel import in_order
-from flame_mdm.data.synthetic_motions import gestures, locomotion, postures
+from flame_mdm.data.synthetic_motions import gestures, locomotion
 from flame_mdm.data.synthetic_motions.body import Attributes, Body
 from flame_mdm.errors import UserError
 from flame_mdm.safe_io import read_yaml
@@ -22,8 +22,7 @@ from flame_mdm.safe_io import read_yaml
 MIN_SECONDS, MAX_SECONDS = 2.0, 3.0  # durations of clips
 AT_ONCE = 32  # number of clips that a process makes at a time
 CAPTIONS = 8  # captions per clip
-PARTIAL = 0.25
-"""Share of the training clips whose captions leave out some attributes; those of val and test state all of them."""
+PARTIAL = 0.25  # share of the training clips whose captions leave out attributes; those of val and test state all
 UNSAID = {"speed": "normal", "amount": "quarter"}  # values that a caption need not state
 CHOICE = re.compile(r"\[([^\[\]]*)\]")
 SLOT = re.compile(r"\{(\w+)(?:\.(\w+))?\}")
@@ -84,14 +83,13 @@ def _sentence(rng: np.random.Generator, attributes: Attributes) -> tuple[str, se
         while CHOICE.search(text):
             text = CHOICE.sub(lambda choice: _one(rng, choice[1].split("|")), text)
         text = SLOT.sub(fill, text)
-    text = _conjugated(rng, text, who, bool(subject.get("plural")))
+    text = _conjugated(rng, text, grammar["tenses"][subject["verbs"] if who else "bare"])
     return " ".join(text.split()), {name for name in said if UNSAID.get(name) != attributes[name]}
 
 
-def _conjugated(rng: np.random.Generator, text: str, who: str, plural: bool) -> str:
-    """Returns the text with its verbs in one tense; without a subject, as imperatives or participles."""
-    kind = "plural" if plural else "singular"
-    auxiliary, column = _one(rng, content()["tenses"][kind if who else "bare"])
+def _conjugated(rng: np.random.Generator, text: str, tenses: Sequence[tuple[str, int]]) -> str:
+    """Returns the text with its verbs in one of the tenses."""
+    auxiliary, column = _one(rng, tenses)
 
     def form(verb: re.Match[str]) -> str:
         nonlocal auxiliary
@@ -140,22 +138,22 @@ ACTIONS = {
     "walk": Action(locomotion.walk, 6, {"direction": WAYS, "speed": ("slow", "normal", "fast")}),
     "run": Action(locomotion.run, 1, FORWARD),
     "turn": Action(locomotion.turn, 3, {"direction": ("left", "right"), "amount": ("quarter", "half")}),
-    "jump": Action(postures.jump, 2, UP_TO_THREE),
+    "jump": Action(gestures.jump, 2, UP_TO_THREE),
     "wave": Action(gestures.wave, 2, ANY_SIDE),
     "raise": Action(gestures.raise_arms, 2, ANY_SIDE),
-    "kick": Action(postures.kick, 2, SIDE | ONCE_OR_TWICE),
+    "kick": Action(gestures.kick, 2, SIDE | ONCE_OR_TWICE),
     "punch": Action(gestures.punch, 2, SIDE | UP_TO_THREE),
-    "squat": Action(postures.squat, 1, ONCE_OR_TWICE),
-    "bow": Action(postures.bow),
+    "squat": Action(gestures.squat, 1, ONCE_OR_TWICE),
+    "bow": Action(gestures.bow),
     "stand": Action(gestures.stand),
-    "sit": Action(postures.sit),
-    "rise": Action(postures.rise),
+    "sit": Action(gestures.sit),
+    "rise": Action(gestures.rise),
     "dance": Action(locomotion.dance),
-    "leap": Action(postures.leap),
-    "pick": Action(postures.pick, 2, SIDE),
+    "leap": Action(gestures.leap),
+    "pick": Action(gestures.pick, 2, SIDE),
     "throw": Action(gestures.throw, 2, SIDE),
     "crawl": Action(locomotion.crawl, 1, FORWARD),
-    "lie": Action(postures.lie, seconds=2.6),
+    "lie": Action(gestures.lie, seconds=2.6),
     "clap": Action(gestures.clap, 2, UP_TO_THREE),
     "salute": Action(gestures.salute, 2, SIDE),
     "nod": Action(gestures.nod, 2, UP_TO_THREE),

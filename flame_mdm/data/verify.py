@@ -30,10 +30,11 @@ def report(data: MotionDataModule) -> dict[str, Any]:
     """
     store = data.open()
     store.verify()
-    needed = data.crop.shortest()
+    needed = data.crop.min_frames
     lengths = [clip.length for clip in store.clips]
     captions = [caption for clip in store.clips for caption in clip.captions]
     still, duplicates = _anomalies(store, data.representation)
+    mean, std = training_statistics(store.folder, store.clips, len(store.features), data.representation)
     content = {
         **{key: store.info[key] for key in ("dataset", "representation", "fps", "fingerprint", "published_split")},
         "files": store.info["sha256"],
@@ -59,7 +60,10 @@ def report(data: MotionDataModule) -> dict[str, Any]:
         "still": [clip.id for clip in still],
         "duplicates": [[clip.id for clip in group] for group in duplicates],
         "duplicates_across_splits": sum(len({clip.split for clip in group}) > 1 for group in duplicates),
-        "statistics": _deviation(store, data.representation),
+        "statistics": {  # those of the store may be published with the data set, so they are compared
+            "largest difference of a mean, in std": float((np.abs(store.mean - mean) / std).max()),
+            "largest relative difference of a std": float(np.abs(store.std / std - 1).max()),
+        },
         "excluded": store.info["excluded"],
     }
     write_text(store.folder / "verify.json", json.dumps(content, indent=2, ensure_ascii=False) + "\n")
@@ -133,12 +137,3 @@ def _anomalies(store: Store, representation: Representation) -> tuple[list[Entry
             still += clips
         identical[sha1(motion.tobytes()).digest()].append(clip)
     return still, [group for group in identical.values() if len(group) > 1]
-
-
-def _deviation(store: Store, representation: Representation) -> dict[str, float]:
-    """Returns how far the statistics, which may be published with the data set, deviate from the training frames."""
-    mean, std = training_statistics(store.folder, store.clips, len(store.features), representation)
-    return {
-        "largest difference of a mean, in std": float((np.abs(store.mean - mean) / std).max()),
-        "largest relative difference of a std": float(np.abs(store.std / std - 1).max()),
-    }

@@ -58,12 +58,7 @@ def motion(store: Store, representation: Representation, clip: Entry) -> Motion:
 
 
 def write_page(
-    path: Path,
-    store: Store,
-    representation: Representation,
-    clips: Sequence[Entry],
-    title: str,
-    body: Mesh | None = None,
+    path: Path, store: Store, representation: Representation, clips: Sequence[Entry], title: str, body: Mesh | None
 ) -> None:
     write_player(
         path,

@@ -1,8 +1,10 @@
-"""Gestures of arms and head, on planted feet."""
+"""Motions about one spot: gestures of arms and head, jumps, kicks, bends, sitting and lying."""
 
 import numpy as np
 
-from flame_mdm.data.synthetic_motions.body import SIDES, SIGN, Attributes, Body, ease, events, pulse
+from flame_mdm.data.synthetic_motions.body import HIP, SHIN, SIDES, SIGN, THIGH, Attributes, Body, ease, events, pulse
+
+CHAIR = 0.54  # height of the pelvis on a chair whose seat is 45 cm high
 
 
 def wave(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
@@ -98,3 +100,166 @@ def nod(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribut
 
 def stand(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
     """Leaves the body as it is: it stands and breathes."""
+
+
+def jump(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+    depth, reach = rng.uniform(0.16, 0.24), rng.uniform(0.8, 1.6)
+    for start, seconds in events(rng, t, int(requested["count"]), 1.05):
+        up = start + 0.4 * seconds
+        air = min(rng.uniform(0.36, 0.44), 0.42 * seconds)
+        land = up + air
+        crouch = pulse(t, start, start + 0.25 * seconds, start + 0.25 * seconds, up + 0.02)
+        absorb = pulse(t, land - 0.03, land + 0.1, land + 0.1, start + seconds)
+        s = np.clip((t - up) / air, 0, 1)
+        height = 9.81 / 8 * air**2 * 4 * s * (1 - s)
+        body.position[:, 1] += height - depth * crouch - 0.6 * depth * absorb
+        body.position[:, 2] -= 0.05 * crouch
+        body.ankles[..., 1] += height + 0.04 * np.sin(np.pi * s) ** 2
+        body.foot_pitch += 0.6 * pulse(t, up - 0.1, up, land - 0.05, land + 0.08)
+        body.spine[0] += 0.45 * crouch + 0.25 * absorb
+        body.pelvis[0] += 0.2 * crouch + 0.1 * absorb
+        body.arms[:, 0] += reach * pulse(t, up - 0.15, up + 0.15, up + 0.15, land + 0.2) - 0.7 * crouch
+
+
+def leap(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+    """Jumps forward with both feet."""
+    length, air = rng.uniform(0.75, 1.1), rng.uniform(0.4, 0.46)
+    up = rng.uniform(0.65, max(0.7, t[-1] - 1.3))
+    land = up + air
+    crouch = pulse(t, up - 0.6, up - 0.25, up - 0.25, up + 0.02)
+    absorb = pulse(t, land - 0.04, land + 0.12, land + 0.12, land + 0.75)
+    s = np.clip((t - up) / air, 0, 1)
+    height = 9.81 / 8 * air**2 * 4 * s * (1 - s)
+    body.position[:, 1] += height - 0.24 * crouch - 0.18 * absorb
+    body.position[:, 2] += length * ease(t, up - 0.3, land + 0.3) - 0.08 * crouch
+    body.ankles[..., 1] += height + 0.06 * np.sin(np.pi * s) ** 2
+    body.ankles[..., 2] += length * ease(s, 0, 1)
+    body.foot_pitch += 0.9 * pulse(t, up - 0.15, up, up + 0.1, land - 0.05)
+    body.foot_pitch -= 0.25 * pulse(t, up + 0.15, land - 0.04, land, land + 0.1)
+    body.pelvis[0] += 0.3 * crouch + 0.2 * absorb
+    body.spine[0] += 0.5 * crouch + 0.35 * absorb
+    body.head[0] -= 0.4 * crouch
+    body.arms[:, 0] += 1.5 * pulse(t, up - 0.2, up + 0.12, up + 0.2, land + 0.5) - 0.9 * crouch
+
+
+def kick(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+    (side,) = SIDES[str(requested["side"])]
+    high = rng.uniform(1.15, 1.45)
+    kicks = events(rng, t, int(requested["count"]), 1.25)
+    first, last = kicks[0][0], kicks[-1][0] + kicks[-1][1]
+    leaning = pulse(t, first - 0.1, first + 0.2, last - 0.2, last)
+    body.position[:, 0] -= 0.07 * SIGN[side] * leaning
+    body.spine[2] += 0.06 * SIGN[side] * leaning
+    for arm in (0, 1):
+        body.move_arm(arm, leaning, (0.5, 0.4, -0.6, 1.3))
+    for start, seconds in kicks:
+        at = start + seconds * np.array([0.0, 0.18, 0.28, 0.52, 0.58, 0.8, 1.0])
+        back = pulse(t, at[0], at[1], at[1], at[3])
+        out = pulse(t, at[1], at[3], at[4], at[6])
+        hip = high * out - 0.4 * back
+        knee = 0.2 + 1.3 * pulse(t, at[0], at[2], at[2], at[3]) + 0.9 * pulse(t, at[4], at[5], at[5], at[6])
+        free = pulse(t, at[0], at[1], at[5], at[6])
+        root = body.position + np.array([SIGN[side] * HIP[0], HIP[1], HIP[2]])
+        zero = np.zeros_like(hip)
+        thigh = np.stack([zero, -np.cos(hip), np.sin(hip)], -1)
+        shin = np.stack([zero, -np.cos(hip - knee), np.sin(hip - knee)], -1)
+        body.ankles[side] += free[:, None] * (root + THIGH * thigh + SHIN * shin - body.ankles[side])
+        body.foot_pitch[side] += 0.4 * back + 0.3 * free - 0.8 * out
+        body.pelvis[0] -= 0.15 * out
+        body.spine[0] += 0.1 * out
+        body.spine[1] += 0.25 * SIGN[side] * out
+        body.arms[1 - side, 0] += 0.6 * out
+        body.arms[side, 0] -= 0.6 * out
+
+
+def squat(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+    depth, reach = rng.uniform(0.34, 0.44), rng.uniform(1.0, 1.9)
+    for start, seconds in events(rng, t, int(requested["count"]), 1.9):
+        down = pulse(t, start, start + 0.45 * seconds, start + 0.5 * seconds, start + seconds)
+        body.position[:, 1] -= depth * down
+        body.position[:, 2] -= 0.16 * down
+        body.pelvis[0] += 0.35 * down
+        body.spine[0] += 0.35 * down
+        body.head[0] -= 0.4 * down
+        body.arms[:, 0] += (reach + 0.3) * down
+
+
+def bow(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+    start, end = rng.uniform(0.15, 0.35), t[-1] - rng.uniform(0.1, 0.25)
+    middle, half = (start + end) / 2, rng.uniform(0.1, 0.25)
+    down = pulse(t, start, middle - half, middle + half, end)
+    deep = rng.uniform(0.9, 1.3)
+    body.pelvis[0] += 0.4 * deep * down
+    body.spine[0] += 0.6 * deep * down
+    body.head[0] += 0.2 * down
+    body.position[:, 2] -= 0.13 * deep * down
+    body.arms[:, 0] += 0.75 * deep * down
+
+
+def pick(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+    """Bends down, takes something from the floor and holds it in front of the body."""
+    (side,) = SIDES[str(requested["side"])]
+    start, end = rng.uniform(0.1, 0.2), t[-1] - rng.uniform(0.15, 0.3)
+    low, rise = start + 0.42 * (end - start), start + 0.54 * (end - start)
+    down, holds = pulse(t, start, low, rise, end), ease(t, start, low)
+    body.position[:, 1] -= rng.uniform(0.4, 0.46) * down
+    body.position[:, 2] -= 0.16 * down
+    body.pelvis += np.stack([0.6 * down, -0.15 * SIGN[side] * down, 0 * down])
+    body.spine += np.stack([0.7 * down, -0.2 * SIGN[side] * down, -0.1 * SIGN[side] * down])
+    body.head[0] -= 0.25 * down
+    body.move_arm(side, holds, (0.45 + 0.7 * down, 0.2, -0.1, 1.3))
+    body.move_arm(1 - side, down, (0.2, 0.6, -0.3, 0.5))
+    spot = (SIGN[side] * rng.uniform(0.24, 0.28), rng.uniform(0.11, 0.14), rng.uniform(0.22, 0.28))
+    body.reach(side, pulse(t, start + 0.1, low, rise, rise + 0.6 * (end - rise)), spot)
+
+
+def _seat(body: Body, seated: np.ndarray, bent: np.ndarray) -> None:
+    """Seats a body by the share `seated` (F,) on a chair behind its feet; `bent` (F,) is how far the trunk leans."""
+    body.position[:, 1] += seated * (CHAIR - body.position[:, 1])
+    body.position[:, 2] -= 0.36 * seated
+    body.pelvis[0] += 0.45 * bent - 0.08 * seated
+    body.spine[0] += 0.45 * bent + 0.05 * seated
+    body.head[0] -= 0.4 * bent
+    for side, sign in enumerate(SIGN):
+        body.move_arm(side, seated, (0.55, 0.25, -0.7, 0.8))
+        body.move_arm(side, bent, (1.4, 0.15, -0.3, 0.5))
+        thigh = np.stack([sign * 0.15 + 0 * seated, 0.63 + 0 * seated, -0.18 + body.ankles[side, :, 2]], 1)
+        body.reach(side, seated**3, thigh)
+
+
+def sit(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+    start, seconds = rng.uniform(0.1, 0.25), rng.uniform(1.25, 1.5)
+    end = start + seconds
+    _seat(body, ease(t, start, end), pulse(t, start, start + 0.5 * seconds, start + 0.6 * seconds, end + 0.25))
+
+
+def rise(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+    start, seconds = rng.uniform(0.35, 0.5), rng.uniform(1.25, 1.45)
+    end = start + seconds
+    _seat(body, 1 - ease(t, start + 0.1, end), pulse(t, start - 0.3, start + 0.4 * seconds, start + 0.5 * seconds, end))
+    for path in (body.position, *body.ankles):
+        path[:, 2] += 0.36
+    body.reaches = [(side, weight, goal + np.array([0, 0, 0.36]), frame) for side, weight, goal, frame in body.reaches]
+
+
+def lie(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+    """Sits down on the floor, with the hands behind the hips, and lies down on the back."""
+    start, stretch = rng.uniform(0.05, 0.12), (t[-1] - 0.25) / 2.4
+    a, b, c, d = start + stretch * np.array([0.0, 1.05, 1.35, 2.2])
+    down, back = ease(t, a, b), ease(t, b - 0.2, d)
+    bent = pulse(t, a, a + 0.55 * (b - a), a + 0.6 * (b - a), b)
+    body.position[:, 1] += down * (0.11 - body.position[:, 1])
+    body.position[:, 2] -= 0.42 * down + 0.03 * back
+    body.pelvis[0] += 0.5 * bent - 0.15 * down - 1.4 * back
+    body.spine[0] += 0.7 * bent + 0.25 * down - 0.25 * back
+    body.head[0] += 0.2 * back - 0.2 * bent
+    for side, sign in enumerate(SIGN):
+        body.move_arm(side, bent * (1 - down), (0.8, 0.2, -0.2, 0.4))
+        body.move_arm(side, down, (-0.45 + 0.5 * back, 0.35, -0.4 - back, 0.3))
+        hand = np.stack([sign * (0.27 + 0.04 * back), 0.05 - 0.02 * back, -0.64 + 0.18 * back], 1)
+        body.reach(side, ease(t, a + 0.6 * (b - a), b + 0.1), hand)
+        out = ease(t, c + 0.12 * side, d + 0.12 * side)
+        body.ankles[side, :, 2] += rng.uniform(0.38, 0.43) * out
+        body.ankles[side, :, 1] += 0.28 * out * (1 - out)
+        body.foot_pitch[side] -= 0.9 * ease(t, c + 0.12 * side - 0.3, c + 0.12 * side + 0.2)
+        body.foot_yaw[side] += 0.25 * sign * out

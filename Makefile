@@ -52,7 +52,7 @@ lint: $(READY) ## check style and types
 	@$(VENV)/bin/pyright
 
 bench: $(READY) ## measure the speed of training, write docs/benchmarks/speed.md; DEVICE=cuda adds a GPU
-	@$(VENV)/bin/python benchmarks/run.py $(or $(DEVICE),cpu)
+	@$(VENV)/bin/python benchmarks/steps.py $(or $(DEVICE),cpu)
 
 docs: $(READY) ## write the pages that are generated from the code, and build the site in build/docs
 	@$(VENV)/bin/python docs/generate.py

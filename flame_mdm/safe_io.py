@@ -17,7 +17,6 @@ import secrets
 import shutil
 import socket
 import stat
-import tokenize
 import zipfile
 import zlib
 from collections.abc import Callable, Collection, Iterator
@@ -213,27 +212,22 @@ def regular_file(path: str | Path, limit: int | None = None) -> int:
 
 
 def read_text(path: str | Path, limit: int = TEXT_LIMIT) -> str:
-    path = Path(path)
     regular_file(path, limit)
-    try:
-        return path.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise UserError(f"{path}: not a UTF-8 text file: {error}") from error
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read: {error.strerror}") from error
+    with (
+        naming(path, UnicodeDecodeError, what="not a UTF-8 text file: "),
+        naming(path, OSError, what="cannot be read: "),
+    ):
+        return Path(path).read_text(encoding="utf-8")
 
 
 def read_json(path: str | Path, limit: int = TEXT_LIMIT) -> Any:
     """Returns the content of a JSON file without NaN, infinity and lone surrogates."""
-    text = read_text(path, limit)
-    try:
-        return parse_json(text)
-    except ValueError as error:
-        raise UserError(f"{path}: not a JSON file: {error}") from error
+    with naming(path, ValueError, what="not a JSON file: "):
+        return parse_json(read_text(path, limit))
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Returns the content of a JSON text; raises `ValueError` in all cases in which `read_json` raises `UserError`."""
+    """Returns the content of a JSON text; raises `ValueError` for what `read_json` refuses."""
 
     def refuse(constant: str) -> None:
         raise ValueError(f"{constant} is not a JSON number")
@@ -259,10 +253,9 @@ def read_yaml(path: str | Path) -> Any:
             raise ValueError(f"more than {YAML_NODES:,} values after its aliases are expanded")
         content = OmegaConf.create(text) if text.strip() else None  # with OmegaConf's reading of numbers
         return OmegaConf.to_container(content) if content is not None else None
-    except RecursionError:
-        raise UserError(f"{path}: not a readable YAML file: nested too deeply") from None
     except Exception as error:  # YAML and OmegaConf raise many kinds of errors for invalid files
-        raise UserError(f"{path}: not a readable YAML file: {first_line(error)}") from error
+        reason = "nested too deeply" if isinstance(error, RecursionError) else first_line(error)
+        raise UserError(f"{path}: not a readable YAML file: {reason}") from error
 
 
 def _nodes(node: Any, counted: dict[int, float]) -> float:
@@ -334,10 +327,8 @@ def _check_array(file: IO[bytes], size: int, name: str) -> int:
     try:
         read_header = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}[npy.read_magic(file)]
         shape, _, dtype = read_header(file)
-    except KeyError as error:
-        raise ValueError(f"{name}: its format is {error}, not 1.0 or 2.0") from error
-    except (ValueError, EOFError, TypeError, RecursionError, MemoryError, SyntaxError, tokenize.TokenError) as error:
-        raise ValueError(f"{name}: not an array: {first_line(error)}") from error
+    except Exception as error:  # NumPy parses the header as Python
+        raise ValueError(f"{name}: not an array of format 1.0 or 2.0: {first_line(error)}") from error
     if dtype.hasobject:
         raise ValueError(f"{name}: an array of Python objects, which could run code")
     count = math.prod(shape)
@@ -348,14 +339,9 @@ def _check_array(file: IO[bytes], size: int, name: str) -> int:
 
 
 def check_member(member: zipfile.ZipInfo) -> None:
-    """Raises `UserError` if a member of a zip archive is encrypted, or compressed with another method than deflate.
-
-    Only for deflate does `zipfile` limit the bytes unpacked at a time by the declared size.
-    """
-    if member.flag_bits & 1:
-        raise UserError(f"{member.filename}: encrypted")
-    if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise UserError(f"{member.filename}: compressed with method {member.compress_type}, not deflate")
+    """Refuses members of a zip archive other than deflated ones, of which alone `zipfile` limits the unpacked bytes."""
+    if member.flag_bits & 1 or member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise UserError(f"{member.filename}: encrypted, or compressed with another method than deflate")
 
 
 def read_torch(path: Path) -> Any:
@@ -363,10 +349,8 @@ def read_torch(path: Path) -> Any:
     import torch
 
     check_torch(path)
-    try:
+    with naming(path, Exception, what="damaged, or not a file of plain values and tensors: "):
         return torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch raises many kinds of errors for damaged files and other pickles
-        raise UserError(f"{path}: damaged, or not a file of plain values and tensors: {first_line(error)}") from error
 
 
 def check_torch(path: Path) -> None:

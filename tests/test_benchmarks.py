@@ -2,21 +2,17 @@
 
 import json
 import math
-import sys
 from pathlib import Path
 
 import pytest
+from support.fixtures import ROOT, script
 
-ROOT = Path(__file__).parent.parent
-sys.path.append(str(ROOT / "benchmarks"))  # the scripts import each other
-
-import run  # noqa: E402
-import steps  # noqa: E402
+steps = script("benchmarks/steps.py")
 
 
 @pytest.fixture
 def page(tmp_path, monkeypatch) -> Path:
-    monkeypatch.setattr(run, "PAGE", tmp_path / "speed.md")
+    monkeypatch.setattr(steps, "PAGE", tmp_path / "speed.md")
     return tmp_path / "speed.md"
 
 
@@ -27,24 +23,24 @@ def test_the_page_is_rendered_from_the_figures_and_keeps_those_of_earlier_script
     kept = section | {"title": "Text", "script": "benchmarks/text.py at commit x", "date": "2001-02-03"}
     kept |= {"machine": {"cores": 1}}  # type: ignore[dict-item]
     page.with_suffix(".json").write_text(json.dumps({"text": kept}))
-    run.main()
+    steps.main()
     figures = json.loads(page.with_suffix(".json").read_text())
     assert figures["text"] == kept
     text = page.read_text()
-    assert text == run.render(figures)
+    assert text == steps.render(figures)
     assert "Speeds:\n\n| way | ms |\n| --- | ---: |\n| a | 1,234 |" in text
     assert "`benchmarks/text.py at commit x`, 2001-02-03, machine 2." in text
     assert text.index("## Steps") < text.index("## Text")
     assert "torch: " in text.split("## Machine")[1].split("##")[0]
     sections = json.loads((ROOT / "docs" / "benchmarks" / "speed.json").read_text())
-    assert (ROOT / "docs" / "benchmarks" / "speed.md").read_text() == run.render(sections)
+    assert (ROOT / "docs" / "benchmarks" / "speed.md").read_text() == steps.render(sections)
 
 
 def test_a_device_that_is_not_there_is_refused(page, monkeypatch):
-    monkeypatch.setattr(run.torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(steps.torch.cuda, "is_available", lambda: False)
     for device in ("tpu", "cuda"):
         with pytest.raises(SystemExit, match=f"^DEVICE={device}: give cpu, or cuda on a machine with a CUDA GPU$"):
-            run.main(device)
+            steps.main(device)
     assert not page.exists()
 
 
@@ -56,4 +52,4 @@ def test_the_benchmark_runs_at_a_toy_size():
     assert all(math.isfinite(value) for value in numbers if isinstance(value, int | float))
     columns = [{tuple(row) for row in rows} for rows in section["tables"].values()]
     assert all(len(names) == 1 for names in columns)
-    assert section["title"] in run.render({"steps": section | {"date": "2001-02-03", "machine": run.machine()}})
+    assert section["title"] in steps.render({"steps": section | {"date": "2001-02-03", "machine": steps.machine()}})

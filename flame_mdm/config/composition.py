@@ -67,10 +67,9 @@ class ConfigSource(NamedTuple):
 def prepare_overrides(
     recipe: ConfigSource, overrides: Sequence[str], first: Sequence[str] = ()
 ) -> tuple[list[str], Config]:
-    """Checks overrides and prepares them for Hydra. Keys that the recipe lacks but a `_target_` accepts get a `++`.
+    """Checks overrides, except `first`, and prepares them for Hydra; also returns the recipe before those of keys.
 
-    Overrides in `first` are passed to Hydra unchecked. Also returns the recipe without overrides of single keys, empty
-    if there are no overrides. An override must have the type of the value in it.
+    Keys that the recipe lacks but a `_target_` accepts get a `++`. Without overrides, the second value is empty.
     """
     parsed = parse(overrides)
     _check_groups(parsed, recipe)

@@ -231,7 +231,7 @@ class SampleMotions(Callback):
     """Samples fixed prompts with fixed noise: writes files to the run directory and logs a video.
 
     Args:
-        folder: folder of the samples; those of each step are in a subfolder, such as `step_0001000/player.html`.
+        folder: folder of the samples; those of a step are in a subfolder, such as `step_0001000`.
         every_n_steps: minimum number of steps between samples, which are drawn at validation and after training.
         prompts: texts, action names, or (text, requested attributes) pairs; None = `UNCONDITIONED` motions. If a model
             is conditioned on actions and no prompt is one of them, its first actions are used instead.

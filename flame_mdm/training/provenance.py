@@ -47,14 +47,12 @@ class WriteProvenance(Callback):
         write_json(folder / PROVENANCE, facts)
         for logger in trainer.loggers:
             log_config(logger, self.config, facts)
-        self._introduce(trainer, pl_module, facts)
-
-    def _introduce(self, trainer: Trainer, task: Task, facts: dict[str, Any]) -> None:
         clips = self.config["data"]["batch_size"]
         size = clips * trainer.world_size * trainer.accumulate_grad_batches
         module: MotionDataModule = trainer.datamodule  # type: ignore[attr-defined]
         data, speed = module.store.info, self.config["run"].get("speed", "reference")
-        say(f"{self.config['experiment']}: {task.describe()}, {facts['parameters'] / 1e6:.2f} M trainable parameters")
+        size_in_millions = facts["parameters"] / 1e6
+        say(f"{self.config['experiment']}: {pl_module.describe()}, {size_in_millions:.2f} M trainable parameters")
         say(f"data: {data['dataset']} as {data['representation']}; {data['hours']} hours")
         say(*module.counts(module.store))
         say(f"device: {facts['device']}, {trainer.precision}, speed={speed}")

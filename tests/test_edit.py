@@ -259,10 +259,14 @@ def test_motions_that_cannot_be_read_are_one_line(diffusion, store, tmp_path):
     joints, file = np.zeros((9, 22, 3)), tmp_path / "motion.npz"
     clean = {"joints": joints, "fps": 20, "representation": "humanml-clean-smpl22"}
     cases: list[tuple[Any, dict[str, Any], str]] = [
-        ({"joints": joints[:, :21], "fps": 20}, {}, r"shape \(9, 21, 3\), but humanml-clean-smpl22 takes"),
-        ({"joints": joints[..., 0], "fps": 20}, {}, r"joints of shape \(9, 22\), not \(frames, joints, 3\)"),
-        ({"fps": 20}, {}, "contains fps; a motion has joints and fps"),
-        (clean | {"features": joints[..., 0]}, {}, r"features of shape \(9, 22\), not \(frames, 263\)"),
+        (
+            {"joints": joints[:, :21], "fps": 20},
+            {},
+            r"motion\.npz.* shape \(9, 21, 3\), but humanml-clean-smpl22",
+        ),
+        ({"joints": joints[..., 0], "fps": 20}, {}, r"motion\.npz.* joints of shape \(9, 22\), not"),
+        ({"fps": 20}, {}, r"motion\.npz.* contains fps; a motion has joints and fps"),
+        (clean | {"features": joints[..., 0]}, {}, r"motion\.npz.* features of shape \(9, 22\), not"),
         (tmp_path / "absent.npz", {}, r"absent\.npz: no such file"),
         ("kit:1", {}, "no prepared data set"),
         ("walk", {}, r"Give a \.npz, \.bvh, \.amc, \.json, \.npy file, or dataset:id"),
@@ -276,7 +280,6 @@ def test_motions_that_cannot_be_read_are_one_line(diffusion, store, tmp_path):
         with pytest.raises((UserError, FileNotFoundError), match=message) as error:
             read_motion(diffusion.representation, path, data_root=store, **options)
         assert "\n" not in str(error.value)
-        assert str(path) in str(error.value)
     np.savez(file, joints=joints, fps=20)
     with pytest.raises(UserError, match=r"motion.npz: motion: shape \(9, 22, 3\), expected \(frames, 3 \+ 3 x joints"):
         read_motion(SMPL(), file)

@@ -114,10 +114,9 @@ class Edit:
     Attributes:
         known: (B, F, D) normalized features of the motion.
         keep: (B, F, D) bool, True = keep this feature of this frame.
-        mode: how the process applies the edit. "x0" overwrites the clean estimate (MDM); "x_t" replaces part of the
-            noisy sample by the equally noisy known part (FLAME, RePaint); "trajectory" overwrites the early part of the
-            flow's path (MFM).
-        until: for "trajectory", the flow time up to which (inclusive) the path is overwritten.
+        mode: "x0" overwrites the clean estimate (MDM); "x_t" replaces part of the noisy sample by the equally noisy
+            known part (FLAME, RePaint); "trajectory" overwrites the early part of the flow's path (MFM).
+        until: for "trajectory", the last flow time at which the path is overwritten.
         blend: for "x_t", replace the kept part "after" each step (FLAME, eq. 6), which ends in the known motion itself,
             or "before" each call of the denoiser (FLAME's code), which ends in the model's version of it.
         resample: for "x_t", how many times each step is repeated, after adding noise again (RePaint, algorithm 1).

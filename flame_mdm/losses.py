@@ -27,14 +27,9 @@ def masked_mse(a: Tensor, b: Tensor, mask: Tensor) -> Tensor:
     return masked_mean((a - b).square(), mask)
 
 
-def differences(x: Tensor) -> Tensor:
-    """Returns the change (B, F - 1, ...) from each frame of x (B, F, ...) to the next."""
-    return x[:, 1:] - x[:, :-1]
-
-
-def bone_lengths(joints: Tensor, edges: Sequence[tuple[int, int]]) -> Tensor:
-    """Returns the distances (..., number of edges) of the pairs of joints that a bone connects, from (..., J, 3)."""
-    parents, children = zip(*edges, strict=True)
+def bone_lengths(joints: Tensor, edges: Sequence[tuple[int, int]] | Tensor) -> Tensor:
+    """Returns the lengths (..., N) of bones, given by `edges` (N, 2), parent and child, from joints (..., J, 3)."""
+    parents, children = torch.as_tensor(edges).T
     return (joints[..., children, :] - joints[..., parents, :]).norm(dim=-1)
 
 
@@ -43,6 +38,21 @@ class MotionLosses(nn.Module):
 
     All are means over real frames and entries: the norms in the paper are divided by the number of entries per frame,
     as in its code. Velocities are per frame. Terms with weight 0 are not computed.
+
+    Args:
+        to_joints: differentiable map from normalized features (B, F, D) to joint positions (B, F, J, 3) in meters.
+        feet: indices of the joints that touch the ground.
+        edges: (parent, child) of each bone, for `bone_length`.
+        joints: weight of the squared error of the joint positions (eq. 3).
+        velocity: weight of the squared error of the features' velocity (eq. 5).
+        foot_contact: weight of the squared velocity of feet in contact in the data (eq. 4). The mean includes feet that
+            are not in contact, whose entries are 0, like the sum over all frames in the paper.
+        bone_length: weight of the squared error of the bone lengths, in square meters; the bone length loss of InterGen
+            (arXiv:2304.05684), which applies it only up to a noise level, here at all of them.
+        root_relative: subtract the first joint from all joints, as in MDM's code, so that joint-based losses do not
+            depend on the root translation.
+        velocity_features: number of features, from the first, that `velocity` uses, as in MDM's code (144 of 25 x 6,
+            262 of 263: the last row of the feature matrix is left out). None = all.
     """
 
     def __init__(
@@ -58,56 +68,32 @@ class MotionLosses(nn.Module):
         root_relative: bool = False,
         velocity_features: int | None = None,
     ):
-        """Stores weights and options.
-
-        Args:
-            to_joints: differentiable map from normalized features (B, F, D) to joint positions (B, F, J, 3) in meters.
-            feet: indices of the joints that touch the ground.
-            edges: (parent, child) of each bone, for `bone_length`.
-            joints: weight of the squared error of the joint positions (eq. 3).
-            velocity: weight of the squared error of the features' velocity (eq. 5).
-            foot_contact: weight of the squared velocity of feet in contact in the data (eq. 4). The mean includes feet
-                that are not in contact, whose entries are 0, like the sum over all frames in the paper.
-            bone_length: weight of the squared error of the bone lengths, in square meters; the bone length loss of
-                InterGen (arXiv:2304.05684), which applies it only up to a noise level, here at all of them.
-            root_relative: subtract the first joint from all joints, as in MDM's code, so that joint-based losses do not
-                depend on the root translation.
-            velocity_features: number of features, from the first, that `velocity` uses, as in MDM's code (144 of
-                25 x 6, 262 of 263: the last row of the feature matrix is left out). None = all.
-        """
         super().__init__()
         self.to_joints = to_joints
         self.feet, self.edges = list(feet), list(edges)
-        self.weights = {
-            "joints": joints,
-            "velocity": velocity,
-            "foot_contact": foot_contact,
-            "bone_length": bone_length,
-        }
-        self.root_relative = root_relative
-        self.velocity_features = velocity_features
+        self.joints, self.velocity, self.foot_contact, self.bone_length = joints, velocity, foot_contact, bone_length
+        self.root_relative, self.velocity_features = root_relative, velocity_features
 
     def forward(self, x0_hat: Tensor, x: Tensor, mask: Tensor) -> dict[str, Tensor]:
         """Returns weighted losses (B,) by name, from clean estimate and data (B, F, D) and mask (B, F)."""
         # The first frame has no velocity. Padding is at the end, so a velocity is real if its second frame is.
         moving = mask[:, 1:]
         losses: dict[str, Tensor] = {}
-        if self.weights["velocity"]:
-            size = self.velocity_features
-            losses["velocity"] = masked_mse(differences(x0_hat[..., :size]), differences(x[..., :size]), moving)
-        if any(self.weights[name] for name in ("joints", "foot_contact", "bone_length")):
-            predicted, real = self._joints(x0_hat), self._joints(x)
-            if self.weights["joints"]:
-                losses["joints"] = masked_mse(predicted, real, mask)
-            if self.weights["foot_contact"]:
-                in_contact = differences(real[:, :, self.feet]).norm(dim=-1, keepdim=True) <= CONTACT_SPEED
-                slide = torch.where(in_contact, differences(predicted[:, :, self.feet]), 0.0)
-                losses["foot_contact"] = masked_mean(slide.square(), moving)
-            if self.weights["bone_length"]:
-                lengths, real_lengths = (bone_lengths(joints, self.edges) for joints in (predicted, real))
-                losses["bone_length"] = masked_mse(lengths, real_lengths, mask)
-        return {name: self.weights[name] * loss for name, loss in losses.items()}
-
-    def _joints(self, x: Tensor) -> Tensor:
-        joints = self.to_joints(x)
-        return joints - joints[:, :, :1] if self.root_relative else joints
+        if self.velocity:
+            velocity, real_velocity = (motion[..., : self.velocity_features].diff(dim=1) for motion in (x0_hat, x))
+            losses["velocity"] = self.velocity * masked_mse(velocity, real_velocity, moving)
+        if not (self.joints or self.foot_contact or self.bone_length):
+            return losses
+        predicted, real = self.to_joints(x0_hat), self.to_joints(x)
+        if self.root_relative:
+            predicted, real = predicted - predicted[:, :, :1], real - real[:, :, :1]
+        if self.joints:
+            losses["joints"] = self.joints * masked_mse(predicted, real, mask)
+        if self.foot_contact:
+            in_contact = real[:, :, self.feet].diff(dim=1).norm(dim=-1, keepdim=True) <= CONTACT_SPEED
+            slide = torch.where(in_contact, predicted[:, :, self.feet].diff(dim=1), 0.0)
+            losses["foot_contact"] = self.foot_contact * masked_mean(slide.square(), moving)
+        if self.bone_length:
+            lengths, real_lengths = (bone_lengths(joints, self.edges) for joints in (predicted, real))
+            losses["bone_length"] = self.bone_length * masked_mse(lengths, real_lengths, mask)
+        return losses

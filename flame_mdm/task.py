@@ -50,9 +50,9 @@ class Task(Model, LightningModule):
 
     def setup(self, stage: str) -> None:
         """Opens the captions encoded by `prepare_data`, and adds the facts about the data to `facts`."""
-        self.condition.load_cache(*self._captions())
+        size = self.condition.load_cache(*self._captions())
         data: MotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
-        if device := data.choose_device(self.condition.cache_size()):
+        if device := data.choose_device(size):
             self.condition.move_cache(device)
         # Buffers are equal in all processes. If DDP broadcast them in each forward pass, processes with more validation
         # batches than others would wait forever.

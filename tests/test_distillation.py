@@ -9,7 +9,7 @@ import pytest
 import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
-from support.analytic import NO_CONDITION, drawn, real, sample
+from support.analytic import NO_CONDITION, CountedDenoise, drawn, real, sample
 from support.runs import RUN, TINY, TWO, finish, reference, spawn
 from torch import Tensor
 
@@ -31,7 +31,6 @@ from flame_mdm.processes import Process
 from flame_mdm.processes.consistency import consistency_terms
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.processes.flow_matching import FlowMatching
-from flame_mdm.processes.samplers import CountedDenoise
 from flame_mdm.task import MotionGeneration
 from flame_mdm.training import adaptation
 

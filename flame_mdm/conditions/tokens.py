@@ -22,12 +22,10 @@ START = "<start>"
 class LearnedTokens(ConditionEncoder):
     """Hashed words, learned positions and one transformer layer; the null is one learned vector.
 
-    A word is the sum of two rows of the table, selected by its hash, see `vocabulary.hashed`. Captions are lowercased,
-    punctuation separates words, and words after `max_words` are dropped. Words that the training captions do not
-    contain are replaced by a form that they do contain (walked, walks), or dropped: their vectors are random.
-
-    Each distinct caption of a batch is encoded once, so that samples with the same caption share its dropout. Linear
-    layers skip the padding.
+    A word is the sum of two rows of the table, selected by its hash, see `vocabulary.hashed`. Words that the training
+    captions do not contain are replaced by a form that they do contain (walked, walks), or dropped: their vectors are
+    random. Each distinct caption of a batch is encoded once, so that samples with the same caption share its dropout.
+    Linear layers skip the padding.
 
     The pooled vector is the mean of the tokens, and the null token is the null vector, so that all parameters receive
     gradients whether a denoiser reads the pooled vector or the tokens.
@@ -35,9 +33,9 @@ class LearnedTokens(ConditionEncoder):
     Args:
         features: C, the width of the tokens and of the pooled vector.
         buckets: rows of the word table.
-        max_words: maximum number of words per caption.
+        max_words: maximum number of words per caption; the rest is dropped.
         heads: attention heads; divides `features`.
-        dropout: dropout rate of the transformer layer.
+        dropout: of the transformer layer.
         pretrain_steps: number of steps of `pretrain`.
     """
 
@@ -51,8 +49,7 @@ class LearnedTokens(ConditionEncoder):
         pretrain_steps: int = 0,
     ):
         super().__init__()
-        self.features, self.buckets, self.max_words = features, buckets, max_words
-        self.pretrain_steps = pretrain_steps
+        self.features, self.buckets, self.max_words, self.pretrain_steps = features, buckets, max_words, pretrain_steps
         self.words = nn.Embedding(buckets, features)
         self.positions = nn.Parameter(nn.init.normal_(torch.empty(max_words + 1, features), std=0.02))
         self.layer = nn.TransformerEncoderLayer(
@@ -94,9 +91,7 @@ class LearnedTokens(ConditionEncoder):
 
     def forward(self, batch: MotionBatch) -> Condition:
         if batch.text is None:
-            raise UserError(
-                "condition=learned needs captions, and this batch has none: add captions, or choose another condition"
-            )
+            raise UserError("condition=learned: this batch has no captions. Add some, or choose another condition")
         device = self.null.device
         numbers = {caption: number for number, caption in enumerate(dict.fromkeys(batch.text))}
         for caption in numbers.keys() - self._rows.keys():

@@ -33,8 +33,8 @@ def words(text: str) -> list[str]:
 def hashed(word: str, buckets: int) -> tuple[int, int]:
     """Returns the two rows of a table of `buckets` word vectors whose sum is the vector of a word.
 
-    They are two parts of its hash (Svenstrup et al. 2017, "Hash embeddings"): no vocabulary is stored, and two words
-    are confused only if both parts collide. The hash (CRC-32) is the same on every machine.
+    They are two parts of its hash (Svenstrup et al. 2017, "Hash embeddings"), so that two words are confused only if
+    both parts collide. The hash (CRC-32) is the same on every machine.
     """
     # Not two hashes of the word with different prefixes: CRC is linear, so both would collide together.
     number = zlib.crc32(word.encode())
@@ -42,9 +42,9 @@ def hashed(word: str, buckets: int) -> tuple[int, int]:
 
 
 def vocabulary(captions: Iterable[str], *, share: bool) -> dict[str, list[str]]:
-    """Returns what a checkpoint keeps of the training captions: all words, sorted, as "vocabulary".
+    """Returns what a checkpoint keeps of the training captions: "vocabulary", all words, sorted.
 
-    If the license allows to `share` captions, also up to `MAX_CAPTIONS` of them, evenly spaced, as "captions".
+    If the license allows to `share` them, also "captions", up to `MAX_CAPTIONS`, evenly spaced.
     """
     distinct = sorted(set(captions))
     kept = {"vocabulary": sorted({word for caption in distinct for word in words(caption)})}
@@ -69,21 +69,19 @@ def advice(text: str, facts: Mapping[str, Any], max_words: int | None = None) ->
 
     Imported models have no vocabulary, so their words are not checked; `max_words` None = no limit.
     """
-    lines, prompt = [], words(text)
+    lines = []
     if unknown := _unknown(text, facts):
         lines.append(f"never seen in training: {', '.join(unknown)}.{_suggested(text, facts)}")
-    if max_words is not None and len(prompt) > max_words:
-        lines.append(f"only the first {max_words} words are read, not '{' '.join(prompt[max_words:])}'")
+    if max_words is not None and (unread := words(text)[max_words:]):
+        lines.append(f"only the first {max_words} words are read, not '{' '.join(unread)}'")
     return lines
 
 
 def check_known(text: str, facts: Mapping[str, Any]) -> None:
-    """Checks that a model knows a word of a text that says what happens. Raises `UserError` if it knows none."""
+    """Raises `UserError` if a model knows no word of a text that says what happens."""
     if facts.get("vocabulary") and _unknown(text, facts) == _content(text):
-        raise UserError(
-            f"'{shortened(text, 60)}': the model knows no word of it that says what happens."
-            + (_suggested(text, facts) or " Use words of its training captions")
-        )
+        instead = _suggested(text, facts) or " Use words of its training captions"
+        raise UserError(f"'{shortened(text, 60)}': the model knows no word of it that says what happens.{instead}")
 
 
 def _content(text: str) -> list[str]:

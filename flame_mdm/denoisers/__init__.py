@@ -23,16 +23,13 @@ class Denoiser(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
-        """Predicts from a noisy motion. A pure function, except for dropout in training.
+        """Returns the prediction (B, F, out_features). A pure function, except for dropout in training.
 
         Args:
             x_t: (B, F, D) noisy motion.
             t: (B,) float in [0, 1000), the time as a row of the sinusoidal table.
             mask: (B, F) bool, True = real frame. See also `mask_padding`.
             cond: the condition, in which dropped samples are already replaced by nulls.
-
-        Returns:
-            (B, F, out_features).
 
         Raises:
             UserError: If a motion is too long for the network, or condition tokens are missing or too many.

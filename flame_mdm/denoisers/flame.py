@@ -25,9 +25,6 @@ class FLAME(Denoiser):
             fewer steps than from tokens alone.
         length_unit: ML embeds the length rounded down to a multiple of this. `task.build` passes the unit of the
             windows in training: ML knows no other lengths.
-
-    Raises:
-        UserError: If `length_unit` is not a positive whole number.
     """
 
     def __init__(
@@ -57,9 +54,7 @@ class FLAME(Denoiser):
         self.input = nn.Linear(in_features, latent_dim)
         self.pooled_projection = nn.Linear(cond_features, latent_dim) if cond_features else None
         self.token_projection = nn.Linear(cond_features, latent_dim) if cond_features and cross_attention else None
-        self.transformer = Transformer(
-            latent_dim, ff_size, num_layers, num_heads, dropout, nn.ReLU, cross_attention=cross_attention
-        )
+        self.transformer = Transformer(latent_dim, ff_size, num_layers, num_heads, dropout, nn.ReLU, cross_attention)
         self.output = nn.Linear(latent_dim, out_features)
 
     def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
@@ -79,13 +74,10 @@ class FLAME(Denoiser):
         if self.condition_frames:
             x = x + (prefix[-1] if self.pooled_projection is None else prefix[-1] + prefix[-2])[:, None]
         prefix = torch.stack(prefix, 1)
-        memory = memory_mask = None
+        memory, memory_mask = prefix, None
         if self.token_projection is not None:
             memory = torch.cat([prefix, self.token_projection(cond.tokens)], 1)
-            if cond.token_mask is not None:
-                memory_mask = with_prefix(cond.token_mask, prefix.shape[1])
-        else:
-            memory = prefix
+            memory_mask = None if cond.token_mask is None else with_prefix(cond.token_mask, prefix.shape[1])
         x = torch.cat([prefix, x], 1)
         x = x + cosine_first_sinusoid(torch.arange(x.shape[1], device=x.device), x.shape[-1]).to(x_t.dtype)
         x = self.transformer(x, with_prefix(mask, prefix.shape[1]), memory, memory_mask)

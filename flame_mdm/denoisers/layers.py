@@ -57,14 +57,9 @@ class Attention(nn.Module):
             weight, bias = self.qkv.weight, self.qkv.bias
             (query,) = heads(functional.linear(x, weight[:size], bias[:size]), 1)
             key, value = heads(functional.linear(memory, weight[size:], bias[size:]), 2)
-        y = self.attend(
-            query,
-            key,
-            value,
-            attn_mask=None if mask is None else mask[:, None, None],
-            dropout_p=self.dropout if self.training else 0.0,
-        )
-        return self.out(y.transpose(1, 2).flatten(2))
+        mask = None if mask is None else mask[:, None, None]
+        dropout = self.dropout if self.training else 0.0
+        return self.out(self.attend(query, key, value, attn_mask=mask, dropout_p=dropout).transpose(1, 2).flatten(2))
 
 
 class TransformerLayer(nn.Module):
@@ -111,10 +106,8 @@ class Transformer(nn.Module):
         cross_attention: bool = False,
     ):
         super().__init__()
-        self.layers = nn.ModuleList(
-            TransformerLayer(features, ff_size, num_heads, dropout, activation, cross_attention)
-            for _ in range(num_layers)
-        )
+        options = features, ff_size, num_heads, dropout, activation, cross_attention
+        self.layers = nn.ModuleList(TransformerLayer(*options) for _ in range(num_layers))
 
     def forward(
         self, x: Tensor, mask: Tensor | None, memory: Tensor | None = None, memory_mask: Tensor | None = None
@@ -126,19 +119,15 @@ class Transformer(nn.Module):
 
 
 class TimeAndCondition(nn.Module):
-    """z_tk of MDM: the embedded time plus the projected condition (Tevet et al. 2023, section 3).
+    """z_tk of MDM (Tevet et al. 2023, section 3): the sinusoid of the time after two linear layers, plus the condition.
 
-    The time is a row of the sinusoidal table, passed through two linear layers. The null condition is a zero vector
-    *before* the projection, so that only the projection's bias remains.
+    The null condition is a zero vector *before* the projection, so that only the projection's bias remains.
     """
 
     def __init__(self, features: int, cond_features: int, project_condition: bool):
         super().__init__()
         if cond_features and not project_condition and cond_features != features:
-            raise UserError(
-                f"with project_condition=false the condition is added directly to the time embedding: its width "
-                f"({cond_features}) must equal latent_dim ({features})"
-            )
+            raise UserError(f"project_condition=false needs latent_dim={cond_features}, the width of the condition")
         self.features, self.cond_features = features, cond_features
         self.time_embedding = nn.Sequential(nn.Linear(features, features), nn.SiLU(), nn.Linear(features, features))
         self.projection = nn.Linear(cond_features, features) if cond_features and project_condition else nn.Identity()

@@ -52,16 +52,13 @@ class MDMEncoder(Denoiser):
         if self.max_tokens:
             tokens, token_mask = condition_tokens(cond)
             if tokens.shape[1] > self.max_tokens:
-                raise UserError(
-                    f"{tokens.shape[1]} condition tokens: denoiser.max_tokens ({self.max_tokens}) must be at least that"
-                )
+                raise UserError(f"denoiser.max_tokens={self.max_tokens}: give at least {tokens.shape[1]}")
             prefix = torch.cat([self.condition.time(t)[:, None], self.condition.projection(tokens)], 1)
         else:
             prefix = self.condition(t, cond.pooled)[:, None]
         size = prefix.shape[1]
         positions = torch.arange(1 + self.max_tokens + x_t.shape[1], device=x_t.device)
-        if size <= self.max_tokens:  # frames keep their positions
-            positions = torch.cat([positions[:size], positions[1 + self.max_tokens :]])
+        positions = torch.cat([positions[:size], positions[1 + self.max_tokens :]])  # frames keep theirs
         frames = self.input(x_t)
         x = torch.cat([prefix, frames + prefix[:, :1] if self.condition_frames else frames], 1)
         x = self.dropout(x + sinusoid(positions, x.shape[-1]).to(x_t.dtype))
@@ -99,8 +96,6 @@ class MDMDecoder(Denoiser):
         mask_padding: bool = True,
     ):
         super().__init__()
-        if input_token not in ("none", "condition", "time"):
-            raise UserError(f"input_token is none, condition or time, not {input_token!r}")
         self.input_token, self.mask_padding = input_token, mask_padding
         self.token_memory = token_memory and cond_features > 0
         self.condition = TimeAndCondition(latent_dim, cond_features, project_condition)

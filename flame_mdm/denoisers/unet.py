@@ -5,6 +5,7 @@ The paper specifies convolutions over time, joints as channels, 23.47 M paramete
 """
 
 from collections.abc import Sequence
+from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -40,10 +41,7 @@ class MDMUNet(Denoiser):
         project_condition: bool = True,
     ):
         super().__init__()
-
-        def block(in_channels: int, out_channels: int) -> ResidualBlock:
-            return ResidualBlock(in_channels, out_channels, latent_dim, num_groups, dropout)
-
+        block = partial(ResidualBlock, features=latent_dim, num_groups=num_groups, dropout=dropout)
         self.condition = TimeAndCondition(latent_dim, cond_features, project_condition)
         self.input = nn.Conv1d(in_features, channels[0], 3, padding=1)
         finer = [channels[0], *channels[:-1]]
@@ -57,9 +55,7 @@ class MDMUNet(Denoiser):
 
     def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
         token = functional.silu(self.condition(t, cond.pooled))
-        masks = [mask[:, None].to(x_t.dtype)]
-        for _ in self.downsample:
-            masks.append(masks[-1][..., ::2])
+        masks = [mask[:, None, :: 2**level].to(x_t.dtype) for level in range(len(self.down))]
         x = self.input(x_t.transpose(1, 2) * masks[0])
         skips = []
         for level, block in enumerate(self.down):
@@ -72,9 +68,8 @@ class MDMUNet(Denoiser):
         for level in reversed(range(len(self.up))):
             x = self.up[level](torch.cat([x, skips[level]], 1), token, masks[level])
             if level:
-                finer = masks[level - 1]
-                x = x.repeat_interleave(2, -1)[..., : finer.shape[-1]]
-                x = self.upsample[level - 1](x * finer)
+                x = x.repeat_interleave(2, -1)[..., : masks[level - 1].shape[-1]]
+                x = self.upsample[level - 1](x * masks[level - 1])
         x = functional.silu(self.output_norm(x, masks[0]))
         return self.output(x * masks[0]).transpose(1, 2)
 

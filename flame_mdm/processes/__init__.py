@@ -125,17 +125,20 @@ class Process(nn.Module, ABC):
         names = ["guidance_scale", "sampler", "num_inference_steps", *self.samplers[name].options]
         for option, value in options.chosen().items():
             if option not in names:
-                raise UserError(
-                    f"{option}={value}: the sampler {name} has no such option; it has {', '.join(names)}. "
-                    f"Omit {option}, or choose another sampler"
-                )
+                has = ", ".join(names)
+                raise UserError(f"{option}={value}: the sampler {name} has no such option. Omit it, or give {has}")
         return self.samplers[name]
 
-    def check_edit(self, edit: Edit, mask: Tensor) -> None:
-        """Raises `UserError` if the process does not support an edit, or its shape is not that of the motions."""
+    def check_edit(self, edit: Edit, mask: Tensor, options: SamplerOptions) -> None:
+        """Raises `UserError` if process or sampler cannot make an edit, or its shape is not that of the motions."""
         if edit.mode not in self.edit_modes:
             modes = ", ".join(self.edit_modes)
             raise UserError(f"edit mode '{edit.mode}' is not supported: {type(self).__name__} has {modes}")
-        if edit.known.shape != edit.keep.shape or edit.known.shape[:2] != mask.shape:
-            shapes = f"known {tuple(edit.known.shape)}, keep {tuple(edit.keep.shape)}"
-            raise UserError(f"edit does not match the shape of the motions: {shapes}, mask {tuple(mask.shape)}")
+        kinds = {edit.mode, "resample"} if edit.resample > 1 else {edit.mode}
+        able = [name for name, sampler in self.samplers.items() if not kinds & set(sampler.unsupported)]
+        if options.sampler not in able:
+            edits = " and ".join(sorted(kinds))
+            raise UserError(f"{options.sampler} cannot edit with {edits}: choose the sampler from {', '.join(able)}")
+        shapes = [tuple(x.shape) for x in (edit.known, edit.keep, mask)]
+        if shapes[0] != shapes[1] or shapes[0][:2] != shapes[2]:
+            raise UserError(f"edit does not match the shape of the motions: known, keep and mask have shapes {shapes}")

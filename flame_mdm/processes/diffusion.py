@@ -22,21 +22,19 @@ class GaussianDiffusion(Process):
     Args:
         num_train_timesteps: T.
         schedule: name of the noise schedule.
-        prediction: meaning of the first D channels of the denoiser's output: the clean motion, the noise, or the
-            velocity sqrt(ab) noise - sqrt(1 - ab) x (Salimans and Ho 2022).
-        variance: variance of the reverse process: that of the posterior, beta, or learned between the two, from a
-            second set of D channels (Nichol and Dhariwal 2021, eq. 15).
-        vlb_weight: lambda in L_simple + lambda L_vlb (FLAME, eq. 4 and 15), if the variance is learned. L_vlb is
-            the sum over T steps, estimated by T times the term of one step. So 0.001 at T = 1000, the value of
-            Nichol and Dhariwal, corresponds to 1 in FLAME's code.
+        prediction: first D channels of the denoiser's output: the clean motion, the noise, or the velocity
+            sqrt(ab) noise - sqrt(1 - ab) x (Salimans and Ho 2022).
+        variance: of the reverse process: that of the posterior, beta, or learned between the two, from a second set of
+            D channels (Nichol and Dhariwal 2021, eq. 15).
+        vlb_weight: lambda in L_simple + lambda L_vlb (FLAME, eq. 4 and 15), if the variance is learned. L_vlb, a sum
+            over T steps, is T times the term of one step: 0.001 at T = 1000 (Nichol and Dhariwal) is 1 in FLAME's code.
         average_padding: average losses over the padded length with noise 0 in the padding, as in FLAME's code, so
             that short motions have less weight. The denoiser must return 0 there.
         clip_x0: clamp the clean estimate to [-1, 1] in sampling, as in FLAME's code.
         timestep_sampling: how training steps are drawn (FLAME, tables 6 and 7).
         skip: only with prediction epsilon: the noise is sqrt(1 - ab) x_t + sqrt(ab) times the output (Karras et al.
-            2022, eq. 7, for data of variance 1), so that the network need not carry its input, and the clean
-            estimate divides nothing by the signal. The output is then a velocity, trained with the error of the
-            noise.
+            2022, eq. 7, for data of variance 1). The output is then a velocity, trained with the error of the noise:
+            the network need not carry its input, and the clean estimate divides nothing by the signal.
         min_snr: weight of a step's squared error is that of min(SNR, min_snr) on the clean motion (Hang et al.
             2023, eq. 4, there 5). None = 1, whatever is predicted.
     """
@@ -158,12 +156,9 @@ class GaussianDiffusion(Process):
         The steps are 2 to T steps placed by `options.spacing`, or the steps themselves in increasing order; those of
         "consistency" are 1 to T steps of `grid`. An edit of mode "x0" reproduces the kept part exactly.
         """
-        sampler = self.find_sampler(options)
+        sampler, steps = self.find_sampler(options), self._steps(options)
         if edit is not None:
-            self.check_edit(edit, mask)
-            if edit.resample > 1 and not sampler.single_step:
-                raise UserError("resample needs a sampler without history: choose ancestral or ddim")
-        steps = self._steps(options)
+            self.check_edit(edit, mask, options)
         schedule = self.schedule.respace(steps)
 
         def clean(x_t: Tensor, i: int) -> tuple[Tensor, Tensor]:
@@ -185,29 +180,25 @@ class GaussianDiffusion(Process):
         draws, total = map(noise, itertools.count()), len(steps)
         x = start = next(draws)
         descent = range(total if edit is None else edit.steps(total))[::-1]
-        run = samplers.Descent(estimate, schedule, descent, draws, options)
+        run = samplers.Descent(estimate, schedule, draws, options)
         if edit is not None and edit.strength is not None:
             x = schedule.corrupt(edit.known, start, descent[0])
-        if edit is None or edit.mode == "x0":
-            x = sampler.loop(x, run)
-        elif edit.resample > 1:
-            x = samplers.repaint(sampler, x, run, edit)
-        else:
-            x = sampler.loop(x, samplers.blended(run, edit, start))
-            x = torch.where(edit.keep, edit.known, x) if edit.blend == "after" else x
+        if edit is not None and edit.mode == "x_t":
+            return samplers.blended(sampler, x, run, descent, edit, start) * mask[..., None]
+        for i in descent:
+            x = sampler.step(x, run, i)
         return x * mask[..., None]
 
     def _steps(self, options: SamplerOptions) -> list[int]:
         chosen, total = options.num_inference_steps, len(self.schedule)
-        if not isinstance(chosen, Sequence):
-            if options.sampler == "consistency" and chosen is not None and chosen <= total:
-                return [int(step) for step in reversed(self.grid(chosen))]
-            if chosen is None or chosen < 2:
-                raise UserError(f"num_inference_steps is {chosen}: diffusion takes 2 to {total} steps")
-            return timesteps(total, chosen, options.spacing or "linspace")
-        steps = list(chosen)
-        if len(steps) < 2 or steps != sorted(set(steps)) or steps[-1] >= total:
-            raise UserError(
-                f"sampling steps must be at least 2 distinct steps from 0 to {total - 1}, increasing: got {steps}"
-            )
-        return steps
+        if isinstance(chosen, Sequence):
+            steps = list(chosen)
+            if len(steps) < 2 or steps != sorted(set(steps)) or steps[-1] >= total:
+                raise UserError(f"sampling steps must be 2 or more from 0 to {total - 1}, increasing: got {steps}")
+            return steps
+        least = 1 if options.sampler == "consistency" else 2
+        if chosen is None or not least <= chosen <= total:
+            raise UserError(f"num_inference_steps={chosen}: diffusion takes {least} to {total} steps")
+        if options.sampler == "consistency":
+            return [int(step) for step in reversed(self.grid(chosen))]
+        return timesteps(total, chosen, options.spacing or "linspace")

@@ -1,7 +1,6 @@
 """Flow matching on straight paths (Lipman et al. 2023; Motion Flow Matching)."""
 
 import itertools
-from functools import partial
 from typing import Literal
 
 import torch
@@ -92,27 +91,25 @@ class FlowMatching(Process):
         """See `Process.sample`. Takes N >= 1 equal steps; "dopri5" chooses its own. Only "consistency" draws more noise
         than number 0.
 
-        An edit of mode "trajectory" overwrites the kept part early on the path (MFM, algorithm 1); after that, the
-        model moves it freely. Mode "x0" overwrites the clean estimate of every call, which reproduces the kept part
-        exactly. "dopri5" cannot edit.
+        An edit of mode "trajectory" replaces the kept part before each step at a time <= `until` by the straight path
+        from its noise to the known motion (MFM, algorithm 1); after that, the model moves it freely. Mode "x0"
+        overwrites the clean estimate of every call, which reproduces the kept part exactly.
         """
         sampler, count = self.find_sampler(options), options.num_inference_steps
         if not isinstance(count, int):
             raise UserError(f"num_inference_steps={count}: a flow takes a number of equal steps")
         if edit is not None:
-            self.check_edit(edit, mask)
-            if not sampler.single_step:
-                able = ", ".join(name for name, other in self.samplers.items() if other.single_step)
-                raise UserError(f"{options.sampler} chooses its own steps and cannot edit: choose from {able}")
+            self.check_edit(edit, mask, options)
         imposed = edit if edit is not None and edit.mode == "x0" else None
+        guide = None if imposed is None else imposed.guide
 
         def velocity(x: Tensor, t: float | Tensor) -> Tensor:
             # Filling a tensor on the device with a number needs no copy and no synchronization.
             precision = torch.promote_types(x.dtype, torch.float32)
             time = t.expand(len(x)) if isinstance(t, Tensor) else x.new_full((len(x),), t, dtype=precision)
             seen = x
-            if imposed is not None and imposed.guide is not None:
-                seen = imposed.guide.steer(lambda x: self.clean(denoise, x, time, mask, cond), x)
+            if guide is not None:
+                seen = guide.steer(lambda x: self.clean(denoise, x, time, mask, cond), x)
             output = denoise(seen, self.table_time(time), mask, cond).to(x.dtype)
             if self.prediction == "velocity" and trajectory is None and imposed is None:
                 return output
@@ -122,24 +119,20 @@ class FlowMatching(Process):
             if trajectory is not None:
                 trajectory.append(x0_hat * mask[..., None])
             straight = (x0_hat - (1 - self.sigma_min) * x) / (1 - (1 - self.sigma_min) * time[:, None, None])
-            if self.prediction == "x0" or (imposed is not None and imposed.guide is not None):
+            if self.prediction == "x0" or guide is not None:
                 return straight
             return output if imposed is None else torch.where(imposed.keep, straight, output)
 
-        start, times = noise(0), self.times(count)
-        if options.sampler == "consistency":
-            if edit is not None and edit.mode == "trajectory":
-                raise UserError("the sampler consistency forgets the path that method=mfm overwrites: use method=mdm")
-            loop = partial(sampler.loop, draws=map(noise, itertools.count(1)), sigma_min=self.sigma_min)
-            sampler = samplers.Sampler(loop)
-        if edit is None:
-            return sampler.loop(velocity, start, times) * mask[..., None]
-        first = count - edit.steps(count)
-        x = start
-        if edit.strength is not None:
+        draws = map(noise, itertools.count())
+        x = start = next(draws)
+        run = samplers.Flow(velocity, draws, self.sigma_min)
+        count = 1 if sampler.adaptive else count
+        times, first = self.times(count), 0 if edit is None else count - edit.steps(count)
+        if edit is not None and edit.strength is not None:
             x = self.corrupt(edit.known, start, start.new_full((len(start),), times[first]))
-        if edit.mode == "trajectory":
-            x = samplers.rewrite(sampler, velocity, x, times, first, start, edit)
-        else:
-            x = torch.where(edit.keep, edit.known, sampler.loop(velocity, x, times[first:]))
+        for i in range(first, count):
+            if edit is not None and edit.mode == "trajectory" and i / count <= edit.until:
+                x = torch.where(edit.keep, (start * (count - i) + edit.known * i) / count, x)
+            x = sampler.step(x, run, times[i], times[i + 1])
+        x = x if imposed is None else torch.where(imposed.keep, imposed.known, x)
         return x * mask[..., None]

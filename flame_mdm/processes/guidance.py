@@ -8,6 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from flame_mdm.batch import Condition, Denoise
+from flame_mdm.losses import bone_lengths
 
 STEERING_STEPS = 2  # gradient steps before each step of the sampler
 STEERING_LIMIT = 0.02
@@ -104,18 +105,19 @@ def reach(
     """
     offset = torch.arange(-int(3 * smoothness), int(3 * smoothness) + 1, device=x.device)
     kernel = torch.exp(-0.5 * (offset / smoothness) ** 2)
-    frames, parents, children = bones
+    frames, edges = bones[0], bones[1:].T
 
     def values(features: Tensor) -> Tensor:
         joints = to_joints(features)
-        return torch.cat([positions.of(joints), (joints[frames, children] - joints[frames, parents]).norm(dim=-1)])
+        lengths = (joints[frames, edges[:, 1]] - joints[frames, edges[:, 0]]).norm(dim=-1)
+        return torch.cat([positions.of(joints), lengths])
 
     around = frames.unique()
     near = torch.exp(-0.5 * ((torch.arange(x.shape[1], device=x.device)[:, None] - around) / smoothness) ** 2)
     changed = []
     for motion, may in zip(x, free, strict=True):
         joints = to_joints(motion)
-        usual = (joints[:, children] - joints[:, parents]).norm(dim=-1).median(0).values
+        usual = bone_lengths(joints, edges).median(0).values
         for _ in range(MOST_STEPS):
             error = torch.cat([positions.values, usual]) - values(motion)
             if error.abs().max() < CLOSE:
@@ -128,11 +130,10 @@ def reach(
             gram += torch.diag(RELAXATION * gram.diagonal() + 1e-9)
             motion = motion + torch.einsum("m,mfd->fd", torch.linalg.solve(gram, error.double()).to(x), smooth)
         if len(around):
-            edges = bones[1:, frames == around[0]]
-            before = (joints[:, edges[1]] - joints[:, edges[0]]).norm(dim=-1)
-            weight = near.amax(1, keepdim=True)
+            all_edges = edges[frames == around[0]]
+            before, weight = bone_lengths(joints, all_edges), near.amax(1, keepdim=True)
             lengths = weight * before.median(0).values + (1 - weight) * before
-            motion = _with_bones(motion, to_joints, edges, lengths, may)
+            motion = _with_bones(motion, to_joints, all_edges, lengths, may)
         changed.append(motion)
     return torch.stack(changed)
 
@@ -140,17 +141,16 @@ def reach(
 def _with_bones(
     motion: Tensor, to_joints: Callable[[Tensor], Tensor], edges: Tensor, lengths: Tensor, free: Tensor
 ) -> Tensor:
-    """Returns the nearest motion (F, D) whose bones (2, N) have `lengths` (F, N) in each frame."""
+    """Returns the nearest motion (F, D) whose bones `edges` (N, 2) have `lengths` (F, N) in each frame."""
 
-    def bone_lengths(frame: Tensor) -> Tensor:
-        joints = to_joints(frame[None])[0]
-        return (joints[edges[1]] - joints[edges[0]]).norm(dim=-1)
+    def lengths_of(frame: Tensor) -> Tensor:
+        return bone_lengths(to_joints(frame[None])[0], edges)
 
     for _ in range(MOST_STEPS):
-        error = lengths - torch.func.vmap(bone_lengths)(motion)
+        error = lengths - torch.func.vmap(lengths_of)(motion)
         if error.abs().max() < CLOSE:
             break
-        slope = torch.func.vmap(torch.func.jacrev(bone_lengths))(motion) * free[:, None]  # (F, N, D)
+        slope = torch.func.vmap(torch.func.jacrev(lengths_of))(motion) * free[:, None]  # (F, N, D)
         gram = (slope @ slope.mT).double()
         gram = gram + torch.diag_embed(RELAXATION * gram.diagonal(dim1=1, dim2=2) + 1e-9)
         motion = motion + (torch.linalg.solve(gram, error.double()).to(motion)[..., None] * slope).sum(1)

@@ -23,8 +23,7 @@ def cosine_betas(num_train_timesteps: int) -> Tensor:
 def linear_betas(num_train_timesteps: int) -> Tensor:
     """Returns noise variances (T,) float64 of Ho et al. 2020, section 4: 1e-4 to 0.02 at T = 1000.
 
-    For other T they are scaled by 1000 / T to end at the same noise, as in guided-diffusion. Clipped at 0.999, which is
-    reached below T = 21.
+    For other T they are scaled by 1000 / T to end at the same noise, as in guided-diffusion, and clipped at 0.999.
     """
     scale = 1000 / num_train_timesteps
     betas = torch.linspace(scale * 1e-4, scale * 0.02, num_train_timesteps, dtype=torch.float64, device="cpu")
@@ -58,7 +57,7 @@ class Schedule:
             "log_betas": betas.log(),
             "large_log_variance": torch.cat([clipped[:1], betas[1:]]).log(),
         }
-        self._numbers: dict[str, list[float]] = {}
+        self.numbers: dict[str, list[float]] = {name: table.tolist() for name, table in self.tables.items()}
         self._moved: dict[tuple[str, torch.device, torch.dtype], Tensor] = {}
 
     def __len__(self) -> int:
@@ -67,9 +66,7 @@ class Schedule:
     def at(self, name: str, i: int | Tensor, x: Tensor) -> Tensor | float:
         """Returns a coefficient at step i: a number, or for steps (B,) a tensor (B, 1, 1) like x, at least float32."""
         if isinstance(i, int):
-            if name not in self._numbers:
-                self._numbers[name] = self.tables[name].tolist()
-            return self._numbers[name][i]
+            return self.numbers[name][i]
         key = (name, x.device, torch.promote_types(x.dtype, torch.float32))
         if key not in self._moved:
             self._moved[key] = self.tables[name].to(*key[1:])
@@ -85,6 +82,10 @@ class Schedule:
         """Returns x_t (B, F, D) at step i (Ho et al. 2020, eq. 4)."""
         return self.at("signal", i, x) * x + self.at("noise", i, x) * noise
 
+    def log_snr(self, i: int) -> float:
+        """Returns half the logarithm of the signal-to-noise ratio at step i."""
+        return math.log(self.numbers["signal"][i] / self.numbers["noise"][i])
+
     def posterior_mean(self, x0: Tensor, x_t: Tensor, i: int | Tensor) -> Tensor:
         """Returns the mean (B, F, D) of x_{t-1} given x_0 and x_t (Ho et al. 2020, eq. 7)."""
         return self.at("posterior_x0", i, x_t) * x0 + self.at("posterior_x_t", i, x_t) * x_t
@@ -94,8 +95,7 @@ def build_schedule(name: str, num_train_timesteps: int) -> Schedule:
     """Returns the schedule "cosine" or "linear" with 2 to `MAX_STEPS` steps."""
     if not 2 <= num_train_timesteps <= MAX_STEPS:
         raise UserError(f"num_train_timesteps is {num_train_timesteps}: a diffusion has 2 to {MAX_STEPS:,} steps")
-    betas = {"cosine": cosine_betas, "linear": linear_betas}[name]
-    return Schedule(betas(num_train_timesteps))
+    return Schedule({"cosine": cosine_betas, "linear": linear_betas}[name](num_train_timesteps))
 
 
 def timesteps(num_train_timesteps: int, num_inference_steps: int, spacing: str = "linspace") -> list[int]:
@@ -110,9 +110,9 @@ def timesteps(num_train_timesteps: int, num_inference_steps: int, spacing: str =
     if not 1 <= count <= total:
         raise UserError(f"num_inference_steps is {count}: choose from 1 to num_train_timesteps = {total}")
     if spacing == "stride":
-        for stride in range(1, total + 1):
-            if len(range(0, total, stride)) == count:
-                return list(range(0, total, stride))
+        for steps in (range(0, total, stride) for stride in range(1, total + 1)):
+            if len(steps) == count:
+                return list(steps)
         raise UserError(f"no stride gives {count} of {total} steps: choose another number or spacing=linspace")
     stride = (total - 1) / (count - 1) if count > 1 else 1.0
     # A running sum, not i * stride: its rounding decides ties, and the released models were sampled at those steps.

@@ -25,10 +25,7 @@ class Windows:
 
 
 def blended(denoise: Denoise, windows: Windows) -> Denoise:
-    """Returns a denoiser of entire motions (B, F, D) that blends the outputs of `denoise` for their windows.
-
-    Its conditions are those of the windows.
-    """
+    """Returns a denoiser of entire motions (B, F, D), which gets the conditions of the windows and blends outputs."""
 
     def blend(x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
         rows = windows.rows[:, None]

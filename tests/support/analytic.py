@@ -72,6 +72,17 @@ def oracle(process: Process, x: Tensor, start: Tensor | None = None) -> Denoise:
     return denoise
 
 
+class CountedDenoise:
+    """A denoiser that counts its calls; guidance around it makes one call with the doubled batch."""
+
+    def __init__(self, denoise: Denoise):
+        self.denoise, self.calls = denoise, 0
+
+    def __call__(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
+        self.calls += 1
+        return self.denoise(x_t, t, mask, cond)
+
+
 def linear_denoiser(A: np.ndarray, b: np.ndarray, g: float) -> Denoise:
     """Each group of channels (one a column of b) mixed by A (outputs, inputs), plus b and g t / 1000."""
 

@@ -205,9 +205,9 @@ def test_flame_position_errors_equal_the_authors(stem: str):
 
 def averages(metric: reconstruction.PositionErrors, pairs: list[Any]) -> list[float]:
     """APE and AVE of pairs of parts, without what `update` does to motions."""
-    position, variance = map(torch.stack, zip(*(metric.errors(*pair) for pair in pairs), strict=True))
-    frames = torch.tensor([[len(pair[0]["root"])] for pair in pairs])
-    return [*metric.average(position, frames).tolist(), *variance.mean(0).tolist()]
+    ids = keys(len(pairs))
+    metric.add(ids, [metric.errors(*pair) for pair in pairs], groups=ids)
+    return list(metric.compute().values())
 
 
 def temos_errors(case: str) -> list[float]:
@@ -234,7 +234,7 @@ def test_temos_position_errors_equal_the_authors(stem: str):
     metric, pairs = TemosPositionErrors(), []
     metric.units_per_meter = 1.0
     for *motions, length in zip(fake, real, array("temos_ape/lengths"), strict=True):
-        pairs.append([{part: x[:length] for part, x in metric.parts(motion).items()} for motion in motions])
+        pairs.append([{part: x[:length] for part, x in metric.positions(motion).items()} for motion in motions])
     np.testing.assert_allclose(averages(metric, pairs), temos_errors("padded"), rtol=2e-6)
     parts, length = temos_parts(fake[0]), int(array("temos_ape/lengths")[0])
     names = {"root": "root", "trajectory": "traj", "mean_local": "pose_local", "mean_global": "joints"}

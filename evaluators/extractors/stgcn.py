@@ -42,17 +42,15 @@ class STGCN(nn.Module):
     """
 
     def __init__(
-        self, in_channels: int, num_actions: int, parents: Sequence[int], widths: Sequence[int], strides: Sequence[int]
+        self, parents: Sequence[int], num_actions: int, widths: Sequence[int], strides: Sequence[int], channels: int = 3
     ):
         super().__init__()
         self.register_buffer("A", adjacency(parents))
         self.A: Tensor
-        self.data_bn = nn.BatchNorm1d(in_channels * len(parents))
-        channels = [in_channels, *widths]
-        self.st_gcn_networks = nn.ModuleList(
-            _Block(channels[i], width, len(self.A), stride, residual=i > 0)
-            for i, (width, stride) in enumerate(zip(widths, strides, strict=True))
-        )
+        self.data_bn = nn.BatchNorm1d(channels * len(parents))
+        self.st_gcn_networks = nn.ModuleList()
+        for before, width, stride in zip([channels, *widths[:-1]], widths, strides, strict=True):
+            self.st_gcn_networks.append(_Block(before, width, len(self.A), stride, len(self.st_gcn_networks) > 0))
         self.edge_importance = nn.ParameterList([nn.Parameter(torch.ones_like(self.A)) for _ in widths])
         self.fcn = nn.Conv2d(widths[-1], num_actions, 1)
 
@@ -97,7 +95,7 @@ class UESTC(STGCN):
 
     def __init__(self):
         widths = (64,) * 4 + (128,) * 3 + (256,) * 3
-        super().__init__(6, 40, SMPL24.parents, widths, (1, 1, 1, 1, 2, 1, 1, 2, 1, 1))
+        super().__init__(SMPL24.parents, 40, widths, (1, 1, 1, 1, 2, 1, 1, 2, 1, 1), channels=6)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
         """Returns features (B, 256) of motions (B, F, 150) as 25 x 6 features; the root trajectory is ignored."""
@@ -108,7 +106,7 @@ class Unconstrained(STGCN):
     """The classifier of MDM's unconstrained evaluation (Raab et al. 2022, "MoDi"): 15 joints, 12 actions."""
 
     def __init__(self):
-        super().__init__(3, 12, UNCONSTRAINED_PARENTS, (64, 64, 64, 128, 128, 256), (1, 1, 1, 2, 1, 2))
+        super().__init__(UNCONSTRAINED_PARENTS, 12, (64, 64, 64, 128, 128, 256), (1, 1, 1, 2, 1, 2))
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
         """Returns features (B, 256) of joints (B, F, 24, 3) in meters, y up; the network sees them with y down."""
@@ -121,9 +119,6 @@ class Unconstrained(STGCN):
 
 class JointSTGCN(STGCN):
     """A classifier to train on the joints of any skeleton, relative to the first position of the root."""
-
-    def __init__(self, parents: Sequence[int], num_actions: int, widths: Sequence[int], strides: Sequence[int]):
-        super().__init__(3, num_actions, parents, widths, strides)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
         return super().forward(x - x[:, :1, :1], mask)

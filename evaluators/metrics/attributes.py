@@ -36,8 +36,11 @@ def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
     floor = np.percentile(smooth[:, TOES, 1], 10)
     forward, left, turned = _heading(smooth)
 
+    # Standing, the neck is 25 cm above the pelvis and the pelvis 50 cm above the toes, half of the time.
+    pelvis = smooth[:, PELVIS, 1]
+    stands = np.median(smooth[:, NECK, 1] - pelvis) > 0.25 and np.median(pelvis - smooth[:, TOES, 1].min(1)) > 0.5
     lowered = _lowered(smooth, floor, forward, fps)
-    if lowered or not _stands(smooth):
+    if lowered or not stands:
         return lowered
     jumps = _count((smooth[:, TOES, 1] - floor).min(1), 0.07, 0.035)
     # A leap goes more than 45 cm with both feet side by side, a dance sways at least three times by more than 3.5 cm to
@@ -59,7 +62,6 @@ def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
     side = int(hands.min(0).argmin())
     if hands[:, side].min() < 0.42 and np.ptp(hands[:, side]) > 0.3:
         return {"action": "pick", "side": SIDES[side]}
-    pelvis = smooth[:, PELVIS, 1]
     if squats := _count(np.percentile(pelvis, 95) - pelvis, 0.18, 0.1):
         return {"action": "squat", "count": squats}
     if _tilt(smooth).max() > 28:
@@ -90,12 +92,6 @@ def _is_a_body(joints: np.ndarray, smooth: np.ndarray) -> bool:
     return bool(steady and calm and length.min() > 0.15 and length.max() < 0.6)
 
 
-def _stands(smooth: np.ndarray) -> bool:
-    """Returns whether the neck is 25 cm above the pelvis and the pelvis 50 cm above the toes, half of the time."""
-    upright = np.median(smooth[:, NECK, 1] - smooth[:, PELVIS, 1]) > 0.25
-    return bool(upright and np.median(smooth[:, PELVIS, 1] - smooth[:, TOES, 1].min(1)) > 0.5)
-
-
 def _tilt(smooth: np.ndarray) -> np.ndarray:
     """Returns the angle (F,) between the trunk and the vertical in degrees."""
     trunk = smooth[:, NECK] - smooth[:, PELVIS]
@@ -105,8 +101,8 @@ def _tilt(smooth: np.ndarray) -> np.ndarray:
 def _lowered(smooth: np.ndarray, floor: float, forward: np.ndarray, fps: float) -> dict[str, str | int]:
     """Reads crawling, lying down, sitting down and standing up from the height of the pelvis and the tilt of the trunk.
 
-    A standing pelvis is higher than 78 cm; a seated one, at the end or the beginning, is at 35 to 72 cm. Who lies has
-    the pelvis below 35 cm and the trunk tilted by more than 55 degrees; so has a crawling trunk, which moves forward.
+    A standing pelvis is higher than 78 cm, a seated one at 35 to 72 cm, a lying one below 35 cm. The trunk of who lies
+    or crawls is tilted by more than 55 degrees.
     """
     pelvis, tilt = smooth[:, PELVIS, 1] - floor, _tilt(smooth)
     first, last = (slice(0, max(1, round(0.1 * fps))), slice(-max(1, round(0.1 * fps)), None))

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from evaluators.metrics.samples import MotionMean, SampleMetric
+from evaluators.metrics.samples import MotionMean
 from flame_mdm.representations import rotation
 from flame_mdm.representations.rifke import Rifke, upsample
 
@@ -38,8 +38,8 @@ def flame_parts(joints: Tensor, root: Tensor, parents: Sequence[int]) -> dict[st
     return {"root": root, "trajectory": root[:, [0, 2]], "mean_local": bones, "mean_global": joints}
 
 
-class PositionErrors(SampleMetric):
-    """APE and AVE by part. Each clip adds a sum of position errors, its number of frames, and its variance errors.
+class PositionErrors(MotionMean):
+    """APE and AVE of each of `PARTS`, such as `ape_root`; of several `samples` per text, `best_ape_root`, ...
 
     With several `samples` per text, the values are those of the best and the worst one, as in TEMOS: those with the
     smallest and the largest APE of the root. `upsampling` is the number of frames of a recording per frame of a motion;
@@ -47,15 +47,14 @@ class PositionErrors(SampleMetric):
     """
 
     higher_is_better = False
-    states = ("groups", "position", "variance", "frames")
-    equal_clips = False  # whether position errors are averaged over clips instead of frames
+    states = ("sums", "counts", "groups")
+    parts = tuple(f"{error}_{part}" for error in ("ape", "ave") for part in PARTS)
 
     def __init__(self, samples: int = 1, upsampling: int = 1):
         super().__init__()
         self.samples, self.upsampling = samples, upsampling
         self.ranked = {"best_": False, "worst_": True} if samples > 1 else {"": False}
-        errors = [f"{error}_{part}" for error in ("ape", "ave") for part in PARTS]
-        self.names = [f"{prefix}{error}" for prefix in self.ranked for error in errors]
+        self.names = [f"{prefix}{error}" for prefix in self.ranked for error in self.parts]
 
     def update(
         self,
@@ -77,40 +76,30 @@ class PositionErrors(SampleMetric):
                 missing = "the store has no recordings at their own frame rate"
                 raise self.error(f"{missing}. Prepare the data set again with force=true")
             motions, real_motions = [upsample(motion, self.upsampling) for motion in motions], list(references)
-        rows = []
+        errors = []
         for motion, real in zip(motions, real_motions, strict=True):
-            a, b = self.parts(motion.double()), self.parts(real.double())
+            a, b = self.positions(motion.double()), self.positions(real.double())
             length = min(len(a["root"]), len(b["root"]))
             self.need(length, 2, "frames of a motion")
-            position, variance = self.errors(*({part: x[:length] for part, x in side.items()} for side in (a, b)))
-            rows.append((position, variance, position.new_tensor([length])))
-        if rows:
-            position, variance, frames = map(torch.stack, zip(*rows, strict=True))
-            groups = keys if groups is None or self.samples == 1 else groups
-            super().update(keys=keys, groups=groups, position=position, variance=variance, frames=frames)
+            errors.append(self.errors(*({part: x[:length] for part, x in side.items()} for side in (a, b))))
+        self.add(keys, errors, groups=keys if groups is None or self.samples == 1 else groups)
 
-    def value(self, groups: Tensor, position: Tensor, variance: Tensor, frames: Tensor) -> dict[str, float | None]:
-        """Returns "ape" and "ave" of each of `PARTS`, such as `ape_root`; of several per text, `best_ape_root` ..."""
+    def value(self, sums: Tensor, counts: Tensor, groups: Tensor) -> dict[str, float | None]:
         texts = self.by_group(groups, self.samples)
-        root = (position[:, 0] / frames[:, 0])[texts]
-        values: list[float] = []
+        root, values = (sums[:, 0] / counts[:, 0])[texts], []
         for descending in self.ranked.values():
             first = root.argsort(dim=1, descending=descending, stable=True)[:, :1]
             chosen = texts.gather(1, first)[:, 0]
-            values += self.average(position[chosen], frames[chosen]).tolist() + variance[chosen].mean(0).tolist()
+            values += super().value(sums[chosen], counts[chosen]).values()
         return dict(zip(self.names, values, strict=True))
 
-    def parts(self, joints: Tensor) -> dict[str, Tensor]:
-        """Returns the compared quantities of a whole motion (F, J, 3), by the names of `PARTS`."""
+    def positions(self, joints: Tensor) -> dict[str, Tensor]:
+        """Returns the compared positions of a whole motion (F, J, 3), by the names of `PARTS`."""
         raise NotImplementedError
 
-    def errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """Returns the errors of each part of a clip, (4,): of positions, summed over frames, and of variances."""
+    def errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Returns the errors of a clip by name: "ape" per frame (F,), or their mean if clips have equal weight."""
         raise NotImplementedError
-
-    def average(self, position: Tensor, frames: Tensor) -> Tensor:
-        """Averages the position errors (4,) of all clips from their sums (N, 4) and numbers of frames (N, 1)."""
-        return (position / frames).mean(0) if self.equal_clips else position.sum(0) / frames.sum(0)
 
 
 class TemosPositionErrors(PositionErrors):
@@ -124,15 +113,15 @@ class TemosPositionErrors(PositionErrors):
 
     units_per_meter = 640.0  # KIT units per meter of `joints`, as in the KIT representations
 
-    def parts(self, joints: Tensor) -> dict[str, Tensor]:
+    def positions(self, joints: Tensor) -> dict[str, Tensor]:
         if joints.shape[1] != 21:
             raise self.error(f"{joints.shape[1]} joints, but defined only for KIT's 21 (MMM)")
         return {part: x / 1000 for part, x in temos_parts(joints * self.units_per_meter).items()}
 
-    def errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
-        distance = [(a[part] - b[part]).norm(dim=-1) for part in PARTS]
-        variance = [(a[part].var(0) - b[part].var(0)).norm(dim=-1).mean() for part in PARTS]
-        return torch.stack([d.sum() if d.ndim == 1 else d.mean(1).sum() for d in distance]), torch.stack(variance)
+    def errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        distances = {part: (a[part] - b[part]).norm(dim=-1) for part in PARTS}
+        position = {f"ape_{part}": x if x.ndim == 1 else x.mean(1) for part, x in distances.items()}
+        return position | {f"ave_{part}": (a[part].var(0) - b[part].var(0)).norm(dim=-1).mean() for part in PARTS}
 
 
 class FlamePositionErrors(PositionErrors):
@@ -144,22 +133,19 @@ class FlamePositionErrors(PositionErrors):
     unchanged, and the first one is the root. `parents` are those of the skeleton's joints, -1 for the root.
     """
 
-    equal_clips = True
-
     def __init__(self, parents: Sequence[int], samples: int = 1):
         super().__init__(samples)
         self.parents = tuple(parents)
 
-    def parts(self, joints: Tensor) -> dict[str, Tensor]:
+    def positions(self, joints: Tensor) -> dict[str, Tensor]:
         return flame_parts(joints, joints[:, 0], self.parents)
 
-    def errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
-        along_axes = (a["trajectory"] - b["trajectory"]).abs().sum(-1)
-        root, local, all_joints = ((a[p] - b[p]).norm(dim=-1) for p in ("root", "mean_local", "mean_global"))
-        position = torch.stack([root.sum(), along_axes.sum(), local.mean(1).sum(), all_joints.mean(1).sum()])
-        root, trajectory, local, all_joints = (a[part].var(0) - b[part].var(0) for part in PARTS)
-        variance = [root.norm(), trajectory.norm(), local.norm(dim=-1).mean(), all_joints.mean(0).norm()]
-        return position, torch.stack(variance)
+    def errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        root, path, local, joints = (a[part] - b[part] for part in PARTS)
+        distances = [root.norm(dim=-1), path.abs().sum(-1), local.norm(dim=-1).mean(1), joints.norm(dim=-1).mean(1)]
+        root, path, local, joints = (a[part].var(0) - b[part].var(0) for part in PARTS)
+        variances = [root.norm(), path.norm(), local.norm(dim=-1).mean(), joints.mean(0).norm()]
+        return dict(zip(self.parts, [*(x.mean() for x in distances), *variances], strict=True))
 
 
 class EditErrors(MotionMean):

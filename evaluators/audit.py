@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
-from scipy.stats import hypergeom, mannwhitneyu, spearmanr
+from scipy.stats import hypergeom, mannwhitneyu, rankdata
 from torch import Tensor
 
 from evaluators.evaluator import Evaluator, Motions, Rows
@@ -39,19 +39,15 @@ PHYSICS = (physics.FootSkating, physics.StaticShare, physics.Penetration, physic
 
 
 def audit(request: EvaluationRequest, cache: Path, resamples: int) -> AuditCard:
-    """Measures perturbations of the motions of a split; see docs/audit.md.
+    """Measures perturbations of the motions of a split, with intervals from bootstrap resamples; see docs/audit.md.
 
-    `samples` of the request limits the motions; `resamples` is the number of bootstrap resamples, for the intervals. A
-    killed audit continues with the metric inputs in the folder `cache`. Raises `UserError` if data, protocol and
-    extractor do not match, or the data is not represented by joint positions.
+    A killed audit continues with the metric inputs in the folder `cache`. Raises `UserError` if data, protocol and
+    extractor do not match.
     """
     data = open_data(request, None)
     info, representation = data.store.info, data.representation.to(request.device or "cpu")
     if not isinstance(representation, HumanML):
-        raise UserError(
-            f"{info['dataset']} is encoded as {representation.name}, but an audit perturbs joint positions. Choose a "
-            "representation of joint positions, such as representation=humanml_clean"
-        )
+        raise UserError(f"an audit needs joint positions, not {representation.name}. Add representation=humanml_clean")
     clips = data.clips(request.split)
     protocol, _ = open_protocol(str(request.protocol), clips, representation, None, replications=1)
     extractor = protocol.open_extractor(request.extractor, representation, info["dataset"])
@@ -295,10 +291,10 @@ def _agreement(
     for name in scores[0]:
         if name.endswith("/top1") or name in ("mm_dist", "mclip_score", "mid"):
             score = np.concatenate([of_set[name] for of_set in scores]) * (-1 if name == "mm_dist" else 1)
-            larger = mannwhitneyu(score[right], score[~right], method="asymptotic").statistic
+            larger = mannwhitneyu(score[right], score[~right], method="asymptotic")[0]
             both = [(grade[name][0], grade[TRUTH][0]) for grade in grades if grade[name][0] is not None]
             agreement[name] = {
                 "auc": float(larger / (right.sum() * (~right).sum())),
-                "correlation": float(spearmanr(both).statistic),
+                "correlation": float(np.corrcoef(rankdata(both, axis=0).T)[0, 1]),
             }
     return agreement

@@ -1,6 +1,7 @@
 """Evaluation during training."""
 
 from pathlib import Path
+from typing import Any
 
 from lightning import Callback, LightningModule, Trainer
 
@@ -42,8 +43,7 @@ class Evaluate(Callback):
         if extractor not in (None, "none") and not Path(extractor).exists():
             raise UserError(
                 f"callbacks.evaluate.extractor={extractor}: no such file, but it is needed to choose the best "
-                f"checkpoint: {made_by(extractor)}. Or choose by the validation loss with selection=loss; results "
-                "record the choice"
+                f"checkpoint: {made_by(extractor)}. Or choose by the validation loss: selection=loss"
             )
         self.name, self.path, self.every_n_steps = protocol, extractor, every_n_steps
         self.samples, self.replications, self.batch_size = samples, replications, batch_size
@@ -66,8 +66,9 @@ class Evaluate(Callback):
         assert isinstance(pl_module, MotionGeneration)
         self.next = (trainer.global_step // self.every_n_steps + 1) * self.every_n_steps
         protocol = self.evaluation.protocol
-        options, size = sampling_options(protocol, pl_module), {"seed": 0, "batch_size": self.batch_size}
-        source = Generator(pl_module, protocol, self.evaluation.clips, *options, **size, progress=False)
+        options, edit = sampling_options(protocol, pl_module)
+        size: dict[str, Any] = {"seed": 0, "batch_size": self.batch_size, "progress": False}
+        source = Generator(pl_module, protocol, self.evaluation.clips, options, edit, **size)
         values = self.evaluation.run(source, ground_truth=False).values or {}
         numbers = {name: v.mean for name, v in values.items() if v is not None and v.mean is not None}
         widths = {f"{name}/ci": v.ci for name, v in values.items() if v is not None and v.ci is not None}

@@ -16,7 +16,6 @@ Item = TypeVar("Item")
 
 
 def world_size() -> int:
-    """Returns the number of processes."""
     return dist.get_world_size() if dist.is_available() and dist.is_initialized() else 1
 
 
@@ -48,10 +47,7 @@ def dealt(function: Callable[[Item], T], items: Sequence[Item]) -> list[T]:
 
 @contextmanager
 def processes(device: str | None) -> Iterator[str]:
-    """Joins the processes started by torchrun, if any, and yields the device of this process.
-
-    Without `device`, it is a GPU if there is one. Raises `UserError` if this machine has no such device.
-    """
+    """Joins the processes started by torchrun, if any, and yields the device: by default, a GPU if there is one."""
     if device is None:
         local = int(os.environ.get("LOCAL_RANK", 0))
         device = f"cuda:{local % torch.cuda.device_count()}" if torch.cuda.is_available() else "cpu"

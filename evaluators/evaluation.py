@@ -31,11 +31,7 @@ Scores = list[tuple[dict[str, float | None], int]]  # values by metric, and numb
 
 
 def evaluate(request: EvaluationRequest) -> None:
-    """Evaluates a checkpoint, motion files or a baseline, and writes the result file.
-
-    Raises `UserError` if model, data, protocol and extractor do not match, or real motions do not have the expected
-    values.
-    """
+    """Evaluates a checkpoint, motion files or a baseline, and writes the result file; see `Plan`."""
     if request.out is not None:  # checked here, before hours of work
         if Path(request.out).is_dir():
             raise UserError(f"out={request.out} is a folder. Name the JSON file to write")
@@ -76,13 +72,8 @@ class Evaluation:
         """Evaluates real motions of all replications, and then the motions of the source, if there is one.
 
         Of several processes, each generates and extracts a share of the batches. The first one computes the metrics;
-        all return the result. Raises `UserError` before anything is generated if real motions do not have the expected
-        values.
-
-        Args:
-            source: source of the motions.
-            ground_truth: whether real motions are measured.
-            force: generate even if real motions do not have the values that the protocol expects.
+        all return the result. Without `force`, raises `UserError` before anything is generated if real motions do not
+        have the expected values; they are not measured without `ground_truth`.
         """
         seeds = [key("draws", self.seed, replication) for replication in range(self.protocol.replications)]
         measured = Measured(

@@ -42,19 +42,14 @@ class Motions:
     captions: list[str] | None = None  # of motions with text
     tokens: list[list[str] | None] | None = None  # "word/PART" tokens of the captions, if the data has them
     inputs: dict[str, Any] = field(default_factory=dict)  # further inputs, by the names in `evaluators.metrics`
-    # parts kept from real motions, as `region` and `joints` of `flame_mdm.sampling.editing.kept_parts`
-    edit: Mapping[str, Any] | None = None
+    edit: Mapping[str, Any] | None = None  # parts kept from real motions: `region` and `joints` of `kept_parts`
 
     def __len__(self) -> int:
         return len(self.ids)
 
 
 Rows = dict[str, Any]
-"""Metric inputs of N motions: tensors or lists of N entries, by the names in `evaluators.metrics`.
-
-"keys" (N,) identify the motions. joints, kept and contacts are lists of the values of one motion, and missing if no
-metric needs them.
-"""
+"""Metric inputs of N motions by the names in `evaluators.metrics`: tensors, or lists, as for joints, of N entries."""
 
 
 @dataclass
@@ -117,9 +112,10 @@ class Evaluator:
     @torch.no_grad()
     def reference(self) -> Rows | None:
         """Returns features of the extractor's own real motions; None = sets are compared with motions of the data."""
-        features = self.extractor.reference() if self.extractor is not None else None
-        keys = None if features is None else keys_of([f"reference {number}" for number in range(len(features))])
-        return None if features is None else {"generated": features, "keys": keys}
+        features = self.extractor and self.extractor.reference()
+        if features is None:
+            return None
+        return {"generated": features, "keys": keys_of([f"reference {number}" for number in range(len(features))])}
 
     def _batch(self, motions: Motions, indices: Sequence[int]) -> tuple[list[Tensor], dict[str, Tensor]]:
         for i in indices:
@@ -149,12 +145,9 @@ class Evaluator:
     ) -> tuple[dict[str, float | None], dict[str, str]]:
         """Computes all metrics of generated motions and of the real ones paired with them, in the same order.
 
-        Comparisons of sets use `real`, a separate draw, since the distance of a set from itself is 0. Raises
-        `UserError` if the motions lack an input that a metric needs.
-
-        Returns:
-            The values by name, `metric` or `metric/part`, None if not computable; and by metric, why a value is
-            missing. Both are empty in all processes but the first.
+        Comparisons of sets use `real`, a separate draw, since the distance of a set from itself is 0. Returns the
+        values by name, `metric` or `metric/part`, None if not computable; and by metric, why a value is missing. Both
+        are empty in all processes but the first. Raises `UserError` if the motions lack an input that a metric needs.
         """
         if not is_first():
             return {}, {}
@@ -193,7 +186,6 @@ class Evaluator:
 
 
 def keys_of(names: Sequence[str]) -> Tensor:
-    """Returns the keys (N,) of names."""
     return torch.tensor([key(name) for name in names], dtype=torch.long)
 
 

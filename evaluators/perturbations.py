@@ -97,7 +97,6 @@ def through_rate(joints: Joints, rate: float, fps: float) -> Joints:
 
 
 def crop(joints: Joints, percent: float) -> Joints:
-    """Removes this share of the time at the end."""
     return joints[: max(3, round(len(joints) * (1 - percent / 100)))]
 
 
@@ -114,8 +113,7 @@ def continue_with(joints: Joints, other: Joints, fps: float) -> Joints:
 def encode(representation: HumanML, motions: Sequence[Joints]) -> list[np.ndarray]:
     """Encodes motions as features (F, D) float32, with as many rows as frames, and at their own height.
 
-    The representation needs one more frame, which continues the last step, and puts the lowest joint of a motion on the
-    floor, which would hide floating and sinking.
+    The encoder needs one more frame, and puts the lowest joint on the floor, which would hide floating and sinking.
     """
     longer = [torch.from_numpy(np.concatenate([x, 2 * x[-1:] - x[-2:-1]])) for x in motions]
     encoded = []
@@ -130,15 +128,17 @@ def encode(representation: HumanML, motions: Sequence[Joints]) -> list[np.ndarra
 
 @dataclass(frozen=True)
 class Perturbation:
-    """A perturbation of a set of motions, and its grades."""
+    """A perturbation of a set of motions, and its grades.
 
-    name: str  # unique name
+    `change` computes joints from joints, grade, generator and frames per second; None = `Scene` replaces features,
+    captions or the set.
+    """
+
+    name: str
     group: str  # joints, meaning, set or plumbing
-    about: str  # what is done
-    unit: str = ""  # of the grades. Shares ("% of motions", "% of captions", "% of actions") say how many are replaced.
-    grades: Sequence[float] = (1,)  # from weak to strong; () = not graded
-    # returns joints; arguments are joints, grade, generator and frames per second. None = it concerns features,
-    # captions or the set, which `Scene` replaces.
+    about: str
+    unit: str = ""  # of the grades; "% of motions", "% of captions" and "% of actions" say how many are replaced
+    grades: Sequence[float] = (1,)  # from weak to strong
     change: Callable[[Joints, float, Draws, float], Joints] | None = None
 
 
@@ -174,8 +174,6 @@ PERTURBATIONS = [
 """All perturbations, apart from those that depend on the data: near misses by attribute, other representations."""
 
 
-# Near-miss captions: they name the action of a clip, but contradict it in one attribute ------------------------------
-
 ACTION = ("action", "content")  # names of the attribute that says what is done; clips without it have no near misses
 UNSAID = "normal"  # value that captions do not mention: such captions are less exact, but not wrong
 
@@ -186,8 +184,7 @@ def near_misses(clips: Sequence[Entry]) -> list[dict[str, list[str]]]:
     """Returns the near misses of each clip among the captions of the others, sorted, by the attribute that differs.
 
     A caption of another clip is a near miss if both clips show the same action, and of the attributes that both have
-    (side, style, count, direction, speed, ...), exactly one differs. An attribute that only one of them has does not
-    matter: "walks backward" is a near miss of a slow walk forward.
+    (side, style, count, ...), exactly one differs: "walks backward" is a near miss of a slow walk forward.
     """
     stated = [_stated(clip) for clip in clips]
     captions: dict[_Stated, set[str]] = {}
@@ -220,8 +217,6 @@ def _contradicting(own: _Stated, captions: dict[_Stated, set[str]]) -> dict[str,
     return {name: sorted(texts) for name, texts in sorted(wrong.items()) if texts}
 
 
-# Perturbed sets of motions and texts ----------------------------------------------------------------------------------
-
 BASE, REAL = "decoded and encoded", "reference"
 """Sets of motions that all others are compared with: those of grade 0, and the real ones of set metrics."""
 
@@ -253,7 +248,6 @@ class Scene:
         self.wrong = self._wrong()
 
     def draws(self, *parts: str | int) -> np.random.Generator:
-        """Returns the generator for a purpose."""
         return np.random.default_rng(key("audit", self.seed, *parts))
 
     def motions(self) -> dict[str, Callable[[], list[np.ndarray]]]:
@@ -322,14 +316,11 @@ class Scene:
         return {kind: chosen for kind, chosen in wrong.items() if any(chosen)}
 
     def perturbations(self, captioned: bool) -> list[Perturbation]:
-        """Returns the perturbations of this data."""
         listed = []
         for perturbation in PERTURBATIONS:
             if perturbation.unit == "% of captions":
-                kinds = (
-                    [kind for kind in self.wrong if kind.partition(":")[0] == perturbation.name] if captioned else []
-                )
-                for kind in kinds:
+                names = [name for name in self.wrong if captioned and name.partition(":")[0] == perturbation.name]
+                for kind in names:
                     most = 100 * sum(text is not None for text in self.wrong[kind]) / len(self.rows)
                     grades = [*(grade for grade in perturbation.grades if grade < most), round(most, 1)]
                     listed.append(replace(perturbation, name=kind, grades=grades))
@@ -369,5 +360,4 @@ class Scene:
 
 
 def text_of(row: DrawnClip, caption: str) -> Text:
-    """Returns a caption of the clip of a row with its attributes."""
     return Text(caption, row.tokens(caption), row.requested)

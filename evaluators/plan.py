@@ -30,12 +30,10 @@ class Plan:
 
     Attributes:
         model, file, sampling: the model, its checkpoint and its sampling options; None and {} without a model.
-        data, clips, representation: the data set, the evaluated split, and the representation on its device.
+        clips, representation: the evaluated split of `data`, and its representation, on its device.
         skeleton: the bones of joints computed from SMPL's rotations; None if the data has joint positions.
         protocol, changed: the protocol in the requested size, and the options that differ.
-        extractor: None = metrics that need features are skipped.
-        source, batch_size: source of the motions, and motions per batch.
-        path: of the result file.
+        path: path of the result file.
     """
 
     source: Source
@@ -58,8 +56,8 @@ class Plan:
             options, edit = sampling_options(protocol, model, request.options, request.editing)
             self.sampling = options.chosen() | {"edit": edit}
             folder = self._motions_folder(request, self.file, protocol)
-            size = {"seed": request.seed, "batch_size": self.batch_size}
-            self.source = Generator(model, protocol, self.clips, options, edit, **size, folder=folder)
+            cached: dict[str, Any] = {"seed": request.seed, "batch_size": self.batch_size, "folder": folder}
+            self.source = Generator(model, protocol, self.clips, options, edit, **cached)
             path = folder / "result"
         elif request.baseline is not None:
             self.source = Baseline(request.baseline, self.clips, protocol.condition, request.seed)
@@ -90,10 +88,7 @@ class Plan:
 
 
 def open_data(request: EvaluationRequest, model: MotionGenerator | None) -> MotionDataModule:
-    """Returns the prepared data, with its own representation. The model keeps the statistics of its training data.
-
-    Raises `UserError` if no data set is named, or it is not prepared, or the model generates another representation.
-    """
+    """Returns the prepared data, with its own representation; `UserError` if the model generates another one."""
     module, encoding, root = request.data, request.representation, "data"
     if model is not None and not module:
         if "data" not in model.config:
@@ -106,10 +101,8 @@ def open_data(request: EvaluationRequest, model: MotionGenerator | None) -> Moti
     root = request.data_root or os.environ.get("FLAME_MDM_DATA") or root
     representation: Representation = instantiate(encoding)
     if model is not None and representation.name != model.representation.name:
-        raise UserError(
-            f"the checkpoint generates {model.representation.name}, but the data set {module['name']} has "
-            f"{representation.name}"
-        )
+        names = f"{model.representation.name}, but the data set {module['name']} has {representation.name}"
+        raise UserError(f"the checkpoint generates {names}")
     data = instantiate(module | {"root": root}, representation=representation, seed=0)
     if not isinstance(data, MotionDataModule):
         raise UserError(f"{request.ckpt}: its recipe names {type(data).__name__} as the data set. Add data=NAME")
@@ -133,10 +126,7 @@ def sampling_options(
     options: SamplerOptions | None = None,
     editing: EditRequest | None = None,
 ) -> tuple[SamplerOptions, dict[str, Any]]:
-    """Returns the options of the sampler and those of `Edit`: the requested ones, otherwise those of the recipe.
-
-    Raises `UserError` if nothing is edited but an editing option is given, or the process does not allow an option.
-    """
+    """Returns the options of the sampler and those of `Edit`: the requested ones, otherwise those of the recipe."""
     options, editing = options or SamplerOptions(), editing or EditRequest()
     edit: dict[str, Any] = {}
     if protocol.edit is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -41,7 +41,6 @@ class DrawnClip:
 
     @property
     def text(self) -> str:
-        """The drawn caption."""
         assert self.caption is not None
         return self.clip.captions[self.caption]
 
@@ -69,8 +68,7 @@ class Protocol(ClosedSchema):
     """A named and versioned evaluation procedure, as a file in experiments/evaluation describes it.
 
     The caption and crop of a clip, and the noise of its generated motion, are functions of (seed, replication, id).
-    Motions are generated at the length of the real clip. Real motions are measured first, with the same metrics,
-    against a second draw of real motions.
+    Motions are generated at the length of the real clip. Real motions are compared with a second draw of them.
     """
 
     model_config = ConfigDict(strict=True, frozen=True)
@@ -106,8 +104,7 @@ class Protocol(ClosedSchema):
     ) -> tuple[Protocol, dict[str, Any]]:
         """Returns the protocol with another size for a split of `clips`, and the options that changed.
 
-        A quick evaluation has few motions and replications. `batch_size` is for protocols that measure time. Raises
-        `UserError` if a number is less than 1.
+        A quick evaluation has few motions and replications. `batch_size` is for protocols that measure time.
         """
         defaults = {"replications": QUICK_REPLICATIONS, "samples": min(QUICK_SAMPLES, clips)} if quick else {}
         changed: dict[str, Any] = {}
@@ -125,17 +122,14 @@ class Protocol(ClosedSchema):
         return self.model_copy(update={**changed, "quick": quick, "multimodality": several}), changed
 
     def open_extractor(self, path: str | None, representation: Representation, dataset: str) -> Extractor | None:
-        """Opens an extractor at `path`, or that of the protocol; None if it is not needed, or `path` is "none".
-
-        Raises `UserError` or `FileNotFoundError` if it is missing, or belongs to another representation or data set.
-        """
+        """Opens an extractor at `path`, or that of the protocol; None if it is not needed, or `path` is "none"."""
         if self.extractor is None or path == "none":
             return None
         path = path or self.extractor.get("path")
         if path is None:
             raise UserError(
-                f"protocol {self.name} needs a feature extractor. Give extractor=FILE, such as a checkpoint of make "
-                "train EXP=motion_clip/..., or extractor=none to skip the metrics that need features"
+                f"protocol {self.name} needs a feature extractor. Give extractor=FILE, or extractor=none to skip the "
+                "metrics that need features"
             )
         extractor: Extractor = instantiate(self.extractor, path=path, device=representation.mean.device)
         extractor.check(representation, dataset)
@@ -146,22 +140,16 @@ class Protocol(ClosedSchema):
         return f"{self.name}-{self.version}"
 
     def selected(self, clips: Clips) -> list[Entry]:
-        """Returns the clips of a split that the protocol evaluates on."""
         return [clip for clip in clips.clips if self.only.items() <= clip.attributes.items()]
 
     def rows(self, clips: Clips, seed: int, replication: int, *, purpose: str = "generated") -> list[DrawnClip]:
-        """Returns the motions of one replication; another `purpose` gives another draw of clips, captions and crops.
-
-        Raises `UserError` if the split has no clip to evaluate on.
-        """
+        """Returns the motions of one replication; another `purpose` gives another draw of clips, captions and crops."""
         drawn = () if purpose == "generated" else (purpose,)
         entries = sorted(self.selected(clips), key=lambda clip: key("sample", *drawn, seed, replication, clip.id))
         if not entries:
             only = "".join(f" and {name}={value}" for name, value in self.only.items())
-            raise UserError(
-                f"the split has no clip with at least {clips.crop.shortest()} frames{only}. Choose another with "
-                "split=..., or, for your own data, add a `split` column to captions.csv"
-            )
+            reason = f"the split has no clip with at least {clips.crop.shortest()} frames{only}"
+            raise UserError(f"{reason}. Choose another with split=..., or add a `split` column to captions.csv")
         count = self.samples if purpose == "generated" else self.real_samples
         rows = []
         for number in range(len(entries) if count is None else count):
@@ -177,11 +165,8 @@ class Protocol(ClosedSchema):
         """Returns the motions of one replication of multimodality: several for each of the first prompts."""
         assert self.multimodality is not None
         prompts = self.rows(clips, seed, replication)[: self.multimodality.prompts]
-        return [
-            DrawnClip(f"{row.id}~{number}", row.clip, row.frames, row.caption, row.id)
-            for row in prompts
-            for number in range(self.multimodality.samples)
-        ]
+        numbers = range(self.multimodality.samples)
+        return [replace(row, id=f"{row.id}~{number}", prompt=row.id) for row in prompts for number in numbers]
 
     def count(self, clips: Clips) -> int:
         """Returns the number of motions that a model generates in the whole evaluation."""
@@ -192,26 +177,20 @@ class Protocol(ClosedSchema):
 
     def check(self, clips: Clips, model: MotionGenerator | None) -> None:
         """Raises `UserError` if there is no clip, one lacks the caption or label, or the model another condition."""
-        lacking = {"text": lambda row: row.caption is None, "action": lambda row: row.clip.action is None}
-        if any(map(lacking.get(self.condition, lambda row: False), self.rows(clips, 0, 0))):
+        rows, condition, fault = self.rows(clips, 0, 0), self.condition, ""
+        drawn = {"text": [row.caption for row in rows], "action": [row.clip.action for row in rows], "none": []}
+        if None in drawn[condition]:
+            fault = f"the data set {clips.store.info['dataset']} has clips without {condition}"
+        elif model is not None and condition not in ("none", model.conditioned_on):
+            fault = f"the checkpoint was trained with condition {model.conditioned_on}"
+        if fault:
             raise UserError(
-                f"protocol {self.name} generates motions from {self.condition}, but the data set "
-                f"{clips.store.info['dataset']} has clips without {self.condition}. Choose another protocol"
-            )
-        if model is not None and self.condition not in ("none", model.conditioned_on):
-            raise UserError(
-                f"protocol {self.name} generates motions from {self.condition}, but the checkpoint was trained "
-                f"with condition {model.conditioned_on}. Choose another protocol, such as {default_protocol(model)}"
+                f"protocol {self.name} generates motions from {condition}, but {fault}. Choose another protocol"
             )
 
 
 def protocol_names(folder: Path = FOLDER) -> list[str]:
-    """Returns the names of the protocols in a folder, variants included."""
-    names = []
-    for path in folder.glob("*.yaml"):
-        content = _read(path)
-        names += [path.stem] * ("metrics" in content) + [f"{path.stem}_{name}" for name in content.get("variants", {})]
-    return sorted(names)
+    return sorted(name for path in folder.glob("*.yaml") for name in _protocols(path))
 
 
 def protocol_config(name: str) -> Config:
@@ -222,35 +201,32 @@ def protocol_config(name: str) -> Config:
     """
     path = Path(name) if name.endswith((".yaml", ".yml")) else FOLDER / f"{name}.yaml"
     for file in [path] if path.is_file() else sorted(path.parent.glob("*.yaml")):
-        variant = path.stem.removeprefix(file.stem)
-        if variant and not (variant.startswith("_") and path.stem.startswith(file.stem)):
-            continue
-        content = _read(file)
-        variants = content.pop("variants", {})
-        if not variant and "metrics" not in content:
-            raise UserError(f"protocol {name}: choose a variant: {', '.join(f'{name}_{own}' for own in variants)}")
-        if not variant or variant[1:] in variants:
-            return {"name": path.stem, **content, **variants.get(variant[1:], {})}
+        protocols = _protocols(file) if path.stem.startswith(file.stem) else {}
+        if path.stem in protocols:
+            return {"name": path.stem, **protocols[path.stem]}
+        if file == path:
+            raise UserError(f"protocol {name}: choose a variant: {', '.join(protocols)}")
     names = protocol_names(path.parent)
     raise UserError(
         f"no protocol is called '{name}'.{did_you_mean(path.stem, names)} Available: {', '.join(names) or 'none'}"
     )
 
 
-def _read(path: Path) -> Config:
+def _protocols(path: Path) -> dict[str, Config]:
+    """Returns the protocols in a file by name: its own, if it has metrics, and its variants."""
     content = read_yaml(path)
-    if not isinstance(content, dict) or not isinstance(content.get("variants", {}), dict):
-        raise UserError(f"{path}: not a protocol: it needs keys such as condition and metrics")
-    if not all(isinstance(variant, dict) for variant in content.get("variants", {}).values()):
-        raise UserError(f"{path}: a variant is not a mapping of options")
-    return content
+    variants = content.pop("variants", {}) if isinstance(content, dict) else None
+    if not isinstance(variants, dict) or not all(isinstance(variant, dict) for variant in variants.values()):
+        raise UserError(f"{path}: not a protocol: it needs keys such as condition and metrics; variants are mappings")
+    protocols = {f"{path.stem}_{name}": content | variant for name, variant in variants.items()}
+    return {path.stem: content} | protocols if "metrics" in content else protocols
 
 
 def load_protocol(name: str, representation: Representation) -> Protocol:
     """Loads a protocol, see `protocol_config`, for motions of a representation.
 
     Its file may use ${representation.fps}, ${representation.feet}, ${representation.toes} and
-    ${representation.parents}. Raises `UserError` if it does not exist, or an option is missing or unknown.
+    ${representation.parents}.
     """
     skeleton = representation.skeleton
     feet, parents = list(skeleton.feet), list(skeleton.parents)
@@ -290,7 +266,6 @@ def open_protocol(
 
 
 def default_protocol(model: MotionGenerator) -> str:
-    """Returns the name of the default protocol for a model."""
     condition, dataset = model.conditioned_on, model.facts.get("dataset", "")
     if condition == "none":
         return "unconditioned"

@@ -40,10 +40,7 @@ class EvaluationKeys:
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationRequest(EvaluationKeys):
-    """What is evaluated, and how: the keys of `flame-mdm evaluate`, with data set and representation composed.
-
-    Raises `UserError` if keys contradict each other, or a value is out of range.
-    """
+    """The keys of `flame-mdm evaluate`, with data set and representation composed; they must not contradict."""
 
     ckpt: str | None = None
     which: Which = "last"
@@ -58,7 +55,6 @@ class EvaluationRequest(EvaluationKeys):
 
     @classmethod
     def of(cls, config: Config) -> EvaluationRequest:
-        """Returns the request of a composed configuration."""
 
         def values(kind: Any) -> dict[str, Any]:
             return {key.name: config[key.name] for key in fields(kind) if key.name in config}
@@ -69,10 +65,7 @@ class EvaluationRequest(EvaluationKeys):
         _ = self.editing  # checks its keys
         what = [name for name in ("ckpt", "from_samples", "baseline") if getattr(self, name) is not None]
         if len(what) != 1:
-            raise UserError(
-                "give exactly one of ckpt=runs/.../checkpoints/last.ckpt, from_samples=<folder of .npz files> and "
-                "baseline=shuffled"
-            )
+            raise UserError("give exactly one of ckpt=FILE, from_samples=FOLDER and baseline=NAME, such as shuffled")
         if what != ["ckpt"] and not self.data:
             raise UserError(f"{what[0]} needs a data set. Add data=NAME, such as data=humanml3d")
         if what != ["ckpt"] and self.protocol is None:

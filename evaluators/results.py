@@ -116,7 +116,6 @@ def _overlaps(request: EvaluationRequest, plan: Plan) -> list[str]:
 
 
 def show(result: Result, path: Path) -> None:
-    """Prints the values next to those of real motions."""
     protocol, data = result.protocol, result.data
     mark = " QUICK RUN, NOT FOR PUBLICATION" if result.quick else ""
     say(f"{protocol.name} version {protocol.version}, {data.dataset} {result.split}{mark}")

@@ -4,9 +4,9 @@ import json
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import ConfigDict
+from pydantic import AliasPath, Field
 
 from flame_mdm import safe_io
 from flame_mdm.config import Config, read_saved
@@ -16,36 +16,16 @@ from flame_mdm.schemas import Int, Number, Result, Schema, check_shape, read_jso
 CONFIG, PROVENANCE, FAULT = "config.yaml", "provenance.json", "bad_batch.json"
 HISTORY = "metrics.jsonl"  # training curves, one line per log step
 RESULTS = "evaluation/**/result*.json"
-SAMPLES = "samples/step_*"
 HISTORY_LIMIT = 256 * safe_io.MEBIBYTE
 """Maximum size of a history; a million steps logged every 50 steps take about 20 MiB."""
 
 
-class RunName(Schema):
-    """The keys `run` of a configuration."""
-
-    name: str | Int | Number = "default"
-
-
-class TrainerSteps(Schema):
-    """The keys `trainer` of a configuration."""
-
-    max_steps: Int
-
-
 class RunConfig(Schema):
-    """The configuration of a run, with the keys that pages read."""
+    """The keys of the configuration of a run that pages read."""
 
     experiment: str | None
-    run: RunName
-    trainer: TrainerSteps
-
-
-class TrainedOn(Schema):
-    """The key `data` of a provenance file, which may contain other facts about the data."""
-
-    model_config = ConfigDict(strict=True, extra="allow")
-    fingerprint: str = "–"
+    name: Annotated[str | Int | Number, Field(validation_alias=AliasPath("run", "name"))] = "default"
+    max_steps: Annotated[Int, Field(validation_alias=AliasPath("trainer", "max_steps"))]
 
 
 class Provenance(Schema):
@@ -56,7 +36,7 @@ class Provenance(Schema):
     python: str
     machine: str
     packages: dict[str, str]
-    data: TrainedOn
+    data: dict[str, Any]
     changed: str | None = None
     device: str = "–"
     parameters: Int | None = None
@@ -89,10 +69,7 @@ def made_by(path: str | Path) -> str:
 
 @dataclass
 class Run:
-    """Content of a run directory: curves are name -> step -> value, results are by their path in the folder.
-
-    There is no provenance before training began.
-    """
+    """Content of a run directory: curves are name -> step -> value, results are by their path in the folder."""
 
     folder: Path
     config: Config
@@ -108,7 +85,8 @@ class Run:
 
     @property
     def samples(self) -> Path | None:
-        return newest_samples(self.folder, "motion_000.npz")
+        folders = [path.parent for path in self.folder.glob("samples/step_*/motion_000.npz")]
+        return max((path for path in folders if path.name.removeprefix("step_").isdecimal()), default=None)
 
     @property
     def steps(self) -> int:
@@ -117,14 +95,7 @@ class Run:
         return max((max(curve) + 1 for curve in trained), default=0)
 
 
-def newest_samples(folder: Path, file: str) -> Path | None:
-    """Returns the newest folder of samples in a run directory that contains `file`."""
-    folders = (path.parent for path in folder.glob(f"{SAMPLES}/{file}"))
-    return max((path for path in folders if path.name.removeprefix("step_").isdecimal()), default=None)
-
-
 def check_run(folder: Path) -> None:
-    """Raises `UserError` if the folder is not a run directory."""
     if not (folder / CONFIG).exists():
         raise UserError(f"{folder}: contains no {CONFIG}; give a run directory, such as runs/synthetic/mdm/default")
 
@@ -132,16 +103,15 @@ def check_run(folder: Path) -> None:
 def read_run(folder: Path) -> Run:
     """Returns the content of a run directory; raises `UserError` if it is none, or a file is damaged."""
     check_run(folder)
-    path = folder / CONFIG
-    config = read_saved(path)
+    config = read_saved(folder / CONFIG)
     try:
         check_shape(config, RunConfig)
     except ValueError as error:
-        raise UserError(f"{path}: not the configuration of a run: {error}") from error
-    origin = folder / PROVENANCE
-    remedy = "delete it; the page then omits it"
+        raise UserError(f"{folder / CONFIG}: not the configuration of a run: {error}") from error
+    provenance: Provenance | None = None
+    if (folder / PROVENANCE).exists():
+        provenance = read_json(folder / PROVENANCE, Provenance, "delete it; the page then omits it")
     results = {path.relative_to(folder).as_posix(): read_result(path) for path in sorted(folder.glob(RESULTS))}
-    provenance: Provenance | None = read_json(origin, Provenance, remedy) if origin.exists() else None
     return Run(folder, config, provenance, read_history(folder), results)
 
 
@@ -163,12 +133,9 @@ def records(path: Path) -> list[dict[str, Any]]:
     complete = []
     for number, line in enumerate(lines, 1):
         try:
-            record = json.loads(line)
-            if not isinstance(record, dict) or type(record.get("step")) is not int or not 0 <= record["step"] < 2**63:
+            record: dict[str, Any] = check_shape(json.loads(line), dict[str, float | int])
+            if type(record.get("step")) is not int or record["step"] < 0:
                 raise ValueError("it has no integer step")
-            wrong = [name for name, value in record.items() if type(value) not in (int, float)]
-            if wrong or any(type(value) is int and abs(value) >= 2**63 for value in record.values()):
-                raise ValueError(f"{', '.join(wrong) or 'a value'} should be a number")
             "".join(record).encode()  # a lone surrogate cannot be written again
         except (ValueError, RecursionError) as error:
             raise UserError(f"{path}: line {number} is damaged; delete that line ({error})") from error

@@ -19,9 +19,6 @@ Number = Annotated[float, Field(gt=-1e300, lt=1e300)]  # a finite number that do
 Plain = str | bool | Int | Number | None
 
 
-# Schema ---------------------------------------------------------------------------------------------------------------
-
-
 class Schema(BaseModel):
     """Content of a file. Types are not converted: "1" is not a number. Unlisted keys are ignored."""
 
@@ -41,9 +38,7 @@ class ClosedSchema(Schema):
 
 
 class Value(Schema):
-    """A metric over replications: mean, half-width of its 95 % interval, number of motions, and the value of each
-    replication; None if not computable.
-    """
+    """A metric over replications: mean, half-width of its 95 % interval, number of motions; None if not computable."""
 
     mean: Number | None
     ci: Number | None
@@ -53,7 +48,7 @@ class Value(Schema):
 
 
 class ProtocolVersion(Schema):
-    """The protocol of an evaluation or audit: its name and version, and the hash of its content."""
+    """The protocol of an evaluation or audit, and the hash of its content."""
 
     name: str
     version: Int
@@ -71,7 +66,7 @@ class Data(Schema):
 
 
 class ExtractorRecord(Schema):
-    """The feature extractor: its file and hash, and the fingerprint of the data it was trained on, if known."""
+    """A feature extractor, and the fingerprint of the data it was trained on, if known."""
 
     sha256: str
     path: str = ""
@@ -122,8 +117,7 @@ class Measured(Schema):
     """What an evaluation measures: `values` and, of real motions, `ground_truth`, by metric; None = not measured.
 
     `not_computed` has reasons by metric; `invalid_because` is [] if the values are valid. They are `forced` if motions
-    were generated although real motions do not have the expected values. `seeds` are those of the draws of
-    metrics, by replication.
+    were generated although real motions do not have the expected values. `seeds` are those of metrics, by replication.
     """
 
     ground_truth: dict[str, Value | None] | None
@@ -137,30 +131,21 @@ class Measured(Schema):
 
 
 class Result(Measured):
-    """A result of `flame-mdm evaluate`: what was evaluated, how and where, and the values.
+    """A result of `flame-mdm evaluate`: what was evaluated, how and where, and the values."""
 
-    Attributes:
-        quick: whether this is a quick evaluation, not for publication.
-        changed: options that differ from the protocol.
-        published_split: whether the published split tests on clips seen in training, or has no validation clips.
-        samples_sha256, baseline: hash of the files, or kind of the baseline, if no checkpoint made the motions.
-        audit: path of the audit card of the extractor; None = not audited.
-        skeleton: None if the data has joint positions.
-    """
-
-    quick: bool
+    quick: bool  # not for publication
     protocol: ProtocolVersion
-    changed: dict[str, Plain] = {}
+    changed: dict[str, Plain] = {}  # options that differ from the protocol
     split: str
-    published_split: bool = False
+    published_split: bool = False  # whether it tests on clips seen in training, or has no validation clips
     data: Data
     seed: Int
     extractor: ExtractorRecord | None
     checkpoint: Checkpoint | None
-    samples_sha256: str | None = None
+    samples_sha256: str | None = None  # of motion files from another system
     baseline: str | None = None
-    audit: str | None = None
-    skeleton: UsedSkeleton | None = None
+    audit: str | None = None  # path of the audit card of the extractor; None = not audited
+    skeleton: UsedSkeleton | None = None  # None if the data has joint positions
     device: str
     precision: str = ""
     environment: dict[str, Any] = {}
@@ -219,8 +204,6 @@ class AuditCard(ClosedSchema):
     truth: dict[str, dict[str, Number | None]]
 
 
-# Reading --------------------------------------------------------------------------------------------------------------
-
 EXPECTED = {
     **{"string": "a text", "bool": "true or false", "int": "a whole number", "float": "a number", "finite": "a number"},
     **{"less": "a smaller number", "greater": "a larger number", "none": "null"},
@@ -235,8 +218,7 @@ _adapter = functools.cache(TypeAdapter)
 def check_shape(content: Any, kind: type[T] | Any, strict: bool = True) -> T:
     """Returns content of a file converted to a `Schema` or another type that pydantic supports.
 
-    Raises `ValueError` if it has another type; the message gives key, found value and expected type. For dataclasses,
-    `strict` is False, and "1" is a number.
+    Raises `ValueError`, with key, found value and expected type. Dataclasses need `strict` = False: "1" is a number.
     """
     if large := _too_large(content):
         raise ValueError(f"{large[:40]} ... is too large for a JSON integer; the maximum is {MAX_INTEGER:,}")

@@ -74,6 +74,9 @@ SPECS = {
     "title: t\nparts: {P: {recipes: {a: quickstart}, keys: {}}}\n": "keys is {}, not a longer",
     f"title: t\nnotes: [0x{'f' * 20_000}]\n": NUMBER,
     "\n".join(f"{k * (2**61 - 1)}: 1" for k in range(8_000)): NUMBER,  # keys of one hash
+    "title: x\nparts: {a: {rows: []}}": "parts.a: needs columns and rows, or recipes",
+    "title: x\nparts: {a: {columns: {A: {value: fid}}, rows: [{ckpt: x}]}}": "parts.a.rows.0 has no label",
+    "title: x\nparts: {a: {columns: {A: {value: fid}}, rows: [{label: x, ckpt: x}]}}": "needs a protocol",
 }
 
 
@@ -81,6 +84,7 @@ def test_table_specs(attacked, bad):
     for content, says in SPECS.items():
         (bad / "spec.yaml").write_bytes(content.encode(errors="surrogateescape"))
         attacked("tables", f"table={bad / 'spec.yaml'}", "evaluate=false", says=says)
+    attacked("tables", "table=mdm_9", says="no table is called 'mdm_9'. Did you mean mdm_")
 
 
 def huge(path: Path) -> None:

@@ -43,9 +43,7 @@ def main(settings: AuditSettings) -> None:
             say(*write_card(read_card(Path(card)), out))
         return
     if settings.data is None or settings.extractor is None:
-        raise UserError(
-            "an audit needs a data set and an extractor. Give data=NAME and extractor=FILE, or extractor=none"
-        )
+        raise UserError("give a data set and an extractor: data=NAME extractor=FILE, or extractor=none")
     if settings.resamples < 100 or (settings.samples or 64) < 8:
         raise UserError(f"resamples={settings.resamples}, samples={settings.samples}: give 100, and 8, or more")
     from evaluators.audit import audit as measure

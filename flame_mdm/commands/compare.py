@@ -60,7 +60,6 @@ def _tested(runs: Mapping[str, Run]) -> list[str]:
 
 
 def _newest(run: Run) -> dict[Prompt, Motion]:
-    """Returns the newest samples of a run, by prompt."""
     from flame_mdm.formats.readers import read
 
     numbered: dict[Prompt, Motion] = {}

@@ -52,17 +52,15 @@ def main(settings: TablesSettings) -> None:
     failed = evaluate_missing(specs, results, settings) if settings.evaluate else []
     out = Path(settings.out)
     built = {name: build(name, spec, results) for name, spec in specs.items()}
-    counts = {}
-    invalid = False
+    counts, invalid = {}, []
     for name, table in built.items():
         write(table, out)
-        lines = [line for part in table.parts for line in part.lines if line.kind == "measured"]
-        counts[name] = f"{sum(not line.state for line in lines)} of {len(lines)}"
+        lines = [(part, line) for part in table.parts for line in part.lines if line.kind == "measured"]
+        counts[name] = f"{sum(not line.state for _, line in lines)} of {len(lines)}"
         say(f"{name}: {counts[name]} rows measured: {out / name}.html, .md, .tex, .csv")
-        for part in table.parts:
-            for line in (line for line in part.lines if line.state == NOT_VALID):
-                invalid = True
-                say(f"NOT VALID: {name}, {part.name}, {line.label}: {line.facts['not valid because']}", error=True)
+        invalid += [(name, part, line) for part, line in lines if line.state == NOT_VALID]
+    for name, part, line in invalid:
+        say(f"NOT VALID: {name}, {part.name}, {line.label}: {line.facts['not valid because']}", error=True)
     if len(specs) > 1:
         write_text(out / "index.html", page("Tables", render("index.html", tables=built, measured=counts)))
         say(f"all tables: {out / 'index.html'}")
@@ -114,8 +112,8 @@ def outdated(path: Path, evaluation: Evaluation) -> bool:
         return True
     for used, key in ((result.checkpoint, "ckpt"), (result.extractor, "extractor")):
         file = Path(str(evaluation.keys.get(key)))
-        weights = key == "extractor" and file.suffix in (".ckpt", ".safetensors")
-        if file.is_file() and (used is None or used.sha256 != (weights_sha256 if weights else sha256)(file)):
+        hashed = weights_sha256 if key == "extractor" and file.suffix in (".ckpt", ".safetensors") else sha256
+        if file.is_file() and (used is None or used.sha256 != hashed(file)):
             return True
     return False
 
@@ -130,10 +128,6 @@ def count_lengths(dataset: str, results: Path, settings: TablesSettings) -> None
         say(f"{dataset}: not prepared, so its lengths are omitted. To prepare it: make prepare DATA={dataset}")
         return
     store = data.open()
-    counted = Lengths(
-        fingerprint=store.fingerprint,
-        fps=store.info["fps"],
-        lengths=sorted(clip.length for clip in store.clips),
-        excluded=store.info["excluded"],
-    )
+    facts = {name: store.info[name] for name in ("fingerprint", "fps", "excluded")}
+    counted = Lengths(lengths=sorted(clip.length for clip in store.clips), **facts)
     write_json(results / "lengths" / f"{dataset}.json", counted.model_dump(), indent=None)

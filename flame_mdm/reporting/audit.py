@@ -11,10 +11,8 @@ from flame_mdm.reporting.page import interval, number, page, render
 from flame_mdm.safe_io import write_text
 from flame_mdm.schemas import AuditCard, AuditedPerturbation, read_json
 
-COMMITTED = "docs/benchmarks/audit"
-"""Folder of the cards in the repository; audited.json in this package lists their names."""
-PHYSICS = ("foot_skating", "penetration", "floating", "jitter", "static_share")
-"""Metrics of joints, which are not expected to see the meaning of a motion."""
+COMMITTED = "docs/benchmarks/audit"  # folder of the cards that audited.json lists
+PHYSICS = ("foot_skating", "penetration", "floating", "jitter", "static_share")  # do not see the meaning of a motion
 ROUNDING = 1e-6  # relative differences below this are not seen
 WIDE, HIGH = 132, 48
 LEGEND = (
@@ -70,8 +68,7 @@ def _name(dataset: str, sha256: str | None) -> str:
 def card_of(dataset: str, sha256: str | None) -> Path | None:
     """Returns the card of an extractor on a data set, or of metrics of joints; None if it was not audited.
 
-    It is in the folder that FLAME_MDM_AUDITS names, by default runs/audit, or else one of the cards in the repository.
-    An installed package knows only the names of those.
+    It is in the folder that FLAME_MDM_AUDITS names, by default runs/audit, or one of those named in audited.json.
     """
     name = _name(dataset, sha256)
     path = Path(os.environ.get("FLAME_MDM_AUDITS", "runs/audit")) / f"{name}.html"
@@ -82,20 +79,20 @@ def card_of(dataset: str, sha256: str | None) -> Path | None:
 
 
 def read_card(path: Path) -> AuditCard:
-    """Returns a card; raises `UserError` if the file is damaged."""
     return read_json(path, AuditCard, "run `flame-mdm audit` again")
 
 
 def write_card(card: AuditCard, out: Path) -> list[Path]:
     """Writes a card as a web page and as Markdown; returns the paths."""
     metrics = sorted(card.metrics, key=lambda name: name.startswith("attributes"))
+    evaluator = f"{card.extractor.name} ({card.extractor.sha256[:12]})" if card.extractor else "metrics of joints"
     rows = []
     for perturbation in card.perturbations:
         cells = [_cell(card, perturbation, metric) for metric in metrics]
         curves = [(metric, curve) for metric in metrics if (curve := _curve(card, perturbation, metric))]
         rows.append({"about": perturbation, "cells": cells, "curves": curves})
     values = {
-        "title": f"Audit of {_evaluator(card)} on {card.data.dataset}",
+        "title": f"Audit of {evaluator} on {card.data.dataset}",
         "facts": _facts(card),
         "findings": findings(card),
         "truth": [(name, number(x["auc"]), number(x["correlation"])) for name, x in card.truth.items()],
@@ -108,10 +105,6 @@ def write_card(card: AuditCard, out: Path) -> list[Path]:
     write_text(paths[0], page(values["title"], render("audit.html", **values, wide=WIDE, high=HIGH)))
     write_text(paths[1], str(render("audit.md", **values, metric_text=_metric_text)))
     return paths
-
-
-def _evaluator(card: AuditCard) -> str:
-    return f"{card.extractor.name} ({card.extractor.sha256[:12]})" if card.extractor else "metrics of joints"
 
 
 def _facts(card: AuditCard) -> list[list[str]]:

@@ -37,16 +37,13 @@ def find(folders: Sequence[Path]) -> dict[str, Run]:
     return {run.label if labels.count(run.label) == 1 else str(run.folder): run for run in runs}
 
 
-# Side by side ---------------------------------------------------------------------------------------------------------
-
-
 def comparison(runs: Mapping[str, Run], shown: Sequence[Mapping[Prompt, Motion]], mesh: Mesh | None = None) -> str:
     """Returns the page that compares runs side by side. The same runs give the same bytes."""
     body = render(
         "compare.html",
         title=" · ".join(runs),
         labels=list(runs),
-        facts=filled(FACTS, _facts(runs)),
+        facts=_facts(runs),
         differences=_differences(runs),
         player=_player(list(runs), shown, mesh),
         evaluations=_evaluations(runs),
@@ -58,11 +55,8 @@ def comparison(runs: Mapping[str, Run], shown: Sequence[Mapping[Prompt, Motion]]
     return page("Comparison", body)
 
 
-FACTS = ("run", "steps", "passes", "parameters", "s/step", "samples per second", "device", "data", "folder")
-"""Column titles of `_facts`."""
-
-
-def _facts(runs: Mapping[str, Run]) -> list[list[str]]:
+def _facts(runs: Mapping[str, Run]) -> tuple[list[str], list[list[str]]]:
+    head = ("run", "steps", "passes", "parameters", "s/step", "samples per second", "device", "data", "folder")
     rows = []
     for label, run in runs.items():
         facts = run.provenance
@@ -70,9 +64,9 @@ def _facts(runs: Mapping[str, Run]) -> list[list[str]]:
         row += [f"{facts.parameters / 1e6:.2f} M" if facts and facts.parameters else "–"]
         curves = [run.curves.get(f"train/{name}") for name in ("seconds_per_step", "samples_per_second")]
         row += [number(statistics.median(curve.values()) if curve else None) for curve in curves]
-        row += [facts.device, facts.data.fingerprint] if facts else ["–", "–"]
+        row += [facts.device, str(facts.data.get("fingerprint", "–"))] if facts else ["–", "–"]
         rows.append([*row, str(run.folder)])
-    return rows
+    return filled(head, rows)
 
 
 def _differences(runs: Mapping[str, Run]) -> list[list[str]]:
@@ -104,18 +98,14 @@ EXPLAINED = (
 
 
 def differences(first: Result, second: Result) -> list[list[str]] | str:
-    """Returns rows for `HEAD`, the differences of all metrics of two results of the same evaluation, or why not.
-
-    The intervals are Student's for the paired replications, whose captions, crops and noise differ.
-    """
+    """Returns rows for `HEAD`, the differences of all metrics of two results of the same evaluation, or why not."""
     if invalid := [*first.invalid_because, *second.invalid_because]:
         return f"not compared: not valid: {invalid[0]}"
     paired = [(r.seed, r.data.frames, r.skeleton) for r in (first, second)]
     if paired[0] != paired[1]:
         return "not compared: other seed, limits of length or skeleton, so that the motions are not paired"
-    values = [result.values or {} for result in (first, second)]
-    names = sorted(values[0].keys() & values[1].keys())
-    rows = [_difference(name, values[0][name], values[1][name]) for name in names]
+    one, two = first.values or {}, second.values or {}
+    rows = [_difference(name, one[name], two[name]) for name in sorted(one.keys() & two.keys())]
     return [row for row in rows if row] or (
         "not compared: no metric has values per replication of the same number of motions. Results of earlier versions "
         "have none: evaluate both again; motions are not generated again"
@@ -126,12 +116,12 @@ def _difference(name: str, first: Value | None, second: Value | None) -> list[st
     """Returns a row of cells, second - first; [] if the results have no pairs of values of the metric."""
     if first is None or second is None or first.n != second.n:
         return []
-    both = list(zip(first.per_replication, second.per_replication, strict=False))
-    pairs = [(a, b) for a, b in both if a is not None and b is not None]
-    if not pairs or len(pairs) < len(both):
+    count = min(len(first.per_replication), len(second.per_replication))
+    one, two = (np.array(value.per_replication[:count], float) for value in (first, second))
+    if not count or np.isnan(one + two).any():
         return []
-    mean, low, high = paired_difference([a for a, _ in pairs], [b for _, b in pairs])
-    if len(pairs) == 1:
+    mean, low, high = paired_difference(one, two)
+    if count == 1:
         return [name, number(mean), "–", "not tested: one replication"]
     shown = "higher" if low > 0 else "lower" if high < 0 else "no difference shown"
     return [name, number(mean), f"[{number(low)}, {number(high)}]", shown]

@@ -1,7 +1,4 @@
-"""Self-contained web pages from templates: one file that opens from disk without a network.
-
-The same input gives the same bytes.
-"""
+"""Self-contained web pages, one file each, from templates. The same input gives the same bytes."""
 
 from __future__ import annotations
 
@@ -34,7 +31,7 @@ def render(template: str, **values: Any) -> Markup:
 
 
 def page(title: str, body: str) -> str:
-    """Returns a complete page around `body`, the output of `render`; plain text is escaped."""
+    """Returns a complete page around `body`, the output of `render`."""
     return str(render("page.html", title=title, body=body, policy=POLICY))
 
 

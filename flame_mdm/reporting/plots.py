@@ -80,9 +80,6 @@ def chart(title: str, curves: Mapping[str, Curve], bands: Mapping[str, Curve] | 
     return render("chart.html", title=title, plot=plot, key=key, colors=COLORS)
 
 
-# Geometry -------------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class _Axis:
     low: float
@@ -101,7 +98,7 @@ def _drawn(panel: Panel) -> dict[str, Any] | None:
     series = [] if isinstance(panel.content, Histogram) else panel.content
     points = {s.name: [(x, y) for x, y in s.points if x > 0 or not panel.log_x] for s in series}
     everything = [point for curve in points.values() for point in curve]
-    if histogram is not None:
+    if histogram:
         everything = [(0, 0), (histogram.step * len(histogram.counts), max(histogram.counts))]
     if not everything:
         return None
@@ -139,7 +136,7 @@ def _drawn(panel: Panel) -> dict[str, Any] | None:
         "levels": [at(x_axis.low, level)[1] for level in panel.levels],
         "bars": _bars(histogram, at) if histogram else [],
         "lines": lines,
-        "legend": legend if panel.legend and len(names) > 0 else [],
+        "legend": legend if panel.legend else [],
         "x": panel.x,
         "y": panel.y,
         "high": HIGH + ROW * (bool(panel.x) + len(names) * panel.legend),

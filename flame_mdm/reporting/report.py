@@ -13,6 +13,8 @@ from flame_mdm.safe_io import write_text
 from flame_mdm.schemas import Result, Value, read_json
 
 if TYPE_CHECKING:
+    from markupsafe import Markup
+
     from flame_mdm.visualize.body import Mesh
 
 COST = ("lr", "grad_norm", "samples_per_second", "seconds_per_step", "gpu_memory_gib")
@@ -29,7 +31,7 @@ def write_report(folder: Path, mesh: Mesh | None = None) -> Path:
         fault = read_json(folder / FAULT, Fault, "delete it to write the page without it")
     faulty = [[f"process {b.rank}, batch {b.batch}", b.loss, ", ".join(b.ids)] for b in fault.batches] if fault else []
     groups = {
-        heading: [chart(name, *_curves(run, name, families)) for name, families in titles.items()]
+        heading: [_chart(run, name, families) for name, families in titles.items()]
         for heading, titles in charted(run.curves).items()
     }
     body = render(
@@ -49,9 +51,6 @@ def write_report(folder: Path, mesh: Mesh | None = None) -> Path:
     path = folder / "report.html"
     write_text(path, page(run.label, body))
     return path
-
-
-# Parts of the page ----------------------------------------------------------------------------------------------------
 
 
 def last(curve: Curve) -> float | None:
@@ -79,9 +78,9 @@ def _player(run: Run, body: Mesh | None) -> str:
     return player_page([read(path) for path in sorted(run.samples.glob("motion_*.npz"))], body=body)
 
 
-def _curves(run: Run, name: str, families: list[str]) -> tuple[dict[str, Curve], dict[str, Curve]]:
+def _chart(run: Run, name: str, families: list[str]) -> Markup:
     lines: dict[str, Curve] = {family: run.curves[f"{family}/{name}"] for family in families}
-    return lines, {family: run.curves.get(f"{family}/{name}/ci", {}) for family in families}
+    return chart(name, lines, {family: run.curves.get(f"{family}/{name}/ci", {}) for family in families})
 
 
 def charted(curves: Collection[str]) -> dict[str, dict[str, list[str]]]:
@@ -146,7 +145,7 @@ def _provenance(facts: Provenance) -> list[list[str]]:
     return [
         ["command", " ".join(facts.command)],
         ["commit", (facts.commit or "not from a clone") + changed],
-        ["data", ", ".join(f"{k} {v}" for k, v in facts.data.model_dump(exclude_unset=True).items() if k != "actions")],
+        ["data", ", ".join(f"{name} {fact}" for name, fact in facts.data.items() if name != "actions")],
         ["device", facts.device],
         ["machine", f"{facts.machine}, Python {facts.python}"],
         ["packages", ", ".join(f"{name} {version}" for name, version in facts.packages.items())],

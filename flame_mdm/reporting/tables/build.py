@@ -32,23 +32,22 @@ def build(name: str, spec: Config, results: Path) -> Table:
     unknown = published.keys() - spec["parts"].keys()
     if unknown:
         raise UserError(f"{PUBLISHED}: {name} has parts that are not in its spec: {', '.join(sorted(unknown))}")
-    parts = []
+    table = Table(name, spec["title"], [], spec.get("notes", []))
     for part_name, part in spec["parts"].items():
-        reported = published.get(part_name)
         if "recipes" in part:
-            built = settings_table(part_name, part, reported)
+            built = settings_table(part_name, part, published.get(part_name))
         elif "lengths" in part:
             built = _lengths(part_name, part, results)
         else:
-            built = _measured(part_name, part, reported, results)
-            built.figures = [Figure(**figure) for figure in spec.get("figures", []) if figure["part"] == part_name]
-        parts.append(built)
-    return Table(name, spec["title"], parts, list(spec.get("notes", [])))
+            built = _measured(part_name, part, published.get(part_name), results)
+        built.figures = [Figure(**figure) for figure in spec.get("figures", []) if figure["part"] == part_name]
+        table.parts.append(built)
+    return table
 
 
 @functools.cache
 def _published(path: Path, changed: int) -> Config:
-    """Returns the published numbers. They are read once for all tables, until the file changes."""
+    """Returns the published numbers, read once for all tables until the file changes."""
     return load_mapping(path)
 
 
@@ -71,12 +70,11 @@ def _measured(name: str, part: Config, reported: Config | None, results: Path) -
                 commands = [made_by(path) for path in evaluation.absent.values()] or ["make tables evaluates it"]
                 missing += [(line.label, command) for command in commands]
         timed = {path for path, value in zip(paths, values, strict=True) if value == "seconds_per_sample"}
-        pairs = [(path, result) for path, result in zip(paths, read, strict=True) if result is not None]
-        line.marks = ",".join(dict.fromkeys(_letter(_conditions(r, path in timed), conditions) for path, r in pairs))
+        facts = [_conditions(r, path in timed) for path, r in zip(paths, read, strict=True) if r is not None]
+        line.marks = ",".join(dict.fromkeys(_letter(fact, conditions) for fact in facts))
         if line.marks and line.marks not in truths:
-            cells = [
-                _entry(r.ground_truth, v) if r and v not in ABOUT else None for r, v in zip(read, values, strict=True)
-            ]
+            pairs = zip(read, values, strict=True)
+            cells = [_entry(r.ground_truth, v) if r and v not in ABOUT else None for r, v in pairs]
             truths[line.marks] = Line("Real motions", "real", cells, line.marks)
     lines = [line for line in truths.values() if any(line.cells)] + lines
     notes = [*_condition_notes(conditions), *_by_text(missing), *_warnings(lines, values, list(columns))]
@@ -101,10 +99,10 @@ def _condition_notes(conditions: list[dict[str, str]]) -> list[tuple[str, str]]:
     notes = []
     for facts in conditions:
         different = [text or f"no {name}" for name, text in facts.items() if text != conditions[0][name]]
-        whole = "; ".join(filter(None, facts.values()))
-        notes.append(
-            (_letter(facts, conditions), f"as a, but {'; '.join(different)}" if 0 < len(different) <= 3 else whole)
+        text = (
+            f"as a, but {'; '.join(different)}" if 0 < len(different) <= 3 else "; ".join(filter(None, facts.values()))
         )
+        notes.append((_letter(facts, conditions), text))
     return notes
 
 
@@ -272,12 +270,11 @@ def _print_cells(lines: Sequence[Line], columns: int) -> None:
 
 def _rank(lines: Sequence[Line], columns: Mapping[str, str]) -> None:
     """Marks best and second best among rows of the same kind with the same marks."""
-    for kind in ("measured", "reported"):
+    for kind, real in (("measured", "real"), ("reported", "reported real")):
         for marks in {line.marks for line in lines}:
-            rows = [x for x in lines if x.kind == kind and x.marks == marks and not x.state]
-            rows = [x for x in rows if not x.facts.get("baseline")]
-            truths = [x for x in lines if x.kind == {"measured": "real", "reported": "reported real"}[kind]]
-            truths = [x for x in truths if kind == "reported" or x.marks == marks]
+            same = [x for x in lines if x.marks == marks or x.kind == "reported real"]
+            rows = [x for x in same if x.kind == kind and not x.state and not x.facts.get("baseline")]
+            truths = [x for x in same if x.kind == real]
             for index, better in enumerate(columns.values()):
                 numbers = [cell.value if (cell := row.cells[index]) else None for row in rows]
                 reals = [c.value for x in truths if (c := x.cells[index]) is not None]
@@ -285,9 +282,6 @@ def _rank(lines: Sequence[Line], columns: Mapping[str, str]) -> None:
                 for row, rank in zip(rows, ranked, strict=True):
                     if (cell := row.cells[index]) is not None:
                         cell.rank = rank
-
-
-# Published numbers ----------------------------------------------------------------------------------------------------
 
 
 def _reported(
@@ -315,9 +309,6 @@ def _leading(text: str) -> float | None:
     """Returns the number at the beginning of a printed value; 1,000 is one thousand."""
     number = re.match(r"[-+]?[\d,]*\.?\d+(?:[eE][-+]?\d+)?", text.strip())
     return float(number[0].replace(",", "")) if number else None
-
-
-# Other kinds of parts -------------------------------------------------------------------------------------------------
 
 
 def _lengths(name: str, part: Config, results: Path) -> Part:

@@ -30,8 +30,7 @@ KINDS = {
 }
 NO_RESULTS = ("NOT VALID", "QUICK")  # states of rows whose values must not be mistaken for results
 CARD = re.compile(r"(?<=\baudit )([\w./-]+\.html)")  # paths of audit cards in footnotes
-SHARED = ("checkpoint sha256", "recipe", "sampler")
-"""Facts that rows must have in common to be listed together as sources."""
+SHARED = ("checkpoint sha256", "recipe", "sampler")  # facts that rows listed together as sources have in common
 
 
 @dataclass
@@ -48,9 +47,8 @@ class Cell:
 class Line:
     """One row of a table, of a kind in `KINDS`, with one cell per column; None if there is no value.
 
-    Only rows with the same footnote marks are compared. `state` is "" if the row is complete and valid, otherwise the
-    reason: "no checkpoint", "NOT VALID". `options` are numbers for the x-axis of figures, and `facts` the provenance
-    of the values.
+    Only rows with the same footnote marks are compared. `state` is "" if the row is complete and valid, or a reason
+    such as "no checkpoint". `options` are numbers for the x-axis of figures, `facts` the provenance of the values.
     """
 
     label: str
@@ -120,9 +118,6 @@ def rendered(table: Table, suffix: str) -> Markup:
     return render(f"table.{suffix}", table=table, **values, **functions)
 
 
-# What the templates read ----------------------------------------------------------------------------------------------
-
-
 def _linked(table: Table, text: str) -> list[tuple[str, str]]:
     """Splits a footnote into texts and their links; "" = no link, also to a card that is not on this machine."""
     return [
@@ -167,9 +162,6 @@ def _tex(text: str) -> str:
     return one_line(text).translate(str.maketrans(special))
 
 
-# CSV ------------------------------------------------------------------------------------------------------------------
-
-
 def comma_separated(table: Table) -> str:
     """Returns the table as CSV: for each row, the number, interval and place of each cell, and its provenance."""
     facts = list(dict.fromkeys(name for part in table.parts for line in part.lines for name in line.facts))
@@ -196,9 +188,6 @@ def _inert(text: str) -> str:
     text = one_line(text)
     number = re.fullmatch(r"[-+]?[\d.,]+([eE][-+]?\d+)?( ?± ?[\d.,]+)?", text)
     return text if number or not text.lstrip().startswith(("=", "+", "-", "@")) else f"'{text}"
-
-
-# Plots ----------------------------------------------------------------------------------------------------------------
 
 
 def draw(part: Part, figure: Figure) -> Markup | None:

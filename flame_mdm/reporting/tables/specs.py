@@ -42,14 +42,14 @@ class Options(ClosedSchema):
 
 
 class ColumnSpec(Options):
-    """A column: a metric or a key of `ABOUT`, and which of its values are better."""
+    """A column: a metric or a key of `ABOUT`."""
 
     value: str
     better: Literal["higher", "lower", "real", "none"] = "none"
 
 
 class RowSpec(Options):
-    """A row: a model or baseline, and its sampling options. Keys that contain a dot override keys of the data."""
+    """A row: a model or baseline, and its sampling options; dotted keys override those of the data."""
 
     label: str
     note: str = ""
@@ -178,7 +178,7 @@ def load_mapping(path: Path) -> Config:
     if not isinstance(content, dict):
         raise UserError(f"{path}: not a mapping")
     plain(content, path)
-    return {str(key): value for key, value in content.items()}
+    return content
 
 
 @dataclass(frozen=True)
@@ -189,10 +189,7 @@ class Evaluation:
     keys: Mapping[str, Any]
 
     def path(self, results: Path) -> Path:
-        """Returns the path of the result, a function of the keys alone.
-
-        Tables therefore share results, and are rendered without checkpoints.
-        """
+        """Returns the path of the result, a function of the keys alone, so that tables share results."""
         digest = hashlib.sha256(json.dumps(dict(self.keys), sort_keys=True).encode()).hexdigest()
         what = self.keys.get("baseline") or self.keys.get("ckpt") or self.keys["from_samples"]
         name = re.sub(r"^runs-|-checkpoints-|-ckpt$|-default", "-", re.sub(r"[^A-Za-z0-9]+", "-", str(what))).strip("-")
@@ -208,20 +205,19 @@ class Evaluation:
 
 
 def evaluations(part: Mapping[str, Any]) -> Iterator[tuple[dict[str, Any], list[Evaluation]]]:
-    """Yields the rows of a part, with lists of options expanded, each with one evaluation per column."""
+    """Yields the rows of a part, with lists of options expanded, each with one evaluation per column.
+
+    The label of an expanded row lists the options that vary and that no column shows.
+    """
+    shown = {column["value"] for column in part.get("columns", {}).values()}
     for row in part.get("rows", []):
-        for values in itertools.product(*(as_list(row[name]) for name in SWEPT if name in row)):
-            single = row | dict(zip((name for name in SWEPT if name in row), values, strict=True))
-            single["label"] = _spread_label(part, row, single)
+        names = [name for name in SWEPT if name in row]
+        varied = [name for name in names if name not in shown and len(as_list(row[name])) > 1]
+        for values in itertools.product(*(as_list(row[name]) for name in names)):
+            single = row | dict(zip(names, values, strict=True))
+            options = ", ".join(f"{ABOUT[name]} {single[name]}" for name in varied)
+            single["label"] += f" ({options})" if options else ""
             yield single, [_evaluation(part, single, column) for column in part["columns"].values()]
-
-
-def _spread_label(part: Mapping[str, Any], row: Mapping[str, Any], single: Mapping[str, Any]) -> str:
-    """Returns the label of an expanded row, with the options that vary and that no column shows."""
-    shown = {column["value"] for column in part["columns"].values()}
-    swept = [name for name in SWEPT if name not in shown and len(as_list(row.get(name))) > 1]
-    options = [f"{ABOUT[name]} {single[name]}" for name in swept]
-    return f"{row['label']} ({', '.join(options)})" if options else row["label"]
 
 
 def _evaluation(part: Mapping[str, Any], row: Mapping[str, Any], column: Mapping[str, Any]) -> Evaluation:

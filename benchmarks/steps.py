@@ -136,10 +136,7 @@ def batch_of(lengths: np.ndarray, frames: int, device: str) -> MotionBatch:
 
 
 def take_turns(runs: Mapping[str, Callable[[], object]], rounds: int, device: str = "cpu") -> dict[str, float]:
-    """Returns the median seconds of each function. They take turns, so that a busy machine slows all of them.
-
-    The first round warms up.
-    """
+    """Returns the median seconds of functions, which take turns, since machines may be busy; one round warms up."""
     times: dict[str, list[float]] = {name: [] for name in runs}
     for _ in range(rounds + 1):
         for name, run in runs.items():
@@ -253,7 +250,7 @@ def measure(device: str = "cpu", quick: bool = False) -> Section:
 def machine() -> dict[str, str | int]:
     has, software = torch.cpu.get_capabilities(), environment()
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    facts: dict[str, str | int] = {
+    return {
         "processor": has.get("cpu_name") or platform.processor(),
         "cores": cores,
         "bfloat16 instructions": " ".join(name for name in ("avx512_bf16", "amx_bf16") if has.get(name)) or "none",
@@ -261,10 +258,8 @@ def machine() -> dict[str, str | int]:
         "torch": software["packages"]["torch"],
         "lightning": software["packages"]["lightning"],
         "python": software["python"],
+        **({"GPU": torch.cuda.get_device_name()} if torch.cuda.is_available() else {}),
     }
-    if torch.cuda.is_available():
-        facts["GPU"] = torch.cuda.get_device_name()
-    return facts
 
 
 def cell(value: str | float | None) -> str:

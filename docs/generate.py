@@ -45,10 +45,7 @@ about the same length, every sample of a batch has the same weight, and checkpoi
 
 
 def published_tables() -> dict[str, dict[str, dict[str, Any]]]:
-    """Returns the hyperparameters of the papers, from published.yaml: title -> recipe -> dotted key -> value.
-
-    None = the value is shown, but not in the paper.
-    """
+    """Returns the papers' hyperparameters: title -> recipe -> dotted key -> value; None = not in the paper."""
     published = read_yaml(PUBLISHED)
     tables = {}
     for page in published["hyperparameters"]["pages"]:

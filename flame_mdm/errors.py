@@ -31,10 +31,7 @@ def did_you_mean(name: str, names: Iterable[str]) -> str:
 
 
 def shortened(text: str, most: int = MAX_LINE) -> str:
-    r"""Returns a text of at most `most` characters; a longer one ends in an ellipsis.
-
-    Direction characters are escaped (`\u202e`), so that a caption cannot rearrange a page.
-    """
+    """Returns a text of at most `most` characters, direction characters escaped; a longer one ends in an ellipsis."""
     text = DIRECTIONS.sub(lambda match: _escaped(match[0]), text[: most + 1])
     return text if len(text) <= most else f"{text[: most - 1]}…"
 
@@ -58,10 +55,7 @@ def markdown_text(text: str) -> str:
 
 
 def say(*lines: object, error: bool = False) -> None:
-    """Prints each argument as one `printable` line, to standard output or, with `error`, to standard error.
-
-    Commands use it instead of `print`, because any name or text may come from an untrusted file.
-    """
+    """Prints each argument as one `printable` line, because any name or text may come from an untrusted file."""
     for line in lines:
         text = str(line)
         if error and len(text) > MAX_LINE:

@@ -61,10 +61,7 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def atomic_folder(path: str | Path) -> Iterator[Path]:
-    """Does the same as `atomic_write` for a folder.
-
-    If the folder `path` exists, the new files replace files of the same name, and other files are kept.
-    """
+    """Does the same for a folder; if it exists, the new files replace those of the same name, and others are kept."""
     path = Path(path)
     if path.exists() and not path.is_dir():
         raise UserError(f"{path}: a file, not a folder. Choose another folder")
@@ -276,10 +273,7 @@ def _nodes(node: Any, counted: dict[int, float]) -> float:
 def read_npz(
     source: Path | IO[bytes], *, skip: Collection[str] = (), only: Collection[str] | None = None
 ) -> dict[str, np.ndarray]:
-    """Returns the arrays of an .npz file, or seekable open file, by name, without those in `skip`, or `only` some.
-
-    Raises `UserError` if the file is damaged or encrypted, contains objects, or expands disproportionately.
-    """
+    """Returns the arrays of an .npz file, or seekable open file, by name; refuses objects and excessive sizes."""
     from numpy.lib import format as npy
 
     with _opened(source) as (file, size), zipfile.ZipFile(file) as archive:

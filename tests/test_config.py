@@ -1,10 +1,12 @@
 """Recipes, command lines, the check of signatures, and devices that are not there."""
 
 import os
+import re
 import subprocess
 import sys
 import textwrap
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, fields
 from importlib import import_module
 from typing import ClassVar, Literal, get_type_hints
@@ -19,7 +21,7 @@ from flame_mdm.__main__ import COMMANDS, main
 from flame_mdm.checkpoints.loading import NO_GPU
 from flame_mdm.commands.evaluate import EvaluateSettings
 from flame_mdm.commands.inspect import InspectSettings
-from flame_mdm.config import check, compose, compose_data, guarded, instantiate, parameters, recipes, trust
+from flame_mdm.config import check, compose, compose_data, guarded, instantiate, parameters, recipes, sweeps, trust
 from flame_mdm.config.command_line import make_variables, read_settings, run
 from flame_mdm.config.signatures import check_kind, source_file
 from flame_mdm.errors import UserError
@@ -57,16 +59,20 @@ WRONG = {
 @pytest.mark.slow
 def test_a_wrong_override_is_one_line_with_the_nearest_names():
     for override, message in WRONG.items():
-        with pytest.raises(UserError) as error:
+        with pytest.raises(UserError, match=rf"\A[^\n]*{re.escape(message)}[^\n]*\Z"):
             compose("quickstart", [override])
-        assert message in str(error.value)
-        assert "\n" not in str(error.value)
 
 
-def test_keys_that_lightning_checks_late_are_checked_first(capsys, tmp_path):
-    for word in ("trainer.val_check_interval=0", "trainer.log_every_n_steps=0", "trainer.accumulate_grad_batches=0"):
-        assert main(["train", "quickstart", f"run.dir={tmp_path / 'run'}", word]) == 1
-        assert capsys.readouterr().err == f"error: {word}: must be above 0\n"
+def test_what_lightning_checks_late_is_checked_before_the_data(capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "cpu_count", lambda: 3)
+    for word, reason in (
+        *((f"trainer.{key}=0", "must be above 0") for key in sweeps.LATE),
+        ("trainer.devices=99", f"this machine has 3 CPU cores, and {NO_GPU}. Give at most trainer.devices=3"),
+    ):
+        folders = [f"run.dir={tmp_path / 'run'}", f"data_root={tmp_path}"]
+        assert main(["train", "quickstart", *folders, "trainer.accelerator=auto", word]) == 1
+        assert capsys.readouterr().err == f"error: {word}: {reason}\n"
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_parts_are_swapped_whole_except_in_a_saved_configuration(tmp_path):
@@ -132,8 +138,6 @@ def test_values_are_checked_against_annotations():
 
 
 ENCODER = {"_target_": "flame_mdm.denoisers.mdm.MDMEncoder"}
-
-
 UNTRUSTED = [
     *("os.system", "builtins.eval", "subprocess.Popen", "torch.load", "torch.hub.load", "torch.nn.Identity"),
     *("torch.utils.collect_env.run", "lightning.pytorch.Trainer"),
@@ -183,9 +187,6 @@ def test_own_classes_outside_the_repository_need_no_registration(tmp_path, monke
     assert type(instantiate({"_target_": "my_parts.Mine", "width": 3})).__name__ == "Mine"
     with pytest.raises(UserError, match="Did you mean width"):
         check({"_target_": "my_parts.Mine", "widht": 3})
-    with pytest.raises(UserError) as error:
-        instantiate({"_target_": "torch.nn.Linear", "in_features": "a", "out_features": []})
-    assert "\n" not in str(error.value)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -303,8 +304,7 @@ def test_help_and_wrong_words_do_not_wait_for_torch():
     """
     words = [sys.executable, "-c", textwrap.dedent(program)]
     result = subprocess.run(words, capture_output=True, text=True, check=False)
-    assert result.returncode == 0, result.stderr
-    assert result.stderr.count("error: ") == len(REFUSED.splitlines()), result.stderr
+    assert (result.returncode, result.stderr.count("error: ")) == (0, len(REFUSED.splitlines())), result.stderr
     assert "error: unknown command: trian. Did you mean train? `flame-mdm --help` lists the commands\n" in result.stderr
     assert dir(flame_mdm) == ["Motion", "adapt", "edit", "generate", "load"]
 
@@ -326,42 +326,27 @@ def test_only_errors_that_the_user_can_fix_are_one_line(capsys, monkeypatch):
     ):
         assert guarded(fail) == (70 if line is None else 1)
         shown = capsys.readouterr().err
-        if line is None:
-            assert shown.startswith("Traceback")
-            assert "bug in flame_mdm. Please report it" in shown.splitlines()[-1]
-        else:
-            assert shown.startswith(line)
-            assert shown.count("\n") == 1
+        assert shown.startswith(line or "Traceback")
+        assert ("bug in flame_mdm. Please report it" in shown) == (line is None)
+        assert line is None or shown.count("\n") == 1
     monkeypatch.setenv("FLAME_MDM_TRACEBACK", "1")
     error = UserError("wrong")
     guarded(fail)
     assert "Traceback" in capsys.readouterr().err
 
 
-MISSING = [
-    (0, "trainer.accelerator=gpu", f"trainer.accelerator=gpu: {NO_GPU}. Drop it to train on the CPU"),
-    (0, "trainer.accelerator=cuda", f"trainer.accelerator=cuda: {NO_GPU}. Drop it to train on the CPU"),
-    (0, "trainer.devices=99", f"trainer.devices=99: this machine has 3 CPU cores, and {NO_GPU}. Give at most"),
-    (1, "trainer.devices=2", "trainer.devices=2: this machine has 1 GPU. Give at most trainer.devices=1"),
-    (2, "trainer.devices=4 trainer.accelerator=gpu", "trainer.devices=4: this machine has 2 GPUs. Give at most"),
-]
-
-
-@pytest.mark.slow
-def test_training_names_what_is_missing(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(os, "cpu_count", lambda: 3)
-    for gpus, words, message in MISSING:
-        monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)  # noqa: B023 (called before the next)
-        folders = [f"run.dir={tmp_path / 'run'}", f"data_root={tmp_path}"]
-        assert main(["train", "quickstart", *folders, *words.split()]) == 1
-        error = capsys.readouterr().err
-        assert message in error
-        assert error.count("\n") == 1
-
-
-def test_a_cpu_may_be_told_to_run_more_processes_than_cores(monkeypatch):
+@pytest.mark.parametrize(
+    ("gpus", "accelerator", "devices", "message"),
+    [
+        (0, "gpu", 1, f"trainer.accelerator=gpu: {NO_GPU}. Drop it to train on the CPU"),
+        (0, "cuda", 1, f"trainer.accelerator=cuda: {NO_GPU}. Drop it to train on the CPU"),
+        (1, "auto", 2, "trainer.devices=2: this machine has 1 GPU. Give at most trainer.devices=1"),
+        (2, "gpu", 4, "trainer.devices=4: this machine has 2 GPUs. Give at most trainer.devices=2"),
+        *((0, "cpu", 2, ""), (2, "auto", 2, ""), (2, "cpu", 8, "")),  # a CPU may run more processes than it has cores
+    ],
+)
+def test_training_names_the_devices_that_are_missing(gpus, accelerator, devices, message, monkeypatch):
     monkeypatch.setattr(os, "cpu_count", lambda: 1)
-    check_devices({"accelerator": "cpu", "devices": 2})
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    check_devices({"accelerator": "auto", "devices": 2})
-    check_devices({"accelerator": "cpu", "devices": 8})
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
+    with pytest.raises(UserError, match=f"^{message}$") if message else nullcontext():
+        check_devices({"accelerator": accelerator, "devices": devices})

@@ -1,28 +1,25 @@
-"""Full disks, loading processes that die or stop, kills at random moments; what the start of a command imports."""
+"""Full disks, loading processes that die, and kills at random moments."""
 
-import io
-import multiprocessing
 import os
 import random
 import resource
-import shutil
 import signal
 import subprocess
-import sys
-import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from multiprocessing import active_children
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from support.runs import TINY, finish, spawn
+from support.runs import TINY, finish, no_children, spawn
 
 from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.commands import train
+from flame_mdm.data.datamodule import Clips
 from flame_mdm.errors import UserError
 from flame_mdm.signals import StopRequest
 from flame_mdm.training.checkpointing import LAST, AtomicCheckpoints, newest
@@ -36,13 +33,6 @@ QUIET = ["callbacks.samples=null", "callbacks.best=null", "logger=csv", "callbac
 
 def words(root: Path, run: Path, *more: str) -> list[str]:
     return ["quickstart", *TINY, *QUIET, f"data_root={root}", f"run.dir={run}", *more]
-
-
-def prepared(root: Path, clips: int) -> list[str]:
-    return ["data=synthetic", f"data.source.clips={clips}", f"data_root={root}"]
-
-
-# Full disks -----------------------------------------------------------------------------------------------------------
 
 
 @contextmanager
@@ -70,54 +60,32 @@ def test_a_full_disk_leaves_the_checkpoint_before(tmp_path):
 def test_a_preparation_without_room_leaves_nothing(tmp_path, capsys):
     for size in (0, 100_000):
         with file_limit(size):
-            assert main(["prepare", *prepared(tmp_path / "data", 60)]) == 1
+            assert main(["prepare", "data=synthetic", "data.source.clips=60", f"data_root={tmp_path / 'data'}"]) == 1
         line = capsys.readouterr().err.splitlines()[-1]
         assert line.startswith(f"error: {tmp_path / 'data' / STORE}: cannot be written: File too large. ")
         assert f" are free on the disk of {tmp_path / 'data'}" in line
         assert list(tmp_path.iterdir()) == []
 
 
-# Loading processes ----------------------------------------------------------------------------------------------------
+def test_a_killed_loading_process_is_named_in_one_line(tmp_path, data_root, monkeypatch, capsys):
+    load, parent = Clips.__getitems__, os.getpid()
 
+    def killed(self: Clips, draws: Any) -> Any:
+        if os.getpid() != parent and (tmp_path / "run" / "checkpoints" / LAST).exists():
+            os.kill(os.getpid(), signal.SIGKILL)
+        return load(self, draws)
 
-def running(pids: list[int]) -> list[int]:
-    return [pid for pid in pids if Path(f"/proc/{pid}").exists()]
-
-
-@pytest.fixture
-def training(tmp_path, data_root) -> Iterator[tuple[subprocess.Popen[str], list[int]]]:
-    """A run with two loading processes, after its first checkpoint, and the ids of these."""
-    line = words(data_root, tmp_path / "run", "data.num_workers=2", "data.resident=false", "trainer.max_steps=1000000")
-    process = spawn(["flame_mdm", "train", *line], PYTHONWARNINGS="ignore")  # Lightning's own
-    end = time.monotonic() + 60
-    while not (tmp_path / "run" / "checkpoints" / LAST).exists():
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < end
-        time.sleep(0.02)
-    workers = [int(pid) for pid in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()]
-    yield process, workers
-    for pid in running([process.pid, *workers]):
-        os.kill(pid, signal.SIGKILL)
-    process.communicate()
-
-
-@pytest.mark.robustness
-def test_a_killed_loading_process_is_named_in_one_line(training, tmp_path, data_root):
-    process, workers = training
-    assert len(workers) >= 2
-    os.kill(workers[-1], signal.SIGKILL)
-    code, out, err = finish(process)
-    assert code == 1
-    # Python's own thread that shares files between processes may print one.
-    assert err.count("Traceback") <= err.count("resource_sharer.py")
-    line = next(line for line in err.splitlines() if line.startswith("error: "))
-    assert line.startswith("error: a data loading process ")  # "was killed", unless its silence shows first
-    assert "data.num_workers=0" in line
-    assert not running(workers), out
+    monkeypatch.setattr(Clips, "__getitems__", killed)
+    line = words(data_root, tmp_path / "run", "data.num_workers=2", "data.resident=false")
+    children = active_children()
+    assert train.main([*line, "trainer.max_steps=1000"]) == 1
+    assert "\nerror: a data loading process was killed, " in f"\n{capsys.readouterr().err}"
+    assert no_children(children)
     assert not (tmp_path / "run" / "run.lock").exists()
+    monkeypatch.undo()
     resumed = newest(tmp_path / "run" / "checkpoints")
     assert resumed is not None
-    assert train.main(words(data_root, tmp_path / "run", f"trainer.max_steps={resumed.step + 2}")) == 0
+    assert train.main([*line, f"trainer.max_steps={resumed.step + 2}"]) == 0
 
 
 def test_which_second_signal_ends_a_run_at_once(monkeypatch):
@@ -151,52 +119,8 @@ def test_torch_messages_about_lost_workers_are_understood(tmp_path, monkeypatch)
         assert list(tmp_path.iterdir()) == []
 
 
-# Kills ----------------------------------------------------------------------------------------------------------------
-
 KILLS = int(os.environ.get("FLAME_MDM_KILLS", "4"))
 """Kills, half of them SIGKILL and half SIGTERM."""
-
-
-def work(line: list[str], log: Path, signum: int, seconds: float, writing: bool) -> None:
-    """Trains in this process until a signal: after some seconds, or while it writes the next checkpoint."""
-    save = torch.save
-
-    def half(checkpoint: object, file: io.BufferedWriter) -> None:
-        whole = io.BytesIO()
-        save(checkpoint, whole)
-        file.write(whole.getvalue()[: len(whole.getvalue()) // 2])
-        file.flush()
-        os.kill(os.getpid(), signum)
-
-    def kill() -> None:
-        if writing:
-            torch.save = half
-        else:
-            os.kill(os.getpid(), signum)
-
-    torch.set_num_threads(1)
-    with log.open("w") as file:
-        os.dup2(file.fileno(), 1)
-        os.dup2(file.fileno(), 2)
-        timer = threading.Timer(seconds, kill)
-        timer.daemon = True
-        if signum:
-            timer.start()
-        code = train.main(line)
-        sys.stdout.flush()
-    os._exit(code)
-
-
-def killed(line: list[str], log: Path, signum: int = 0, seconds: float = 0, writing: bool = False) -> bool:
-    """Trains in a process forked from one that has imported everything; returns whether the signal ended it."""
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["flame_mdm.training.fit"])
-    process = context.Process(target=work, args=(line, log, signum, seconds, writing))
-    process.start()
-    process.join()
-    expected = (0, -signum, 128 + signum) if signum else (0,)
-    assert process.exitcode in expected, f"exit code {process.exitcode}: {log.read_text()}"
-    return process.exitcode != 0
 
 
 def result(folder: Path) -> Any:
@@ -209,19 +133,21 @@ def result(folder: Path) -> Any:
 @pytest.mark.robustness
 def test_kills_at_random_moments_change_nothing(data_root, tmp_path):
     """Of a training; tests/test_evaluate.py kills an evaluation, tests/test_prepare.py interrupts a preparation."""
-    log, draw = tmp_path / "log", random.Random(0)
+    often = ["trainer.val_check_interval=50", "callbacks.checkpoints.every_n_steps=10", "trainer.max_steps=500"]
 
-    def line(folder: Path) -> list[str]:
-        often = ["trainer.val_check_interval=50", "callbacks.checkpoints.every_n_steps=10"]
-        return words(data_root, folder, "denoiser.dropout=0.1", *often, "trainer.max_steps=120")
+    def start(folder: Path) -> subprocess.Popen[str]:
+        return spawn(["flame_mdm", "train", *words(data_root, folder, "denoiser.dropout=0.1", *often)])
 
-    whole, folder = tmp_path / "whole", tmp_path / "killed"
-    begin = time.monotonic()
-    killed(line(whole), log)
+    draw, begin = random.Random(0), time.monotonic()
+    assert finish(start(tmp_path / "whole"))[0] == 0
     longest = time.monotonic() - begin
     for number in range(KILLS):
         signum = signal.SIGTERM if number % 2 else signal.SIGKILL
-        while not killed(line(folder), log, signum, draw.uniform(0, longest), writing=number % 4 == 2):
-            shutil.rmtree(folder)  # too late
-    killed(line(folder), log)
-    assert result(folder) == result(whole)
+        process = start(tmp_path / "killed")
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(draw.uniform(0.3, 0.9) * longest)
+        process.send_signal(signum)
+        code, _, err = finish(process)
+        assert code in (0, -signum, 128 + signum), err
+    assert finish(start(tmp_path / "killed"))[0] == 0
+    assert result(tmp_path / "killed") == result(tmp_path / "whole")

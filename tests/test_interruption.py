@@ -5,8 +5,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Iterator
 
 import pytest
 from support.runs import spawn
@@ -20,29 +19,18 @@ pytestmark = pytest.mark.slow
 STORE = "synthetic-humanml-clean-smpl22"
 
 
-def start(command: str, *words: str) -> subprocess.Popen[str]:
-    return spawn(["flame_mdm", command, *words])
-
-
-def wait_for(condition: Callable[[], object], process: subprocess.Popen[str]) -> None:
-    end = time.monotonic() + 60
-    while not condition():
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < end, "it never came to that"
-        time.sleep(0.002)
-
-
-def words(root: Path) -> list[str]:
-    return ["data=synthetic", "data.source.clips=100", f"data_root={root}"]
-
-
 @pytest.fixture
 def both(tmp_path) -> Iterator[tuple[subprocess.Popen[str], subprocess.Popen[str]]]:
     """One process that is halted while it prepares, and another that waits for it."""
-    first = start("prepare", *words(tmp_path))
-    wait_for(lambda: any(tmp_path.glob(f".{STORE}.*")), first)
+    line = ["flame_mdm", "prepare", "data=synthetic", "data.source.clips=100", f"data_root={tmp_path}"]
+    first = spawn(line)
+    end = time.monotonic() + 60
+    while not any(tmp_path.glob(f".{STORE}.*")):
+        assert first.poll() is None, first.communicate()
+        assert time.monotonic() < end, "it never prepares"
+        time.sleep(0.002)
     first.send_signal(signal.SIGSTOP)
-    second = start("prepare", *words(tmp_path))
+    second = spawn(line)
     assert second.stdout is not None
     assert "another process is preparing it" in second.stdout.readline()
     yield first, second
@@ -57,8 +45,7 @@ def test_two_processes_prepare_the_same_data_once(both, tmp_path):
     outputs = [process.communicate(timeout=120) for process in both]
     assert [first.returncode, second.returncode] == [0, 0], outputs
     assert [path.name for path in tmp_path.iterdir()] == [STORE]
-    assert "preparing" in outputs[0][1]
-    assert "preparing" not in outputs[1][1], "it opens what the other has written"
+    assert ["preparing" in err for _, err in outputs] == [True, False], "one opens what the other has written"
     assert outputs[0][0].splitlines()[-1] == outputs[1][0].splitlines()[-1], "the fingerprint is the same"
     Store(tmp_path / STORE).verify()
 
@@ -86,10 +73,10 @@ def test_a_library_that_fails_after_a_signal_does_not_hide_it(signum, code, fail
                 raise OSError("cannot close the file")
 
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # shells ignore it for jobs in the background
-    handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    handlers = list(map(signal.getsignal, (signal.SIGINT, signal.SIGTERM)))
     try:
         assert guarded(command, (signal.SIGINT, signal.SIGTERM)) == code
-        assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == handlers
+        assert list(map(signal.getsignal, (signal.SIGINT, signal.SIGTERM))) == handlers
     finally:
         signal.signal(signal.SIGINT, before)
     assert "cannot close" not in capsys.readouterr().err

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from support.fixtures import GENERATION, ROOT, recipe, script
@@ -35,15 +36,10 @@ def test_no_two_recipes_are_the_same():
         assert same == name, f"{name} repeats {same}"
 
 
-def test_values_come_from_the_class_where_the_recipe_is_silent():
+def test_values_come_from_the_class_where_the_recipe_is_silent_and_agree_to_the_papers_digits():
     config = recipe("humanml3d/mdm")
-    assert "betas" not in config["optimizer"]
-    assert value(config, "optimizer.betas") == (0.9, 0.999)
-    assert value(config, "denoiser.mask_padding") is True
-    assert value(config, "denoiser.max_frames") is None
-
-
-def test_values_agree_to_the_papers_digits():
+    keys = ("optimizer.betas", "denoiser.mask_padding", "denoiser.max_frames")
+    assert [value(config, key) for key in keys] == [(0.9, 0.999), True, None]
     same = [(17.880327, 17.88), (17.880327, 17.9), ((0.9, 0.999), (0.9, 0.999))]
     other = [(23.565959, 23.47), (1.04e-4, 1e-4), ("cosine", "linear"), (None, 0.1)]
     assert [generate.same(*pair) for pair in (*same, *other)] == [True] * 3 + [False] * 4
@@ -54,13 +50,12 @@ def test_the_pages_are_those_of_the_recipes():
     assert stale == [], "python docs/generate.py writes them"
 
 
-def test_recipes_name_paper_and_deviations():
+def test_recipes_of_the_papers_sets_name_paper_and_deviations():
     for name in recipes():
         what, deviations = generate.head(name)
         if name.split("/")[0] in ("humanml3d", "kit", "babel", "humanact12", "uestc"):
-            assert "arXiv:" in what
-            assert "table" in what or "not a row of the" in what.lower()
-            assert deviations
+            whole = "arXiv:" in what and ("table" in what or "not a row of the" in what.lower()) and deviations
+            assert whole, name
 
 
 def test_samplers_steps_and_prompts_suit_process_and_condition():
@@ -132,15 +127,12 @@ def built(name: str) -> MotionGeneration:
     return task
 
 
-def clips(task: MotionGeneration) -> MotionBatch:
-    mask = length_mask(torch.tensor([FRAMES, FRAMES - 8]))
-    x = torch.randn(*mask.shape, task.representation.features) * mask[..., None]
-    return MotionBatch(x, mask, ["a", "b"], ["a person walks", "a person jumps"], torch.tensor([0, 1]))
-
-
 def step(name: str) -> None:
     task = built(name)
-    batch, optimizer = clips(task), task.make_optimizer()
+    mask = length_mask(torch.tensor([FRAMES, FRAMES - 8]))
+    x = torch.randn(*mask.shape, task.representation.features) * mask[..., None]
+    batch = MotionBatch(x, mask, ["a", "b"], ["a person walks", "a person jumps"], torch.tensor([0, 1]))
+    optimizer = task.make_optimizer()
     before = [parameter.detach().clone() for parameter in task.parameters()]
     loss = task.training_step(batch, 0)
     loss.backward()
@@ -153,15 +145,14 @@ def step(name: str) -> None:
     task.eval()
     with torch.no_grad():
         task.validation_step(batch, 0)
-    values = {key: float(metric.compute()) for key, metric in task.val_losses.items()}  # type: ignore[operator]
+    values = [float(metric.compute()) for metric in task.val_losses.values()]  # type: ignore[operator]
     assert values
-    assert all(value == value for value in values.values())
+    assert np.isfinite(values).all()
     task.on_validation_epoch_end()
 
 
 @pytest.mark.slow
 def test_every_recipe_trains_and_validates_a_step():
-    assert {name for name in GENERATION if "process" in recipe(name)} == set(GENERATION)
     failures = {}
     for name in {decisive(name): name for name in reversed(GENERATION)}.values():
         try:

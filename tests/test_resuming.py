@@ -3,11 +3,13 @@
 import copy
 import json
 import multiprocessing
-import subprocess
+import shutil
 import time
 from collections.abc import Callable
+from functools import reduce
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -46,17 +48,16 @@ def words(folder: Path, data_root: Path) -> list[str]:
 
 @pytest.fixture
 def resume(run, tmp_path, data_root) -> Callable[..., int]:
-    """Resumes a copy of the run in `tmp_path / "run"`, of whose last checkpoint other content was written."""
+    """Resumes a copy of the run, `tmp_path / "run"`, after other content is written to its last checkpoint."""
+    folder = tmp_path / "run"
+    shutil.copytree(run, folder)
+    config = folder / "config.yaml"
+    config.write_text(config.read_text().replace(str(run), str(folder)))
 
-    def to_step_6(content: dict[str, Any] | None = None, *more: str) -> int:
-        folder = tmp_path / "run"
-        if not folder.exists():
-            subprocess.run(["cp", "-r", run, folder], check=True)
-            config = folder / "config.yaml"
-            config.write_text(config.read_text().replace(str(run), str(folder)))
+    def to_step_6(content: dict[str, Any] | None = None) -> int:
         if content is not None:
             torch.save(content, folder / "checkpoints" / LAST)
-        return main(["train", *words(folder, data_root), "trainer.max_steps=6", *more])
+        return main(["train", *words(folder, data_root), "trainer.max_steps=6"])
 
     return to_step_6
 
@@ -78,7 +79,6 @@ def test_a_foreign_checkpoint_removes_no_other_files(resume, best, tmp_path):
     content, state = best
     folder, infinite = tmp_path / "run" / "checkpoints", torch.tensor(float("inf"))
     (tmp_path / "victim.txt").write_text("mine")
-    assert resume(None, "trainer.max_steps=4") == 0  # copies the run
     (folder / "link").symlink_to(tmp_path)
     for name in ("../../victim.txt", "../checkpoints/../../victim.txt", "link/victim.txt"):
         path = f"{folder}/{name}"
@@ -91,32 +91,24 @@ def test_a_foreign_checkpoint_removes_no_other_files(resume, best, tmp_path):
 
 HUGE = torch.zeros(1, dtype=torch.float64).expand(2**31, 16)
 JUNK: list[tuple[tuple[Any, ...], Any]] = [
-    (("pytorch-lightning_version",), None),
-    (("pytorch-lightning_version",), "1.0.0"),
-    (("global_step",), True),
+    *((("pytorch-lightning_version",), version) for version in (None, "1.0.0")),
+    *((("global_step",), True), (("callbacks",), 3), (("lr_schedulers",), [3]), (("state_dict",), {})),
     (("loops", "fit_loop", "epoch_progress"), None),
-    (("callbacks",), 3),
     (("optimizer_states",), [3]),
     (("optimizer_states", 0, "param_groups", 0, "params"), []),
     (("optimizer_states", 0, "state", 0, "exp_avg"), HUGE),
-    (("lr_schedulers",), [3]),
     (("averaging_state",), {"n_averaged": "x"}),
     (("current_model_state",), {"x": torch.zeros(3)}),
-    (("state_dict",), {}),
 ]
 
 
 def test_junk_in_the_state_of_training_is_one_line(resume, best, tmp_path, capsys):
-    assert resume(None, "trainer.max_steps=4") == 0  # copies the run
     (tmp_path / "run" / "checkpoints" / PREVIOUS).unlink()
     config = (tmp_path / "run" / "config.yaml").read_bytes()
     for keys, value in JUNK:
         changed: Any = copy.deepcopy(best[0])
         *above, last = keys
-        node = changed
-        for key in above:
-            node = node[key]
-        node[last] = value
+        reduce(lambda node, key: node[key], above, changed)[last] = value
         capsys.readouterr()
         assert resume(changed) == 1, keys
         assert f"{LAST}: " in one_error(capsys), keys
@@ -159,7 +151,7 @@ def test_a_run_does_not_resume_on_other_data(run, tmp_path, data_root, capsys, m
     assert train.main([*words(run, root), "trainer.max_steps=6"]) == 1
     line = one_error(capsys)
     fingerprints = [Store(folder / STORE).fingerprint for folder in (data_root, root)]
-    assert all(part in line for part in (f"{run}/checkpoints/last.ckpt", *fingerprints, "run.name=..."))
+    assert all(part in line for part in (f"{run}/checkpoints/last.ckpt", *fingerprints))
     assert tree(run, root) == before
 
 
@@ -197,7 +189,7 @@ def test_a_damaged_checkpoint_gives_way_to_the_one_before(resume, tmp_path, caps
     whole = (folder / LAST).read_bytes()
     before = newest(folder)
     assert before is not None
-    assert (before.path, before.step) == (folder / LAST, 6)
+    assert before[:2] == (folder / LAST, 6)
     flipped = bytearray(whole)
     flipped[len(whole) // 2] ^= 1  # in the middle of a weight, where the structure is intact
     for content in (whole[: len(whole) // 2], bytes(flipped), b""):
@@ -230,13 +222,11 @@ def break_loss(monkeypatch: pytest.MonkeyPatch, step: int, change: Callable[[tor
     monkeypatch.setattr(GaussianDiffusion, "loss", loss)
 
 
-@pytest.mark.parametrize(("factor", "reason"), [(float("nan"), "is nan"), (1e6, "(typical: ")])
+@pytest.mark.parametrize(("factor", "reason"), [(float("nan"), "step 5 is nan"), (1e6, "(typical: ")])
 def test_a_bad_loss_stops_before_a_checkpoint_is_spoiled(tmp_path, data_root, monkeypatch, capsys, factor, reason):
     break_loss(monkeypatch, 5, lambda value: value * factor)
     assert main(["train", *words(tmp_path, data_root), "trainer.max_steps=8", "trainer.log_every_n_steps=2"]) == 1
-    message = one_error(capsys)
-    assert "the loss of step 5 " in message
-    assert reason in message
+    assert reason in one_error(capsys)
     bad = json.loads((tmp_path / "bad_batch.json").read_text())
     assert (bad["step"], bad["batches"][0]["batch"], len(bad["batches"][0]["ids"])) == (5, 4, 8)
     checkpoint = read_checkpoint(tmp_path / "checkpoints" / LAST)
@@ -244,11 +234,8 @@ def test_a_bad_loss_stops_before_a_checkpoint_is_spoiled(tmp_path, data_root, mo
     assert all(value.isfinite().all() for value in checkpoint["state_dict"].values() if value.is_floating_point())
 
 
-def test_out_of_memory_names_the_batch(tmp_path, data_root, monkeypatch, capsys):
-    def fail(value: torch.Tensor) -> torch.Tensor:
-        raise torch.OutOfMemoryError("CUDA out of memory.")
-
-    break_loss(monkeypatch, 3, fail)
+def test_out_of_memory_names_the_step(tmp_path, data_root, monkeypatch, capsys):
+    break_loss(monkeypatch, 3, Mock(side_effect=torch.OutOfMemoryError("CUDA out of memory.")))
     assert main(["train", *words(tmp_path, data_root), "trainer.max_steps=5"]) == 1
     assert one_error(capsys).startswith("error: out of memory at step 2. Lower data.batch_size")
 

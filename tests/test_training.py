@@ -31,11 +31,9 @@ from flame_mdm.task import MotionGeneration
 STEPS = ["trainer.val_check_interval=4", "callbacks.checkpoints.every_n_steps=4", "callbacks.samples=null"]
 
 
-def run(overrides: list[str], steps: int, folder: Path | None = None) -> Path:
-    changes = [f"run.dir={folder}"] if folder else []
-    assert main(["train", "quickstart", *overrides, *changes, f"trainer.max_steps={steps}"]) == 0
-    directory = folder or Path(next(o for o in overrides if o.startswith("run.dir=")).removeprefix("run.dir="))
-    return directory / "checkpoints" / "last.ckpt"
+def run(overrides: list[str], steps: int, folder: Path) -> Path:
+    assert main(["train", "quickstart", *overrides, f"run.dir={folder}", f"trainer.max_steps={steps}"]) == 0
+    return folder / "checkpoints" / "last.ckpt"
 
 
 def same_weights(first: Path, second: Path) -> bool:
@@ -45,39 +43,28 @@ def same_weights(first: Path, second: Path) -> bool:
     return all(x.keys() == y.keys() and all(torch.equal(x[name], y[name]) for name in x) for x, y in pairs)
 
 
-def tensorboard_tags(folder: Path) -> set[str]:
-    events = EventAccumulator(str(folder))
-    events.Reload()
-    return set(events.Tags()["scalars"])
-
-
 @pytest.mark.slow
-def test_a_run_leaves_what_a_user_looks_for(tiny, tmp_path):
-    checkpoint, folder = read_checkpoint(run([*tiny, "trainer.val_check_interval=1"], 2)), tmp_path / "run"
+def test_training_learns_and_leaves_what_a_user_looks_for(tiny, tmp_path):
+    words = [*tiny, "trainer.val_check_interval=30", "optimizer.lr=0.01", "trainer.log_every_n_steps=1"]
+    folder = tmp_path / "run"
+    checkpoint = read_checkpoint(run(words, 60, folder))
+    losses = list(read_history(folder)["train/loss"].values())
+    assert len(losses) == checkpoint["global_step"] == 60
+    assert np.mean(losses[-10:]) < 0.7 * np.mean(losses[:5])
     files = ("config.yaml", "provenance.json", "metrics.jsonl", "report.html", "checkpoints/best.ckpt")
-    for name in (*files, "samples/step_0000002/player.html"):
+    for name in (*files, "samples/step_0000060/player.html"):
         assert (folder / name).is_file(), name
-    assert "val/loss" in tensorboard_tags(folder / "tensorboard")
-    assert "epoch" not in tensorboard_tags(folder / "tensorboard"), "always 0"
+    events = EventAccumulator(str(folder / "tensorboard"))
+    events.Reload()
+    assert {"val/loss", "epoch"} & set(events.Tags()["scalars"]) == {"val/loss"}, "the epoch is always 0"
     assert checkpoint["config"]["experiment"] == "quickstart"
-    assert checkpoint["global_step"] == 2
     training = checkpoint["facts"].pop("training")
     assert training.keys() == {"hours", "memory_gib", "processes", "speed", "precision", "device"}
     assert re.fullmatch(r"1 x (?!cpu).+, \d+ threads?", training["device"]), "names the processor"
     facts = json.loads((folder / "provenance.json").read_text())["data"]
-    assert facts == {
-        name: fact for name, fact in checkpoint["facts"].items() if name not in ("vocabulary", "verbs", "captions")
-    }
+    assert facts.items() <= checkpoint["facts"].items()
+    assert checkpoint["facts"].keys() - facts.keys() == {"vocabulary", "verbs", "captions"}
     assert not list(folder.rglob("*.partial"))
-
-
-@pytest.mark.slow
-def test_training_learns(tiny):
-    checkpoint = run([*tiny, *STEPS, "optimizer.lr=0.01", "trainer.log_every_n_steps=1", "logger=csv"], 60)
-    losses = list(read_history(checkpoint.parent.parent)["train/loss"].values())
-    assert len(losses) == 60
-    assert (checkpoint.parent.parent / "csv" / "metrics.csv").is_file()
-    assert np.mean(losses[-10:]) < 0.7 * np.mean(losses[:5])
 
 
 @pytest.mark.slow
@@ -88,7 +75,6 @@ def test_a_resumed_run_is_the_uninterrupted_one_and_adds_up_what_it_cost(tiny, t
     training = first["facts"]["training"]
     assert 0 < training["hours"] < 1
     assert 0.01 < training["memory_gib"] < 1000
-    assert training["processes"] == 1
     training |= {"hours": 100.0, "memory_gib": 2000.0}
     torch.save(first, parts)
     with (tmp_path / "parts" / "metrics.jsonl").open("a") as file:  # what a killed run leaves behind
@@ -97,8 +83,7 @@ def test_a_resumed_run_is_the_uninterrupted_one_and_adds_up_what_it_cost(tiny, t
     assert same_weights(parts, run(overrides, 11, tmp_path / "whole"))
     a, b = (read_history(tmp_path / name) for name in ("parts", "whole"))
     assert a.keys() == b.keys()
-    for name in ("train/loss", "train/grad_norm", "val/loss", "train/epochs"):
-        assert a[name] == b[name]
+    assert all(a[name] == b[name] for name in ("train/loss", "train/grad_norm", "val/loss", "train/epochs"))
     resumed = read_checkpoint(parts)["facts"]["training"]
     assert 100 < resumed["hours"] < 101
     assert resumed["memory_gib"] == 2000
@@ -121,12 +106,12 @@ def test_a_decaying_learning_rate_resumes_where_it_was(tiny, tmp_path):
 
 
 @pytest.mark.slow
-def test_progress_counts_all_steps_and_shows_losses(tiny, capfd, monkeypatch):
+def test_progress_counts_all_steps_and_shows_losses(tiny, tmp_path, capfd, monkeypatch):
     """Also after a resume; in a log file as plain lines, here one per step."""
     monkeypatch.setattr(ProgressBar, "SECONDS", 0.0)
     overrides = [*tiny, *STEPS, "trainer.enable_progress_bar=true", "trainer.log_every_n_steps=2"]
-    run(overrides, 6)
-    run(overrides, 8)
+    for count in (6, 8):
+        run(overrides, count, tmp_path / "run")
     lines = [line for line in capfd.readouterr().err.splitlines() if line.startswith("training:")]
     counts = [re.search(r" (\d+/\d+) \[", line) for line in lines]
     steps = [*(f"{step}/6" for step in range(7)), "6/8", "7/8", "8/8"]
@@ -139,23 +124,19 @@ def test_progress_counts_all_steps_and_shows_losses(tiny, capfd, monkeypatch):
 def test_waiting_threads_soon_sleep():
     """Importing the package says so to OpenMP before torch is loaded, unless the user has said otherwise."""
     code = "import os, sys, flame_mdm; assert 'torch' not in sys.modules; print(os.environ.get('GOMP_SPINCOUNT'))"
-    names = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")
-    environment = {name: value for name, value in os.environ.items() if name not in names}
+    environment = {name: os.environ[name] for name in os.environ.keys() - {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT"}}
     for own, expected in (({}, "2000"), ({"GOMP_SPINCOUNT": "7"}, "7"), ({"OMP_WAIT_POLICY": "ACTIVE"}, "None")):
-        line = [sys.executable, "-c", code]
-        done = subprocess.run(line, capture_output=True, text=True, check=True, env=environment | own)
-        assert done.stdout.strip() == expected
+        printed = subprocess.check_output([sys.executable, "-c", code], text=True, env=environment | own)
+        assert printed.strip() == expected
 
 
 @pytest.mark.slow
 def test_a_finished_run_says_so_another_configuration_is_refused_and_a_saved_one_repeats_it(tiny, tmp_path, capsys):
     for _ in range(2):
-        first = run([*tiny, *STEPS], 2)
+        first = run([*tiny, *STEPS], 2, tmp_path / "run")
     assert "already trained for 2 steps" in capsys.readouterr().out
     assert main(["train", "quickstart", *tiny, *STEPS, "optimizer.lr=0.5", "trainer.max_steps=4"]) == 1
-    message = capsys.readouterr().err
-    assert "optimizer.lr (0.002 there, 0.5 here)" in message
-    assert "run.name=" in message
+    assert "optimizer.lr (0.002 there, 0.5 here)" in capsys.readouterr().err
     assert main(["train", str(tmp_path / "run" / "config.yaml"), f"run.dir={tmp_path / 'again'}"]) == 0
     assert same_weights(tmp_path / "again" / "checkpoints" / "last.ckpt", first)
 
@@ -163,8 +144,7 @@ def test_a_finished_run_says_so_another_configuration_is_refused_and_a_saved_one
 @pytest.mark.slow
 @pytest.mark.parametrize("signum", [pytest.param(signal.SIGINT, marks=pytest.mark.robustness), signal.SIGTERM])
 def test_a_signal_stops_at_the_end_of_a_step_and_the_run_goes_on(tiny, signum, tmp_path):
-    overrides = [*tiny, *STEPS, "trainer.max_steps=100000"]
-    process = spawn(["flame_mdm", "train", "quickstart", *overrides])
+    process = spawn(["flame_mdm", "train", "quickstart", *tiny, *STEPS, "trainer.max_steps=100000"])
     checkpoint = tmp_path / "run" / "checkpoints" / "last.ckpt"
     deadline = time.monotonic() + 120
     while not checkpoint.exists() and time.monotonic() < deadline and process.poll() is None:
@@ -175,7 +155,7 @@ def test_a_signal_stops_at_the_end_of_a_step_and_the_run_goes_on(tiny, signum, t
     assert "Traceback" not in err
     step = read_checkpoint(checkpoint)["global_step"]
     assert f"stopped at step {step}. Run the same command to resume" in out
-    run([*tiny, *STEPS], step + 2)
+    run([*tiny, *STEPS], step + 2, tmp_path / "run")
     assert same_weights(checkpoint, run([*tiny, *STEPS], step + 2, tmp_path / "whole"))
 
 
@@ -214,7 +194,7 @@ def test_sampling_writes_motions_and_a_player_and_takes_every_option(trained, tm
     words += ["samples=2", "shared_noise=true", "trajectory=true"]
     assert main(["sample", f"ckpt={trained}", f"text={text}", f"out={out}", *words]) == 0
     assert "player.html" in capsys.readouterr().out
-    assert {p.name for p in out.iterdir()} >= {"player.html", "motions.gif", "motions.png", "motion_000.npz"}
+    assert {p.name for p in out.iterdir()} >= {"player.html", "motions.gif"}
     model = load(trained)
 
     def features(**change: Any) -> np.ndarray:
@@ -245,9 +225,7 @@ def test_cleanup_is_noted_in_the_results(trained, tmp_path, monkeypatch):
         assert "features" not in motion
         assert not np.allclose(motion["joints"], raw.joints, atol=1e-3)
     clean = edit(model, raw, "a person jumps", region="in_between", cleanup=True)[0]
-    assert clean.cleanup
-    assert clean.feature_error == 0
-    assert clean.joint_error > 0
+    assert (clean.cleanup, clean.feature_error, clean.joint_error > 0) == (True, 0, True)
 
 
 def test_shared_noise_is_that_of_no_text(trained):

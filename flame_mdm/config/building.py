@@ -94,8 +94,7 @@ def instantiate(node: Config, **derived: Any) -> Any:
     """Instantiates the object described by a mapping with a `_target_`, including nested ones.
 
     It supports Hydra's keys `_target_` and `_recursive_`. Interpolations are treated as plain text. Mappings and lists
-    are passed as plain copies, as with Hydra's `_convert_: all`. `derived` are further arguments, from other parts of
-    the recipe. Raises `UserError` if the class or function does not exist, or refuses its arguments.
+    are passed as plain copies, as with Hydra's `_convert_: all`. `derived` are further arguments.
     """
     name = node.get("_target_") if isinstance(node, Mapping) else None
     if not isinstance(name, str):

@@ -53,11 +53,7 @@ def run(command: Callable[[Settings], None], kind: type[Settings], argv: Sequenc
 
 
 def read_settings(kind: type[Settings], words: Sequence[str]) -> Settings:
-    """Returns the settings of a command from its words; raises `UserError` for unknown keys and wrong types.
-
-    Values of type `str` are taken literally; lists of texts are split like words of a shell; others have Hydra's
-    grammar.
-    """
+    """Returns settings: texts are literal, lists of texts are split as in a shell, others have Hydra's grammar."""
     annotations = _annotations(kind)
     values: dict[str, Any] = {}
     composed: list[str] = []
@@ -146,8 +142,7 @@ def _help(kind: type[Any]) -> list[str]:
 def make_variables() -> list[str]:
     """Returns the variables given to make, as words: `EXP` names the recipe, other upper-case names are keys.
 
-    Make passes them in MAKEFLAGS after ` -- `, latest first, with escaped spaces and doubled dollar signs. Read from
-    there, they have not been processed by a shell.
+    Make passes them in MAKEFLAGS after ` -- `, latest first, with escaped spaces and doubled dollar signs.
     """
     variables = (" " + os.environ.get("MAKEFLAGS", "")).partition(" -- ")[2]
     words = [re.sub(r"\\(.)", r"\1", w).replace("$$", "$") for w in re.findall(r"(?:\\.|[^\\ ])+", variables)]

@@ -35,24 +35,15 @@ def recipes() -> list[str]:
 
 
 def compose(name: str, overrides: Sequence[str] = ()) -> Config:
-    """Composes a recipe with overrides such as `trainer.max_steps=10` or `denoiser=mdm_encoder`, and checks it.
-
-    `name` is a file in `experiments/` without its suffix, or the path of a recipe or of a saved `config.yaml`.
-    """
+    """Composes and checks a recipe, a name in `experiments/` or a path, with overrides such as `denoiser=mdm_unet`."""
     source = find_recipe(name)
-    config = resolve(source, *prepare_overrides(source, overrides))
-    check(config)
-    return config
+    return resolve(source, *prepare_overrides(source, overrides))
 
 
 def compose_data(name: str, overrides: Sequence[str] = (), *, data_root: str = "data", seed: int = 0) -> Config:
-    """Composes a file in experiments/data and its representation: a mapping with the keys `data` and `representation`.
-
-    `data_root` is the folder of the prepared data sets, and `seed` that of generated data.
-    """
+    """Composes a file in experiments/data with its representation; returns the keys `data` and `representation`."""
     source, first = ConfigSource(EXPERIMENTS, None), [f"+seed={seed}", quoted(f"+data_root={data_root}")]
     config = resolve(source, *prepare_overrides(source, [f"+data={name}", *overrides], first))
-    check(config)
     return {key: config[key] for key in ("data", "representation")}
 
 
@@ -162,7 +153,7 @@ def _check_groups(overrides: Sequence[Override], recipe: ConfigSource) -> None:
 
 
 def resolve(source: ConfigSource, overrides: list[str], base: Config | None = None) -> Config:
-    """Composes a configuration with prepared overrides; values must have the same type as in `base`."""
+    """Composes a configuration with prepared overrides; checks it if `base` is given, whose types values must have."""
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(version_base="1.3", config_dir=str(source.folder)):
@@ -171,7 +162,9 @@ def resolve(source: ConfigSource, overrides: list[str], base: Config | None = No
     except (HydraException, OmegaConfBaseException, ValueError, TypeError, RecursionError) as error:
         raise UserError(f"{source.stem or 'data'}: {first_line(error)}") from error
     config: Config = {str(key): value for key, value in resolved.items()}  # type: ignore[union-attr]
-    check_same_kinds(base or {}, config)
+    if base is not None:
+        check_same_kinds(base, config)
+        check(config)
     return config
 
 

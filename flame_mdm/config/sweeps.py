@@ -8,21 +8,11 @@ from hydra import main as hydra_main
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 
+from flame_mdm.config import composition
 from flame_mdm.config.building import plain
 from flame_mdm.config.command_line import STOP, guarded, make_variables
-from flame_mdm.config.composition import (
-    LAUNCH,
-    compose,
-    find_recipe,
-    first_choice,
-    groups,
-    parse,
-    prepare_overrides,
-    quoted,
-    recipes,
-    resolve,
-)
-from flame_mdm.config.signatures import Config, check
+from flame_mdm.config.composition import LAUNCH, quoted
+from flame_mdm.config.signatures import Config
 from flame_mdm.errors import UserError, say
 
 QUIET = ["hydra/job_logging=disabled", "hydra/hydra_logging=disabled", "hydra.output_subdir=null"]
@@ -38,10 +28,10 @@ def run_recipe(command: Callable[[Config], None], usage: str, argv: Sequence[str
     words = make_variables() if "--from-make" in argv else list(argv)
     if not words or any(word in ("-h", "--help") for word in words):
         say(*usage.strip().splitlines(), "", "experiments:")
-        for folder, names in groupby(recipes(), lambda recipe: recipe.rpartition("/")[0]):
+        for folder, names in groupby(composition.recipes(), lambda recipe: recipe.rpartition("/")[0]):
             listed = ", ".join(name.rpartition("/")[2] for name in names)
             say(f"  {f'{folder}/' if folder else '':13}{listed}")
-        say("parts: " + ", ".join(f"{group}=..." for group in groups()))
+        say("parts: " + ", ".join(f"{group}=..." for group in composition.groups()))
         return 0 if words else 2
     codes = [0]
     return guarded(lambda: _serve(command, words, codes), INTERRUPT) or max(codes)
@@ -51,16 +41,15 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
     name, *words = words
     if name.startswith("-") or "=" in name:
         raise UserError(f"the first word must name an experiment, such as quickstart, not '{name}'")
-    recipe = find_recipe(name)
+    recipe = composition.find_recipe(name)
     flags = [word for word in words if word.startswith("-")]
     if unknown := [flag for flag in flags if flag not in ("-m", "--multirun")]:
         raise UserError(f"unknown option {unknown[0]}. Available: --help, --multirun, and keys as key=value")
-    overrides, base = prepare_overrides(recipe, [word for word in words if word not in flags])
-    parsed = parse(overrides)
+    overrides, base = composition.prepare_overrides(recipe, [word for word in words if word not in flags])
+    parsed = composition.parse(overrides)
     launcher = [str(o.value()) for o in parsed if o.key_or_group == LAUNCH]
     sweep = bool(launcher or flags)
-    config = resolve(recipe, [first_choice(o) for o in parsed] if sweep else overrides, base)
-    check(config)
+    config = composition.resolve(recipe, [composition.first_choice(o) for o in parsed] if sweep else overrides, base)
     _check_whole(config, name)
     if "local" in launcher and config["trainer"].get("devices", 1) != 1:
         raise UserError("launch=local runs each job in one process. Remove launch, or trainer.devices")
@@ -79,7 +68,7 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
         hydra = HydraConfig.get()
         HydraConfig.instance().cfg = None  # otherwise Lightning adds words for Hydra's command line
         task = [str(word) for word in hydra.overrides.task if not str(word).startswith(f"{LAUNCH}=")]
-        code = start(compose(name, [*task, quoted(f"run.dir={hydra.runtime.output_dir}")]), task)
+        code = start(composition.compose(name, [*task, quoted(f"run.dir={hydra.runtime.output_dir}")]), task)
         if code > 128 or (launcher and code):  # a signal ends the whole sweep; a launched job counts as failed
             raise SystemExit(code)
 

@@ -42,18 +42,16 @@ class MovingAverage(WeightAveraging):
         self.weights = [p.detach() for p in pl_module.parameters()]
         for copy, module in zip(self.averaged().modules(), pl_module.modules(), strict=True):
             copy._buffers = module._buffers  # shared, so that both always have the current ones
-        assert self._average_model is not None
-        self.begun = int(self._average_model.n_averaged) > 0
+        self.begun = int(self._average_model.n_averaged) > 0  # type: ignore[union-attr]
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         step = trainer.global_step
         if step <= self._latest_update_step or step % self.update_every_n_steps:
             return
-        assert self._average_model is not None
         if self.begun and step > self.update_starting_at_step:
             self.average(self.averages, self.weights, None)
         else:
             for average, weight in zip(self.averages, self.weights, strict=True):
                 average.copy_(weight)
-        self._average_model.n_averaged += 1
+        self._average_model.n_averaged += 1  # type: ignore[union-attr]
         self._latest_update_step, self.begun = step, True

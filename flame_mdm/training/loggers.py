@@ -19,10 +19,7 @@ from flame_mdm.schemas import read_json
 
 
 class History(Logger):
-    """Appends all logged values to `metrics.jsonl` in the run directory, from which reports and comparisons are made.
-
-    A run that resumes at `step` drops later lines.
-    """
+    """Appends all logged values to `metrics.jsonl` in the run folder; a run that resumes drops lines after `step`."""
 
     def __init__(self, folder: str | Path, step: int = 0):
         super().__init__()
@@ -68,10 +65,7 @@ class Kept(TypedDict, total=False):
 
 
 class WandbRun(WandbLogger):
-    """Weights & Biases logger that continues the same wandb run whenever training is resumed.
-
-    Steps that are trained again after a kill have the same values and are not logged twice.
-    """
+    """Weights & Biases logger that continues the same wandb run when training is resumed, and logs no step twice."""
 
     def __init__(self, save_dir: str, **options: Any):
         self.path = Path(save_dir) / "wandb.json"

@@ -17,10 +17,7 @@ FREE = (
 
 
 def train(config: Config) -> None:
-    """Trains the composed experiment, or resumes the run in its directory.
-
-    An interruption raises `SystemExit` with 128 + the number of the signal, after a checkpoint is written.
-    """
+    """Trains the composed experiment, or resumes the run in its directory; an interruption raises `SystemExit`."""
     folder = Path(config["run"]["dir"])
     if (folder / "config.yaml").exists():
         _check_same(folder, config)

@@ -148,7 +148,7 @@ class Protocol(ClosedSchema):
         entries = sorted(self.selected(clips), key=lambda clip: key("sample", *drawn, seed, replication, clip.id))
         if not entries:
             only = "".join(f" and {name}={value}" for name, value in self.only.items())
-            reason = f"the split has no clip with at least {clips.crop.shortest()} frames{only}"
+            reason = f"the split has no clip with at least {clips.crop.min_frames} frames{only}"
             raise UserError(f"{reason}. Choose another with split=..., or add a `split` column to captions.csv")
         count = self.samples if purpose == "generated" else self.real_samples
         rows = []

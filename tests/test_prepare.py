@@ -30,7 +30,8 @@ from support.stores import (
 
 from flame_mdm.__main__ import main
 from flame_mdm.config import EXPERIMENTS
-from flame_mdm.data.bandai import Bandai, split_of
+from flame_mdm.data import bandai
+from flame_mdm.data.bandai import split_of
 from flame_mdm.data.store import Store
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.formats import bvh
@@ -155,18 +156,18 @@ def test_an_interrupted_preparation_leaves_nothing(
 ):
     root = tmp_path / "data"
     words = ["data=bandai", f"source={takes}"]
-    clips, make = count(1), Bandai._clip
+    clips, describe = count(1), bandai.captions
 
-    def interrupted(self: Bandai, *arguments, **options):
+    def interrupted(*arguments: str) -> list[str]:
         if next(clips) == 5:
             os.kill(os.getpid(), how)
-        return make(self, *arguments, **options)
+        return describe(*arguments)
 
     gc.collect()  # readers that other tests left open end their processes
     before, earlier = signal.getsignal(signal.SIGTERM), active_children()
     ignored = signal.signal(signal.SIGINT, signal.default_int_handler)  # it is, where the tests run in the background
     with monkeypatch.context() as patch:
-        patch.setattr(Bandai, "_clip", interrupted)
+        patch.setattr(bandai, "captions", interrupted)
         assert main(["prepare", *words, f"data_root={root}", "data.source.workers=2"]) == code
     signal.signal(signal.SIGINT, ignored)
     assert not root.exists()

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from diffusers.schedulers.scheduling_dpmsolver_multistep import DPMSolverMultistepScheduler
-from hydra.utils import instantiate
 from support.analytic import (
     NO_CONDITION,
     CountedDenoise,
@@ -181,7 +180,7 @@ def test_flow_run(case):
 
 
 def built(released: Released) -> Denoise:
-    network = instantiate(released.config, *released.features)
+    network = released.network(*released.features, **released.options)
     network.load_state_dict(released.state)
     return network.eval().requires_grad_(False)
 
@@ -334,7 +333,7 @@ MIXING = linear_denoiser(np.array([[0.3, -0.2], [0.1, 0.4]]), np.array([[0.2], [
 @pytest.mark.parametrize("prediction", ["x0", "epsilon", "velocity"])
 def test_dpm_solver_agrees_with_diffusers(prediction):
     process, steps = GaussianDiffusion(1000, prediction=prediction), [0, 30, 90, 250, 400, 777, 950]
-    names = {"x0": "sample", "epsilon": "epsilon", "velocity": "v_prediction"}
+    names: Any = {"x0": "sample", "epsilon": "epsilon", "velocity": "v_prediction"}
     scheduler: Any = DPMSolverMultistepScheduler(
         1000,
         trained_betas=process.schedule.tables["betas"].numpy(),  # type: ignore[arg-type]
@@ -449,7 +448,7 @@ REFUSED: dict[type[Process], list[tuple[dict[str, Any], str]]] = {
         ({"num_inference_steps": 1001}, "1000"),
         ({"num_inference_steps": [5, 3]}, "increasing"),
         ({"num_inference_steps": [5, 1000]}, "999"),
-        ({"num_inference_steps": [0, 1.5]}, "give a number of steps, or a list"),
+        ({"num_inference_steps": [0, 1.5]}, "or a list of steps"),
         ({"eta": 1.0}, "eta=1.0: the sampler ancestral has no such option. Omit it, or give guidance_scale"),
         ({"sampler": "ddim", "eta": 1.5}, "0 to 1"),
         ({"sampler": 3}, "sampler=3: give the name"),

@@ -1,6 +1,8 @@
 """Schedules, the two processes, their losses, the steps they train on, and classifier-free guidance."""
 
 import math
+from functools import partial
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -24,6 +26,7 @@ from flame_mdm.batch import Condition, length_mask
 from flame_mdm.config import check
 from flame_mdm.errors import UserError
 from flame_mdm.losses import masked_mean, masked_mse
+from flame_mdm.processes import Process
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.processes.flow_matching import FlowMatching
 from flame_mdm.processes.guidance import classifier_free_guidance
@@ -57,12 +60,9 @@ def test_schedules_sampling_steps_and_their_betas(stem):
         _, case, table = key.split("/")
         name, total = case.split("_T")
         tables = build_schedule(name, int(total)).tables
-        if table == "sqrt_recip_alphas_cumprod":
-            value = 1 / tables["signal"]
-        elif table == "sqrt_recipm1_alphas_cumprod":
-            value = tables["noise"] / tables["signal"]
-        else:
-            value = tables[TABLES.get(table, table)]
+        tables["sqrt_recip_alphas_cumprod"] = 1 / tables["signal"]
+        tables["sqrt_recipm1_alphas_cumprod"] = tables["noise"] / tables["signal"]
+        value = tables[TABLES.get(table, table)]
         np.testing.assert_allclose(value.numpy(), GAUSSIAN[key], rtol=1e-9, err_msg=key)
     for key in (key for key in GAUSSIAN if key.startswith("respace/")):
         total, spec = key.removeprefix("respace/T").split("/")
@@ -75,8 +75,8 @@ def test_schedules_sampling_steps_and_their_betas(stem):
 
 def test_the_linear_schedule_has_the_ends_of_ho_et_al():
     for total, first, last in ((1000, 1e-4, 0.02), (500, 2e-4, 0.04), (10, 0.01, 0.999)):
-        betas = build_schedule("linear", total).tables["betas"]
-        assert (float(betas[0]), float(betas[-1])) == pytest.approx((first, last))
+        betas = build_schedule("linear", total).numbers["betas"]
+        assert (betas[0], betas[-1]) == pytest.approx((first, last))
 
 
 @pytest.mark.golden
@@ -139,7 +139,7 @@ def test_variational_bound(case, dtype):
 
 
 RECIPES = sorted((ROOT / "experiments" / "process").glob("*.yaml"))
-PROCESSES: dict[str, GaussianDiffusion | FlowMatching] = {
+PROCESSES: dict[str, Process] = {
     **{path.stem: instantiate(read_yaml(path)) for path in RECIPES},
     "x0": GaussianDiffusion(prediction="x0"),
     "epsilon": GaussianDiffusion(prediction="epsilon"),
@@ -152,12 +152,6 @@ PROCESSES: dict[str, GaussianDiffusion | FlowMatching] = {
 }
 
 
-def random_times(process: GaussianDiffusion | FlowMatching, batch: int) -> Tensor:
-    if isinstance(process, FlowMatching):
-        return torch.cat([torch.tensor([0.0]), torch.rand(batch - 1)])
-    return torch.randint(len(process.schedule), (batch,)).float()
-
-
 @pytest.mark.parametrize("name", PROCESSES)
 def test_oracle_has_no_loss_and_padding_has_no_say(name):
     torch.manual_seed(0)
@@ -166,33 +160,30 @@ def test_oracle_has_no_loss_and_padding_has_no_say(name):
     mask = length_mask(lengths)
     x, noise = torch.randn(2, 3, 7, features).unbind()
     x = x * mask[..., None]
-    t = random_times(process, 3)
+    t, exact = process.training_times(torch.tensor([0.0, 0.31, 0.94])), (x.double(), noise.double())
     spare = process.out_features(features) - features
-    target, x_t = process.target(x.double(), noise.double(), t.double()), process.corrupt(x.double(), noise.double(), t)
-    torch.testing.assert_close(process.to_x0(target, x_t, t.double()), x.double(), rtol=0, atol=1e-7)
+    target, x_t = process.target(*exact, t.double()), process.corrupt(*exact, t)
+    torch.testing.assert_close(process.to_x0(target, x_t, t.double()), exact[0], rtol=0, atol=1e-7)
 
     def oracle(x_t, time, mask, cond):
         target = process.target(x, noise, t)
         assert (time >= 0).all()
         assert (time < 1000).all()
         # Losses over the padded length see the padding, where such a process needs a denoiser that returns 0.
-        garbage = torch.where(mask[..., None], target, 0.0 if getattr(process, "average_padding", False) else 1e3)
+        garbage = torch.where(mask[..., None], target, 0.0 if process.average_padding else 1e3)
         return torch.cat([garbage, torch.zeros(*garbage.shape[:2], spare)], -1)
 
-    seen = {}
-
     def auxiliary(x0_hat, clean, mask):
-        seen["error"] = masked_mse(x0_hat, clean, mask)
-        return {"extra": torch.full((3,), 0.25)}
+        return {"extra": 0.25 + masked_mse(x0_hat, clean, mask)}
 
-    terms = process.loss(oracle, x, mask, NO_CONDITION, t=t, noise=noise, auxiliary=auxiliary)
+    quiet = torch.where(mask[..., None], noise, 0.0)
+    terms, other = (
+        process.loss(oracle, x, mask, NO_CONDITION, t=t, noise=n, auxiliary=auxiliary) for n in (noise, quiet)
+    )
     assert set(terms) == {"mse", "extra", "loss"} | ({"vlb"} if spare else set())
     torch.testing.assert_close(terms["mse"], torch.zeros(3))
-    torch.testing.assert_close(seen["error"], torch.zeros(3), rtol=0, atol=1e-2)
-    total = sum(value for key, value in terms.items() if key != "loss")
-    torch.testing.assert_close(terms["loss"], total)
-    quiet = torch.where(mask[..., None], noise, 0.0)
-    other = process.loss(oracle, x, mask, NO_CONDITION, t=t, noise=quiet, auxiliary=auxiliary)
+    torch.testing.assert_close(terms["extra"], torch.full((3,), 0.25), rtol=0, atol=1e-2)
+    torch.testing.assert_close(terms["loss"], sum(value for key, value in terms.items() if key != "loss"))
     torch.testing.assert_close(other["loss"], terms["loss"])
 
 
@@ -228,21 +219,23 @@ def test_hybrid_loss_trains_the_variance_alone():
 
 
 def test_unknown_options_and_impossible_steps_are_refused():
-    cases: list[tuple[Any, Any, str]] = [
-        (GaussianDiffusion, {"num_train_timesteps": 1}, "1"),
-        (GaussianDiffusion, {"skip": True}, "epsilon"),
-        (GaussianDiffusion, {"min_snr": -1.0}, "min_snr=-1.0"),
-        (FlowMatching, {"sigma_min": 1.0}, "1.0"),
-        *((timesteps, steps, "choose") for steps in ((1000, 0), (1000, 1001), (1000, 400, "stride"))),
+    cases: list[tuple[Any, str]] = [
+        (lambda: GaussianDiffusion(num_train_timesteps=1), "1"),
+        (lambda: GaussianDiffusion(skip=True), "epsilon"),
+        (lambda: GaussianDiffusion(min_snr=-1.0), "min_snr=-1.0"),
+        (lambda: FlowMatching(sigma_min=1.0), "1.0"),
+        (lambda: timesteps(1000, 0), "choose"),
+        (lambda: timesteps(1000, 1001), "choose"),
+        (lambda: timesteps(1000, 400, "stride"), "choose"),
     ]
-    for path, values in (("diffusion", ("schedule", "prediction", "variance")), ("flow_matching", ("prediction",))):
-        config = {"process": read_yaml(ROOT / "experiments" / "process" / f"{path}.yaml")}
-        for name in values:
-            with pytest.raises(UserError, match=rf"process\.{name}=other: must be one of "):
-                check({"process": config["process"] | {name: "other"}})
-    for build, options, message in cases:
+    for path, name in product(RECIPES, ("schedule", "prediction", "variance")):
+        config = read_yaml(path)
+        if name in config:
+            wrong = {"process": config | {name: "other"}}
+            cases.append((partial(check, wrong), rf"process\.{name}=other: must be one of "))
+    for call, message in cases:
         with pytest.raises(UserError, match=message):
-            build(**options) if isinstance(options, dict) else build(*options)
+            call()
 
 
 def test_tables_keep_their_precision_when_the_model_is_cast():
@@ -283,22 +276,19 @@ def test_flow_times_and_rows(case):
 def test_flow_times_are_drawn_as_named(distribution, in_the_middle):
     """The probability of |logit| < ln 3 of a normal variable is 0.728."""
     torch.manual_seed(0)
-    seen: list[Tensor] = []
-
-    def denoise(x_t, t, mask, cond):
-        seen.append(t / 1000)
-        return x_t
-
-    process, mask = FlowMatching(time_distribution=distribution), torch.ones(4000, 1, dtype=torch.bool)
-    process.loss(denoise, torch.zeros(4000, 1, 1), mask, NO_CONDITION)
-    assert seen[0].mean() == pytest.approx(0.5, abs=0.03)
-    assert ((seen[0] > 0.25) & (seen[0] < 0.75)).float().mean() == pytest.approx(in_the_middle, abs=0.03)
+    process, mask = FlowMatching(time_distribution=distribution, prediction="x0"), torch.ones(4000, 1).bool()
+    # Of motions that are 0, the error of a denoiser that returns the square root of the time is the time.
+    terms = process.loss(
+        lambda x_t, t, *_: (t / 1000).sqrt()[:, None, None], torch.zeros(4000, 1, 1), mask, NO_CONDITION
+    )
+    times = terms["mse"]
+    assert times.mean() == pytest.approx(0.5, abs=0.03)
+    assert ((times > 0.25) & (times < 0.75)).float().mean() == pytest.approx(in_the_middle, abs=0.03)
 
 
 MASK = length_mask(torch.tensor([4, 2]))
 NULL = Condition(torch.tensor([[10.0]]), torch.zeros(1, 0, 1), None)
 COND = Condition(torch.tensor([[1.0], [2.0]]), torch.zeros(2, 0, 1), None, NULL)
-ZEROS = torch.zeros(2, 4, 2), torch.zeros(2)
 
 
 def sees_condition(x_t, t, mask, cond):
@@ -309,23 +299,17 @@ def sees_condition(x_t, t, mask, cond):
 
 
 @pytest.mark.parametrize("scale", [0.0, 2.5, torch.tensor([2.5, 0.0]), torch.tensor([1.0, 8.0])])
-def test_guidance_is_two_passes_in_one(scale):
+def test_guidance_is_two_passes_in_one_except_for_a_learned_variance_and_scale_one(scale):
     x_t, t = torch.randn(2, 4, 2), torch.tensor([3.0, 5.0])
-    denoise = CountedDenoise(sees_condition)
-    guided = classifier_free_guidance(denoise, scale, features=2)(x_t, t, MASK, COND)
     with_cond = sees_condition(x_t, t, MASK, COND)
     null = sees_condition(x_t, t, MASK, COND.drop(torch.tensor([True, True])))
     strength = scale[:, None, None] if isinstance(scale, torch.Tensor) else scale
-    torch.testing.assert_close(guided[..., :2], (null + strength * (with_cond - null))[..., :2])
-    assert torch.equal(guided[..., 2:], with_cond[..., 2:])
-    assert denoise.calls == 1
-
-
-def test_without_a_learned_variance_all_channels_are_guided_and_scale_one_is_the_denoiser_itself():
-    x_t = torch.randn(2, 4, 2)
-    guided = classifier_free_guidance(lambda *args: sees_condition(*args)[..., :2], 3.0, features=2)
-    expected = (x_t + 10 + 3 * (COND.pooled[:, None] - 10)) * MASK[..., None]
-    torch.testing.assert_close(guided(x_t, torch.zeros(2), MASK, COND), expected)
+    expected = torch.cat([(null + strength * (with_cond - null))[..., :2], with_cond[..., 2:]], -1)
+    for channels in (4, 2):
+        denoise = CountedDenoise(lambda *args, channels=channels: sees_condition(*args)[..., :channels])
+        guided = classifier_free_guidance(denoise, scale, features=2)(x_t, t, MASK, COND)
+        torch.testing.assert_close(guided, expected[..., :channels])
+        assert denoise.calls == 1
     assert classifier_free_guidance(sees_condition, 1, 2) is sees_condition
 
 
@@ -339,7 +323,7 @@ def test_doubled_conditions_and_masks_are_made_once_per_run_and_follow_a_change(
     guided = classifier_free_guidance(denoise, 2.0, 2)
     other = Condition(COND.pooled + 1, COND.tokens, None, NULL)
     for mask, cond in ((MASK, COND), (MASK, COND), (MASK, other), (~MASK, COND), (MASK, COND)):
-        guided(*ZEROS, mask, cond)
+        guided(torch.zeros(2, 4, 2), torch.zeros(2), mask, cond)
     masks, conditions = zip(*seen, strict=True)
     assert masks[0] is masks[1]
     assert conditions[0] is conditions[1]

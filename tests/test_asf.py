@@ -9,7 +9,6 @@ from flame_mdm.formats import asf
 
 SKELETON = """# two bones: an arm along x that turns about its own axes, and a hand without freedoms
 :units
-  mass 1.0
   length 0.45
   angle deg
 :root
@@ -19,7 +18,6 @@ SKELETON = """# two bones: an arm along x that turns about its own axes, and a h
    orientation 0 0 0
 :bonedata
   begin
-     id 1
      name arm
      direction 1 0 0
      length 2
@@ -29,7 +27,6 @@ SKELETON = """# two bones: an arm along x that turns about its own axes, and a h
             (-70.0 70.0)
   end
   begin
-     id 2
      name hand
      direction 0 1 0
      length 3
@@ -63,10 +60,10 @@ def files(tmp_path):
     return tmp_path
 
 
-def test_joints_in_closed_form(files):
+def test_joints_in_closed_form_and_missing_skeletons_and_rates(files):
     motion = asf.read(files / "07_01.amc", 120)
-    assert (motion.joints, motion.parents, motion.end_parents) == (("root", "arm", "hand"), (-1, 0, 1), (2,))
-    positions = motion.with_end_joints().positions()
+    assert (motion.joints, motion.parents) == (("root", "arm", "hand", "hand.end"), (-1, 0, 1, 2))
+    positions = motion.positions()
     assert positions[0].tolist() == [[10, 20, 30], [10, 20, 30], [12, 20, 30], [12, 23, 30]]
     # the arm's x axis is the world's y: by 90 degrees about it, x becomes -z; then the root turns x to y
     np.testing.assert_allclose(positions[1], [[10, 20, 30], [10, 20, 30], [10, 20, 28], [7, 20, 28]], atol=1e-12)
@@ -79,23 +76,28 @@ def test_joints_in_closed_form(files):
     np.testing.assert_allclose(positions[2, 2:], [arm @ [2, 0, 0], arm @ [2, 3, 0]], atol=1e-12)
     (files / "07.asf").rename(files / "someone.asf")  # the only skeleton of the folder
     np.testing.assert_array_equal(asf.read(files / "07_01.amc", 120).frames, motion.frames)
+    with pytest.raises(UserError, match="AMC files contain no frame rate: give fps=120, or `fps: 120` in skeleton"):
+        asf.read(files / "07_01.amc", None)
+    (files / "someone.asf").unlink()
+    with pytest.raises(UserError, match=r"no skeleton 07\.asf next to it"):
+        asf.read(files / "07_01.amc", 120)
 
 
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
         (":DEGREES", ":RADIANS", "07_01.amc, line 3: angles in radians are not supported"),
-        ("angle deg", "angle rad", "07.asf, line 5: angles in radians are not supported"),
+        ("angle deg", "angle rad", "07.asf, line 4: angles in radians are not supported"),
         ("arm 40 50", "arm 40", r"07_01.amc, line 12: expected 2 finite number\(s\), found 40"),
         ("arm 40 50", "leg 40 50", "line 12: leg is no moving bone"),
         ("arm 40 50\n", "", "line 11: frame 3 ends without arm"),
         (MOTION, "", "line 1: not an AMC file"),
         (MOTION, "version https://git-lfs.github.com/spec/v1\n", "line 1: version is no moving bone"),
-        ("dof rx rz", "dof rx l", "07.asf, line 21: degrees of freedom must be among rx, ry and rz"),
-        ("axis 0 0 90 XYZ", "axis 0 0 90 XXZ", "line 21: an order of axes is needed"),
-        ("    arm hand", "    arm foot", "line 32: bone foot is unknown"),
-        ("   position 0 0 0", "   position 0 1 0", "line 9: a root whose position is not 0 0 0"),
-        ("     length 2\n", "", "line 20: a bone without length"),
+        ("dof rx rz", "dof rx l", "07.asf, line 19: degrees of freedom must be among rx, ry and rz"),
+        ("axis 0 0 90 XYZ", "axis 0 0 90 XXZ", "line 19: an order of axes is needed"),
+        ("    arm hand", "    arm foot", "line 29: bone foot is unknown"),
+        ("   position 0 0 0", "   position 0 1 0", "line 8: a root whose position is not 0 0 0"),
+        ("     length 2\n", "", "line 18: a bone without length"),
         (SKELETON, "HIERARCHY\n", "07.asf, line 1: not an ASF file"),
     ],
 )
@@ -103,12 +105,4 @@ def test_damaged_files_are_named_with_their_line(files, old, new, message):
     for name in ("07.asf", "07_01.amc"):
         (files / name).write_text((files / name).read_text().replace(old, new))
     with pytest.raises(UserError, match=message):
-        asf.read(files / "07_01.amc", 120)
-
-
-def test_missing_skeletons_and_rates_are_named(files):
-    with pytest.raises(UserError, match="AMC files contain no frame rate: give fps=120, or `fps: 120` in skeleton"):
-        asf.read(files / "07_01.amc", None)
-    (files / "07.asf").unlink()
-    with pytest.raises(UserError, match=r"no skeleton 07\.asf next to it"):
         asf.read(files / "07_01.amc", 120)

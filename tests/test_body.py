@@ -4,9 +4,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 from support.fixtures import script
-from support.motions import frames_array, posed, sway
+from support.motions import degrees, frames_array, posed, sway
 
 from flame_mdm.errors import UserError
 from flame_mdm.formats.motion import Motion
@@ -16,19 +15,15 @@ from flame_mdm.visualize.body import ANCHORS, fit_body, load_body, mannequin, si
 from flame_mdm.visualize.posture import JOINT
 
 
-def volume(points: np.ndarray, triangles: np.ndarray) -> float:
-    a, b, c = (points[triangles[:, k]] for k in range(3))
-    return float((a * np.cross(b, c)).sum() / 6)
-
-
-def test_the_mesh_is_one_closed_symmetric_surface():
+def test_the_mesh_is_one_closed_symmetric_surface_in_its_stored_pose():
     points, triangles = mannequin().points, mannequin().triangles
     assert 1000 <= len(points) <= 3000
     edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), 1)
     distinct, count = np.unique(edges, axis=0, return_counts=True)
     assert (count == 2).all()
     assert len(points) - len(distinct) + len(triangles) == 2  # Euler: like a sphere
-    assert 0.05 < volume(points, triangles) < 0.09  # cubic meters; a person of 1.78 m has 0.07
+    a, b, c = (points[triangles[:, k]] for k in range(3))
+    assert 0.05 < (a * np.cross(b, c)).sum() / 6 < 0.09  # cubic meters; a person of 1.78 m has 0.07
     assert 1.7 < np.ptp(points[:, 1]) < 1.85
     assert {tuple(p) for p in points.round(5).tolist()} == {tuple(p) for p in (points * [-1, 1, 1]).round(5).tolist()}
     np.testing.assert_allclose(mannequin().weights.sum(1), 1)
@@ -36,23 +31,18 @@ def test_the_mesh_is_one_closed_symmetric_surface():
     left = mannequin().weights @ np.array(sides(SMPL22), float)[list(ANCHORS)]
     assert (left[points[:, 0] > 0.2] > 0.5).all()
     assert (left[points[:, 0] < -0.2] < -0.5).all()
-
-
-def test_the_stored_pose_gives_the_stored_mesh():
+    # the stored pose gives the stored mesh
     turns = {"shoulder": (0, 0, -46), "elbow": (0, -14, 0), "hip": (0, 0, 4), "ankle": (0, 0, -4)}
-    both = {
-        f"{side}_{k}": (x, f * y, f * z) for side, f in (("left", 1), ("right", -1)) for k, (x, y, z) in turns.items()
-    }
+    both = {f"left_{name}": turn for name, turn in turns.items()}
+    both |= {f"right_{name}": (x, -y, -z) for name, (x, y, z) in turns.items()}
     points, _ = fit_body(posed(1, 1.0, **both)).skinned(0)
-    np.testing.assert_allclose(
-        points - [0, 0.955 + mannequin().sole, 0], mannequin().points, atol=4e-3
-    )  # a little twist
+    points -= [0, 0.955 + mannequin().sole, 0]
+    np.testing.assert_allclose(points, mannequin().points, atol=4e-3)  # a little twist
 
 
 def test_joints_of_the_body_are_those_of_the_motion_and_soles_are_on_the_floor():
-    motion = posed(
-        scale=0.93, left_hip=(-50, 10, 0), left_knee=(70, 0, 0), right_shoulder=(0, 30, 60), spine2=(15, 0, 9)
-    )
+    turns: Any = {"left_hip": (-50, 10, 0), "left_knee": (70, 0, 0), "right_shoulder": (0, 30, 60)}
+    motion = posed(scale=0.93, spine2=(15, 0, 9), **turns)
     drawn = fit_body(motion)
     np.testing.assert_allclose(drawn.starts[0, :22] - [0, drawn.lift, 0], motion.joints[0], atol=1e-6)
     points, normals = drawn.skinned(0)
@@ -68,12 +58,12 @@ def test_joints_of_the_body_are_those_of_the_motion_and_soles_are_on_the_floor()
 
 def test_a_twisted_wrist_turns_the_forearm_by_degrees():
     drawn = fit_body(posed(left_wrist=(80, 0, 0)))
-    turned = Rotation.from_matrix(drawn.turns[0] @ fit_body(posed()).turns[0].mT).magnitude()
+    turned = degrees(drawn.turns[0] @ fit_body(posed()).turns[0].mT)
     helper = next(bone for bone, joint in enumerate(ANCHORS[22:], 22) if SMPL22.joints[joint] == "left_elbow")
-    assert np.degrees(turned[[JOINT["left_elbow"], helper, JOINT["left_wrist"]]]) == pytest.approx([0, 44, 80], abs=1.5)
+    assert turned[[JOINT["left_elbow"], helper, JOINT["left_wrist"]]] == pytest.approx([0, 44, 80], abs=1.5)
 
 
-def test_toes_bend_where_the_heel_rises_and_the_head_is_level():
+def test_toes_bend_where_the_heel_rises_and_the_head_is_level_also_after_a_long_bow():
     raised = posed(left_ankle=(40, 0, 0), left_knee=(10, 0, 0), neck=(25, 0, 0))
     raised.joints[:, :, 1] -= raised.joints[..., 10, 1].min()  # the toes stand on the floor
     drawn = fit_body(Motion(np.concatenate([posed(3, neck=(25, 0, 0)).joints, raised.joints]), 20))
@@ -81,9 +71,6 @@ def test_toes_bend_where_the_heel_rises_and_the_head_is_level():
     assert abs(forward[-1, JOINT["left_foot"], 1]) < 0.12
     assert forward[-1, JOINT["left_ankle"], 1] < -0.4
     assert abs(forward[0, JOINT["head"], 1]) < 0.05
-
-
-def test_a_long_bow_does_not_tip_the_head_back_later():
     bowed = posed(30, pelvis=(70, 0, 0), neck=(30, 0, 0))
     drawn = fit_body(Motion(np.concatenate([bowed.joints, posed(10).joints]), 20))
     pitch = np.degrees(np.arcsin((drawn.turns @ mannequin().turns)[:, JOINT["head"], 1, 2]))
@@ -91,7 +78,7 @@ def test_a_long_bow_does_not_tip_the_head_back_later():
     assert pitch[0] < -60
 
 
-def test_the_nearest_triangle_is_drawn():
+def test_the_nearest_triangle_is_drawn_and_pictures_show_the_body_in_its_clothes():
     image = np.full((20, 20, 3), 255, np.uint8)
     square = np.array([[2.0, 18], [18, 18], [18, 2], [2, 2]])
     at, triangles = np.concatenate([square, square]), np.array([[0, 1, 2], [0, 2, 3]])
@@ -102,9 +89,7 @@ def test_the_nearest_triangle_is_drawn():
     assert (image[18:] == 255).all()
     render._rasterize(image, at, np.repeat([3.0, 0.5], 4), colors, triangles[:, ::-1])  # seen from inside
     assert (image[2:18, 2:18] == [10, 20, 30]).all()
-
-
-def test_pictures_show_the_body_in_its_clothes():
+    # pictures show the body in its clothes
     image = frames_array(posed(), 192)[0].astype(int)
     blue = (image[..., 2] > image[..., 0] + 25).nonzero()[0]
     skin = (image[..., 0] > image[..., 2] + 30).nonzero()[0]
@@ -133,7 +118,7 @@ def test_bodies_in_files_are_drawn_and_damaged_ones_named(tmp_path):
     body = load_body(str(tmp_path / "other.npz"))
     assert fit_body(motion, body).mesh is body
     for name in ("a.glb", "a.gif"):
-        motion.save(tmp_path / name, body=body)
+        assert motion.save(tmp_path / name, body=body).startswith(f"{tmp_path / name}: 1 frames at 20 per second, ")
         motion.save(tmp_path / f"mannequin_{name}")
         assert (tmp_path / name).read_bytes() != (tmp_path / f"mannequin_{name}").read_bytes()
     assert player_page([motion], body=body) != player_page([motion])

@@ -66,7 +66,7 @@ def motionbuilder(tree: bvh.Bvh) -> bvh.Bvh:
     offsets = np.where(np.isin(tree.joints, lost)[:, None], 0, tree.offsets)
     pose = np.concatenate([tree.frames[:1, :3], np.zeros((1, tree.frames.shape[1] - 3))], 1)
     frames = np.concatenate([pose, tree.frames])
-    return replace(tree, joints=tuple(names[name] for name in tree.joints), offsets=offsets, frames=frames)
+    return replace(tree, joints=tuple(names.get(name, name) for name in tree.joints), offsets=offsets, frames=frames)
 
 
 @pytest.fixture

@@ -1,5 +1,6 @@
 """Inverse kinematics, and motion files of every kind written and read back."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,7 @@ import torch
 from numpy.typing import ArrayLike
 from support.analytic import euler_to_matrix
 from support.glb import Glb
-from support.motions import posed, synthetic
+from support.motions import degrees, largest_step, posed, synthetic
 from torch import Tensor
 
 from flame_mdm.data import amass
@@ -20,12 +21,11 @@ from flame_mdm.formats.readers import read
 from flame_mdm.formats.retarget import continuous_euler
 from flame_mdm.representations import rotation
 from flame_mdm.representations.rot6d import Rot6D
-from flame_mdm.representations.skeleton import KIT21, SMPL22, global_rotations
+from flame_mdm.representations.skeleton import KIT21, SMPL22
 from flame_mdm.representations.smpl import SMPL
 from flame_mdm.visualize.body import fit_body, mannequin
 
 FPS = 20.0
-ROTATED = (".bvh", ".glb", ".npz")
 
 
 def walking(heading: ArrayLike, root: np.ndarray) -> Poses:
@@ -46,22 +46,6 @@ def two_circles() -> Poses:
     return walking(angle + np.pi, np.stack([1.5 * np.cos(angle), 0.95 + 0 * angle, -1.5 * np.sin(angle)], -1))
 
 
-def backward(heading: float) -> Poses:
-    """Walks 2 m backward."""
-    way = -np.linspace(0, 2, 60)
-    return walking(heading, np.stack([way * np.sin(heading), 0.95 + 0 * way, way * np.cos(heading)], -1))
-
-
-def quaternions(poses: Poses) -> Tensor:
-    return rotation.continuous(rotation.matrix_to_quaternion(poses.rotations), dim=0)
-
-
-def largest_step(poses: Poses) -> float:
-    """Degrees that any joint turns from one frame to the next, at most."""
-    q = quaternions(poses)
-    return float(torch.rad2deg(2 * torch.acos((q[1:] * q[:-1]).sum(-1).abs().clamp(max=1))).max())
-
-
 @pytest.fixture(scope="module")
 def circle() -> Motion:
     """The motion of a body, without its rotations."""
@@ -75,25 +59,27 @@ def clips() -> list[Tensor]:
     return [torch.from_numpy(synthetic(action).joints).double() for action in actions]
 
 
-def test_recorded_motion_comes_out_exactly_and_limbs_do_not_flip(clips):
+def test_recorded_motion_comes_out_exactly_and_neither_limbs_flip_nor_angles_jump(clips):
     for joints in clips:
         poses = solve(joints, FPS)
         torch.testing.assert_close(poses.joints(), joints, rtol=0, atol=1e-6)
-        assert largest_step(poses) < 70  # a punch stretches the elbow by 50 degrees per frame
+        assert largest_step(poses.rotations) < 70  # a punch stretches the elbow by 50 degrees per frame
+    poses = solve(clips[1], FPS)
+    angles = continuous_euler(poses.rotations)
+    for joint, order in ((0, "YZX"), (16, "YXZ")):
+        again = euler_to_matrix(angles[:, joint], order)
+        torch.testing.assert_close(again, poses.rotations[:, joint], rtol=0, atol=1e-6)
+    assert torch.rad2deg(angles.diff(dim=0).abs().max()) < 100
 
 
-def test_turns_and_backward_walks_do_not_flip():
-    for made in (two_circles(), backward(0.0), backward(np.pi)):
+def test_turns_and_backward_walks_do_not_flip_and_bent_limbs_show_their_twist():
+    start, way = np.array([0, 0.95, 0]), np.linspace(0, 2, 60)[:, None] * [0, 0, 1]
+    for made in (two_circles(), walking(0.0, start - way), walking(np.pi, start + way)):
         poses = solve(made.joints(), FPS)
         torch.testing.assert_close(poses.joints(), made.joints(), rtol=0, atol=1e-9)
-        assert largest_step(poses) < 1.3 * largest_step(made) < 20
-        q = quaternions(poses)
-        assert ((q[1:] * q[:-1]).sum(-1) > 0.9).all()
-        turned = rotation.matrix_to_axis_angle(made.rotations.mT @ poses.rotations)
-        assert torch.linalg.vector_norm(turned, dim=-1)[:, [0, 9]].max() < 1e-6  # pelvis and chest are exact
-
-
-def test_bent_limbs_show_their_twist():
+        assert largest_step(poses.rotations) < 1.3 * largest_step(made.rotations) < 20
+        assert degrees(made.rotations.mT @ poses.rotations)[:, [0, 9]].max() < 5e-5  # pelvis and chest are exact
+    # bent limbs show their twist
     turns: dict[str, Any]
     for side, sign in (("left", 1), ("right", -1)):
         for limb, turns in (
@@ -103,19 +89,15 @@ def test_bent_limbs_show_their_twist():
             made = posed(20, **turns).posed()
             joint = SMPL22.joints.index(f"{side}_{limb}")
             solved = solve(made.joints(), FPS).rotations[:, joint]
-            angle = rotation.matrix_to_axis_angle(solved @ made.rotations[:, joint].mT)
-            assert torch.rad2deg(torch.linalg.vector_norm(angle, dim=-1)).max() < 6, (side, limb)
+            assert degrees(solved @ made.rotations[:, joint].mT).max() < 6, (side, limb)
 
 
-def test_bones_that_change_length_are_met_on_average(clips):
+def test_bones_that_change_length_are_met_on_average_and_joints_without_rotations_are_refused(clips):
     noisy = clips[0] + 0.005 * torch.randn(clips[0].shape, generator=torch.Generator().manual_seed(0))
     poses = solve(noisy, FPS)
     lengths = torch.linalg.vector_norm(SMPL22.bones(poses.joints()), dim=-1)
     torch.testing.assert_close(lengths, lengths[:1].expand_as(lengths))
     assert torch.linalg.vector_norm(poses.joints() - noisy, dim=-1).mean() < 0.008
-
-
-def test_joints_without_rotations_are_refused():
     joints = two_circles().joints()
     with pytest.raises(UserError, match="22 joints of SMPL"):
         solve(joints[:, :21], FPS)
@@ -124,44 +106,35 @@ def test_joints_without_rotations_are_refused():
         solve(joints, FPS)
 
 
-def test_euler_angles_are_those_rotations_however_they_are_unwound(clips):
-    poses = solve(clips[1], FPS)
-    angles = continuous_euler(poses.rotations)
-    for joint, order in ((0, "YZX"), (16, "YXZ")):
-        again = euler_to_matrix(angles[:, joint], order)
-        torch.testing.assert_close(again, poses.rotations[:, joint], rtol=0, atol=1e-6)
-    assert torch.rad2deg(angles.diff(dim=0).abs().max()) < 100
-
-
-def test_files_bring_joints_back(tmp_path, circle):
+def test_files_bring_joints_back_and_angles_of_bvh_do_not_jump(tmp_path, circle):
+    features = np.arange(6, dtype=np.float32).reshape(3, 2)
     for ending in (".bvh", ".json", ".npy", ".npz"):
-        circle.save(tmp_path / f"circle{ending}")
+        replace(circle, features=features, representation="mine").save(tmp_path / f"circle{ending}", seed=3)
         again = read(tmp_path / f"circle{ending}", fps=FPS if ending == ".npy" else None)
         np.testing.assert_allclose(again.joints, circle.joints, rtol=0, atol=2e-5)
         assert (again.fps, again.id) == (FPS, "circle")
         assert again.text == ("" if ending in (".bvh", ".npy") else circle.text)
+    np.testing.assert_array_equal(again.features, features)
+    assert (again.representation, again.poses, np.load(tmp_path / "circle.npz")["seed"]) == ("mine", None, 3)
     assert len(list(tmp_path.iterdir())) == 4
     circle.save(tmp_path / "rest.bvh", rest_pose=True)
     joints = read(tmp_path / "rest.bvh").joints
     np.testing.assert_allclose(joints[0], circle.posed().rest(), atol=1e-4)
     np.testing.assert_allclose(joints[1:], circle.joints, atol=1e-4)
-
-
-def test_bvh_is_in_centimeters_and_its_angles_do_not_jump(tmp_path, circle):
-    circle.save(tmp_path / "circle.bvh")
+    # BVH is in centimeters, and its angles do not jump
     file = bvh.read(tmp_path / "circle.bvh")
-    assert (file.fps, len(file.end_parents)) == (FPS, 5)
+    assert (file.fps, sum(name.endswith(".end") for name in file.joints)) == (FPS, 5)
     np.testing.assert_allclose(file.frames[:, :3], 100 * circle.joints[:, 0], atol=1e-4)
     np.testing.assert_array_equal(file.offsets[0], 0)
     assert np.abs(np.diff(file.frames[:, 3:], axis=0)).max() < 25
-    yaw = file.frames[:, 3 + file.channels[0][3:].index("Yrotation")]
+    yaw = file.frames[:, file.channels[0].index("Yrotation")]
     assert yaw[-1] - yaw[0] == pytest.approx(720, abs=1)
     for unit in (1.0, 0.005):
         with pytest.raises(UserError, match=r"the legs are .* m long .*The unit may be 0\.01 \(centimeters\)"):
             read(tmp_path / "circle.bvh", unit=unit)
 
 
-def test_amass_file_is_one_of_amass(tmp_path):
+def test_amass_files_are_those_of_amass_and_keep_rotations(tmp_path):
     made = two_circles()
     Motion(made.joints().float().numpy(), FPS, poses=made).save(tmp_path / "a.npz")
     recording = amass.read(tmp_path / "a.npz", "a.npz")
@@ -174,10 +147,7 @@ def test_amass_file_is_one_of_amass(tmp_path):
         names = np.concatenate([file["root_orient"], file["pose_body"]], 1)
         np.testing.assert_array_equal(names, file["poses"][:, :66])
         assert (file["mocap_frame_rate"].item(), file["betas"].shape) == (20.0, (16,))
-
-
-def test_rotations_of_amass_are_kept(tmp_path):
-    """A head that turns about itself shows in no joint position."""
+    # a head that turns about itself shows in no joint position
     head = SMPL22.joints.index("head")
     for width, rate in ((72, "mocap_framerate"), (156, "mocap_framerate"), (165, "mocap_frame_rate")):
         poses = 0.2 * np.random.default_rng(0).normal(size=(9, width))
@@ -185,20 +155,18 @@ def test_rotations_of_amass_are_kept(tmp_path):
         np.savez(tmp_path / "a.npz", **arrays)
         recording = read(tmp_path / "a.npz")
         assert recording.fps == 60
-        for ending in ROTATED:
+        for ending in (".bvh", ".glb", ".npz"):
             recording.save(tmp_path / f"b{ending}")
         expected = rotation.axis_angle_to_matrix(torch.from_numpy(poses[:, 3 * head : 3 * head + 3]))
         vectors = torch.from_numpy(np.load(tmp_path / "b.npz")["poses"])[:, 3 * head : 3 * head + 3]
         file = bvh.read(tmp_path / "b.bvh")
-        for turns in (
-            rotation.axis_angle_to_matrix(vectors),
-            torch.from_numpy(file.rotations())[:, file.joints.index("head")],
-            turns_of(Glb(tmp_path / "b.glb"))[:, head],
-        ):
+        of_bvh = torch.from_numpy(file.rotations())[:, file.joints.index("head")]
+        of_glb = torch.from_numpy(Glb(tmp_path / "b.glb").curves()[head, "rotation"][:, [3, 0, 1, 2]])
+        for turns in (rotation.axis_angle_to_matrix(vectors), of_bvh, rotation.quaternion_to_matrix(of_glb)):
             torch.testing.assert_close(turns.double(), expected, rtol=0, atol=1e-5)
 
 
-def test_features_that_are_rotations_of_smpl_are_exported_as_they_are(tmp_path):
+def test_features_that_are_rotations_of_smpl_are_exported_and_those_of_humanml_are_not(tmp_path, circle):
     raw = 0.2 * torch.randn(9, 75, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     for representation in (SMPL(FPS), Rot6D(FPS)):
         features = representation.encode(raw)
@@ -209,27 +177,14 @@ def test_features_that_are_rotations_of_smpl_are_exported_as_they_are(tmp_path):
         made.save(tmp_path / "b.npz")
         again = np.load(tmp_path / "b.npz")["poses"]
         np.testing.assert_allclose(again[:, 3:66], raw[:, 6:69], atol=1e-5)  # all but the root, whose world differs
-
-
-def test_rotations_among_humanml_features_are_never_used(tmp_path, circle):
     for name, features in (("a", np.zeros((160, 263))), ("b", np.full((160, 263), 7.0))):
         arrays = {"joints": circle.joints, "features": features, "fps": FPS, "representation": "humanml263"}
         np.savez(tmp_path / f"{name}.npz", **arrays)
         read(tmp_path / f"{name}.npz").save(tmp_path / f"{name}.bvh")
     assert (tmp_path / "a.bvh").read_text() == (tmp_path / "b.bvh").read_text()
-    np.save(tmp_path / "features.npy", features)
-    with pytest.raises(UserError, match=r"joints of shape \(160, 263\), not \(frames, joints, 3\)"):
-        read(tmp_path / "features.npy", fps=FPS)
 
 
-def turns_of(file: Glb) -> Tensor:
-    """Rotations (F, 22, 3, 3) of the joints in a .glb file."""
-    curves = file.curves()
-    turns = np.stack([curves[node, "rotation"] for node in range(22)], 1)[..., [3, 0, 1, 2]]
-    return rotation.quaternion_to_matrix(torch.from_numpy(turns))
-
-
-def test_glb_holds_the_motion(tmp_path, circle):
+def test_glb_holds_the_motion_and_a_body_on_its_joints(tmp_path, circle):
     circle.save(tmp_path / "a.glb")
     file = Glb(tmp_path / "a.glb")
     document, curves = file.document, file.curves()
@@ -237,10 +192,8 @@ def test_glb_holds_the_motion(tmp_path, circle):
     parents = {child: k for k, node in enumerate(nodes) for child in node.get("children", [])}
     assert [parents[k] for k in range(22)] == [23, *SMPL22.parents[1:]]
     assert tuple(node["name"] for node in nodes[:22]) == SMPL22.joints
-    offsets = torch.tensor([node["translation"] for node in nodes[:22]])
-    root = torch.from_numpy(curves[0, "translation"])
-    poses = Poses(offsets.double(), turns_of(file).double(), root.double())
-    np.testing.assert_allclose(poses.joints(), circle.joints, atol=1e-5)
+    lift = np.array(nodes[23]["translation"])
+    np.testing.assert_allclose(file.worlds()[:, :22, :3, 3] - lift, circle.joints, atol=1e-5)
     times = file.array(animation["samplers"][0]["input"])[:, 0]
     np.testing.assert_allclose(times, np.arange(len(times)) / FPS, atol=1e-6)
     assert (animation["name"], document["asset"]["extras"]["fps"]) == (circle.text, FPS)
@@ -248,10 +201,7 @@ def test_glb_holds_the_motion(tmp_path, circle):
         np.testing.assert_allclose(np.linalg.norm(turns, axis=1), 1, atol=1e-6)
         assert ((turns[1:] * turns[:-1]).sum(1) > 0).all()
 
-
-def test_glb_has_a_body_that_hangs_on_the_joints(tmp_path, circle):
-    circle.save(tmp_path / "a.glb")
-    file = Glb(tmp_path / "a.glb")
+    # a body hangs on the joints
     skin, primitive = file.document["skins"][0], file.document["meshes"][0]["primitives"][0]
     assert skin["joints"] == list(range(22))
     position, normal, joint, weight = (
@@ -265,14 +215,10 @@ def test_glb_has_a_body_that_hangs_on_the_joints(tmp_path, circle):
     a, b, c = (position[triangles[:, k]] for k in range(3))
     outward = (np.cross(b - a, c - a) * normal[triangles].mean(1)).sum(1)
     assert (outward > 0).mean() > 0.995  # normals are smoothed at folds
-    lift = file.document["nodes"][23]["translation"]
     assert lift[1] == pytest.approx(0.026, abs=0.003)
     # a program that reads the file shows what our pictures show
-    world, drawn = global_rotations(turns_of(file).double(), SMPL22.parents)[7].numpy(), fit_body(circle)
-    moves = np.tile(np.eye(4), (22, 1, 1))
-    moves[:, :3, :3], moves[:, :3, 3] = world, circle.joints[7] + np.array(lift)
     shared = mannequin().weights[:, :22].sum(1) > 0.99
-    off = np.linalg.norm(file.skinned(moves) - drawn.skinned(7)[0], axis=1)
+    off = np.linalg.norm(file.skinned(file.worlds()[7]) - fit_body(circle).skinned(7)[0], axis=1)
     assert shared.mean() > 0.65
     assert off[shared].max() < 0.003
     assert "without a body: the bone that ends in" in posed(scale=3.0).save(tmp_path / "giant.glb")
@@ -284,12 +230,7 @@ def test_what_does_not_fit_a_file_is_refused(tmp_path, circle):
     options: dict[str, Any]
     for motion, name, options, message in (
         (circle, "a.glb", {"rest_pose": True}, "rest_pose only for .bvh"),
-        (
-            circle,
-            "a.bvh",
-            {"rig": "miximo"},
-            r"rig=miximo: unknown\. Did you mean mixamo\? Use one of mixamo, unreal, ",
-        ),
+        (circle, "a.bvh", {"rig": "miximo"}, r"rig=miximo: unknown\. Did you mean mixamo\? Use one of mixamo, unreal"),
         (circle, "a.npz", {"rig": "mixamo"}, r"rig is only for \.bvh and \.glb"),
         (kit, "a.bvh", {}, r"\.json or \.npy"),
         (circle, "walk.npz.txt", {}, "unknown kind of motion file. Use one of .bvh, .glb, .npz, .json, .npy, .gif"),

@@ -64,13 +64,12 @@ def mixamo(path: Path, scale: float = 1.0, toes: float = 1.0, frames: int = 40) 
     numbers = np.zeros((frames, 6 + 3 * (len(kept) - 1)))
     numbers[:, :3] = 100 * scale * WALK[0, 0]
     numbers[:, 5] = np.arange(frames) * 40.0
+    names = [MIXAMO[joint] for joint in SMPL22.joints]
     body = bvh.Bvh(
-        tuple(MIXAMO[SMPL22.joints[k]] for k in kept),
-        tuple(kept.index(parents[k]) if k else -1 for k in kept),
-        offsets[kept],
-        (CHANNELS, *[CHANNELS[3:]] * (len(kept) - 1)),
-        tuple(kept.index(parents[k]) for k in cut),
-        offsets[cut].reshape(-1, 3) * toes,
+        (*(names[k] for k in kept), *(f"{names[parents[k]]}.end" for k in cut)),
+        tuple(kept.index(parents[k]) if k else -1 for k in kept + cut),
+        np.concatenate([offsets[kept], offsets[cut] * toes]),
+        (CHANNELS, *[CHANNELS[3:]] * (len(kept) - 1), *[()] * len(cut)),
         numbers,
         30.0,
     )
@@ -128,10 +127,10 @@ def test_skeletons_are_recognized(name: str, tmp_path: Path):
     local[:, 1:] -= local[:, :1]
     size = len(columns)
     frames = np.concatenate([local, np.zeros_like(local)], 2).reshape(len(local), -1)
-    parents, none = (-1, *[0] * (size - 1)), np.zeros((0, 3))
+    parents = (-1, *[0] * (size - 1))
     for prefix in ("", "mixamorig:", "mixamorig_", "mixamorig1_"):
         names = tuple(prefix + n for n in [*own, *extra])
-        take = bvh.Bvh(names, parents, np.zeros((size, 3)), (CHANNELS,) * size, (), none, frames, 30.0)
+        take = bvh.Bvh(names, parents, np.zeros((size, 3)), (CHANNELS,) * size, frames, 30.0)
         bvh.write(take, tmp_path / "take.bvh")
         motion = only(tmp_path)
         for joint, names in sources.items():
@@ -189,7 +188,10 @@ BAD = {
     "unit": (lambda f: np.save(f / "one.npy", WALK * 100), r"one\.npy: the legs are 8\d.* m long .* be 0\.01 \(cent"),
     "sides": (lambda f: np.save(f / "one.npy", WALK * [-1, 1, 1]), r"one\.npy: the toes point backwards"),
     "up": (lambda f: np.savez(f / "deep/two.npz", joints=LYING, fps=9), "the body is lying down"),
-    "yaml key": (lambda f: skeleton(f, rate=30), r"skeleton\.yaml: unknown key rate; use map, joints"),
+    "yaml key": (
+        lambda f: skeleton(f, rate=30),
+        r"skeleton\.yaml: rate: Extra inputs are not permitted\. Use map, joints",
+    ),
     "yaml map": (lambda f: skeleton(f, map={"pelvis": "Hips"}), r"skeleton\.yaml: map: no joint given for head"),
     "map": (lambda f: skeleton(f, fps=30, map=HEADLESS), r"two\.npz: the map in skeleton\.yaml uses .* head\?"),
 }
@@ -219,7 +221,7 @@ def test_motions_are_excluded_by_name(arrays: Path):
 def test_wrong_units_are_refused_with_the_unit_that_fits(tmp_path: Path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     mixamo(tmp_path / "mine" / "a.bvh", INCH)
-    message = r"a\.bvh: the legs are 0\.3\d+ m long .*The unit may be 0\.0254 \(inches\): set `unit: 0\.0254`"
+    message = r"a\.bvh: the legs are 0\.3\d+ m long .*The unit may be 0\.0254 \(inches\): set `unit`"
     with pytest.raises(ValueError, match=message):
         only(tmp_path / "mine")
     assert [main(["convert", "mine/a.bvh", "out=a.glb", *words]) for words in ([], ["unit=0.0254"])] == [1, 0]

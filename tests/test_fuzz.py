@@ -18,7 +18,7 @@ import pytest
 from support.fixtures import ROOT
 from support.motions import adult, bvh_text
 from support.pages import a_run
-from support.refusals import one_line
+from support.refusals import npz, one_line
 from support.runs import TINY, finish, spawn
 
 from flame_mdm.__main__ import main
@@ -177,8 +177,10 @@ def broken_arrays() -> Iterator[dict[str, Any]]:
 
 def written(content: dict[str, Any] | np.ndarray) -> bytes:
     """The bytes of an array or of named arrays in a file."""
+    if isinstance(content, dict):
+        return npz(**content)
     stream = io.BytesIO()
-    np.savez(stream, **content) if isinstance(content, dict) else np.save(stream, content)
+    np.save(stream, content)
     return stream.getvalue()
 
 

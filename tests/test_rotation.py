@@ -6,17 +6,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.analytic import euler_to_matrix
-from support.fixtures import golden, golden_case
+from support.fixtures import golden, golden_case, tensors
 from torch import Tensor
 
 from flame_mdm.representations import rotation
 
 ORDERS = ("XYZ", "YXZ", "ZXY", "ZYX", "XZY", "YZX")
-STEM = "smpl147"
-
-
-def fixture(key: str) -> Tensor:
-    return torch.from_numpy(golden(STEM)[key])
+finite = st.floats(-4, 4, width=32)
+vectors = st.tuples(finite, finite, finite).map(lambda v: torch.tensor(v, dtype=torch.float64))
 
 
 def same(actual: Tensor, expected: Tensor, atol: float) -> None:
@@ -28,70 +25,56 @@ def same_rotation(actual: Tensor, expected: Tensor, atol: float) -> None:
     same(actual * (actual * expected).sum(-1, keepdim=True).sign(), expected, atol)
 
 
-def random_quaternions(seed: int) -> Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    return torch.nn.functional.normalize(torch.randn(50, 4, generator=generator, dtype=torch.float64), dim=-1)
-
-
-finite = st.floats(-4, 4, width=32)
-vectors = st.tuples(finite, finite, finite).map(lambda v: torch.tensor(v, dtype=torch.float64))
-
-
-@golden_case(STEM)
-def test_conversions(stem: str):
+@golden_case("smpl147")
+def test_conversions_are_the_authors(stem: str):
+    file = tensors(golden(stem))
     for dtype in (torch.float32, torch.float64):
-        axis_angle = fixture("conv/axis_angle").to(dtype)
+        axis_angle = file["conv/axis_angle"].to(dtype)
         quaternion = rotation.axis_angle_to_quaternion(axis_angle)
         matrix = rotation.axis_angle_to_matrix(axis_angle)
         assert matrix.dtype == dtype
-        same(quaternion.float(), fixture("conv/quat_p3d"), 2e-6)
-        same(matrix.float(), fixture("conv/matrix"), 2e-6)
-        same(rotation.matrix_to_rot6d(matrix, "rows").float(), fixture("conv/rot6d_rows"), 2e-6)
-        same(rotation.matrix_to_rot6d(matrix, "columns").float(), fixture("conv/rot6d_cols"), 2e-6)
+        same(quaternion.float(), file["conv/quat_p3d"], 2e-6)
+        same(matrix.float(), file["conv/matrix"], 2e-6)
+        same(rotation.matrix_to_rot6d(matrix, "rows").float(), file["conv/rot6d_rows"], 2e-6)
+        same(rotation.matrix_to_rot6d(matrix, "columns").float(), file["conv/rot6d_cols"], 2e-6)
         actual = rotation.quaternion_to_matrix(rotation.matrix_to_quaternion(matrix))
         for key, atol in (("p3d072", 2e-6), ("p3dhead", 2e-6), ("copysign", 2e-3)):  # it loses digits near a half turn
-            expected = rotation.quaternion_to_matrix(fixture(f"conv/quat_from_matrix_{key}")).to(dtype)
+            expected = rotation.quaternion_to_matrix(file[f"conv/quat_from_matrix_{key}"]).to(dtype)
             same(actual, expected, atol)
         back = rotation.matrix_to_axis_angle(matrix)
         assert back.norm(dim=-1).max() <= torch.pi + 1e-6
         same(rotation.axis_angle_to_matrix(back), matrix, 2e-6)
-
-
-@golden_case(STEM)
-def test_rot6d_that_is_not_orthonormal(stem: str):
-    noisy = fixture("conv/noisy6")
-    same(rotation.rot6d_to_matrix(noisy, "rows"), fixture("conv/noisy6_to_matrix_rows"), 1e-5)
-    same(rotation.rot6d_to_matrix(noisy, "columns"), fixture("conv/noisy6_to_matrix_cols"), 1e-5)
+    # 6D vectors that are not orthonormal
+    noisy = file["conv/noisy6"]
+    same(rotation.rot6d_to_matrix(noisy, "rows"), file["conv/noisy6_to_matrix_rows"], 1e-5)
+    same(rotation.rot6d_to_matrix(noisy, "columns"), file["conv/noisy6_to_matrix_cols"], 1e-5)
     quaternion = rotation.matrix_to_quaternion(rotation.rot6d_to_matrix(noisy.double(), "columns"))
-    same_rotation(quaternion.float(), fixture("conv/cont6d_to_quat"), 1e-5)
+    same_rotation(quaternion.float(), file["conv/cont6d_to_quat"], 1e-5)
 
 
-@golden_case(STEM)
-def test_quaternion_algebra(stem: str):
-    a, b = fixture("hmlq/qa"), fixture("hmlq/qb")
-    v, w = fixture("hmlq/v"), fixture("hmlq/w")
-    same(rotation.multiply(a, b), fixture("hmlq/qmul"), 2e-6)
-    same(rotation.inverse(a), fixture("hmlq/qinv"), 0)
-    same(rotation.rotate(a, v), fixture("hmlq/qrot"), 4e-6)
-    same(rotation.between(v, w), fixture("hmlq/qbetween"), 2e-6)
-    same(rotation.quaternion_to_matrix(a), fixture("hmlq/to_matrix"), 2e-6)
-    same(rotation.matrix_to_rot6d(rotation.quaternion_to_matrix(a), "columns"), fixture("hmlq/cont6d"), 2e-6)
-    same(rotation.continuous(fixture("hmlq/qfix_in"), 0), fixture("hmlq/qfix_out"), 0)
-
-
-@golden_case(STEM)
-def test_euler_angles(stem: str):
-    angles = fixture("hmlq/euler_xyz_rad").double()
+@golden_case("smpl147")
+def test_quaternion_algebra_and_euler_angles_are_the_authors(stem: str):
+    file = tensors(golden(stem))
+    a, b, v, w = (file[f"hmlq/{name}"] for name in ("qa", "qb", "v", "w"))
+    same(rotation.multiply(a, b), file["hmlq/qmul"], 2e-6)
+    same(rotation.inverse(a), file["hmlq/qinv"], 0)
+    same(rotation.rotate(a, v), file["hmlq/qrot"], 4e-6)
+    same(rotation.between(v, w), file["hmlq/qbetween"], 2e-6)
+    same(rotation.quaternion_to_matrix(a), file["hmlq/to_matrix"], 2e-6)
+    same(rotation.matrix_to_rot6d(rotation.quaternion_to_matrix(a), "columns"), file["hmlq/cont6d"], 2e-6)
+    same(rotation.continuous(file["hmlq/qfix_in"], 0), file["hmlq/qfix_out"], 0)
+    # Euler angles
+    angles = file["hmlq/euler_xyz_rad"].double()
     for order in ("xyz", "yxz"):
         matrix = euler_to_matrix(angles[:, ["xyz".index(axis) for axis in order]], order.upper())
-        same_rotation(rotation.matrix_to_quaternion(matrix).float(), fixture(f"hmlq/quat_from_euler_{order}"), 2e-6)
+        same_rotation(rotation.matrix_to_quaternion(matrix).float(), file[f"hmlq/quat_from_euler_{order}"], 2e-6)
     for order in ("XYZ", "YXZ", "ZXY", "ZYX"):
-        matrix = euler_to_matrix(fixture("euler/angles"), order)
-        same(matrix, fixture(f"euler/{order}_matrix"), 2e-6)
-        same(rotation.matrix_to_euler(matrix, order), fixture(f"euler/{order}_back"), 1e-4)
+        matrix = euler_to_matrix(file["euler/angles"], order)
+        same(matrix, file[f"euler/{order}_matrix"], 2e-6)
+        same(rotation.matrix_to_euler(matrix, order), file[f"euler/{order}_back"], 1e-4)
 
 
-def test_euler_gimbal_lock():
+def test_euler_angles_in_gimbal_lock_and_of_unknown_orders():
     for order, sign in itertools.product(ORDERS, (1, -1)):
         matrix = euler_to_matrix(torch.tensor([0.4, sign * torch.pi / 2, -1.1], dtype=torch.float64), order)
         back = rotation.matrix_to_euler(matrix, order)
@@ -143,8 +126,9 @@ def test_gradients_are_finite_and_right():
             assert gradient[0, 0].item() == pytest.approx(1)
 
 
-def test_slerp():
-    a, b = random_quaternions(3), random_quaternions(4)
+def test_slerp_takes_the_shorter_way():
+    q = torch.randn(2, 50, 4, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    a, b = torch.nn.functional.normalize(q, dim=-1)
     same(rotation.slerp(a, b, 0.0), a, 1e-12)
     same_rotation(rotation.slerp(a, b, 1.0), b, 1e-12)
     same(rotation.slerp(a, a, 0.3), a, 1e-12)
@@ -153,10 +137,3 @@ def test_slerp():
     assert ((a * half).sum(-1) >= 0.5**0.5 - 1e-9).all(), "the longer way round"
     steps = torch.linspace(0, 1, 5, dtype=a.dtype)[:, None, None]
     same(rotation.slerp(a, b, steps)[2], half, 1e-12)
-
-
-def test_rotate_y_is_the_rotation_about_the_vertical():
-    angle = torch.linspace(-4, 4, 9, dtype=torch.float64)
-    vector = torch.randn(5, 9, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    quaternion = rotation.axis_angle_to_quaternion(angle[:, None] * torch.tensor([0.0, 1.0, 0.0]))
-    same(rotation.rotate_y(vector, angle), rotation.rotate(quaternion, vector), 1e-12)

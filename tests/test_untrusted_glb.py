@@ -3,19 +3,21 @@
 import copy
 import json
 import random
+import re
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from support.glb import Glb, odd_character, packed, write_names
+from support.glb import Glb, changed, odd_character, packed, write_names
 from support.motions import synthetic
 from support.refusals import bounded
 
 from flame_mdm.errors import UserError
-from flame_mdm.formats import characters, glb
+from flame_mdm.formats import glb
 from flame_mdm.formats.motion import Motion
 
 Change = Callable[[dict[str, Any]], object]
@@ -45,20 +47,18 @@ def outcome(path: Path, out: Path) -> str:
         message = str(error)
     assert out.exists() == (not message)
     if message:
-        assert str(path) in message
-        assert "\n" not in message
+        assert re.fullmatch(f".*{re.escape(str(path))}.*", message)  # one line
     else:
         assert all(np.isfinite(values).all() for values in Glb(out).curves().values())
         out.unlink()
     return message
 
 
-def node(**values: Any) -> Change:
-    return lambda document: document["nodes"][0].update(values)
-
-
 def item(part: str, **values: Any) -> Change:
     return lambda document: document[part][0].update(values)
+
+
+node = partial(item, "nodes")
 
 
 def bind(**values: Any) -> Change:
@@ -67,22 +67,20 @@ def bind(**values: Any) -> Change:
 
 
 def unbuffered(document: dict[str, Any]) -> None:
-    """No binary part is needed: neither vertices nor bind matrices are stored."""
     for accessor in document["accessors"]:
         accessor.pop("bufferView")
     document["skins"][0].pop("inverseBindMatrices")
-    document |= {"bufferViews": []}
-    del document["buffers"]
-
-
-def unended(document: dict[str, Any]) -> None:
-    document["nodes"][21]["children"] = [0]
+    del document["bufferViews"], document["buffers"]
 
 
 def deep(document: dict[str, Any]) -> None:
-    """A chain of as many nodes as are allowed."""
     first = len(document["nodes"])
     document["nodes"] += [{"children": [number + 1]} for number in range(first, glb.MAX_NODES - 1)] + [{}]
+
+
+def many(document: dict[str, Any]) -> None:
+    document["nodes"] += [{"name": f"bone {k}"} for k in range(len(document["nodes"]), glb.MAX_NODES)]
+    document["skins"][0] = {"joints": list(range(glb.MAX_NODES))}
 
 
 def drawn(document: dict[str, Any]) -> None:
@@ -93,9 +91,10 @@ def drawn(document: dict[str, Any]) -> None:
 FAULTS: dict[str, tuple[Change, str]] = {
     "child that does not exist": (node(children=[999]), "child: there is no number 999"),
     "two parents": (lambda d: d["nodes"][0]["children"].append(d["nodes"][1]["children"][0]), "two parents"),
-    "own ancestor": (unended, "damaged"),
+    "own ancestor": (lambda document: document["nodes"][21].update(children=[0]), "damaged"),
     "many nodes": (lambda document: document["nodes"].extend([{}] * 100_000), "at most 4096"),
-    "long chain": (deep, ""),
+    "chain of all nodes": (deep, ""),
+    "all nodes are joints": (many, ""),
     "many primitives": (drawn, "parts of meshes"),
     "nothing stored": (unbuffered, ""),
     "bool as a number": (item("bufferViews", byteOffset=True), "valid integer"),
@@ -121,12 +120,10 @@ def test_faults_of_documents_are_named(heroes: list[Path], tmp_path: Path):
     shutil.copy(heroes[1].with_suffix(".yaml"), tmp_path / "odd.yaml")
     for number, (name, (change, message)) in enumerate(FAULTS.items()):
         hero = heroes[number % 3]
-        file = Glb(hero)
-        change(file.document)
-        path = tmp_path / hero.name
-        file.save(path)
+        path = Path(shutil.copy(hero, tmp_path))
+        changed(path, change)
         result = outcome(path, tmp_path / "out.glb")
-        if message not in result or (name in ("long chain", "nothing stored") and result):
+        if message not in result or (change in (deep, many, unbuffered) and result):
             surprises.append(f"{name}: {result}")
     assert not surprises
 
@@ -149,18 +146,6 @@ def test_faults_of_the_parts_of_a_file_are_named(heroes: list[Path], tmp_path: P
     ):
         path.write_bytes(content)
         assert message in outcome(path, tmp_path / "out.glb"), content[:40]
-
-
-@pytest.mark.slow
-def test_many_nodes_are_read_in_time(heroes: list[Path], tmp_path: Path):
-    path = tmp_path / "mixamo.glb"
-    file = Glb(heroes[0])
-    file.document["nodes"] += [{"name": f"bone {k}"} for k in range(len(file.document["nodes"]), glb.MAX_NODES)]
-    file.document["skins"][0]["joints"] = list(range(glb.MAX_NODES))
-    del file.document["skins"][0]["inverseBindMatrices"]
-    file.save(path)
-    assert outcome(path, tmp_path / "out.glb") == ""
-    assert len(characters.read(path).rig.joints) == glb.MAX_NODES
 
 
 VALUES = [None, True, -1, 0, 1, 7, 99, 2**31, 2**70, HUGE, 0.5, -1e-300, 1e30, 1e308, "", "x", "0", [], [0], [-1], [[]]]

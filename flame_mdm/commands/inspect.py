@@ -18,7 +18,6 @@ from flame_mdm.sampler_options import option, required
 if TYPE_CHECKING:
     from flame_mdm.formats.motion import Motion
 
-FAULTY = 3
 MOST_LINES = 20  # faults that are printed per motion; the player shows all
 
 
@@ -62,8 +61,7 @@ def main(settings: InspectSettings) -> None:
         score = (len({fault.kind for fault in faults}), len(frames) / len(motion.joints))
         worst = sorted([*worst, (score, motion, faults)], key=lambda row: row[0], reverse=True)[: settings.clips]
     for _, motion, faults in [row for row in worst if row[2]] if count <= settings.clips else []:
-        more = [f"  and {len(faults) - MOST_LINES} more"] if len(faults) > MOST_LINES else []
-        say(motion.id, *(f"  {fault}" for fault in faults[:MOST_LINES]), *more)
+        say(f"{motion.id}: {len(faults)} faults", *(f"  {fault}" for fault in faults[:MOST_LINES]))
     say(f"{name}: {faulty} of {count} motions with faults")
     say(*(f"  {kind:12} {kinds[kind]:6} ({kinds[kind] / count:.1%}): {LIMITS[kind][2]}" for kind in LIMITS))
     out = Path(settings.out or Path("runs") / "inspect" / f"{name}.html")
@@ -71,7 +69,7 @@ def main(settings: InspectSettings) -> None:
     write_player(out, [motion for _, motion, _ in worst], f"Faults of {name}", marks=marks, body=body)
     say(f"{out}: the {len(worst)} worst motions (open in any browser)" if count > len(worst) else f"player: {out}")
     if faulty:
-        raise SystemExit(FAULTY)
+        raise SystemExit(3)
 
 
 def _files(name: str) -> list[Path]:

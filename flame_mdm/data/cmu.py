@@ -259,7 +259,7 @@ def standardize(tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
                 offsets[at(child)] = share * offsets[at(bone)]
         tree = replace(tree, offsets=offsets, joints=tuple(FACTS["motionbuilder"].get(n, n) for n in tree.joints))
     elif "lButtock" in tree.joints:
-        tree, unit, blended = _added(tree.with_end_joints(), upperback=("abdomen", [0, 0, 0])), 0.01, BLENDED
+        tree, unit, blended = _added(tree, upperback=("abdomen", [0, 0, 0])), 0.01, BLENDED
         rows = [FACTS["daz"].get(name, [name, *offset]) for name, offset in zip(tree.joints, tree.offsets, strict=True)]
         tree = replace(tree, joints=tuple(row[0] for row in rows), offsets=np.array([row[1:] for row in rows], float))
     if "lfemur" not in tree.joints:

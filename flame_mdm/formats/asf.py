@@ -56,14 +56,12 @@ def read(path: Path, fps: float | None) -> Bvh:
                 warnings.simplefilter("ignore")  # in gimbal lock, any third angle is as good
                 columns.append((bone.axes * turned * bone.axes.inv()).as_euler("ZYX", degrees=True))
         channels.append(_POSITIONS * (name == "root") + _ROTATIONS * bool(turns))
-    ends = [names.index(name) for name in names if name not in parents.values()]
+    parents |= {f"{name}.end": name for name in names if name not in parents.values()}
     return Bvh(
-        joints=names,
-        parents=tuple(names.index(parents[name]) if name in parents else -1 for name in names),
-        offsets=np.stack([bones[parents[name]].vector if name in parents else np.zeros(3) for name in names]),
-        channels=tuple(channels),
-        end_parents=tuple(ends),
-        end_offsets=np.stack([bones[names[joint]].vector for joint in ends]),
+        joints=("root", *parents),
+        parents=(-1, *(names.index(parent) for parent in parents.values())),
+        offsets=np.stack([np.zeros(3), *(bones[parent].vector for parent in parents.values())]),
+        channels=(*channels, *[()] * (1 + len(parents) - len(names))),
         frames=np.concatenate(columns, 1),
         fps=frame_rate(fps),
     )

@@ -11,7 +11,7 @@ import itertools
 import math
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
 from typing import NoReturn
@@ -30,14 +30,12 @@ LARGEST = 1e9  # largest number that is read, and largest sum of the numbers in 
 
 @dataclass(frozen=True, eq=False)
 class Bvh:
-    """A skeleton and its motion. J joints, E end sites, F frames, C channels; lengths in the file's unit."""
+    """A skeleton and its motion. J joints, F frames, C channels; lengths in the file's unit."""
 
-    joints: tuple[str, ...]  # J names; end sites are not joints
+    joints: tuple[str, ...]  # J names; the end site of a joint is a joint without channels, `NAME.end`
     parents: tuple[int, ...]  # index of each joint's parent, smaller than its own; -1 for a root
     offsets: np.ndarray  # (J, 3) float64, rest position of each joint in its parent's frame
     channels: tuple[tuple[str, ...], ...]  # names of each joint's channels in the order of its columns, from `CHANNELS`
-    end_parents: tuple[int, ...]  # the parent joint of each end site
-    end_offsets: np.ndarray  # (E, 3) float64, position of each end site in the frame of that joint
     frames: np.ndarray  # (F, C) float64, the channels of all joints in joint order; angles in degrees
     fps: float  # frames per second
 
@@ -45,19 +43,6 @@ class Bvh:
         """Returns the columns of `frames` with each joint's channels."""
         ends = list(itertools.accumulate(map(len, self.channels)))
         return [slice(end - len(names), end) for end, names in zip(ends, self.channels, strict=True)]
-
-    def with_end_joints(self) -> Bvh:
-        """Returns the file with its end sites as joints: `NAME.end`, also if a joint has several."""
-        names = [f"{self.joints[parent]}.end" for parent in self.end_parents]
-        return replace(
-            self,
-            joints=(*self.joints, *names),
-            parents=self.parents + self.end_parents,
-            offsets=np.concatenate([self.offsets, self.end_offsets]),
-            channels=self.channels + ((),) * len(names),
-            end_parents=(),
-            end_offsets=np.zeros((0, 3)),
-        )
 
     def rotations(self) -> np.ndarray:
         """Returns the rotation (F, J, 3, 3) of each joint in its parent's frame."""
@@ -126,38 +111,33 @@ def read(path: str | Path) -> Bvh:
     source = read_lines(path)
     if [word.upper() for word in next(iter(source), [])] != ["HIERARCHY"]:
         source.fail("not a BVH file (it must begin with HIERARCHY)")
-    joints: list[_Node] = []
-    ends: list[_Node] = []
-    blocks: list[_Node] = []  # those whose braces are open
+    nodes: list[_Node] = []
+    blocks: list[int] = []  # numbers of the nodes whose braces are open
 
     while (keyword := source.word().upper()) != "MOTION":
-        node = blocks[-1] if blocks else None
-        inside = node is not None and node.number >= 0
-        if len(joints) + len(ends) > MAX_JOINTS:
+        parent = blocks[-1] if blocks else -1
+        node = nodes[parent] if blocks else _Node("", -1, ("ROOT",))
+        if keyword not in node.keywords:
+            source.fail(f"unexpected {keyword[:40]}")
+        if len(nodes) > MAX_JOINTS:
             source.fail(f"more than {MAX_JOINTS} joints and end sites")
-        if keyword == ("ROOT" if node is None else "JOINT") and (node is None or inside):
-            blocks.append(_Node(len(joints), node.number if node else -1, source.word()))
-            joints.append(blocks[-1])
-            source.word("{")
-        elif keyword == "END" and node is not None and inside:
-            source.word("SITE")
-            blocks.append(_Node(-1, node.number))
-            ends.append(blocks[-1])
-            source.word("{")
-        elif keyword == "OFFSET" and node is not None:
+        if keyword == "OFFSET":
             node.offset = source.numbers([source.word() for _ in range(3)], 3)
-        elif keyword == "CHANNELS" and node is not None and inside:
+        elif keyword == "CHANNELS":
             node.channels = tuple(source.word().capitalize() for _ in range(int(source.numbers([source.word()], 1)[0])))
             if len(set(node.channels)) < len(node.channels) or not set(node.channels) <= set(CHANNELS):
                 names = " ".join(node.channels)[:80]
                 source.fail(f"channels must be distinct and among {', '.join(CHANNELS)}, found {names}")
-        elif keyword == "}" and node is not None:
+        elif keyword == "}":
             if not node.offset:
                 source.fail("joint or end site without OFFSET")
             blocks.pop()
         else:
-            source.fail(f"unexpected {keyword[:40]}")
-    if blocks or not joints:
+            name = source.word("SITE" if keyword == "END" else "")
+            blocks.append(len(nodes))
+            nodes.append(_Node(f"{node.name}.end", parent, _IN_END) if keyword == "END" else _Node(name, parent))
+            source.word("{")
+    if blocks or not nodes:
         source.fail("MOTION before the end of the hierarchy")
 
     count = int(source.labeled(r"Frames:\s*(\d{1,18})", "Frames: and a number"))
@@ -170,29 +150,30 @@ def read(path: str | Path) -> Bvh:
     # a rounded time (0.0333333 for 1/30) means the integer, or resampling could move the last frame past the end
     whole, last_digit = max(round(1 / time), 1), 10.0 ** int(Decimal(seconds).as_tuple().exponent)
     fps = float(whole) if abs(1 / whole - time) < min(last_digit, 0.01 * time) else 1 / time
-    width = sum(len(node.channels) for node in joints)
+    width = sum(len(node.channels) for node in nodes)
     frames = [source.numbers(words, width) for words in source]
     if len(frames) != count or not frames:
         source.fail(f"the file ends after {len(frames)} frames, but must have {max(count, 1)}")
     return Bvh(
-        tuple(node.name for node in joints),
-        tuple(node.parent for node in joints),
-        np.array([node.offset for node in joints], float),
-        tuple(node.channels for node in joints),
-        tuple(node.parent for node in ends),
-        np.array([node.offset for node in ends], float).reshape(-1, 3),
+        tuple(node.name for node in nodes),
+        tuple(node.parent for node in nodes),
+        np.array([node.offset for node in nodes], float),
+        tuple(node.channels for node in nodes),
         np.array(frames),
         fps,
     )
 
 
+_IN_JOINT, _IN_END = ("OFFSET", "CHANNELS", "JOINT", "END", "}"), ("OFFSET", "}")
+
+
 @dataclass
 class _Node:
-    """A joint of a hierarchy, or an end site, whose number is -1."""
+    """A joint of a hierarchy or an end site, and the keywords that may be in its braces."""
 
-    number: int
+    name: str
     parent: int
-    name: str = ""
+    keywords: tuple[str, ...] = _IN_JOINT
     offset: Sequence[float] = ()
     channels: tuple[str, ...] = ()
 
@@ -248,28 +229,26 @@ class Lines:
 
 def write(bvh: Bvh, path: str | Path) -> None:
     """Writes a BVH file that `read` converts back to the same numbers; joints are in depth-first order."""
-    children: list[list[int]] = [[] for _ in bvh.joints]  # -1, -2, ... are end sites
+    children: list[list[int]] = [[] for _ in bvh.joints]
     for joint, parent in enumerate(bvh.parents):
         if parent >= 0:
             children[parent].append(joint)
-    for end, parent in enumerate(bvh.end_parents):
-        children[parent].append(-1 - end)
     lines, order, columns = ["HIERARCHY"], list[int](), bvh.columns()
     stack = [(0, joint, False) for joint, parent in enumerate(bvh.parents) if parent < 0][::-1]
     while stack:
         depth, joint, closing = stack.pop()
-        indent = "\t" * depth
+        indent, name, channels = "\t" * depth, bvh.joints[joint], bvh.channels[joint]
         if closing:
             lines.append(f"{indent}}}")
             continue
-        head = "End Site" if joint < 0 else f"{'JOINT' if depth else 'ROOT'} {bvh.joints[joint]}"
-        offset = bvh.end_offsets[-1 - joint] if joint < 0 else bvh.offsets[joint]
-        lines += [f"{indent}{head}", f"{indent}{{", f"{indent}\tOFFSET {_numbers(offset)}"]
+        is_end = name.endswith(".end") and not channels and not children[joint]
+        head = "End Site" if is_end else f"{'JOINT' if depth else 'ROOT'} {name}"
+        lines += [f"{indent}{head}", f"{indent}{{", f"{indent}\tOFFSET {_numbers(bvh.offsets[joint])}"]
+        if not is_end:
+            lines.append(" ".join([f"{indent}\tCHANNELS", str(len(channels)), *channels]))
+        order.append(joint)
         stack.append((depth, joint, True))
-        if joint >= 0:
-            order.append(joint)
-            lines.append(" ".join([f"{indent}\tCHANNELS", str(len(bvh.channels[joint])), *bvh.channels[joint]]))
-            stack += [(depth + 1, child, False) for child in reversed(children[joint])]
+        stack += [(depth + 1, child, False) for child in reversed(children[joint])]
     lines += ["MOTION", f"Frames: {len(bvh.frames)}", f"Frame Time: {1 / bvh.fps!r}"]
     lines += map(_numbers, bvh.frames[:, np.r_[tuple(columns[joint] for joint in order)]])
     write_text(path, "\n".join(lines) + "\n")

@@ -53,7 +53,10 @@ def cleanup(joints: np.ndarray, fps: float, skeleton: Skeleton, contacts: np.nda
     else:
         contact = np.clip(2 * contacts[:-1, [skeleton.feet.index(toe) for toe in toes]] - 0.5, 0, 1)
     for chain, weight in zip(skeleton.chains[:2], contact.T, strict=True):
-        _bend(motion, chain[1:], _pin(motion[:, chain[-1]], weight))
+        toe, shift = motion[:, chain[-1]], np.zeros((len(motion), 3))  # over the ground, fades out between contacts
+        still = -np.diff(toe[:, [0, 2]], axis=0)
+        shift[:, [0, 2]] = _least_squares(len(toe), (1, 30 * weight, still), (0, 0.03, 0.0), (2, 0.1, 0.0))
+        _bend(motion, chain[1:], shift)
     for side in ("left", "right"):
         _push_out(motion, skeleton, side, fps)
     return motion.astype(np.float32)
@@ -123,14 +126,6 @@ def _follow_feet(motion: np.ndarray, toes: list[int], fps: float) -> np.ndarray:
     out = motion.copy()
     out[1:, :, [0, 2]] -= drift.cumsum(0)[:, None]
     return out
-
-
-def _pin(toe: np.ndarray, contact: np.ndarray) -> np.ndarray:
-    """Returns the shift (F, 3) over the ground that keeps a toe (F, 3) in place in contact and fades out between."""
-    shift = np.zeros_like(toe)
-    still = -np.diff(toe[:, [0, 2]], axis=0)
-    shift[:, [0, 2]] = _least_squares(len(toe), (1, 30 * contact, still), (0, 0.03, 0.0), (2, 0.1, 0.0))
-    return shift
 
 
 def _push_out(motion: np.ndarray, skeleton: Skeleton, side: str, fps: float) -> None:

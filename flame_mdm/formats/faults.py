@@ -50,10 +50,16 @@ def find_faults(motion: Motion) -> list[Fault]:
     step = np.linalg.norm(np.diff(joints, axis=0), axis=-1) * fps
     height, still = joints[..., 1].min(1)[:, None], step.max(1, initial=0.0)[:, None]
     aloft, slow = height > LOW, np.append(step[:, :1], step[-1:, :1], axis=0) < STANDSTILL
+    toes, slides = skeleton.feet[1::2], np.zeros(joints.shape[:2])
+    low = joints[:, toes, 1] < LOW
+    travel = np.linalg.norm(np.diff(joints[:, toes][..., [0, 2]], axis=0), axis=-1) * fps
+    slides[:-1, toes] = travel * (low[1:] & low[:-1])
+    jumps = np.zeros(joints.shape[:2])  # distances from the middle of the neighbors in time, as accelerations
+    jumps[1:-1] = np.linalg.norm(np.diff(joints, n=2, axis=0), axis=-1) * fps**2
     floats = [binary_opening(flag, np.ones((math.ceil(s * fps), 1))) for s, flag in ((0.8, aloft), (0.3, aloft & slow))]
     faults = [
-        *_runs("skating", names, _skating(joints, skeleton.feet[1::2], fps), frames=math.ceil(0.4 * fps)),
-        *_runs("pop", names, _pops(joints, fps)),
+        *_runs("skating", names, slides, frames=math.ceil(0.4 * fps)),
+        *_runs("pop", names, jumps),
         *_runs("bone length", names, *_stretched(joints, skeleton.edges)),
         *_runs("penetration", names, -joints[..., 1]),
         *_runs("inside", names, _inside(joints, names)),
@@ -75,21 +81,6 @@ def _runs(
         for start, end in edges.reshape(-1, 2).tolist():
             runs.append(Fault(kind, names[joint], start, end, float(values[start:end, joint].max())))
     return runs
-
-
-def _skating(joints: np.ndarray, toes: Sequence[int], fps: float) -> np.ndarray:
-    speed = np.zeros(joints.shape[:2])
-    low = joints[:, toes, 1] < LOW
-    travel = np.linalg.norm(np.diff(joints[:, toes][..., [0, 2]], axis=0), axis=-1) * fps
-    speed[:-1, toes] = travel * (low[1:] & low[:-1])
-    return speed
-
-
-def _pops(joints: np.ndarray, fps: float) -> np.ndarray:
-    """Returns how far each joint is from the middle of its neighbors in time, as an acceleration."""
-    size = np.zeros(joints.shape[:2])
-    size[1:-1] = np.linalg.norm(np.diff(joints, n=2, axis=0), axis=-1) * fps**2
-    return size
 
 
 def _stretched(joints: np.ndarray, edges: Sequence[tuple[int, int]]) -> tuple[np.ndarray, np.ndarray]:
@@ -143,14 +134,12 @@ def depths(joints: np.ndarray, names: Sequence[str], side: str) -> tuple[np.ndar
     elbow, wrist = at[f"{side}_elbow"], at[f"{side}_wrist"]
     points = np.stack([elbow, wrist, wrist + PALM * (wrist - elbow)], 1)
     across = unit(at["left_shoulder"] - at["right_shoulder"])
-    trunk = _away(points, joints[:, 0], at["neck"])
-    lateral = (trunk * across[:, None]).sum(-1, keepdims=True) * across[:, None]
-    away = [trunk - (1 - 1 / WIDTH) * lateral]
-    sizes = [TRUNK * _length(at["neck"] - joints[:, 0])]
-    for leg in ("left", "right"):
-        hip, knee = at[f"{leg}_hip"], at[f"{leg}_knee"]
-        away.append(_away(points, hip, knee))
-        sizes.append(THIGH * _length(knee - hip))
+    bones = [(joints[:, 0], at["neck"]), *((at[f"{leg}_hip"], at[f"{leg}_knee"]) for leg in ("left", "right"))]
+    away = [_away(points, start, end) for start, end in bones]
+    lateral = (away[0] * across[:, None]).sum(-1, keepdims=True) * across[:, None]
+    away[0] = away[0] - (1 - 1 / WIDTH) * lateral
+    lengths = [float(np.median(np.linalg.norm(end - start, axis=-1))) for start, end in bones]
+    sizes = np.multiply([TRUNK, THIGH, THIGH], lengths)
     depth = np.stack([size - np.linalg.norm(way, axis=-1) for size, way in zip(sizes, away, strict=True)])
     deepest = depth.argmax(0)[None]
     way = np.take_along_axis(np.stack(away), deepest[..., None], 0)[0]
@@ -162,10 +151,6 @@ def _away(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
     axis, points = (end - start)[:, None], points - start[:, None]
     share = (points * axis).sum(-1, keepdims=True) / np.maximum((axis**2).sum(-1, keepdims=True), 1e-9)
     return points - np.clip(share, 0, 1) * axis
-
-
-def _length(bones: np.ndarray) -> float:
-    return float(np.median(np.linalg.norm(bones, axis=-1)))
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:

@@ -24,19 +24,16 @@ UP = {
     "y": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
     "z": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
     "-y": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
-}
-"""The axis that points up -> rows of the rotation that maps it to +y."""
-LEG = (0.6, 1.2)  # shortest and longest leg of an adult, in meters: hip to knee to ankle
+}  # the axis that points up -> rows of the rotation that maps it to +y
+LEG, USUAL_LEG = (0.6, 1.2), 0.83  # shortest, longest and usual leg of an adult, in meters: hip to knee to ankle
 CHILD = 0.25  # shortest leg of a child in meters, at about one year
-USUAL_LEG = 0.83
 FOOT = 0.02  # shortest foot in meters, ankle to toes
 UNITS = {  # in meters
     **{"meters": 1.0, "centimeters": 0.01, "millimeters": 0.001, "inches": 0.0254, "feet": 0.3048},
     **{"the unit of CMU's recordings": 0.0564444},
 }
 
-Source = str | Annotated[dict[str, FiniteFloat], Field(min_length=1)]
-"""A joint of a file, or weights of several joints whose weighted mean is the position."""
+Source = str | Annotated[dict[str, FiniteFloat], Field(min_length=1)]  # a joint, or weights of a mean of joints
 
 
 class Layout(BaseModel):
@@ -110,17 +107,14 @@ def map_bvh(file: bvh.Bvh, fps: float | None, fields: Mapping[str, Any]) -> tupl
     `fields` of `Layout` override the known ones. Known skeletons whose arrays are in meters are in centimeters in BVH
     files, as written by `flame_mdm.formats`.
     """
-    ended = file.with_end_joints()
-    names = [name.rpartition(":")[2] for name in ended.joints]
+    names = [name.rpartition(":")[2] for name in file.joints]
     if "map" not in fields:
         names = [re.sub(r"^mixamorig\d*_?", "", name) for name in names]
     layout = find_layout(names, fields)
     if layout.unit == 1 and not {"map", "unit"} & set(fields):
         layout = layout.model_copy(update={"unit": 0.01})
-    if not layout.used.isdisjoint(names[len(file.joints) :]):
-        file = ended
     positions = file.positions() if fps is None else bvh.forward_kinematics(file.parents, *file.resample(fps))[0]
-    return layout.apply(positions, names[: len(file.joints)]), layout
+    return layout.apply(positions, names), layout
 
 
 def array_layout(joints: np.ndarray, fields: Mapping[str, Any]) -> tuple[Layout, Sequence[str]]:
@@ -179,16 +173,12 @@ def find_skeleton(path: Path, up: str | None = None) -> dict[str, Any]:
 
 def read_skeleton(path: Path) -> dict[str, Any]:
     """Reads some fields of `Layout` from a skeleton file; a `UserError` names the file and the key."""
-    data = read_yaml(path)
-    allowed = ", ".join(Layout.model_fields)
-    if not isinstance(data, dict) or not set(data) <= Layout.model_fields.keys():
-        unknown = ", ".join(map(str, set(data) - Layout.model_fields.keys())) if isinstance(data, dict) else str(data)
-        raise UserError(f"{path}: unknown key {unknown[:100]}; use {allowed}")
     try:
-        fields = Layout.model_validate(data).model_dump(exclude_unset=True)
+        fields = Layout.model_validate(read_yaml(path)).model_dump(exclude_unset=True)
     except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False)[0]
-        raise UserError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']} (docs/own-data.md)") from error
+        first, keys = error.errors(include_url=False, include_input=False)[0], ", ".join(Layout.model_fields)
+        where = ".".join(map(str, first["loc"]))[:100]
+        raise UserError(f"{path}: {where}: {first['msg']}. Use {keys} (docs/own-data.md)") from error
     if missing := sorted(set(SMPL22.joints) - set(fields.get("map", SMPL22.joints))):
         raise UserError(f"{path}: map: no joint given for {', '.join(missing)}")
     return fields
@@ -211,12 +201,11 @@ def check_size(joints: np.ndarray, unit: float, children: bool = False) -> None:
         return
     fitting = {name: u for name, u in UNITS.items() if LEG[0] <= leg / unit * u <= LEG[1]}
     name = min(fitting, key=lambda name: abs(math.log(leg / unit * fitting[name] / USUAL_LEG)), default=None)
-    right = f"{fitting[name]:.6g}" if name else "..."
+    advice = f"The unit may be {fitting[name]:.6g} ({name})" if name else "The unit is wrong"
     small = " If these are children, set `children: true`." if not children and CHILD <= leg < LEG[0] else ""
     raise UserError(
         f"the legs are {leg:.3g} m long (unit {unit:.6g}), but people's are {shortest:g} to {LEG[1]:g} m.{small} "
-        f"{f'The unit may be {right} ({name})' if name else 'The unit is wrong'}: set `unit: {right}` in skeleton.yaml"
-        f" (unit={right} in convert and edit)"
+        f"{advice}: set `unit` in skeleton.yaml, or unit=... of convert and edit"
     )
 
 
@@ -225,17 +214,12 @@ def check_feet(joints: np.ndarray) -> None:
     at = {name: joints[:, number] for number, name in enumerate(SMPL22.joints)}
     for side in ("left", "right"):
         if _bone(joints, f"{side}_ankle", f"{side}_foot") < FOOT:
-            raise UserError(
-                f"the {side} foot has no length: {side}_foot and {side}_ankle are the same point. Map {side}_foot in "
-                "skeleton.yaml to the toes, or to the end site of the ankle, such as LeftAnkle.end"
-            )
+            advice = "to the toes, or to the end site of the ankle, such as LeftAnkle.end"
+            raise UserError(f"the {side} foot has no length. Map {side}_foot in skeleton.yaml {advice}")
     across, trunk = at["left_hip"] - at["right_hip"], at["neck"] - at["pelvis"]
     toes = at["left_foot"] + at["right_foot"] - at["left_ankle"] - at["right_ankle"]
     if np.median((np.cross(across, trunk) * toes).sum(1)) < 0:
-        raise UserError(
-            "the toes point backwards: left and right are swapped, or the axes are mirrored (mirrored: true in "
-            "skeleton.yaml)"
-        )
+        raise UserError("the toes point backwards. Exchange left and right in skeleton.yaml, or set `mirrored: true`")
 
 
 def _bone(joints: np.ndarray, start: str, end: str) -> float:

@@ -1,8 +1,8 @@
 """`Motion`, one motion outside the models, and writers of motion files. `docs/formats.md` describes the files.
 
 The 6D rotations among the 263 features of HumanML3D are not SMPL's: they follow different chains and do not define the
-twist of a bone. They are never exported as rotations, which come from joint positions (`flame_mdm.formats.poses`) or
-from features and files that contain SMPL's rotations.
+twist of a bone. They are never exported; rotations come from joint positions (`flame_mdm.formats.poses`) or from
+features and files that contain SMPL's.
 """
 
 import json
@@ -22,6 +22,7 @@ from flame_mdm.formats import WRITTEN, bvh, characters
 from flame_mdm.formats.characters import Character
 from flame_mdm.formats.glb import Binary, quaternions
 from flame_mdm.formats.poses import Poses, solve
+from flame_mdm.formats.resampling import frame_rate
 from flame_mdm.formats.retarget import continuous_euler, preset, retarget
 from flame_mdm.formats.rig import CENTIMETER, Rig
 from flame_mdm.representations import rotation
@@ -81,9 +82,7 @@ class Motion:
         if not np.isfinite(self.joints).all():
             frame, joint, _ = np.argwhere(~np.isfinite(self.joints))[0]
             raise UserError(f"{name}: joint {joint} in frame {frame} is not finite; did the model diverge?")
-        self.fps = float(self.fps)
-        if not 0 < self.fps < float("inf"):
-            raise UserError(f"{name}: fps is {self.fps}, expected a number above 0")
+        self.fps = frame_rate(self.fps, f"{name}: fps")
         if self.contacts is not None:
             self.contacts = np.asarray(self.contacts, dtype=bool)
             expected = (shape[0], len(skeleton.feet))
@@ -131,8 +130,7 @@ class Motion:
         rigged = character is None and ending in (".bvh", ".glb")
         if (rig is not None and not rigged) or (rest_pose and (ending != ".bvh" or not rigged)):
             raise UserError(
-                f"{path}: rig is only for .bvh and .glb files, and rest_pose only for .bvh files; neither is for the "
-                "file of a character"
+                f"{path}: rig is only for .bvh and .glb files, rest_pose only for .bvh, neither for characters"
             )
         if character is not None:
             character = character if isinstance(character, Character) else characters.read(character)
@@ -189,15 +187,10 @@ def _write_npz(motion: Motion, path: Path, facts: dict[str, Any]) -> str:
     what = f"{len(motion.skeleton)} joints in meters, y up"
     if motion.poses is not None:
         turns, translation = amass_parameters(motion.poses)
-        content |= {
-            "poses": np.pad(turns, ((0, 0), (0, 90))),  # hands at rest
-            "trans": translation,
-            "betas": np.zeros(16),
-            "gender": "neutral",
-            "mocap_framerate": motion.fps,
-            # names of AMASS's SMPL-X files, which GMR reads
-            **{"root_orient": turns[:, :3], "pose_body": turns[:, 3:], "mocap_frame_rate": motion.fps},
-        }
+        content |= {"poses": np.pad(turns, ((0, 0), (0, 90))), "trans": translation}  # hands at rest
+        content |= {"betas": np.zeros(16), "gender": "neutral", "mocap_framerate": motion.fps}
+        # names of AMASS's SMPL-X files, which GMR reads
+        content |= {"root_orient": turns[:, :3], "pose_body": turns[:, 3:], "mocap_frame_rate": motion.fps}
         what += "; also in AMASS's format: SMPL+H poses in axis-angle, meters, z up, bone lengths of SMPL's body"
     with atomic_write(path) as temporary:
         np.savez_compressed(temporary, **content, **facts)
@@ -223,19 +216,16 @@ def _write_bvh(motion: Motion, path: Path, rest_pose: bool, rig: str | None) -> 
         columns.append(angles[:, joint])
     offsets[skeleton.hips] = 0  # programs disagree on whether the channels replace the offset or add to it
     ends = {skeleton.sources.index(SMPL22.joints.index(name)): site for name, site in END_SITES.items()}
-    bvh.write(
-        bvh.Bvh(
-            joints=skeleton.joints,
-            parents=skeleton.parents,
-            offsets=offsets,
-            channels=tuple(channels),
-            end_parents=tuple(ends),
-            end_offsets=np.stack([site @ skeleton.neutral[joint] for joint, site in ends.items()]) / skeleton.unit,
-            frames=np.concatenate(columns, axis=1),
-            fps=motion.fps,
-        ),
-        path,
+    end_offsets = np.stack([site @ skeleton.neutral[joint] for joint, site in ends.items()]) / skeleton.unit
+    file = bvh.Bvh(
+        joints=(*skeleton.joints, *(f"{skeleton.joints[joint]}.end" for joint in ends)),
+        parents=(*skeleton.parents, *ends),
+        offsets=np.concatenate([offsets, end_offsets]),
+        channels=(*channels, *[()] * len(ends)),
+        frames=np.concatenate(columns, axis=1),
+        fps=motion.fps,
     )
+    bvh.write(file, path)
     unit = "centimeters" if skeleton.unit == CENTIMETER else f"unit {skeleton.unit:.4g} m"
     return f"{unit}, y up; {_error(motion, poses)}" + "; the first frame is the rest pose" * rest_pose
 

@@ -17,9 +17,8 @@ PELVIS, SPINE3 = 0, 9
 ALIKE = ((0,), (1, 2), (3,), (4, 5), (6,), (7, 8), (9,), (12,), (13, 14), (16, 17), (18, 19))
 """Joints with children, from the root outward; those of both sides together."""
 SPINE = {3: 1 / 3, 6: 2 / 3}  # joints between pelvis and chest -> fraction of the rotation from pelvis to chest
-FORWARD = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-BENDS = {1: -FORWARD, 2: -FORWARD, 16: FORWARD, 17: FORWARD}
-"""Hips and shoulders -> direction in which the knee or elbow bends the limb in the rest pose."""
+BENDS = {1: -1.0, 2: -1.0, 16: 1.0, 17: 1.0}
+"""Hips and shoulders -> z of the direction in which the knee or elbow bends the limb in the rest pose."""
 STRAIGHT = 0.15
 """Sine of the bend of a knee or elbow at which bend and parent's rotation have the same weight for the limb's twist.
 Weights are squared, so that a clear bend dominates."""
@@ -141,7 +140,7 @@ def _twist(group: Sequence[int], swung: Tensor, offsets: Tensor, bones: Tensor, 
     middle = [CHILDREN[joint][0] for joint in group]
     end = [CHILDREN[joint][0] for joint in middle]
     axis = F.normalize(rotation.rotate(swung, offsets), dim=-1)
-    forward = BENDS[group[0]].to(offsets).expand_as(offsets)
+    forward = offsets.new_tensor([0.0, 0.0, BENDS[group[0]]]).expand_as(offsets)
     hinge = rotation.rotate(swung, F.normalize(torch.linalg.cross(offsets, forward), dim=-1))
     limb, beyond = F.normalize(bones[:, middle], dim=-1), F.normalize(bones[:, end], dim=-1)
     bend = torch.linalg.cross(limb, beyond)

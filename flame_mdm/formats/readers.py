@@ -23,7 +23,6 @@ from flame_mdm.safe_io import MEBIBYTE, naming, read_json, read_npy, read_npz, r
 
 CAMERA_AXES = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))  # of the action data sets: y down to y up
 ROTATED = {"smpl147": 147, "rot6d-25": 150, "motion272": 272}  # with SMPL's rotations -> number of features
-KIMODO_FPS = 30.0
 JSON_LIMIT = 128 * MEBIBYTE  # maximum size of a `.json` motion; parsed, it takes many times its size
 
 
@@ -122,7 +121,7 @@ def read_arrays(path: Path) -> dict[str, Any]:
     else:
         data = _read_json(path)
     if "posed_joints" in data:  # of NVIDIA's Kimodo, whose files do not contain their rate
-        data = {"fps": KIMODO_FPS, **data, "joints": data["posed_joints"]}
+        data = {"fps": 30.0, **data, "joints": data["posed_joints"]}
     if not {"joints", "poses"} & set(data):
         names = ", ".join(data) or "nothing"
         raise UserError(f"contains {names}; a motion has joints and fps, or poses, trans and mocap_framerate")

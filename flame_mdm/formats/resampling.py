@@ -16,8 +16,8 @@ def frame_rate(value: Any, name: str = "fps") -> float:
     """Returns a frame rate, `name` in its file, as a float; raises `UserError` unless it is a number in `RATES`."""
     number = np.asarray(value)
     if number.shape or number.dtype.kind not in "fiu" or not RATES[0] <= float(number) <= RATES[1]:
-        shown = f"{float(number):g}" if not number.shape and number.dtype.kind in "fiu" else f"{value}"[:40]
-        raise UserError(f"{name} is {shown}, not a number of frames per second from {RATES[0]:g} to {RATES[1]:g}")
+        limits = f"from {RATES[0]:g} to {RATES[1]:g}"
+        raise UserError(f"{name} is {str(value)[:40]}, not a number of frames per second {limits}")
     return float(number)
 
 

@@ -69,17 +69,17 @@ def preset(name: str | None, poses: Poses) -> Rig:
     for part, side, mark in _parts(data):
         start, names = starts[part], list(data[part].items())
         parent = next((k for k, joint in enumerate(joints) if joint.name == start), len(joints) - 1)
-        for number, (name, source) in enumerate(names):
-            name = name.replace("*", mark)
+        for number, (label, source) in enumerate(names):
+            label = label.replace("*", mark)
             if isinstance(source, str):
                 joint = JOINT[side + source]
                 end = SMPL22.parents.index(joint) if joint in SMPL22.parents else joint  # continues the bone before it
                 local = _axes(data.get("axes", {}), part, source, offsets[end], side == "right_")
-                joints.append(_RigJoint(name, parent, joint, rest[joint], posed[joint] @ local, local))
+                joints.append(_RigJoint(label, parent, joint, rest[joint], posed[joint] @ local, local))
             else:
                 above, following = joints[parent], next(ours for _, ours in names[number:] if isinstance(ours, str))
                 position = above.position + source * (rest[JOINT[side + following]] - above.position)
-                joints.append(_RigJoint(name, parent, -1, position, above.turn, above.neutral))
+                joints.append(_RigJoint(label, parent, -1, position, above.turn, above.neutral))
             parent = len(joints) - 1
     names, parents, sources, positions, turns, neutral = zip(*joints, strict=True)
     return Rig(

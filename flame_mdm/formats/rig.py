@@ -1,7 +1,4 @@
-"""Skeletons of other programs and characters, and how they move as a body does.
-
-It needs numpy alone: the extension of Blender contains this file.
-"""
+"""Skeletons of other programs and characters in motion. Blender's extension contains it, so it needs numpy alone."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -18,15 +15,12 @@ SIDES = ("left", "right")
 LEGS = (("hip", "knee"), ("knee", "ankle"))
 LIMBS = {"hip": "knee", "knee": "ankle", "shoulder": "elbow", "elbow": "wrist"}
 """Joints whose bone takes the direction of the motion's bone -> the joint at the end of this bone."""
-REQUIRED = ("hip", "knee", "ankle", "shoulder", "elbow", "wrist")
-"""Joints of both sides that a character must have, beside the pelvis."""
 SPINE = ("spine1", "spine2", "spine3")
 TILT = 45  # degrees between trunk and vertical at which a rest pose is refused
 SNAP = 8  # largest angle in degrees between the facing direction and an axis that it is taken for
 BEND = 0.15  # minimum sine of the bend of an elbow or knee in the rest pose from which the twist of the limb is read
 GROUND = 0.1  # largest height in meters at which the lowest joint of a clip counts as on the floor
-STRAIGHT = 0.05
-"""Distance of the knee from the line of the leg, relative to the thigh, at which bend and thigh weigh the same."""
+STRAIGHT = 0.05  # distance of the knee from the line of the leg, in thighs, at which bend and thigh weigh the same
 REACH = 0.999  # maximum distance from hip to ankle relative to the length of the straight leg
 
 
@@ -120,7 +114,7 @@ def matched(
     if double := next((joint for joint, numbers in candidates.items() if len(numbers) > 1), None):
         same = ", ".join(names[number] for number in candidates[double])
         raise UserError(f"{source}: {len(candidates[double])} joints for {double}: {same}. Rename all but one")
-    required = ["pelvis", *(f"{side}_{name}" for name in REQUIRED for side in SIDES)]
+    required = ["pelvis", *(f"{side}_{name}" for side in SIDES for limb in LIMBS.items() for name in limb)]
     missing = [joint for joint in JOINT if joint in required and joint not in candidates]
     return {joint: number for joint, (number,) in candidates.items()}, missing
 
@@ -150,9 +144,8 @@ def rest_pose(
 ) -> RestPose:
     """Returns a rest pose, turned to y up and +z ahead; `source` names the character in messages.
 
-    Positions (J, 3) and rotations `turned` (J, 3, 3) of the J joints are in a world of any unit and direction, in which
-    `vertical` (3,) is up. `joints` maps SMPL's joints to indices of the character's; `lowest` are points that include
-    the lowest one.
+    Positions (J, 3), rotations `turned` (J, 3, 3) and points that include the `lowest` one are in a world of any unit
+    and direction, in which `vertical` (3,) is up. `joints` maps SMPL's joints to indices of the character's.
     """
     at = {joint: positions[number] for joint, number in joints.items()}
 
@@ -169,7 +162,7 @@ def rest_pose(
     tilt = max(np.degrees(np.arccos(np.clip(v @ up / max(np.linalg.norm(v), 1e-9), -1, 1))) for v in (trunk, legs))
     if not tilt <= TILT:
         raise UserError(
-            f"{source}: the rest pose is not upright, it leans by {tilt:.0f} degrees. It must be a T-pose or an A-pose"
+            f"{source}: the rest pose is not upright, it leans by {tilt:.0f} degrees. Use a T- or an A-pose"
         )
     left = at["left_hip"] + at["left_shoulder"] - at["right_hip"] - at["right_shoulder"]
     left = left - up * (up @ left)
@@ -181,9 +174,7 @@ def rest_pose(
     frame = np.stack([left, up, np.cross(left, up)])
     feet = [at[f"{side}_foot"] - at[f"{side}_ankle"] for side in SIDES if f"{side}_foot" in at]
     if feet and frame[2] @ np.sum(feet, 0) < 0:
-        raise UserError(
-            f"{source}: the toes point backward. Are left and right exchanged, or is the character mirrored?"
-        )
+        raise UserError(f"{source}: the toes point backward. Are left and right exchanged, or mirrored?")
     sources = dict(joints)
     spine = [joint for joint in SPINE if joint in sources]
     if spine:  # the arms start at the last joint of the spine, which moves as the chest
@@ -203,7 +194,7 @@ def rest_pose(
 
 
 def fitted(character: RestPose, offsets: np.ndarray) -> Rig:
-    """Returns the skeleton with its neutral rotations: limbs have the directions of a body's in its rest pose.
+    """Returns the skeleton with its neutral rotations: limbs have the directions of those of a body.
 
     `offsets` (22, 3) are the positions of the body's joints relative to their parents in the rest pose.
     """

@@ -93,9 +93,11 @@ class Representation(nn.Module, ABC):
         return features
 
     def normalize(self, features: Tensor) -> Tensor:
+        """Normalizes features (..., D) in the data's units."""
         return (features - self.mean) / self.std
 
     def denormalize(self, x: Tensor) -> Tensor:
+        """Converts normalized features (..., D) to the data's units."""
         return x * self.std + self.mean
 
     def to_joints(self, x: Tensor) -> Tensor:
@@ -110,8 +112,7 @@ def check_finite(motion: Tensor, name: str = "motion") -> None:
         raise UserError(f"{name}: numbers in frame {frame} are not finite; leave the motion out")
 
 
-SMALLEST_STD = 1e-4
-"""A group of features with a smaller std is constant up to rounding (positions in KIT's units round to 3e-5)."""
+SMALLEST_STD = 1e-4  # of a group of features that is not constant; positions in KIT's units round to 3e-5
 
 
 def grouped_statistics(features: Tensor | Frames, groups: Iterable[slice]) -> tuple[Tensor, Tensor]:

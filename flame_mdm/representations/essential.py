@@ -4,9 +4,6 @@ from flame_mdm.representations.humanml import HumanML
 
 
 class Essential(HumanML):
-    """The first 67 of HumanML3D's 263 features (Meng et al. 2025, MARDM), 64 of KIT's 251, 3 J + 1 for J joints.
-
-    They are turn, root velocity, root height and positions, from which `decode` gives the same joints.
-    """
+    """The first 67 of HumanML3D's 263 features (Meng et al. 2025, MARDM), 64 of KIT's 251, 3 J + 1 for J joints."""
 
     essential = True

@@ -58,14 +58,13 @@ class HumanML(Representation):
         units_per_metre: float = 1.0,
         contact_threshold: float = 0.002,
     ):
-        """Input and output joints are in meters; features are in units of 1 / `units_per_metre` meters.
+        """Input and output joints are in meters; features are in units of 1 / `units_per_metre` meters (KIT: 1/640).
 
         Args:
             skeleton: key in `SKELETONS`.
             variant: "clean" for the intended features, "legacy" for the published ones.
             bone_lengths: J lengths in the features' unit, of the bone that ends in each joint, that all motions are
                 retargeted to; None keeps the lengths of each motion.
-            units_per_metre: KIT's features are in units of about 1/640 of a meter.
             contact_threshold: squared displacement of a foot per frame, in the features' unit, below which the foot is
                 in contact: 0.002 for HumanML3D, 0.05 for KIT.
         """
@@ -113,10 +112,6 @@ class HumanML(Representation):
         features += [local[:, 1:].flatten(1), rotations.flatten(1), velocities.flatten(1), contacts]
         rows = torch.cat([part.float() for part in features], 1)[:, : self.features].contiguous()
         return list(rows.split([length - 1 for length in lengths]))
-
-    def canonicalize(self, motion: Tensor) -> Tensor:
-        """Returns canonical joints (T, J, 3) float64 of joints (T, J, 3) in meters, `decode(encode(motion))`."""
-        return self._canonical([motion])[0] / self.units_per_metre
 
     def decode(self, features: Tensor) -> Tensor:
         """Decodes turn, root and positions of features (..., F, D) to joints (..., F, J, 3), meters. Differentiable."""

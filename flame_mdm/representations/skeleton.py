@@ -162,13 +162,10 @@ def part_names(skeleton: Skeleton) -> dict[str, list[int]]:
 
 def find_joints(skeleton: Skeleton, names: str | Sequence[str]) -> list[int]:
     """Returns the indices of joints given by names of joints or body parts; a `UserError` suggests similar names."""
-    parts = part_names(skeleton)
-    indices = parts | {name: [index] for index, name in enumerate(skeleton.joints)}
+    indices = part_names(skeleton) | {name: [index] for index, name in enumerate(skeleton.joints)}
     chosen: list[Any] = list(names) if isinstance(names, list | tuple) else [names]
     for name in chosen:
         if not isinstance(name, str) or name not in indices:
-            raise UserError(
-                f"skeleton {skeleton.name} has no joint or part '{name}'.{did_you_mean(str(name), list(indices))} "
-                f"Parts: {', '.join(parts)}; joints: {', '.join(skeleton.joints)}"
-            )
+            near = did_you_mean(str(name), indices)
+            raise UserError(f"skeleton {skeleton.name} has no joint or part '{name}'.{near} Use {', '.join(indices)}")
     return sorted({index for name in chosen for index in indices[name]})

@@ -18,10 +18,8 @@ ADULT = (
     *((0.12, 0.045, -0.02), (-0.12, 0.045, -0.02), (0.26, -0.015, -0.025), (-0.26, -0.015, -0.025)),
     *((0.267, 0.01, 0.0), (-0.267, 0.01, 0.0), (0.085, -0.01, -0.015), (-0.085, -0.01, -0.015)),
 )
-"""Position of each of SMPL's 24 joints relative to its parent in the rest pose (arms out, facing +z, y up), meters.
-
-Replaces the licensed model files: bone lengths of HumanML3D's reference clip, rounded and symmetric.
-"""
+"""Position of each of SMPL's 24 joints relative to its parent in the rest pose (arms out, facing +z, y up), meters: in
+place of the licensed model files, with the bone lengths of HumanML3D's reference clip, rounded and symmetric."""
 
 
 def read_pose(motion: Tensor) -> tuple[Tensor, Tensor]:

@@ -59,10 +59,11 @@ class Shown(Protocol):
     def posed(self) -> Posed: ...
 
 
-def check_any(motions: Sequence[Shown], path: Path) -> None:
-    """Raises `UserError` if there are no motions to write to `path`."""
+def target(path: str | Path, motions: Sequence[Shown]) -> Path:
+    """Returns the path of a file; raises `UserError` if there are no motions to write to it."""
     if not motions:
         raise UserError(f"{path}: no motions to show")
+    return Path(path)
 
 
 def sides(skeleton: Skeleton) -> list[int]:
@@ -130,26 +131,16 @@ def load_body(name: str) -> Mesh:
 
 @dataclass(frozen=True, eq=False)
 class FittedBody:
-    """A body with the bone lengths of a clip, and its motion. F frames, B = 28 bones.
-
-    Attributes:
-        fit: (22, 3, 3), linear map of each joint's part of the stored mesh to the clip's proportions.
-        joints: (22, 3) of the stored pose with the clip's bone lengths, pelvis at 0; `points` (V, 3) of the mesh in it.
-        neutral: (22, 3, 3), rotation of each part of the mesh in the rest pose, so that soles are flat and the head
-            upright.
-        turns: (F, B, 3, 3), rotation of each bone from the stored pose to each frame.
-        starts: (F, B, 3), where each bone begins: at the motion's joints, lifted.
-        lift: height of a joint of the body above that of the motion: the thickness of the sole.
-    """
+    """A body with the bone lengths of a clip, and its motion. F frames, B = 28 bones."""
 
     mesh: Mesh
-    fit: np.ndarray
-    joints: np.ndarray
-    points: np.ndarray
-    neutral: np.ndarray
-    turns: np.ndarray
-    starts: np.ndarray
-    lift: float
+    fit: np.ndarray  # (22, 3, 3), linear map of each joint's part of the stored mesh to the clip's proportions
+    joints: np.ndarray  # (22, 3) of the stored pose with the clip's bone lengths, pelvis at 0
+    points: np.ndarray  # (V, 3) of the mesh in this pose
+    neutral: np.ndarray  # (22, 3, 3), rotation of each part of the mesh at rest: soles are flat, the head is upright
+    turns: np.ndarray  # (F, B, 3, 3), rotation of each bone from the stored pose to each frame
+    starts: np.ndarray  # (F, B, 3), where each bone begins: at the motion's joints, lifted
+    lift: float  # height of a joint of the body above that of the motion: the thickness of the sole
 
     def skinned(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
         """Returns vertices and normals (V, 3) of a frame, by linear blend skinning."""

@@ -13,16 +13,12 @@ from scipy.spatial.transform import Rotation
 
 from flame_mdm.errors import shortened
 from flame_mdm.safe_io import write_text
-from flame_mdm.visualize.body import ANCHORS, FittedBody, Mesh, Shown, check_any, head, mannequin, radii, sides, try_fit
-
-MILLIMETER = 0.001
+from flame_mdm.visualize.body import ANCHORS, FittedBody, Mesh, Shown, head, mannequin, radii, sides, target, try_fit
 
 
 def write_player(path: str | Path, motions: Sequence[Shown], title: str = "Motions", **options: Any) -> None:
     """Writes the page of `player_page`, with its options, to a file."""
-    path = Path(path)
-    check_any(motions, path)
-    write_text(path, player_page(motions, title, **options))
+    write_text(target(path, motions), player_page(motions, title, **options))
 
 
 def player_page(
@@ -53,13 +49,16 @@ def player_page(
     blank = [""] * len(motions)
     rows = zip(motions, groups or blank, beside or blank, marks or [()] * len(motions), strict=True)
     packed = [_packed(*row, body) for row in rows]
-    # "<" never occurs in the data, so no caption can close the script element
+    stored = (body or mannequin()).stored
+    arrays = {name: _base64(stored[name]) for name in ("points", "normals", "bones", "weights", "colors", "triangles")}
+    mesh = arrays | {"joints": np.round(stored["joints"], 5).ravel().tolist(), "anchors": ANCHORS}
     fitting = any(motion["body"] for motion in packed)
     content = {
         "TITLE": html.escape(shortened(title)),
         "ABOUT": about and f"<details><summary>About these motions</summary><div>{about}</div></details>",
         "COLUMNS": str(columns),
-        "BODY": json.dumps(_mesh(body or mannequin()) if fitting else None, separators=(",", ":")),
+        "BODY": json.dumps(mesh if fitting else None, separators=(",", ":")),
+        # "<" never occurs in the data, so no caption can close the script element
         "DATA": json.dumps(packed, separators=(",", ":")).replace("<", "\\u003c"),
     }
     template = Path(__file__).with_suffix(".html").read_text(encoding="utf-8")
@@ -71,7 +70,7 @@ def _packed(
 ) -> dict[str, Any]:
     low, high = motion.joints.min((0, 1)).astype(float), motion.joints.max((0, 1)).astype(float)
     center = (low + high) / 2
-    step = max(MILLIMETER, float((high - low).max()) / 65534)
+    step = max(0.001, float((high - low).max()) / 65534)
     body, reason = try_fit(motion, mesh)
     return {
         "id": shortened(motion.id),
@@ -112,13 +111,6 @@ def _packed_body(body: FittedBody) -> dict[str, Any]:
         "lift": round(float(body.lift), 5),
         "turns": _base64(packed.astype("<u4")),
     }
-
-
-def _mesh(mesh: Mesh) -> dict[str, Any]:
-    stored = mesh.stored
-    names = ("points", "normals", "bones", "weights", "colors", "triangles")
-    joints = np.round(stored["joints"], 5).ravel().tolist()
-    return {name: _base64(stored[name]) for name in names} | {"joints": joints, "anchors": ANCHORS}
 
 
 def _base64(array: np.ndarray) -> str:

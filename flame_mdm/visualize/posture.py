@@ -1,7 +1,4 @@
-"""Posture of a body in motion: rotations in the world, also those that joint positions do not determine.
-
-It needs numpy alone: the extension of Blender contains this file.
-"""
+"""Rotations of a body in the world. Blender's extension contains this file: it needs numpy alone."""
 
 import numpy as np
 

@@ -14,7 +14,7 @@ from PIL import Image, ImageDraw, ImageFilter, ImageFont
 
 from flame_mdm.errors import UserError, shortened
 from flame_mdm.safe_io import atomic_write
-from flame_mdm.visualize.body import MATERIALS, FittedBody, Mesh, Shown, check_any, head, radii, sides, try_fit
+from flame_mdm.visualize.body import MATERIALS, FittedBody, Mesh, Shown, head, radii, sides, target, try_fit
 
 Color = tuple[int, int, int]
 SIDE_COLORS: dict[int, Color] = {1: (47, 127, 209), -1: (226, 112, 42), 0: (140, 149, 163)}
@@ -35,8 +35,7 @@ def write_gif(path: str | Path, motions: Sequence[Shown], size: int = 256, body:
     It has the highest frame rate of the motions, but at most 50 per second, the limit of the format. A motion that ends
     earlier stays at its last frame. `body` None = the mannequin.
     """
-    path = Path(path)
-    check_any(motions, path)
+    path = target(path, motions)
     fps = max(motion.fps for motion in motions)
     fps /= math.ceil(fps / 50)
     palette = _palette()
@@ -50,8 +49,7 @@ def write_gif(path: str | Path, motions: Sequence[Shown], size: int = 256, body:
 
 def write_mp4(path: str | Path, motions: Sequence[Shown], size: int = 384, body: Mesh | None = None) -> None:
     """Writes the animation of `write_gif` as H.264 video (yuv420p), with no limit on the frame rate."""
-    path = Path(path)
-    check_any(motions, path)
+    path = target(path, motions)
     try:
         av = import_module("av")
     except ImportError:
@@ -75,8 +73,7 @@ def contact_sheet(
     path: str | Path, motions: Sequence[Shown], frames: int = 6, size: int = 192, body: Mesh | None = None
 ) -> None:
     """Writes one PNG with a row per motion: `frames` poses of `size` pixels, equally spaced in time, and a caption."""
-    path = Path(path)
-    check_any(motions, path)
+    path = target(path, motions)
     rows = []
     for motion in motions:
         fitted, _ = try_fit(motion, body)
@@ -122,23 +119,19 @@ def _video(motions: Sequence[Shown], fps: float, size: int, mesh: Mesh | None) -
     """Yields images of the panels side by side, one every 1 / fps seconds, with a progress bar."""
     seconds = max(len(motion.joints) / motion.fps for motion in motions)
     columns = len(motions) if len(motions) < 4 else min(4, math.ceil(math.sqrt(len(motions))))
-    frames = [-1] * len(motions)
-    panels = [Image.new("RGB", (0, 0))] * len(motions)
     bodies = [try_fit(motion, mesh)[0] for motion in motions]
     lines = [_lines(motion, body, size, size) for motion, body in zip(motions, bodies, strict=True)]
     captions = [_caption(own, size, max(map(len, lines)), size) for own in lines]
     count = max(1, math.ceil(seconds * fps - 1e-6))
 
     def draw(k: int, frame: int) -> Image.Image:
-        if frame == frames[k]:
-            return panels[k]
         return _below(_figure(motions[k], bodies[k], frame, size), captions[k])
 
     with ThreadPoolExecutor(min(len(motions), os.cpu_count() or 1)) as pool:
         for tick in range(count):
             # past its end, a motion stays at its last frame
             now = [min(int(tick / fps * motion.fps + 1e-6), len(motion.joints) - 1) for motion in motions]
-            panels, frames = list(pool.map(draw, range(len(motions)), now)), now
+            panels = list(pool.map(draw, range(len(motions)), now))
             height = panels[0].height
             image = Image.new("RGB", (columns * size, math.ceil(len(motions) / columns) * height + 3), PAPER)
             for k, panel in enumerate(panels):
@@ -159,20 +152,18 @@ def _figure(motion: Shown, body: FittedBody | None, frame: int, size: int) -> Im
     project = _camera(np.array([x, 0.85, z]), side)
     pixel = size / 256 * SMOOTH
 
-    ring = np.linspace(0, 2 * np.pi, 49)[:, None]
-    pen.polygon(_points(project(np.array([x, 0, z]) + 3 * np.hstack([np.cos(ring), 0 * ring, np.sin(ring)]))), GROUND)
+    ring, middle = np.linspace(0, 2 * np.pi, 49)[:, None], np.array([x, 0, z])
+    pen.polygon(_points(project(middle + 3 * np.hstack([np.cos(ring), 0 * ring, np.sin(ring)]))), GROUND)
     for k in range(-3, 4):
-        gx, gz = round(x) + k, round(z) + k
-        for inside, ends in (
-            (9 - (gx - x) ** 2, lambda reach, g=gx: [[g, 0, z - reach], [g, 0, z + reach]]),
-            (9 - (gz - z) ** 2, lambda reach, g=gz: [[x - reach, 0, g], [x + reach, 0, g]]),
-        ):
+        for point, along in (([round(x) + k, 0, z], [0, 0, 1]), ([x, 0, round(z) + k], [1, 0, 0])):
+            inside = 9 - ((point - middle) ** 2).sum()
             if inside > 0:
-                pen.line(_points(project(np.array(ends(inside**0.5)))), LINE, round(pixel))
+                reach = inside**0.5 * np.array(along)
+                pen.line(_points(project(np.stack([point - reach, point + reach]))), LINE, round(pixel))
 
     floor = np.array([1.0, 0.0, 1.0])
     root = motion.joints[: frame + 1, 0] * floor
-    root = root[np.linalg.norm(root - [x, 0, z], axis=1) < 3]
+    root = root[np.linalg.norm(root - middle, axis=1) < 3]
     if len(root) > 1:
         pen.line(_points(project(root)), TRAIL, round(1.5 * pixel))
     shadow = project(joints * floor)
@@ -198,11 +189,11 @@ def _figure(motion: Shown, body: FittedBody | None, frame: int, size: int) -> Im
     return image.reduce(SMOOTH)
 
 
-def _camera(target: np.ndarray, side: int) -> Callable[[np.ndarray], np.ndarray]:
+def _camera(center: np.ndarray, side: int) -> Callable[[np.ndarray], np.ndarray]:
     """Returns the projection of points (N, 3) in meters to (N, 4): x, y, pixels per meter and depth."""
 
     def project(points: np.ndarray) -> np.ndarray:
-        offset = points - target
+        offset = points - center
         depth = np.maximum(5.0 - offset @ TOWARD, NEAR)
         scale = 2.05 * side / depth
         up = np.cross(TOWARD, RIGHT)

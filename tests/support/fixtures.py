@@ -91,6 +91,11 @@ def load(path: Path) -> Arrays:
         return {key: file[key] for key in file.files}
 
 
+def tensors(arrays: Arrays) -> dict[str, torch.Tensor]:
+    """The numbers of a fixture."""
+    return {key: torch.from_numpy(value) for key, value in arrays.items() if value.dtype.kind in "fi"}
+
+
 def meta(arrays: Arrays) -> dict:
     """The options a fixture was made with."""
     return json.loads(str(arrays["meta"]))

@@ -75,6 +75,18 @@ def posed(
     return motion_of_poses(Poses(offsets, torch.tensor(rotations), torch.tensor(np.array(pelvis))), 20)
 
 
+def degrees(rotations: ArrayLike) -> np.ndarray:
+    """The angles (...) of rotations (..., 3, 3)."""
+    matrices = np.asarray(rotations)
+    return np.degrees(Rotation.from_matrix(matrices.reshape(-1, 3, 3)).magnitude()).reshape(matrices.shape[:-2])
+
+
+def largest_step(rotations: ArrayLike) -> float:
+    """Degrees that any joint turns from one frame to the next, at most, of rotations (F, J, 3, 3)."""
+    turns = np.asarray(rotations)
+    return float(degrees(turns[1:].mT @ turns[:-1]).max())
+
+
 def adult(frames: int) -> np.ndarray:
     """Joints (F, 22, 3) float32 of SMPL's body, which turns left and right."""
     return posed(frames, heading=np.sin(np.arange(frames) / 5)).joints.astype(np.float32)

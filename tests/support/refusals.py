@@ -1,5 +1,6 @@
 """Commands on input that they must refuse: one line, exit code 1, nothing left behind."""
 
+import io
 import os
 import re
 import resource
@@ -9,7 +10,9 @@ import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from flame_mdm.__main__ import main
@@ -98,6 +101,13 @@ def address_space() -> int:
     """Bytes of address space of this process."""
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     return pages * resource.getpagesize()
+
+
+def npz(**arrays: Any) -> bytes:
+    """The bytes of an .npz file."""
+    stream = io.BytesIO()
+    np.savez(stream, **arrays)
+    return stream.getvalue()
 
 
 def one_line(err: str) -> bool:

@@ -342,14 +342,12 @@ def synthetic_take(seed: int, frames: int) -> bvh.Bvh:
     values[:, 0] = 0
     values[:, 1, :3] += 30 * np.sin(2 * time[:, 0] + phase[1])
     channels = ("Xposition", "Yposition", "Zposition", "Zrotation", "Xrotation", "Yrotation")
-    ends = [joints.index(name) for name in ("Head", "Hand_L", "Hand_R", "Toes_L", "Toes_R")]
+    ends = ("Head", "Hand_L", "Hand_R", "Toes_L", "Toes_R")
     return bvh.Bvh(
-        joints,
-        tuple(-1 if parent == "-" else joints.index(parent) for _, parent, *_ in ROWS),
-        offsets,
-        (channels,) * 22,
-        tuple(ends),
-        np.zeros((5, 3)),
+        (*joints, *(f"{name}.end" for name in ends)),
+        (*(-1 if parent == "-" else joints.index(parent) for _, parent, *_ in ROWS), *map(joints.index, ends)),
+        np.concatenate([offsets, np.zeros((5, 3))]),
+        (*(channels,) * 22, *[()] * 5),
         values.reshape(frames, -1),
         30.0,
     )

@@ -37,8 +37,7 @@ class MotionGenerator(Model, nn.Module):
     process: Process
     condition: ConditionEncoder
     representation: Representation
-    sampler_options: SamplerOptions
-    """Defaults of `generate`, from the recipe."""
+    sampler_options: SamplerOptions  # defaults of `generate`, from the recipe
 
     @classmethod
     def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:
@@ -52,13 +51,9 @@ class MotionGenerator(Model, nn.Module):
         process: Process = part("process")
         condition: ConditionEncoder = part("condition", num_actions=len(actions))
         width, crop = representation.features, config.get("data", {}).get("crop")
-        denoiser: Denoiser = part(
-            "denoiser",
-            in_features=width,
-            out_features=process.out_features(width),
-            cond_features=condition.features,
-            length_unit=crop.get("unit", 1) if isinstance(crop, dict) else 1,  # of all lengths in training
-        )
+        unit = crop.get("unit", 1) if isinstance(crop, dict) else 1  # of all lengths in training
+        sizes = {"in_features": width, "out_features": process.out_features(width), "cond_features": condition.features}
+        denoiser: Denoiser = part("denoiser", **sizes, length_unit=unit)
         model = cls.of_parts(config, denoiser, process, condition, representation)
         model.config, model.facts = config, {"actions": list(actions)}
         return model
@@ -67,19 +62,13 @@ class MotionGenerator(Model, nn.Module):
     def of_parts(cls, config: Config, *parts: Any) -> Self:
         """Combines denoiser, process, condition and representation, with the sampling of the recipe `config`."""
         model = cls()
-        options = ("guidance_scale", "sampler", "num_inference_steps")
-        model.combine(*parts, **{name: config["task"][name] for name in options})
+        names = ("guidance_scale", "sampler", "num_inference_steps")
+        model.combine(*parts, **{name: config["task"][name] for name in names})
         return model
 
-    def combine(
-        self,
-        denoiser: Denoiser,
-        process: Process,
-        condition: ConditionEncoder,
-        representation: Representation,
-        **options: Any,
-    ) -> None:
-        """Stores the parts and the defaults of sampling; raises `UserError` if one of them is invalid."""
+    def combine(self, *parts: Any, **options: Any) -> None:
+        """Stores denoiser, process, condition, representation and the sampling; raises `UserError` for invalid ones."""
+        denoiser, process, condition, representation = parts
         if not isinstance(denoiser, Denoiser):
             raise UserError(f"{type(denoiser).__name__} is no denoiser: derive it from flame_mdm.denoisers.Denoiser")
         if options["num_inference_steps"] is None:  # a recipe may come from a file

@@ -8,8 +8,7 @@ from typing import Any, Self
 from flame_mdm.errors import UserError
 
 MAX_STEPS = 100_000  # maximum number of steps of a diffusion or sampler
-SPACINGS = ("linspace", "stride")
-"""How diffusion places a number of steps; see `flame_mdm.processes.schedules.timesteps`."""
+SPACINGS = ("linspace", "stride")  # how diffusion places steps; see `flame_mdm.processes.schedules.timesteps`
 Check = Callable[[str, Any], None]
 """Check of the value of a key, by name and value; raises `UserError` or `FileNotFoundError`."""
 

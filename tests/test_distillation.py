@@ -1,5 +1,6 @@
 """Students, on Gaussian data, for which everything is known, and of models; adapters, from clips to a prompt."""
 
+import itertools
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -36,12 +37,12 @@ from flame_mdm.training import adaptation
 
 MEAN, VARIANCE = torch.tensor([0.5, -1.0, 0.0]).double(), torch.tensor([0.3, 1.0, 2.0]).double()
 """Of the data: independent normal features."""
-PROCESSES: list[Process] = [
-    GaussianDiffusion(50),
-    GaussianDiffusion(1000, prediction="velocity"),
-    FlowMatching(),
-    FlowMatching(prediction="x0"),
-]
+PROCESSES: list[Process] = [GaussianDiffusion(50), GaussianDiffusion(1000, prediction="velocity")]
+PROCESSES += [FlowMatching(), FlowMatching(prediction="x0")]
+
+
+def name(process: Process) -> str:
+    return f"{type(process).__name__}-{process.prediction}"
 
 
 def coefficients(process: Process, t: Tensor) -> tuple[Tensor, Tensor]:
@@ -59,24 +60,24 @@ def gains(process: Process, times: Tensor) -> Tensor:
     return k
 
 
-def denoiser(process: Process, gain: Callable[[Tensor, Tensor], Tensor]) -> Denoise:
-    """The denoiser with f = mean + gain(a, s) (x - a mean)."""
+def denoiser(process: Process, gain: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Denoise:
+    """The denoiser with f = mean + gain(a, s, t) (x - a mean)."""
 
     def denoise(x_t: Tensor, table_time: Tensor, *_: object) -> Tensor:
         t = table_time / 1000 if isinstance(process, FlowMatching) else table_time
         a, s = coefficients(process, t)
-        f = MEAN + gain(a, s) * (x_t - a * MEAN)
+        f = MEAN + gain(a, s, t) * (x_t - a * MEAN)
         return process.target(f, (x_t - a * f) / s, t)
 
     return denoise
 
 
-def posterior(a: Tensor, s: Tensor) -> Tensor:
+def posterior(a: Tensor, s: Tensor, *_: Tensor) -> Tensor:
     """The gain of E[x | x_t], which a trained denoiser returns."""
     return a * VARIANCE / (a**2 * VARIANCE + s**2)
 
 
-def path(a: Tensor, s: Tensor) -> Tensor:
+def path(a: Tensor, s: Tensor, *_: Tensor) -> Tensor:
     """The gain along the path of infinitely many steps."""
     return (VARIANCE / (a**2 * VARIANCE + s**2)).sqrt()
 
@@ -89,24 +90,18 @@ def loss(process: Process, student: Denoise, times: Tensor) -> Tensor:
     return consistency_terms(*parts, **draws, auxiliary=lambda *_: {})["loss"]
 
 
-@pytest.mark.parametrize("process", PROCESSES, ids=lambda process: f"{type(process).__name__}-{process.prediction}")
+@pytest.mark.parametrize("process", PROCESSES, ids=name)
 def test_the_exact_student_of_gaussian_data_has_no_loss(process):
     torch.manual_seed(0)
     times = torch.tensor(process.grid(10)).double()
     exact = gains(process, times)
-
-    def student(x_t: Tensor, table_time: Tensor, *_: object) -> Tensor:
-        t = table_time / 1000 if isinstance(process, FlowMatching) else table_time
-        a, s = coefficients(process, t)
-        f = MEAN + exact[(t[:, None] - times).abs().argmin(1)][:, None] * (x_t - a * MEAN)
-        return process.target(f, (x_t - a * f) / s, t)
-
+    student = denoiser(process, lambda a, s, t: exact[(t[:, None] - times).abs().argmin(1)][:, None])
     assert loss(process, student, times).max() < 1e-9
     exact[0] += 0.1
     assert loss(process, student, times)[0] > 1e-3
 
 
-@pytest.mark.parametrize("process", PROCESSES[1:], ids=lambda process: f"{type(process).__name__}-{process.prediction}")
+@pytest.mark.parametrize("process", PROCESSES[1:], ids=name)
 def test_fine_grids_lead_to_the_data_and_so_do_one_two_and_four_calls(process):
     times = torch.tensor(process.grid(400)).double()
     a, s = (value[:, 0] for value in coefficients(process, times))
@@ -151,8 +146,7 @@ def test_a_student_starts_as_its_teacher_and_keeps_its_hash_data_and_text_encode
 
 def test_a_student_is_sampled_edited_led_chained_and_exported_without_its_teacher(trained, student, tmp_path):
     assert main(["export", str(student), str(tmp_path / "student.safetensors")]) == 0
-    hidden = trained.with_suffix(".away")
-    trained.rename(hidden)
+    hidden = trained.rename(trained.with_suffix(".away"))
     try:
         model = flame_mdm.load(tmp_path / "student.safetensors")
     finally:
@@ -175,21 +169,20 @@ def test_a_student_is_sampled_edited_led_chained_and_exported_without_its_teache
 
 @pytest.mark.slow
 def test_a_resumed_distillation_ends_in_the_same_weights(trained, data_root, tmp_path, capsys):
-    run = tmp_path / "run"
+    run, last = tmp_path / "run", tmp_path / "run" / "checkpoints" / "last.ckpt"
     words = ["distill", str(trained), str(run), *SHORT, f"data.root={data_root}"]
     words.append("logger._target_=lightning.pytorch.loggers.TensorBoardLogger")
     assert main(words) == 0
-    once = read_checkpoint(run / "checkpoints" / "last.ckpt")
-    (run / "checkpoints" / "previous.ckpt").rename(run / "checkpoints" / "last.ckpt")
-    assert read_checkpoint(run / "checkpoints" / "last.ckpt")["global_step"] == 2
+    once = read_checkpoint(last)
+    last.with_name("previous.ckpt").rename(last)
+    assert read_checkpoint(last)["global_step"] == 2
     assert main(words) == 0
-    again = read_checkpoint(run / "checkpoints" / "last.ckpt")
+    again = torch.load(last, weights_only=True)
     for key in ("state_dict", "current_model_state"):
         torch.testing.assert_close(again[key], once[key], atol=0, rtol=0)
     capsys.readouterr()
-    content = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)
-    content["facts"]["teacher"] = "another"
-    torch.save(content, run / "checkpoints" / "last.ckpt")
+    again["facts"]["teacher"] = "another"
+    torch.save(again, last)
     assert "weights have changed since this run began" in error(capsys, *words, "trainer.max_steps=6")
 
 
@@ -207,33 +200,40 @@ def test_two_processes_are_one_with_both_batches(student, tmp_path):
 def test_a_model_that_cannot_be_a_teacher_gets_one_line(trained, student, data_root, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("FLAME_MDM_DATA", str(data_root))
-    assert "no ckpt given. Write flame-mdm distill CKPT" in error(capsys, "distill", "trainer.max_steps=4")
-    assert "runs/no/model: no such checkpoint" in error(capsys, "distill", "runs/no/model")
-    assert f"distilled already. Give its teacher, {trained}" in error(capsys, "distill", student)
     content = torch.load(trained, weights_only=True)
-    content["config"]["process"] |= {"prediction": "epsilon"}
-    torch.save(content, tmp_path / "noise.ckpt")
-    assert "predicts noise, whose clean estimate is divided" in error(capsys, "distill", "noise.ckpt")
-    content["config"]["process"] |= {"prediction": "x0"}
     torch.save(content | {"global_step": 0}, tmp_path / "untrained.ckpt")
-    assert "was not trained by this framework" in error(capsys, "distill", "untrained.ckpt")
-    content["config"]["representation"] |= {"fps": 30}
-    torch.save(content, tmp_path / "other.ckpt")
-    line = error(capsys, "distill", trained, "out", *SHORT, "distillation.teacher=other.ckpt")
-    assert "has representation.fps=30, but the student has 20. Both need the same parts" in line
-    line = error(capsys, "distill", trained, "out", *SHORT, "distillation.teacher=gone.ckpt")
-    assert "distillation.teacher=gone.ckpt: no such checkpoint" in line
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["noise.ckpt", "other.ckpt", "untrained.ckpt"]
+    for part, change in (("process", {"prediction": "epsilon"}), ("representation", {"fps": 30})):
+        config = content["config"] | {part: content["config"][part] | change}
+        torch.save(content | {"config": config}, tmp_path / f"{part}.ckpt")
+    own = [trained, "out", *SHORT]
+    for words, says in (
+        (["trainer.max_steps=4"], "no ckpt given. Write flame-mdm distill CKPT"),
+        (["runs/no/model"], "runs/no/model: no such checkpoint"),
+        ([student], f"distilled already. Give its teacher, {trained}"),
+        (["process.ckpt"], "predicts noise, whose clean estimate is divided"),
+        (["untrained.ckpt"], "was not trained by this framework"),
+        ([*own, "distillation.teacher=representation.ckpt"], "has representation.fps=30, but the student has 20. Both"),
+        ([*own, "distillation.teacher=gone.ckpt"], "distillation.teacher=gone.ckpt: no such checkpoint"),
+    ):
+        assert says in error(capsys, "distill", *words)
+    assert {path.stem for path in tmp_path.iterdir()} == {"untrained", "process", "representation"}
 
 
 ABOUT: About = {"name": "", "action": False, "rank": 2, "words": [], "rows": [], "captions": [], "base": ""}
 
 
-def build() -> MotionGeneration:
-    config = compose("quickstart", TINY)
+def build(*words: str) -> MotionGeneration:
+    config = compose("quickstart", [*TINY, *words])
     task = MotionGeneration.build(config, instantiate(config["representation"]))
     task.facts |= {"max_frames": 40, "vocabulary": ["a", "person", "walks"], "captions": ["a person walks"]}
     return task.eval()
+
+
+def write(task: MotionGeneration, about: About, file: Path) -> None:
+    """Writes the checkpoint of an adaptation, and its adapter next to it."""
+    content = {"config": task.config | {"adapter": about}, "facts": task.facts, "state_dict": task.state_dict()}
+    torch.save(content | {"global_step": 3, "flame_mdm_format": 2}, file.with_suffix(".ckpt"))
+    write_adapter(file, file.with_suffix(".ckpt"))
 
 
 @pytest.fixture(scope="module")
@@ -256,13 +256,7 @@ def taught(tmp_path_factory):
         assert len(trainable) == 2 * 4 + 1  # two parts of four weights, and the words
         for parameter in trainable:
             torch.nn.init.normal_(parameter, std=0.3)
-        config = task.config | {"adapter": about, "base": "base.safetensors"}
-        torch.save(
-            {"config": config, "facts": task.facts, "state_dict": task.state_dict(), "global_step": 3}
-            | {"flame_mdm_format": 2},
-            folder / f"{name}.ckpt",
-        )
-        write_adapter(folder / f"{name}.safetensors", folder / f"{name}.ckpt")
+        write(task, about, folder / f"{name}.safetensors")
     return folder
 
 
@@ -272,18 +266,17 @@ def sampled(model, text="a person walks in limp style") -> torch.Tensor:
 
 
 def test_strength_0_is_the_base_and_1_the_trained_model(taught):
-    base = flame_mdm.load(taught / "base.safetensors")
-    adapted = [
-        flame_mdm.load(taught / "base.safetensors", adapter=taught / "limp.safetensors", strength=s) for s in (0, 1)
-    ]
-    assert torch.equal(sampled(adapted[0]), sampled(base))
+    file, adapter = taught / "base.safetensors", taught / "limp.safetensors"
+    none, full = (sampled(flame_mdm.load(file, adapter=adapter, strength=strength)) for strength in (0, 1))
+    base = sampled(flame_mdm.load(file))
+    assert torch.equal(none, base)
     unmerged, checkpoint = build(), read_checkpoint(taught / "limp.ckpt")
     attach(unmerged, checkpoint["config"]["adapter"])
     unmerged.load_state_dict(checkpoint["state_dict"])
     unmerged.condition.seen = frozenset(checkpoint["facts"]["vocabulary"])
-    torch.testing.assert_close(sampled(adapted[1]), sampled(unmerged), rtol=0, atol=1e-5)
-    torch.testing.assert_close(sampled(adapted[1]), sampled(flame_mdm.load(taught / "limp.ckpt")), rtol=0, atol=1e-5)
-    assert not torch.allclose(sampled(adapted[1]), sampled(base), atol=1e-2)
+    for trained_model in (unmerged, flame_mdm.load(taught / "limp.ckpt")):
+        torch.testing.assert_close(full, sampled(trained_model), rtol=0, atol=1e-5)
+    assert not torch.allclose(full, base, atol=1e-2)
 
 
 def test_several_adapters_add_up_and_export_merges_them(taught, tmp_path):
@@ -318,23 +311,19 @@ def test_what_is_no_adapter_of_the_base_is_refused(taught, tmp_path):
         flame_mdm.load(taught / "base.safetensors", adapter=taught / "limp.safetensors", strength=[1, 2])
     with pytest.raises(UserError, match="an adapter, which changes a model"):
         flame_mdm.load(taught / "limp.safetensors")
-    gru = [word for word in TINY if "ff_size" not in word and "num_heads" not in word]
-    config = compose("quickstart", ["denoiser=mdm_gru_small", *gru])
+    model = build()
+    model.denoiser = torch.nn.Linear(1, 1)  # type: ignore[assignment]
     with pytest.raises(UserError, match="has no attention"):
-        attach(MotionGeneration.build(config, instantiate(config["representation"])), ABOUT)
+        attach(model, ABOUT)
 
 
 @pytest.mark.parametrize(("action", "kept"), [(False, {"1", "2"}), (True, {"0", "1", "2"})])
 def test_files_contain_the_changes_of_later_layers_and_for_actions_of_all(tmp_path, action, kept):
     about: About = {**ABOUT, "action": action}
-    config = compose("quickstart", [*TINY, "denoiser.num_layers=3"])
-    model = MotionGeneration.build(config, instantiate(config["representation"]))
-    model.facts |= {"actions": [], "max_frames": 40}
+    model = build("denoiser.num_layers=3")
     attach(model, about)
     assert len([parameter for parameter in model.parameters() if parameter.requires_grad]) == 3 * 2 * 4
-    state = {"config": model.config | {"adapter": about}, "facts": model.facts, "state_dict": model.state_dict()}
-    torch.save(state | {"global_step": 1, "flame_mdm_format": 2}, tmp_path / "last.ckpt")
-    write_adapter(tmp_path / "limp.safetensors", tmp_path / "last.ckpt")
+    write(model, about, tmp_path / "limp.safetensors")
     assert {name.split("layers.")[1][0] for name in load_file(tmp_path / "limp.safetensors")} == kept
 
 
@@ -389,13 +378,11 @@ def test_all_weights_and_half_of_each_batch_from_the_data_of_the_base(trained, c
     assert main([*words, "trainer.max_steps=2"]) == 0
     model, base = flame_mdm.load(tmp_path / "run" / "limp.safetensors"), flame_mdm.load(trained)
     assert not torch.equal(*(of.state_dict()["denoiser.output.weight"] for of in (model, base)))
-    config = model.config
-    data = instantiate(config["data"] | {"root": str(tmp_path / "run" / "data")}, representation=model.representation)
+    root = {"root": str(tmp_path / "run" / "data")}
+    data = instantiate(model.config["data"] | root, representation=model.representation)
     data.setup("fit")
-    batches = iter(data.train_dataloader())
-    for _ in range(3):
-        sources = [name.startswith("prior/") for name in next(batches).ids]
-        assert sources == [False, False, True, True]
+    for batch in itertools.islice(data.train_dataloader(), 3):
+        assert [name.startswith("prior/") for name in batch.ids] == [False, False, True, True]
 
 
 def test_unusable_requests_are_refused(refused, trained, clips, tmp_path):
@@ -403,7 +390,7 @@ def test_unusable_requests_are_refused(refused, trained, clips, tmp_path):
         refused("adapt", str(trained), f"source={clips}", f"name={name}", says="give one word")
     lesson = ["adapt", str(trained), f"source={clips}", "name=limp"]
     refused(*lesson[:2], says="no source given")
-    refused(*lesson, "rank=0", says="rank=0: give 1 or more")
+    refused(*lesson, "rank=0", says="rank=0: must be at least 1")
     refused(*lesson, "losses.velocity=3", says="keeps the losses of its base")
     refused(*lesson[:2], f"source={tmp_path / 'none'}", "name=limp", says="no such folder")
     joints = next(iter(Synthetic(clips=1).clips(20.0))).motion

@@ -1,7 +1,13 @@
-"""Export to ONNX: the sampling loop as numbers, graphs of each denoiser, and the runner without PyTorch."""
+"""Export to ONNX: the sampling loop as numbers, graphs of each denoiser, the runner without PyTorch, the web page."""
 
+import functools
+import http.server
+import json
+import shutil
 import subprocess
 import sys
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +15,9 @@ import numpy as np
 import pytest
 import torch
 from hydra.utils import instantiate
-from support.fixtures import ROOT, recipe
+from support.browser import CHROMIUM, Tab, browser
+from support.fixtures import ROOT, recipe, script
+from support.glb import Glb
 from torch import Tensor
 
 import flame_mdm
@@ -20,6 +28,7 @@ from flame_mdm.checkpoints import runner
 from flame_mdm.conditions import vocabulary
 from flame_mdm.errors import UserError
 from flame_mdm.formats.poses import solve
+from flame_mdm.formats.readers import read
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.processes.flow_matching import FlowMatching
 from flame_mdm.representations import rotation
@@ -36,6 +45,7 @@ NETWORKS = {
 CONDITIONS = {"MDMEncoder": "action", "MDMUNet": "none"}  # those of other classes are texts
 VARIANTS = [(name, CONDITIONS.get(target.rpartition(".")[2], "learned")) for target, name in NETWORKS.items()]
 VARIANTS += [("mdm_decoder_token", "learned"), ("mfm_encoder_tokens", "learned")]
+TEXT = "a person kicks with the left foot twice"
 NOTHING = Condition(torch.zeros(1, 0), torch.zeros(1, 0, 0), None)
 
 
@@ -58,16 +68,13 @@ def followed(plan: list[list[float]], clip: bool, noise: Any) -> Tensor:
 
 
 DIFFUSION = [("ancestral", {}), ("ddim", {}), ("ddim", {"eta": 0.7}), ("dpm_solver_pp_2m", {}), ("consistency", {})]
+FLOW = ("euler", "midpoint", "heun", "consistency")
 CASES = [
     *((GaussianDiffusion(50, prediction=p), name, options) for p in ("x0", "epsilon") for name, options in DIFFUSION),
     (GaussianDiffusion(50, prediction="velocity", variance="fixed_large", clip_x0=True), "ancestral", {}),
     (GaussianDiffusion(50, variance="learned_range"), "ddim", {"spacing": "stride", "num_inference_steps": 10}),
     (GaussianDiffusion(50), "ancestral", {"num_inference_steps": [0, 3, 20, 49]}),
-    *(
-        (FlowMatching(prediction=p), name, {})
-        for p in ("velocity", "x0")
-        for name in ("euler", "midpoint", "heun", "consistency")
-    ),
+    *((FlowMatching(prediction=p), name, {}) for p in ("velocity", "x0") for name in FLOW),
     (FlowMatching(quantize_time=True, odeint_grid=True), "euler", {}),
 ]
 
@@ -155,12 +162,11 @@ def test_the_runner_samples_the_motions_of_the_package_without_pytorch_and_refus
     exported, out = tmp_path / "model", tmp_path / "out.npz"
     assert main(["export", str(trained), str(exported), "format=onnx", "half=true"]) == 0
     model = flame_mdm.load(trained)
-    text, seconds, seed = "a person kicks with the left foot twice", 2.2, 1
-    words = [str(exported), text, str(out), f"seconds={seconds}", f"seed={seed}"]
+    words = [str(exported), TEXT, str(out), "seconds=2.2", "seed=1"]
     script = f"import sys, runpy; sys.argv = ['runner.py', *{words}]; sys.modules['torch'] = None\n"
     script += f"runpy.run_path({str(exported / 'runner.py')!r}, run_name='__main__')"
     assert subprocess.run([sys.executable, "-I", "-c", script], check=False).returncode == 0
-    motion = flame_mdm.generate(model, text, seconds=seconds, seed=seed)[0]
+    motion = flame_mdm.generate(model, TEXT, seconds=2.2, seed=1)[0]
     with np.load(out) as file:
         assert np.abs(file["joints"] - motion.joints).max() < 1e-3
     sampler = runner.Sampler(exported)
@@ -170,9 +176,9 @@ def test_the_runner_samples_the_motions_of_the_package_without_pytorch_and_refus
     matrices = rotation.quaternion_to_matrix(torch.from_numpy(quaternions))
     torch.testing.assert_close(matrices.double(), poses.rotations, atol=2e-3, rtol=0)
     assert sampler.unknown("a person walks backflipping") == ["backflipping"]
-    for wrong in ({"seconds": 9}, {"seconds": 0}):
+    for seconds in (9, 0):
         with pytest.raises(ValueError, match=r"give 0\.1 to 3 seconds"):
-            sampler.generate(text, **wrong)
+            sampler.generate(TEXT, seconds)
 
     description, graph = ((exported / name).read_bytes() for name in ("model.json", "joints.onnx"))
     capfd.readouterr()
@@ -197,3 +203,102 @@ def test_models_with_a_language_model_and_unknown_formats_are_refused(refused: A
     model.condition.features, model.condition.reads = 16, "text"  # type: ignore[union-attr]
     with pytest.raises(UserError, match="a language model is not exported"):
         onnx.graphs(model)
+
+
+# The page that samples in the browser, built by tools/web.py and driven in Chromium ----------------------------------
+
+DONE = "document.body?.dataset.made || document.querySelector('#notes.error')?.textContent"
+
+
+class Handler(http.server.SimpleHTTPRequestHandler):
+    extensions_map = http.server.SimpleHTTPRequestHandler.extensions_map | {".mjs": "text/javascript"}
+
+    def log_message(self, *_: Any) -> None:
+        pass
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("web") / "page"
+    script("tools/web.py").build("quickstart", out)
+    return out
+
+
+@pytest.fixture
+def served(folder: Path, tmp_path: Path) -> Iterator[tuple[Path, str]]:
+    """A copy of the page that a test may damage, and its address."""
+    copy = shutil.copytree(folder, tmp_path / "page")
+    handler = functools.partial(Handler, directory=str(copy))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield copy, f"http://127.0.0.1:{server.server_port}/"
+        server.shutdown()
+
+
+def in_browser(test: Any) -> Any:
+    skip = pytest.mark.skipif(CHROMIUM is None or shutil.which("npm") is None, reason="needs chromium and npm")
+    return pytest.mark.tools(pytest.mark.slow(pytest.mark.timeout(900)(skip(test))))
+
+
+def made(tab: Tab) -> dict[str, Any]:
+    return json.loads(tab.wait(DONE, 120))
+
+
+@in_browser
+def test_the_page_samples_the_motions_of_the_package(served: tuple[Path, str], tmp_path: Path) -> None:
+    folder, url = served
+    assert sum(p.stat().st_size for p in folder.iterdir() if p.is_file()) <= 8e6
+    model = flame_mdm.load("quickstart")
+    with browser(tmp_path / "profile") as tab:
+        tab.send("Page.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
+        tab.open(f"{url}#text={TEXT}&seconds=2.2&seed=2")
+        assert made(tab)["seed"] == "2"
+        for seed in (0, 1, 2):
+            tab.run("delete document.body.dataset.made")
+            tab.type("#seed", str(seed))
+            tab.click("#generate")
+            assert made(tab) | {"milliseconds": 0} == {"text": TEXT, "seed": str(seed), "milliseconds": 0}
+            expected = flame_mdm.generate(model, TEXT, seconds=2.2, seed=seed)[0]
+            joints = np.array(tab.run("joints()")).reshape(expected.joints.shape)
+            assert np.abs(joints - expected.joints).max() < 1e-3
+        file = tmp_path / "a-person-kicks-with-the-left-foot-twice.glb"
+        for ending in ("bvh", "glb"):
+            expected.save(tmp_path / f"python.{ending}")
+            tab.click(f"#{ending}")
+            while not file.with_suffix(f".{ending}").exists():  # until the time of the test is up
+                tab.run("new Promise((done) => setTimeout(done, 50))")
+        theirs, ours = read(file.with_suffix(".bvh")), read(tmp_path / "python.bvh")
+        assert theirs.fps == pytest.approx(ours.fps)
+        assert np.abs(theirs.joints - ours.joints).max() < 1e-3
+        theirs, ours = (Glb(path).worlds()[:, :22, :3, 3] for path in (file, tmp_path / "python.glb"))
+        assert np.abs(theirs - ours).max() < 0.01  # the proportions of its body are those of one example
+        assert "seed=2" in tab.run("location.hash")
+        tab.type("#text", "a person kicks backflipping")
+        tab.click("#generate")
+        assert "backflipping" in tab.wait("document.getElementById('notes').textContent")
+        assert tab.run("document.querySelectorAll('#notes button').length") == 3
+        tab.type("#text", "qwer asdf")
+        tab.click("#generate")
+        assert "knows no word" in tab.wait("document.querySelector('#notes.error')?.textContent")
+        assert tab.errors == []
+        assert [address for address in tab.requested if not address.startswith((url, "blob:", "data:"))] == []
+
+
+@in_browser
+@pytest.mark.parametrize(
+    ("file", "change", "says"),
+    [
+        ("denoiser.onnx", lambda data: data[:-9] + b"x" * 9, "denoiser.onnx has changed since it was exported"),
+        ("model.json", lambda data: data[:-9], "model.json is damaged: not JSON"),
+        ("model.json", lambda data: data.replace(b"[[49.0,", b"[[49.0, 1,"), "model.json is damaged: steps"),
+        ("figure.json", lambda data: data[:-9], "figure.json is damaged"),
+    ],
+)
+def test_a_damaged_page_says_so_in_one_line(
+    served: tuple[Path, str], tmp_path: Path, file: str, change: Any, says: str
+) -> None:
+    folder, url = served
+    (folder / file).write_bytes(change((folder / file).read_bytes()))
+    with browser(tmp_path / "profile") as tab:
+        tab.open(url)
+        assert says in tab.wait(DONE, 60)

@@ -1,22 +1,31 @@
-"""Requests for samples: a file of prompts, a length per prompt, videos, and where motions are written."""
+"""Requests for samples: files of prompts, lengths, videos, where motions are written; and the model in the package."""
 
-import importlib.util
 import json
 import re
 import sys
+from contextlib import suppress
+from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
+from support.fixtures import ROOT
+from support.refusals import one_line_error
 
 import flame_mdm
+from evaluators.metrics.attributes import read_attributes
 from flame_mdm.__main__ import main
+from flame_mdm.checkpoints.locating import SHIPPED, find
 from flame_mdm.commands.sample import default_folder
+from flame_mdm.conditions.vocabulary import check_known
 from flame_mdm.errors import UserError
 from flame_mdm.formats.readers import read
+from flame_mdm.safe_io import read_yaml, sha256
 
+SENTENCES = read_yaml(ROOT / "tests" / "fixtures" / "sentences.yaml")
 PROMPTS = ["a person walks", "a person jumps: 100%, twice", "人が歩く, waving"]
 
 
@@ -24,11 +33,6 @@ PROMPTS = ["a person walks", "a person jumps: 100%, twice", "人が歩く, wavin
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     return tmp_path
-
-
-def folders(root: Path) -> dict[str, Path]:
-    """The folders of motions below a folder, by the caption of their first motion."""
-    return {read(path).text: path.parent for path in sorted(root.rglob("motion_000.npz"))}
 
 
 @pytest.mark.slow
@@ -40,37 +44,41 @@ def test_each_prompt_of_a_file_is_sampled_as_if_alone(here, trained, capsys):
     assert page == "samples/quickstart/p.html"
     assert all(json.dumps(text, ensure_ascii=True)[1:-1] in Path(page).read_text() for text in PROMPTS)
     assert "warning: 'a person jumps: 100%, twice': never seen in training: " in "\n".join(lines)
-    together = folders(here / "samples")
-    assert list(together) == sorted(PROMPTS, key=lambda text: together[text])
-    text, kept = PROMPTS[1], {path.name for path in together[PROMPTS[1]].iterdir()}
-    assert len(kept) == 5
-    before = read(together[text] / "motion_001.npz")
+    together = {read(path).text: path.parent for path in here.rglob("motion_000.npz")}
+    assert set(together) == set(PROMPTS)
+    text, file = PROMPTS[1], together[PROMPTS[1]] / "motion_001.npz"
+    kept, before = set(here.rglob("*")), read(file)
+    assert len(list(together[text].iterdir())) == 5
     assert main(["sample", str(trained), f"text={text}", "seconds=1.5", "samples=2"]) == 0
-    again = read(together[text] / "motion_001.npz")  # the same folder
-    np.testing.assert_allclose(again.joints, before.joints, atol=1e-4)
-    assert {path.name for path in together[text].iterdir()} == kept
-    assert len(folders(here / "samples")) == 3
+    np.testing.assert_allclose(read(file).joints, before.joints, atol=1e-4)  # in the same folder
+    assert set(here.rglob("*")) == kept
 
 
 @pytest.mark.slow
-def test_a_chosen_folder_gets_a_folder_per_prompt(here, trained):
+def test_a_chosen_folder_gets_a_folder_per_prompt_without_files_of_an_earlier_request(here, trained):
     Path("p.txt").write_text("a person walks\na person jumps\na person walks\n")
-    words = ["prompts=p.txt", "seconds=1", "samples=1", "trajectory=true", "out=mine"]
-    assert main(["sample", str(trained), *words]) == 0
+    words, videos = ["prompts=p.txt", "seconds=1", "samples=1", "out=mine"], bool(find_spec("av"))
+    assert main(["sample", str(trained), *words, "trajectory=true", f"mp4={videos}".lower()]) == 0
     jumps, walks, page = sorted(Path("mine").iterdir())
     assert [jumps.name[:-7], walks.name[:-7], page.name] == ["a-person-jumps", "a-person-walks", "p.html"]
-    twice = [read(path) for path in sorted(walks.glob("motion_*.npz"))]
-    assert len(twice) == 2
-    assert np.abs(twice[0].joints - twice[1].joints).max() > 0.001
-    assert [path.parent.name[:14] for path in Path("mine").rglob("trajectory.png")] == ["a-person-walks"]
+    first, second = (read(path) for path in sorted(walks.glob("motion_*.npz")))
+    assert np.abs(first.joints - second.joints).max() > 0.001
+    assert [path.parent for path in Path("mine").rglob("trajectory.png")] == [walks]
+    assert len(list(Path("mine").rglob("motions.mp4"))) == 2 * videos
+    (walks / "motion_1_of_mine.npz").touch()
+    assert main(["sample", str(trained), *words]) == 0
+    numbers = [f"motion_{number}.npz" for number in ("000", "001", "1_of_mine")]
+    assert sorted(path.name for path in walks.iterdir()) == [*numbers, "motions.gif", "motions.png", "player.html"]
 
 
-def test_a_bad_request_is_one_line_and_writes_nothing(here, trained, capsys):
+def test_a_bad_request_is_one_line_and_writes_nothing(here, trained, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "av", None)
     for content, words, message in (
-        (None, [], "prompts: p.txt: no such file"),
-        (b" \n\t\r\n\n", [], "prompts: p.txt: no prompts. Write one per line"),
-        (b"PK\x03\x04\xff\xfe\x00", [], "prompts: p.txt: not a UTF-8 text file"),
-        (b"a\n" * 2**20, [], "prompts: p.txt: 2 MiB, but such a file may have at most 1 MiB"),
+        (None, [], "p.txt: no such file"),
+        (b" \n\t\r\n\n", [], "p.txt: no prompts. Write one per line"),
+        (b"PK\x03\x04\xff\xfe\x00", [], "p.txt: not a UTF-8 text file"),
+        (b"a\n" * 2**20, [], "p.txt: 2 MiB, but such a file may have at most 1 MiB"),
+        (b"walks", ["mp4=true"], 'mp4=true: MP4 needs the package av. Run pip install "flame-mdm[video]"'),
         (b"walks", ["text=jumps"], "text and prompts exclude each other. Give only one of them"),
         (b"walks\njumps", ["seconds=[1,2,3]"], "seconds=[1, 2, 3]: lengths: 3, prompts: 2. Give one length, or one"),
         (b"walks\njumps", ["seconds=[1,30]"], "30 seconds (600 frames) cannot be sampled"),
@@ -90,35 +98,15 @@ def test_each_prompt_has_a_length_of_its_own(trained):
     model = flame_mdm.load(trained)
     motions = flame_mdm.generate(model, PROMPTS[:2], seconds=[1, 1.5], samples=2)
     assert [(m.text, len(m.joints)) for m in motions] == [(PROMPTS[0], 20)] * 2 + [(PROMPTS[1], 30)] * 2
-    alone = flame_mdm.generate(model, PROMPTS[1], seconds=np.float32(1.5))[0]  # type: ignore[arg-type]
-    np.testing.assert_allclose(motions[2].joints, alone.joints, atol=1e-4)
-    assert [len(m.joints) for m in flame_mdm.generate(model, PROMPTS, frames=np.array([20, 21, 22]))] == [20, 21, 22]  # type: ignore[arg-type]
+    numpy: dict[str, Any] = {"seconds": np.float32(1.5)}
+    np.testing.assert_allclose(motions[2].joints, flame_mdm.generate(model, PROMPTS[1], **numpy)[0].joints, atol=1e-4)
     for seconds, message in (
         ([1, 2], r"seconds=\[1, 2\]: lengths: 2, prompts: 1\. Give one length, or one per prompt"),
         ([], "lengths: 0, prompts: 1"),
         *((value, "is not a valid length") for value in ([[1]], ["x"], [float("nan")], 10**400, "3")),
     ):
-        with pytest.raises(UserError, match=message):
+        with one_line_error(message):
             flame_mdm.generate(model, PROMPTS[0], seconds=seconds)  # type: ignore[arg-type]
-
-
-@pytest.mark.slow
-def test_a_video_is_written_when_asked_for(here, trained, monkeypatch, capsys):
-    words = ["sample", str(trained), "text=a person walks", "samples=2", "seconds=1", "out=out"]
-    if importlib.util.find_spec("av"):
-        assert main([*words, "mp4=true", "trajectory=true"]) == 0
-        assert capsys.readouterr().out.rstrip().endswith("out/player.html, motions.gif, motions.mp4")
-        assert b"ftyp" in Path("out/motions.mp4").read_bytes()[:12]
-        Path("out/motion_1_of_mine.npz").touch()
-        assert main(words) == 0
-        assert {path.name for path in Path("out").iterdir()} == {
-            *("motion_000.npz", "motion_001.npz", "motions.gif", "motions.png", "player.html"),
-            "motion_1_of_mine.npz",
-        }
-    monkeypatch.setitem(sys.modules, "av", None)
-    assert main([*words, "mp4=true", "out=other"]) == 1
-    assert 'error: mp4=true: MP4 needs the package av. Run pip install "flame-mdm[video]"' in capsys.readouterr().err
-    assert not Path("other").exists()
 
 
 def folder(experiment: Any, text: str = "a person walks", **options: Any) -> str:
@@ -139,11 +127,43 @@ def test_requests_for_different_motions_share_no_folder():
     assert re.fullmatch(r"samples/a/(walks-){6}walk-[0-9a-f]{6}", folder("a", "walks " * 20, seed=1))
 
 
-def test_no_checkpoint_leads_out_of_the_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_no_checkpoint_leads_out_of_the_folder(here):
     names = ["../../x", "/etc/x", "..", "a/../../../b", ".x", "a\0b", "~/x", "-/..", None, 3, "", "\\..\\x", ". ."]
     for name in names:
         path = Path(folder(name, "../../../etc passwd\0", sampler="../../x", joints=["/a", ".."]))
         assert ".." not in path.parts
         assert "\0" not in str(path)
-        assert path.resolve().is_relative_to(tmp_path / "samples")
+        assert path.resolve().is_relative_to(here / "samples")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("every", [3, pytest.param(1, marks=pytest.mark.robustness)])
+def test_the_model_understands_sentences_as_people_type_them(every):
+    """A motion is right if it shows every attribute that its sentence states; a list holds what fits."""
+    assert len(SENTENCES) == len({sentence["text"].lower() for sentence in SENTENCES}) == 300
+    model, known = flame_mdm.load("quickstart"), {}
+    assert all(value.dtype == torch.float32 for value in model.parameters())
+    for sentence in SENTENCES[::every]:
+        with suppress(UserError):
+            check_known(sentence["text"], model.facts)
+            known[sentence["text"]] = {key: value for key, value in sentence.items() if key != "text"}
+    right, motions = 0, flame_mdm.generate(model, list(known), cleanup=True, num_inference_steps=10)
+    for motion, stated in zip(motions, known.values(), strict=True):
+        seen = read_attributes(motion.joints, motion.fps)
+        right += all(seen.get(key) in (value if isinstance(value, list) else [value]) for key, value in stated.items())
+    assert right / len(SENTENCES[::every]) >= 0.85
+
+
+def test_shipped_names_come_after_paths(here, capsys):
+    assert find("quickstart") == SHIPPED["quickstart"]
+    assert main(["sample", "quikstart", "text=a person walks"]) == 1
+    assert "Did you mean quickstart?" in capsys.readouterr().err
+    (here / "quickstart").mkdir()
+    (here / "quickstart" / "mine.safetensors").touch()
+    assert find("quickstart").name == "mine.safetensors"
+
+
+def test_the_documented_file_is_in_the_package():
+    assert sha256(SHIPPED["quickstart"]) in (ROOT / "docs" / "checkpoints.md").read_text()
+    assert SHIPPED["quickstart"].stat().st_size < 4.6e6
+    assert "license: mit" in SHIPPED["quickstart"].with_suffix(".md").read_text()

@@ -40,13 +40,8 @@ def export(source: str | Path, out: str | Path, *, half: bool = False, **adapted
     return write_model_file(out, state, config=config, facts=checkpoint["facts"], origin=origin)
 
 
-def push(
-    source: str | Path, repository: str, folder: str | Path, *, upload: bool = True, private: bool = False
-) -> Path:
-    """Writes a folder with a model file, its recipe and its card, and uploads it to the hub as "user/name".
-
-    `source` and errors are as for `flame_mdm.load`; raises `UserError` also if the hub cannot be reached or refuses.
-    """
+def push(source: str | Path, repository: str, folder: str | Path, *, upload: bool, private: bool) -> Path:
+    """Writes a folder with model file, recipe and card, and uploads it to the hub as "user/name"; see `export`."""
     if not re.fullmatch(r"\w[\w.-]*/\w[\w.-]*", repository):
         raise UserError(f"{repository}: not a repository name. Write user/name")
     for name, mark in WRITTEN.items():

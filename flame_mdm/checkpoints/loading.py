@@ -81,7 +81,7 @@ def _build(checkpoint: dict[str, Any], kind: type[Trained]) -> Trained:
     """Builds the task of a checkpoint with its weights, without compiling it.
 
     Networks of this project are built on the meta device, so that a recipe takes no more memory than the weights in the
-    file. Other classes may only be named if the user trusts them, and are built as in training.
+    file. Other classes, which the user must trust, are built as in training.
     """
     config, state = checkpoint["config"], checkpoint["state_dict"]
     parts: Config = {name: config[name] for name in PARTS if name in config}

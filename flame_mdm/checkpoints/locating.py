@@ -2,7 +2,7 @@
 
 import re
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
 from flame_mdm.checkpoints.model_files import FILE
 from flame_mdm.errors import UserError, did_you_mean, first_line
@@ -20,8 +20,6 @@ def find(source: str | Path, which: Which = "last") -> Path:
     `source` is a file; a run directory, of which `which` names the checkpoint; a folder with one .safetensors file; the
     name of a model in this package; or "user/name[@revision]" on the Hugging Face hub. An existing path comes first.
     """
-    if which not in get_args(Which):
-        raise UserError(f"which={which}: write last or best")
     path = Path(source)
     if path.is_dir():
         return _find_in_folder(path, which)
@@ -41,7 +39,7 @@ def find(source: str | Path, which: Which = "last") -> Path:
     try:
         return Path(hf_hub_download(match[1], FILE, revision=match[2]))
     except Exception as error:  # the client raises many kinds: no network, no such repository, no permission ...
-        what = f"no such file or folder, and {FILE} of this name cannot be downloaded from the hub"
+        what = f"no such file or folder, and {FILE} of a model with this name cannot be downloaded from the hub"
         raise UserError(f"{source}: {what}: {first_line(error)}") from error
 
 
@@ -56,8 +54,6 @@ def _find_in_folder(folder: Path, which: Which) -> Path:
         return file
     if len(weights) != 1:
         names = ", ".join(file.name for file in weights) or "no .safetensors file"
-        runs = ", ".join(str(path.parent) for path in sorted(folder.glob("*/checkpoints"))[:3])
-        advice = f"Name a run: {runs}" if runs else "Name the file of the model"
-        raise UserError(f"{folder}: this folder holds {names}. {advice}")
+        raise UserError(f"{folder}: this folder holds {names}. Name the file of the model, or a run directory")
     regular_file(weights[0])
     return weights[0]

@@ -144,11 +144,10 @@ def check_weights(weights: Mapping[Any, Any], path: Path) -> None:
     kinds = (torch.float64, torch.float32, torch.float16, torch.bfloat16)
     kinds += (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8, torch.bool)
     for name, value in weights.items():
-        if not (isinstance(name, str) and isinstance(value, torch.Tensor)):
-            raise UserError(f"{path}: damaged: its weights are not tensors by name: {str(name)[:80]}")
-        if value.layout != torch.strided or value.device.type != "cpu" or value.dtype not in kinds or value.is_neg():
-            shown = f"{name[:80]} is {value.dtype}, {value.layout}, on {value.device.type}"
-            raise UserError(f"{path}: damaged: its weights are not dense tensors of real numbers: {shown}")
+        is_dense = isinstance(name, str) and isinstance(value, torch.Tensor) and value.layout == torch.strided
+        if not is_dense or value.device.type != "cpu" or value.dtype not in kinds or value.is_neg():
+            shown = f"{str(name)[:80]} is {getattr(value, 'dtype', type(value).__name__)}"
+            raise UserError(f"{path}: damaged: its weights are not dense tensors of real numbers by name: {shown}")
     if sum(value.numel() * value.element_size() for value in weights.values()) > 2 * path.stat().st_size:  # 2: shared
         raise UserError(f"{path}: damaged: its weights are declared to be larger than the file")
 
@@ -156,10 +155,7 @@ def check_weights(weights: Mapping[Any, Any], path: Path) -> None:
 def write_model_file(
     out: str | Path, state: Mapping[str, Tensor], *, config: Mapping[str, Any], facts: Mapping[str, Any], origin: Any
 ) -> Path:
-    """Writes a model file atomically: weights, recipe, metadata of the data set, and origin of the weights.
-
-    `out` is a .safetensors file, or a folder for `FILE`. Returns the path of the file.
-    """
+    """Writes a model file atomically, to a .safetensors file or to `FILE` in a folder, and returns its path."""
     from safetensors.torch import save
 
     path = Path(out) if Path(out).suffix == ".safetensors" else Path(out) / FILE

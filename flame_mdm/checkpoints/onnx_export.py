@@ -32,8 +32,7 @@ from flame_mdm.sampler_options import SamplerOptions
 
 RUNNER = Path(__file__).with_name("runner.py")
 TOLERANCE = 1e-4  # maximum difference between the outputs of a graph and of PyTorch, relative to the largest output
-FIXED_LENGTH = (MDMGRU, MDMUNet)
-"""Networks whose graphs have a fixed number of frames, that of the longest motion: shorter ones are padded."""
+FIXED_LENGTH = (MDMGRU, MDMUNet)  # their graphs have as many frames as the longest motion: shorter ones are padded
 TINY = 1e-6  # probe of `to_x0` that no clipping of the clean estimate changes
 
 
@@ -121,8 +120,7 @@ def sampling_plan(process: Process, options: SamplerOptions) -> list[list[float]
     """Returns the sampling loop as rows of 7 numbers (t, p, q, a, b, c, d), one for each call of the denoiser.
 
     A call at time t, as the denoiser gets it, with output y gives the clean estimate x0 = p x + q y. Then x <- a x + b
-    x0 + c x0' + d noise, with the clean estimate x0' of the call before and new noise. Raises `UserError` if the
-    process does not have the sampler, or the sampler is not of this form.
+    x0 + c x0' + d noise, with the clean estimate x0' of the call before. Raises `UserError` for other samplers.
     """
     plans = [np.array(_plan(process, options, variance)) for variance in (0.0, 1.0)]
     if not np.array_equal(plans[0], plans[1]):
@@ -164,11 +162,10 @@ class Graph(NamedTuple):
 
 
 class Call(nn.Module):
-    """One call of a model's denoiser, with its condition encoder and guidance.
+    """One call of a model's denoiser, with its condition encoder and guidance, without a learned variance.
 
     Inputs are x_t (B, F, D), the time t (B,) as the denoiser gets it, lengths (B,) int64, and the condition: actions
-    (B,) int64, or rows of the word table (B, S, 2) int64 with the `counts` (B,) of each caption. The output is that of
-    the denoiser (B, F, D), without a learned variance.
+    (B,) int64, or rows of the word table (B, S, 2) int64 with the `counts` (B,) of each caption.
     """
 
     def __init__(self, model: MotionGenerator):
@@ -223,10 +220,8 @@ def graphs(model: MotionGenerator) -> list[Graph]:
         inputs["condition"] = torch.tensor([0, len(model.facts["actions"]) - 1])
         dimensions["condition"] = {0: batch}
     to_joints = Function(representation.to_joints)
-    made = [
-        Graph("denoiser", Call(model), inputs, dimensions, ["output"]),
-        Graph("joints", to_joints, {"x": x}, {"x": {0: batch, 1: frames}}, ["joints"]),
-    ]
+    made = [Graph("denoiser", Call(model), inputs, dimensions, ["output"])]
+    made += [Graph("joints", to_joints, {"x": x}, {"x": {0: batch, 1: frames}}, ["joints"])]
     if representation.skeleton.name == SMPL22.name:
         solver = Function(partial(solve_checked, fps=representation.fps))
         joints = {"joints": representation.to_joints(x[0]) + torch.randn(x.shape[1], len(SMPL22), 3)}

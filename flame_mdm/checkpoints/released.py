@@ -12,18 +12,8 @@ from hydra.utils import get_class
 from pydantic import BeforeValidator, Field
 from torch import Tensor
 
+from flame_mdm.checkpoints import released_weights as theirs
 from flame_mdm.checkpoints.model_files import MOST_FRAMES, check_weights, without_own_paths, write_model_file
-from flame_mdm.checkpoints.released_weights import (
-    DECODER_LAYER,
-    ENCODER_LAYER,
-    NAMES,
-    layer_names,
-    load_strictly,
-    read_released,
-    released_state,
-    renamed,
-    shape_of,
-)
 from flame_mdm.config import EXPERIMENTS, Config, compose, instantiate, plain
 from flame_mdm.data.humanact12 import HumanAct12
 from flame_mdm.denoisers import Denoiser
@@ -37,8 +27,8 @@ from flame_mdm.schemas import Number, Schema, check_shape
 from flame_mdm.task import MotionGeneration, Task
 
 NETWORKS = {
-    "trans_enc": (MDMEncoder, "seqTransEncoder", ENCODER_LAYER),
-    "trans_dec": (MDMDecoder, "seqTransDecoder", DECODER_LAYER),
+    "trans_enc": (MDMEncoder, "seqTransEncoder", theirs.ENCODER_LAYER),
+    "trans_dec": (MDMDecoder, "seqTransDecoder", theirs.DECODER_LAYER),
     "gru": (MDMGRU, "", {}),
 }
 """Authors' name of each architecture of MDM -> our network, their name of its transformer, and the names in a layer."""
@@ -93,7 +83,7 @@ class Released(NamedTuple):
         """Returns this; raises `UserError` unless the network has these weights and no others."""
         with torch.device("meta"):
             network = self.network(*self.features, **self.options)
-        load_strictly(network, self.state, "released weights", assign=True)
+        theirs.load_strictly(network, self.state, "released weights", assign=True)
         return self
 
 
@@ -106,24 +96,24 @@ def import_mdm(state: Mapping[str, Tensor], args: Options, *, time_token: bool =
     network, stack, layer = NETWORKS[args.arch]
     dropped = ("sequence_pos_encoder.pe", "embed_timestep.sequence_pos_encoder.pe", "clip_model.")
     learned = {key: value for key, value in state.items() if not key.startswith(dropped)}
-    cond_features = shape_of(learned, ACTIONS)[1] if ACTIONS in learned else 0
+    cond_features = theirs.shape_of(learned, ACTIONS)[1] if ACTIONS in learned else 0
     embedding = learned.pop(ACTIONS, None)
-    names, num_layers = layer_names(learned, stack, layer)
-    ours = renamed(learned, NAMES["mdm"] | names)
+    names, num_layers = theirs.layer_names(learned, stack, layer)
+    ours = theirs.renamed(learned, theirs.NAMES["mdm"] | names)
 
-    out_features, latent_dim = shape_of(ours, "output.weight")
-    in_features = shape_of(ours, "input.weight")[1]
+    out_features, latent_dim = theirs.shape_of(ours, "output.weight")
+    in_features = theirs.shape_of(ours, "input.weight")[1]
     options: dict[str, Any] = {"latent_dim": latent_dim, "num_layers": num_layers, "dropout": 0.1}
     if embedding is not None:
         options["project_condition"] = False
     if "condition.projection.weight" in ours:
-        cond_features = shape_of(ours, "condition.projection.weight")[1]
+        cond_features = theirs.shape_of(ours, "condition.projection.weight")[1]
     if args.arch == "gru":
         in_features -= latent_dim
         num_layers = sum(key.startswith("gru.weight_ih_l") for key in ours)
         options |= {"num_layers": num_layers, "recur_over_batch": True}
     else:
-        ff_size = shape_of(ours, "transformer.layers.0.feed_forward.0.weight")[0]
+        ff_size = theirs.shape_of(ours, "transformer.layers.0.feed_forward.0.weight")[0]
         options |= {"ff_size": ff_size, "num_heads": args.num_heads, "mask_padding": args.mask_frames}
     if args.arch == "trans_dec":
         distilbert = args.text_encoder_type == "bert"
@@ -136,19 +126,14 @@ def import_mdm(state: Mapping[str, Tensor], args: Options, *, time_token: bool =
 def import_flame(state: Mapping[str, Tensor], *, num_heads: int = 8) -> Released:
     """Converts FLAME's network, without its RoBERTa; its 8 attention heads cannot be read from the weights."""
     learned = {key: value for key, value in state.items() if not key.startswith("lm.")}
-    names, num_layers = layer_names(learned, "tf_decoder", DECODER_LAYER)
-    ours = renamed(learned, NAMES["flame"] | names)
-    latent_dim, in_features = shape_of(ours, "input.weight")
-    options = {
-        "latent_dim": latent_dim,
-        "ff_size": shape_of(ours, "transformer.layers.0.feed_forward.0.weight")[0],
-        "num_layers": num_layers,
-        "num_heads": num_heads,
-        "dropout": 0.1,
-        "max_frames": shape_of(ours, "length_embedding.weight")[0],
-    }
-    features = (in_features, shape_of(ours, "output.weight")[0], shape_of(ours, "pooled_projection.weight")[1])
-    return Released(FLAME, features, options, ours).checked()
+    names, num_layers = theirs.layer_names(learned, "tf_decoder", theirs.DECODER_LAYER)
+    ours = theirs.renamed(learned, theirs.NAMES["flame"] | names)
+    latent_dim, in_features = theirs.shape_of(ours, "input.weight")
+    output, pooled = (theirs.shape_of(ours, name) for name in ("output.weight", "pooled_projection.weight"))
+    ff_size, _ = theirs.shape_of(ours, "transformer.layers.0.feed_forward.0.weight")
+    options = {"latent_dim": latent_dim, "ff_size": ff_size, "num_layers": num_layers, "num_heads": num_heads}
+    options |= {"dropout": 0.1, "max_frames": theirs.shape_of(ours, "length_embedding.weight")[0]}
+    return Released(FLAME, (in_features, output[0], pooled[1]), options, ours).checked()
 
 
 def _recipe(name: str, released: Released, representation: str, condition: Config, process: Config) -> Config:
@@ -180,7 +165,7 @@ def _flame_recipe(released: Released) -> tuple[Config, dict[str, Any]]:
 
 
 def _mdm_recipe(kind: str, released: Released, args: Options) -> tuple[Config, dict[str, Any]]:
-    dataset, representation = NAMES["datasets"][args.dataset]
+    dataset, representation = theirs.NAMES["datasets"][args.dataset]
     actions: list[str] = []
     condition: Config = _option("condition", "none")
     if released.action_embedding is not None:
@@ -220,18 +205,16 @@ def import_released(
     time_token: bool = False,
     run_code: bool = False,
 ) -> Path:
-    """Converts a released checkpoint of MDM, MFM, FLAME or FLAME's motion-CLIP into a model file, and returns its path.
-
-    The arguments are the keys of `flame-mdm import`. Raises `UserError` if a file is damaged, or of another kind.
-    """
+    """Converts a released checkpoint into a model file, and returns its path; see the keys of `flame-mdm import`."""
     file = Path(file)
     if (args is None) != (kind in ("flame", "mclip")):
         needs = "takes no" if args else "needs a"
         raise UserError(f"{kind} {needs} file of options: MDM's args.json, or MFM's .hydra/config.yaml")
     options = _options(args, {} if num_heads is None else {"num_heads": num_heads})
-    checkpoint = read_released(file, run_code=run_code, advice="Add run_code=true if you trust the authors of the file")
+    advice = "Add run_code=true if you trust the authors of the file"
+    checkpoint = theirs.read_released(file, run_code=run_code, advice=advice)
     try:
-        state = released_state(checkpoint, ema=averaged and kind != "mclip")
+        state = theirs.released_state(checkpoint, ema=averaged and kind != "mclip")
         check_weights(state, file)
         if kind == "mclip":
             sizes = [] if num_heads is None else [f"task.network.num_heads={num_heads}"]

@@ -19,9 +19,9 @@ ENCODER_LAYER, DECODER_LAYER = NAMES["encoder_layer"], NAMES["decoder_layer"]
 
 
 def read_released(path: Path, *, run_code: bool = False, advice: str = "Save only its state dict") -> Mapping[str, Any]:
-    """Reads a released file; with `run_code` also pickles that hold more than weights, which runs any code in them.
+    """Reads a released file; with `run_code` also pickles of other objects, which runs any code in them.
 
-    Raises `UserError` if it is damaged, or holds other objects than plain weights; `advice` says what to do about them.
+    Raises `UserError` if it is damaged, or holds such objects, with `advice` what to do about them.
     """
     try:
         check_torch(path)

@@ -64,8 +64,8 @@ class Sampler:
     def generate(self, prompt: str = "", seconds: float | None = None, seed: int = 0, sample: int = 0) -> np.ndarray:
         """Returns normalized features (F, D) of one motion, for a text or an action; "" for an unconditional model.
 
-        `seconds` is by default 3, or the longest motion in training if that is shorter; `sample` numbers the motions of
-        one text. Raises `ValueError` if the model has no such length or action, or the result is not finite.
+        `sample` numbers the motions of one text; `seconds` is by default up to 3. Raises `ValueError` for an unknown
+        length or action, and if the result is not finite.
         """
         content = self.content
         longest, fps = content["max_frames"], content["fps"]

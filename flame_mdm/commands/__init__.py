@@ -2,8 +2,7 @@
 
 import os
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -39,17 +38,10 @@ def motion_file(key: str, source: str) -> None:
 def model_source(key: str, source: str) -> None:
     """Checks that the files of an extractor or of another model exist."""
     if source != "none" and not Path(source).exists():
-        with about_key(key):
+        try:
             find(source)
-
-
-@contextmanager
-def about_key(key: str) -> Iterator[None]:
-    """Adds the key to errors about the model that it names."""
-    try:
-        yield
-    except (UserError, FileNotFoundError) as error:
-        raise UserError(f"{key}: {error}") from error
+        except (UserError, FileNotFoundError) as error:
+            raise UserError(f"{key}: {error}") from error
 
 
 def body_name(key: str, body: str) -> None:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-from flame_mdm.commands import ModelSettings, usual_data_root
+from flame_mdm.commands import ModelSettings, above_zero, usual_data_root
 from flame_mdm.sampler_options import option, required
 
 
@@ -24,7 +24,7 @@ class AdaptSettings(ModelSettings):
     action: bool = option(False, "true = the clips show an action that the model does not know, instead of a style")
     full: bool = option(False, "true = train all weights; the result is a model instead of an adapter")
     force: bool = option(False, "true = accept clips that drift upward or float")
-    rank: int = option(8, "of the changes of the weights; more for motions far from what the model knows")
+    rank: int = option(8, "of the changes of the weights; more for motions far from what the model knows", above_zero)
     data_root: str = option(usual_data_root, "folder of the prepared data sets")
     composed: tuple[str, ...] = ()
 

@@ -8,7 +8,8 @@ from typing import ClassVar
 from flame_mdm.commands import FileSettings, motion_file, usual_data_root
 from flame_mdm.commands.sample import OutputSettings, check_condition, default_folder, summary
 from flame_mdm.errors import say
-from flame_mdm.sampler_options import SamplerOptions, option, required
+from flame_mdm.safe_io import sha256
+from flame_mdm.sampler_options import option, required
 from flame_mdm.sampling.request import EditRequest
 
 
@@ -28,16 +29,11 @@ class EditSettings(OutputSettings, EditRequest, FileSettings):
     data_root: str = option(usual_data_root, "folder of the prepared data sets")
     out: str | None = option(None, "folder; default samples/<experiment>/edit-<motion>-<text>-<hash>")
 
-    def __post_init__(self) -> None:
-        SamplerOptions.__post_init__(self)
-        EditRequest.__post_init__(self)
-
 
 def main(settings: EditSettings) -> None:
     request = settings.request()
     file = settings.model_file()
 
-    from flame_mdm.safe_io import sha256
     from flame_mdm.sampling.editing import edit_request
     from flame_mdm.sampling.generation import write_motions
     from flame_mdm.sampling.reading import read_motion

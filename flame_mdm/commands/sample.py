@@ -11,11 +11,11 @@ from pathlib import Path
 from statistics import mean
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from flame_mdm.commands import AdaptedSettings, BodySettings, about_key, device_name, existing, motion_file
+from flame_mdm.commands import AdaptedSettings, BodySettings, device_name, existing, motion_file
 from flame_mdm.errors import UserError, say, shortened
-from flame_mdm.safe_io import MEBIBYTE, read_text
+from flame_mdm.safe_io import MEBIBYTE, read_text, sha256
 from flame_mdm.sampler_options import SamplerOptions, option, same_option
-from flame_mdm.sampling.request import TRAINED_ON, EditRequest, SamplingRequest, path_targets, read_path
+from flame_mdm.sampling.request import TRAINED_ON, EditRequest, SamplingRequest, path_targets, read_path, understood
 
 if TYPE_CHECKING:
     from flame_mdm.formats.motion import Motion
@@ -110,9 +110,7 @@ def main(settings: SampleSettings) -> None:
     request = settings.request()
     file = settings.model_file()
 
-    from flame_mdm.safe_io import sha256
     from flame_mdm.sampling.generation import sample_request, write_motions
-    from flame_mdm.sampling.request import understood
 
     model, body = settings.load(file)
     typed, request = request.prompts, understood(request, model)
@@ -178,11 +176,10 @@ def _gallery(settings: SampleSettings, folders: Mapping[Path, list[Motion]], bod
 
 def read_prompts(path: str) -> list[str]:
     """Returns the lines of a file of prompts that are not blank."""
-    with about_key("prompts"):
-        text = read_text(path, MEBIBYTE)
-        prompts = [line.strip() for line in text.removeprefix("\ufeff").splitlines() if line.strip()]
-        if not prompts or "\0" in text:
-            raise UserError(f"{path}: no prompts. Write one per line")
+    text = read_text(path, MEBIBYTE)
+    prompts = [line.strip() for line in text.removeprefix("\ufeff").splitlines() if line.strip()]
+    if not prompts or "\0" in text:
+        raise UserError(f"{path}: no prompts. Write one per line")
     return prompts
 
 

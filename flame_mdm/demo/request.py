@@ -10,8 +10,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSeriali
 from flame_mdm.errors import UserError, did_you_mean, one_line, shortened
 from flame_mdm.sampling.request import path_targets, read_parts, read_path
 
-MAX_TEXT, MAX_SECONDS, MAX_SAMPLES, MAX_STEPS, MAX_EDITS = 300, 30, 4, 1000, 8
-"""Limits of a request: characters, seconds, motions, sampling steps, edits."""
+MAX_TEXT, MAX_SECONDS, MAX_SAMPLES, MAX_STEPS, MAX_EDITS = 300, 30, 4, 1000, 8  # limits of a request
 MAX_SEED = 2**31 - 1
 MAX_WAY_POINTS, FAR = 16, 20.0  # a path: way points, and meters along x and z
 PLUS = " + "  # between the names of a model and of its adapter

@@ -25,10 +25,7 @@ FORMATS = {".bvh": "BVH", ".glb": "GLB", ".npz": "NPZ", ".mp4": "MP4"}  # files 
 
 
 class Studio:
-    """Makes the motions of requests with a fixed set of models, of which the first is loaded at once.
-
-    `sources` are names of models, as for `flame_mdm.load`, or "MODEL + ADAPTER"; requests can choose no other.
-    """
+    """Makes the motions of requests, with no other models than `sources`, as for `load`, or "MODEL + ADAPTER"."""
 
     def __init__(self, sources: Sequence[str], device: str):
         self.device = device
@@ -50,10 +47,7 @@ class Studio:
     def motions(
         self, request: DemoRequest, report: Callable[[int], None] = lambda calls: None, stop: Event | None = None
     ) -> Sequence[Motion]:
-        """Returns the motions of a request, from memory if they were made before; ends one that takes too long.
-
-        Before each call of the network, `report` gets the number of calls so far; `stop` ends the request.
-        """
+        """Returns the motions of a request, from memory if possible; `report` gets the number of network calls."""
         with self._working:
             model = self.model(request.model)
             steps, cleanup = _plan(model, request)

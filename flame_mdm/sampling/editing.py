@@ -31,19 +31,14 @@ MFM_STEPS = 25
 class Edited(Motion):
     """An edited motion, of which a part was kept.
 
-    Attributes:
-        original: the motion before editing.
-        keep: (F, D) bool, True if this feature of this frame was to be kept.
-        feature_error: maximum change of kept values in normalized features; 0 if the method is exact.
-        joint_error: maximum distance in meters between the world positions of a kept joint before and after. It can be
-            large although features are kept: they are relative to the root, so a kept part continues from where a
-            resampled part ends.
+    The joint error can be large although features are kept: they are relative to the root, so a kept part continues
+    from where a resampled part ends.
     """
 
-    original: Motion
-    keep: np.ndarray
-    feature_error: float
-    joint_error: float
+    original: Motion  # before editing
+    keep: np.ndarray  # (F, D) bool, True if this feature of this frame was to be kept
+    feature_error: float  # maximum change of kept values in normalized features; 0 if the method is exact
+    joint_error: float  # maximum distance in meters between the world positions of a kept joint before and after
 
 
 def edit(

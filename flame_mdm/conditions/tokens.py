@@ -24,8 +24,7 @@ class LearnedTokens(ConditionEncoder):
 
     A word is the sum of two rows of the table, selected by its hash, see `vocabulary.hashed`. Words that the training
     captions do not contain are replaced by a form that they do contain (walked, walks), or dropped: their vectors are
-    random. Each distinct caption of a batch is encoded once, so that samples with the same caption share its dropout.
-    Linear layers skip the padding.
+    random. Samples with the same caption share its dropout, since it is encoded once. Linear layers skip the padding.
 
     The pooled vector is the mean of the tokens, and the null token is the null vector, so that all parameters receive
     gradients whether a denoiser reads the pooled vector or the tokens.

@@ -113,9 +113,9 @@ def _suggested(text: str, facts: Mapping[str, Any]) -> str:
 def in_parts(text: str, verbs: Collection[str]) -> list[str]:
     """Splits a sentence with several actions: "walks, turns left and waves. Then she sits" has four parts.
 
-    It is split at ends of sentences and at "then"; if `verbs`, all forms of those that the model knows, are given, also
-    at commas followed by a verb, and in such an enumeration at "and" followed by one. "Raises both hands and waves" is
-    one action. Parts without a verb belong to their neighbor; "in limp style" at the end, which adapters teach, to all.
+    It is split at ends of sentences and at "then"; if `verbs`, all known forms, are given, also at commas followed by a
+    verb, and in such an enumeration at "and" followed by one. "Raises both hands and waves" is one action. Parts
+    without a verb belong to their neighbor; "in limp style" at the end, which adapters teach, to all.
     """
     comma, also = _before_verb(tuple(verbs))
     parts: list[str] = []

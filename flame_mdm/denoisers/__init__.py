@@ -11,15 +11,15 @@ class Denoiser(nn.Module, ABC):
     """A network (x_t, t, mask, cond) -> prediction.
 
     The first arguments of subclasses are `in_features` (D), `out_features` (D, or 2D with a learned variance) and
-    `cond_features` (C; 0 = unconditioned), which `task.build` passes; the others come from the configuration. Several
-    networks have `latent_dim`, the width of their layers; `ff_size`, the hidden width of feed-forward layers;
-    `num_layers`; `num_heads` of attention; `dropout`, a probability after the positions and inside the layers; and
-    `project_condition`, False to add the condition to the time without projection, as MDM does with action embeddings.
+    `cond_features` (C; 0 = unconditioned), which `task.build` passes; the others come from the configuration:
+    `latent_dim`, the width of the layers; `ff_size`, the hidden width of feed-forward layers; `num_heads` of attention;
+    `dropout` after the positions and inside the layers; `project_condition`, False to add the condition to the time
+    without projection, as MDM does with action embeddings.
     """
 
     mask_padding: bool = True
-    """Whether the content and the number of frames past the end of a motion have no influence on its real frames. Set
-    it to False in a network that attends to padding: it is then sampled at the padded length of its training."""
+    """Whether padding has no influence on real frames. A network that attends to it (False) is sampled at the padded
+    length of its training."""
 
     @abstractmethod
     def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:

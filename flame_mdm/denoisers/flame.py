@@ -21,10 +21,8 @@ class FLAME(Denoiser):
         max_frames: maximum length of a motion that ML can embed.
         length_token: False omits ML (table 4, first row).
         cross_attention: False gives a transformer encoder over ML, TS, CLS and frames (table 4, first two rows).
-        condition_frames: also add TS and CLS to every frame. A small network then learns to follow the text in
-            fewer steps than from tokens alone.
-        length_unit: ML embeds the length rounded down to a multiple of this. `task.build` passes the unit of the
-            windows in training: ML knows no other lengths.
+        condition_frames: also add TS and CLS to every frame: a small network follows the text after fewer steps.
+        length_unit: ML embeds the length rounded down to a multiple of this, the unit of the windows in training.
     """
 
     def __init__(

@@ -28,8 +28,7 @@ def with_prefix(mask: Tensor, prefix: int) -> Tensor:
 class Attention(nn.Module):
     """Multi-head attention of x to itself or to a memory (Vaswani et al. 2017, section 3.2.2).
 
-    Query, key and value share one matrix (3C, C), so that self-attention projects once and released weights can be
-    copied directly.
+    Query, key and value share one matrix (3C, C), as in released weights, so that self-attention projects once.
     """
 
     def __init__(self, features: int, num_heads: int, dropout: float):

@@ -19,8 +19,8 @@ class MDMEncoder(Denoiser):
             between the time and the frames (MFM with T5: 30); frames keep their positions if there are fewer.
         mask_padding: False lets frames attend to the padding, as the released models of MDM and MFM do: they are
             sampled at the padded length of their training and cropped.
-        condition_frames: also add time + condition (with `max_tokens`, the time) to every frame. A small network
-            then learns to follow the text in fewer steps than from a single token.
+        condition_frames: also add time + condition (with `max_tokens`, the time) to every frame: a small network
+            follows the text after fewer steps.
     """
 
     def __init__(
@@ -71,11 +71,9 @@ class MDMDecoder(Denoiser):
     """Transformer decoder over the frames, with time + condition as cross-attention memory.
 
     Args:
-        input_token: token before the frames: "condition" is the paper's "+ input token", where time + condition
-            are both input token and memory, as in the released model; "time" is MDM's code since February 2025,
-            where the token is only the time.
-        token_memory: use all condition tokens as memory, with the time added to each (MDM with DistilBERT), instead
-            of the pooled vector.
+        input_token: token before the frames: "condition" is time + condition, as in the paper's "+ input token" and the
+            released model; "time" is the time alone, as in MDM's code since February 2025.
+        token_memory: memory of all condition tokens, with the time added to each, as MDM with DistilBERT.
         mask_padding: False lets frames attend to the padding, as the released models without `mask_frames` do.
     """
 

@@ -29,8 +29,7 @@ def consistency_terms(
 ) -> dict[str, Tensor]:
     """Returns the losses (B,) of f at x_t against f after one step of the teacher: "consistency", auxiliary, "loss".
 
-    The step is that of DDIM with eta = 0, which for a flow is Euler's. After the last time of the grid comes the data,
-    where f is the teacher's estimate.
+    The step is that of DDIM with eta = 0, for a flow Euler's. After the grid comes the data, the teacher's estimate.
 
     Args:
         process: of student and teacher; predicts the clean motion or the velocity.

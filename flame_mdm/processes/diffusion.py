@@ -115,8 +115,7 @@ class GaussianDiffusion(Process):
         error = masked_mse(scale * output[..., : x.shape[-1]], scale * self.target(x, noise, t), mask)
         terms = {"mse": self._snr_weight(t) * error}
         if self.variance == "learned_range" and self.vlb_weight:
-            bound = masked_mean(self.vlb(output, x, x_t, t), mask)
-            terms["vlb"] = self.vlb_weight * len(self.schedule) * bound
+            terms["vlb"] = self.vlb_weight * len(self.schedule) * masked_mean(self.vlb(output, x, x_t, t), mask)
         return terms
 
     def _snr_weight(self, t: Tensor) -> Tensor | float:

@@ -88,8 +88,7 @@ class FlowMatching(Process):
         edit: Edit | None = None,
         trajectory: list[Tensor] | None = None,
     ) -> Tensor:
-        """See `Process.sample`. Takes N >= 1 equal steps; "dopri5" chooses its own. Only "consistency" draws more noise
-        than number 0.
+        """See `Process.sample`. Takes N >= 1 equal steps; "dopri5" chooses its own. Only "consistency" adds noise.
 
         An edit of mode "trajectory" replaces the kept part before each step at a time <= `until` by the straight path
         from its noise to the known motion (MFM, algorithm 1); after that, the model moves it freely. Mode "x0"

@@ -12,8 +12,8 @@ from flame_mdm.losses import bone_lengths
 
 STEERING_STEPS = 2  # gradient steps before each step of the sampler
 STEERING_LIMIT = 0.02
-"""Maximum length of such a step, as RMS over the normalized features. With longer steps, x_t is no longer like noisy
-motions of the training where the denoiser depends on it only weakly: in one trial, arms grew by a third."""
+"""Maximum length of such a step, as RMS over normalized features. With longer ones, x_t is unlike noisy motions of the
+training where the denoiser depends on it only weakly: in one trial, arms grew by a third."""
 CLOSE, MOST_STEPS = 0.005, 8
 """Largest error in meters that ends the search for a motion that reaches positions, and its maximum number of steps."""
 RELAXATION = 1e-3
@@ -23,8 +23,7 @@ RELAXATION = 1e-3
 def classifier_free_guidance(denoise: Denoise, scale: float | Tensor, features: int) -> Denoise:
     """Returns a denoiser guided by its unconditional prediction: null + scale * (cond - null), with batch size 2B.
 
-    Ho and Salimans 2021 in the form of MDM and FLAME (eq. 5), where 1 means no guidance; w in Ho and Salimans is
-    scale - 1.
+    Ho and Salimans 2021, with w = scale - 1, in the form of MDM and FLAME (eq. 5), where 1 means no guidance.
 
     Args:
         denoise: the denoiser; its condition must have a null.

@@ -56,9 +56,6 @@ class Flow:
     sigma_min: float  # standard deviation of the noise left at the end
 
 
-# Diffusion ------------------------------------------------------------------------------------------------------------
-
-
 def ancestral(x: Tensor, run: Descent, i: int) -> Tensor:
     """Draws x_{t-1} from the learned reverse process (Ho et al. 2020, algorithm 2); the last one is its mean."""
     x0_hat, log_variance = run.estimate(x, i)
@@ -108,9 +105,8 @@ def consistency(x: Tensor, run: Descent, i: int) -> Tensor:
 def blended(sampler: Sampler, x: Tensor, run: Descent, steps: Sequence[int], edit: Edit, start: Tensor) -> Tensor:
     """Takes `steps` and replaces the kept part of each noisy motion by the known motion, as noisy as the rest.
 
-    With the blend "after", the kept part of the first x_t has the noise of the `start`, as if it were blended after a
-    step before that. RePaint (Lugmayr et al. 2022, algorithm 1) takes each step several times, adding its noise again
-    in between.
+    With the blend "after", the kept part of the first x_t has the noise of the `start`, as if blended after a step
+    before. RePaint (Lugmayr et al. 2022, algorithm 1) repeats each step after adding its noise again.
     """
     schedule, draws = run.schedule, run.draws
     if edit.blend == "after":
@@ -135,8 +131,6 @@ DIFFUSION_SAMPLERS = {
     "dpm_solver_pp_2m": Sampler(dpm_solver_pp_2m, ("spacing",), unsupported=("resample",)),
     "consistency": Sampler(consistency),
 }
-
-# Flows ----------------------------------------------------------------------------------------------------------------
 
 
 def euler(x: Tensor, run: Flow, t: float, end: float) -> Tensor:

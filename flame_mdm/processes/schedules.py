@@ -101,10 +101,9 @@ def build_schedule(name: str, num_train_timesteps: int) -> Schedule:
 def timesteps(num_train_timesteps: int, num_inference_steps: int, spacing: str = "linspace") -> list[int]:
     """Returns N = `num_inference_steps` increasing sampling steps from 0 ... T - 1.
 
-    The spacing "linspace" gives evenly spaced steps including both ends, rounded half to even ("N" in the code of MDM
-    and FLAME, after Nichol and Dhariwal 2021). "stride" counts from 0 with the smallest integer stride that gives N
-    steps, so that the last, noisiest step may be well below T - 1 ("ddimN" there, after Song et al. 2021). Raises
-    `UserError` if N is not in 1 ... T, or no stride gives N steps.
+    "linspace" includes both ends and rounds half to even ("N" in the code of MDM and FLAME, after Nichol and Dhariwal
+    2021). "stride" counts from 0 with the smallest integer stride that gives N steps, so that the noisiest step may be
+    well below T - 1 ("ddimN" there, after Song et al. 2021). Raises `UserError` if nothing gives N steps.
     """
     total, count = num_train_timesteps, num_inference_steps
     if not 1 <= count <= total:

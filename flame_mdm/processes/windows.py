@@ -41,8 +41,7 @@ def spans(lengths: Sequence[int], longest: int, overlap: int, loop: bool = False
     """Covers the consecutive parts of a motion with windows: part, first frame and number of frames of each.
 
     The windows of a part reach half the overlap, an even number, into its neighbors. A part that does not fit into one
-    window of at most `longest` frames gets several. In a loop, the first part follows the last one, and windows begin
-    before frame 0.
+    window of at most `longest` frames gets several. In a loop, windows begin before frame 0.
     """
     total, begin, windows = sum(lengths), 0, []
     for part, length in enumerate(lengths):

@@ -62,7 +62,7 @@ class SamplerOptions:
         steps = self.num_inference_steps
         listed, least = (steps, 0) if isinstance(steps, list | tuple) else ([steps], 1)
         if steps is not None and not all(type(step) is int and least <= step <= MAX_STEPS for step in listed):
-            raise UserError(f"num_inference_steps={steps}: give a number from 1 to {MAX_STEPS:,}, or a list of steps")
+            raise UserError(f"num_inference_steps={steps}: give a number of steps, or a list, up to {MAX_STEPS:,}")
         object.__setattr__(self, "num_inference_steps", tuple(steps) if isinstance(steps, list) else steps)
 
     def chosen(self) -> dict[str, Any]:

@@ -6,13 +6,11 @@ import json
 import os
 import random
 import re
-import runpy
 import signal
 import socket
 import subprocess
 import sys
 import threading
-import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
@@ -27,6 +25,7 @@ from support.browser import CHROMIUM, browser
 from support.fixtures import ROOT
 
 from flame_mdm.__main__ import main
+from flame_mdm.demo import studio as making
 from flame_mdm.demo.request import MAX_EDITS, DemoEdit, DemoRequest, parse_query
 from flame_mdm.errors import UserError
 from flame_mdm.formats.retarget import presets
@@ -49,8 +48,7 @@ def parsed(query: str) -> DemoRequest:
 
 def test_a_link_reproduces_its_request_and_names_every_option_that_is_not_left_to_the_model():
     for request in (DemoRequest(text="a person walks"), EDITED, PATH, DemoRequest(text="ü & = # % + ' \" <b>")):
-        assert parsed(request.query()) == request
-        assert parsed(request.query() + "&__theme=dark") == request
+        assert parsed(request.query()) == parsed(request.query() + "&__theme=dark") == request
     sampling = ["guidance_scale", "num_inference_steps", "sampler", "cleanup", "split"]
     keys = ["model", "text", "seconds", "samples", "seed", *sampling, "edit", "edit"]
     assert [key for key, _ in parse_qsl(EDITED.query())] == keys
@@ -100,13 +98,11 @@ def query_of(bad: str) -> str:
 
 
 @pytest.fixture(scope="module")
-def studio() -> Any:
-    from flame_mdm.demo.studio import Studio
-
-    return Studio(["quickstart"], "cpu")
+def studio() -> making.Studio:
+    return making.Studio(["quickstart"], "cpu")
 
 
-def test_the_python_lines_give_the_same_motions(studio, tmp_path, monkeypatch):
+def test_the_python_lines_and_the_files_give_the_same_motions(studio, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for request in (PATH.model_copy(update={"edits": (DemoEdit(strength=0.5, samples=2),)}), EDITED):
         ours, names = studio.motions(request), dict[str, Any]()
@@ -114,15 +110,17 @@ def test_the_python_lines_give_the_same_motions(studio, tmp_path, monkeypatch):
         for motion, program in zip(ours, names["motions"], strict=True):
             assert motion.cleanup == (not request.path)
             np.testing.assert_array_equal(motion.joints, program.joints)
-        assert Path("motion.bvh").stat().st_size > 1000
-    assert not np.array_equal(ours[0].joints, ours[1].joints)
+        assert studio.file(request, 0, ".bvh") == Path("motion.bvh").read_bytes()
+    with np.load(io.BytesIO(studio.file(EDITED, 1, ".npz"))) as file:
+        np.testing.assert_array_equal(file["joints"], ours[1].joints)
+    assert all(studio.file(EDITED, 1, ".bvh", rig).startswith(b"HIERARCHY") for rig in presets())
+    for wrong, says in (((2, ".bvh"), "there are 2 motions"), ((0, ".exe"), "not a format"), ((0, ".bvh", "no"), "no")):
+        with pytest.raises(UserError, match=says):
+            studio.file(EDITED, *wrong)
 
 
-def test_a_request_stops_within_a_step_and_the_next_one_runs(studio):
-    from flame_mdm.demo import studio as module
-
-    stop, seen = threading.Event(), []
-    request = DemoRequest(text="a person walks", seconds=1)
+def test_a_request_stops_within_a_step_and_the_next_one_runs(studio, monkeypatch):
+    stop, seen, request = threading.Event(), [], DemoRequest(text="a person walks", seconds=1)
 
     def report(calls: int) -> None:
         seen.append(calls)
@@ -133,10 +131,9 @@ def test_a_request_stops_within_a_step_and_the_next_one_runs(studio):
         studio.motions(request, report, stop)
     assert seen == [0, 1, 2, 3, 4, 5]
     assert len(studio.motions(request)) == 1
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "TIME_LIMIT", -1.0)
-        with pytest.raises(UserError, match="stopped after"):
-            studio.motions(request.model_copy(update={"seed": 1}))
+    monkeypatch.setattr(making, "TIME_LIMIT", -1.0)
+    with pytest.raises(UserError, match="stopped after"):
+        studio.motions(request.model_copy(update={"seed": 1}))
 
 
 def test_a_wrong_port_and_a_missing_package_are_one_line(monkeypatch, capsys):
@@ -228,17 +225,15 @@ def body_of(function: int, *data: Any, session: str = "") -> bytes:
 def generated(server: str, query: str, session: str = "") -> list[Any]:
     """Outputs of the page for a query string."""
     session = session or f"s{random.getrandbits(40)}"
-    page = get(server)[1].decode()
-    config = re.findall(r"window.gradio_config = (\{.*?\});</script>", page, re.DOTALL)[0]
+    config = re.findall(r"window.gradio_config = (\{.*?\});</script>", get(server)[1].decode(), re.DOTALL)[0]
     functions = json.loads(config)["dependencies"]
     show = next(function["id"] for function in functions if len(function["outputs"]) == 7)
     status, body = get(f"{server}/gradio_api/queue/join", body_of(show, query, session=session))
     assert status == 200, body
     _, stream = get(f"{server}/gradio_api/queue/data?session_hash={session}")
-    lines = re.findall(rb"^data: (.*process_completed.*)$", stream, re.MULTILINE)
-    last = json.loads(lines[-1])
-    assert "data" in last["output"], (query[:200], last)
-    return last["output"]["data"]
+    output = json.loads(re.findall(rb"^data: (.*process_completed.*)$", stream, re.MULTILINE)[-1])["output"]
+    assert "data" in output, (query[:200], output)
+    return output["data"]
 
 
 @pytest.mark.slow
@@ -262,23 +257,10 @@ def test_a_sentence_becomes_parts_and_a_suggestion_a_button(server):
     request = DemoRequest(text="a person walks. Then she waves the lefft hand", **FAST)
     _, notes, query, *_, text = generated(server, request.query())
     assert text == parsed(query).text == "a person walks | she waves the lefft hand"
-    assert (
-        '<p class="warning">never seen in training: lefft. <button type="button">she waves the left hand</button></p>'
-        in notes
-    )
+    assert 'never seen in training: lefft. <button type="button">she waves the left hand</button></p>' in notes
     assert generated(server, request.model_copy(update={"split": False}).query())[-1] == request.text
     assert "knows no word of it" in (refused := generated(server, query_of("text=asdf+qwer"))[1])
     assert '<button type="button">a person ' in refused
-
-
-def test_a_space_is_served_under_its_name(monkeypatch):
-    from flame_mdm.demo import app
-
-    served: list[Any] = []
-    monkeypatch.setattr(app, "serve", lambda *words, **keys: served.append((words, keys)))
-    monkeypatch.setenv("SPACE_HOST", "user-demo.hf.space")
-    runpy.run_path(str(ROOT / "docs" / "space" / "app.py"))
-    assert served == [((["quickstart"],), {"host": "0.0.0.0", "port": 7860, "hosts": ["user-demo.hf.space"]})]
 
 
 @pytest.mark.slow
@@ -320,10 +302,9 @@ def test_requests_of_other_sites_and_for_other_names_are_refused(server):
 
 def test_bodies_are_counted_as_they_arrive(server):
     host, port = server.removeprefix("http://").split(":")
-    head = f"POST /gradio_api/queue/join HTTP/1.1\r\nHost: {host}\r\nTransfer-Encoding: chunked\r\n\r\n"
+    head, sent = f"POST /gradio_api/queue/join HTTP/1.1\r\nHost: {host}\r\nTransfer-Encoding: chunked\r\n\r\n", 0
     with socket.create_connection((host, int(port)), timeout=60) as connection:
         connection.sendall(head.encode())
-        sent = 0
         with contextlib.suppress(OSError):  # the server closes the connection
             while sent < 300:
                 connection.sendall(b"%x\r\n%s\r\n" % (2**20, b"x" * 2**20))
@@ -355,18 +336,6 @@ def test_requests_from_eight_clients_are_answered_in_constant_memory(normal):
     assert resident() - before < 30_000
 
 
-@pytest.mark.slow
-def test_downloads_are_the_shown_motion(server, studio):
-    motion = studio.motions(EDITED)[1]
-    generated(server, EDITED.query())
-    shown = joints_of(f"{server}/motion.npz?{EDITED.query()}&motion=1")
-    np.testing.assert_allclose(shown, motion.joints, atol=1e-5)  # other numbers of threads
-    for rig in presets():
-        assert get(f"{server}/motion.bvh?{EDITED.query()}&rig={rig}")[1].startswith(b"HIERARCHY")
-    for wrong in ("npz?motion=2", "npz?motion=x", "bvh?rig=no", "exe?"):
-        assert get(f"{server}/motion.{wrong}&{EDITED.query()}")[0] == 400
-
-
 LINKS = "[...document.querySelectorAll('#files a')]"
 
 
@@ -382,12 +351,6 @@ def test_a_person_uses_the_page(server, tmp_path):
         tab.type("#ask textarea", "a person waves with the right hand")
         click(tab, "Generate")
         link = tab.wait("location.search.includes('right') && location.href")
-        frames = []
-        for number in range(2):  # the person moves
-            time.sleep(0.4)
-            frames.append(tab.screenshot(tmp_path / f"{number}.png"))
-        assert frames[0] != frames[1]
-
         files = tab.run(f"Object.fromEntries({LINKS}.map(a => [a.text, a.href]))")
         assert list(files)[:8] == ["Blender", "Unreal", "Unity", "Mixamo", "BVH", "GLB", "NPZ", "MP4"]
         shown = joints_of(files["NPZ"])
@@ -404,9 +367,8 @@ def test_a_person_uses_the_page(server, tmp_path):
         for address, expected in ((link, shown), (edited, after)):  # a link gives the same motion
             tab.open("about:blank")
             tab.open(address)
-            tab.wait("!!document.querySelector('#player iframe')")
-            assert tab.run("document.querySelector('#ask textarea').value") == "a person waves with the right hand"
             query = tab.wait("document.querySelector('#files a')?.href").partition("?")[2]
+            assert tab.run("document.querySelector('#ask textarea').value") == "a person waves with the right hand"
             np.testing.assert_array_equal(joints_of(f"{server}/motion.npz?{query}"), expected)
         assert [url for url in tab.requested if not url.startswith((server, "data:", "blob:", "about:"))] == []
         assert tab.errors == []
@@ -414,7 +376,6 @@ def test_a_person_uses_the_page(server, tmp_path):
         tab.open(link)
         tab.wait("document.querySelectorAll('#examples img').length > 8 && !!document.querySelector('#files a')", 60)
         assert tab.run("document.documentElement.scrollWidth <= innerWidth")
-        assert tab.run("document.documentElement.scrollHeight") < 1900
         example = tab.run("document.querySelectorAll('#examples button')[3].textContent")
         tab.click("#examples button:nth-child(4)")
         tab.wait(f"new URLSearchParams(location.search).get('text') === {json.dumps(example)}")
@@ -449,7 +410,6 @@ def test_a_person_writes_a_sequence_in_rows_and_draws_a_path(server, tmp_path):
             for kind in ("mousePressed", "mouseReleased"):
                 at = {"x": x + right * width, "y": y + down * height}
                 tab.send("Input.dispatchMouseEvent", type=kind, **at, button="left", clickCount=1)
-        tab.wait("document.querySelectorAll('#floor circle').length === 3")
         tab.click("[data-point='2'] circle")  # removes it
         tab.wait("document.querySelectorAll('#floor circle').length === 2")
         drawn = tab.run("document.querySelector('#path textarea, #path input').value")
@@ -457,16 +417,10 @@ def test_a_person_writes_a_sequence_in_rows_and_draws_a_path(server, tmp_path):
         click(tab, "Generate")
         tab.wait("location.search.includes('path=')")
         address = tab.wait(f"{LINKS}.map(a => a.href).find(h => /npz.*path=/.test(h))")
-        joints = joints_of(address)
-        points = parsed(address.partition("?")[2].partition("&motion=")[0]).targets("text")["root"]
-        assert [point["position"] for point in points] == [[0.6, 0.8], [0.3, 1.2]]
-        for point in points:
-            assert np.abs(joints[round(20 * point["time"]), 0, [0, 2]] - point["position"]).max() < 0.03
-
+        end = joints_of(address)[round(20 * (1.5 - 0.2)), 0, [0, 2]]
+        np.testing.assert_allclose(end, [0.3, 1.2], atol=0.03)
         click(tab, "Clear")
         tab.wait("!document.querySelector('#floor circle')")
-        click(tab, "Generate")
-        tab.wait("location.search && !location.search.includes('path=')")
         assert tab.errors == []
 
 

@@ -28,7 +28,6 @@ def test_attributes_of_one_clip_alone_do_not_matter():
         {"direction": ["walks backward"], "speed": ["walks forward slowly"]},
         {"direction": ["walks forward quickly", "walks forward slowly"]},
     ]
-    # A caption that does not mention the attribute is not wrong.
     slow = clip("a", ["walks slowly"], action="walk", speed="slow")
     assert near_misses([slow, clip("b", ["walks"], action="walk", speed="normal")]) == [{}, {"speed": ["walks slowly"]}]
 

@@ -1,6 +1,5 @@
 """Export to ONNX: the sampling loop as numbers, graphs of each denoiser, the runner without PyTorch, the web page."""
 
-import functools
 import http.server
 import json
 import shutil
@@ -8,6 +7,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,10 +38,8 @@ from flame_mdm.seeds import key, seeded_noise
 from flame_mdm.task import MotionGeneration
 
 SIZES = {"latent_dim": 16, "ff_size": 24, "num_layers": 1, "num_heads": 2, "channels": [8, 16], "num_groups": 4}
-NETWORKS = {
-    read_yaml(path)["_target_"]: path.stem for path in sorted((ROOT / "experiments" / "denoiser").glob("*.yaml"))
-}
-"""One recipe of each class of denoisers."""
+RECIPES = sorted((ROOT / "experiments" / "denoiser").glob("*.yaml"))
+NETWORKS = {read_yaml(path)["_target_"]: path.stem for path in RECIPES}  # one recipe of each class of denoisers
 CONDITIONS = {"MDMEncoder": "action", "MDMUNet": "none"}  # those of other classes are texts
 VARIANTS = [(name, CONDITIONS.get(target.rpartition(".")[2], "learned")) for target, name in NETWORKS.items()]
 VARIANTS += [("mdm_decoder_token", "learned"), ("mfm_encoder_tokens", "learned")]
@@ -49,9 +47,9 @@ TEXT = "a person kicks with the left foot twice"
 NOTHING = Condition(torch.zeros(1, 0), torch.zeros(1, 0, 0), None)
 
 
-def network(x_t: Tensor, t: Tensor, *_: Any) -> Tensor:
-    """A denoiser that is not linear, with a learned variance."""
-    return torch.cat([torch.sin(3 * x_t + t[:, None, None]), torch.cos(x_t)], -1)
+def network(x_t: Tensor, t: Tensor, *_: Any, width: int = 8) -> Tensor:
+    """A denoiser that is not linear, of 4 features and, with `width` 8, a learned variance."""
+    return torch.cat([torch.sin(3 * x_t + t[:, None, None]), torch.cos(x_t)], -1)[..., :width]
 
 
 def followed(plan: list[list[float]], clip: bool, noise: Any) -> Tensor:
@@ -84,10 +82,8 @@ def test_a_plan_leads_to_the_motion_of_the_sampler() -> None:
     noise = seeded_noise(["a"], 5, 4, seed=1, replication=0, like=like)
     for process, sampler, options in CASES:
         requested = SamplerOptions(**{"sampler": sampler, "num_inference_steps": 8} | options)
-        width = process.out_features(4)
-        expected = process.sample(
-            lambda *inputs, width=width: network(*inputs)[..., :width], noise, mask, NOTHING, requested
-        )
+        denoise = partial(network, width=process.out_features(4))
+        expected = process.sample(denoise, noise, mask, NOTHING, requested)
         plan = onnx.sampling_plan(process, requested)
         assert np.shape(plan)[1] == 7
         ours = followed(plan, getattr(process, "clip_x0", False), noise)
@@ -191,8 +187,7 @@ def test_the_runner_samples_the_motions_of_the_package_without_pytorch_and_refus
         (exported / "model.json").write_bytes(description)
         (exported / name).write_bytes(content)
         assert runner.main([str(exported), "walk", str(out)]) == 1
-        error = capfd.readouterr().err
-        assert says in error
+        assert says in (error := capfd.readouterr().err)
         assert error.count("\n") == 1
 
 
@@ -213,9 +208,6 @@ DONE = "document.body?.dataset.made || document.querySelector('#notes.error')?.t
 class Handler(http.server.SimpleHTTPRequestHandler):
     extensions_map = http.server.SimpleHTTPRequestHandler.extensions_map | {".mjs": "text/javascript"}
 
-    def log_message(self, *_: Any) -> None:
-        pass
-
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -228,7 +220,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def served(folder: Path, tmp_path: Path) -> Iterator[tuple[Path, str]]:
     """A copy of the page that a test may damage, and its address."""
     copy = shutil.copytree(folder, tmp_path / "page")
-    handler = functools.partial(Handler, directory=str(copy))
+    handler = partial(Handler, directory=str(copy))
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         yield copy, f"http://127.0.0.1:{server.server_port}/"

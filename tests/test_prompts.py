@@ -18,7 +18,7 @@ from support.refusals import one_line_error
 import flame_mdm
 from evaluators.metrics.attributes import read_attributes
 from flame_mdm.__main__ import main
-from flame_mdm.checkpoints.locating import SHIPPED, find
+from flame_mdm.checkpoints.locating import find
 from flame_mdm.commands.sample import default_folder
 from flame_mdm.conditions.vocabulary import check_known
 from flame_mdm.errors import UserError
@@ -88,9 +88,8 @@ def test_a_bad_request_is_one_line_and_writes_nothing(here, trained, capsys, mon
         if content is not None:
             Path("p.txt").write_bytes(content)
         assert main(["sample", str(trained), "prompts=p.txt", *words]) == 1
-        captured = capsys.readouterr()
-        assert message in captured.err
-        assert captured.err.count("\n") == 1
+        assert message in (error := capsys.readouterr().err)
+        assert error.count("\n") == 1
         assert not Path("samples").exists()
 
 
@@ -154,16 +153,12 @@ def test_the_model_understands_sentences_as_people_type_them(every):
     assert right / len(SENTENCES[::every]) >= 0.85
 
 
-def test_shipped_names_come_after_paths(here, capsys):
-    assert find("quickstart") == SHIPPED["quickstart"]
+def test_the_shipped_file_is_documented_and_its_name_comes_after_paths(here, capsys):
+    assert sha256(find("quickstart")) in (ROOT / "docs" / "checkpoints.md").read_text()
+    assert find("quickstart").stat().st_size < 4.6e6
+    assert "license: mit" in find("quickstart").with_suffix(".md").read_text()
     assert main(["sample", "quikstart", "text=a person walks"]) == 1
     assert "Did you mean quickstart?" in capsys.readouterr().err
     (here / "quickstart").mkdir()
     (here / "quickstart" / "mine.safetensors").touch()
     assert find("quickstart").name == "mine.safetensors"
-
-
-def test_the_documented_file_is_in_the_package():
-    assert sha256(SHIPPED["quickstart"]) in (ROOT / "docs" / "checkpoints.md").read_text()
-    assert SHIPPED["quickstart"].stat().st_size < 4.6e6
-    assert "license: mit" in SHIPPED["quickstart"].with_suffix(".md").read_text()

@@ -118,7 +118,6 @@ def test_bad_requests_give_one_clear_line(model):
     cases: list[tuple[Any, dict[str, Any], str]] = [
         ("walks | | sits", {}, "part 2 is empty"),
         ("walks @fast", {}, "seconds of a part are a number"),
-        ("walks @-1", {}, "seconds of a part are a number"),
         ("walks @0.2 | sits", {}, "'walks': a part of 0.2 seconds is too short"),
         ("walks @9999", {}, "too long"),
         ("walks", {"after": "walk.npz", "loop": True}, r"^after=walk\.npz: a motion .* cannot have loop\."),
@@ -131,7 +130,6 @@ def test_bad_requests_give_one_clear_line(model):
         (" ", {}, "empty text"),
         ([], {}, "empty text"),  # is not an unconditioned motion
         (["walk", 3], {}, r"^text=3 is not a string\. Give a string"),
-        ("walks", {"spacing": "even"}, "spacing=even"),
     ]
     for text, options, message in cases:
         with one_line_error(message):
@@ -145,14 +143,13 @@ def bones(motion: flame_mdm.Motion) -> np.ndarray:
 
 def test_a_linear_decoder_is_solved_exactly_and_changes_least():
     """Two of six features decide on the position: both change by half, and smoothly in time."""
-    x, index = torch.zeros(1, 9, 6), torch.tensor([4])
+    x, free = torch.zeros(1, 9, 6), torch.ones(1, 9, 6, dtype=torch.bool)
 
     def to_joints(features: torch.Tensor) -> torch.Tensor:
         position = features[..., 0] + features[..., 1]
         return torch.stack([position, features[..., 2], features[..., 3]], -1)[..., None, :]
 
-    goal = Positions(index, torch.tensor([0]), torch.tensor([0]), torch.tensor([2.0]))
-    free = torch.ones_like(x, dtype=torch.bool)
+    goal = Positions(torch.tensor([4]), torch.tensor([0]), torch.tensor([0]), torch.tensor([2.0]))
     no_bones = torch.zeros(3, 0, dtype=torch.long)
     moved = reach(x, to_joints, goal, no_bones, free, smoothness=1.0)[0]
     assert moved[4, :2].tolist() == pytest.approx([1.0, 1.0], abs=1e-2)
@@ -182,6 +179,9 @@ def test_way_points_joints_and_poses_are_reached(model, tmp_path):
     np.testing.assert_allclose(motion.features[48, local], bow.features[20, local], atol=1e-5)
     arms = np.linalg.norm(motion.joints[:, 18:22] - motion.joints[:, 16:20], axis=-1)
     np.testing.assert_allclose(arms[30], np.median(arms, 0), rtol=0.05)
+    targets = {"root": [{"time": t, "position": [0.1 * t, 0.3 * t]} for t in (1, 2, 3, 4)]}
+    sequence = flame_mdm.generate(model, f"{TEXT} @2.4 | {TEXT} @2.4", targets=targets, num_inference_steps=10)[0]
+    assert errors(sequence, read_targets(model.representation, targets)).max() < 0.05
     # a pose at a position faces its heading
     entry = {"time": 1.0, "file": str(tmp_path / "bow.npz"), "frame": 5, "position": [0.2, 0.5], "heading": 90}
     pose = read_targets(model.representation, {"poses": [entry]}).positions.values.reshape(22, 3)
@@ -190,19 +190,11 @@ def test_way_points_joints_and_poses_are_reached(model, tmp_path):
     assert np.degrees(np.arctan2(-left[2], left[0])) == pytest.approx(90, abs=1e-3)
 
 
-def test_targets_of_a_sequence(model):
-    targets = {"root": [{"time": t, "position": [0.1 * t, 0.3 * t]} for t in (1, 2, 3, 4)]}
-    motion = flame_mdm.generate(model, f"{TEXT} @2.4 | {TEXT} @2.4", targets=targets, num_inference_steps=10)[0]
-    assert errors(motion, read_targets(model.representation, targets)).max() < 0.05
-
-
 def test_bad_targets_give_one_clear_line(model, tmp_path):
     for content, message in (
         ([], r"the file is \[\], not a mapping; see docs/targets.md"),
         ({"roots": []}, "unknown key: roots. Did you mean root, joints"),
-        ({"root": {"time": 1, "position": [0, 1]}}, "root is {.*"),
         ({"root": [{"time": "1", "position": [0, 1]}]}, 'root.0.time is "1", not a number'),
-        ({"root": [[0, 1]]}, r"root.0 is \[0, 1\], not a mapping"),
         ({"root": [{"time": 1, "position": [1]}]}, r"root.0.position is \[1\], not a longer list"),
         ({"root": [{"time": 1, "position": [0, 30]}]}, "30.0 m from the start in 1 seconds is impossible"),
         ({"root": [{"time": 9, "position": [0, 1]}]}, "9 seconds is after .* last frame is at 1.95 seconds"),
@@ -247,7 +239,10 @@ def test_targets_that_the_text_does_not_suggest_do_not_stretch_bones(model):
 CAPTIONS = ["A person walks forward.", "a person waves with the left hand", "someone jumps"]
 
 
-def test_a_vocabulary_holds_every_word_once_and_captions_only_if_they_may_be_shared():
+def test_a_vocabulary_holds_every_word_once_and_captions_only_if_they_may_be_shared(trained):
+    facts = read_checkpoint(trained)["facts"]
+    assert facts["vocabulary"] == sorted({word for caption in facts["captions"] for word in vocabulary.words(caption)})
+    assert "walks" in facts["vocabulary"]
     kept = vocabulary.vocabulary([*CAPTIONS, *CAPTIONS], share=False)
     assert kept == {"vocabulary": sorted(set(" ".join(CAPTIONS).lower().replace(".", "").split()))}
     assert vocabulary.vocabulary(CAPTIONS, share=True)["captions"] == sorted(CAPTIONS)
@@ -315,9 +310,3 @@ def test_sentences_of_several_actions_are_split_at_their_verbs():
         assert vocabulary.in_parts(text, Synthetic.verbs) == (parts or [text])
     assert vocabulary.in_parts("walks forward, turns left. Then waves", ()) == ["walks forward, turns left", "waves"]
     assert vocabulary.in_parts("walks, then turns in limp style.", ()) == ["walks in limp style", "turns in limp style"]
-
-
-def test_checkpoints_know_the_words_of_their_training_clips(trained):
-    facts = read_checkpoint(trained)["facts"]
-    assert facts["vocabulary"] == sorted({word for caption in facts["captions"] for word in vocabulary.words(caption)})
-    assert "walks" in facts["vocabulary"]

@@ -7,7 +7,6 @@ import io
 import json
 import os
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from copy import deepcopy
 from functools import reduce
 from pathlib import Path
@@ -107,12 +106,9 @@ def test_recipes(refused, bad):
 
 def test_real_processes(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    lines = ["train none_such", "sample ckpt=none.ckpt text=a", "convert a.bvh unt=2"]
-    with ThreadPoolExecutor(2) as pool:
-        ended = pool.map(lambda line: finish(spawn(["flame_mdm", *line.split()], PYTHONPATH=str(ROOT))), lines)
-    for line, (code, _, err) in zip(lines, ended, strict=True):
-        assert code in (1, 2), (line, err)
-        assert one_line(err), (line, err)
+    for line in ("sample ckpt=none.ckpt text=a", "convert a.bvh unt=2"):
+        code, _, err = finish(spawn(["flame_mdm", *line.split()], PYTHONPATH=str(ROOT)))
+        assert (code, one_line(err)) == (1, True), (line, err)
     assert not list(tmp_path.iterdir())
 
 
@@ -199,15 +195,12 @@ def test_damaged_motions(refused, bad):
 
 def test_strange_texts_are_legal(trained, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    texts = [
-        "walk " * 390,
-        "walk\x07b\x1b[31m c\x7f {a: [b 走る ü \u202e '; $(rm) `x` \\<script>alert(1)</script> & </style>",
-    ]
-    for number, text in enumerate(texts):
-        words = ["samples=1", "seconds=0.5", f"out=out{number}"]
-        assert main(["sample", f"ckpt={trained}", f"text={text}", *words]) == 0, text[:50]
-        assert "<script>alert(1)" not in (tmp_path / f"out{number}" / "player.html").read_text(encoding="utf-8")
-        with np.load(tmp_path / f"out{number}" / "motion_000.npz") as file:
+    strange = "walk\x07b\x1b[31m c\x7f {a: [b 走る ü \u202e '; $(rm) `x` \\<script>alert(1)</script> & </style>"
+    for text in ("walk " * 390, strange):
+        out = tmp_path / str(len(text))
+        assert main(["sample", f"ckpt={trained}", f"text={text}", "samples=1", "seconds=0.5", f"out={out}"]) == 0
+        assert "<script>alert(1)" not in (out / "player.html").read_text(encoding="utf-8")
+        with np.load(out / "motion_000.npz") as file:
             assert str(file["text"]) == text
 
 

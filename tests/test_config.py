@@ -14,6 +14,7 @@ from typing import ClassVar, Literal, get_type_hints
 import pytest
 import torch
 from support.fixtures import recipe
+from support.refusals import one_error
 
 import flame_mdm
 from flame_mdm import config
@@ -50,9 +51,7 @@ WRONG = {
     "+denoiser.heads=3": "unknown config key 'denoiser.heads'. Did you mean denoiser.num_heads?",
     "denoiser._target_=flame_mdm.denoisers.mdm.Encoder": "no such class or function",
     "denoiser.num_heads=true": "denoiser.num_heads=True: must be a whole number",
-    "trainer.gradient_clip_val=nan": "trainer.gradient_clip_val=nan: must be",
     "optimizer.lr=inf": "optimizer.lr=inf: must be a finite number",
-    "trainer.devices=[0,x]": "trainer.devices",
 }
 
 
@@ -65,13 +64,14 @@ def test_a_wrong_override_is_one_line_with_the_nearest_names():
 
 def test_what_lightning_checks_late_is_checked_before_the_data(capsys, tmp_path, monkeypatch):
     monkeypatch.setattr(os, "cpu_count", lambda: 3)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
     for word, reason in (
         *((f"trainer.{key}=0", "must be above 0") for key in sweeps.LATE),
         ("trainer.devices=99", f"this machine has 3 CPU cores, and {NO_GPU}. Give at most trainer.devices=3"),
     ):
         folders = [f"run.dir={tmp_path / 'run'}", f"data_root={tmp_path}"]
         assert main(["train", "quickstart", *folders, "trainer.accelerator=auto", word]) == 1
-        assert capsys.readouterr().err == f"error: {word}: {reason}\n"
+        assert one_error(capsys) == f"error: {word}: {reason}"
     assert list(tmp_path.iterdir()) == []
 
 
@@ -229,10 +229,7 @@ def test_wrong_words_are_one_line(capsys):
         (["--fast"], "unknown option --fast"),
     ):
         assert run(lambda _: pytest.fail("it ran"), Example, words) == 1
-        error = capsys.readouterr().err
-        assert error.startswith("error: ")
-        assert message in error
-        assert error.count("\n") == 1
+        assert message in one_error(capsys)
 
 
 def test_every_command_lists_its_keys_with_defaults_and_help(capsys):
@@ -261,28 +258,25 @@ def test_settings_with_a_data_set_compose_it(tmp_path):
     nodes = compose_data("synthetic", ["representation=smpl", "data.source.clips=5"], data_root=f"{tmp_path}/${{a}}")
     assert nodes["representation"]["_target_"].endswith("SMPL")
     assert (nodes["data"]["source"]["clips"], nodes["data"]["root"]) == (5, f"{tmp_path}/${{a}}")
-    settings = read_settings(EvaluateSettings, ["ckpt=x", "data=synthetic", "data.source.clips=5", "guidance_scale=2"])
+    settings = read_settings(EvaluateSettings, ["ckpt=x", "data=synthetic", "data.source.clips=5"])
     assert settings.nodes["data"]["source"]["clips"] == 5
     assert read_settings(InspectSettings, ["motion=synthetic"]).data == "synthetic"
-    for words, message in (
-        (["data=synthetic", "data.source.clip=5"], r"Did you mean data\.source\.clips"),
-        (["data.x=5"], "none is named"),
-        (["data=syntetic"], "no data is called 'syntetic'"),
+    for line, message in (
+        ("data=synthetic data.source.clip=5", r"Did you mean data\.source\.clips"),
+        ("data.x=5", "none is named"),
+        ("data=syntetic", "no data is called 'syntetic'"),
     ):
         with pytest.raises(UserError, match=message):
-            read_settings(EvaluateSettings, words)
+            read_settings(EvaluateSettings, line.split())
 
 
 REFUSED = """train quickstart trainer.max_step=1
-sample text=a
-sample quickstart text=a guidance_scale=x
 sample absent text=a
 sample quickstart text=a device=meta
 sample quickstart text=a after=absent.npz
 sample quickstart text=a body=x
 edit quickstart motion=walk.xyz text=a
 convert absent.npz x.glb
-convert Makefile x.npz
 inspect absent.npz
 evaluate absent extractor=none
 export absent out=x

@@ -13,6 +13,7 @@ from typing import cast
 import pytest
 import torch
 from support.fixtures import ROOT
+from support.refusals import one_error
 from support.runs import RUN, TWO, alarm, finish, free_port, reference, spawn
 from torchmetrics import MeanMetric
 
@@ -167,10 +168,7 @@ def test_what_is_wrong_is_told_before_anything_is_submitted(tmp_path, capsys, mo
     monkeypatch.chdir(tmp_path)
     for line, message in REFUSED.items():
         assert main(line.split()) == 1
-        error = capsys.readouterr().err
-        assert error.startswith("error: ")
-        assert message in error
-        assert error.count("\n") == 1
+        assert message in one_error(capsys)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -37,8 +37,7 @@ NOT_COMPOSED = {
 }
 """Commands of each page that are not composed: they name a part that the reader writes (mine, my_set), or leave a name
 open (...)."""
-TARGETS = {"setup", "test", "test-fast", "test-tools", "test-robustness", "lint", "bench", "docs"}
-TARGETS |= {"web", "blender", "help"}
+TARGETS = set(re.findall("^([a-z-]+):.*##", (ROOT / "Makefile").read_text(), re.MULTILINE))
 
 
 def broken_links(page: Path, text: str) -> list[str]:
@@ -163,7 +162,6 @@ def test_the_python_examples_of_a_page_run_and_print_what_they_say(page, trained
 
 
 def test_few_examples_do_not_run():
-    """A block that needs registered data, a GPU or the network has `<!-- not run: REASON -->` above it."""
     reasons = [reason for examples in EXAMPLES.values() for reason, _ in examples]
     assert len(reasons) >= 9
     assert list(filter(None, reasons)) == ["it needs clips, and trains for minutes"]

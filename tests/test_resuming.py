@@ -1,6 +1,7 @@
 """Resuming a run: damaged and foreign checkpoints, other data, bad losses, and one run per directory."""
 
 import copy
+import itertools
 import json
 import multiprocessing
 import shutil
@@ -13,6 +14,7 @@ from unittest.mock import Mock
 
 import pytest
 import torch
+from support.refusals import one_error
 from support.runs import TINY
 
 from flame_mdm.__main__ import main
@@ -60,12 +62,6 @@ def resume(run, tmp_path, data_root) -> Callable[..., int]:
         return main(["train", *words(folder, data_root), "trainer.max_steps=6"])
 
     return to_step_6
-
-
-def one_error(capsys: pytest.CaptureFixture[str]) -> str:
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("error: ")
-    return line
 
 
 @pytest.fixture
@@ -161,14 +157,14 @@ def test_a_store_of_other_options_is_refused_everywhere(tmp_path, trained, capsy
     capsys.readouterr()
     before = tree(root)
     message = f"error: {root / STORE}: prepared with clips=61, but the recipe has clips=120. Prepare it again"
-    for command, line in (
-        ("train", [*words(run, root), "trainer.max_steps=2"]),
-        ("prepare", prepared(root, 120)),
-        ("prepare", prepared(root, 120, "verify=true")),
-        ("browse", prepared(root, 120, f"out={tmp_path / 'page.html'}")),
-        ("evaluate", [f"ckpt={trained}", "extractor=none", "quick=true", f"data_root={root}"]),
+    for line in (
+        ["train", *words(run, root), "trainer.max_steps=2"],
+        ["prepare", *prepared(root, 120)],
+        ["prepare", *prepared(root, 120, "verify=true")],
+        ["browse", *prepared(root, 120, f"out={tmp_path / 'page.html'}")],
+        ["evaluate", f"ckpt={trained}", "extractor=none", "quick=true", f"data_root={root}"],
     ):
-        assert main([command, *line]) == 1
+        assert main(line) == 1
         assert one_error(capsys).startswith(message)
     assert tree(root) == before
     assert [path.name for path in tmp_path.iterdir()] == ["data"]
@@ -212,12 +208,12 @@ def test_a_damaged_checkpoint_gives_way_to_the_one_before(resume, tmp_path, caps
 
 def break_loss(monkeypatch: pytest.MonkeyPatch, step: int, change: Callable[[torch.Tensor], torch.Tensor]) -> None:
     """Changes the loss terms of a training step."""
-    original, count = GaussianDiffusion.loss, [0]
+    original, count = GaussianDiffusion.loss, itertools.count(1)
 
     def loss(self, *args, **kwargs):
-        count[0] += kwargs.get("t") is None  # not in validation
         terms = original(self, *args, **kwargs)
-        return {name: change(value) for name, value in terms.items()} if count[0] == step else terms
+        is_broken = kwargs.get("t") is None and next(count) == step  # validation gives the times
+        return {name: change(value) for name, value in terms.items()} if is_broken else terms
 
     monkeypatch.setattr(GaussianDiffusion, "loss", loss)
 

@@ -128,6 +128,13 @@ def one_line(err: str) -> bool:
     return len(lines) == 1 and lines[0].startswith("error: ") and len(lines[0]) > len("error: ") + 8
 
 
+def one_error(capture: pytest.CaptureFixture[str]) -> str:
+    """The error line that was printed, and nothing else with it."""
+    (line,) = capture.readouterr().err.splitlines()
+    assert line.startswith("error: ")
+    return line
+
+
 def carry_out(task: tuple) -> object:
     """Calls the first of these with the others; for processes of their own, which import no more than this module."""
     function, *arguments = task

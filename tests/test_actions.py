@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.sparse import csc_matrix
+from scipy.spatial.transform import Rotation
 from support.fixtures import golden, golden_case
 from support.runs import TINY
 from support.stores import VIDEOS, write_humanact12, write_uestc, written
@@ -38,7 +39,6 @@ from flame_mdm.data.store import write_store
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.data.uestc import TRAIN_SUBJECTS, UESTC, front_view
 from flame_mdm.errors import UserError
-from flame_mdm.representations import rotation
 from flame_mdm.representations.rot6d import Rot6D
 from flame_mdm.representations.skeleton import SMPL24
 from flame_mdm.runs import read_history
@@ -68,10 +68,10 @@ CONTENT = {
 
 
 def test_arrays_and_plain_values_are_read(tmp_path: Path):
-    for protocol, core in product(range(6), ("core", "_core")):
+    for protocol, core in product(range(6), (b"core", b"_core")):
         data = pickle.dumps(CONTENT, protocol)
         if protocol < 4:  # where names are lines, and not counted
-            data = data.replace(b"numpy._core.", f"numpy.{core}.".encode())
+            data = data.replace(b"numpy._core.", b"numpy.%s." % core)
         (tmp_path / "x.pkl").write_bytes(data)
         content = restricted_pickle.read(tmp_path / "x.pkl")
         assert all(content[key] == CONTENT[key] for key in ("number", "raw", "y"))
@@ -274,28 +274,26 @@ def test_front_view_is_actors_camera():
         picture = (scale * (points[:, :2] + [x, y]) + 1) / 2 * 540
         places.append([x, y, 500 * np.linalg.norm(np.ptp(points[:, :2], 0)) / np.linalg.norm(np.ptp(picture, 0))])
     places = np.array(places) - places[0]
-    for view, side in ((5, 2), (5, 1)):
-        video = uestc.Video(0, "x", 0, view, 1, side)
-        motion = front_view(pose, joints[:, uestc.ROOT], camera, video)
-        turn = rotation.axis_angle_to_matrix(torch.tensor([0.0, -view * np.pi / 4 * (side != 1), 0.0]).double()).numpy()
+    for side, angle in ((2, -5 * np.pi / 4), (1, 0.0)):
+        motion = front_view(pose, joints[:, uestc.ROOT], camera, uestc.Video(0, "x", 0, 5, 1, side))
+        turn = Rotation.from_rotvec([0.0, angle, 0.0]).as_matrix()
         np.testing.assert_allclose(motion[:, :3], (joints[:, uestc.ROOT] + places) @ turn.T, atol=1e-5)
-        turned = rotation.axis_angle_to_matrix(torch.from_numpy(motion[:, 3:6]).double()).numpy()
-        before = rotation.axis_angle_to_matrix(torch.from_numpy(pose[:, :3])).numpy()
+        turned, before = (Rotation.from_rotvec(vectors).as_matrix() for vectors in (motion[:, 3:6], pose[:, :3]))
         np.testing.assert_allclose(turned, turn @ before, atol=1e-5)
         np.testing.assert_allclose(motion[:, 6:], pose[:, 3:], atol=1e-6)
 
 
 def test_damaged_lists_are_named(tmp_path: Path):
     folder = write_uestc(tmp_path / "uestc")
-    for file, text, message in (
-        ("names.txt", "a0_p001.avi\n", r"names\.txt, line 1: 'a0_p001\.avi' is not the name of a video"),
-        ("names.txt", "a40_d0_p001_c1_color.avi\n", r"names\.txt, line 1: .* one of the 40 actions"),
-        ("names.txt", "\n".join(VIDEOS[:3]), r"num_frames_min\.txt \d+ and vibe_cache_refined\.pkl 60 clips"),
+    for text, message in (
+        ("a0_p001.avi\n", r"names\.txt, line 1: 'a0_p001\.avi' is not the name of a video"),
+        ("a40_d0_p001_c1_color.avi\n", r"names\.txt, line 1: .* one of the 40 actions"),
+        ("\n".join(VIDEOS[:3]), r"num_frames_min\.txt \d+ and vibe_cache_refined\.pkl 60 clips"),
     ):
-        (folder / "info" / file).write_text(text)
+        (folder / "info/names.txt").write_text(text)
         with pytest.raises(UserError, match=message):
             list(UESTC(str(folder)).clips(20.0))
-    (folder / "info" / "names.txt").unlink()
+    (folder / "info/names.txt").unlink()
     with pytest.raises(FileNotFoundError, match=r"info/names\.txt: not found; it is published with the poses"):
         list(UESTC(str(folder)).clips(20.0))
 

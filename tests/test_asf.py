@@ -67,12 +67,9 @@ def test_joints_in_closed_form_and_missing_skeletons_and_rates(files):
     assert positions[0].tolist() == [[10, 20, 30], [10, 20, 30], [12, 20, 30], [12, 23, 30]]
     # the arm's x axis is the world's y: by 90 degrees about it, x becomes -z; then the root turns x to y
     np.testing.assert_allclose(positions[1], [[10, 20, 30], [10, 20, 30], [10, 20, 28], [7, 20, 28]], atol=1e-12)
-
-    def turn(axis: str, degrees: float) -> np.ndarray:
-        return Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
-
-    root, axes = turn("z", 30) @ turn("y", 20) @ turn("x", 10), turn("z", 90)
-    arm = root @ axes @ turn("z", 50) @ turn("x", 40) @ axes.T
+    turns = (("ZYX", [30, 20, 10]), ("Z", 90), ("ZX", [50, 40]))
+    root, axes, turned = (Rotation.from_euler(order, angles, degrees=True).as_matrix() for order, angles in turns)
+    arm = root @ axes @ turned @ axes.T
     np.testing.assert_allclose(positions[2, 2:], [arm @ [2, 0, 0], arm @ [2, 3, 0]], atol=1e-12)
     (files / "07.asf").rename(files / "someone.asf")  # the only skeleton of the folder
     np.testing.assert_array_equal(asf.read(files / "07_01.amc", 120).frames, motion.frames)

@@ -25,13 +25,9 @@ WAVE = {"sentence": "a person waves with both hands", "seconds": 3, "seed": 2, "
 
 
 @pytest.fixture(scope="module")
-def tool() -> Any:
-    return script("tools/blender.py")
-
-
-@pytest.fixture(scope="module")
-def package(tool: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
     blender()
+    tool = script("tools/blender.py")
     path = tmp_path_factory.mktemp("blender") / "flame_mdm.zip"
     tool.build("quickstart", path, tool.this_machine())
     return path
@@ -91,8 +87,8 @@ def test_what_cannot_be_generated_and_damage_are_refused_in_one_line(package: Pa
         assert "\n" not in error
 
 
-def test_an_unknown_platform_is_refused(tool: Any, tmp_path: Path) -> None:
+def test_an_unknown_platform_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"PLATFORM=linux-x86: unknown\. Did you mean linux-x64"):
-        tool.build("quickstart", tmp_path / "x.zip", "linux-x86")
+        script("tools/blender.py").build("quickstart", tmp_path / "x.zip", "linux-x86")
     assert list(tmp_path.iterdir()) == []
     assert any("thighl" in names and "spine006" in names for names in known_skeletons())

@@ -56,14 +56,12 @@ def test_joints_of_the_body_are_those_of_the_motion_and_soles_are_on_the_floor()
         assert np.linalg.norm(end - drawn.starts[0, joint]) < 1e-4, SMPL22.joints[joint]
 
 
-def test_a_twisted_wrist_turns_the_forearm_by_degrees():
+def test_a_twisted_wrist_turns_the_forearm_by_degrees_toes_bend_and_the_head_is_level():
     drawn = fit_body(posed(left_wrist=(80, 0, 0)))
     turned = degrees(drawn.turns[0] @ fit_body(posed()).turns[0].mT)
     helper = next(bone for bone, joint in enumerate(ANCHORS[22:], 22) if SMPL22.joints[joint] == "left_elbow")
     assert turned[[JOINT["left_elbow"], helper, JOINT["left_wrist"]]] == pytest.approx([0, 44, 80], abs=1.5)
-
-
-def test_toes_bend_where_the_heel_rises_and_the_head_is_level_also_after_a_long_bow():
+    # toes bend where the heel rises, and the head is level, also after a long bow
     raised = posed(left_ankle=(40, 0, 0), left_knee=(10, 0, 0), neck=(25, 0, 0))
     raised.joints[:, :, 1] -= raised.joints[..., 10, 1].min()  # the toes stand on the floor
     drawn = fit_body(Motion(np.concatenate([posed(3, neck=(25, 0, 0)).joints, raised.joints]), 20))

@@ -38,7 +38,6 @@ def matrix(axis: str, degrees: float) -> np.ndarray:
 
 @pytest.fixture
 def parse(tmp_path) -> Callable[[str | bytes], bvh.Bvh]:
-    """Reads the content of a file, arm.bvh."""
     path = tmp_path / "arm.bvh"
 
     def parse(content: str | bytes) -> bvh.Bvh:

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import ArrayLike
 from support.analytic import euler_to_matrix
 from support.glb import Glb
-from support.motions import degrees, largest_step, posed, synthetic
+from support.motions import degrees, largest_step, posed, sway, synthetic
 from torch import Tensor
 
 from flame_mdm.data import amass
@@ -29,7 +29,6 @@ FPS = 20.0
 
 
 def walking(heading: ArrayLike, root: np.ndarray) -> Poses:
-    """Legs swing, knees and elbows bend, the body leans."""
     swing = np.degrees(0.5 * np.sin(2 * np.pi * np.arange(len(root)) / FPS))
     none, bend = np.zeros_like(swing), np.maximum(swing, 0)
     turns: dict[str, Any] = {"pelvis": np.stack([none + 6, none, 0.1 * swing], -1), "left_shoulder": (0, 0, -69)}
@@ -48,13 +47,11 @@ def two_circles() -> Poses:
 
 @pytest.fixture(scope="module")
 def circle() -> Motion:
-    """The motion of a body, without its rotations."""
     return Motion(two_circles().joints().float().numpy(), FPS, text="a person walks </b> é", id="circle")
 
 
 @pytest.fixture(scope="module")
 def clips() -> list[Tensor]:
-    """Joints (F, 22, 3) of some actions of the synthetic set."""
     actions = ("walk", "kick", "wave", "jump", "punch", "raise")
     return [torch.from_numpy(synthetic(action).joints).double() for action in actions]
 
@@ -226,8 +223,8 @@ def test_glb_holds_the_motion_and_a_body_on_its_joints(tmp_path, circle):
 
 
 def test_what_does_not_fit_a_file_is_refused(tmp_path, circle):
-    kit = Motion(np.random.default_rng(0).normal(size=(5, len(KIT21), 3)), 12.5, KIT21)
     options: dict[str, Any]
+    kit = sway(5, 12.5, KIT21)
     for motion, name, options, message in (
         (circle, "a.glb", {"rest_pose": True}, "rest_pose only for .bvh"),
         (circle, "a.bvh", {"rig": "miximo"}, r"rig=miximo: unknown\. Did you mean mixamo\? Use one of mixamo, unreal"),

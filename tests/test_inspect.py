@@ -1,6 +1,5 @@
 """Faults of motions, the command that shows them, and perturbations of real motions against closed forms."""
 
-import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -22,7 +21,7 @@ Change = Callable[[np.ndarray], None]
 
 def body() -> np.ndarray:
     """Joints (80, 22, 3) of a body that stands on the floor, arms down, and swings its arms."""
-    swing = np.degrees(0.5 * np.sin(2 * math.pi * np.arange(FRAMES) / FPS))
+    swing = np.degrees(0.5 * np.sin(2 * np.pi * np.arange(FRAMES) / FPS))
     arms = {side: np.stack([0 * swing, swing, 0 * swing + down], 1) for side, down in (("left", -90), ("right", 90))}
     joints = posed(FRAMES, left_shoulder=arms["left"], right_shoulder=arms["right"]).joints.astype(float)
     return joints - [0, joints[..., 1].min(), 0]
@@ -107,7 +106,7 @@ def test_nothing_to_inspect_is_an_error(tmp_path, capsys):
         ([str(tmp_path)], "no motion files (.npz, "),
         ([str(tmp_path / "absent.npz")], "absent.npz: no such file"),
         (["bandia"], "bandia"),
-        ([str(tmp_path / "absent.npz"), "clips=0"], "clips=0: must be at least 1"),
+        ([str(tmp_path), "clips=0"], "clips=0: must be at least 1"),
     ):
         assert main(["inspect", *words]) in (1, 2)
         assert message in capsys.readouterr().err
@@ -139,7 +138,7 @@ def test_jitter_has_the_given_deviation_and_wobble_is_a_slow_sine(walk):
     assert np.linalg.norm(offset[:20], axis=-1).max(0).min() > 0.0195
 
 
-def test_skating_multiplies_the_speed_of_the_root_and_resizing_scales_all_bones(walk):
+def test_skating_resizing_wrists_drawn_in_and_pops(walk):
     changed = p.skate(walk, 1.5)
     np.testing.assert_allclose(changed - changed[:, :1], walk - walk[:, :1], atol=1e-12)
     steps = np.diff(changed[:, 0], axis=0)
@@ -151,8 +150,7 @@ def test_skating_multiplies_the_speed_of_the_root_and_resizing_scales_all_bones(
     np.testing.assert_allclose(changed[:, 0, [0, 2]], walk[:, 0, [0, 2]])
     np.testing.assert_allclose(changed[..., 1], 1.1 * walk[..., 1])
 
-
-def test_wrists_are_drawn_into_the_trunk_and_a_pop_displaces_one_frame(walk):
+    # wrists are drawn into the trunk, and a pop displaces one frame
     changed = p.draw_in(walk, 10) - walk
     sizes = np.linalg.norm(changed[:, [18, 19, 20, 21]], axis=-1)
     np.testing.assert_allclose(sizes, [[0.05, 0.05, 0.1, 0.1]] * len(walk))

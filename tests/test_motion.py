@@ -22,8 +22,6 @@ from flame_mdm.sampling.editing import edit
 from flame_mdm.sampling.reading import read_motion
 from flame_mdm.task import MotionGeneration
 
-KINDS = ["sample.npz", "amass.npz", "joints.npz", "walk.bvh", "walk.json", "walk.npy"]
-
 
 @pytest.fixture(scope="module")
 def walk() -> Motion:
@@ -50,7 +48,7 @@ def model() -> MotionGeneration:
     return untrained(TINY, max_frames=196)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["sample.npz", "amass.npz", "joints.npz", "walk.bvh", "walk.json", "walk.npy"])
 def test_every_kind_is_converted_edited_and_own_data(folder: Path, walk: Motion, model, tmp_path: Path, kind: str):
     tolerance = 0.25 if kind == "amass.npz" else 0.02  # AMASS files have the bones of SMPL's body
     rate = 30 if kind.endswith(".npy") else None

@@ -32,7 +32,6 @@ def kick() -> Motion:
 
 
 def joints_of(file: Glb, character: characters.Character) -> dict[str, np.ndarray]:
-    """Positions (F, 3) of SMPL's joints in a written character."""
     worlds = file.worlds()
     return {joint: worlds[:, character.file.nodes[number], :3, 3] for joint, number in character.map.items()}
 
@@ -155,7 +154,6 @@ def test_names_of_joints_are_read_from_a_file(kick: Motion, tmp_path: Path, caps
 
 
 def below_another(document: dict[str, Any], **fields: Any) -> None:
-    """Puts all nodes below one with these fields."""
     document["nodes"].append({"children": document["scenes"][0].pop("nodes"), **fields})
     document["scenes"][0]["nodes"] = [len(document["nodes"]) - 1]
 

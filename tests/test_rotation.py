@@ -21,7 +21,6 @@ def same(actual: Tensor, expected: Tensor, atol: float) -> None:
 
 
 def same_rotation(actual: Tensor, expected: Tensor, atol: float) -> None:
-    """Quaternions up to their sign."""
     same(actual * (actual * expected).sum(-1, keepdim=True).sign(), expected, atol)
 
 
@@ -100,7 +99,7 @@ def test_round_trips(axis_angle: Tensor):
         same(rotation.quaternion_to_axis_angle(rotation.axis_angle_to_quaternion(axis_angle)), axis_angle, 1e-12)
 
 
-def test_between_opposite_directions():
+def test_opposite_directions_and_small_angles_have_finite_and_right_gradients():
     directions = ([1.0, 0, 0], [0, -1.0, 0], [0, 0, 1.0], [0.6, 0.0, -0.8])
     for direction, tilt in itertools.product(directions, (0.0, 1e-12, 1e-9, 1e-7, 1e-4)):
         start = torch.tensor(direction, dtype=torch.float64, requires_grad=True)
@@ -111,8 +110,6 @@ def test_between_opposite_directions():
         assert start.grad is not None
         assert start.grad.isfinite().all()
 
-
-def test_gradients_are_finite_and_right():
     def through_everything(axis_angle: Tensor) -> Tensor:
         return rotation.matrix_to_rot6d(rotation.axis_angle_to_matrix(axis_angle), "columns")
 

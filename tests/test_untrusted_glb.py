@@ -62,7 +62,6 @@ node = partial(item, "nodes")
 
 
 def bind(**values: Any) -> Change:
-    """Changes the accessor of the inverse bind matrices."""
     return lambda document: document["accessors"][document["skins"][0]["inverseBindMatrices"]].update(values)
 
 
@@ -174,7 +173,6 @@ def mutated(value: Any, draw: random.Random) -> Any:
 
 @pytest.mark.robustness
 def test_mutated_characters_are_refused_or_written(heroes: list[Path], tmp_path: Path):
-    """200 mutations: changes in the document, in its bytes and in the binary part."""
     draw, surprises, refused = random.Random(0), [], 0
     shutil.copy(heroes[1].with_suffix(".yaml"), tmp_path)
     for number in range(200):

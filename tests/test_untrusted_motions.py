@@ -121,7 +121,6 @@ def refuses(says: str, call: Callable[..., object], *arguments: Any, **options: 
 
 
 def of_folder(folder: Path) -> None:
-    """Reads a folder of motions, as `prepare` does."""
     list(Folder(str(folder)).clips(20.0))
 
 

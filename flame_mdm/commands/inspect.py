@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
@@ -41,17 +41,18 @@ class InspectSettings(BodySettings, FileSettings, DataSettings):
         name = self.motion
         if not (Path(name).suffix or Path(name).exists() or "/" in name):  # not a file: a data set
             object.__setattr__(self, "data", name)
+        elif self.data is None:
+            existing("motion", name)
         super().__post_init__()
 
 
 def main(settings: InspectSettings) -> None:
-    files = [] if settings.data is not None else _files(settings.motion)
     from flame_mdm.formats.faults import LIMITS, find_faults
     from flame_mdm.visualize import write_player
     from flame_mdm.visualize.body import load_body
 
     body = load_body(settings.body)
-    name, count, motions = _read(settings, files) if files else _clips(settings)
+    name, count, motions = _read(settings) if settings.data is None else _clips(settings)
     worst, kinds, faulty = [], Counter(), 0
     for motion in ProgressBar(motions, "inspecting", count, unit=" motions", disable=None if count > 1 else True):
         faults = find_faults(motion)
@@ -72,16 +73,12 @@ def main(settings: InspectSettings) -> None:
         raise SystemExit(3)
 
 
-def _files(name: str) -> list[Path]:
-    existing("motion", name)
-    return motion_files(Path(name)) if Path(name).is_dir() else [Path(name)]
-
-
-def _read(settings: InspectSettings, files: Sequence[Path]) -> tuple[str, int, Iterator[Motion]]:
+def _read(settings: InspectSettings) -> tuple[str, int, Iterator[Motion]]:
     from flame_mdm.formats.layouts import find_skeleton
     from flame_mdm.formats.readers import read
 
     path = Path(settings.motion)
+    files = motion_files(path) if path.is_dir() else [path]
 
     def motion(file: Path) -> Motion:
         content = read(file, settings.fps, settings.unit, fields=find_skeleton(file, settings.up))

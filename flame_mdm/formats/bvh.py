@@ -70,8 +70,7 @@ class Bvh:
     def resample(self, fps: float) -> tuple[np.ndarray, np.ndarray]:
         """Returns rotations (F', J, 3, 3) and translations (F', J, 3) at times 0, 1/fps, ... up to the last frame.
 
-        Rotations are interpolated on the sphere (slerp) and translations linearly. Unlike with interpolated joint
-        positions, bones whose translation does not change keep their exact length.
+        Rotations are interpolated on the sphere (slerp), so that bones keep their length, and translations linearly.
         """
         before, after, share = frame_pairs(len(self.frames), self.fps, fps, len(self.joints), slack=0)
         translations = self.translations()

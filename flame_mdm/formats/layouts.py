@@ -143,14 +143,11 @@ def find_layout(names: Sequence[str], fields: Mapping[str, Any]) -> Layout:
     candidates = {"the map": Layout(map=fields["map"])} if "map" in fields else LAYOUTS | _TOELESS
     name, nearest = min(candidates.items(), key=lambda item: len(item[1].used - set(names)))
     if missing := sorted(nearest.used - set(names)):
-        lacking = ", ".join(missing)[:500]
+        lacking, own = ", ".join(missing)[:500], ", ".join(names)[:1000]
         which = f"unknown skeleton. {name} is the nearest known one; missing: {lacking}"
         if "map" in fields:
             which = f"the map in skeleton.yaml uses joints that the file lacks: {lacking}"
-        raise UserError(
-            f"{which}. Map the joints of SMPL in skeleton.yaml (docs/own-data.md) to those of the file: "
-            f"{', '.join(names)[:1000]}"
-        )
+        raise UserError(f"{which}. Map SMPL's joints in skeleton.yaml (docs/own-data.md) to those of the file: {own}")
     return nearest.model_copy(update=dict(fields))
 
 

@@ -302,11 +302,9 @@ def _skin(binary: Binary, body: FittedBody, rig: Rig) -> dict[str, Any]:
 
 
 def _write_json(motion: Motion, path: Path) -> str:
-    content: dict[str, Any] = {
-        **{"id": motion.id, "caption": motion.text, "fps": motion.fps, "unit": "metre", "up": "y"},
-        **{"names": motion.skeleton.joints, "parents": motion.skeleton.parents},
-        "joints": np.round(motion.joints.astype(float), 5).tolist(),
-    }
+    content: dict[str, Any] = {"id": motion.id, "caption": motion.text, "fps": motion.fps, "unit": "metre", "up": "y"}
+    content |= {"names": motion.skeleton.joints, "parents": motion.skeleton.parents}
+    content["joints"] = np.round(motion.joints.astype(float), 5).tolist()
     write_text(path, json.dumps(content, separators=(",", ":"), ensure_ascii=False))
     return f"{len(motion.skeleton)} joints in meters, y up"
 

@@ -69,10 +69,7 @@ class Rig:
         return local
 
     def turned(self, body: np.ndarray) -> np.ndarray:
-        """Returns rotations (F, J, 3, 3) in the world, while SMPL's joints have the rotations `body` (F, 22, 3, 3).
-
-        Joints with a counterpart follow it; the others keep their angle to their parent.
-        """
+        """Returns rotations (F, J, 3, 3) in the world that follow SMPL's, `body` (F, 22, 3, 3), or the parent's."""
         rest, turned = self.rest(), np.tile(self.turns, (len(body), 1, 1, 1))
         for joint, (parent, source) in enumerate(zip(self.parents, self.sources, strict=True)):
             if source >= 0:
@@ -194,10 +191,7 @@ def rest_pose(
 
 
 def fitted(character: RestPose, offsets: np.ndarray) -> Rig:
-    """Returns the skeleton with its neutral rotations: limbs have the directions of those of a body.
-
-    `offsets` (22, 3) are the positions of the body's joints relative to their parents in the rest pose.
-    """
+    """Returns the skeleton with its neutral rotations: limbs point as a body's with `offsets` (22, 3) at rest."""
     rig, turns = character.rig, np.tile(np.eye(3), (len(SMPL22), 1, 1))
     for side in SIDES:
         for (start, middle, end), bend in ((("hip", "knee", "ankle"), -1), (("shoulder", "elbow", "wrist"), 1)):

@@ -122,7 +122,7 @@ class HumanML(Representation):
         return torch.cat([root[..., None, :], turned + ground[..., None, :]], -2) / self.units_per_metre
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
-        """Of the lower body, including the root, equals MDM's `HML_LOWER_BODY_MASK`."""
+        """Equals MDM's `HML_LOWER_BODY_MASK` for the lower body, including the root."""
         part = self.joint_mask(joints)
         feet = part[list(self.skeleton.feet)]
         others = [part[1:].repeat_interleave(size) for size in (3, 6)]
@@ -160,7 +160,7 @@ class HumanML(Representation):
     def _facing(self, joints: Tensor, hips: float = 1.0) -> Tensor:
         """Returns x and z (N, 2) of the direction hips and shoulders face; shorter if the body lies on its side.
 
-        It is the cross product of the vertical and the direction to the right, in which `hips` is the hips' factor.
+        It is the cross product of the vertical and the direction to the right; `hips` is the weight of the hips.
         """
         right_hip, left_hip, right_shoulder, left_shoulder = joints[:, list(self.skeleton.facing)].unbind(1)
         right = F.normalize(hips * (right_hip - left_hip) + (right_shoulder - left_shoulder), dim=-1)

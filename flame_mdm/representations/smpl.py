@@ -18,8 +18,8 @@ ADULT = (
     *((0.12, 0.045, -0.02), (-0.12, 0.045, -0.02), (0.26, -0.015, -0.025), (-0.26, -0.015, -0.025)),
     *((0.267, 0.01, 0.0), (-0.267, 0.01, 0.0), (0.085, -0.01, -0.015), (-0.085, -0.01, -0.015)),
 )
-"""Position of each of SMPL's 24 joints relative to its parent in the rest pose (arms out, facing +z, y up), meters: in
-place of the licensed model files, with the bone lengths of HumanML3D's reference clip, rounded and symmetric."""
+"""Position of each of SMPL's 24 joints relative to its parent in the rest pose (arms out, facing +z, y up), meters.
+It replaces the licensed model files: bone lengths of HumanML3D's reference clip, rounded and symmetric."""
 
 
 def read_pose(motion: Tensor) -> tuple[Tensor, Tensor]:
@@ -29,10 +29,7 @@ def read_pose(motion: Tensor) -> tuple[Tensor, Tensor]:
     code, so that the hands are its left_index1 and left_index2. Raises `UserError` if a number is not finite.
     """
     if motion.ndim != 2 or not len(motion) or motion.shape[1] < 75 or motion.shape[1] % 3:
-        shape = tuple(motion.shape)
-        raise UserError(
-            f"motion: shape {shape}, expected (frames, 3 + 3 x joints): translation, 24 or more axis-angles"
-        )
+        raise UserError(f"motion: shape {tuple(motion.shape)}, expected (frames, 3 + 3 x joints), 24 joints or more")
     check_finite(motion)
     motion = motion.double()
     return motion[:, :3], rotation.axis_angle_to_matrix(motion[:, 3:75].unflatten(1, (24, 3)))

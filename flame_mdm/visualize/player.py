@@ -37,8 +37,7 @@ def player_page(
     millimeters, or to 1/65534 of the span of a motion.
 
     Args:
-        motions: of any skeletons, lengths and frame rates.
-        title: heading of the page.
+        motions: of any skeletons, lengths and frame rates; `title` is the heading of the page.
         about: HTML of a collapsible section below the heading; its texts must be escaped.
         columns: motions per row; 0 = as many as fit into the window.
         groups: for each motion, a name to filter by, such as its split; "" = none.

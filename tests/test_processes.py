@@ -19,7 +19,7 @@ from support.analytic import (
     real,
     spaced,
 )
-from support.fixtures import ROOT, golden, golden_case, meta
+from support.fixtures import ROOT, golden, golden_case, golden_cases, meta
 from torch import Tensor
 
 from flame_mdm.batch import Condition, length_mask
@@ -97,9 +97,8 @@ def pointwise_output(x_t: Tensor, learned: bool) -> Tensor:
     return linear_denoiser(A, b, float(GAUSSIAN["lin4/g"]))(x_t, t, real(x_t), NO_CONDITION)
 
 
-@pytest.mark.golden
 @pytest.mark.parametrize("dtype", DTYPES, ids=["f32", "f64"])
-@pytest.mark.parametrize("case", [pytest.param(case, id=f"gaussian-{case}") for case in POINTWISE])
+@golden_cases("gaussian", POINTWISE)
 def test_reverse_step(case, dtype):
     process, t = POINTWISE[case], torch.tensor(GAUSSIAN["pw/t"])
     x_t = motions(GAUSSIAN["f64/pw/x_t" if dtype == torch.float64 else "pw/x_t"], dtype)
@@ -118,15 +117,14 @@ def test_reverse_step(case, dtype):
     assert_golden(GAUSSIAN, f"pw/{case}/mean", process.schedule.posterior_mean(x0_hat, x_t, t))
 
 
-@pytest.mark.golden
 @pytest.mark.parametrize("dtype", DTYPES, ids=["f32", "f64"])
-@pytest.mark.parametrize("case", ["gaussian-guided_bits", "gaussian-flame_nats"])
+@golden_cases("gaussian", ["guided_bits", "flame_nats"])
 def test_variational_bound(case, dtype):
     process = GaussianDiffusion(T, prediction="epsilon", variance="learned_range")
     x, noise = motions(GAUSSIAN["pw/x0"], dtype), motions(GAUSSIAN["pw/noise"], dtype)
     mask, t = real(x), torch.tensor(GAUSSIAN["pw/t"]).float()
     x_t = process.corrupt(x, noise, t)
-    key, arrays = f"pw/vb_{case.removeprefix('gaussian-')}", GAUSSIAN
+    key, arrays = f"pw/vb_{case}", GAUSSIAN
     if "guided" in case:  # guided-diffusion has bits, and at step 0 the likelihood of a pixel: not for motion
         output, later = pointwise_output(x_t, learned=True), t > 0
         bound = masked_mean(process.vlb(output, x, x_t, t), mask)[later] / math.log(2)
@@ -261,8 +259,7 @@ def test_flow_path_target_and_loss(dtype):
 GRIDS = sorted(key.removesuffix("_row") for key in MFM if key.startswith("times/") and key.endswith("_row"))
 
 
-@pytest.mark.golden
-@pytest.mark.parametrize("case", [pytest.param(key, id=f"mfm-{key}") for key in GRIDS])
+@golden_cases("mfm", GRIDS)
 def test_flow_times_and_rows(case):
     name, count = case.removeprefix("times/").split("_N")
     process = FlowMatching(quantize_time=True, odeint_grid=name == "odeint")

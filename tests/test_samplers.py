@@ -23,7 +23,7 @@ from support.analytic import (
     sample,
     spaced,
 )
-from support.fixtures import golden, golden_case, meta, weights
+from support.fixtures import golden, golden_case, golden_cases, meta, weights
 from torch import Tensor
 from torchdiffeq import odeint
 
@@ -45,17 +45,12 @@ CALLS = {"euler": 1, "midpoint": 2, "heun": 2, "rk4": 4}
 KINDS = {"ddpm": "ancestral", "ddim": "ddim"}
 
 
-def cases(stem: str, names: Any) -> pytest.MarkDecorator:
-    return pytest.mark.parametrize("case", [pytest.param(name, id=f"{stem}-{name}") for name in names])
-
-
 def steps_of(section: str | list[int], total: int) -> list[int]:
     return spaced(total, section if isinstance(section, str) else ",".join(map(str, section)))
 
 
-@pytest.mark.golden
 @both_precisions
-@cases("gaussian", OPTIONS["mdm_loops"])
+@golden_cases("gaussian", OPTIONS["mdm_loops"])
 def test_mdm_loop(case, dtype):
     total, section, kind, options = OPTIONS["mdm_loops"][case]
     supported = {"eta", "inpaint", "skip_timesteps", "skip", "init_image", "init", "const_noise", "const"}
@@ -88,9 +83,8 @@ def flame_edit(known: Tensor, joints: list[int], keep_translation: bool) -> Edit
     return Edit(known, keep, mode="x_t", blend="before")
 
 
-@pytest.mark.golden
 @both_precisions
-@cases("gaussian", OPTIONS["flame_loops"])
+@golden_cases("gaussian", OPTIONS["flame_loops"])
 def test_flame_loop(case, dtype):
     options = OPTIONS["flame_loops"][case]
     process = GaussianDiffusion(options["T"], prediction="epsilon", variance="learned_range", clip_x0=True)
@@ -107,9 +101,8 @@ def test_flame_loop(case, dtype):
 DDIM_STEPS = sorted(key.removeprefix("step/") for key in GAUSSIAN if key.startswith("step/ddim_eta"))
 
 
-@pytest.mark.golden
 @both_precisions
-@cases("gaussian", ["p_sample", *DDIM_STEPS])
+@golden_cases("gaussian", ["p_sample", *DDIM_STEPS])
 def test_one_step(case, dtype):
     process, t = GaussianDiffusion(OPTIONS["T"]), torch.tensor(GAUSSIAN["pw/t"])
     schedule = process.schedule
@@ -160,9 +153,12 @@ def stages(times: np.ndarray) -> np.ndarray:
     return (rows - begins) / (rows[:, -1:] - begins)
 
 
-@pytest.mark.golden
-@cases("mfm", [name for name, run in FLOW_RUNS.items() if run["on"] == "field"])
+@golden_cases("mfm", FLOW_RUNS)
 def test_flow_run(case):
+    """On the fixture's velocity field, whose times are compared too, or with its network."""
+    if FLOW_RUNS[case]["on"] != "field":
+        replay_flow_run(case, *released_flow(), quantize_time=True)
+        return
     calls = []
 
     def field(x_t, t, mask, cond):
@@ -197,12 +193,6 @@ def released_flow() -> tuple[Denoise, Condition]:
     return built(released), Condition(pooled, tokens, None, Condition(torch.zeros_like(pooled[:1]), tokens[:1], None))
 
 
-@pytest.mark.golden
-@cases("mfm", [name for name, run in FLOW_RUNS.items() if run["on"] != "field"])
-def test_flow_run_of_the_network(case):
-    replay_flow_run(case, *released_flow(), quantize_time=True)
-
-
 @golden_case("mfm")
 def test_flow_loss_of_the_network(stem):
     denoise, cond = released_flow()
@@ -228,8 +218,7 @@ def released_flame() -> tuple[Denoise, Condition]:
     return denoise, Condition(pooled[:-1], tokens[:-1], seen[:-1], null)
 
 
-@pytest.mark.golden
-@cases("flame_text2motion", [*FLAME_LOOPS, "edit"])
+@golden_cases("flame_text2motion", [*FLAME_LOOPS, "edit"])
 def test_flame_loop_of_the_network(case):
     config = meta(FLAME)["config"]
     total, section, kind = [*config["edit_T"], "ddpm"] if case == "edit" else FLAME_LOOPS[case]
@@ -266,8 +255,7 @@ def test_flame_loss_of_the_network(stem):
 @pytest.mark.parametrize("variance", ["fixed_small", "fixed_large", "learned_range"])
 def test_oracle_diffusion_returns_the_data(variance, prediction, sampler, count):
     torch.manual_seed(0)
-    process = GaussianDiffusion(50, prediction=prediction, variance=variance)
-    mask = length_mask(torch.tensor([6, 3]))
+    process, mask = GaussianDiffusion(50, prediction=prediction, variance=variance), length_mask(torch.tensor([6, 3]))
     data = torch.randn(2, 6, 4, dtype=torch.float64) * mask[..., None]
     denoise, estimates = CountedDenoise(oracle(process, data)), list[Tensor]()
     noise, how = drawn((2, 6, 4), torch.float64), {"sampler": sampler, "num_inference_steps": count}
@@ -283,12 +271,11 @@ def test_oracle_diffusion_returns_the_data(variance, prediction, sampler, count)
 @pytest.mark.parametrize("sampler", [*CALLS, "dopri5"])
 def test_oracle_flow_returns_the_data(sampler, count, prediction):
     torch.manual_seed(0)
-    process = FlowMatching(sigma_min=1e-3, prediction=prediction)
-    mask = length_mask(torch.tensor([6, 3]))
+    process, mask = FlowMatching(sigma_min=1e-3, prediction=prediction), length_mask(torch.tensor([6, 3]))
     data, noise = torch.randn(2, 2, 6, 4, dtype=torch.float64)
     data = data * mask[..., None]
-    velocity = process.target(data, noise, torch.zeros(2))
-    denoise, estimates = CountedDenoise(lambda x_t, t, mask, cond: velocity), list[Tensor]()
+    output = process.target(data, noise, torch.zeros(2))
+    denoise, estimates = CountedDenoise(lambda *_: output), list[Tensor]()
     how = {"sampler": sampler, "num_inference_steps": count}
     x = sample(process, denoise, recorded(noise), mask, trajectory=estimates, **how)
     # The path ends where its last noise has deviation sigma_min; every estimate on it is the data itself.

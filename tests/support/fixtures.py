@@ -11,7 +11,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -115,6 +115,12 @@ def assert_within(ours: torch.Tensor, arrays: Arrays, name: str, like: str | Non
     """Within ten times of what the authors' float32 differs from their float64."""
     tolerance = 10 * meta(arrays)["max_abs_diff_f32_vs_f64"][like or name][0]
     torch.testing.assert_close(ours, torch.from_numpy(arrays[name]), atol=tolerance, rtol=0)
+
+
+def golden_cases(stem: str, cases: Iterable[str]) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Marks a test on each `case` of a fixture, with the fixture's name in its id."""
+    parameters = pytest.mark.parametrize("case", [pytest.param(case, id=f"{stem}-{case}") for case in cases])
+    return lambda test: pytest.mark.golden(parameters(test))
 
 
 def golden_case(stem: str) -> Callable[[Callable[..., None]], Callable[..., None]]:

@@ -24,7 +24,7 @@ from flame_mdm.data.datamodule import Clips
 from flame_mdm.errors import UserError
 from flame_mdm.representations import Representation
 from flame_mdm.safe_io import write_json
-from flame_mdm.schemas import Cost, Measured, Value
+from flame_mdm.schemas import Measured, Value
 from flame_mdm.seeds import key
 
 Scores = list[tuple[dict[str, float | None], int]]  # values by metric, and number of motions, of each replication
@@ -39,15 +39,8 @@ def evaluate(request: EvaluationRequest) -> None:
     with processes(request.device) as device:
         plan = Plan(request, device)
         result = make_result(request, plan)
-        evaluation = Evaluation(
-            plan.protocol,
-            plan.clips,
-            plan.extractor,
-            plan.representation,
-            seed=request.seed,
-            batch_size=plan.batch_size,
-            training=plan.data.clips("train"),
-        )
+        parts = (plan.protocol, plan.clips, plan.extractor, plan.representation)
+        evaluation = Evaluation(*parts, request.seed, plan.batch_size, training=plan.data.clips("train"))
         measured = evaluation.run(plan.source, force=request.force)
         if is_first():
             reasons = measured.invalid_because + result.invalid_because
@@ -76,9 +69,7 @@ class Evaluation:
         have the expected values; they are not measured without `ground_truth`.
         """
         seeds = [key("draws", self.seed, replication) for replication in range(self.protocol.replications)]
-        measured = Measured(
-            ground_truth=None, values=None, not_computed={}, invalid_because=[], cost=Cost(), seeds=seeds
-        )
+        measured = Measured(ground_truth=None, values=None, not_computed={}, invalid_because=[], seeds=seeds)
         real_sets = self._measure_real(measured, source, ground_truth)
         measured.invalid_because = shared(self._unexpected(measured.ground_truth or {}))
         if measured.invalid_because and source is not None:

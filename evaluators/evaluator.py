@@ -58,20 +58,14 @@ class Evaluator:
 
     For the same features, all values are bit-identical for any batch size and order. Several processes share the
     feature pass, in whole batches, so that features do not depend on their number. The first one computes the metrics.
-
-    Attributes:
-        extractor: computes the features for metrics; None = no features.
-        metrics: mappings with the `_target_` of a metric, by name; each replication uses a different seed.
-        skip_features: whether metrics of features have no value, instead of raising for lack of input.
-        training: motions that generated ones may be copies of; None = this is not measured.
     """
 
-    extractor: Extractor | None
-    metrics: Mapping[str, Config]
+    extractor: Extractor | None  # computes the features for metrics; None = no features
+    metrics: Mapping[str, Config]  # mappings with the `_target_` of a metric, by name
     representation: Representation
     batch_size: int = 64
-    skip_features: bool = False
-    training: TrainingMotions | None = None
+    skip_features: bool = False  # whether metrics of features have no value, instead of raising for lack of input
+    training: TrainingMotions | None = None  # motions that generated ones may be copies of; None = not measured
 
     @torch.no_grad()
     def extract(self, motions: Motions) -> Rows:

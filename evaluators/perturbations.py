@@ -232,19 +232,18 @@ class Text(NamedTuple):
     requested: Mapping[str, Any]
 
 
+@dataclass
 class Scene:
     """Real motions of a split, and how to perturb them."""
 
-    def __init__(
-        self,
-        data: MotionDataModule,
-        rows: list[DrawnClip],
-        features: list[np.ndarray],
-        representation: HumanML,
-        seed: int,
-    ):
-        self.data, self.rows, self.features, self.representation, self.seed = data, rows, features, representation, seed
-        self.joints = [representation.decode(torch.from_numpy(x)).double().numpy() for x in features]
+    data: MotionDataModule
+    rows: list[DrawnClip]
+    features: list[np.ndarray]
+    representation: HumanML
+    seed: int
+
+    def __post_init__(self) -> None:
+        self.joints = [self.representation.decode(torch.from_numpy(x)).double().numpy() for x in self.features]
         self.wrong = self._wrong()
 
     def draws(self, *parts: str | int) -> np.random.Generator:

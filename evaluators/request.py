@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, field, fields
-from typing import Any, Literal
+from typing import Literal
 
 from flame_mdm.checkpoints.locating import Which
 from flame_mdm.config import Config
@@ -55,11 +55,9 @@ class EvaluationRequest(EvaluationKeys):
 
     @classmethod
     def of(cls, config: Config) -> EvaluationRequest:
-
-        def values(kind: Any) -> dict[str, Any]:
-            return {key.name: config[key.name] for key in fields(kind) if key.name in config}
-
-        return cls(**values(cls), options=SamplerOptions(**values(SamplerOptions)))
+        kinds = (cls, SamplerOptions)
+        own, options = ({key.name: config[key.name] for key in fields(kind) if key.name in config} for kind in kinds)
+        return cls(**own, options=SamplerOptions(**options))
 
     def __post_init__(self) -> None:
         _ = self.editing  # checks its keys

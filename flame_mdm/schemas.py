@@ -114,20 +114,16 @@ class Cost(Schema):
 
 
 class Measured(Schema):
-    """What an evaluation measures: `values` and, of real motions, `ground_truth`, by metric; None = not measured.
-
-    `not_computed` has reasons by metric; `invalid_because` is [] if the values are valid. They are `forced` if motions
-    were generated although real motions do not have the expected values. `seeds` are those of metrics, by replication.
-    """
+    """What an evaluation measures: `values` and, of real motions, `ground_truth`, by metric; None = not measured."""
 
     ground_truth: dict[str, Value | None] | None
     values: dict[str, Value | None] | None
-    not_computed: dict[str, str]
-    invalid_because: list[str]
-    forced: bool = False
+    not_computed: dict[str, str]  # reasons by metric
+    invalid_because: list[str]  # [] if the values are valid
+    forced: bool = False  # whether motions were generated although real motions do not have the expected values
     warnings: list[str] = []
     cost: Cost | None = None
-    seeds: list[Int] = []
+    seeds: list[Int] = []  # of metrics, by replication
 
 
 class Result(Measured):
@@ -182,11 +178,7 @@ class AuditedExtractor(Schema):
 
 
 class AuditCard(ClosedSchema):
-    """An evaluator audit, as `flame-mdm audit` writes it.
-
-    `metrics` says whether higher values are better; None = values near those of `real` motions, with half widths of
-    their 95 % intervals. `truth` is the agreement with exact attributes: `auc` and `correlation`, by metric.
-    """
+    """An evaluator audit, as `flame-mdm audit` writes it."""
 
     format: Int
     extractor: AuditedExtractor | None
@@ -197,11 +189,11 @@ class AuditCard(ClosedSchema):
     seed: Int
     resamples: Int
     packages: dict[str, str]
-    metrics: dict[str, bool | None]
-    real: dict[str, Annotated[list[Number | None], Field(min_length=2, max_length=2)]]
+    metrics: dict[str, bool | None]  # whether higher values are better; None = values near those of real motions
+    real: dict[str, Annotated[list[Number | None], Field(min_length=2, max_length=2)]]  # and half widths of intervals
     perturbations: Annotated[list[AuditedPerturbation], Field(min_length=1)]
     not_computed: dict[str, str]
-    truth: dict[str, dict[str, Number | None]]
+    truth: dict[str, dict[str, Number | None]]  # agreement with exact attributes: `auc` and `correlation`, by metric
 
 
 EXPECTED = {

@@ -1,6 +1,5 @@
 """Evaluator audits: measurement, resumption, cards, and links to them."""
 
-import csv
 import json
 from collections.abc import Mapping
 from functools import partial
@@ -71,11 +70,10 @@ def scene(tmp_path_factory):
 def test_values_without_resampling_are_those_of_an_evaluation(scene):
     measure, sets, texts, values, _ = scene
     found = measure(sets[BASE], texts)
-    compared = [name for name in found if name in values and "_for_" not in name]
-    assert {"fid", "mm_dist", "mclip_score", "mid", "jitter", "foot_skating", "attributes/action"} <= set(compared)
-    for name in compared:
-        assert found[name][0] == pytest.approx(values[name], rel=1e-9), name
-    assert {"mbench/foot_floating", "kimodo/skate_ratio", "kimodo/contact_consistency"} <= set(compared)
+    compared = {name: found[name][0] for name in found if name in values and "_for_" not in name}
+    assert {"fid", "mm_dist", "mclip_score", "mid", "jitter", "foot_skating", "attributes/action"} <= compared.keys()
+    assert {"mbench/foot_floating", "kimodo/skate_ratio", "kimodo/contact_consistency"} <= compared.keys()
+    assert compared == pytest.approx({name: values[name] for name in compared}, rel=1e-9)
     assert not any(name.startswith("edge") for name in found), "not defined at 20 frames per second"
 
 
@@ -114,20 +112,14 @@ def card() -> AuditCard:
     shared = {"group": "joints", "about": "noise <b>", "unit": "mm"}
     still = [{"grade": 1.0, "values": {"fid": [1.0, 0.9, 0.0, 0.0], "jitter": [None] * 4}}]
     content = {
-        "format": 1,
+        **{"format": 1, "split": "test", "motions": 40, "seed": 0, "resamples": 10, "packages": {"torch": "2"}},
         "extractor": {"sha256": "ab" * 32, "name": "motion_clip/x"},
         "protocol": {"name": "text_to_motion", "version": 1},
         "data": {"dataset": "x", "fingerprint": "f", "frames": [24, 60]},
-        "split": "test",
-        "motions": 40,
-        "seed": 0,
-        "resamples": 10,
-        "packages": {"torch": "2"},
         "metrics": {"fid": False, "jitter": False},
         "real": {"fid": [1.0, 0.9], "jitter": [9.0, 5.0]},
         "perturbations": [{"name": "noise", "grades": values, **shared}, {"name": "still", "grades": still, **shared}],
-        "not_computed": {},
-        "truth": {"fid": {"auc": 0.9, "correlation": -0.5}},
+        **{"not_computed": {}, "truth": {"fid": {"auc": 0.9, "correlation": -0.5}}},
     }
     return check_shape(content, AuditCard)
 
@@ -147,16 +139,12 @@ def test_a_grade_is_seen_from_where_all_stronger_ones_differ_and_findings_are_se
 def test_pages_escape(card, tmp_path):
     page, text = write_card(card, tmp_path)
     assert page.name == "x-abababababab.html"
-    assert "noise &lt;b&gt;" in page.read_text()
-    assert "2 → 5" in page.read_text()
     assert page.read_text().count("<polyline") == 2
     assert "| noise (mm) | 2 → 5 | 1 → – |" in text.read_text()
-    markup = "<img src=x onerror=alert(1)>"
-    text = card.model_dump_json()
+    content = card.model_dump_json()
     for own in ('"jitter"', '"mm"', '"noise <b>"', '"motion_clip/x"', '"test"', '"torch"', '"x"', '"f"'):
-        assert own in text
-        text = text.replace(own, json.dumps(markup))
-    for path in write_card(check_shape(json.loads(text), AuditCard), tmp_path):
+        content = content.replace(own, json.dumps("<img src=x onerror=alert(1)>"))
+    for path in write_card(check_shape(json.loads(content), AuditCard), tmp_path):
         assert "<img" not in path.read_text()
         assert path.read_text().count("&lt;img src=x onerror=alert(1)&gt;") > 10
 
@@ -184,9 +172,7 @@ def test_an_audit_resumes_and_gives_the_same_card(tmp_path, monkeypatch, capsys)
     assert sorted(truth, reverse=True) == truth
     assert (card.real["attributes/all"][0] or 0) > 0.95 > truth[-1]  # exact attributes see every wrong caption
     jitter = seen(card, by_name["jitter"], "jitter")
-    assert jitter is not None
-    assert jitter.grade == 1
-    assert "fid" not in card.metrics
+    assert (jitter and jitter.grade, "fid" in card.metrics) == (1, False)
     assert card.not_computed == {"extractor": "metrics that need features"}
     before = json.loads(path.read_text())
     removed = sorted((tmp_path / "out" / "cache").glob("*/*.npz"))[0]
@@ -197,22 +183,6 @@ def test_an_audit_resumes_and_gives_the_same_card(tmp_path, monkeypatch, capsys)
     assert main([*words[:-2], "extractor=missing.ckpt", words[-1]]) == 1
     assert main(["audit", "data=synthetic"]) == 1
     assert "extractor=none" in capsys.readouterr().err
-
-
-def test_each_broken_model_is_ranked_last_by_a_headline_metric():
-    """Shuffled, noisy and static motions of the committed table of the synthetic set."""
-    with (ROOT / "docs" / "benchmarks" / "synthetic.csv").open(encoding="utf-8") as file:
-        rows = {row["row"]: row for row in csv.DictReader(file) if row["part"] == "Sanity-check baselines"}
-    real = rows["Real motions"]
-    shuffled, noisy, static = "real motions, captions shuffled", "real motions, noise added", "the first frame, held"
-
-    def worst(metric):
-        """The broken model that is farthest from real motions."""
-        return max((shuffled, noisy, static), key=lambda label: abs(float(rows[label][metric]) - float(real[metric])))
-
-    assert worst("R precision (top 1)") == worst("mCLIP score") == shuffled
-    assert worst("FID") == worst("Jitter") == noisy
-    assert worst("Diversity") == worst("Static") == static
 
 
 CARDS = sorted((ROOT / "docs" / "benchmarks" / "audit").glob("*.json"))

@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 import torch
 from support.pages import result
-from support.runs import TINY
 
 import evaluators.evaluation
+from evaluators.request import EvaluationRequest
 from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.model_files import FORMAT, FORMAT_KEY, weights_sha256
 from flame_mdm.commands.tables import outdated
@@ -20,6 +20,7 @@ from flame_mdm.reporting.tables import build as builder
 from flame_mdm.reporting.tables.build import build
 from flame_mdm.reporting.tables.format import Cell, Line, Table, ranks, rendered
 from flame_mdm.reporting.tables.specs import Evaluation, evaluations, load_spec, spec_names
+from flame_mdm.safe_io import write_json
 
 SPEC = """
 title: "A table, 50 % & more_of_it"
@@ -50,6 +51,9 @@ figures:
 """
 
 
+REAL = (0.002, 0.797, 9.503)
+
+
 def entry(mean: float) -> dict[str, Any]:
     return {"mean": mean, "ci": 0.0123, "replications": 5, "n": 400}
 
@@ -57,9 +61,7 @@ def entry(mean: float) -> dict[str, Any]:
 def measured(fid: float, top3: float, diversity: float, **other: Any) -> dict[str, Any]:
     """A result with these values of generated motions."""
     names = ("fid", "texts_for_motion/top3", "diversity")
-    values, real = (
-        dict(zip(names, map(entry, x), strict=True)) for x in ((fid, top3, diversity), (0.002, 0.797, 9.503))
-    )
+    values, real = (dict(zip(names, map(entry, means), strict=True)) for means in ((fid, top3, diversity), REAL))
     checkpoint = {"path": "mdm.ckpt", "sha256": "c" * 64, "experiment": "synthetic/mdm", "selected_by": "none: last"}
     checkpoint |= {"averaged_weights": True, "guidance_scale": 2.5, "sampler": "ddpm", "num_inference_steps": 50}
     data = {"dataset": "synthetic", "fingerprint": "f" * 16}
@@ -176,7 +178,11 @@ def test_footnotes_tell_what_was_left_out_the_skeleton_and_how_checkpoints_were_
     assert "MFM: best checkpoint by val/text_to_motion_t2m/fid" in notes
     assert "MDM; FLAME <b>: last checkpoint, not chosen by validation" in notes
     assert "FID of real motions is 0 by construction: clips are taken whole" in rendered(made(folder), "md")
-    change(folder, "MDM", data={"excluded": left_out})
+    sampled = {"sampler": "ddim", "eta": 0.5, "num_inference_steps": [0, 5, 9]}
+    change(folder, "MDM", data={"excluded": left_out}, changed={"samples": 4, "seed": 2}, checkpoint=sampled)
+    text = rendered(made(folder), "md")
+    assert "differs from the protocol: samples = 4, seed = 2" in text
+    assert "sampler ddim, eta 0.5, steps 0, 5, 9" in text
     words = "; excluded from the data set: 1,191 motions of HumanAct12, as data.source.humanact12 is not given"
     assert [words in note for _, note in made(folder).parts[0].notes].count(True) == 1
     lengths = {"fingerprint": "f" * 16, "fps": 20.0, "lengths": [50, 60], "excluded": left_out}
@@ -195,13 +201,12 @@ def test_footnotes_tell_what_was_left_out_the_skeleton_and_how_checkpoints_were_
 
 
 def test_a_missing_extractor_is_noted_beside_a_missing_checkpoint(folder):
-    (folder / "clip.ckpt").unlink()
     text = (folder / "spec.yaml").read_text().replace(f"{folder}/clip.ckpt", "assets/t2m/kit")
-    (folder / "spec.yaml").write_text(text)
+    (folder / "spec.yaml").write_text(text.replace(f"{folder}/missing", "runs/synthetic/mdm/default/checkpoints/last"))
     part = made(folder).parts[0]
     notes = [note for mark, note in part.notes if not mark]
     assert next(line.state for line in part.lines if line.label == "missing") == "no checkpoint"
-    assert f"missing: {folder}/missing.ckpt is missing" in notes
+    assert "missing: make train EXP=synthetic/mdm" in notes
     note = 'MDM; MFM; FLAME <b>; missing: assets/t2m/kit is missing; see "Extractors" in docs/evaluation.md'
     assert note in notes, "one line for all rows"
 
@@ -279,16 +284,29 @@ def test_times_are_compared_in_batches_of_the_same_size_alone(folder):
     assert "predicts – / – / velocity" in rendered(Table("timed", "", [part]), "md")
 
 
-def test_the_batch_size_of_the_command_is_not_that_of_timed_rows(folder, monkeypatch):
+def test_what_is_missing_or_changed_is_evaluated_once_and_timed_rows_have_their_own_batch_size(folder, monkeypatch):
     (folder / "timed.yaml").write_text(TIMED.format(folder=folder))
     needed = []
-    monkeypatch.setattr(evaluators.evaluation, "evaluate", needed.append)
+
+    def evaluate(request: EvaluationRequest) -> None:
+        needed.append(request)
+        content = measured(0, 0, 0)
+        content["checkpoint"]["sha256"] = hashlib.sha256(Path(str(request.ckpt)).read_bytes()).hexdigest()
+        write_json(str(request.out), content)
+
+    monkeypatch.setattr(evaluators.evaluation, "evaluate", evaluate)
     words = [f"results={folder / 'none'}", f"out={folder / 'out'}", "batch_size=256"]
-    assert main(["tables", f"table={folder / 'timed.yaml'}", *words]) == 0
-    assert [request.batch_size for request in needed] == [1, 64, None]
+    for number in range(3):
+        assert main(["tables", f"table={folder / 'timed.yaml'}", *words]) == 0
+        assert len(needed) == (3, 3, 4)[number]
+        if number == 1:
+            (folder / "mfm.ckpt").write_bytes(b"trained again")
+    assert [request.batch_size for request in needed] == [1, 64, None, None]
+    assert needed[-1].ckpt == f"{folder}/mfm.ckpt"
     needed.clear()
     assert main(["tables", f"table={folder / 'spec.yaml'}", *words]) == 0
-    assert {request.batch_size for request in needed} == {256}
+    assert {(request.batch_size, request.extractor) for request in needed} == {(256, f"{folder}/clip.ckpt")}
+    assert [request.options.num_inference_steps for request in needed[3:]] == [5, 5, 10, 10]
 
 
 def test_published_numbers_are_marked_and_ranked_among_themselves(folder, monkeypatch):
@@ -355,50 +373,6 @@ def test_numbers_have_the_decimals_of_their_column_and_are_never_all_zeros():
     lines = [Line("", "measured", [Cell("", value, 0.0021)]) for value in (103.6, 0.016, 0.0)]
     builder._print_cells(lines, 1)
     assert [cell.text for line in lines if (cell := line.cells[0])] == ["103.6 ±0.0", "0.016 ±0.002", "0.0 ±0.0"]
-
-
-MINE = """
-title: mine
-parts:
-  all:
-    protocol: synthetic
-    extractor: none
-    replications: 1
-    samples: 4
-    columns: {Action: {value: attributes/action, better: higher}, FID: {value: fid},
-      Steps: {value: num_inference_steps}}
-    rows:
-      - {label: tiny, ckpt: runs/tiny/default/checkpoints/last.ckpt, sampler: ddim, eta: 0.5,
-         num_inference_steps: [2, [0, 5, 9]]}
-      - {label: elsewhere, ckpt: runs/synthetic/mdm/default/checkpoints/last.ckpt}
-"""
-
-
-@pytest.mark.slow
-def test_what_is_missing_is_evaluated_once(tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    words = ["data.source.clips=400", *TINY[1:], f"data_root={tmp_path / 'data'}", "run.dir=runs/tiny/default"]
-    words += ["callbacks.samples=null", "trainer.val_check_interval=2", "trainer.max_steps=2"]
-    assert main(["train", "quickstart", *words]) == 0
-    Path("mine.yaml").write_text(MINE)
-    needed = ["table=mine.yaml", "device=cpu"]
-    assert main(["tables", *needed]) == 0
-    shown = capsys.readouterr().out
-    assert "evaluating 1 of 2: tiny" in shown
-    assert "mine: 2 of 3 rows measured" in shown
-    first = files(Path("runs/tables"))
-    assert b"elsewhere: make train EXP=synthetic/mdm" in first["mine.md"]
-    assert b"ddim, eta 0.5" in first["mine.html"]
-    assert b"| 0, 5, 9 |" in first["mine.md"]
-    assert b"differs from the protocol: replications = 1, samples = 4" in first["mine.md"]
-    assert main(["tables", *needed]) == 0
-    assert "evaluating" not in capsys.readouterr().out
-    assert files(Path("runs/tables")) == first
-    # another checkpoint under the same name
-    assert main(["train", "quickstart", *words[:-1], "trainer.max_steps=3"]) == 0
-    assert main(["tables", *needed]) == 0
-    assert "evaluating 2 of 2" in capsys.readouterr().out
-    assert files(Path("runs/tables"))["mine.md"] != first["mine.md"]
 
 
 def clip_file(folder: Path, weight: float, steps: int) -> str:

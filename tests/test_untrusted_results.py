@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -30,7 +31,6 @@ from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError, say
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.readers import read
-from flame_mdm.reporting.page import POLICY
 from flame_mdm.reporting.plots import Panel, Series, svg
 from flame_mdm.reporting.report import write_report
 from flame_mdm.reporting.tables.format import Cell, Line, Part, Table, comma_separated, draw, rendered, write
@@ -43,8 +43,6 @@ from flame_mdm.schemas import Cost
 from flame_mdm.visualize import contact_sheet, player_page, write_gif
 
 pytestmark = pytest.mark.slow
-
-TEXT = "text=a person walks"
 
 ROWS = """title: t
 parts:
@@ -131,14 +129,11 @@ def test_numbers_at_the_ends_of_the_range_are_drawn(bad):
         assert svg("a", [Panel(points), Panel(points, from_zero=True), Panel(points, log_x=True)])
 
 
-def test_long_names_are_shortened(attacked, bad, capfd):
+def test_long_names_and_many_texts(attacked, bad, tmp_path, trained, capfd):
     (bad / "spec.yaml").write_text(f"title: t\nparts: {{P: {{lengths: [{'a' * 5_000}]}}}}\n")
     attacked("tables", f"table={bad / 'spec.yaml'}", "evaluate=false", says="aaa … ")
     say("b" * 5_000, error=True)
     assert len(capfd.readouterr().err) < 2_010
-
-
-def test_long_and_many_texts(attacked, tmp_path, trained):
     attacked("sample", f"ckpt={trained}", f"text={'a person walks ' * 66_667}", says=" characters are too many")
     with pytest.raises(UserError, match=r"5,001 texts with samples=2: at most 10,000 motions"):
         flame_mdm.generate(flame_mdm.load(trained), [f"text {number}" for number in range(5001)], samples=2)
@@ -190,25 +185,20 @@ def test_four_processes_write_the_same_files(tmp_path):
     for process in processes:
         process.join(60)
     assert [process.exitcode for process in processes] == [0] * 4
-    assert sorted(path.name for path in (tmp_path / "tables").iterdir()) == [
-        *("t-figure.svg", "t.csv", "t.html", "t.md", "t.tex")
-    ]
-    assert {path.name for path in (tmp_path / "samples" / "mine").iterdir()} == {
-        *("motion_000.npz", "motions.gif", "motions.png", "player.html")
-    }
-    assert not list(tmp_path.rglob(".*"))
+    written = {path.name for path in tmp_path.rglob("*") if path.is_file()}
+    assert written == {
+        *("t-figure.svg", "t.csv", "t.html", "t.md", "t.tex", "kit.json", "rep_0.npz"),
+        *("motion_000.npz", "motions.gif", "motions.png", "player.html"),
+    }, "no temporary files"
     assert read(tmp_path / "samples" / "mine" / "motion_000.npz").text == "a person walks"
     assert read_samples(tmp_path / "rep_0.npz")["ids"].tolist() == ["000001"]
 
 
-def full(*_: Any, **__: Any) -> None:
-    raise OSError(28, "No space left on device")
-
-
 def test_a_sample_folder_is_whole_or_absent(attacked, bad, trained, monkeypatch):
-    words = ["sample", f"ckpt={trained}", TEXT, "seconds=1"]
+    words = ["sample", f"ckpt={trained}", "text=a person walks", "seconds=1"]
     for name in ("Motion.save", "write_player"):
         with monkeypatch.context() as patch:
+            full = Mock(side_effect=OSError(28, "No space left on device"))
             patch.setattr(f"flame_mdm.sampling.generation.{name}", full)
             attacked(*words, "out=new/folder", says="No space left on device")
     (bad / "file").write_text("mine")
@@ -279,19 +269,14 @@ def test_tables_hold_text_not_markup_and_no_formulas():
     assert html.count("&lt;b&gt;") > 3
     assert tex.count("{") - tex.count("\\{") == tex.count("}") - tex.count("\\}")
     assert not [line for line in text.splitlines() if re.match(r"\s*(# Heading|<b>|\|`)", line)]
-    assert "\\[a\\]" in text
-    assert "&lt;b&gt;" in text
-    assert "\\`" in text
+    assert all(escaped in text for escaped in ("\\[a\\]", "&lt;b&gt;", "\\`"))
     for form in (text, tex, comma_separated(table)):
         assert not re.search("[\x00-\x09\x0b-\x1f\u202e]", form)
     assert not [line for line in tex.splitlines() if line.lstrip().startswith(("#", "<b>", "["))]
     cells = [cell for row in csv.reader(io.StringIO(comma_separated(table))) for cell in row]
     formulas = [cell for cell in cells if cell.lstrip().startswith(tuple("=+-@")) and not re.match(r"-[\d.]+", cell)]
     assert not formulas
-    assert "-5" in cells
-    assert "-0.5 ±0.1" in cells
-    assert "'-2+3+cmd" in cells
-    assert "'=HYPERLINK(1)" in cells
+    assert {"-5", "-0.5 ±0.1", "'-2+3+cmd", "'=HYPERLINK(1)"} <= set(cells)
     part = table.parts[0]
     part.lines[0].label = r"$\frac{$"
     assert draw(part, part.figures[0])
@@ -301,7 +286,7 @@ def test_commands_print_no_control_characters(tmp_path, capsys):
     folder = a_run(tmp_path / "a\x1b[31m\u202e\nerror: b")
     assert main(["report", f"runs='{folder}'"]) == 0
     out = capsys.readouterr().out
-    assert "a\\x1b[31m\\u202e\\nerror: b/report.html" in out
+    assert out.endswith("a\\x1b[31m\\u202e\\nerror: b/report.html\n")
     assert len(out.splitlines()) == 1
     say("one", "two\x1b")
     assert capsys.readouterr().out == "one\ntwo\\x1b\n"
@@ -315,18 +300,15 @@ def test_all_that_is_printed_is_printable():
 
 
 def test_pages_use_no_network_and_play_the_motions_not_the_pages_of_others(tmp_path):
-    policy = f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">'
-    assert "default-src 'none'" in POLICY
     assert "Content-Security-Policy" in player_page([Motion(np.zeros((2, 22, 3)), 20.0, SMPL22)])
     runs = [motions(a_run(tmp_path / name, name=name) / "samples" / "step_0000009").parent.parent for name in "ab"]
     assert main(["compare", f"runs={runs[0]} {runs[1]}", f"out={tmp_path / 'out.html'}"]) == 0
     (runs[0] / "samples" / "step_0000009" / "player.html").write_text("<script>fetch('https://example.com')</script>")
     report = write_report(runs[0])
     for path in (tmp_path / "out.html", report, _table(tmp_path)):
-        assert policy in path.read_text()
+        assert """<meta http-equiv="Content-Security-Policy" content="default-src 'none'; """ in path.read_text()
     assert "example.com" not in report.read_text()
     assert "a person jumps" in report.read_text()
-    assert "Samples at step 9" in report.read_text()
 
 
 def test_push_takes_names_not_paths_and_overwrites_only_its_own_files(attacked, bad, trained):
@@ -334,8 +316,7 @@ def test_push_takes_names_not_paths_and_overwrites_only_its_own_files(attacked, 
         attacked("push", str(trained), name, "dry_run=true", says="not a repository name. Write user/name")
     (bad / "config.yaml").write_text("mine")
     attacked("push", str(trained), "a/b", f"out={bad}", "dry_run=true", says="not written by push")
-    assert [path.name for path in bad.iterdir()] == ["config.yaml"]
-    assert (bad / "config.yaml").read_text() == "mine"
+    assert [path.read_text() for path in bad.iterdir()] == ["mine"]
     for _ in range(2):
         assert main(["push", str(trained), "a/x.safetensors", "dry_run=true"]) == 0
     names = {path.name for path in Path("push/x.safetensors").iterdir()}
@@ -345,6 +326,4 @@ def test_push_takes_names_not_paths_and_overwrites_only_its_own_files(attacked, 
 def test_a_card_is_a_table_of_text(trained, tmp_path):
     model = model_files.read_model_file(hub.export(trained, tmp_path))
     model["origin"]["file"] = HOSTILE
-    card = hub.card(model, "me/walker")
-    assert "\n# Heading" not in card
-    assert "\x1b" not in card
+    assert not re.search("\n# Heading|\x1b", hub.card(model, "me/walker"))

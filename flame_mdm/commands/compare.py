@@ -80,10 +80,6 @@ def _sampled(run: Path, texts: list[str], settings: CompareSettings) -> dict[Pro
 
     model = load(run, "cuda" if torch.cuda.is_available() else "cpu")
     labels = texts[0] in model.facts["actions"]
-    request = SamplingRequest(
-        texts=None if labels else texts,
-        actions=texts if labels else None,
-        seconds=settings.seconds,
-        seed=settings.seed,
-    )
+    prompts = (None, texts) if labels else (texts, None)
+    request = SamplingRequest(texts=prompts[0], actions=prompts[1], seconds=settings.seconds, seed=settings.seed)
     return {(text, 0): motion for text, motion in zip(texts, sample_request(model, request), strict=True)}

@@ -1,20 +1,20 @@
 """`flame-mdm tables [NAME ...]`: renders tables and figures from results, and evaluates what is missing."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from flame_mdm.config import Config, compose_data, instantiate
 from flame_mdm.errors import UserError, first_line, say
+from flame_mdm.reporting.page import page, render
+from flame_mdm.reporting.tables.build import NOT_VALID, build
+from flame_mdm.reporting.tables.format import write
+from flame_mdm.reporting.tables.specs import Evaluation, Lengths, evaluations, load_spec, spec_names
 from flame_mdm.safe_io import sha256, write_json, write_text
 from flame_mdm.sampler_options import option
-
-if TYPE_CHECKING:
-    from flame_mdm.reporting.tables.specs import Evaluation
+from flame_mdm.schemas import read_result
 
 INVALID = 3  # exit code if a requested row is not valid
 
@@ -41,11 +41,6 @@ class TablesSettings:
 
 
 def main(settings: TablesSettings) -> None:
-    from flame_mdm.reporting.page import page, render
-    from flame_mdm.reporting.tables.build import NOT_VALID, build
-    from flame_mdm.reporting.tables.format import write
-    from flame_mdm.reporting.tables.specs import load_spec, spec_names
-
     names = settings.table or spec_names()
     specs = {Path(name).stem: load_spec(name) for name in names}
     results = Path(settings.results)
@@ -75,7 +70,6 @@ def evaluate_missing(specs: Mapping[str, Config], results: Path, settings: Table
     from evaluators.evaluation import evaluate
     from evaluators.protocol import protocol_config
     from evaluators.request import EvaluationRequest
-    from flame_mdm.reporting.tables.specs import evaluations
 
     listed: dict[Path, Evaluation] = {}
     for part in (part for spec in specs.values() for part in spec["parts"].values()):
@@ -105,7 +99,6 @@ def evaluate_missing(specs: Mapping[str, Config], results: Path, settings: Table
 def outdated(path: Path, evaluation: Evaluation) -> bool:
     """Returns whether the checkpoint or extractor of a result has changed, or SMPL's model file is now available."""
     from flame_mdm.checkpoints.model_files import weights_sha256
-    from flame_mdm.schemas import read_result
 
     result = read_result(path)
     if result.stand_in_skeleton and os.environ.get("FLAME_MDM_SMPL"):
@@ -120,8 +113,6 @@ def outdated(path: Path, evaluation: Evaluation) -> bool:
 
 def count_lengths(dataset: str, results: Path, settings: TablesSettings) -> None:
     """Writes the motion lengths of a data set to `results`; prints a message if the data set is not prepared."""
-    from flame_mdm.reporting.tables.specs import Lengths
-
     nodes = compose_data(dataset, data_root=settings.data_root or os.environ.get("FLAME_MDM_DATA", "data"))
     data = instantiate(nodes["data"], representation=instantiate(nodes["representation"]))
     if not (data.folder / "store.json").exists():

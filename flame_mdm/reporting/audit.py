@@ -23,17 +23,12 @@ LEGEND = (
 
 @dataclass(frozen=True)
 class Seen:
-    """How a metric responds to a perturbation.
+    """How a metric responds to a perturbation; None = at no grade."""
 
-    `grade` is the smallest one at which, and above which, the paired difference from real motions is not 0; `outside`
-    the same for values outside the 95 % interval of real motions; None = none. `rewarded`: the strongest grade is rated
-    better than real motions. `monotone`: every stronger grade differs at least as much, within its interval.
-    """
-
-    grade: float | None
-    outside: float | None
-    rewarded: bool
-    monotone: bool
+    grade: float | None  # from which on the paired difference from real motions is not 0
+    outside: float | None  # from which on values are outside the 95 % interval of real motions
+    rewarded: bool  # whether the strongest grade is rated better than real motions
+    monotone: bool  # whether every stronger grade differs at least as much, within its interval
 
 
 def seen(card: AuditCard, perturbation: AuditedPerturbation, metric: str) -> Seen | None:

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from flame_mdm.reporting.page import TEMPLATES, number, render, short
+from flame_mdm.reporting.page import number, render, short
 
 if TYPE_CHECKING:
     from markupsafe import Markup
@@ -56,7 +56,7 @@ class Panel:
 
 
 def svg(title: str, panels: Sequence[Panel]) -> Markup | None:
-    """Draws panels side by side; None if they have no points. `standalone` turns the SVG into a separate file."""
+    """Draws panels side by side, with the styles of the page; None if they have no points."""
     drawn = [_drawn(panel) for panel in panels]
     if not any(drawn):
         return None
@@ -64,15 +64,8 @@ def svg(title: str, panels: Sequence[Panel]) -> Markup | None:
     return render("plot.svg", title=title, panels=drawn, width=WIDE, high=high, left=LEFT, right=WIDE - RIGHT)
 
 
-def standalone(plot: str) -> str:
-    return str(plot).replace(">", f"><style>{(TEMPLATES / 'plot.css').read_text(encoding='utf-8')}</style>", 1)
-
-
 def chart(title: str, curves: Mapping[str, Curve], bands: Mapping[str, Curve] | None = None) -> Markup:
-    """Draws curves over training steps in one chart, and lists their last values, without those that are not finite.
-
-    The y-axis is logarithmic if the values span more than `LOG_RANGE`. `bands` are half widths of 95 % intervals.
-    """
+    """Draws curves over training steps, and lists their last finite values; `bands` are half widths of intervals."""
     spread = {name: {x: abs(width) for x, width in _finite(curve)} for name, curve in (bands or {}).items()}
     series = [Series(name, _finite(curve), spread.get(name, {})) for name, curve in curves.items()]
     key = [(s.name, number(s.points[-1][1]) if s.points else "–") for s in series]
@@ -169,7 +162,9 @@ def _linear_axis(low: float, high: float, to_ticks: bool) -> _Axis:
     low, high = (value if abs(value) > SMALLEST else 0.0 for value in (low, high))
     if high - low <= 1e-9 * max(abs(low), abs(high)):
         low, high = low - (abs(low) or 1) / 10, high + (abs(high) or 1) / 10
-    step = _round_step((high - low) / (4 if to_ticks else 5))
+    least = (high - low) / (4 if to_ticks else 5)
+    power = 10 ** math.floor(math.log10(least))
+    step = next(m * power for m in (1, 2, 5, 10) if m * power >= least * 0.999)
     if to_ticks:
         begin, end = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
         low, high = begin * step, end * step
@@ -186,11 +181,6 @@ def _log_axis(low: float, high: float) -> _Axis:
     ticks = [m * 10.0**d for d in decades if (d - decades[0]) % every == 0 for m in steps]
     within = [tick for tick in ticks if low * 0.999 <= tick <= high * 1.001]
     return _Axis(min([low, *within]) / 1.15, max([high, *within]) * 1.15, within, True)
-
-
-def _round_step(least: float) -> float:
-    power = 10 ** math.floor(math.log10(least))
-    return next(m * power for m in (1, 2, 5, 10) if m * power >= least * 0.999)
 
 
 def _tick(value: float) -> str:

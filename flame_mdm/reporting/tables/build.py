@@ -252,8 +252,7 @@ def _entry(values: Mapping[str, Value | None] | None, name: str) -> Cell | None:
 def _print_cells(lines: Sequence[Line], columns: int) -> None:
     """Formats the numbers of each column with the same decimals, about three digits for the largest.
 
-    Short settings, with at most one decimal and no interval, keep their text. Numbers that would round to zero show
-    two significant digits.
+    Settings with at most one decimal keep their text. Numbers that would round to zero show two significant digits.
     """
     for index in range(columns):
         cells = [c for line in lines if not line.kind.startswith("reported") and (c := line.cells[index]) is not None]

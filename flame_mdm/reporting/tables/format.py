@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flame_mdm.errors import one_line, shortened
-from flame_mdm.reporting.page import page, render
-from flame_mdm.reporting.plots import Histogram, Panel, Series, standalone, svg
+from flame_mdm.reporting.page import TEMPLATES, page, render
+from flame_mdm.reporting.plots import Histogram, Panel, Series, svg
 from flame_mdm.reporting.tables.specs import ABOUT, Figure
 from flame_mdm.safe_io import write_text
 
@@ -45,36 +45,28 @@ class Cell:
 
 @dataclass
 class Line:
-    """One row of a table, of a kind in `KINDS`, with one cell per column; None if there is no value.
-
-    Only rows with the same footnote marks are compared. `state` is "" if the row is complete and valid, or a reason
-    such as "no checkpoint". `options` are numbers for the x-axis of figures, `facts` the provenance of the values.
-    """
+    """One row of a table, with one cell per column; None if there is no value."""
 
     label: str
-    kind: str
+    kind: str  # a key of `KINDS`
     cells: list[Cell | None]
-    marks: str = ""
-    state: str = ""
-    options: dict[str, float] = field(default_factory=dict)
-    facts: dict[str, str] = field(default_factory=dict)
+    marks: str = ""  # footnote marks; only rows with the same ones are compared
+    state: str = ""  # "" if the row is complete and valid, or a reason such as "no checkpoint"
+    options: dict[str, float] = field(default_factory=dict)  # for the x-axis of figures
+    facts: dict[str, str] = field(default_factory=dict)  # provenance of the values
 
 
 @dataclass
 class Part:
-    """One table within the table of a paper.
-
-    `columns` are label -> which values are better, a key of `ARROWS`; `notes` are the mark, which may be empty, and
-    the text of each footnote; `drawn`, set by `write`, has file name and SVG of each figure, None if it has no points.
-    """
+    """One table within the table of a paper."""
 
     name: str
-    columns: dict[str, str]
+    columns: dict[str, str]  # label -> which values are better, a key of `ARROWS`
     lines: list[Line]
-    notes: list[tuple[str, str]] = field(default_factory=list)
+    notes: list[tuple[str, str]] = field(default_factory=list)  # mark, which may be empty, and text of each footnote
     figures: list[Figure] = field(default_factory=list)
     histograms: dict[str, Histogram] = field(default_factory=dict)
-    drawn: list[tuple[str, Markup | None]] = field(default_factory=list)
+    drawn: list[tuple[str, Markup | None]] = field(default_factory=list)  # name and SVG of figures, set by `write`
 
 
 @dataclass
@@ -100,7 +92,8 @@ def write(table: Table, out: Path) -> None:
         part.drawn = [(f"{table.name}{slug}-figure{n}", plot) for n, plot in zip(numbers, drawn, strict=False)]
         for name, plot in part.drawn:
             if plot:
-                write_text(out / f"{name}.svg", standalone(plot))
+                style = (TEMPLATES / "plot.css").read_text(encoding="utf-8")
+                write_text(out / f"{name}.svg", str(plot).replace(">", f"><style>{style}</style>", 1))
     texts = {"md": rendered(table, "md"), "tex": rendered(table, "tex"), "csv": comma_separated(table)}
     for suffix, text in (texts | {"html": page(table.title, rendered(table, "html"))}).items():
         write_text(out / f"{table.name}.{suffix}", text)
@@ -193,8 +186,8 @@ def _inert(text: str) -> str:
 def draw(part: Part, figure: Figure) -> Markup | None:
     """Draws a figure of a part as SVG; None if it has no points.
 
-    Curves are named after rows; measured ones are solid, reported ones dashed. If closer to real motions is better in
-    a column, real motions are a dotted line. `points` makes it a scatter plot.
+    Curves are named after rows; reported ones are dashed. If closer to real motions is better in a column, real motions
+    are a dotted line.
     """
     panels = []
     for column in figure.y:
@@ -232,12 +225,9 @@ def ranks(values: Sequence[float | None], better: str, real: float | None) -> li
 
     `better` is higher, lower, real (closest to the value `real` of real motions) or none; a missing value is None.
     """
-    there = [v for v in values if v is not None]
-    if better == "none" or len(there) < 2 or (better == "real" and real is None):
+    if better == "none" or sum(v is not None for v in values) < 2 or (better == "real" and real is None):
         return [0] * len(values)
-
-    def badness(value: float) -> float:
-        return {"higher": -value, "lower": value}.get(better, abs(value - (real or 0.0)))
-
-    order = sorted({badness(v) for v in there})
-    return [0 if v is None else order.index(badness(v)) + 1 if badness(v) in order[:2] else 0 for v in values]
+    distances = {"higher": lambda v: -v, "lower": lambda v: v, "real": lambda v: abs(v - (real or 0.0))}
+    badness = [None if v is None else distances[better](v) for v in values]
+    best = sorted({bad for bad in badness if bad is not None})[:2]
+    return [best.index(bad) + 1 if bad in best else 0 for bad in badness]

@@ -20,8 +20,7 @@ from flame_mdm.schemas import ClosedSchema, Int, Number, Schema, check_shape
 SPECS = EXPERIMENTS / "tables"
 PUBLISHED = SPECS / "published.yaml"
 LABELS: dict[str, dict[str, str]] = read_yaml(Path(__file__).with_name("labels.yaml"))
-ABOUT = LABELS["values"]
-"""Labels of the values that a column may show besides metrics, and of the x-axes of figures."""
+ABOUT = LABELS["values"]  # labels of the values that a column may show besides metrics, and of the x-axes of figures
 SWEPT = ("sampler", "num_inference_steps", "eta", "spacing", "guidance_scale", "until", "strength", "batch_size")
 """Options of a row that may be lists; each value makes one row."""
 MOST_ROWS, MOST_COLUMNS, MOST_FIGURES = 1_000, 100, 100

@@ -9,11 +9,9 @@ import torch
 from torch import Tensor
 
 from flame_mdm.batch import MotionBatch, length_mask
-from flame_mdm.config import EXPERIMENTS, compose, parameters
+from flame_mdm.config import EXPERIMENTS, compose, instantiate, parameters
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.processes.flow_matching import FlowMatching
-from flame_mdm.representations import Representation
-from flame_mdm.representations.skeleton import Skeleton
 from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.task import MotionGeneration
 
@@ -31,26 +29,6 @@ CALLS_A_STEP = {"midpoint": 2, "heun": 2, "rk4": 4}
 LENGTHS = [11, 8, 5]
 TEXTS = ["a person walks", "a person jumps twice and turns to the left", ""]
 ACTIONS = ["walk", "jump", "sit"]
-
-
-class TwoJoints(Representation):
-    """Two joints and one more feature, with statistics that are not trivial."""
-
-    def __init__(self):
-        offsets = ((0, 0, 0), (0, -1, 0))
-        tree = Skeleton("pair", ("root", "foot"), (-1, 0), ((0, 1),), offsets, (0, 0, 0, 0), (1,), (0, 1))
-        super().__init__("two_joints", 7, 20.0, tree)
-        generator = torch.Generator().manual_seed(0)
-        self.mean = torch.randn(7, generator=generator)
-        self.std = 0.5 + torch.rand(7, generator=generator)
-
-    def decode(self, features: Tensor) -> Tensor:
-        return features[..., :6].unflatten(-1, (2, 3))
-
-    def encode(self, *_: Any) -> Any:
-        raise NotImplementedError
-
-    statistics = joint_features = encode  # type: ignore[assignment]
 
 
 @cache
@@ -90,7 +68,10 @@ def build(denoiser: str, process: str, condition: str = "learned", **process_opt
     config["task"] = config["task"] | {"cond_drop_prob": 0.5, "guidance_scale": 2.5, "num_inference_steps": 4}
     config["task"]["sampler"] = samplers(process)[0]
     torch.manual_seed(0)
-    return MotionGeneration.build(config, TwoJoints(), actions=ACTIONS).double()
+    representation = instantiate(config["representation"])
+    representation.mean.normal_()
+    representation.std.uniform_(0.5, 1.5)
+    return MotionGeneration.build(config, representation, actions=ACTIONS).double()
 
 
 def samplers(process: str) -> list[str]:
@@ -101,15 +82,10 @@ def batch(rows: slice = slice(None), frames: int | None = None) -> MotionBatch:
     """Motions of mixed lengths; `rows` chooses some, `frames` pads further."""
     lengths = torch.tensor(LENGTHS)[rows]
     mask = length_mask(lengths, frames)
-    x = torch.randn(len(LENGTHS), max(LENGTHS), 7, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    x = torch.randn(len(LENGTHS), max(LENGTHS), 263, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     x = torch.nn.functional.pad(x, (0, 0, 0, 20))[rows, : mask.shape[1]] * mask[..., None]
     ids = [f"motion {i}" for i in range(len(LENGTHS))][rows]
     return MotionBatch(x, mask, ids, TEXTS[rows], torch.arange(len(LENGTHS))[rows])
-
-
-def legal(denoiser: str, condition: str) -> bool:
-    """Denoisers that read tokens in place of the pooled vector need a condition."""
-    return condition != "none" or not DENOISERS[denoiser].get("max_tokens")
 
 
 each_denoiser = pytest.mark.parametrize("denoiser", DENOISERS)
@@ -120,9 +96,8 @@ PAIRS = [(process, "learned") for process in PROCESSES] + [("x0", "action"), ("x
 @pytest.mark.parametrize(("process", "condition"), PAIRS)
 @each_denoiser
 def test_trains_and_samples(denoiser, process, condition, monkeypatch):
-    task = build(denoiser, process, condition)
-    motions = batch()
-    if not legal(denoiser, condition):
+    task, motions = build(denoiser, process, condition), batch()
+    if condition == "none" and DENOISERS[denoiser].get("max_tokens"):  # reads tokens in place of the pooled vector
         with pytest.raises(ValueError, match="needs condition tokens, but the condition encoder has none"):
             task.generate(motions)
         return
@@ -164,17 +139,11 @@ def test_a_motion_does_not_depend_on_padding_or_neighbors(denoiser, process):
 
 @pytest.mark.parametrize(("process", "sampler"), [(p, s) for p in ("x0", FLOW) for s in samplers(p)])
 def test_one_encoding_a_run_and_one_forward_a_call(process, sampler):
-    task, steps = build("mdm_decoder_text", process), 5
     for guidance_scale, copies in ((2.5, 2), (1.0, 1)):
-        encodings, forwards = [], []
-        hooks = [
-            task.condition.register_forward_hook(lambda *_, calls=encodings: calls.append(1)),
-            task.denoiser.register_forward_hook(lambda _, x, __, calls=forwards: calls.append(len(x[0]))),
-        ]
-        options = SamplerOptions(sampler=sampler, num_inference_steps=steps, guidance_scale=guidance_scale)
-        task.generate(batch(), options)
+        task, encodings, forwards = build("mdm_decoder_text", process), [], []
+        task.condition.register_forward_hook(lambda *_, calls=encodings: calls.append(1))
+        task.denoiser.register_forward_hook(lambda _, x, __, calls=forwards: calls.append(len(x[0])))
+        task.generate(batch(), SamplerOptions(sampler=sampler, num_inference_steps=5, guidance_scale=guidance_scale))
         assert len(encodings) == 1
         assert set(forwards) == {copies * len(LENGTHS)}
-        assert sampler == "dopri5" or len(forwards) == steps * CALLS_A_STEP.get(sampler, 1)
-        for hook in hooks:
-            hook.remove()
+        assert sampler == "dopri5" or len(forwards) == 5 * CALLS_A_STEP.get(sampler, 1)

@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import shlex
 import time
 from itertools import product
 from pathlib import Path
@@ -149,22 +148,21 @@ def test_a_skeleton_file_maps_any_joints(tmp_path: Path):
 
 def test_the_table_gives_captions_actions_splits_and_sources(tmp_path: Path):
     rows = []
-    for k in range(12):
-        np.savez(tmp_path / f"{k:02d}.npz", joints=WALK + 0.01 * k, fps=30)
-        facts = {"action": ("turn left", "turn right", "walk")[k % 3], "split": "val" if k == 11 else "train"}
-        facts["source"] = f"take {k // 2 if k < 10 else k}"
-        rows += [{"id": f"{k:02d}", "text": text, **facts} for text in ("turns Left, clockwise", "is bright")]
+    for k, action in enumerate(("turn left", "turn right", "walk", "walk")):
+        np.savez(tmp_path / f"{k}.npz", joints=WALK + 0.01 * k, fps=30)
+        facts = {"action": action, "split": "val" if k == 3 else "train", "source": f"take {(k + 1) // 2}"}
+        rows += [{"id": k, "text": text, **facts} for text in ("turns Left, clockwise", "is bright")]
     write_table(tmp_path, rows)
     source = Folder(str(tmp_path), mirror=True)
     store = write_store(tmp_path / "store", source, HumanML())
     assert store.info["actions"] == ["turn left", "turn right", "walk"]
-    assert store.info["clips"] == {"train": 22, "val": 1, "test": 0}
+    assert store.info["clips"] == {"train": 6, "val": 1, "test": 0}
     clips = {clip.id: clip for clip in store.clips}
     assert source.count() == len(clips)
-    assert clips["00"].captions == ["turns Left, clockwise", "is bright"]
-    assert clips["M00"].captions == ["turns Right, counterclockwise", "is bright"]
-    assert [clips[i].action for i in ("00", "M00", "02", "M02")] == [0, 1, 2, 2]
-    assert clips["00"].source == clips["M00"].source == clips["01"].source == "take 0"
+    assert clips["0"].captions == ["turns Left, clockwise", "is bright"]
+    assert clips["M0"].captions == ["turns Right, counterclockwise", "is bright"]
+    assert [clips[i].action for i in ("0", "M0", "2", "M2")] == [0, 1, 2, 2]
+    assert [clips[i].source for i in ("0", "M0", "1", "2", "M2")] == ["take 0", "take 0", "take 1", "take 1", "take 1"]
 
 
 HEADLESS = {joint: f"{joint}?" for joint in SMPL22.joints}
@@ -182,11 +180,7 @@ BAD = {
         "line 3: one has two values of split: val and test",
     ),
     "no rate": (lambda f: (f / "skeleton.yaml").unlink(), r"one\.npy: no frame rate in the file"),
-    "cut": (lambda f: (f / "one.npy").write_bytes((f / "one.npy").read_bytes()[:900]), r"one\.npy: damaged"),
     "23 joints": (lambda f: np.save(f / "one.npy", np.zeros((9, 23, 3))), r"one\.npy: 23 joints, not the 22, 24 or 52"),
-    "nan": (lambda f: np.save(f / "one.npy", WALK * np.nan), r"one\.npy: numbers of joints in frame 0 are not finite"),
-    "unit": (lambda f: np.save(f / "one.npy", WALK * 100), r"one\.npy: the legs are 8\d.* m long .* be 0\.01 \(cent"),
-    "sides": (lambda f: np.save(f / "one.npy", WALK * [-1, 1, 1]), r"one\.npy: the toes point backwards"),
     "up": (lambda f: np.savez(f / "deep/two.npz", joints=LYING, fps=9), "the body is lying down"),
     "yaml key": (
         lambda f: skeleton(f, rate=30),
@@ -341,34 +335,8 @@ def test_what_a_folder_lacks_is_reported(tmp_path: Path, monkeypatch, capsys):
     assert not re.search("changed since|no captions", prepared("force=true"))
 
 
-SHORT = [
-    *("trainer.max_steps=3", "trainer.val_check_interval=3", "trainer.enable_progress_bar=false"),
-    *("trainer.accelerator=cpu", "data.num_workers=0"),
-]
-SMALL = ["callbacks.samples.every_n_steps=100", "denoiser.num_layers=1", "task.num_inference_steps=2"]
-
-
-@pytest.mark.slow
-def test_the_tutorial_works_as_it_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
-    """Runs the code blocks of the documentation in their order, in an empty folder."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("FLAME_MDM_DATA", str(tmp_path / "data"))
-    text = (ROOT / "docs" / "own-data.md").read_text()
-    for language, block in re.findall(r"```(\w+)\n(.*?)```", text, re.DOTALL):
-        if language == "python":
-            exec(block, {})
-        elif language == "yaml":
-            Path(re.findall(r"# (\S+\.yaml)", block)[0]).write_text(block)
-        for line in block.splitlines() if language == "bash" else ():
-            _, target, *variables = shlex.split(line)
-            variables += SHORT * (target == "train") + ["quick=true"] * (target == "evaluate")
-            variables += SMALL * (target == "train" and "motion_clip" not in line)
-            escaped = (re.sub(r"([\\ ])", r"\\\1", word).replace("$", "$$") for word in reversed(variables))
-            monkeypatch.setenv("MAKEFLAGS", f" -- {' '.join(escaped)}")  # as make hands variables down, latest first
-            assert main([target, "--from-make"]) == 0, capsys.readouterr()
-    output = capsys.readouterr().out
-    assert "40 clips can be prepared (motions: " in output
-    assert output.count("\nclips: ") == 3, "of preparation and two trainings"
-    assert "not computed: " in output
-    assert list(tmp_path.glob("samples/mine/**/*.html"))
-    assert set(read_skeleton(tmp_path / "mine" / "skeleton.yaml")["map"]) == set(SMPL22.joints)
+def test_the_skeleton_file_in_the_documentation_is_legal(tmp_path: Path):
+    blocks = re.findall(r"```yaml\n(.*?)```", (ROOT / "docs" / "own-data.md").read_text(), re.DOTALL)
+    (block,) = (block for block in blocks if "skeleton.yaml" in block.splitlines()[0])
+    (tmp_path / "skeleton.yaml").write_text(block)
+    assert set(read_skeleton(tmp_path / "skeleton.yaml")["map"]) == set(SMPL22.joints)

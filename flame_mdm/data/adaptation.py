@@ -27,8 +27,7 @@ KEPT = "prior/"  # beginning of the names of these clips
 class Lesson(MotionSource):
     """Clips of a folder, mirrored too, for training unless a table says otherwise, and clips of a store, `prior`.
 
-    All are normalized as those of the store. Captions in the folder become "CAPTION in NAME style", with the name of
-    the data set. `motion` is as for `Folder`.
+    All are normalized as those of the store. Captions in the folder become "CAPTION in NAME style".
     """
 
     named_by_recipe = True
@@ -39,7 +38,6 @@ class Lesson(MotionSource):
 
     @cached_property
     def store(self) -> Store:
-        """The store of what the model knows."""
         return Store(self.prior)
 
     def kept(self) -> list[Entry]:
@@ -77,8 +75,8 @@ def check_clips(path: str | Path, fps: float) -> None:
 def fault_of(joints: np.ndarray, fps: float) -> str:
     """Returns how far the floor of a clip (F, J, 3) rises, or the body floats; "" within `DRIFT` and `FLOAT`.
 
-    The floor at a time is the lowest joint within a second around it, which is longer than a jump. Heights are measured
-    from the lowest joint of the clip, which training puts on the floor.
+    The floor at a time is the lowest joint within a second around it, which is longer than a jump; height 0 is that of
+    the lowest joint of the clip.
     """
     floor = minimum_filter1d(joints[..., 1].min(1), round(fps), mode="nearest")
     rise, height = floor[-1] - floor[0], np.median(floor) - floor.min()

@@ -129,10 +129,7 @@ class Amass:
     def map(
         self, arguments: Mapping[str, Argument], function: Callable[[Argument, Recording], Result], workers: int = 0
     ) -> Iterator[tuple[str, Result]]:
-        """Yields (key, `function(arguments[key], recording)`) for the keys of `key_of`, sorted, from worker processes.
-
-        Function and arguments are picklable; the file name is prepended to its `UserError`s.
-        """
+        """Yields (key, `function(arguments[key], recording)`), sorted; both are picklable, for worker processes."""
         self.check(arguments)
         tasks: list[tuple[Path, dict[str, Argument]]] = []  # a recording or an archive, and arguments
         for subset, keys in groupby(sorted(arguments), _subset_of):

@@ -1,7 +1,7 @@
 """BABEL: time-stamped action labels on the motions of AMASS, cut into clips as FLAME does.
 
-Punnakkal et al., "BABEL: Bodies, Action and Behavior with English Labels", CVPR 2021; Kim et al., "FLAME: Free-form
-Language-based Motion Synthesis & Editing", AAAI 2023, appendix "BABEL". `docs/babel.md` describes the set.
+Punnakkal et al., "BABEL: Bodies, Action and Behavior with English Labels", CVPR 2021; Kim et al. (FLAME), AAAI 2023,
+appendix "BABEL". `docs/babel.md` describes the set.
 """
 
 import math
@@ -27,7 +27,7 @@ GET_IT = (
     "SOURCE=/path/to/babel_v1.0_release"
 )
 
-PARTS: dict[str, tuple[str, ...]] = {"train": ("train", "extra_train"), "val": ("val", "extra_val")}
+PARTS = {"train": ("train", "extra_train"), "val": ("val", "extra_val")}
 """Files of each part. The "extra" files contain labels of several annotators; only the first annotator's are used."""
 
 
@@ -58,11 +58,7 @@ class Babel(MotionSource):
 
     Both splits train on BABEL's entire train part and test on 20 % of its val part: ours on 20 % of the motions, so
     that no motion is in two splits, FLAME's on every fifth clip, so that overlapping windows are in both val and test.
-
-    Args:
-        path: folder with `train.json`, `extra_train.json`, `val.json` and `extra_val.json` (BABEL v1.0).
-        amass: folder of AMASS's SMPL+H G release, as archives or unpacked.
-        published_split: use FLAME's split, in which clips of val and test overlap.
+    `path` is the folder of BABEL v1.0, `amass` that of AMASS's SMPL+H G release, as archives or unpacked.
     """
 
     name = "babel"

@@ -99,10 +99,9 @@ class Bandai(MotionSource):
     """Both data sets on SMPL's skeleton, with captions generated from content and style.
 
     Args:
-        path: a clone of the original repository, any folder above the BVH files, or a zip or tar archive of one.
+        path: a clone of the original repository, any folder above the BVH files, or an archive of one.
         motion: "joints" for representations of joint positions, "smpl" for those of SMPL's rotations.
-        mirror: yield a mirrored copy after each clip of the training split; not of validation and test clips.
-        exclude: takes to leave out, by the name of the BVH file without extension.
+        mirror: yield a mirrored copy after each clip of the training split.
         split: "takes" holds out takes of combinations of content and style that training sees; "compositional"
             holds out the combinations `HELD_OUT`, whose contents and styles training sees only in others.
     """

@@ -18,10 +18,9 @@ ARRAYS = ("J_regressor", "v_template", "kintree_table", "shapedirs")
 
 
 def load_offsets(path: Path) -> Offsets:
-    """Returns the position of SMPL's 24 joints relative to their parents in the rest pose of the mean shape, meters.
+    """Returns the positions of SMPL's 24 joints relative to their parents in the rest pose of the mean shape, meters.
 
-    The first is the pelvis relative to the origin. `path` is SMPL's .pkl from https://smpl.is.tue.mpg.de, of which no
-    code runs, or an .npz with the same arrays.
+    `path` is SMPL's .pkl from https://smpl.is.tue.mpg.de, of which no code runs, or an .npz with the same arrays.
     """
     with naming(path, KeyError, TypeError, IndexError, ValueError, what="not a SMPL model of 24 joints: "):
         if path.suffix == ".npz":
@@ -58,11 +57,7 @@ class Body(NamedTuple):
     shape: torch.Tensor
 
     def joints(self, recording: Recording) -> np.ndarray:
-        """Returns joints (F, 22, 3) float64 in meters, y up as in HumanML3D: AMASS's (-x, z, y).
-
-        These joints do not depend on the other 30, which are finger joints; soft tissue and pose correctives move
-        only the surface.
-        """
+        """Returns joints (F, 22, 3) float64 in meters, y up as in HumanML3D: AMASS's (-x, z, y)."""
         betas = torch.from_numpy(recording.betas[:10].astype(np.float64))
         rest = self.rest + self.shape[..., : len(betas)] @ betas
         poses = torch.from_numpy(recording.poses[:, :66].astype(np.float64)).unflatten(1, (22, 3))
@@ -73,10 +68,7 @@ class Body(NamedTuple):
 
 
 def load_body(folder: Path, gender: str) -> Body:
-    """Loads a body of the extended SMPL+H model: only template, shape and joint regressor.
-
-    It is `male/model.npz`, as in the model's archive, or `SMPLH_MALE.npz`, in the folder or in a subfolder `smplh`.
-    """
+    """Loads `male/model.npz` or `SMPLH_MALE.npz` of the extended SMPL+H model, in the folder or its folder `smplh`."""
     names = (f"{gender}/model.npz", f"SMPLH_{gender.upper()}.npz")
     candidates = [folder / inner / name for inner in ("", "smplh") for name in names]
     path = next((path for path in candidates if path.is_file()), None)

@@ -71,8 +71,7 @@ class CMU(MotionSource):
         path: folder with recordings such as 02_01.bvh, or 02_01.amc and 02.asf, in any subfolders; or an archive of it.
         captions: clone of HumanML3D's repository, or a folder with texts, splits and index; default: `path`.
             KIT-ML's captions of AMASS, kitml*.json, are used if they are in one of the two folders.
-        motion: "joints" for representations of joint positions; "smpl" for SMPL's rotations, computed from these.
-        exclude: recordings to leave out, such as 02_01.
+        motion: "joints", or "smpl" for SMPL's rotations, computed from the joints.
     """
 
     name = "cmu"
@@ -93,12 +92,10 @@ class CMU(MotionSource):
 
     @cached_property
     def path(self) -> Path:
-        """The folder of the recordings."""
         return archives.as_folder(self.archive, self, lambda name: name.lower().endswith(SUFFIXES))
 
     @property
     def captions(self) -> Path:
-        """The folder of the captions."""
         return self.path if self._captions is None else Path(self._captions)
 
     @cached_property

@@ -25,11 +25,7 @@ class HumanAct12(MotionSource):
     """The clips of `humanact12poses.pkl`, as raw motions of the SMPL representations.
 
     The file names neither subjects nor recordings. Our split (70 % train, 10 % val, 20 % test of each action) keeps
-    neighboring clips together.
-
-    Args:
-        path: `humanact12poses.pkl`, or the folder that contains it.
-        published_split: use all clips for training and for testing, as the papers do.
+    neighboring clips together. The published one uses all clips for training and for testing, as the papers do.
     """
 
     name = "humanact12"

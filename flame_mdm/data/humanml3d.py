@@ -1,7 +1,6 @@
 """HumanML3D: motions of AMASS and HumanAct12 with descriptions, as features and as SMPL parameters.
 
-Guo et al., "Generating Diverse and Natural 3D Human Motions From Text", CVPR 2022. `docs/humanml3d.md` explains what to
-download and how the data set is prepared.
+Guo et al., "Generating Diverse and Natural 3D Human Motions From Text", CVPR 2022. See `docs/humanml3d.md`.
 """
 
 import csv
@@ -237,11 +236,9 @@ class HumanML3DSMPL(MotionSource):
     are taken into account, so that motion and caption match.
 
     Args:
-        path: folder with HumanML3D's texts and splits and, in it or next to it, `index.csv`; no motions are needed.
-        amass: folder of AMASS's SMPL+H G archives, packed or unpacked.
+        path, amass: as for `HumanML3D`; no motions are needed.
         humanact12: FLAME's `humanact12_processed.pkl`; without it, the clips of HumanAct12 are left out.
         published_split: train on the validation clips as well (FLAME's "final"); none are left for validation.
-        exclude: names to leave out.
     """
 
     name = "humanml3d-smpl"

@@ -35,12 +35,8 @@ class KITTemos(MotionSource):
 
     Petrovich, Black, Varol, "TEMOS", ECCV 2022, whose rules FLAME follows. Training and validation leave out motions
     of fewer than 10 or more than 500 frames. The test split keeps all motions, but only their first caption; Ghosh et
-    al.'s test clips have the attribute `ghosh_test`.
-
-    Args:
-        path: folder with `NUMBER_fke.csv`, `NUMBER_annotations.json` and `NUMBER_meta.json`.
-        splits: folder `datasets/kit-splits` of https://github.com/Mathux/TEMOS.
-        exclude: numbers to leave out.
+    al.'s test clips have the attribute `ghosh_test`. `path` contains `NUMBER_fke.csv`, `NUMBER_annotations.json` and
+    `NUMBER_meta.json`, `splits` TEMOS's lists of these numbers.
     """
 
     name = "kit-temos"

@@ -97,10 +97,7 @@ def frame_tokens(tokens: Sequence[str]) -> tuple[list[str], int]:
 
 
 def read_splits(folder: Path, ending: str, get_it: str) -> dict[str, Split]:
-    """Returns name -> split, in the order of the lists train, val and test; `get_it` says where these are published.
-
-    Raises `UserError` if a name is in two splits.
-    """
+    """Returns name -> split, in the order of the lists; raises `UserError` if a name is in two splits."""
     splits: dict[str, Split] = {}
     for split in SPLITS:
         file = required(folder, get_it) / f"{split}{ending}"
@@ -113,8 +110,8 @@ def read_splits(folder: Path, ending: str, get_it: str) -> dict[str, Split]:
 class T2MFolder(MotionSource):
     """A processed folder. Cuts and mirrored copies have the split of their motion, which is also their source.
 
-    The attribute `tokens` contains the words with their parts of speech, one list per caption. `exclude` leaves out
-    names; a mirrored copy has its own.
+    The attribute `tokens` contains the words with their parts of speech, one list per caption. A mirrored copy has a
+    name of its own to exclude.
     """
 
     representation: str  # name of the representation of the features in the folder
@@ -128,7 +125,7 @@ class T2MFolder(MotionSource):
 
     @cached_property
     def names(self) -> dict[str, Split]:
-        """Name in a list of the splits -> its split, in the order of the lists."""
+        """Name -> its split, in the order of the lists."""
         return self.not_excluded(read_splits(self.path, ".txt", self.get_it), self.path)
 
     @cached_property

@@ -45,11 +45,8 @@ class Video(NamedTuple):
 class UESTC(MotionSource):
     """The clips of `vibe_cache_refined.pkl`, rotated to the front view, as raw motions of the SMPL representations.
 
-    As published, training clips of fewer than 45 frames are left out and all test clips are kept.
-
-    Args:
-        path: the folder that contains `vibe_cache_refined.pkl` and `info`.
-        published_split: train on all 51 training subjects; otherwise 5 of them are used for validation.
+    As published, training clips of fewer than 45 frames are left out and all test clips are kept. The published split
+    trains on all 51 training subjects; ours uses 5 of them for validation.
     """
 
     name = "uestc"
@@ -71,13 +68,11 @@ class UESTC(MotionSource):
 
     @cached_property
     def poses(self) -> Path:
-        """The file of poses, next to the folder `info`."""
         return find(self.path, "vibe_cache_refined.pkl")
 
     @cached_property
     def videos(self) -> list[Video]:
-        """All videos, in the order of the file of poses."""
-        videos = []
+        videos = []  # in the order of the file of poses
         for index, name in enumerate(self._lines("names.txt")):
             match = NAME.fullmatch(name)
             if match is None or int(match[2]) >= len(self.actions):

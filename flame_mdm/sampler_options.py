@@ -40,7 +40,7 @@ class SamplerOptions:
 
     guidance_scale: float | None = option(None, "scale of classifier-free guidance; 1 = off. Default: the recipe's")
     sampler: str | None = option(
-        None, "ancestral, ddim, dpm_solver_pp_2m; euler, midpoint, heun, rk4, dopri5; consistency. Default: recipe's"
+        None, "ancestral, ddim, dpm_solver_pp_2m; euler, midpoint, heun, rk4, dopri5; consistency. null = the recipe's"
     )
     num_inference_steps: int | Sequence[int] | None = option(
         None, "number of sampling steps; for diffusion also a list of steps, [0,2,5,9]. Default: the recipe's"

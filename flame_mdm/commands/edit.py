@@ -51,10 +51,8 @@ def main(settings: EditSettings) -> None:
     facts = {"seed": settings.seed, "checkpoint": digest, "keep": edits[0].keep}
     write_motions(folder, [shown, *edits], facts, stages, settings.mp4, body)
     say(summary(folder, edits, settings))
-    say(
-        f"{edits[0].keep.mean():.0%} of the features are kept. Largest change in the kept part: "
-        f"{max(e.feature_error for e in edits):.3g} in normalized features, "
-        f"{max(e.joint_error for e in edits):.3g} m in world joint positions"
-    )
-    if max(e.joint_error for e in edits) > 0.01:
+    changed, moved = max(e.feature_error for e in edits), max(e.joint_error for e in edits)
+    largest = f"{changed:.3g} in normalized features, {moved:.3g} m in world joint positions"
+    say(f"{edits[0].keep.mean():.0%} of the features are kept. Largest change in the kept part: {largest}")
+    if moved > 0.01:
         say("a kept part that follows a generated one begins where that one ends, so its place in the world may differ")

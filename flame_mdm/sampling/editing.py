@@ -53,7 +53,6 @@ def edit(
     """Resamples part of a motion: `joints` in `region`, each by default all; with `strength`, as a variation of it.
 
     Args:
-        model: from `flame_mdm.load`.
         motion: a file or clip that `read_motion` reads; a motion, generated or read; or joints (F, J, 3) in meters, y
             up, in the order of a known skeleton.
         texts: what the person does in the new part; one text or several.
@@ -164,8 +163,7 @@ def method_options(
 ) -> tuple[dict[str, Any], SamplerOptions]:
     """Returns the options of `Edit` for the requested method, by default that of the process, and of the sampler."""
     possible = [name for name, how in METHODS.items() if how["mode"] in process.edit_modes]
-    usual = next(name for name in possible if METHODS[name]["mode"] == process.edit_modes[0])
-    method = editing.method or usual
+    method = editing.method or next(name for name in possible if METHODS[name]["mode"] == process.edit_modes[0])
     if method not in possible:
         what = f"is not supported by {type(process).__name__}; this model supports: {', '.join(possible)}"
         raise UserError(f"method={method} {what}")

@@ -45,7 +45,6 @@ def generate(
     sequence "A man walks | sits down", unless `split=False`.
 
     Args:
-        model: from `flame_mdm.load`.
         texts: what the person does; one text or several.
         edit: part of a motion of that length to keep in every sample, with `known` and `keep` (1, F, D).
         stages: list that gets the clean estimates along the sampling of the first motion, at equal intervals, and that

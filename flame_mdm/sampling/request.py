@@ -47,9 +47,7 @@ class EditRequest:
         None, "frames to resample: in_between, prediction (= prefix), suffix, interpolate, or one or more [begin, end]"
     )
     region_seconds: Ranges | None = option(None, "one or more [begin, end] in seconds, instead of region")
-    joints: str | Sequence[str] | None = option(
-        None, "joints to resample: upper_body, lower_body, legs, arms, left_arm ... or [names]. Default: all"
-    )
+    joints: str | Sequence[str] | None = option(None, "joints to resample: upper_body, left_arm, ... or [names]")
     method: str | None = option(
         None, "mdm and flame (keep exactly), flame_code, mfm. Default: mdm for diffusion, mfm for flow matching"
     )
@@ -121,12 +119,8 @@ class SamplingRequest:
     after: str | Path | Motion | None = option(None, "FILE or dataset:id: a motion that the result continues")
     split: bool = option(True, 'sentences with several actions, "walks, then sits", become sequences, "walks | sits"')
     loop: bool = option(False, "the last frame leads to the first one")
-    targets: str | Path | Mapping[str, Any] | None = option(
-        None, "a JSON file of places to reach: way points, joints, poses; see docs/targets.md"
-    )
-    shared_noise: bool = option(
-        False, "all motions get the same noise, so that they differ by their texts and lengths alone"
-    )
+    targets: str | Path | Mapping[str, Any] | None = option(None, "a JSON file of places to reach: docs/targets.md")
+    shared_noise: bool = option(False, "the same noise for all motions: they differ by texts and lengths alone")
     cleanup: bool = option(False, "smooth motions, constant bone lengths, feet that do not slide")
     options: SamplerOptions = field(default_factory=SamplerOptions)
     editing: EditRequest | None = None

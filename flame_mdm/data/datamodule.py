@@ -75,13 +75,11 @@ class MotionDataModule(LightningDataModule):
     """Prepares a data set if it is not prepared yet, and serves its batches.
 
     Args:
-        source: the published data set.
         representation: encodes the clips; receives the statistics of the store.
         root, name: folder of all prepared data sets, and name of that of this one.
         batch_size: clips per process and step.
         num_workers: number of loading processes; 0 loads in the training process.
         crop: rule for the frames of a sample and the minimum length of a clip.
-        seed: of the random draws.
         resident: whether the data set is kept on the training device, where the same batches are gathered without
             workers. "auto": if it takes at most a quarter of the free memory.
         pad_multiple: batches are padded to multiples of this number of frames, so that compiled networks see few
@@ -166,17 +164,14 @@ class MotionDataModule(LightningDataModule):
         shortest = self.crop.min_frames
         used = Counter(clip.split for clip in store.clips if clip.length >= shortest)
         short = {split: total - used[split] for split, total in store.info["clips"].items()}
-        counts = (
-            f"{used[split]}" + f" of {used[split] + n} ({n} shorter than {shortest} frames)" * bool(n) + f" {split}"
-            for split, n in short.items()
-        )
-        advice = [
-            f"all {split} clips are too short: lower data.crop.min_frames"
-            if short[split]
-            else f"no {split} clips. For your own data, add a `split` column to captions.csv"
-            for split in short
-            if not used[split]
-        ]
+        counts, advice = [], []
+        for split, n in short.items():
+            of_all = f" of {used[split] + n} ({n} shorter than {shortest} frames)" if n else ""
+            counts.append(f"{used[split]}{of_all} {split}")
+            if n and not used[split]:
+                advice.append(f"all {split} clips are too short: lower data.crop.min_frames")
+            elif not used[split]:
+                advice.append(f"no {split} clips. For your own data, add a `split` column to captions.csv")
         if not store.info["actions"] and not any(clip.captions for clip in store.clips):
             advice.append("no captions: add captions.csv and prepare with force=true, or train with condition=none")
         return ["clips: " + ", ".join(counts), *(() if store.info["published_split"] else advice)]
@@ -201,9 +196,9 @@ class MotionDataModule(LightningDataModule):
         if self.trainer and device.type == "cpu":
             free //= self.trainer.num_devices
         if self.resident is True and size > free:
+            numbers = f"{size / 2**30:.1f} of {free / 2**30:.1f} GiB that {device} has free"
             raise UserError(
-                f"data.resident=true: {self.folder} and its captions take {size / 2**30:.1f} GiB, but {device} has "
-                f"{free / 2**30:.1f} GiB free. Set data.resident=auto"
+                f"data.resident=true: {self.folder} and its captions take {numbers}. Set data.resident=auto"
             )
         automatic = self.resident == "auto" and device.type in ("cpu", "cuda") and size <= free / SHARE
         self.device = device if self.resident is True or automatic else None

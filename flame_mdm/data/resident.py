@@ -35,10 +35,7 @@ def free_memory(device: torch.device) -> int:
 
 
 def resident_features(store: Store, representation: Representation, device: torch.device) -> Tensor:
-    """Returns all frames of a store (N, D) float32 on a device, and one more of zeros.
-
-    They are normalized, unless the representation adapts cuts: then, batches are normalized.
-    """
+    """Returns all frames of a store (N, D) on a device, normalized unless cuts are adapted, and one more of zeros."""
     features = torch.empty(len(store.features) + 1, store.features.shape[1], device=device)
     mean, std = store.mean.astype(np.float32), store.std.astype(np.float32)
     for begin in range(0, len(store.features), CHUNK):

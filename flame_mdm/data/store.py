@@ -97,6 +97,7 @@ class Store:
         with _intact(contents):
             self.info: dict[str, Any] = read_json(contents)
             check_shape(self.info, Contents)
+        self.fingerprint: str = self.info["fingerprint"]  # in results: equal for equal clips and options anywhere
         self._check("clips.jsonl", "statistics.npz")
         frames, width = self.info["shape"]
         with _intact(self.folder / "features.npy") as path:
@@ -114,11 +115,6 @@ class Store:
         with _intact(contents):
             if _fingerprint(self.folder, name, fps, self.mean, self.std) != self.fingerprint:
                 raise ValueError("its fingerprint does not match the clips")
-
-    @property
-    def fingerprint(self) -> str:
-        """Identifier of the data in results: equal for equal clips and options, on any machine."""
-        return self.info["fingerprint"]
 
     def motion(self, clip: Entry) -> np.ndarray:
         """Returns the features (F, D) float32 of a clip, not normalized: a view of the memory-mapped array."""

@@ -20,7 +20,6 @@ from flame_mdm.errors import UserError
 from flame_mdm.safe_io import read_yaml
 
 MIN_SECONDS, MAX_SECONDS = 2.0, 3.0  # durations of clips
-AT_ONCE = 32  # number of clips that a process makes at a time
 CAPTIONS = 8  # captions per clip
 PARTIAL = 0.25  # share of the training clips whose captions leave out attributes; those of val and test state all
 UNSAID = {"speed": "normal", "amount": "quarter"}  # values that a caption need not state
@@ -188,12 +187,7 @@ class Synthetic(MotionSource):
         return self.size
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        tasks = (range(begin, min(begin + AT_ONCE, self.size)) for begin in range(0, self.size, AT_ONCE))
-        for clips in in_order(partial(self._several, fps), tasks, self.workers):
-            yield from clips
-
-    def _several(self, fps: float, indices: range) -> list[Clip]:
-        return [self.clip(index, fps) for index in indices]
+        return in_order(partial(self.clip, fps=fps), range(self.size), self.workers)
 
     def clip(self, index: int, fps: float) -> Clip:
         """Returns clip number `index` with `round(seconds * fps) + 1` frames."""

@@ -19,8 +19,7 @@ from flame_mdm.errors import UserError
 
 DRIFT, FLOAT = 0.05, 0.1
 """Limits in meters of a clip: rise of its floor from the first to the last second, and median height above it."""
-PRIOR = {"train": 2000, "val": 64}
-"""Maximum number of clips of each split that are kept of what the model knows, evenly spaced in its data."""
+PRIOR = {"train": 2000, "val": 64}  # maximum number of kept clips of what the model knows, evenly spaced in its data
 KEPT = "prior/"  # beginning of the names of these clips
 
 

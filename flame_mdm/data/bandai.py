@@ -1,7 +1,6 @@
 """The Bandai-Namco-Research-Motiondataset 1 and 2: 3,077 takes of three actors, 25 contents in 19 styles.
 
-Kobayashi, Liao, Inoue, Yojima, Takahashi, "Motion Capture Dataset for Practical Use of AI-based Motion Editing and
-Stylization", arXiv 2306.08861, 2023; CC BY-NC 4.0. `docs/bandai.md` describes the set and how it is prepared.
+Kobayashi et al., arXiv 2306.08861, 2023; CC BY-NC 4.0. `docs/bandai.md` describes the set and how it is prepared.
 """
 
 import re
@@ -127,8 +126,8 @@ class Bandai(MotionSource):
         return sum(1 + (self.mirror and take.split == "train") for take in self.takes)
 
     def counts(self) -> dict[str, int]:
-        takes = [take.dataset for take in self.takes]
-        return {"takes": len(takes), **{f"takes of data set {number}": takes.count(number) for number in (1, 2)}}
+        one, two = ([take.dataset for take in self.takes].count(number) for number in (1, 2))
+        return {"takes": one + two, "takes of data set 1": one, "takes of data set 2": two}
 
     def clips(self, fps: float) -> Iterator[Clip]:
         convert_one = partial(convert, fps=fps, kind=self.motion)
@@ -157,10 +156,7 @@ class Bandai(MotionSource):
 
 
 def convert(file: Path, fps: float, kind: str = "joints") -> np.ndarray:
-    """Converts a BVH file to joints (F, 22, 3) float32 in meters, y up, or to the motion of `smpl_motion`, at `fps`.
-
-    Local rotations and the position of the hips are interpolated, so bones keep their length.
-    """
+    """Converts a BVH file to joints (F, 22, 3) float32 in meters, y up, or to the motion of `smpl_motion`, at `fps`."""
     with naming(file, ValueError):
         motion = bvh.read(file)
         if missing := set(JOINTS.values()) - set(motion.joints):

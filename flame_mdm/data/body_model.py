@@ -73,10 +73,8 @@ def load_body(folder: Path, gender: str) -> Body:
     candidates = [folder / inner / name for inner in ("", "smplh") for name in names]
     path = next((path for path in candidates if path.is_file()), None)
     if path is None:
-        raise FileNotFoundError(
-            f"{folder}: contains neither {' nor '.join(names)}; download the extended SMPL+H model from "
-            "https://mano.is.tue.mpg.de"
-        )
+        get_it = "download the extended SMPL+H model from https://mano.is.tue.mpg.de"
+        raise FileNotFoundError(f"{folder}: contains neither {' nor '.join(names)}; {get_it}")
     with naming(path, KeyError, TypeError, IndexError, ValueError, what="not a SMPL+H model of 52 joints: "):
         regressor, template, tree, directions = (read_npz(path, only=ARRAYS)[name] for name in ARRAYS)
         rest = _rest_joints(regressor, template, tree, 52, SMPL22.parents)[:22]

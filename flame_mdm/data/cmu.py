@@ -64,8 +64,8 @@ class Item(NamedTuple):
 class CMU(MotionSource):
     """Clips of HumanML3D, and recordings with captions of KIT-ML, on the 22 joints of SMPL.
 
-    HumanML3D's clips keep their names, splits and mirrored copies. Other recordings are in the test (val) split if a
-    clip of HumanML3D's test (val) split is cut from them, and are split by subject if HumanML3D has no clip of them.
+    HumanML3D's clips keep their names, splits and mirrored copies. Other recordings are in the test (val) split if one
+    of its test (val) clips is cut from them, and are split by subject if HumanML3D has no clip of them.
 
     Args:
         path: folder with recordings such as 02_01.bvh, or 02_01.amc and 02.asf, in any subfolders; or an archive of it.
@@ -87,8 +87,7 @@ class CMU(MotionSource):
         self.archive, self._captions = Path(path), captions
         self.motion, self.exclude, self.workers = motion, tuple(exclude), workers
         self.options = {"motion": motion, "exclude": list(exclude)}
-        self._errors: list[str] = []
-        self._counts: Counter[str] = Counter()
+        self._errors, self._counts = list[str](), Counter[str]()
 
     @cached_property
     def path(self) -> Path:

@@ -1,7 +1,6 @@
 """HumanAct12: 1,191 clips of 12 actions, as the SMPL poses published by ACTOR's authors.
 
-Guo et al., "Action2Motion: Conditioned Generation of 3D Human Motions", ACM MM 2020; poses by Petrovich et al.,
-"Action-Conditioned 3D Human Motion Synthesis with Transformer VAE", ICCV 2021. Described in `docs/actions.md`.
+Guo et al. (Action2Motion), ACM MM 2020; poses by Petrovich et al. (ACTOR), ICCV 2021. See `docs/actions.md`.
 """
 
 from collections import Counter

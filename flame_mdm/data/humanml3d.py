@@ -169,9 +169,9 @@ class HumanML3D(T2MFolder):
     def _make_motions(self, amass: Amass, todo: Sequence[IndexedClip]) -> None:
         folder, encoder = self.path / "new_joint_vecs", HumanML("smpl22", "legacy", bone_lengths=self.bone_lengths)
         write = partial(_write_features, folder, encoder)
+        write_all = partial(_from_amass, write, self._bodies())
         try:
             with ProgressBar(desc=f"creating {self.name}", total=len(todo), unit=" motions") as progress:
-                write_all = partial(_from_amass, write, self._bodies())
                 for _, count in amass.map(by_recording(todo), write_all, self.workers):
                     progress.update(count)
                 for row in todo:
@@ -263,9 +263,8 @@ class HumanML3DSMPL(MotionSource):
         """The clips to read, in the order of the index."""
         rows = [row for row in self.folder.rows if row.name in self.folder.names]
         if absent := [row.name for row in rows if not self.folder.texts.get(row.name)]:
-            raise FileNotFoundError(
-                f"{self.folder.path}: {len(absent)} clips have no text, such as {absent[0]}; unpack texts.zip again"
-            )
+            lacking = f"{len(absent)} clips have no text, such as {absent[0]}"
+            raise FileNotFoundError(f"{self.folder.path}: {lacking}; unpack texts.zip again")
         used = [row for row in rows if self.humanact12 or not row.humanact12]
         listed = sum(not name.startswith("M") for name in self.folder.names)  # without mirrored copies
         excluded = sum(not name.startswith("M") for name in self.folder.exclude)

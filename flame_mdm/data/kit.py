@@ -42,10 +42,7 @@ class KITTemos(MotionSource):
     name = "kit-temos"
     shortest, longest = 10, 500
     get_it = "get datasets/kit-splits of https://github.com/Mathux/TEMOS"
-    get_motions = (
-        "download KIT-ML from https://motion-annotation.humanoids.kit.edu/dataset and the joints as described in "
-        "docs/kit.md"
-    )
+    get_motions = "get KIT-ML at https://motion-annotation.humanoids.kit.edu/dataset and the joints as in docs/kit.md"
 
     def __init__(self, path: str, splits: str, exclude: Sequence[str] = (), workers: int = 0):
         self.path, self.splits, self.workers = Path(path), Path(splits), workers

@@ -148,10 +148,9 @@ class _Unpickler(pickle._Unpickler):
 
 
 def read(path: Path, opaque: tuple[str, ...] = ()) -> Any:
-    """Returns the content of a pickle of arrays, numbers, text and plain containers; protocols 0 to 5.
+    """Returns the content of a pickle, protocols 0 to 5; raises `UserError` if it is damaged or names other globals.
 
-    Objects whose names begin with one of `opaque` may be there, too, and are replaced by their state. Raises
-    `UserError` if the file is damaged or names other globals.
+    Objects whose names begin with one of `opaque` may be there, too, and are replaced by their state.
     """
     size = regular_file(path)
     with path.open("rb") as file:

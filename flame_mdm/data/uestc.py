@@ -1,7 +1,6 @@
 """UESTC: 25,600 videos of 40 exercises by 118 subjects, as the SMPL poses that ACTOR's authors estimated with VIBE.
 
-Ji et al., "A Large-scale RGB-D Database for Arbitrary-view Human Action Recognition", ACM MM 2018; poses by Petrovich
-et al., "Action-Conditioned 3D Human Motion Synthesis with Transformer VAE", ICCV 2021. Described in `docs/actions.md`.
+Ji et al., ACM MM 2018; poses by Petrovich et al. (ACTOR), ICCV 2021. `docs/actions.md` describes the set.
 """
 
 import math
@@ -98,20 +97,15 @@ class UESTC(MotionSource):
         columns = read_lists(path, "pose", "joints3d", "orig_cam")
         frames = self._lines("num_frames_min.txt")
         if not count == len(frames) == len(columns[0]):
-            raise UserError(
-                f"{path.parent}: names.txt has {count} lines, num_frames_min.txt {len(frames)} and {path.name} "
-                f"{len(columns[0])} clips; the numbers must be equal"
-            )
+            sizes = f"names.txt has {count}, num_frames_min.txt {len(frames)} and {path.name} {len(columns[0])} clips"
+            raise UserError(f"{path.parent}: {sizes}")
         self.leave_out("videos of view 8, side 2", count - len(self.used))
         for video in self.used:
             with naming(f"{path}: {video.id}", *NO_NUMBERS, what="does not consist of numbers: "):
                 pose, joint, camera = (np.asarray(column[video.index], np.float64) for column in columns)
                 limit = int(frames[video.index])
-            if pose.shape[1:] != (72,) or joint.shape != (len(pose), 49, 3) or camera.shape != (len(pose), 4):
-                raise UserError(
-                    f"{path}: {video.id} has pose {pose.shape}, joints3d {joint.shape}, orig_cam {camera.shape}, not "
-                    "(F, 72), (F, 49, 3), (F, 4)"
-                )
+                if pose.shape[1:] != (72,) or joint.shape != (len(pose), 49, 3) or camera.shape != (len(pose), 4):
+                    raise UserError(f"wrong: pose {pose.shape}, joints3d {joint.shape} or orig_cam {camera.shape}")
             split, length = self.split(video.subject), min(len(pose), limit)
             if length < (1 if split == "test" else MIN_FRAMES):
                 self.leave_out(f"{'test' if split == 'test' else 'training'} clips that are too short")

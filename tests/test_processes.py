@@ -44,14 +44,13 @@ TABLES: dict[str, str] = {
     "sqrt_one_minus_alphas_cumprod": "noise",
 }
 DTYPES = [torch.float32, torch.float64]
-# Options of the point-wise cases, by what the fixture calls them.
-POINTWISE = {
-    "startx_fixedsmall_clip0": GaussianDiffusion(T),
-    "startx_fixedsmall_clip1": GaussianDiffusion(T, clip_x0=True),
-    "startx_fixedlarge": GaussianDiffusion(T, variance="fixed_large"),
-    "eps_learnedrange_clip0": GaussianDiffusion(T, prediction="epsilon", variance="learned_range"),
-    "eps_learnedrange_clip1": GaussianDiffusion(T, prediction="epsilon", variance="learned_range", clip_x0=True),
+LEARNED: dict[str, Any] = {"prediction": "epsilon", "variance": "learned_range"}
+POINTWISE: dict[str, dict[str, Any]] = {
+    **{"startx_fixedsmall_clip0": {}, "startx_fixedsmall_clip1": {"clip_x0": True}},
+    **{"startx_fixedlarge": {"variance": "fixed_large"}},
+    **{"eps_learnedrange_clip0": LEARNED, "eps_learnedrange_clip1": LEARNED | {"clip_x0": True}},
 }
+"""Options of the point-wise cases, by what the fixture calls them."""
 
 
 @golden_case("gaussian")
@@ -79,17 +78,6 @@ def test_the_linear_schedule_has_the_ends_of_ho_et_al():
         assert (betas[0], betas[-1]) == pytest.approx((first, last))
 
 
-@pytest.mark.golden
-@pytest.mark.parametrize("dtype", DTYPES, ids=["gaussian-f32", "gaussian-f64"])
-def test_corrupt_and_posterior(dtype):
-    process = GaussianDiffusion(T)
-    x, noise = (motions(GAUSSIAN[f"pw/{name}"], dtype) for name in ("x0", "noise"))
-    t = torch.tensor(GAUSSIAN["pw/t"])
-    x_t = process.corrupt(x, noise, t.float())
-    assert_golden(GAUSSIAN, "pw/x_t", x_t)
-    assert_golden(GAUSSIAN, "pw/q_posterior_mean", process.schedule.posterior_mean(x, x_t, t))
-
-
 def pointwise_output(x_t: Tensor, learned: bool) -> Tensor:
     suffix = "2" if learned else ""
     A, b = GAUSSIAN[f"lin4/A{suffix}"], GAUSSIAN[f"lin4/b{suffix}"]
@@ -100,7 +88,7 @@ def pointwise_output(x_t: Tensor, learned: bool) -> Tensor:
 @pytest.mark.parametrize("dtype", DTYPES, ids=["f32", "f64"])
 @golden_cases("gaussian", POINTWISE)
 def test_reverse_step(case, dtype):
-    process, t = POINTWISE[case], torch.tensor(GAUSSIAN["pw/t"])
+    process, t = GaussianDiffusion(T, **POINTWISE[case]), torch.tensor(GAUSSIAN["pw/t"])
     x_t = motions(GAUSSIAN["f64/pw/x_t" if dtype == torch.float64 else "pw/x_t"], dtype)
     output = pointwise_output(x_t, "learned" in case)
     x0_hat = process.to_x0(output, x_t, t)
@@ -119,11 +107,13 @@ def test_reverse_step(case, dtype):
 
 @pytest.mark.parametrize("dtype", DTYPES, ids=["f32", "f64"])
 @golden_cases("gaussian", ["guided_bits", "flame_nats"])
-def test_variational_bound(case, dtype):
-    process = GaussianDiffusion(T, prediction="epsilon", variance="learned_range")
+def test_corruption_posterior_and_variational_bound(case, dtype):
+    process = GaussianDiffusion(T, **LEARNED)
     x, noise = motions(GAUSSIAN["pw/x0"], dtype), motions(GAUSSIAN["pw/noise"], dtype)
     mask, t = real(x), torch.tensor(GAUSSIAN["pw/t"]).float()
     x_t = process.corrupt(x, noise, t)
+    assert_golden(GAUSSIAN, "pw/x_t", x_t)
+    assert_golden(GAUSSIAN, "pw/q_posterior_mean", process.schedule.posterior_mean(x, x_t, t))
     key, arrays = f"pw/vb_{case}", GAUSSIAN
     if "guided" in case:  # guided-diffusion has bits, and at step 0 the likelihood of a pixel: not for motion
         output, later = pointwise_output(x_t, learned=True), t > 0

@@ -108,13 +108,13 @@ def assert_golden(arrays: Arrays, key: str, value: Tensor, within: float = 10.0)
     np.testing.assert_allclose(value.numpy(), expected, rtol=0, atol=tolerance, err_msg=key)
 
 
-def spaced(total: int, spec: str) -> list[int]:
-    """The fixtures' names of step choices: "ddimN", "N", the counts of equal sections "a,b,c", or GLIDE's "fast27"."""
+def spaced(total: int, spec: str | list[int]) -> list[int]:
+    """The fixtures' choices of steps: "ddimN", "N", counts of equal sections "a,b,c" or [a, b, c], GLIDE's "fast27"."""
     if spec == "fast27":
         return sorted({*spaced(total, "10,10,3,2,2"), total - 3} - {total - 1})
-    if spec.startswith("ddim"):
+    if isinstance(spec, str) and spec.startswith("ddim"):
         return timesteps(total, int(spec.removeprefix("ddim")), "stride")
-    counts = [int(count) for count in spec.split(",")]
+    counts = [int(count) for count in spec.split(",")] if isinstance(spec, str) else spec
     steps, start = [], 0
     for index, count in enumerate(counts):
         size = total // len(counts) + (index < total % len(counts))

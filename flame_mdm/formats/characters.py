@@ -107,7 +107,7 @@ def identify(path: Path, names: Mapping[int, str]) -> dict[str, int]:
     """Returns SMPL's joints -> numbers, among numbers -> names of a character; raises `UnknownJoints` if some lack."""
     listed = path.with_suffix(".yaml")
     chosen = read_yaml(listed) if listed.exists() else None
-    candidates = _listed(listed, chosen, names) if chosen else recognized(names, known_skeletons())
+    candidates = _listed(path, listed, chosen, names) if chosen else recognized(names, known_skeletons())
     numbers, missing = matched(path, names, candidates)
     if twice := next((joint for joint, number in numbers.items() if list(numbers.values()).count(number) > 1), None):
         raise UserError(f"{listed}: {names[numbers[twice]]} is listed for {twice} and for another joint. Remove one")
@@ -123,7 +123,7 @@ def identify(path: Path, names: Mapping[int, str]) -> dict[str, int]:
     return numbers
 
 
-def _listed(listed: Path, chosen: object, names: Mapping[int, str]) -> dict[str, list[int]]:
+def _listed(path: Path, listed: Path, chosen: object, names: Mapping[int, str]) -> dict[str, list[int]]:
     if not isinstance(chosen, dict):
         raise UserError(f"{listed}: not a list of names, each on a line such as `left_knee: Calf L`")
     candidates = {}
@@ -133,7 +133,8 @@ def _listed(listed: Path, chosen: object, names: Mapping[int, str]) -> dict[str,
         if name is not None:
             candidates[joint] = [number for number, own in names.items() if own == name]
             if not candidates[joint]:
-                raise UserError(f"{listed}: {joint}: no joint {name}.{did_you_mean(str(name), names.values())}")
+                similar = did_you_mean(str(name), names.values())
+                raise UserError(f"{listed}: {joint}: {path} has no joint {name}.{similar}")
     return candidates
 
 

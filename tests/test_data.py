@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Iterable
+from functools import partial
 from itertools import islice, product
 from pathlib import Path
 from types import SimpleNamespace
@@ -80,13 +81,11 @@ def test_the_same_input_gives_the_same_fingerprint(store, tmp_path, monkeypatch)
     monkeypatch.setattr("time.time", lambda: float(next(clock)))
     again = write_store(tmp_path / "again", Synthetic(clips=40, seed=1), HumanML())
     assert store.fingerprint == again.fingerprint != other.fingerprint
-    # Nor does rounding.
-    names = (store.folder, store.info["representation"], store.info["fps"])
-    noisy = [values + scale * 1e-9 for values, scale in ((store.mean, -1), (store.std, 1))]
+    print_of = partial(_fingerprint, store.folder, store.info["representation"], store.info["fps"], std=store.std)
     zero = np.zeros_like(store.mean)
-    assert _fingerprint(*names, store.mean, store.std) == _fingerprint(*names, *noisy) == store.fingerprint
-    assert _fingerprint(*names, zero + 4e-23, store.std) == _fingerprint(*names, zero - 3e-22, store.std)
-    assert _fingerprint(*names, store.mean + 0.01, store.std) != store.fingerprint
+    assert print_of(mean=store.mean) == print_of(mean=store.mean - 1e-9) == store.fingerprint, "nor does rounding"
+    assert print_of(mean=zero + 4e-23) == print_of(mean=zero - 3e-22)
+    assert print_of(mean=store.mean + 0.01) != store.fingerprint
 
 
 def test_damaged_files_are_named(store, tmp_path):
@@ -173,11 +172,11 @@ def test_statistics_of_frames_read_in_parts_are_those_of_all_frames(tmp_path, mo
     constant = torch.arange(64) >= 50
     frames[:, 50:] = rng.normal(size=14)
     parts = Frames(lambda: np.split(frames, np.sort(rng.integers(0, 997, 30))), 997)
+    whole = torch.from_numpy(frames)
     for size in (1, 7, 64, 996, 997, 5000):
-        whole = torch.from_numpy(frames).split(size)
-        assert all(torch.equal(*pair) for pair in zip(parts.split(size), whole, strict=True))
+        assert all(torch.equal(*pair) for pair in zip(parts.split(size), whole.split(size), strict=True))
     mean, std = Rifke().statistics(parts)
-    whole = torch.from_numpy(frames).double()
+    whole = whole.double()
     assert torch.equal(mean, whole.mean(0).float())
     assert torch.equal(std, torch.where(constant, 1.0, whole.std(0)).float())
 
@@ -192,11 +191,9 @@ def rotations(root: Path, **options: Any) -> MotionDataModule:
     """Clips with a root translation relative to the first frame, labels and statistics; some without a caption."""
     draw = np.random.default_rng(0)
     splits = ("train", "train", "train", "val")
-    clips = [
-        clip(f"{number}", splits[number % 4], encoded="rot6d-25", action=number % 3,
-             motion=draw.normal(size=(20 + number, 150)).astype(np.float32))
-        for number in range(24)
-    ]  # fmt: skip
+    motions = [draw.normal(size=(20 + number, 150)).astype(np.float32) for number in range(24)]
+    options_of = ({"encoded": "rot6d-25", "action": number % 3, "motion": x} for number, x in enumerate(motions))
+    clips = [clip(f"{number}", splits[number % 4], **facts) for number, facts in enumerate(options_of)]
     for number in (0, 1, 3):
         clips[number].captions.clear()
     source = OwnClips(*clips)

@@ -46,22 +46,14 @@ def fill(bad, trained, tmp_path) -> Callable[[str], str]:
     os.mkfifo(bad / "pipe.npz")
     for name in ("folder.npz", "folder.yaml", "folder.txt", "empty"):
         (bad / name).mkdir()
-    texts = {"list.yaml": "- 1\n", "broken.yaml": "a: [\n", "bare.yaml": "name: x\n", "empty.txt": "\n \n"}
-    texts |= {"foreign.yaml": "_target_: os.system\ncommand: ls\n", "file.zip": "x"}
-    texts |= {"part.yaml": "version: 1\ncondition: text\n"}
+    texts = {"list.yaml": b"- 1\n", "broken.yaml": b"a: [\n", "bare.yaml": b"name: x\n", "empty.txt": b"\n \n"}
+    texts |= {"foreign.yaml": b"_target_: os.system\ncommand: ls\n", "file.zip": b"x"}
+    texts |= {"part.yaml": b"version: 1\ncondition: text\n", **dict.fromkeys(("latin.yaml", "latin.txt"), b"a: \xe9\n")}
     for name, text in texts.items():
-        (bad / name).write_text(text)
-    for name in ("latin.yaml", "latin.txt"):
-        (bad / name).write_bytes(b"seed: \xe9\xff\n")
+        (bad / name).write_bytes(text)
     words = {"trained": trained, "bad": bad, "walk": tmp_path / "walk.npz", "long": "x" * 5000}
     words |= {"run": run, "both": f"runs={run} {other}"}
-
-    def fill(word: str) -> str:
-        for name, value in words.items():
-            word = word.replace(f"{{{name}}}", str(value))
-        return word
-
-    return fill
+    return lambda word: reduce(lambda text, name: text.replace(f"{{{name}}}", str(words[name])), words, word)
 
 
 def test_words(refused, fill):
@@ -264,12 +256,9 @@ def reader(name: str, folder: Path) -> tuple[Path, Callable[[], object]]:
         (folder / "lengths").mkdir()
         spec = {"title": "x", "parts": {"A": {"lengths": ["lengths"]}}}
         return folder / "lengths" / path.name, lambda: build("x", spec, folder)
-    reads: dict[str, Callable[[], object]] = {
-        "spec": lambda: build("x", load_spec(str(path)), folder),
-        "result": lambda: read_result(path),
-        "wandb": lambda: WandbRun(str(folder), offline=True),
-    }
-    return path, reads[name]
+    if name == "spec":
+        return path, lambda: build("x", load_spec(str(path)), folder)
+    return path, lambda: read_result(path) if name == "result" else WandbRun(str(folder), offline=True)
 
 
 @pytest.mark.parametrize("name", CASES["files"])

@@ -186,7 +186,7 @@ def words_of(data: str, takes: Path, root: Path) -> list[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("data", sorted({*WHERE} - {"folder", "cmu"}))  # the tests of the tutorial and of CMU do so
+@pytest.mark.parametrize("data", sorted({*WHERE} - {"folder", "cmu"}))  # their own tests do so
 def test_every_set_from_raw_files_to_a_training_step(data: str, takes: Path, tmp_path: Path):
     verified(tmp_path / "data", f"data={data}", *words_of(data, takes, tmp_path))
     condition = "action" if data in ("humanact12", "uestc") else "learned"

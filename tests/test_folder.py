@@ -49,11 +49,10 @@ MIXAMO = {joint: name if isinstance(name, str) else next(iter(name)) for joint, 
 CHANNELS = ("Xposition", "Yposition", "Zposition", "Zrotation", "Xrotation", "Yrotation")
 
 
-def mixamo(path: Path, scale: float = 1.0, toes: float = 1.0, frames: int = 40) -> Path:
+def mixamo(path: Path, scale: float = 1.0, toes: float = 1.0, frames: int = 40) -> None:
     """A stiff body that turns so fast that straight lines between positions would shorten its bones.
 
-    Lengths are in centimeters, times `scale`; unless `toes` is 1, feet end after this share of their length, at end
-    sites instead of toes.
+    Lengths are in centimeters, times `scale`; if `toes` is not 1, feet end after this share of their length, at sites.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     parents = SMPL22.parents
@@ -73,7 +72,6 @@ def mixamo(path: Path, scale: float = 1.0, toes: float = 1.0, frames: int = 40) 
         30.0,
     )
     bvh.write(body, path)
-    return path
 
 
 @pytest.fixture
@@ -180,7 +178,6 @@ BAD = {
         "line 3: one has two values of split: val and test",
     ),
     "no rate": (lambda f: (f / "skeleton.yaml").unlink(), r"one\.npy: no frame rate in the file"),
-    "23 joints": (lambda f: np.save(f / "one.npy", np.zeros((9, 23, 3))), r"one\.npy: 23 joints, not the 22, 24 or 52"),
     "up": (lambda f: np.savez(f / "deep/two.npz", joints=LYING, fps=9), "the body is lying down"),
     "yaml key": (
         lambda f: skeleton(f, rate=30),
@@ -237,10 +234,8 @@ def test_convert_and_edit_read_files_as_prepare_does(tmp_path: Path, monkeypatch
     edited = read_motion(HumanML(), "mine/deep/a.bvh").joints
     np.testing.assert_allclose(np.ptp(edited[0, :, 1]), np.ptp(np.load("b.npy")[0, :, 1]), atol=1e-3)
     assert np.ptp(read_motion(HumanML(), "mine/deep/a.bvh", up="z").joints[0, :, 1]) < 0.6, "it lies"
-
     np.savez("mine/made.npz", joints=WALK, fps=30, text="a person walks")
-    assert main(["convert", "mine/made.npz", "out=made.npy"]) == 0, "motions made by this project are in meters, y up"
-    np.testing.assert_allclose(np.load("made.npy"), WALK, atol=1e-6)
+    np.testing.assert_allclose(read("mine/made.npz").joints, WALK, atol=1e-6)  # made here: in meters, y up
 
 
 def test_feet_without_toes_end_at_the_end_sites(tmp_path: Path):

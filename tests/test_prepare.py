@@ -138,16 +138,11 @@ def test_frames_are_not_kept_in_memory(tmp_path: Path):
 
 
 WHERE = {
-    "babel": "babel.is.tue.mpg.de",
-    "bandai": "github.com/BandaiNamcoResearchInc",
-    "cmu": "clone https://github.com/una-dinosauria/cmu-mocap",
+    **{"babel": "babel.is.tue.mpg.de", "kit_temos": "github.com/Mathux/TEMOS"},
+    **{"bandai": "github.com/BandaiNamcoResearchInc", "cmu": "clone https://github.com/una-dinosauria/cmu-mocap"},
+    **dict.fromkeys(("humanact12", "uestc"), "github.com/Mathux/ACTOR"),
+    **dict.fromkeys(("humanml3d", "humanml3d_smpl", "kit"), "github.com/EricGuo5513/HumanML3D"),
     "folder": "give a folder of .npz, .bvh, .amc, .json, .npy files",
-    "humanact12": "github.com/Mathux/ACTOR",
-    "humanml3d": "github.com/EricGuo5513/HumanML3D",
-    "humanml3d_smpl": "github.com/EricGuo5513/HumanML3D",
-    "kit": "github.com/EricGuo5513/HumanML3D",
-    "kit_temos": "github.com/Mathux/TEMOS",
-    "uestc": "github.com/Mathux/ACTOR",
 }
 
 

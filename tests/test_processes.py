@@ -79,8 +79,7 @@ def test_the_linear_schedule_has_the_ends_of_ho_et_al():
 
 
 def pointwise_output(x_t: Tensor, learned: bool) -> Tensor:
-    suffix = "2" if learned else ""
-    A, b = GAUSSIAN[f"lin4/A{suffix}"], GAUSSIAN[f"lin4/b{suffix}"]
+    A, b = (GAUSSIAN[f"lin4/{name}2" if learned else f"lin4/{name}"] for name in "Ab")
     t = torch.tensor(GAUSSIAN["pw/t"]).float()
     return linear_denoiser(A, b, float(GAUSSIAN["lin4/g"]))(x_t, t, real(x_t), NO_CONDITION)
 
@@ -143,13 +142,11 @@ PROCESSES: dict[str, Process] = {
 @pytest.mark.parametrize("name", PROCESSES)
 def test_oracle_has_no_loss_and_padding_has_no_say(name):
     torch.manual_seed(0)
-    process = PROCESSES[name]
-    lengths, features = torch.tensor([7, 4, 1]), 5
-    mask = length_mask(lengths)
-    x, noise = torch.randn(2, 3, 7, features).unbind()
+    process, mask = PROCESSES[name], length_mask(torch.tensor([7, 4, 1]))
+    x, noise = torch.randn(2, 3, 7, 5)
     x = x * mask[..., None]
     t, exact = process.training_times(torch.tensor([0.0, 0.31, 0.94])), (x.double(), noise.double())
-    spare = process.out_features(features) - features
+    spare = process.out_features(5) - 5
     target, x_t = process.target(*exact, t.double()), process.corrupt(*exact, t)
     torch.testing.assert_close(process.to_x0(target, x_t, t.double()), exact[0], rtol=0, atol=1e-7)
 
@@ -178,28 +175,29 @@ def test_oracle_has_no_loss_and_padding_has_no_say(name):
 def test_weights_of_the_error_and_the_skip_are_those_of_the_noise():
     """At T = 1000 and step 900, SNR < 1: the error of the noise counts 1, and min(SNR, 5) / SNR at step 10."""
     torch.manual_seed(0)
-    x, noise, t = torch.randn(2, 4, 3), torch.randn(2, 4, 3), torch.tensor([10.0, 900.0])
-    mask, wrong = torch.ones(2, 4, dtype=torch.bool), torch.randn(2, 4, 3)
+    (x, noise, wrong), t = torch.randn(3, 2, 4, 3), torch.tensor([10.0, 900.0])
     plain = GaussianDiffusion(prediction="epsilon", min_snr=5.0)
     signal, sigma = (torch.as_tensor(plain.schedule.at(name, t, x)) for name in ("signal", "noise"))
-    terms = plain.loss(lambda *_: noise + wrong, x, mask, NO_CONDITION, t=t, noise=noise)
+    terms = plain.loss(lambda *_: noise + wrong, x, real(x), NO_CONDITION, t=t, noise=noise)
     weight = torch.tensor([5 * (sigma[0] / signal[0]).square().item(), 1.0])
     torch.testing.assert_close(terms["mse"], weight * wrong.square().mean((1, 2)))
     skip = GaussianDiffusion(prediction="epsilon", min_snr=5.0, skip=True)
     output = (noise + wrong - sigma * skip.corrupt(x, noise, t)) / signal
-    for name, term in skip.loss(lambda *_: output, x, mask, NO_CONDITION, t=t, noise=noise).items():
+    for name, term in skip.loss(lambda *_: output, x, real(x), NO_CONDITION, t=t, noise=noise).items():
         torch.testing.assert_close(term, terms[name], rtol=1e-4, atol=0)
 
 
 def test_hybrid_loss_trains_the_variance_alone():
     torch.manual_seed(0)
     process = GaussianDiffusion(400, prediction="epsilon", variance="learned_range", vlb_weight=0.002)
-    x, mask, t = torch.randn(2, 6, 3), torch.ones(2, 6, dtype=torch.bool), torch.tensor([0.0, 200.0])
-    noise = torch.randn_like(x)
-    output = torch.randn(2, 6, 6, requires_grad=True)
-    terms = process.loss(lambda *_: output, x, mask, NO_CONDITION, t=t, noise=noise)
-    x_t = process.corrupt(x, noise, t)
-    torch.testing.assert_close(terms["vlb"], 0.002 * 400 * masked_mean(process.vlb(output, x, x_t, t), mask))
+    (x, noise), t, output = (
+        torch.randn(2, 2, 6, 3),
+        torch.tensor([0.0, 200.0]),
+        torch.randn(2, 6, 6, requires_grad=True),
+    )
+    terms = process.loss(lambda *_: output, x, real(x), NO_CONDITION, t=t, noise=noise)
+    bound = process.vlb(output, x, process.corrupt(x, noise, t), t)
+    torch.testing.assert_close(terms["vlb"], 0.002 * 400 * bound.mean((1, 2)))
     terms["vlb"].sum().backward()
     assert output.grad is not None
     assert (output.grad[..., :3] == 0).all()
@@ -263,12 +261,9 @@ def test_flow_times_and_rows(case):
 def test_flow_times_are_drawn_as_named(distribution, in_the_middle):
     """The probability of |logit| < ln 3 of a normal variable is 0.728."""
     torch.manual_seed(0)
-    process, mask = FlowMatching(time_distribution=distribution, prediction="x0"), torch.ones(4000, 1).bool()
+    process, x = FlowMatching(time_distribution=distribution, prediction="x0"), torch.zeros(4000, 1, 1)
     # Of motions that are 0, the error of a denoiser that returns the square root of the time is the time.
-    terms = process.loss(
-        lambda x_t, t, *_: (t / 1000).sqrt()[:, None, None], torch.zeros(4000, 1, 1), mask, NO_CONDITION
-    )
-    times = terms["mse"]
+    times = process.loss(lambda _, t, *__: (t / 1000).sqrt()[:, None, None], x, real(x), NO_CONDITION)["mse"]
     assert times.mean() == pytest.approx(0.5, abs=0.03)
     assert ((times > 0.25) & (times < 0.75)).float().mean() == pytest.approx(in_the_middle, abs=0.03)
 

@@ -101,13 +101,9 @@ def test_recipes_outside_the_repository(tmp_path):
 
 
 def test_signatures_are_read_through_reexports_bases_and_dataclasses():
-    for name, some in {
-        "torch.optim.AdamW": {"lr", "weight_decay", "fused"},
-        "lightning.Trainer": {"max_steps", "devices"},
-        "lightning.pytorch.callbacks.ModelCheckpoint": {"monitor", "save_top_k"},
-        "flame_mdm.batch.Edit": {"keep", "known", "mode"},
-    }.items():
-        assert some <= parameters(name)
+    assert {"lr", "weight_decay", "fused"} <= parameters("torch.optim.AdamW")
+    assert {"monitor", "save_top_k"} <= parameters("lightning.pytorch.callbacks.ModelCheckpoint")
+    assert {"keep", "known", "mode"} <= parameters("flame_mdm.batch.Edit")
     with pytest.raises(UserError, match="no such class"):
         parameters("torch.optim.Adamm")
     with pytest.raises(UserError, match=r"unknown config key 'a\.0\.lrr'\. Did you mean a\.0\.lr\?"):
@@ -151,8 +147,6 @@ UNTRUSTED = [
 
 
 def test_a_checkpoint_names_only_own_classes_and_those_that_the_user_trusts(monkeypatch):
-    with pytest.raises(UserError, match=r"os\.system at denoiser\.b\. Its code is only run if you trust it"):
-        trust({"denoiser": ENCODER | {"b": {"_target_": "os.system"}}})
     for wrong in ({"num_heads": True}, {"latent_dim": ENCODER}, {"latent_dims": 3}, {"dropout": float("nan")}):
         with pytest.raises(UserError, match=r"denoiser\."):
             trust({"denoiser": ENCODER | wrong})
@@ -166,7 +160,7 @@ def test_a_checkpoint_names_only_own_classes_and_those_that_the_user_trusts(monk
             ENCODER | {"_args_": [{"_partial_": True, "_target_": target}]},
         ):
             for part in ("denoiser", "callbacks"):
-                with pytest.raises(UserError, match="Its code is only run if you"):
+                with pytest.raises(UserError, match=rf"names .* at {part}.*\. Its code is only run if you trust it"):
                     trust({part: hidden})
     monkeypatch.setenv("FLAME_MDM_TRUST", "fractions")
     trust({"denoiser": {"_target_": "fractions.Fraction"}})
@@ -332,8 +326,10 @@ def test_only_errors_that_the_user_can_fix_are_one_line(capsys, monkeypatch):
 @pytest.mark.parametrize(
     ("gpus", "accelerator", "devices", "message"),
     [
-        (0, "gpu", 1, f"trainer.accelerator=gpu: {NO_GPU}. Drop it to train on the CPU"),
-        (0, "cuda", 1, f"trainer.accelerator=cuda: {NO_GPU}. Drop it to train on the CPU"),
+        *(
+            (0, name, 1, f"trainer.accelerator={name}: {NO_GPU}. Drop it to train on the CPU")
+            for name in ("gpu", "cuda")
+        ),
         (1, "auto", 2, "trainer.devices=2: this machine has 1 GPU. Give at most trainer.devices=1"),
         (2, "gpu", 4, "trainer.devices=4: this machine has 2 GPUs. Give at most trainer.devices=2"),
         *((0, "cpu", 2, ""), (2, "auto", 2, ""), (2, "cpu", 8, "")),  # a CPU may run more processes than it has cores

@@ -70,8 +70,7 @@ def test_torchrun_starts_a_killed_group_again(tiny, tmp_path):
     # Else torchrun keeps its store, and the new group finds the addresses of the dead one in there.
     _, out, err = finish(spawn(command, PYTHONPATH=path, TORCH_DISABLE_SHARE_RDZV_TCP_STORE="1", PYTHONUNBUFFERED="1"))
     for line in ("steps: 0 to 100000", "died; taking over its run directory", "steps: 2 to 100000"):
-        assert line in out, err
-    assert out.count("Run the same command to resume") == 1, err
+        assert out.count(line) == 1, err
     step = int(re.findall(r"stopped at step (\d+)", out)[0])
     checkpoint = read_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")
     assert checkpoint["global_step"] == step >= 6
@@ -124,9 +123,8 @@ def test_a_slurm_job_that_runs_out_of_time_is_requeued_and_ends_as_if_it_had_not
     logs = "\n".join(path.read_text() for path in (tmp_path / "run" / ".submitit").rglob("*.out"))
     assert code == 0, out + err + logs
     assert (tmp_path / "listed").read_text() == "requeue 7\n"
-    deadline = time.monotonic() + 20
-    while len(codes := (tmp_path / "codes").read_text().split()) < 2 and time.monotonic() < deadline:
-        time.sleep(0.1)  # the result of a job stands in its file before the job has ended
+    while len(codes := (tmp_path / "codes").read_text().split()) < 2:
+        time.sleep(0.1)  # the result of a job is in its file before the job has ended
     assert codes == ["140", "0"]  # 128 + SIGUSR2
     assert "steps: 2 to 3" in logs
     checkpoint = read_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")

@@ -27,16 +27,14 @@ from flame_mdm.config.command_line import make_variables, read_settings
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 OWN = ("mine", "my_", "NAME", "...")
 """Names in examples for files that readers write."""
-OPEN = "make prepare DATA=... SOURCE=..."
 NOT_COMPOSED = {
-    "README.md": [OPEN],
+    "README.md": ["make prepare DATA=... SOURCE=..."],
     "adding.md": ["make prepare DATA=my_set SOURCE=/path"],
     "data.md": ["make evaluate baseline=real data=bandai data.source.mirror=false ..."],
     "evaluation.md": [f"make train EXP={folder}/..." for folder in ("motion_clip", "t2m", "classifier")],
     "first-problems.md": ["make prepare DATA=... SOURCE=/path/to/what/you/downloaded"],
 }
-"""Commands of each page that are not composed: they name a part that the reader writes (mine, my_set), or leave a name
-open (...)."""
+"""Commands of each page that are not composed: they name a part that the reader writes, or leave a name open."""
 TARGETS = set(re.findall("^([a-z-]+):.*##", (ROOT / "Makefile").read_text(), re.MULTILINE))
 
 

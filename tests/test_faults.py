@@ -1,5 +1,6 @@
 """Full disks, signals, kills at random moments, loading processes that die, and two that prepare the same data."""
 
+import multiprocessing
 import os
 import random
 import resource
@@ -8,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from multiprocessing import active_children
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from flame_mdm.commands import train
 from flame_mdm.config import guarded
 from flame_mdm.data.datamodule import Clips
 from flame_mdm.data.store import Store
+from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError
 from flame_mdm.progress import ProgressBar
 from flame_mdm.signals import StopRequest
@@ -120,45 +122,42 @@ def test_torch_messages_about_lost_workers_are_understood(tmp_path, monkeypatch)
         assert list(tmp_path.iterdir()) == []
 
 
-@pytest.fixture
-def both(tmp_path) -> Iterator[tuple[subprocess.Popen[str], subprocess.Popen[str]]]:
-    """One process that is halted while it prepares, and another that waits for it."""
-    line = ["flame_mdm", "prepare", "data=synthetic", "data.source.clips=100", f"data_root={tmp_path}"]
-    first = spawn(line)
-    end = time.monotonic() + 60
-    while not any(tmp_path.glob(f".{STORE}.*")):
-        assert first.poll() is None, first.communicate()
-        assert time.monotonic() < end, "it never prepares"
-        time.sleep(0.002)
-    first.send_signal(signal.SIGSTOP)
-    second = spawn(line)
-    assert second.stdout is not None
-    assert "another process is preparing it" in second.stdout.readline()
-    yield first, second
-    for process in (first, second):
-        process.kill()
-        process.communicate()
+def prepare(folder: Path, log: Path) -> None:
+    """Prepares data in this process, once the file `go` is there."""
+
+    def clips(self: Synthetic, fps: float) -> Any:
+        (folder / "begun").touch()
+        while not (folder / "go").exists():
+            time.sleep(0.01)
+        return original(self, fps)
+
+    original, Synthetic.clips = Synthetic.clips, clips  # type: ignore[method-assign]
+    with log.open("w", buffering=1) as file, redirect_stdout(file), redirect_stderr(file):
+        code = main(["prepare", "data=synthetic", "data.source.clips=100", f"data_root={folder / 'data'}"])
+    os._exit(code)
 
 
-def test_two_processes_prepare_the_same_data_once(both, tmp_path):
-    first, second = both
-    first.send_signal(signal.SIGCONT)
-    outputs = [process.communicate(timeout=120) for process in both]
-    assert [first.returncode, second.returncode] == [0, 0], outputs
-    assert [path.name for path in tmp_path.iterdir()] == [STORE]
-    assert ["preparing" in err for _, err in outputs] == [True, False], "one opens what the other has written"
-    assert outputs[0][0].splitlines()[-1] == outputs[1][0].splitlines()[-1], "the fingerprint is the same"
-    Store(tmp_path / STORE).verify()
-
-
-def test_the_second_process_takes_over_from_one_that_is_killed(both, tmp_path):
-    first, second = both
-    first.kill()
-    out, err = second.communicate(timeout=120)
-    assert second.returncode == 0, err
-    assert "preparing" in err
-    assert [path.name for path in tmp_path.iterdir()] == [STORE], out
-    Store(tmp_path / STORE).verify()
+@pytest.mark.parametrize("dies", [False, True])
+def test_two_processes_prepare_the_same_data_once_and_one_takes_over_if_the_other_dies(dies, tmp_path):
+    context, logs = multiprocessing.get_context("fork"), [tmp_path / "first", tmp_path / "second"]
+    first, second = (context.Process(target=prepare, args=(tmp_path, log), daemon=True) for log in logs)
+    first.start()
+    while not (tmp_path / "begun").exists():
+        time.sleep(0.01)
+    second.start()
+    while not logs[1].exists() or "another process is preparing it" not in logs[1].read_text():
+        time.sleep(0.01)
+    if dies:
+        first.kill()
+        first.join()
+    (tmp_path / "go").touch()
+    second.join(60)
+    first.join(60)
+    assert [first.exitcode, second.exitcode] == [-signal.SIGKILL if dies else 0, 0], logs[1].read_text()
+    assert [path.name for path in (tmp_path / "data").iterdir()] == [STORE]
+    assert ("preparing synthetic" in logs[1].read_text()) == dies, "otherwise it opens what the other has written"
+    assert len({log.read_text().splitlines()[-1] for log in logs[dies:]}) == 1, "the fingerprint is the same"
+    Store(tmp_path / "data" / STORE).verify()
 
 
 @pytest.mark.parametrize(

@@ -73,9 +73,6 @@ def test_samplers_steps_and_prompts_suit_process_and_condition():
             assert set(prompts) <= set(instantiate(config["data"]["source"]).actions), name
 
 
-FRAMES, ACTIONS = 24, 40
-
-
 class Drawn(ConditionEncoder):
     """Stands in for a frozen language model: pooled vectors, and tokens if the recipe reads them, in its widths."""
 
@@ -111,7 +108,7 @@ def decisive(name: str) -> str:
 def built(name: str) -> MotionGeneration:
     torch.manual_seed(0)
     config = shortened(name)
-    actions = [f"action {label}" for label in range(ACTIONS)]
+    actions = [f"action {label}" for label in range(40)]
     task = MotionGeneration.build(config, instantiate(config["representation"]), actions=actions)
     condition = config["condition"]
     if condition["_target_"].endswith("PretrainedText"):
@@ -122,7 +119,7 @@ def built(name: str) -> MotionGeneration:
 
 def step(name: str) -> None:
     task = built(name)
-    mask = length_mask(torch.tensor([FRAMES, FRAMES - 8]))
+    mask = length_mask(torch.tensor([24, 16]))
     x = torch.randn(*mask.shape, task.representation.features) * mask[..., None]
     batch = MotionBatch(x, mask, ["a", "b"], ["a person walks", "a person jumps"], torch.tensor([0, 1]))
     optimizer = task.make_optimizer()

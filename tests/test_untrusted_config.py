@@ -14,7 +14,8 @@ from typing import Any
 
 import pytest
 import torch
-from safetensors.torch import load_file
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 from support.fixtures import ROOT
 from support.refusals import bounded, one_line
 from support.runs import TINY
@@ -67,16 +68,13 @@ def refuses(path: Path, says: str) -> None:
 def model_file(path: Path, trained: Path, text: str | None = None, **recipe: Any) -> Path:
     """A model file with other content in its metadata, and a right checksum."""
     file = export(trained, path)
-    whole = file.read_bytes()
-    size = int.from_bytes(whole[:8], "little")
-    head = json.loads(whole[8 : 8 + size])
-    content = json.loads(head["__metadata__"][KEY])
+    with safe_open(file, "pt") as opened:
+        metadata, weights = opened.metadata(), load_file(file)
+    content = json.loads(metadata[KEY])
     for key, value in recipe.items():
         content = change(content, key.replace("__", "."), value)
     text = json.dumps(content) if text is None else text
-    head["__metadata__"] |= {KEY: text, "sha256": content_sha256(text, load_file(file))}
-    data = json.dumps(head).encode()
-    file.write_bytes(len(data).to_bytes(8, "little") + data + whole[8 + size :])
+    save_file(weights, file, metadata | {KEY: text, "sha256": content_sha256(text, weights)})
     return file
 
 

@@ -130,32 +130,22 @@ def test_padding_and_company_do_not_change_features(roughness):
         clip(torch.zeros(1, 21, 7), length_mask(torch.tensor([21])))
 
 
-MEANING = torch.tensor([[1, 10], [2, 20], [3, 30], [1, 40], [4, 50], [5, 20]])
-
-
 def test_the_loss_with_hard_negatives_is_that_of_a_loop():
     generator = torch.Generator().manual_seed(5)
     motion, text = (functional.normalize(torch.randn(6, 8, generator=generator), dim=1) for _ in range(2))
+    meaning = torch.tensor([[1, 10], [2, 20], [3, 30], [1, 40], [4, 50], [5, 20]])
     wrong, scale = functional.normalize(torch.randn(6, 2, 8, generator=generator), dim=2), 7.0
     total = 0.0
     for i in range(6):
-        others = [j for j in range(6) if not (MEANING[i] == MEANING[j]).any()]
+        others = [j for j in range(6) if not (meaning[i] == meaning[j]).any()]
         own = math.exp(scale * float(motion[i] @ text[i]))
         texts = [float(motion[i] @ text[j]) for j in others] + [float(motion[i] @ near) for near in wrong[i]]
         motions = [float(text[i] @ motion[j]) for j in others]
         for negatives in (texts, motions):
             total -= math.log(own / (own + sum(math.exp(scale * cosine) for cosine in negatives))) / 12
     # Pairs 0 and 3 share the first number, 1 and 5 the second.
-    loss = info_nce(2 * motion, text, torch.tensor(math.log(scale)), meaning=MEANING, wrong_text=3 * wrong)
+    loss = info_nce(2 * motion, text, torch.tensor(math.log(scale)), meaning=meaning, wrong_text=3 * wrong)
     assert loss.item() == pytest.approx(total, rel=1e-5)
-
-
-def test_the_loss_is_low_for_pairs_and_high_for_exchanged_ones():
-    motion, scale = torch.eye(4), torch.tensor(math.log(1 / 0.07))
-    assert info_nce(motion, motion.roll(1, 0), scale, meaning=torch.tensor([[1, 7], [2, 7], [3, 7], [4, 7]])) == 0
-    assert info_nce(motion, 3 * motion, scale) < 1e-5
-    assert info_nce(motion, motion.roll(1, 0), scale) > 10
-    assert info_nce(torch.ones(4, 4), motion, scale) == pytest.approx(math.log(4), abs=1e-5)
 
 
 def test_the_validation_loss_is_that_of_pools():
@@ -276,15 +266,19 @@ def test_a_checkpoint_is_a_feature_extractor(trained, tmp_path):
 
 @pytest.mark.slow
 def test_a_calibrated_run_resumes_exactly(tmp_path, data_root, capsys):
-    """Checkpoints after four steps at once, and after two and two, are equal; near misses differ from step to step."""
-    options = [f"data_root={data_root}/clip", "trainer.val_check_interval=2", "callbacks.checkpoints.every_n_steps=2"]
+    """Checkpoints after four steps at once, and after two and two, are equal; 32 captions are too few to retrieve."""
+    options = [f"data_root={data_root}/few", "trainer.val_check_interval=2", "callbacks.checkpoints.every_n_steps=2"]
+    options += ["data.source.clips=60", "data.batch_size=8"]
     weights = []
     for stops in ((4,), (2, 4)):
         folder = tmp_path / str(len(stops))
         for steps in stops:
-            command = ["train", "motion_clip/synthetic_calibrated", *set(RUN) - {"logger=csv"}, *options]
+            command = ["train", "motion_clip/synthetic_calibrated", *RUN, *options]
             assert main([*command, f"run.dir={folder}", f"trainer.max_steps={steps}"]) == 0, capsys.readouterr().err
         weights.append(read_checkpoint(folder / "checkpoints" / "last.ckpt")["state_dict"])
+    curves = read_history(folder)
+    assert "val/loss" in curves
+    assert not [name for name in curves if "top1" in name]
     assert weights[0].keys() == weights[1].keys()
     assert all(torch.equal(value, weights[1][name]) for name, value in weights[0].items())
     task = load_task(folder / "checkpoints" / "last.ckpt", MotionCLIPTask)
@@ -305,13 +299,3 @@ def test_near_misses_change_with_step_and_attribute():
         assert sorted(text == "twice" for text in texts) == [False, True]
     assert {task.near_miss("a", 0, step) for step in range(20)} == {"left", "l", "twice"}
     assert task.near_miss("b", 0, 0) == ""
-
-
-@pytest.mark.slow
-def test_few_captions_train_without_retrieval(tmp_path, capsys):
-    options = ["data.source.clips=60", "data.batch_size=8", f"data_root={tmp_path}/data", f"run.dir={tmp_path}/run"]
-    steps = ["trainer.max_steps=2", "trainer.val_check_interval=2"]
-    assert main(["train", "motion_clip/synthetic", *RUN, *options, *steps]) == 0, capsys.readouterr().err
-    curves = read_history(tmp_path / "run")
-    assert "val/loss" in curves
-    assert not [name for name in curves if "top1" in name]

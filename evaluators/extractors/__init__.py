@@ -41,10 +41,7 @@ class Extractor(ABC):
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
         """Returns "features" (B, E) of motions, and "logits" (B, A) of classifiers.
 
-        Args:
-            features: (B, F, D) in the data's units.
-            joints: (B, F, J, 3) in meters, y up.
-            mask: (B, F), True = real frame.
+        Motions are `features` (B, F, D) in the data's units, and joints (B, F, J, 3) in meters, y up, with mask (B, F).
         """
 
     def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor | None:
@@ -111,7 +108,7 @@ class OwnT2MExtractor(OwnExtractor):
     task: T2MTask
 
     def reads(self, other: Representation) -> bool:
-        """Returns whether the network reads motions in a representation; it may see only features that both have."""
+        """Returns whether the network reads motions in a representation, also if it sees only their common part."""
         own = self.task.representation
         part = (other.part_of, other.fps) == (own.name, own.fps) and self.task.network.used <= other.features
         return part or super().reads(other)
@@ -212,10 +209,9 @@ CLASSIFIERS: dict[str, tuple[type[ActionGRU | UESTC | Unconstrained], str | None
     "humanact12_unconstrained": (Unconstrained, None, "humanact12"),
     "uestc": (UESTC, None, "uestc"),
 }
-"""Released action classifiers: network, key of the weights in its file, and data set.
-
-The authors' files are action_recognition_model_humanact12.tar (humanact12_gru.tar in MDM),
-humanact12_gru_modi_struct.pth.tar (not a GRU despite its name) and uestc_rot6d_stgcn.tar."""
+"""Released action classifiers: network, key of the weights in its file, and data set. The authors' files are
+action_recognition_model_humanact12.tar (humanact12_gru.tar in MDM), humanact12_gru_modi_struct.pth.tar (not a GRU
+despite its name) and uestc_rot6d_stgcn.tar."""
 
 
 class ClassifierExtractor(ReleasedExtractor):

@@ -24,15 +24,12 @@ class ActionGRU(nn.Module):
         self.linear2 = nn.Linear(self.features, num_actions)
 
     def forward(self, joints: Tensor, mask: Tensor, state: Tensor | None = None) -> Tensor:
-        """Returns features (B, 30) in (-1, 1) of joints (B, F, J, 3) in meters, y up, with mask (B, F).
-
-        The network sees them with y down and relative to the first position of the pelvis.
-        """
+        """Returns features (B, 30) in (-1, 1) of joints (B, F, J, 3) in meters, y up, with mask (B, F)."""
         joints = joints * joints.new_tensor([1.0, -1.0, -1.0])
         return self.published(joints - joints[:, :1, :1], mask, state)
 
     def published(self, x: Tensor, mask: Tensor, state: Tensor | None = None) -> Tensor:
-        """Returns features (B, 30) of what the network sees (B, F, J, 3)."""
+        """The same with y down and relative to the first position of the pelvis, as the network sees them."""
         outputs, _ = self.recurrent(x.flatten(2), state)
         last = mask.sum(1) - 1
         return torch.tanh(self.linear1(outputs[torch.arange(len(last), device=last.device), last]))

@@ -29,7 +29,6 @@ class ClassifierTask(ExtractorTask):
 
     @classmethod
     def parts(cls, config: Config, representation: Representation, actions: Sequence[str]) -> dict[str, Any]:
-        """Builds the network for the skeleton and the actions of the data, at least two, or raises `UserError`."""
         if len(actions) < 2:
             raise UserError(f"a classifier needs a data set with at least two actions, but this one has {len(actions)}")
         parents = representation.skeleton.parents
@@ -52,7 +51,6 @@ class ClassifierTask(ExtractorTask):
             raise UserError(f"{data.folder}: {which}. Prepare the data without these clips")
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
-        """Returns the cross-entropy of one batch, in nats."""
         self.seed_step(batch_idx)
         logits, labels = self._classified(batch)
         loss = F.cross_entropy(logits, labels)

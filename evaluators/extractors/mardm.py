@@ -39,10 +39,7 @@ class _MotionEncoder(nn.Module):
 
 
 class MARDMClip(nn.Module):
-    """Embeds the essential features of motions, and captions, as vectors of length 1.
-
-    `mean` and `std` (67,) are those of the features; `hidden` is the width of the linear layers of the transformers.
-    """
+    """Embeds the essential features of motions, with `mean` and `std` (67,), and captions, as vectors of length 1."""
 
     mean: Tensor
     std: Tensor

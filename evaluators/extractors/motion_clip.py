@@ -82,7 +82,7 @@ class MotionCLIP(nn.Module):
         return self.output(self.transformer(x, with_prefix(mask, 2))[:, 0])
 
     def text(self, pooled: Tensor) -> Tensor:
-        """Returns features (B, E) of texts, from the pooled outputs (B, C) of the text encoder."""
+        """Returns features (B, E) of texts from the pooled outputs (B, C) of the text encoder."""
         return self.text_projection(pooled)
 
 
@@ -121,16 +121,13 @@ def _of_all_processes(x: Tensor) -> Tensor:
 
 
 class PooledLoss(SampleMetric):
-    """InfoNCE in pools of 32, formed by key and thus independent of batch size and number of processes.
-
-    The pairs of an incomplete last pool are compared with the last 32 pairs; fewer than 32 pairs form one smaller pool.
-    """
+    """InfoNCE in pools of 32 by key; the pairs of an incomplete last pool are compared with the last 32 pairs."""
 
     higher_is_better = False
     states = ("generated", "text")
 
     def update(self, generated: Tensor, text: Tensor, keys: Tensor, scale: Tensor) -> None:
-        """Adds features of length 1, and the inverse temperature ()."""
+        """Adds features of length 1, and the inverse temperature `scale` ()."""
         super().update(keys=keys, generated=scale * generated, text=text)
 
     def value(self, motion: Tensor, text: Tensor) -> float:
@@ -175,7 +172,6 @@ class MotionCLIPTask(ExtractorTask):
         return task.eval()
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Returns features (B, E) of motions (B, F, D) in the data's units, with mask (B, F)."""
         return self.network(self.representation.normalize(x), mask)
 
     def text(self, captions: Sequence[str]) -> Tensor:

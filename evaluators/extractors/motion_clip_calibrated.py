@@ -21,7 +21,7 @@ from flame_mdm.seeds import key
 
 NEAR_MISSES = 2  # Near-miss captions per motion and step, of different attributes if possible
 JITTER = 0.02  # standard deviation of joint positions, in meters, at which the strength of noise is 1
-FEATURE_NOISE = 0.3  # the same of normalized features; joints then err by about 20 mm, too
+FEATURE_NOISE = 0.3  # standard deviation of normalized features at which it is 1: joints err by about 20 mm, too
 WEIGHT = 5.0  # weight of `calibration_error`, compared with `info_nce`
 LENGTH = 10.0  # of all features: the FID of noise of strength s, which moves all motions alike, is about (10 s)^2
 
@@ -44,7 +44,6 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
 
     @classmethod
     def parts(cls, config: Config, representation: Representation, actions: Sequence[str]) -> dict[str, Any]:
-        """Raises `UserError` if the representation does not encode joints."""
         if not isinstance(representation, HumanML):
             raise UserError(
                 f"representation={representation.name}: {cls.__name__} adds noise to joints and encodes them again. "
@@ -59,7 +58,6 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
         return LENGTH * F.normalize(super().text(captions), dim=-1)
 
     def on_fit_start(self) -> None:
-        """Looks up the near misses of the training clips."""
         super().on_fit_start()
         clips = self.trainer.datamodule.train.clips  # type: ignore[attr-defined]
         self.meanings, self.near_misses = {}, {}
@@ -107,8 +105,7 @@ def calibration_error(motion: Tensor, copy: Tensor, strength: Tensor) -> Tensor:
 def noisy_copies(representation: HumanML, x: Tensor, lengths: Tensor, strength: Tensor) -> Tensor:
     """Returns copies (B, F, D) of normalized motions with noise, drawn from torch's generator of the processor.
 
-    The strength (B,) of the noise is on the joints of the first half of the motions, and on the features of the others.
-    Motions and copies are 0 past their ends.
+    The `strength` (B,) is of noise on the joints in the first half of the motions, and on the features in the others.
     """
     half, frames = (len(x) + 1) // 2, lengths.tolist()
     joints = representation.to_joints(x[:half]).cpu()

@@ -55,7 +55,7 @@ class STGCN(nn.Module):
         self.fcn = nn.Conv2d(widths[-1], num_actions, 1)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Returns features (B, E) of motions (B, F, V, C) with mask (B, F); E is the width of the last block."""
+        """Returns features (B, E) of motions (B, F, V, C) with mask (B, F)."""
         x = self.data_bn(x.flatten(2).transpose(1, 2)).unflatten(1, x.shape[2:]).permute(0, 2, 3, 1)
         for block, importance in zip(self.st_gcn_networks, self.edge_importance, strict=True):
             x = block(x, self.A * importance, mask)

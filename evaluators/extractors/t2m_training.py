@@ -73,7 +73,7 @@ def matching_loss(motion: Tensor, text: Tensor, margin: float, fits: Tensor | No
 
 
 class MatchingLoss(SampleMetric):
-    """`matching_loss` over all pairs in the order of their keys, independent of batches and number of processes."""
+    """`matching_loss` over all pairs in the order of their keys."""
 
     higher_is_better = False
     states = ("generated", "text")
@@ -127,7 +127,6 @@ class T2MTask(ExtractorTask):
 
     @classmethod
     def parts(cls, config: Config, representation: Representation, actions: Sequence[str]) -> dict[str, Any]:
-        """Builds the network with the statistics of the data."""
         statistics = {"mean": representation.mean.clone(), "std": representation.std.clone()}
         return {"network": instantiate(config["task"]["network"], **statistics), "condition": Unconditional()}
 
@@ -136,10 +135,7 @@ class T2MTask(ExtractorTask):
         return {"loss": MatchingLoss(self.margin), **of_pairs, "reconstruction": MeanMetric()}
 
     def setup(self, stage: str) -> None:
-        """Sets up the task, reads the word vectors, and collects the tagged words of all captions.
-
-        Raises `FileNotFoundError` or `UserError` if they are missing or damaged, or the batch size is less than 2.
-        """
+        """Sets up the task, reads the word vectors, and collects the tagged words of all captions."""
         super().setup(stage)
         data: MotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
         if data.batch_size < 2:
@@ -163,7 +159,6 @@ class T2MTask(ExtractorTask):
 
     @property
     def learns_words(self) -> bool:
-        """Whether word vectors are learned from captions without tagged words."""
         return isinstance(self.words, LearnedWords)
 
     def get_extra_state(self) -> Tensor:

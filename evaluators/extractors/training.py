@@ -65,10 +65,7 @@ class ExtractorTask(Task):
         torch.manual_seed(key("step", self.seed, batch_idx, self.global_rank))
 
     def update_samples(self, batch: MotionBatch, **inputs: Tensor) -> None:
-        """Updates the metrics of samples with those of a batch.
-
-        With fewer clips than processes, every process has all clips, and only the first process counts.
-        """
+        """Updates the metrics of samples; with fewer clips than processes, each has all and only the first counts."""
         if self.global_rank and len(self.trainer.datamodule.val) < self.trainer.world_size:  # type: ignore[attr-defined]
             return
         for name, kind, names in (("keys", "motion", batch.ids), ("text_keys", "caption", batch.text or ())):
@@ -77,10 +74,7 @@ class ExtractorTask(Task):
         update_metrics(of_samples, **inputs)
 
     def on_validation_epoch_end(self) -> None:
-        """Logs the metrics of a validation over all processes, and resets them.
-
-        Metrics other than the loss that have too few samples are left out: R-precision needs 32 captions.
-        """
+        """Logs and resets the metrics of a validation, without those other than the loss with too few samples."""
         for name, metric in self.val_metrics.items():
             assert isinstance(metric, Metric)
             try:

@@ -1,6 +1,6 @@
 """Metrics of generated motions: torchmetrics classes whose inputs have common names.
 
-Every `update` takes some of these inputs by name. A batch holds B generated and R real motions.
+Every `update` takes some of these inputs by name, of B generated and R real motions.
 
 | name | shape | content |
 |---|---|---|
@@ -22,7 +22,7 @@ Every `update` takes some of these inputs by name. A batch holds B generated and
 | nearest, real_nearest | (B, 1 or 2) | distances from the nearest training motion, see `memorization` |
 | references | B of (F', J, 3) | real motions at the frame rate of their recording |
 
-A key is `flame_mdm.seeds.key` of an id (and of the sample number, if there are several samples). Metrics that compare
+A key is `flame_mdm.seeds.key` of an id, and of the number of the sample if there are several. Metrics that compare
 motions one by one (MID, position and displacement errors) take real motions in the order of the generated ones.
 
 `compute()` returns a number, or a dict of numbers by name; None without samples. It raises UserError if a number would

@@ -158,8 +158,8 @@ def pointwise_mutual_information(
 class MutualInformationDivergence(SampleMetric):
     """MID, in nats: mean `pointwise_mutual_information` of generated motions, their texts and the real motions.
 
-    It needs more samples than motion and text have features together. With fewer, the joint covariance is singular and
-    the value arbitrary (the authors' code requires half as many). `eps` is 5e-4 in FLAME, 0 in the authors' release.
+    It needs more samples than motion and text have features together, or the joint covariance is singular; the authors'
+    code requires half as many. `eps` is 5e-4 in FLAME, 0 in the authors' release.
     """
 
     higher_is_better = True

@@ -12,9 +12,9 @@ NEIGHBORS = 3  # of a sample of `PrecisionRecall`, as in MoDi and MDM
 def frechet_distance(a: Tensor, b: Tensor) -> Tensor:
     """Computes the Fréchet distance of normal distributions fitted to the rows of a (N, E) and b (M, E), float64.
 
-    |m_a - m_b|^2 + tr S_a + tr S_b - 2 tr (S_a S_b)^(1/2) (Dowson and Landau 1982). With centered rows
-    A / sqrt(N - 1) = Q_a R_a, and likewise for b, the last trace is the sum of the singular values of R_a R_b^T. This
-    needs no square root of a matrix, and no special treatment of rank-deficient covariances.
+    |m_a - m_b|^2 + tr S_a + tr S_b - 2 tr (S_a S_b)^(1/2) (Dowson and Landau 1982). With centered rows A / sqrt(N - 1)
+    = Q_a R_a, and likewise for b, the last trace is the sum of the singular values of R_a R_b^T, also if covariances
+    are rank-deficient.
     """
     r_a, r_b = (torch.linalg.qr((x - x.mean(0)) / (len(x) - 1) ** 0.5, mode="r").R for x in (a, b))
     shared = torch.linalg.svdvals(r_a @ r_b.T).sum()
@@ -40,8 +40,7 @@ class FrechetMotionDistance(TwoSets):
 def polynomial_mmd2(a: Tensor, b: Tensor) -> Tensor:
     """Computes the unbiased squared MMD of a (n, E) and b (n, E) with the kernel (x . y / E + 1)^3.
 
-    MMD is the maximum mean discrepancy of Bińkowski et al. 2018, eq. 4, as in the authors' code: for sets of equal
-    size, including the pairs (i, i) across the sets.
+    Bińkowski et al. 2018, eq. 4, including the pairs (i, i) across the sets, as in the authors' code.
     """
     n, width = a.shape
     inner_a, inner_b, cross = ((x @ y.T / width + 1) ** 3 for x, y in ((a, a), (b, b), (a, b)))
@@ -75,10 +74,9 @@ class KernelMotionDistance(TwoSets):
 
 
 def manifold_coverage(points: Tensor, samples: Tensor) -> Tensor:
-    """Returns the fraction of points (M, E) within the manifold of samples (N, E).
+    """Returns the fraction of points (M, E) that are no farther from a sample (N, E) than its third-nearest neighbor.
 
-    A point is within the manifold if it is no farther from a sample than the sample's third-nearest neighbor
-    (Kynkäänniemi et al. 2019, eq. 1 and 2). A sample is not a neighbor of itself.
+    Kynkäänniemi et al. 2019, eq. 1 and 2. A sample is not a neighbor of itself.
     """
     reach = _squared_distances(samples, samples).kthvalue(NEIGHBORS + 1, dim=1).values
     return (_squared_distances(points, samples) <= reach).any(1).double().mean()

@@ -81,7 +81,7 @@ class ActionMultimodality(SampleMetric):
     """Multimodality of Guo et al. 2020 (MDM, eq. 7): 20 random pairs of the same class, for each class.
 
     As in the authors' code, a motion may be drawn repeatedly and be paired with itself. The authors divide the sum by
-    the number of all classes; here, it is divided by the number of classes that have motions.
+    the number of all classes; here, it is divided by that of classes with motions.
     """
 
     higher_is_better = None

@@ -13,10 +13,7 @@ CLOSE = 0.01  # share of the held-out real motions that are closer to a training
 
 
 def poses(joints: Tensor, facing: Sequence[int]) -> Tensor:
-    """Returns joints (F, J, 3) relative to the pelvis on the ground, turned to face z in every frame, as (F, 3J).
-
-    Motions with the same poses differ only in the path and the direction in which they move. `facing` is of `Skeleton`.
-    """
+    """Returns joints (F, J, 3) relative to the pelvis on the ground, turned to face z in every frame, as (F, 3J)."""
     right_hip, left_hip, right_shoulder, left_shoulder = facing
     left = joints[:, left_hip] - joints[:, right_hip] + joints[:, left_shoulder] - joints[:, right_shoulder]
     left = torch.nn.functional.normalize(left[:, [0, 2]], dim=-1)[:, None]
@@ -30,7 +27,7 @@ def poses(joints: Tensor, facing: Sequence[int]) -> Tensor:
 class TrainingMotions:
     """The training motions that a motion may be a copy of."""
 
-    poses: Tensor  # (N, 3J) of all frames of all motions, one after another; see the function `poses`
+    poses: Tensor  # (N, 3J) of all frames of all motions, one after another
     lengths: Tensor  # (M,) frames of each motion
     features: Tensor | None  # (M, E) of the extractor; None without an extractor
     facing: Sequence[int]  # `Skeleton.facing`

@@ -36,7 +36,7 @@ class FootSkating(Timed, MotionMean):
 
 
 class Penetration(MotionMean):
-    """Mean depth of the lowest joint below the floor, y = 0, in meters over all frames; up to 5 mm count as 0.
+    """Mean depth over frames of the lowest joint below the floor, y = 0, in meters; depths up to 5 mm count as 0.
 
     Yuan et al. 2023 (PhysDiff) measure the lowest vertex of a mesh instead.
     """

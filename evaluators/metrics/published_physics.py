@@ -15,7 +15,6 @@ from evaluators.metrics.samples import MotionMean, SampleMetric, Timed
 FEET = (7, 10, 8, 11)  # left ankle or heel, left toe, right ankle or heel and right toe of the 22 SMPL joints
 JERK_OF_REAL_MOTIONS: dict[float, float] = {20: 0.033031363, 30: 0.016383045}
 """Mean jerk of FlowMDM by frame rate: of HumanML3D at 20 frames per second, and of BABEL at 30."""
-
 Values = dict[str, Tensor | float]
 
 
@@ -31,7 +30,6 @@ class PublishedPhysics(Timed, MotionMean):
         self.feet = list(feet)
 
     def value(self, sums: Tensor, counts: Tensor) -> dict[str, float | None]:
-        """Returns the mean of each value, and `measured`; raises `UserError` at any but the required frame rate."""
         if self.required_fps and self.fps != self.required_fps:
             raise self.error(f"defined at {self.required_fps:g} frames per second, but the motions have {self.fps:g}")
         return super().value(sums, counts) | {"measured": (counts > 0).all(1).double().mean().item()}

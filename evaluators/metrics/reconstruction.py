@@ -66,15 +66,11 @@ class PositionErrors(MotionMean):
         groups: Tensor | None = None,
         references: Sequence[Tensor] | None = None,
     ) -> None:
-        """Compares pairs of motions up to the end of the shorter one; upsampling needs `references`.
-
-        Raises `UserError` if a motion has fewer than two frames, or references are missing.
-        """
+        """Compares pairs of motions up to the end of the shorter one, of at least two frames."""
         motions, real_motions = self.real_frames(joints, mask), self.real_frames(real_joints, real_mask)
         if self.upsampling > 1:
             if references is None:
-                missing = "the store has no recordings at their own frame rate"
-                raise self.error(f"{missing}. Prepare the data set again with force=true")
+                raise self.error("the store has no recordings. Prepare the data set again with force=true")
             motions, real_motions = [upsample(motion, self.upsampling) for motion in motions], list(references)
         errors = []
         for motion, real in zip(motions, real_motions, strict=True):

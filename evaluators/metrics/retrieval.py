@@ -29,10 +29,7 @@ def _encoder(config: str) -> ConditionEncoder:
 
 @functools.cache
 def embedding(config: str, caption: str) -> Tensor:
-    """Returns the vector (C,) of length 1 of a caption; `config` is the JSON of an encoder's mapping.
-
-    Captions are encoded one by one, so that a vector does not depend on the other captions.
-    """
+    """Returns the vector (C,) of length 1 of a caption, encoded alone; `config` is the JSON of an encoder's mapping."""
     empty = torch.zeros(1, 1, 1)
     with torch.no_grad():
         vector = _encoder(config)(MotionBatch(empty, empty[..., 0].bool(), [""], text=[caption])).pooled[0]
@@ -58,10 +55,7 @@ def whole_set_retrieval(similarity: Tensor, correct: Tensor | None = None) -> di
 
 
 def best_ranks(similarity: Tensor, correct: Tensor) -> Tensor:
-    """Returns the mean rank (N,) of the best correct candidates, 0 = first: similarities and correctness (N, M).
-
-    Candidates with equal similarity share the mean of their ranks, so that halves occur.
-    """
+    """Returns the rank (N,) of the best correct candidate, 0 = first; equal similarities (N, M) share a mean rank."""
     own = similarity.where(correct, -torch.inf).amax(1, keepdim=True)
     return (similarity > own).sum(1) + ((similarity == own).sum(1) - 1) / 2
 

@@ -37,8 +37,7 @@ class SampleMetric(Metric):
 
     @property
     def update_called(self) -> bool:
-        """Always True: a metric without samples returns None, without a warning."""
-        return True
+        return True  # a metric without samples returns None, without a warning
 
     def update(self, **rows: Any) -> None:
         """Adds equally many rows by the names of their states, which include the keys; `ValueError` otherwise."""
@@ -49,7 +48,6 @@ class SampleMetric(Metric):
             getattr(self, name).append(values.detach())
 
     def compute(self) -> Any:
-        """Returns the `value` of all rows; None, or None by name, if there are none."""
         rows = self.rows("keys", *self.states)
         return self.value(*rows) if rows else self.nothing
 
@@ -179,13 +177,12 @@ class TwoSets(SampleMetric):
         real: Tensor | None = None,
         real_keys: Tensor | None = None,
     ) -> None:
-        """Adds generated (B, E) and real (R, E) features with their keys, in the same call or separately."""
+        """Adds generated (B, E) and real (R, E) features with their keys, together or separately."""
         if generated is not None:
             super().update(keys=keys, generated=generated)
         if real is not None:
             super().update(real_keys=real_keys, real=real)
 
     def compute(self) -> Any:
-        """Returns the value of generated (N, E) and real (M, E) features; None, or None by name, if a set is empty."""
         generated, real = self.rows("keys", "generated"), self.rows("real_keys", "real")
         return self.value(*generated, *real) if generated and real else self.nothing

@@ -252,18 +252,15 @@ def test_a_file_that_is_half_written_when_the_disk_is_full_leaves_the_old_one(tm
 HOSTILE = "x\n# Heading\n\n<b>|`[a](http://b)\r\x1b[31m\u202e\t~~_*"
 
 
-def hostile_table() -> Table:
+def test_tables_hold_text_not_markup_and_no_formulas():
     facts = {"device": "=HYPERLINK(1)", "seed": "-5", "recipe": "@SUM(1)", "result": "\t=1+1", "baseline": "-2+3+cmd"}
     line = Line(HOSTILE, "measured", [Cell("-0.5 ±0.1", -0.5, 0.1), Cell("+cmd")], "a", facts=facts)
     line.options["nfe"] = 1.0
     part = Part(HOSTILE, {"=A": "none", HOSTILE: "none"}, [line], [("a", HOSTILE), ("", HOSTILE)])
     part.figures.append(Figure(part=HOSTILE, x="nfe", y=["=A"]))
-    return Table("t](x) ", HOSTILE, [part, Part("=P", {"x": "none"}, [Line("$\\frac", "measured", [None])])], [HOSTILE])
-
-
-def test_tables_hold_text_not_markup_and_no_formulas():
-    table = hostile_table()
-    table.parts[0].drawn = [("t](x) -x-heading-b-a-http-b-31m-figure", Markup("<svg/>"))]
+    part.drawn = [("t](x) -x-heading-b-a-http-b-31m-figure", Markup("<svg/>"))]
+    other = Part("=P", {"x": "none"}, [Line("$\\frac", "measured", [None])])
+    table = Table("t](x) ", HOSTILE, [part, other], [HOSTILE])
     text, tex, html = (str(rendered(table, suffix)) for suffix in ("md", "tex", "html"))
     assert "<b>" not in html
     assert html.count("&lt;b&gt;") > 3
@@ -277,8 +274,7 @@ def test_tables_hold_text_not_markup_and_no_formulas():
     formulas = [cell for cell in cells if cell.lstrip().startswith(tuple("=+-@")) and not re.match(r"-[\d.]+", cell)]
     assert not formulas
     assert {"-5", "-0.5 ±0.1", "'-2+3+cmd", "'=HYPERLINK(1)"} <= set(cells)
-    part = table.parts[0]
-    part.lines[0].label = r"$\frac{$"
+    line.label = r"$\frac{$"
     assert draw(part, part.figures[0])
 
 

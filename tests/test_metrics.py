@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 from scipy.linalg import sqrtm
-from scipy.spatial.transform import Rotation
 from support.fixtures import golden, golden_case, groups
 from support.motions import keys, wander
 from torch import Tensor
@@ -85,13 +84,6 @@ def test_text_metrics_equal_guos(stem: str):
     assert values["fid"] == pytest.approx(expected["fid"], rel=1e-6)
 
 
-@one
-def test_interval_equals_guos(stem: str):
-    np.testing.assert_allclose(mean_ci(array("ci/values").tolist()), array("ci/mean_ci"), rtol=1e-12)
-    columns = [mean_ci(column.tolist()) for column in array("ci/values3").T]
-    np.testing.assert_allclose(np.transpose(columns), array("ci/mean_ci3"), rtol=1e-12)
-
-
 @pytest.mark.golden
 @pytest.mark.parametrize("case", cases("mm_pairs", "a2m/"))
 def test_action_metrics_equal_the_authors(case: str):
@@ -107,13 +99,25 @@ def test_action_metrics_equal_the_authors(case: str):
 
 
 @one
-def test_accuracy_and_unconstrained_diversity_equal_the_authors(stem: str):
+def test_intervals_accuracy_unconstrained_diversity_precision_recall_and_retrieval_equal_the_authors(stem: str):
+    np.testing.assert_allclose(mean_ci(array("ci/values").tolist()), array("ci/mean_ci"), rtol=1e-12)
+    columns = [mean_ci(column.tolist()) for column in array("ci/values3").T]
+    np.testing.assert_allclose(np.transpose(columns), array("ci/mean_ci3"), rtol=1e-12)
     labels = tensor("a2m/logit_labels")
     value = computed(accuracy.ActionAccuracy(), logits=tensor("a2m/logits"), labels=labels, keys=keys(len(labels)))
     assert value == pytest.approx(float(array("a2m/accuracy")), rel=1e-6)
     features = tensor("a2m/features")
     value = pair_distance(features[tensor("uncond/div_first")], features[tensor("uncond/div_second")])
     assert value == pytest.approx(float(array("uncond/diversity")), rel=1e-5)
+    fake, real = tensor("pr/gen"), tensor("pr/real")
+    order = {"keys": torch.arange(len(fake)), "real_keys": torch.arange(len(real))}  # the larger set is cut
+    values = computed(PrecisionRecall(), generated=fake, real=real, **order)
+    assert values == pytest.approx({name: float(array(f"pr/{name}")) for name in values}, rel=1e-12)
+    values = whole_set_retrieval(tensor("tmr/sims"))
+    for way in ("t2m", "m2t"):
+        recall = {f"{way}_top{k}": float(array(f"tmr/{way}_R{k:02}")) / 100 for k in TMR_TOP}
+        assert {name: values[name] for name in recall} == pytest.approx(recall, rel=1e-12)
+        assert values[f"{way}_median"] == float(array(f"tmr/{way}_MedR"))
 
 
 @pytest.mark.golden
@@ -139,14 +143,6 @@ def test_kernel_distance_of_whole_sets_equals_the_authors(stem: str):
         i, j = generator.choice(len(real), size, replace), generator.choice(len(fake), size, replace)
         mmd.append(polynomial_mmd2(real[i], fake[j]).item())
     np.testing.assert_allclose([np.mean(mmd), np.std(mmd)], array("kid/full/mean_std"), rtol=1e-5)
-
-
-@one
-def test_precision_and_recall_equal_the_authors(stem: str):
-    fake, real = tensor("pr/gen"), tensor("pr/real")
-    order = {"keys": torch.arange(len(fake)), "real_keys": torch.arange(len(real))}  # the larger set is cut
-    values = computed(PrecisionRecall(), generated=fake, real=real, **order)
-    assert values == pytest.approx({name: float(array(f"pr/{name}")) for name in values}, rel=1e-12)
 
 
 def mid(real: Tensor, text: Tensor, generated: Tensor, eps: float) -> float:
@@ -176,7 +172,7 @@ def test_mid_equals_the_authors(case: str):
 
 
 @one
-def test_flame_metrics_equal_the_authors(stem: str):
+def test_flame_metrics_and_position_errors_equal_the_authors(stem: str):
     text, fake, real = tensor("flame/text_feat"), tensor("flame/gen_motion_feat"), tensor("flame/gt_motion_feat")
     own = torch.arange(len(text))
     pools = torch.cat([own[:, None], tensor("flame/wrong_idx")], 1)
@@ -188,9 +184,6 @@ def test_flame_metrics_equal_the_authors(stem: str):
     for name, metric in metrics.items():
         assert metric.compute() == pytest.approx(float(array(f"flame/{name}")), rel=2e-6)
 
-
-@one
-def test_flame_position_errors_equal_the_authors(stem: str):
     metric, pairs = FlamePositionErrors(SMPL22.parents), []
     for clip in groups({k: v for k, v in FIXTURE.items() if k.startswith("flame_ape/clip")}, "translation"):
         sides = []
@@ -210,14 +203,11 @@ def averages(metric: reconstruction.PositionErrors, pairs: list[Any]) -> list[fl
     return list(metric.compute().values())
 
 
-def temos_errors(case: str) -> list[float]:
-    parts = ("root", "traj", "mean_pose", "mean_joints")
-    return [float(array(f"temos_ape/{case}/{error}_{part}")) for error in ("APE", "AVE") for part in parts]
-
-
 @one
 def test_temos_position_errors_equal_the_authors(stem: str):
     """Also of padded batches: their floor sees the padding, which the parts of padded motions reproduce."""
+    names = [f"{error}_{part}" for error in ("APE", "AVE") for part in ("root", "traj", "mean_pose", "mean_joints")]
+    single, padded = ([float(array(f"temos_ape/{case}/{n}")) for n in names] for case in ("single", "padded"))
     fake, real = tensor("temos_ape/padded_text"), tensor("temos_ape/padded_ref")
     lengths = tensor("temos_ape/single/len_text_ref")
     metric = TemosPositionErrors()
@@ -230,26 +220,17 @@ def test_temos_position_errors_equal_the_authors(stem: str):
         real_mask=length_mask(lengths[:, 1], real.shape[1]),
         keys=keys(len(fake)),
     )
-    assert list(values.values()) == pytest.approx(temos_errors("single"), rel=2e-6)
+    assert list(values.values()) == pytest.approx(single, rel=2e-6)
     metric, pairs = TemosPositionErrors(), []
     metric.units_per_meter = 1.0
     for *motions, length in zip(fake, real, array("temos_ape/lengths"), strict=True):
         pairs.append([{part: x[:length] for part, x in metric.positions(motion).items()} for motion in motions])
-    np.testing.assert_allclose(averages(metric, pairs), temos_errors("padded"), rtol=2e-6)
+    np.testing.assert_allclose(averages(metric, pairs), padded, rtol=2e-6)
     parts, length = temos_parts(fake[0]), int(array("temos_ape/lengths")[0])
     names = {"root": "root", "trajectory": "traj", "mean_local": "pose_local", "mean_global": "joints"}
     for part, name in names.items():
         expected = array(f"temos_ape/transform0/{name}")
         np.testing.assert_allclose(parts[part][:length] / 1000, expected[:length], atol=2e-6)
-
-
-@one
-def test_whole_set_retrieval_equals_the_authors(stem: str):
-    values = whole_set_retrieval(tensor("tmr/sims"))
-    for way in ("t2m", "m2t"):
-        for k in TMR_TOP:
-            assert values[f"{way}_top{k}"] == pytest.approx(float(array(f"tmr/{way}_R{k:02}")) / 100, rel=1e-12)
-        assert values[f"{way}_median"] == float(array(f"tmr/{way}_MedR"))
 
 
 def exactly_normal(mean: np.ndarray, covariance: np.ndarray, count: int, seed: int) -> Tensor:
@@ -260,11 +241,6 @@ def exactly_normal(mean: np.ndarray, covariance: np.ndarray, count: int, seed: i
     return torch.from_numpy(x @ np.linalg.cholesky(covariance).T + mean)
 
 
-def covariance(size: int, seed: int) -> np.ndarray:
-    a = np.random.default_rng(seed).normal(size=(size, size))
-    return a @ a.T / size + 0.1 * np.eye(size)
-
-
 def test_frechet_distance_of_normal_distributions():
     """Of commuting covariances: |m - m'|^2 + sum (s - s')^2; of any, scipy's matrix square root."""
     deviations, other = np.array([0.5, 1.0, 3.0]), np.array([2.0, 0.1, 3.5])
@@ -272,13 +248,12 @@ def test_frechet_distance_of_normal_distributions():
     b = exactly_normal(np.array([0.0, 2.0, 5.0]), np.diag(other**2), 70, 1)
     assert frechet_distance(a, b).item() == pytest.approx(5 + ((deviations - other) ** 2).sum(), rel=1e-12)
 
-    s, t = covariance(20, 0), covariance(20, 1)
+    s, t = (a @ a.T / 20 + 0.1 * np.eye(20) for a in np.random.default_rng(0).normal(size=(2, 20, 20)))
     a, b = exactly_normal(np.zeros(20), s, 100, 2), exactly_normal(np.ones(20), t, 60, 3)
     expected = 20 + np.trace(s + t) - 2 * np.trace(np.real(np.asarray(sqrtm(s @ t))))
     assert frechet_distance(a, b).item() == pytest.approx(expected, rel=1e-10)
 
-
-def test_frechet_distance_without_full_rank_and_of_a_set_to_itself():
+    # without full rank, and of a set to itself
     generator = torch.Generator().manual_seed(0)
     a, b = (torch.randn(n, 12, generator=generator, dtype=torch.float64) for n in (40, 30))
     dead = torch.ones(1, 5, dtype=torch.float64)
@@ -326,22 +301,17 @@ def test_r_precision_of_perfect_random_and_blind_features():
         assert perfect == {"top1": 1.0, "top2": 1.0, "top3": 1.0}
         for motion, seen in ((random, text), (blind, blind)):
             values = computed(metric(), generated=motion, text=seen, text_keys=ids, keys=ids)
-            for k in (1, 2, 3):
-                chance = k / 32
-                tolerance = 4 * (chance * (1 - chance) / count) ** 0.5
-                assert values[f"top{k}"] == pytest.approx(chance, abs=tolerance)
+            for chance, value in zip((1 / 32, 2 / 32, 3 / 32), values.values(), strict=True):
+                assert value == pytest.approx(chance, abs=4 * (chance * (1 - chance) / count) ** 0.5)
 
 
-def test_texts_for_motion_never_draw_the_own_caption():
-    """Two captions, far from one another; each motion lies on its own, so a pool of 2 must never hold it twice."""
+def test_texts_for_motion_never_draw_the_own_caption_and_motions_for_text_count_every_text_once():
+    # Two captions, far from one another; each motion lies on its own, so a pool of 2 must never hold it twice.
     captions, which = torch.tensor([[0.0], [10.0]]), torch.arange(40) % 2
     for own, top1 in ((which, 1.0), (1 - which, 0.0)):
         texts = {"text": captions[which], "text_keys": which, "keys": keys(40)}
         assert computed(TextsForMotion(pool=2), generated=captions[own], **texts)["top1"] == top1
-
-
-def test_motions_for_text_count_every_text_once():
-    """33 motions that are mixed up in pairs but for one: whatever the pools, at most the one is right."""
+    # 33 motions that are mixed up in pairs but for one: whatever the pools, at most the one is right.
     text = torch.arange(33.0)[:, None]
     motion = text.clone()
     motion[:32] = text[:32] + torch.tensor([1.0, -1.0]).repeat(16)[:, None]
@@ -351,12 +321,21 @@ def test_motions_for_text_count_every_text_once():
     assert 1 <= round(hits) <= 2  # the one, and one whose partner an incomplete pool may leave out
 
 
-def test_ties_in_retrieval():
+def test_ties_and_directions_in_retrieval():
     candidates, query = torch.tensor([[0.0], [1.0], [1.0], [2.0]]), torch.tensor([[1.0], [1.0], [0.4]])
     pools = torch.arange(4).expand(3, -1)
     assert retrieval_ranks(query, candidates, pools, torch.tensor([1, 2, 3])).tolist() == [0, 1, 3]
     assert set(whole_set_retrieval(torch.eye(4)).values()) == {1.0}
     assert whole_set_retrieval(torch.ones(4, 4))["t2m_median"] == 2.5, "ties count by half"
+
+    text = normalize(torch.randn(64, 8, generator=torch.Generator().manual_seed(0)), dim=-1)
+    lengths = torch.linspace(1, 10, 64)[:, None]
+    rows = {"generated": lengths * text, "text": text, "keys": torch.arange(64)}
+    for alone in (True, False):
+        top1 = computed(MotionsForText(normalize=alone), text_keys=rows["keys"], **rows)["top1"]
+        assert (top1 == 1) if alone else (top1 < 0.9)
+        distance = computed(MultimodalDistance(normalize=alone), **rows)
+        assert distance == pytest.approx(0 if alone else float((lengths - 1).mean()), rel=1e-6, abs=1e-6)
 
 
 def test_diversity_of_two_points():
@@ -402,16 +381,7 @@ def test_joint_variance_of_known_spread():
     assert metric.compute() == pytest.approx(2 / 3)
 
 
-def test_temos_parts_do_not_see_where_a_motion_stands():
-    joints = wander(21, 30, 0).double() * 640
-    rotation = torch.from_numpy(Rotation.from_euler("y", 2.1).as_matrix())
-    moved = joints @ rotation.T + joints.new_tensor([300.0, 50.0, -20.0])
-    for name, values in temos_parts(joints).items():
-        torch.testing.assert_close(temos_parts(moved)[name], values, rtol=0, atol=1e-9)
-    assert temos_parts(joints)["root"][0, [0, 2]].abs().max() < 1e-9
-
-
-def test_displacement_of_shifted_frames():
+def test_displacement_and_drift_of_shifted_frames_and_joints():
     """Shifted by (3, 0, 4) in every frame after the fourth, and by twice that in the last: 5 and 10 metres."""
     real = wander(22, 10, 0)[None]
     fake = real.clone()
@@ -429,21 +399,16 @@ def test_displacement_of_shifted_frames():
         values = computed(reconstruction.DisplacementErrors(), **motions, **change)
         assert values == pytest.approx({"ade": ade, "fde": fde}, rel=1e-6)
 
-
-def test_kept_joints_neither_err_nor_go_unseen_when_they_drift():
-    """Joint 3 is new and 2 m off; of the kept ones joint 5 is 1 m off in one of 10 frames."""
-    real = wander(22, 10, 0)[None]
+    # Joint 3 is new and 2 m off; of the kept ones joint 5 is 1 m off in one of 10 frames.
     fake = real.clone()
     fake[:, :, 3, 0] += 2
     fake[:, 4, 5, 1] += 1
-    mask, keys = torch.ones(1, 10, dtype=torch.bool), torch.tensor([1])
-    kept = torch.ones(1, 10, 22, dtype=torch.bool)
-    kept[:, :, 3] = False
-    motions = {"joints": fake, "mask": mask, "real_joints": real, "real_mask": mask, "keys": keys, "kept": kept}
+    mask, kept = torch.ones(1, 10, dtype=torch.bool), (torch.arange(22) != 3).expand(1, 10, 22)
+    motions |= {"joints": fake, "mask": mask, "real_mask": mask, "kept": kept}
     assert computed(reconstruction.DisplacementErrors(), **motions) == pytest.approx({"ade": 2, "fde": 2}, rel=1e-6)
     assert computed(reconstruction.KeptDrift(), **motions) == pytest.approx({"mean": 1 / 210, "largest": 1}, rel=1e-6)
-    nothing_kept = motions | {"kept": ~mask[..., None].expand_as(kept)}
-    assert computed(reconstruction.KeptDrift(), **nothing_kept) == {"mean": None, "largest": None}
+    values = computed(reconstruction.KeptDrift(), **motions | {"kept": torch.zeros_like(kept)})
+    assert values == {"mean": None, "largest": None}
 
 
 def test_best_and_worst_of_several_are_chosen_by_the_root():
@@ -498,14 +463,3 @@ def test_physics_of_simple_motions():
         values = measured(joints)
         assert values["above"] == pytest.approx(above, rel=1e-6)
         assert values["below"] == pytest.approx(below, rel=1e-6)
-
-
-def test_normalized_features_compare_directions_alone():
-    text = normalize(torch.randn(64, 8, generator=torch.Generator().manual_seed(0)), dim=-1)
-    lengths = torch.linspace(1, 10, 64)[:, None]
-    rows = {"generated": lengths * text, "text": text, "keys": torch.arange(64)}
-    for same in (True, False):
-        top1 = computed(MotionsForText(normalize=same), text_keys=rows["keys"], **rows)["top1"]
-        distance = computed(MultimodalDistance(normalize=same), **rows)
-        assert (top1 == 1) if same else (top1 < 0.9)
-        assert distance == pytest.approx(0 if same else float((lengths - 1).mean()), rel=1e-6, abs=1e-6)

@@ -81,13 +81,6 @@ def test_mbench_equals_the_authors(case: str):
         assert float(ours[name]) == pytest.approx(expected, rel=1e-8, abs=1e-8, nan_ok=True), name
 
 
-@golden_case("mbench_quality")
-def test_mbench_equals_the_authors_in_the_mean(stem: str):
-    values = mean_over(MBenchQuality(20.0), MBENCH, meta(MBENCH)["config"]["summary_over"])
-    expected = {name: float(MBENCH[f"out/summary/{theirs}"][0]) for name, theirs in MBENCH_NAMES.items()}
-    assert values == pytest.approx(expected | {"measured": 1}, abs=1e-6)
-
-
 @pytest.mark.golden
 @pytest.mark.parametrize("case", cases(PFC, "", "pfc"))
 def test_physical_foot_contact_equals_the_authors(case: str):
@@ -97,7 +90,10 @@ def test_physical_foot_contact_equals_the_authors(case: str):
 
 
 @golden_case("pfc")
-def test_physical_foot_contact_leaves_out_motions_without_a_value(stem: str):
+def test_means_of_mbench_and_physical_foot_contact_leave_out_motions_without_a_value(stem: str):
+    values = mean_over(MBenchQuality(20.0), MBENCH, meta(MBENCH)["config"]["summary_over"])
+    expected = {name: float(MBENCH[f"out/summary/{theirs}"][0]) for name, theirs in MBENCH_NAMES.items()}
+    assert values == pytest.approx(expected | {"measured": 1}, abs=1e-6)
     averaged = meta(PFC)["config"]["folder_mean_over"]
     values = mean_over(PhysicalFootContact(30.0), PFC, [*averaged, "static", "steady_glide"])
     expected = {"pfc": float(PFC["f64/folder_mean"]), "measured": len(averaged) / (len(averaged) + 2)}
@@ -120,8 +116,8 @@ def test_kimodos_skating_equals_the_authors(stem: str):
     frames = torch.arange(joints.shape[1]) < lengths[:, None]
     metric.update(joints, frames, torch.arange(len(joints)), contacts)
     values = metric.compute()
-    for name, key_ in theirs.items():
-        assert values[name] == pytest.approx(float(KIMODO[f"f64/quality/{key_}"].mean()), abs=2e-6)
+    expected = {name: float(KIMODO[f"f64/quality/{key_}"].mean()) for name, key_ in theirs.items()}
+    assert {name: values[name] for name in theirs} == pytest.approx(expected, abs=2e-6)
 
 
 @pytest.mark.golden
@@ -150,21 +146,15 @@ def kimodo_errors(case: str) -> dict[str, Tensor]:
 
 
 @one
-def test_kimodos_percentile_is_over_motions(stem: str):
-    config = meta(KIMODO)["config"]["constraint_cases"]
-    means = torch.stack([kimodo_errors(case)["root2d_err"] for case, kinds in config.items() if "root2d" in kinds])
-    assert means.quantile(0.95).item() == pytest.approx(float(KIMODO["out/constraint_root2d_err_p95"]), abs=1e-7)
-
-
-@one
-def test_kimodos_retrieval_distances_and_angles_equal_the_authors(stem: str):
+def test_kimodos_percentile_retrieval_distances_and_angles_equal_the_authors(stem: str):
+    metric, config = KimodoConstraints(), meta(KIMODO)["config"]["constraint_cases"]
+    metric.add(torch.arange(len(config)), [kimodo_errors(case) for case in config])
+    expected = float(KIMODO["out/constraint_root2d_err_p95"])
+    assert metric.compute()["root2d_err_p95"] == pytest.approx(expected, abs=1e-7), "over motions"
     text, motion, real = (torch.from_numpy(KIMODO[f"in/tmr/{n}"]).double() for n in ("text", "motion", "gt_motion"))
     same = text @ text.T > 0.96  # their threshold 0.99 is converted to 0.98 of (cosine + 1) / 2
     for group, query, gallery in (("t2m_R", text, motion), ("m2m_R", motion, real), ("t2m_gt_R", text, real)):
-        ours = whole_set_retrieval(query @ gallery.T, same)
-        for k in TMR_TOP:
-            assert ours[f"t2m_top{k}"] == pytest.approx(float(KIMODO[f"f64/tmr/{group}/R{k:02}"]) / 100, abs=1e-12)
-        assert ours["t2m_median"] == float(KIMODO[f"f64/tmr/{group}/MedR"])
+        assert_recall(whole_set_retrieval(query @ gallery.T, same), KIMODO, {"t2m": f"f64/tmr/{group}"})
     alone = best_ranks(text @ motion.T, torch.eye(len(text), dtype=torch.bool))
     ranks = torch.from_numpy(KIMODO["out/tmr/rank_per_sample"])
     assert torch.equal((alone + 1).floor(), ranks.to(alone)) or torch.equal((alone + 1).ceil(), ranks.to(alone))
@@ -193,12 +183,16 @@ def test_jerk_of_transitions_equals_the_authors(stem: str, kind: str):
     assert values == pytest.approx([float(FLOWMDM[f"f64/{kind}/{n}"]) for n in ("peak_jerk", "auj")], rel=1e-7)
 
 
-def assert_recall(ours: dict, group: str, within: float = 1e-10):
-    for way in ("t2m", "m2t"):
+def assert_recall(ours: dict, fixture: dict[str, np.ndarray], keys: dict[str, str], within: float = 1e-10):
+    """Recall in percent and median rank are those under the fixture's key for each way."""
+    for way, theirs in keys.items():
         for k in TMR_TOP:
-            value = ours[f"{way}_top{k}"] * 100
-            assert value == pytest.approx(float(TMR[f"{group}/{way}/R{k:02}"]), abs=within)
-        assert ours[f"{way}_median"] == float(TMR[f"{group}/{way}/MedR"])
+            assert ours[f"{way}_top{k}"] * 100 == pytest.approx(float(fixture[f"{theirs}/R{k:02}"]), abs=within)
+        assert ours[f"{way}_median"] == float(fixture[f"{theirs}/MedR"])
+
+
+def tmr(group: str) -> dict[str, str]:
+    return {way: f"{group}/{way}" for way in ("t2m", "m2t")}
 
 
 @pytest.mark.golden
@@ -218,13 +212,13 @@ def test_ranks_equal_tmrs(group: str):
     for way, table in (("t2m", similarity), ("m2t", similarity.T)):
         if f"{group}/ranks_{way}" in TMR:
             np.testing.assert_array_equal(best_ranks(table, correct), TMR[f"{group}/ranks_{way}"])
-    assert_recall(whole_set_retrieval(similarity, correct), group)
+    assert_recall(whole_set_retrieval(similarity, correct), TMR, tmr(group))
 
 
 @golden_case("tmr_retrieval")
 def test_retrieval_in_small_batches_and_by_protocol_equals_tmrs(stem: str, monkeypatch):
     similarity, batches = torch.from_numpy(TMR["in/sims"]).double(), torch.from_numpy(TMR["out/guo/batches"])
-    assert_recall(batched_retrieval(similarity, batches), "out/guo")
+    assert_recall(batched_retrieval(similarity, batches), TMR, tmr("out/guo"))
 
     ids, chosen = TMR["in/keyids"].tolist(), TMR["in/nsim_idx"]
     vectors = dict(zip(ids, torch.from_numpy(TMR["in/sent_emb"]), strict=True))
@@ -239,7 +233,7 @@ def test_retrieval_in_small_batches_and_by_protocol_equals_tmrs(stem: str, monke
     for ours, theirs in (("all", "normal"), ("threshold", "threshold_0.95"), ("dissimilar", "nsim")):
         part = {name.removeprefix(f"{ours}_"): value for name, value in values.items() if name.startswith(ours)}
         # Their similarities are float32, which moves single queries whose answers are nearly equal.
-        assert_recall(part, f"out/driver_bs256/{theirs}", within=1.01 * 100 / len(ids))
+        assert_recall(part, TMR, tmr(f"out/driver_bs256/{theirs}"), within=1.01 * 100 / len(ids))
 
 
 def test_multi_positive_r_precision_of_an_example_and_dissimilar_captions():

@@ -60,7 +60,6 @@ class Lesson(MotionSource):
 
 
 def styled(caption: str, name: str) -> str:
-    """Returns the caption that asks for the motions of the user."""
     return f"{caption.rstrip(' .')} in {name} style"
 
 

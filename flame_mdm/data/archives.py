@@ -25,10 +25,9 @@ _DAMAGE = (*ZIP_ERRORS, tarfile.TarError, lzma.LZMAError, OSError, ValueError)
 
 
 def members(path: Path, is_wanted: Callable[[str], bool]) -> Iterator[tuple[str, bytes]]:
-    """Yields names and contents of the files in a zip or tar archive whose names are wanted.
+    """Yields names and contents of the wanted files in a zip or tar archive.
 
-    Raises `UserError` if the archive is damaged or none, a wanted member is a link, a sparse file or encrypted, or the
-    content expands disproportionately.
+    Raises `UserError` if it is damaged, expands disproportionately, or one of them is a link, sparse or encrypted.
     """
     size = regular_file(path)
     with path.open("rb") as file:

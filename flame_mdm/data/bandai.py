@@ -69,8 +69,7 @@ WORDS = read_yaml(Path(__file__).with_suffix(".yaml"))  # contents, styles and c
 CONTENTS_1, STYLES_1 = tuple(WORDS["dataset_1"]["contents"]), tuple(WORDS["dataset_1"]["styles"])
 STYLES_2 = tuple(WORDS["dataset_2"]["styles"])
 TAKES_2: dict[str, list[int]] = WORDS["dataset_2"]["takes"]
-"""Published number of takes in data set 2, by content, in the order of STYLES_2. The split is drawn from these numbers,
-not from the files found, so that a missing or excluded file does not move other takes to another split."""
+"""Published takes of data set 2, by content and STYLES_2: the split must not depend on which files are present."""
 
 WRONG_SIDE, SIDES = WORDS["wrong_side"], WORDS["sides"]
 HELD_OUT = frozenset(

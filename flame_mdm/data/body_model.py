@@ -13,11 +13,10 @@ from flame_mdm.representations import rotation
 from flame_mdm.representations.skeleton import SMPL22, SMPL24, forward_kinematics
 from flame_mdm.safe_io import naming, read_npz
 
-Offsets = tuple[tuple[float, float, float], ...]
 ARRAYS = ("J_regressor", "v_template", "kintree_table", "shapedirs")
 
 
-def load_offsets(path: Path) -> Offsets:
+def load_offsets(path: Path) -> tuple[tuple[float, float, float], ...]:
     """Returns the positions of SMPL's 24 joints relative to their parents in the rest pose of the mean shape, meters.
 
     `path` is SMPL's .pkl from https://smpl.is.tue.mpg.de, of which no code runs, or an .npz with the same arrays.

@@ -154,8 +154,7 @@ class CMU(MotionSource):
             elif not names:
                 self.leave_out("clips of HumanML3D without captions")
             else:
-                part = (row.start, row.end)
-                items[trial] += [Item(n, splits[n], row.name, texts[n], *part, n[0] == "M") for n in names]
+                items[trial] += [Item(n, splits[n], row.name, texts[n], row.start, row.end, n[0] == "M") for n in names]
         for id_, trial, text, _ in self.kit:
             if trial in files:
                 by_subject = hashed_split(f"CMU subject {trial.partition('_')[0]}", val=5, test=10)

@@ -188,10 +188,9 @@ class HumanML3D(T2MFolder):
         shapes = {name: self._load(name, mmap=True).shape for name in sorted(self._motions())}
         if wrong := [name for name, (_, features) in shapes.items() if features != representation.features]:
             raise UserError(f"{self.path}: wrong number of features of {some(wrong)}; delete them and prepare again")
-        frames = sum(count for count, _ in shapes.values())
-        mean, std = representation.statistics(
-            Frames(lambda: (self._load(name).astype(np.float32) for name in shapes), frames)
-        )
+        count = sum(frames for frames, _ in shapes.values())
+        frames = Frames(lambda: (self._load(name).astype(np.float32) for name in shapes), count)
+        mean, std = representation.statistics(frames)
         _save(self.path / "Std.npy", std.numpy())
         _save(self.path / "Mean.npy", mean.numpy())
 

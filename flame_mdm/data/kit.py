@@ -116,15 +116,10 @@ def _recording(task: tuple[Path, int]) -> np.ndarray:
 
 
 def read_joints(path: Path, step: int = 8) -> np.ndarray:
-    """Reads every `step`-th frame of `NUMBER_fke.csv`: joints (F, 21, 3) float32 in meters, y up.
-
-    A row contains its number and 63 coordinates in KIT's unit, about 1/640 of a meter.
-    """
+    """Reads joints (F, 21, 3) float32 in meters, y up, of every `step`-th frame; KIT's unit is about 1/640 m."""
     lines = read_text(path).splitlines()[1::step]
     with naming(path, ValueError, what="damaged, exclude it by its number: "):
         rows = np.loadtxt(lines, delimiter=",", ndmin=2)
-        if rows.shape[1] != 64 or not len(rows):
-            raise UserError(f"{rows.shape[1]} columns, not a row number and 63 coordinates")
-        if not np.isfinite(rows).all():
-            raise UserError("non-finite numbers")
+        if rows.shape[1] != 64 or not len(rows) or not np.isfinite(rows).all():
+            raise UserError(f"rows {rows.shape}, not a row number and 63 coordinates, finite numbers, in each")
     return (rows[:, 1:].reshape(-1, 21, 3) / UNITS_PER_METER).astype(np.float32)

@@ -1,8 +1,7 @@
 """Restricted reader of pickles: arrays, numbers, text, lists, tuples and dictionaries with text keys.
 
 A pickle can name any function and have it called. This reader calls none: each object is kept as its arguments and
-state, and arrays are made from the bytes among them. Not even NumPy's own functions would be safe, because a wrong byte
-in a dtype crashes the interpreter.
+state, and arrays are made from the bytes among them: a wrong byte in a dtype crashes NumPy's own functions.
 
 Python's C unpickler allocates as much memory as a file of ten bytes requests. Therefore this reader is based on the
 unpickler in Python: no read may request more bytes than are left in the file, and repeated content counts each time.

@@ -198,12 +198,11 @@ class T2MFolder(MotionSource):
         path = self.path / name
         array = read_npy(required(path, self.get_it), mmap=mmap)
         if array.ndim != dimensions or array.dtype.kind not in "fiu":
-            kind = "(frames, features)" if dimensions == 2 else "(features,)"
-            raise UserError(f"{path}: shape {array.shape} of {array.dtype}, not numbers {kind}")
+            raise UserError(f"{path}: shape {array.shape} of {array.dtype}, not numbers of {dimensions} dimensions")
         return array
 
     def _account(self, name: str, frames: int, items: Sequence[Cut]) -> None:
-        """Counts why a motion gives no item, or which of its captions are left out."""
+        """Counts why a motion gives no item, or how many of its captions are left out."""
         if frames < self.shortest:
             reason = f"shorter than {self.shortest} frames"
         elif frames >= MAX_LENGTH:

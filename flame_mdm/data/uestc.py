@@ -75,10 +75,8 @@ class UESTC(MotionSource):
         for index, name in enumerate(self._lines("names.txt")):
             match = NAME.fullmatch(name)
             if match is None or int(match[2]) >= len(self.actions):
-                raise UserError(
-                    f"{self.poses.parent}/info/names.txt, line {index + 1}: {name!r} is not the name of a video with "
-                    f"one of the {len(self.actions)} actions, such as a0_d0_p001_c1_color.avi"
-                )
+                row = f"{self.poses.parent}/info/names.txt, line {index + 1}"
+                raise UserError(f"{row}: {name!r} is not the name of a video of one of the {len(self.actions)} actions")
             videos.append(Video(index, match[1], *(int(match[k]) for k in range(2, 6))))
         return videos
 

@@ -28,10 +28,8 @@ MODULES = {
     "data": ("flame_mdm.data",),
 }
 """Modules whose classes a configuration from a checkpoint may name, by part of the configuration."""
-
 MOST_VALUES, MOST_LEVELS = 1_000_000, 50
 """Limits of a configuration in a file: number of values, and depth of nested mappings and lists."""
-
 RUN_DIR = "${run.dir}"
 """Placeholder for the run directory in a saved `config.yaml`, so that `run.dir=...` changes all paths in it."""
 

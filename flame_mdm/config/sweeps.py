@@ -101,7 +101,7 @@ def _check_whole(config: Config, name: str) -> None:
         lacking += ["run.dir"] * (not config["run"].get("dir"))
         lacking += ["trainer.max_steps"] * ("max_steps" not in config["trainer"])
     if lacking:
-        raise UserError(f"{name}: no {lacking[0]}. Begin the recipe with the defaults of another recipe, or with /base")
+        raise UserError(f"{name}: no {lacking[0]}. Set it, or begin with the defaults of another recipe, or with /base")
     for key, value in config.get("denoiser", {}).items():
         if isinstance(value, int) and value < 0:
             raise UserError(f"denoiser.{key}={value}: must not be negative")

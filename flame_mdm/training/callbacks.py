@@ -147,7 +147,7 @@ class Measurements(Callback):
         seconds = (time.perf_counter() - self.since) / steps
         samples = data.batch_size * trainer.world_size * trainer.accumulate_grad_batches
         pl_module.log("train/epochs", step * samples / len(data.train))
-        pl_module.log("train/samples_per_second", samples / seconds, prog_bar=True)
+        pl_module.log("train/samples_per_second", samples / seconds)
         pl_module.log("train/seconds_per_step", seconds)
         if pl_module.device.type == "cuda":
             pl_module.log("train/gpu_memory_gib", torch.cuda.max_memory_allocated(pl_module.device) / 2**30)

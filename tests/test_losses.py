@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from support.analytic import NO_CONDITION, assert_golden, flow_field, motions
@@ -24,11 +23,6 @@ ALL: dict[str, Any] = {"joints": 1.0, "velocity": 1.0, "foot_contact": 1.0, "bon
 BONES = [(0, 1), (1, 2)]
 
 
-def linear_joints(matrix: np.ndarray) -> Callable[[Tensor], Tensor]:
-    """The fixture's stand-in for forward kinematics: joints as a linear function of the features."""
-    return lambda x: (x @ torch.from_numpy(matrix).to(x).T).unflatten(-1, (-1, 3))
-
-
 def joints_as_features(x: Tensor) -> Tensor:
     return x.unflatten(-1, (-1, 3))
 
@@ -42,7 +36,8 @@ def test_mdm_losses(case):
     last_row = FIXTURE[f"{data}/x_start"].shape[2]
     used = [term for term in WEIGHTS if f"{case}/{term}" in FIXTURE]  # some data sets leave terms out
     weights: dict[str, Any] = {OURS[term]: lambdas.get(WEIGHTS[term], 0.0) for term in used}
-    to_joints = linear_joints(FIXTURE[f"{data}/fk"])
+    kinematics = torch.from_numpy(FIXTURE[f"{data}/fk"]).to(x)  # a stand-in: joints are linear in the features
+    to_joints: Callable[[Tensor], Tensor] = lambda x: joints_as_features(x @ kinematics.T)  # noqa: E731
     losses = MotionLosses(to_joints, SMPL_FEET, **weights, velocity_features=x.shape[-1] - last_row)
     process, t = GaussianDiffusion(meta(FIXTURE)["config"]["T"]), torch.from_numpy(FIXTURE[f"{data}/t"]).float()
     seen = []
@@ -72,15 +67,14 @@ def test_velocity_loss_of_mfm(stem):
     mask = torch.from_numpy(FLOW["in/mask"]).flatten(1)
     output = flow_field(FLOW)(process.corrupt(x, noise, t), 1000 * t, mask, NO_CONDITION)
     size = x.shape[-1] - FLOW["loss/x_start"].shape[2]
-    losses = MotionLosses(linear_joints(np.zeros((3, 1))), [], velocity=1.0, velocity_features=size)
+    losses = MotionLosses(joints_as_features, [], velocity=1.0, velocity_features=size)
     velocity = losses(output, process.target(x, noise, t), mask)["velocity"]
     assert_golden(FLOW, "loss/field_vel/vel_mse", velocity)
 
 
 def test_masked_mse_is_the_mean_over_real_frames():
     torch.manual_seed(0)
-    a, b = torch.randn(2, 3, 5, 4).unbind()
-    lengths = [5, 2, 0]
+    (a, b), lengths = torch.randn(2, 3, 5, 4), [5, 2, 0]
     mask = length_mask(torch.tensor(lengths), 5)
     expected = [((a[i, :n] - b[i, :n]) ** 2).mean().item() if n else 0.0 for i, n in enumerate(lengths)]
     torch.testing.assert_close(masked_mse(a, b, mask), torch.tensor(expected))
@@ -89,36 +83,30 @@ def test_masked_mse_is_the_mean_over_real_frames():
 
 def test_equal_motions_lose_nothing_but_sliding_feet():
     """One foot stands and slides in the estimate, the other moves in the data and is free to."""
-    x = torch.zeros(1, 4, 9)
-    x[..., 6] = torch.arange(4.0)
+    x, mask, time = torch.zeros(1, 4, 9), torch.ones(1, 4, dtype=torch.bool), torch.arange(4.0)
+    x[..., 6] = time
     losses = MotionLosses(joints_as_features, [1, 2], BONES, **ALL)
-    mask = torch.ones(1, 4, dtype=torch.bool)
     assert all(loss == 0 for loss in losses(x, x, mask).values())
     slid = x.clone()
-    slid[..., 3] = 0.3 * torch.arange(4.0)
+    slid[..., 3] = 0.3 * time
     terms = losses(slid, x, mask)
     # Means over 3 frames x 2 feet x 3 coordinates, 3 x 3 joints x 3, and 4 x 3 x 3.
     assert terms["foot_contact"].item() == pytest.approx(0.3**2 / 6)
     assert terms["velocity"].item() == pytest.approx(0.3**2 / 9)
     assert terms["joints"].item() == pytest.approx(0.09 * (0 + 1 + 4 + 9) / (4 * 9))
-    other = x.clone()
-    other[..., 6] *= 2
-    assert losses(other, x, mask)["foot_contact"] == 0
+    assert losses(2 * x, x, mask)["foot_contact"] == 0
     # 1 cm per frame in the data is standing, 1.5 cm is not.
     for step, stands in ((0.0099, True), (0.015, False)):
-        slow = torch.zeros(1, 4, 9)
-        slow[..., 3] = step * torch.arange(4.0)
-        assert (MotionLosses(joints_as_features, [1], foot_contact=1.0)(slow, slow, mask)["foot_contact"] > 0) == stands
+        loss = MotionLosses(joints_as_features, [2], foot_contact=1.0)(step * x, step * x, mask)["foot_contact"]
+        assert (loss > 0) == stands
 
 
 def test_bones_lose_their_change_of_length_and_not_their_turns():
     """Bones of 1 m and 2 m are turned in the estimate; in one frame, the second is 0.3 m too long."""
     points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 2, 0]])
-    x = points.flatten().repeat(1, 4, 1)
     turned = points @ torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]) + 5
-    x0_hat = turned.flatten().repeat(1, 4, 1)
-    losses = MotionLosses(joints_as_features, [], BONES, bone_length=2.0)
-    mask = torch.ones(1, 4, dtype=torch.bool)
+    x, x0_hat = (joints.flatten().repeat(1, 4, 1) for joints in (points, turned))
+    losses, mask = MotionLosses(joints_as_features, [], BONES, bone_length=2.0), torch.ones(1, 4, dtype=torch.bool)
     assert losses(x0_hat, x, mask)["bone_length"].item() == pytest.approx(0, abs=1e-10)
     x0_hat[0, 1, 7] += 0.3
     assert losses(x0_hat, x, mask)["bone_length"].item() == pytest.approx(2 * 0.3**2 / (4 * 2), rel=1e-5)

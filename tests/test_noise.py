@@ -6,7 +6,11 @@ from scipy import stats
 from flame_mdm.seeds import key, normal, seeded_noise, uniform
 
 
-def test_noise_is_standard_normal_and_uncorrelated():
+def test_numbers_are_uniform_in_0_to_1_and_noise_is_standard_normal_and_uncorrelated():
+    for draws in uniform(torch.arange(500), (100,)):
+        assert 0 < draws.min() < draws.max() <= 1
+        assert stats.kstest(draws.flatten().numpy(), "uniform").pvalue > 1e-3
+    assert torch.isfinite(normal(torch.arange(500), 10, 5)).all()
     noise = seeded_noise(["a", "b", "c", "d"], 196, 263, seed=1, replication=0, like=torch.zeros(1))
     first, second = noise(0), noise(1)
     assert stats.kstest(first.flatten().numpy(), "norm").pvalue > 1e-3
@@ -28,14 +32,6 @@ def test_noise_of_a_motion_depends_on_its_name_alone():
     for seed, replication, draw in ((4, 1, 2), (3, 2, 2), (3, 1, 3)):
         other = seeded_noise(["b"], 11, 7, seed=seed, replication=replication, like=like)(draw)
         assert not torch.isclose(other, alone).any()
-
-
-def test_uniform_numbers_lie_strictly_between_0_and_1():
-    for draws in uniform(torch.arange(500), (100,)):
-        assert draws.min() > 0
-        assert draws.max() <= 1
-        assert stats.kstest(draws.flatten().numpy(), "uniform").pvalue > 1e-3
-    assert torch.isfinite(normal(torch.arange(500), 10, 5)).all()
 
 
 def test_keys_and_values_are_the_same_on_every_machine():

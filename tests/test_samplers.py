@@ -102,7 +102,6 @@ DDIM_STEPS = sorted(key.removeprefix("step/") for key in GAUSSIAN if key.startsw
 @golden_cases("gaussian", ["p_sample", *DDIM_STEPS])
 def test_one_step(case, dtype):
     process, t = GaussianDiffusion(OPTIONS["T"]), torch.tensor(GAUSSIAN["pw/t"])
-    schedule = process.schedule
     x_t = motions(GAUSSIAN["f64/pw/x_t" if dtype == torch.float64 else "pw/x_t"], dtype)
     noise = motions(GAUSSIAN["step/noise"][["p_sample", *DDIM_STEPS].index(case)], dtype)
     denoise = linear_denoiser(GAUSSIAN["lin4/A"], GAUSSIAN["lin4/b"], float(GAUSSIAN["lin4/g"]))
@@ -110,8 +109,8 @@ def test_one_step(case, dtype):
     name, eta = ("ancestral", None) if case == "p_sample" else ("ddim", float(case.removeprefix("ddim_eta")))
     stepped = []
     for x, x0, draw, step in zip(x_t, x0_hat, noise, t.tolist(), strict=True):
-        estimate = x0, process.log_variance(x0, x, step, schedule)
-        run = Descent(lambda *_, known=estimate: known, schedule, iter([draw]), SamplerOptions(eta=eta))
+        estimate = x0, process.log_variance(x0, x, step, process.schedule)
+        run = Descent(lambda *_, same=estimate: same, process.schedule, iter([draw]), SamplerOptions(eta=eta))
         stepped.append(process.samplers[name].step(x, run, step))
     x = torch.stack(stepped)
     assert_golden(GAUSSIAN, f"step/{case}", x)
@@ -179,8 +178,7 @@ def built(released: Released) -> Denoise:
 def released_flow() -> tuple[Denoise, Condition]:
     """The fixture's network with its random weights, and its conditions, texts or actions, with their null."""
     released = import_mdm(weights(MFM), Options(num_heads=meta(MFM)["config"]["heads"]))
-    if "in/action" in MFM:
-        assert released.action_embedding is not None
+    if released.action_embedding is not None and "in/action" in MFM:
         pooled = released.action_embedding[torch.from_numpy(MFM["in/action"]).flatten()]
     else:
         pooled = torch.from_numpy(MFM["in/text_embed"]).flatten(0, -2)
@@ -270,8 +268,8 @@ def test_oracle_flow_returns_the_data(sampler, count, prediction):
     data, noise = torch.randn(2, 2, 6, 4, dtype=torch.float64)
     data = data * mask[..., None]
     output = process.target(data, noise, torch.zeros(2))
-    denoise, estimates = CountedDenoise(lambda *_: output), list[Tensor]()
-    how = {"sampler": sampler, "num_inference_steps": count}
+    estimates, how = list[Tensor](), {"sampler": sampler, "num_inference_steps": count}
+    denoise = CountedDenoise(lambda *_: output)
     x = sample(process, denoise, recorded(noise), mask, trajectory=estimates, **how)
     # The path ends where its last noise has deviation sigma_min; every estimate on it is the data itself.
     torch.testing.assert_close(x, (data + 1e-3 * noise) * mask[..., None], rtol=0, atol=1e-5)
@@ -383,8 +381,8 @@ def test_blended_parts_are_as_noisy_as_the_rest_and_each_noisy_step_is_resampled
         return known
 
     edit = Edit(known, torch.arange(4000).expand(1, 1, -1) < 2000, "x_t", blend=blend, resample=resample)
-    how = {"sampler": sampler, "num_inference_steps": [0, 5, 15, 30, 60, 99]}
-    x = sample(process, denoise, drawn((1, 1, 4000)), edit=edit, **how)
+    steps = [0, 5, 15, 30, 60, 99]
+    x = sample(process, denoise, drawn((1, 1, 4000)), edit=edit, sampler=sampler, num_inference_steps=steps)
     torch.testing.assert_close(x, known, rtol=0, atol=1e-4)
     assert len(seen) == 5 * resample + 1
     for number, (step, x_t) in enumerate(seen):

@@ -18,7 +18,8 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 from support.fixtures import GOLDEN, Arrays, golden, meta, weights
-from support.refusals import one_line_error
+from support.refusals import error_of, one_line_error
+from support.runs import inputs_of
 
 from flame_mdm.__main__ import main
 from flame_mdm.batch import Condition, MotionBatch
@@ -263,13 +264,13 @@ def test_averaged_weights_are_taken_and_models_that_attend_to_padding_are_sample
     last = {key: value + 1 for key, value in averaged.items()}
     words = released_file(tmp_path, {"model": last, "model_avg": averaged}, {"dataset": "uestc"})
     assert main(["import", "mdm", *words]) == 0
-    model, seen = load(tmp_path), set()
+    model = load(tmp_path)
     assert main(["import", "mdm", *words, "averaged=false"]) == 0
     bias = model.denoiser.get_parameter("output.bias")
     assert torch.equal(load(tmp_path).denoiser.get_parameter("output.bias"), bias + 1)
-    model.denoiser.register_forward_hook(lambda module, inputs, output: seen.add(inputs[0].shape[1]))
-    assert len(generate(model, frames=24, num_inference_steps=2)[0].features) == 24
-    assert seen == {60}
+    with inputs_of(model.denoiser) as seen:
+        assert len(generate(model, frames=24, num_inference_steps=2)[0].features) == 24
+    assert {x_t.shape[1] for x_t, *_ in seen} == {60}
 
 
 def test_imports_that_cannot_be_are_one_line(refused, bad):
@@ -395,8 +396,7 @@ def test_push_writes_a_card_and_uploads_these_files_alone(trained, tmp_path, cap
     assert "notes.txt" not in api.upload_folder.call_args.kwargs["allow_patterns"]
     capsys.readouterr()
     api.create_repo.side_effect = RuntimeError("no token\nlog in")
-    assert main(words) == 1
-    assert capsys.readouterr().err == f"error: me/walker: upload failed: no token. The files are in {folder}\n"
+    assert error_of(capsys, *words) == f"error: me/walker: upload failed: no token. The files are in {folder}"
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ import sys
 import threading
 import urllib.error
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,10 +21,10 @@ from urllib.parse import parse_qsl, quote, urlencode
 
 import numpy as np
 import pytest
-from support.browser import CHROMIUM, browser
+from support.browser import browser, in_chromium
 from support.fixtures import ROOT
+from support.refusals import error_of
 
-from flame_mdm.__main__ import main
 from flame_mdm.demo import studio as making
 from flame_mdm.demo.request import MAX_EDITS, DemoEdit, DemoRequest, parse_query
 from flame_mdm.errors import UserError
@@ -138,12 +138,8 @@ def test_a_request_stops_within_a_step_and_the_next_one_runs(studio, monkeypatch
 
 def test_a_wrong_port_and_a_missing_package_are_one_line(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "gradio", None)
-    for words, says in (
-        (["port=99999"], "port=99999: give a number from 0 to 65535; 0 is any free port"),
-        ([], 'the demo needs the package gradio. Run pip install "flame-mdm[demo]"'),
-    ):
-        assert main(["demo", *words]) == 1
-        assert capsys.readouterr().err == f"error: {says}\n"
+    assert error_of(capsys, "demo", "port=99999").startswith("error: port=99999: give a number from 0 to 65535")
+    assert error_of(capsys, "demo") == 'error: the demo needs the package gradio. Run pip install "flame-mdm[demo]"'
 
 
 INSIDE = """
@@ -337,10 +333,6 @@ def test_requests_from_eight_clients_are_answered_in_constant_memory(normal):
 
 
 LINKS = "[...document.querySelectorAll('#files a')]"
-
-
-def in_chromium(test: Callable[..., None]) -> Callable[..., None]:
-    return pytest.mark.tools(pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")(test))
 
 
 @in_chromium

@@ -11,7 +11,8 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from support.analytic import NO_CONDITION, CountedDenoise, drawn, real, sample
-from support.runs import RUN, TINY, TWO, finish, reference, spawn
+from support.refusals import error_of
+from support.runs import RUN, TINY, TWO, finish, inputs_of, reference, spawn
 from torch import Tensor
 
 import flame_mdm
@@ -118,13 +119,6 @@ def test_fine_grids_lead_to_the_data_and_so_do_one_two_and_four_calls(process):
 SHORT = ["callbacks.checkpoints.every_n_steps=2", "trainer.max_steps=4"]
 
 
-def error(capsys: pytest.CaptureFixture[str], *words: object) -> str:
-    """The only line that a failing command prints as an error."""
-    assert main([str(word) for word in words]) == 1
-    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
-    return line
-
-
 @pytest.fixture(scope="module")
 def student(trained, data_root, tmp_path_factory) -> Path:
     """The run directory of a student after 4 steps."""
@@ -151,11 +145,10 @@ def test_a_student_is_sampled_edited_led_chained_and_exported_without_its_teache
         model = flame_mdm.load(tmp_path / "student.safetensors")
     finally:
         hidden.rename(trained)
-    calls = []
-    model.denoiser.register_forward_pre_hook(lambda _, arguments: calls.append(len(arguments[0])))
     text = {"texts": "a person walks", "seconds": 1.0}
-    motion = flame_mdm.generate(model, **text)[0]
-    assert calls == [1] * 4
+    with inputs_of(model.denoiser) as seen:
+        motion = flame_mdm.generate(model, **text)[0]
+    assert [len(x_t) for x_t, *_ in seen] == [1] * 4
     assert len(flame_mdm.generate(model, "a person walks @1 | a person waves @1")[0].joints) == 40
     targets = {"root": [{"time": 0.8, "position": [0.1, 0.2]}]}
     assert abs(flame_mdm.generate(model, targets=targets, **text)[0].joints[16, 0, [0, 2]] - [0.1, 0.2]).max() < 0.01
@@ -183,7 +176,7 @@ def test_a_resumed_distillation_ends_in_the_same_weights(trained, data_root, tmp
     capsys.readouterr()
     again["facts"]["teacher"] = "another"
     torch.save(again, last)
-    assert "weights have changed since this run began" in error(capsys, *words, "trainer.max_steps=6")
+    assert "weights have changed since this run began" in error_of(capsys, *words, "trainer.max_steps=6")
 
 
 @pytest.mark.robustness
@@ -215,7 +208,7 @@ def test_a_model_that_cannot_be_a_teacher_gets_one_line(trained, student, data_r
         ([*own, "distillation.teacher=representation.ckpt"], "has representation.fps=30, but the student has 20. Both"),
         ([*own, "distillation.teacher=gone.ckpt"], "distillation.teacher=gone.ckpt: no such checkpoint"),
     ):
-        assert says in error(capsys, "distill", *words)
+        assert says in error_of(capsys, "distill", *words)
     assert {path.stem for path in tmp_path.iterdir()} == {"untrained", "process", "representation"}
 
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from support.motions import synthetic
 from support.refusals import one_line_error
-from support.runs import TINY, untrained
+from support.runs import TINY, inputs_of, untrained
 
 import flame_mdm
 from flame_mdm.__main__ import main
@@ -146,16 +146,12 @@ def test_exact_methods_keep_exactly(diffusion, motion, method, options):
 
 def test_other_methods_keep_roughly(diffusion, flow, motion):
     """The last of repeated steps is taken once; flows are rewritten in the first 6 of 25 steps, up to time 0.2."""
-    calls: list[object] = []
-    hooks = [model.denoiser.register_forward_hook(lambda *_: calls.append(1)) for model in (diffusion, flow)]
     options = {"method": "flame_code", "num_inference_steps": 4, "resample": 3}
-    assert edit(diffusion, motion, region="in_between", **options)[0].feature_error > 1e-3
-    assert len(calls) == 3 * 3 + 1
-    default = edit(flow, motion, region="in_between")[0]
-    assert len(calls) == 3 * 3 + 1 + 25
+    with inputs_of(diffusion.denoiser) as repeated, inputs_of(flow.denoiser) as rewritten:
+        assert edit(diffusion, motion, region="in_between", **options)[0].feature_error > 1e-3
+        default = edit(flow, motion, region="in_between")[0]
+    assert (len(repeated), len(rewritten)) == (3 * 3 + 1, 25)
     assert default.feature_error > 1e-3
-    for hook in hooks:
-        hook.remove()
     six, five = (edit(flow, motion, region="in_between", until=time, num_inference_steps=25)[0] for time in (0.2, 0.19))
     assert np.array_equal(default.features, six.features)
     assert not np.array_equal(default.features, five.features)
@@ -173,10 +169,9 @@ def test_world_error_tells_of_a_suffix_that_has_moved(diffusion, motion):
 @pytest.mark.parametrize("strength", [0.3, 1.0])
 @pytest.mark.parametrize("kind", ["diffusion", "flow"])
 def test_a_variation_starts_from_the_noised_motion(kind, strength, motion, request):
-    model, seen = request.getfixturevalue(kind), []
-    hook = model.denoiser.register_forward_hook(lambda module, inputs, output: seen.append(inputs))
-    varied = edit(model, motion, strength=strength, num_inference_steps=10, guidance_scale=1.0)[0]
-    hook.remove()
+    model = request.getfixturevalue(kind)
+    with inputs_of(model.denoiser) as seen:
+        varied = edit(model, motion, strength=strength, num_inference_steps=10, guidance_scale=1.0)[0]
     assert len(seen) == round(10 * strength)
     assert not varied.keep.any()
     assert (varied.feature_error, varied.joint_error) == (0, 0)
@@ -200,14 +195,13 @@ def test_an_edit_depends_on_its_own_seed_alone(diffusion, motion):
 def test_models_that_attend_to_the_padding_know_it_as_empty(motion):
     """As MDM's and MFM's code: edited at the padded length, where what lies beyond the motion is kept, as zeros."""
     model = build([*TINY, "denoiser.mask_padding=false"])
-    seen = []
-    model.denoiser.register_forward_hook(lambda module, inputs, output: seen.append(inputs[0]))
-    result = edit(model, motion, region="in_between")[0]
+    with inputs_of(model.denoiser) as seen:
+        result = edit(model, motion, region="in_between")[0]
     assert result.feature_error == 0
     assert result.features.shape == motion.features.shape
-    assert {x.shape[1] for x in seen} == {60}
-    beyond = seen[-1][:, len(motion.features) :]  # the kept zeros with the noise of step 1
-    assert beyond.std() < seen[0].std()
+    assert {x_t.shape[1] for x_t, *_ in seen} == {60}
+    beyond = seen[-1][0][:, len(motion.features) :]  # the kept zeros with the noise of step 1
+    assert beyond.std() < seen[0][0].std()
     assert beyond.mean().abs() < 0.1
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import torch
 from hydra.utils import instantiate
-from support.browser import CHROMIUM, Tab, browser
+from support.browser import Tab, browser, in_chromium
 from support.fixtures import ROOT, recipe, script
 from support.glb import Glb
 from torch import Tensor
@@ -227,16 +227,16 @@ def served(folder: Path, tmp_path: Path) -> Iterator[tuple[Path, str]]:
         server.shutdown()
 
 
-def in_browser(test: Any) -> Any:
-    skip = pytest.mark.skipif(CHROMIUM is None or shutil.which("npm") is None, reason="needs chromium and npm")
-    return pytest.mark.tools(pytest.mark.slow(pytest.mark.timeout(900)(skip(test))))
+def of_page(test: Any) -> Any:
+    built = pytest.mark.skipif(shutil.which("npm") is None, reason="needs npm")
+    return in_chromium(pytest.mark.slow(pytest.mark.timeout(900)(built(test))))
 
 
 def made(tab: Tab) -> dict[str, Any]:
     return json.loads(tab.wait(DONE, 120))
 
 
-@in_browser
+@of_page
 def test_the_page_samples_the_motions_of_the_package(served: tuple[Path, str], tmp_path: Path) -> None:
     folder, url = served
     assert sum(p.stat().st_size for p in folder.iterdir() if p.is_file()) <= 8e6
@@ -276,7 +276,7 @@ def test_the_page_samples_the_motions_of_the_package(served: tuple[Path, str], t
         assert [address for address in tab.requested if not address.startswith((url, "blob:", "data:"))] == []
 
 
-@in_browser
+@of_page
 @pytest.mark.parametrize(
     ("file", "change", "says"),
     [

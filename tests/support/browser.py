@@ -8,14 +8,20 @@ import json
 import shutil
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import aiohttp
+import pytest
 
 CHROMIUM = shutil.which("chromium")
+
+
+def in_chromium(test: Callable[..., None]) -> Callable[..., None]:
+    """Marks a test that drives Chromium."""
+    return pytest.mark.tools(pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")(test))
 
 
 class Tab:

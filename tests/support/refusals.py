@@ -119,6 +119,13 @@ def one_line_error(match: str) -> Iterator[None]:
     assert "\n" not in str(error.value), match
 
 
+def error_of(capture: pytest.CaptureFixture[str], *words: object) -> str:
+    """The only line that a failing command prints as an error."""
+    assert main([str(word) for word in words]) == 1
+    (line,) = [line for line in capture.readouterr().err.splitlines() if line.startswith("error: ")]
+    return line
+
+
 def one_line(err: str) -> bool:
     """Whether a refusal is one clear line.
 

@@ -8,6 +8,8 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from multiprocessing import active_children
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -111,6 +113,15 @@ def untrained(words: list[str], max_frames: int) -> MotionGeneration:
     model = MotionGeneration.build(config, instantiate(config["representation"]))
     model.facts |= {"max_frames": max_frames, "dataset": "synthetic", "fingerprint": "f00d"}
     return model.eval()
+
+
+@contextmanager
+def inputs_of(module: torch.nn.Module) -> Iterator[list[tuple[torch.Tensor, ...]]]:
+    """The inputs of each call of a module in the block."""
+    inputs: list[tuple[torch.Tensor, ...]] = []
+    hook = module.register_forward_hook(lambda _, arguments, output: inputs.append(arguments))
+    yield inputs
+    hook.remove()
 
 
 def free_port() -> int:

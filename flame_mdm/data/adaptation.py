@@ -40,7 +40,6 @@ class Lesson(MotionSource):
         return Store(self.prior)
 
     def kept(self) -> list[Entry]:
-        """Returns the clips that are used of the store."""
         clips = {split: [clip for clip in self.store.clips if clip.split == split] for split in PRIOR}
         return [clip for split, of in clips.items() for clip in of[:: -(-len(of) // PRIOR[split]) or 1]]
 

@@ -24,8 +24,7 @@ LENGTH, STRIDE = 128, 10  # frames of a clip, and between the windows of a label
 Segment = tuple[str, list[str] | None, float | None, float | None]  # words, categories, start, end
 GET_IT = "BABEL v1.0 is published at https://babel.is.tue.mpg.de: unpack it, then run `make prepare SOURCE=/path/to/it`"
 
-PARTS = {"train": ("train", "extra_train"), "val": ("val", "extra_val")}
-"""Files of each part. The "extra" files contain labels of several annotators; only the first annotator's are used."""
+PARTS = {"train": ("train", "extra_train"), "val": ("val", "extra_val")}  # extra: only the first annotator's labels
 
 
 class Label(NamedTuple):

@@ -49,7 +49,6 @@ class IndexedClip(NamedTuple):
 
 
 def read_index(path: Path) -> list[IndexedClip]:
-    """Reads the clips of HumanML3D's `index.csv`."""
     required(path, "it is index.csv of https://github.com/EricGuo5513/HumanML3D")
     rows = []
     with naming(path, csv.Error, KeyError, TypeError, ValueError, what="not HumanML3D's index of clips: "):
@@ -121,7 +120,6 @@ class HumanML3D(T2MFolder):
 
     @cached_property
     def rows(self) -> list[IndexedClip]:
-        """The clips of the index that are not excluded."""
         return [row for row in read_index(self._beside("index.csv")) if row.name not in self.exclude]
 
     @cached_property

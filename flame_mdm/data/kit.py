@@ -17,7 +17,6 @@ from flame_mdm.errors import UserError
 from flame_mdm.safe_io import naming, read_json, read_text
 
 UNITS_PER_METER = 640
-MMM_FPS = 100
 
 
 class KIT(T2MFolder):
@@ -84,7 +83,7 @@ class KITTemos(MotionSource):
         return sum(self._fits(name) for name in self.frames)
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        self.check_fps(fps, MMM_FPS / 8)
+        self.check_fps(fps, 12.5)
         for name, split in self.names.items():
             if name not in self.texts:
                 self.leave_out(f"motions of {split} without a caption")

@@ -125,7 +125,6 @@ class T2MFolder(MotionSource):
 
     @cached_property
     def names(self) -> dict[str, Split]:
-        """Name -> its split, in the order of the lists."""
         return self.not_excluded(read_splits(self.path, ".txt", self.get_it), self.path)
 
     @cached_property

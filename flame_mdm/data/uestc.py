@@ -113,7 +113,6 @@ class UESTC(MotionSource):
             yield Clip(video.id, motion, [], split, f"subject {video.subject}", video.action, attributes)
 
     def split(self, subject: int) -> Split:
-        """Returns the split of a subject's clips."""
         if subject not in TRAIN_SUBJECTS:
             return "test"
         ranked = sorted(TRAIN_SUBJECTS, key=lambda s: name_hash(f"uestc_p{s:03d}"))

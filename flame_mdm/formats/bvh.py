@@ -136,8 +136,8 @@ def read(path: str | Path) -> Bvh:
             blocks.append(len(nodes))
             nodes.append(_Node(f"{node.name}.end", parent, _IN_END) if keyword == "END" else _Node(name, parent))
             source.word("{")
-    if blocks or not nodes:
-        source.fail("MOTION before the end of the hierarchy")
+    if blocks or not nodes or source.row[-1].upper() != "MOTION":
+        source.fail("MOTION before the end of the hierarchy, or before the end of its line")
 
     count = int(source.labeled(r"Frames:\s*(\d{1,18})", "Frames: and a number"))
     # few digits, because Python needs quadratic time for many
@@ -181,7 +181,7 @@ class Lines:
     """Lines of a text file as words, without blank lines and comments (#); tracks the line number for errors."""
 
     def __init__(self, data: bytes, name: str):
-        self.name, self.line = name, 1
+        self.name, self.line, self.row = name, 1, list[str]()
         try:
             lines = data.decode("utf-8-sig").splitlines()
         except UnicodeDecodeError as error:
@@ -193,7 +193,7 @@ class Lines:
     def __iter__(self) -> Iterator[list[str]]:
         for number, words in self.lines:
             if words:
-                self.line = number
+                self.line, self.row = number, words
                 yield words
 
     def fail(self, what: str) -> NoReturn:

@@ -1,5 +1,6 @@
 """The page that shows a data set: which clips, what it says of them, and nothing from them that runs."""
 
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -64,8 +65,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
 
 
 def page_of(store: Store, path: Path) -> Page:
-    clips = [clip for family in find(store.clips, None, "") for clip in family]
-    write_page(path, store, HumanML(), clips, HOSTILE, None)
+    write_page(path, store, HumanML(), list(chain(*find(store.clips, None, ""))), HOSTILE, None)
     return Page(path)
 
 

@@ -156,8 +156,7 @@ def test_batches_are_a_function_of_their_number_and_processes_share_them():
 
     stream = batches(40)
     assert batches(23, first=17) == stream[17:]
-    one_pass = [index for batch in stream[:12] for index, _ in batch]
-    assert len(set(one_pass)) == len(one_pass) == 96
+    assert len({index for batch in stream[:12] for index, _ in batch}) == 96, "a pass has no clip twice"
     assert all(number == n for n, batch in enumerate(stream) for _, number in batch)
     assert [batches(20, rank=rank, world=2) for rank in (0, 1)] == [stream[0::2], stream[1::2]]
     lengths = np.random.default_rng(0).integers(24, 60, 31)
@@ -248,8 +247,7 @@ def test_a_store_of_another_representation_is_refused(root):
 
 def test_cuts_of_adapted_features_labels_and_missing_captions(tmp_path):
     for kind in ("train", "val"):
-        on, off = (loader(rotations(tmp_path, resident=r), kind) for r in (True, False))
-        first, second = list(islice(on, 12)), list(islice(off, 12))
+        first, second = (list(islice(loader(rotations(tmp_path, resident=r), kind), 12)) for r in (True, False))
         assert_equal(first, second)
         assert all(batch.action is not None for batch in first)
         moved = torch.cat([batch.x[:, 0, 144:147] for batch in first])
@@ -275,8 +273,7 @@ def test_batches_are_padded_to_few_lengths(root):
     [("auto", 4.1, 1, True), ("auto", 3.9, 1, False), ("auto", 5, 2, False), (True, 1.1, 1, True)],
 )
 def test_what_fits_into_free_memory_is_kept(root, option, share, devices, kept, monkeypatch):
-    """Processes share the memory of a CPU."""
-    data = module(root, CROPS[0], resident=option)
+    data = module(root, CROPS[0], resident=option)  # processes share the memory of a CPU
     size = 4 * data.open().features.size
     monkeypatch.setattr(datamodule, "free_memory", lambda device: int(share * size))
     strategy = SimpleNamespace(root_device=torch.device("cpu"))

@@ -93,9 +93,9 @@ def test_arrays_and_text_files(arrays: Path):
     assert list(clips) == ["deep_two", "one", "three"]
     assert all(clip.captions == ["a person walks", "someone goes ahead"] for clip in clips.values())
     one, amass = clips["one"].motion, clips["three"].motion
-    assert len(one) == np.floor((len(WALK) - 1) * 20 / 30 + 1e-6) + 1
+    assert len(one) == (len(WALK) - 1) * 20 // 30 + 1
     np.testing.assert_allclose(one[::2], WALK[::3][: len(one[::2])], atol=1e-6)
-    assert amass.shape == (20, 22, 3)
+    assert len(amass) == 20
     at = dict(zip(SMPL22.joints, amass[-1], strict=True))
     assert at["head"][1] > at["pelvis"][1] > at["left_foot"][1]
     np.testing.assert_allclose(at["pelvis"], [-57 / 59 - ADULT[0][0], 1, 0], atol=1e-5)
@@ -164,7 +164,6 @@ def test_the_table_gives_captions_actions_splits_and_sources(tmp_path: Path):
 
 
 HEADLESS = {joint: f"{joint}?" for joint in SMPL22.joints}
-LYING = WALK[..., [0, 2, 1]] * [1, -1, 1]
 BAD = {
     "no motion": (lambda f: [p.unlink() for p in f.rglob("*.np*")], "no motions in it; give a folder"),
     "twice": (lambda f: np.savez(f / "one.npz", joints=WALK, fps=30), r"one\.npz: has the same name as one\.npy"),
@@ -178,11 +177,11 @@ BAD = {
         "line 3: one has two values of split: val and test",
     ),
     "no rate": (lambda f: (f / "skeleton.yaml").unlink(), r"one\.npy: no frame rate in the file"),
-    "up": (lambda f: np.savez(f / "deep/two.npz", joints=LYING, fps=9), "the body is lying down"),
-    "yaml key": (
-        lambda f: skeleton(f, rate=30),
-        r"skeleton\.yaml: rate: Extra inputs are not permitted\. Use map, joints",
+    "up": (
+        lambda f: np.savez(f / "deep/two.npz", joints=WALK[..., [0, 2, 1]] * [1, -1, 1], fps=9),
+        "body is lying down",
     ),
+    "yaml key": (lambda f: skeleton(f, rate=30), r"skeleton\.yaml: rate: Extra inputs are .* Use map, joints"),
     "yaml map": (lambda f: skeleton(f, map={"pelvis": "Hips"}), r"skeleton\.yaml: map: no joint given for head"),
     "map": (lambda f: skeleton(f, fps=30, map=HEADLESS), r"two\.npz: the map in skeleton\.yaml uses .* head\?"),
 }
@@ -268,7 +267,6 @@ def test_check_lists_skeletons_and_all_failures(tmp_path: Path):
     mixamo(tmp_path / "b.bvh", INCH)
     (tmp_path / "c.bvh").write_text((tmp_path / "a.bvh").read_text().replace("Spine2", "Back"))
     (tmp_path / "d.bvh").write_text("HIERARCHY\n")
-    lines = Folder(str(tmp_path)).check()
     expected = (
         r"Mixamo, unit 0\.01, 30 fps: 1 motions",
         r"error: .*b\.bvh: the legs are.*",
@@ -276,7 +274,7 @@ def test_check_lists_skeletons_and_all_failures(tmp_path: Path):
         r"error: .*d\.bvh, line 1: .*",
         r"error: 3 of 4 motions of .* cannot be prepared",
     )
-    assert all(re.fullmatch(pattern, line) for pattern, line in zip(expected, lines, strict=True)), lines
+    assert re.fullmatch("\n".join(expected), "\n".join(Folder(str(tmp_path)).check()))
 
 
 def test_a_first_frame_in_an_unusual_pose_is_not_an_error(tmp_path: Path):

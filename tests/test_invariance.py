@@ -172,8 +172,12 @@ def test_without_samples_values_are_none_never_0(expected: dict[str, Any]):
     assert measure(all_metrics(), []) == none
 
 
-def test_too_few_samples_are_an_error():
-    for metric, count, message in (
+def test_too_few_samples_and_wrong_inputs_are_errors():
+    values = evaluation()
+    wrong = values | {"joints": values["joints"][:, :, :20]}
+    kept = values | {"kept": values["kept"] | True}
+    short = values | {"mask": values["mask"] & (torch.arange(34) < 1)}
+    for metric, inputs, message in (
         (distribution.FrechetMotionDistance(), 1, "got 1 generated motions, needs at least 2"),
         (distribution.KernelMotionDistance(), 45, "got 45 generated motions for subsets of 1000, needs at least 1000"),
         (distribution.PrecisionRecall(), 3, "got 3 motions in the smaller set, needs at least 4"),
@@ -186,9 +190,17 @@ def test_too_few_samples_are_an_error():
         (diversity.Diversity(pairs=300, replace=False), 45, "got 45 motions for 300 pairs, needs at least 300"),
         (diversity.TextMultimodality(), 45, "9 of 9 prompts do not have 30 motions but 5 to 5. Generate 30 for each"),
         (diversity.ActionMultimodality(), 5, "got 1 motions of class 1, needs at least 2"),
+        (reconstruction.DisplacementErrors(), kept, "a motion has no generated frame"),
+        (reconstruction.TemosPositionErrors(), wrong, "20 joints, but defined only"),
+        (reconstruction.TemosPositionErrors(), short, "got 1 frames"),
     ):
         with pytest.raises(UserError, match=f"{type(metric).__name__}: {message}"):
-            measure({"metric": metric}, [evaluation(count)])
+            measure({"metric": metric}, [evaluation(inputs) if isinstance(inputs, int) else inputs])
+    with pytest.raises(ValueError, match="MultimodalDistance: got 45 keys, 45 generated, 44 text"):
+        measure({"metric": alignment.MultimodalDistance()}, [values | {"text": values["text"][:-1]}])
+    del values["real"]
+    with pytest.raises(UserError, match=r"metric mid \(Mut.*\): missing input: real\. Remove the metric"):
+        update_metrics({"mid": alignment.MutualInformationDivergence()}, **values)
 
 
 def test_samples_given_twice_and_features_that_are_not_finite_are_errors():
@@ -202,21 +214,6 @@ def test_samples_given_twice_and_features_that_are_not_finite_are_errors():
             metric.reset()
         with pytest.raises(UserError, match="not finite"):
             measure({name: metric}, [bad])
-
-
-def test_wrong_inputs_are_errors():
-    values = evaluation()
-    for metric, change, message in (
-        (alignment.MultimodalDistance(), {"text": values["text"][:-1]}, "45 keys, 45 generated, 44 text"),
-        (reconstruction.DisplacementErrors(), {"kept": values["kept"] | True}, "no generated frame"),
-        (reconstruction.TemosPositionErrors(), {"joints": values["joints"][:, :, :20]}, "20 joints, but defined only"),
-        (reconstruction.TemosPositionErrors(), {"mask": values["mask"] & (torch.arange(34) < 1)}, "got 1 frames"),
-    ):
-        with pytest.raises(ValueError, match=f"{type(metric).__name__}: .*{message}"):
-            measure({"metric": metric}, [values | change])
-    del values["real"]
-    with pytest.raises(UserError, match=r"metric mid \(Mut.*\): missing input: real\. Remove the metric"):
-        update_metrics({"mid": alignment.MutualInformationDivergence()}, **values)
 
 
 def loss_and_gradients(first: int, last: int, hard: bool = False) -> tuple[float, dict[str, torch.Tensor]]:

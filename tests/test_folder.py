@@ -177,10 +177,7 @@ BAD = {
         "line 3: one has two values of split: val and test",
     ),
     "no rate": (lambda f: (f / "skeleton.yaml").unlink(), r"one\.npy: no frame rate in the file"),
-    "up": (
-        lambda f: np.savez(f / "deep/two.npz", joints=WALK[..., [0, 2, 1]] * [1, -1, 1], fps=9),
-        "body is lying down",
-    ),
+    "up": (lambda f: np.savez(f / "deep/two.npz", joints=WALK[..., [0, 2, 1]] * [1, -1, 1], fps=9), "is lying down"),
     "yaml key": (lambda f: skeleton(f, rate=30), r"skeleton\.yaml: rate: Extra inputs are .* Use map, joints"),
     "yaml map": (lambda f: skeleton(f, map={"pelvis": "Hips"}), r"skeleton\.yaml: map: no joint given for head"),
     "map": (lambda f: skeleton(f, fps=30, map=HEADLESS), r"two\.npz: the map in skeleton\.yaml uses .* head\?"),

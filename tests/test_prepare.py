@@ -115,9 +115,7 @@ def test_numbers_that_are_not_finite_are_damage(tmp_path: Path, capsys: pytest.C
     assert f"frame 3 of clip {entry.id} is not finite" in capsys.readouterr().err
 
 
-class Large(OwnClips):
-    """400,000 frames, which have 420 MB."""
-
+class Large(OwnClips):  # 400,000 frames, which have 420 MB
     def clips(self, fps):
         noise = np.random.default_rng(0).normal(size=(100, 263)).astype(np.float32)
         for number in range(4000):

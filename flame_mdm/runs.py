@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import AliasPath, Field
+from pydantic import AliasPath, ConfigDict, Field
 
 from flame_mdm import safe_io
 from flame_mdm.config import Config, read_saved
@@ -28,6 +28,13 @@ class RunConfig(Schema):
     max_steps: Annotated[Int, Field(validation_alias=AliasPath("trainer", "max_steps"))]
 
 
+class TrainedOn(Schema):
+    """The key `data` of a provenance file, which may contain other facts about the data."""
+
+    model_config = ConfigDict(strict=True, extra="allow")
+    fingerprint: str = "–"
+
+
 class Provenance(Schema):
     """Command, code, machine, versions, device, parameters and data of a run."""
 
@@ -36,7 +43,7 @@ class Provenance(Schema):
     python: str
     machine: str
     packages: dict[str, str]
-    data: dict[str, Any]
+    data: TrainedOn
     changed: str | None = None
     device: str = "–"
     parameters: Int | None = None

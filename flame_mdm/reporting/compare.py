@@ -64,7 +64,7 @@ def _facts(runs: Mapping[str, Run]) -> tuple[list[str], list[list[str]]]:
         row += [f"{facts.parameters / 1e6:.2f} M" if facts and facts.parameters else "–"]
         curves = [run.curves.get(f"train/{name}") for name in ("seconds_per_step", "samples_per_second")]
         row += [number(statistics.median(curve.values()) if curve else None) for curve in curves]
-        row += [facts.device, str(facts.data.get("fingerprint", "–"))] if facts else ["–", "–"]
+        row += [facts.device, facts.data.fingerprint] if facts else ["–", "–"]
         rows.append([*row, str(run.folder)])
     return filled(head, rows)
 

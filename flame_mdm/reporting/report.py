@@ -145,7 +145,7 @@ def _provenance(facts: Provenance) -> list[list[str]]:
     return [
         ["command", " ".join(facts.command)],
         ["commit", (facts.commit or "not from a clone") + changed],
-        ["data", ", ".join(f"{name} {fact}" for name, fact in facts.data.items() if name != "actions")],
+        ["data", ", ".join(f"{k} {v}" for k, v in facts.data.model_dump(exclude_unset=True).items() if k != "actions")],
         ["device", facts.device],
         ["machine", f"{facts.machine}, Python {facts.python}"],
         ["packages", ", ".join(f"{name} {version}" for name, version in facts.packages.items())],

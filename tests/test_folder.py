@@ -320,7 +320,8 @@ def test_what_a_folder_lacks_is_reported(tmp_path: Path, monkeypatch, capsys):
     assert "no captions: add captions.csv and prepare with force=true" in output
     assert "changed since" not in prepared()
     write_table(tmp_path / "mine", [{"id": str(n), "text": "walks"} for n in range(10)])
-    os.utime(tmp_path / "mine" / "captions.csv", (time.time() + 10,) * 2)
+    later = time.time() + 10
+    os.utime(tmp_path / "mine" / "captions.csv", (later, later))
     assert "mine: captions.csv changed since: prepare with force=true to read them" in prepared()
     assert not re.search("changed since|no captions", prepared("force=true"))
 

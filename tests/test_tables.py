@@ -302,6 +302,39 @@ def test_what_is_missing_or_changed_is_evaluated_once_and_timed_rows_have_their_
     assert [request.options.num_inference_steps for request in needed[3:]] == [5, 5, 10, 10]
 
 
+MINE = """
+title: mine
+parts:
+  all:
+    protocol: synthetic
+    extractor: none
+    replications: 1
+    samples: 4
+    columns: {{Action: {{value: attributes/action, better: higher}}, FID: {{value: fid}}}}
+    rows:
+      - {{label: tiny, ckpt: {ckpt}, sampler: ddim, eta: 0.5, num_inference_steps: [2, [0, 5, 9]]}}
+      - {{label: elsewhere, ckpt: runs/synthetic/mdm/default/checkpoints/last.ckpt}}
+"""
+
+
+@pytest.mark.slow
+def test_rows_are_measured_from_their_checkpoint(trained, data_root, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("mine.yaml").write_text(MINE.format(ckpt=trained))
+    words = ["table=mine.yaml", "device=cpu", f"data_root={data_root}"]
+    assert main(["tables", *words]) == 0
+    shown = capsys.readouterr().out
+    assert "evaluating 1 of 2: tiny" in shown
+    assert "mine: 2 of 3 rows measured" in shown
+    first = files(Path("runs/tables"))
+    assert b"elsewhere: make train EXP=synthetic/mdm" in first["mine.md"]
+    assert b"ddim, eta 0.5" in first["mine.html"]
+    assert b"differs from the protocol: replications = 1, samples = 4" in first["mine.md"]
+    assert main(["tables", *words]) == 0
+    assert "evaluating" not in capsys.readouterr().out
+    assert files(Path("runs/tables")) == first
+
+
 def test_published_numbers_are_marked_and_ranked_among_themselves(folder, monkeypatch):
     published = folder / "published.yaml"
     printed = [

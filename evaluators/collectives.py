@@ -47,7 +47,10 @@ def dealt(function: Callable[[Item], T], items: Sequence[Item]) -> list[T]:
 
 @contextmanager
 def processes(device: str | None) -> Iterator[str]:
-    """Joins the processes started by torchrun, if any, and yields the device: by default, a GPU if there is one."""
+    """Joins the processes started by torchrun, if any, and yields the device: by default, a GPU if there is one.
+
+    Raises `UserError` if this machine has no such device.
+    """
     if device is None:
         local = int(os.environ.get("LOCAL_RANK", 0))
         device = f"cuda:{local % torch.cuda.device_count()}" if torch.cuda.is_available() else "cpu"

@@ -31,7 +31,10 @@ Scores = list[tuple[dict[str, float | None], int]]  # values by metric, and numb
 
 
 def evaluate(request: EvaluationRequest) -> None:
-    """Evaluates a checkpoint, motion files or a baseline, and writes the result file; see `Plan`."""
+    """Evaluates a checkpoint, motion files or a baseline, and writes the result file; see `Plan`.
+
+    Raises `UserError` if model, data, protocol and extractor do not match, or real motions miss the expected values.
+    """
     if request.out is not None:  # checked here, before hours of work
         if Path(request.out).is_dir():
             raise UserError(f"out={request.out} is a folder. Name the JSON file to write")

@@ -88,7 +88,10 @@ class Plan:
 
 
 def open_data(request: EvaluationRequest, model: MotionGenerator | None) -> MotionDataModule:
-    """Returns the prepared data, with its own representation; `UserError` if the model generates another one."""
+    """Returns the prepared data, with its own representation.
+
+    Raises `UserError` if no data set is named, it is not prepared, or the model generates another representation.
+    """
     module, encoding, root = request.data, request.representation, "data"
     if model is not None and not module:
         if "data" not in model.config:

@@ -122,7 +122,10 @@ class Protocol(ClosedSchema):
         return self.model_copy(update={**changed, "quick": quick, "multimodality": several}), changed
 
     def open_extractor(self, path: str | None, representation: Representation, dataset: str) -> Extractor | None:
-        """Opens an extractor at `path`, or that of the protocol; None if it is not needed, or `path` is "none"."""
+        """Opens an extractor at `path`, or that of the protocol; None if it is not needed, or `path` is "none".
+
+        Raises `UserError` or `FileNotFoundError` if it is missing, or belongs to another representation or data set.
+        """
         if self.extractor is None or path == "none":
             return None
         path = path or self.extractor.get("path")
@@ -143,7 +146,10 @@ class Protocol(ClosedSchema):
         return [clip for clip in clips.clips if self.only.items() <= clip.attributes.items()]
 
     def rows(self, clips: Clips, seed: int, replication: int, *, purpose: str = "generated") -> list[DrawnClip]:
-        """Returns the motions of one replication; another `purpose` gives another draw of clips, captions and crops."""
+        """Returns the motions of one replication; another `purpose` gives another draw of clips, captions and crops.
+
+        Raises `UserError` if the split has no clip to evaluate on.
+        """
         drawn = () if purpose == "generated" else (purpose,)
         entries = sorted(self.selected(clips), key=lambda clip: key("sample", *drawn, seed, replication, clip.id))
         if not entries:

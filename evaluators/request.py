@@ -40,7 +40,10 @@ class EvaluationKeys:
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationRequest(EvaluationKeys):
-    """The keys of `flame-mdm evaluate`, with data set and representation composed; they must not contradict."""
+    """The keys of `flame-mdm evaluate`, with data set and representation composed.
+
+    Raises `UserError` if keys contradict each other, or a value is out of range.
+    """
 
     ckpt: str | None = None
     which: Which = "last"

@@ -172,7 +172,8 @@ class SampleFolder:
 
     Each file holds `ids` (N,), names of clips of the split; `lengths` (N,); `features` (sum of lengths, D) in the
     data's units, or `joints` (sum of lengths, J, 3) in meters, y up, at the data's frame rate; and `captions` (N,), if
-    the motions were generated for other captions than those drawn by the protocol.
+    the motions were generated for other captions than those drawn by the protocol. Raises `UserError` if the folder has
+    no such files, or one is damaged, names clips that are not in the split, or repeats one.
     """
 
     def __init__(self, folder: Path, representation: Representation):
@@ -220,7 +221,8 @@ class Baseline:
     """Sanity-check baselines: motions without a model, which show what each metric detects.
 
     They are real motions: other windows of the same clips ("real"), those of other captions or labels ("shuffled"),
-    with Gaussian noise of `NOISE` in normalized features ("noisy"), or with the first frame held ("static").
+    with Gaussian noise of `NOISE` in normalized features ("noisy"), or with the first frame held ("static"). Raises
+    `UserError` if the kind is unknown, or there is nothing to shuffle.
     """
 
     def __init__(self, kind: str, clips: Clips, condition: str, seed: int):

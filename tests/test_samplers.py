@@ -417,7 +417,7 @@ REFUSED: dict[type[Process], list[tuple[dict[str, Any], str]]] = {
         ({"num_inference_steps": 1001}, "1000"),
         ({"num_inference_steps": [5, 3]}, "increasing"),
         ({"num_inference_steps": [5, 1000]}, "999"),
-        ({"num_inference_steps": [0, 1.5]}, "or a list of steps"),
+        ({"num_inference_steps": [0, 1.5]}, "give a number of steps, or a list"),
         ({"eta": 1.0}, "eta=1.0: the sampler ancestral has no such option. Omit it, or give guidance_scale"),
         ({"sampler": "ddim", "eta": 1.5}, "0 to 1"),
         ({"sampler": 3}, "sampler=3: give the name"),

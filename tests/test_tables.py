@@ -400,9 +400,12 @@ def test_numbers_have_the_decimals_of_their_column_and_are_never_all_zeros():
     assert [cell.text for line in lines if (cell := line.cells[0])] == ["103.6 ±0.0", "0.016 ±0.002", "0.0 ±0.0"]
 
 
+PARTS = {part: {"_target_": "any.Class"} for part in ("task", "representation")}
+
+
 def clip_file(folder: Path, weight: float, steps: int) -> str:
     """Writes an extractor and returns the sha256 of its weights."""
-    content = {"config": {"experiment": "motion_clip/synthetic"}, "facts": {"actions": [], "max_frames": 60}}
+    content = {"config": {"experiment": "motion_clip/synthetic"} | PARTS, "facts": {"actions": [], "max_frames": 60}}
     content |= {"global_step": steps, FORMAT_KEY: FORMAT, "state_dict": {"w": torch.tensor([weight])}}
     torch.save(content, folder / "clip.ckpt")
     return weights_sha256(folder / "clip.ckpt")

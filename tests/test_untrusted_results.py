@@ -135,7 +135,7 @@ def test_long_names_and_many_texts(attacked, bad, tmp_path, trained, capfd):
     say("b" * 5_000, error=True)
     assert len(capfd.readouterr().err) < 2_010
     attacked("sample", f"ckpt={trained}", f"text={'a person walks ' * 66_667}", says=" characters are too many")
-    with pytest.raises(UserError, match=r"5,001 texts with samples=2: at most 10,000 motions"):
+    with pytest.raises(UserError, match=r"samples=2 of each text: at most 10,000 motions"):
         flame_mdm.generate(flame_mdm.load(trained), [f"text {number}" for number in range(5001)], samples=2)
     caption = "x" * 1_000_000
     short, shown = (Motion(np.zeros((frames, 22, 3)), 20.0, SMPL22, text=caption, id=caption) for frames in (2, 20))

@@ -6,6 +6,7 @@
 import io
 import json
 import os
+import zipfile
 from collections.abc import Callable, Iterator
 from copy import deepcopy
 from functools import reduce
@@ -110,12 +111,23 @@ def mangled(data: bytes, count: int, seed: int) -> Iterator[bytes]:
             yield data[:at] + draw.bytes(int(draw.integers(1, 50))) + data[at + 20 :]
 
 
+def members(archive: bytes) -> dict[str, bytes]:
+    """The content of the members of a zip archive; empty if it is damaged."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(archive)) as file:
+            return {name: file.read(name) for name in file.namelist()}
+    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError):
+        return {}
+
+
 def test_damaged_checkpoints(refused, trained, bad):
     refused.every = 12
     model = Path(export(trained, bad / "whole.safetensors")).read_bytes()
     for suffix, data in (("ckpt", trained.read_bytes()), ("safetensors", model)):
         path = bad / f"bad.{suffix}"
         for number, content in enumerate(mangled(data, 60, 2)):
+            if len(content) == len(data) and suffix == "ckpt" and members(content) == members(data):
+                continue  # only padding between the members changed
             path.write_bytes(content)
             refused("export", str(path), "out=out.safetensors")
             if number % 6 == 0:

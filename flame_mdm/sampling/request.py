@@ -65,6 +65,8 @@ class EditRequest:
             if isinstance(value, str) and value not in choices:
                 raise UserError(f"{name}={value} is unknown.{did_you_mean(value, choices)} Use {', '.join(choices)}")
         _ = self.ranges  # raises if they are invalid
+        if self.joints is not None and not self.joints:
+            raise UserError("joints: no joint is named. Name the joints to resample, or omit joints for all of them")
         if type(self.resample) is not int or self.resample < 1:
             raise UserError(f"resample={self.resample}: give a whole number, 1 or more")
         if self.strength is not None and not 0 < self.strength <= 1:

@@ -42,7 +42,8 @@ _HIP, _KNEE, _ANKLE, _HEAD = (ADULT[SMPL22.joints.index(n)] for n in ("left_hip"
 ADULT_LEG = float(np.linalg.norm(_KNEE) + np.linalg.norm(_ANKLE))
 GET_IT = (
     "clone https://github.com/una-dinosauria/cmu-mocap or unpack ASF/AMC files of http://mocap.cs.cmu.edu, clone "
-    "https://github.com/EricGuo5513/HumanML3D, and give SOURCE=/path/to/the/motions CAPTIONS=/path/to/HumanML3D"
+    "https://github.com/EricGuo5513/HumanML3D, and give SOURCE=/path/to/the/motions "
+    "data.source.captions=/path/to/HumanML3D"
 )
 
 

@@ -238,7 +238,7 @@ def replaced(content: Any, keys: str, value: Any) -> str:
 
 
 def malformed(name: str, content: Any) -> list[str]:
-    """What a file may hold that is not what it should hold: two values of other kinds at each key, and the rest."""
+    """Malformed contents of a JSON file: at each key two values of other types, and the further cases of the table."""
     case, draw, texts = CASES["files"][name], np.random.default_rng(9), list(NO_JSON)
     for keys, value in values(content):
         wrong = WRONG[type(value)] if keys not in case.get("any", ()) else []

@@ -44,7 +44,7 @@ class Representation(nn.Module, ABC):
     mean: Tensor
     std: Tensor
     part_of: str = ""  # name of a representation whose first features these are, so that its features can be cut
-    relative: bool = True  # whether the root trajectory is that from frame to frame: a part of the features is a motion
+    relative: bool = True  # whether the root moves by steps between frames, so that any window of frames is a motion
     slices: Mapping[str, slice] = {}  # columns of the features by name
 
     def __init__(self, name: str, features: int, fps: float, skeleton: Skeleton):

@@ -1,4 +1,4 @@
-"""What a user asks of a model, checked once, and without importing torch, so that it can be refused at once."""
+"""Requests for motions and edits, checked once. The checks do not import torch, so wrong input is refused at once."""
 
 from __future__ import annotations
 

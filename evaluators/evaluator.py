@@ -24,7 +24,7 @@ from flame_mdm.config import Config
 from flame_mdm.errors import UserError
 from flame_mdm.representations import Representation
 from flame_mdm.sampling.editing import kept_parts
-from flame_mdm.sampling.request import EditRequest
+from flame_mdm.sampling.motion_request import EditRequest
 from flame_mdm.seeds import key
 
 CHUNK = 64  # motions per metric update; more do not fit into a processor's cache

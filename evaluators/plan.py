@@ -19,7 +19,7 @@ from flame_mdm.representations.smpl import SMPL
 from flame_mdm.safe_io import sha256
 from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.sampling.editing import method_options
-from flame_mdm.sampling.request import EditRequest
+from flame_mdm.sampling.motion_request import EditRequest
 from flame_mdm.schemas import UsedSkeleton
 
 

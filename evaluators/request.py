@@ -10,7 +10,7 @@ from flame_mdm.checkpoints.locating import Which
 from flame_mdm.config import Config
 from flame_mdm.errors import UserError
 from flame_mdm.sampler_options import SamplerOptions, option, same_option
-from flame_mdm.sampling.request import EditRequest
+from flame_mdm.sampling.motion_request import EditRequest
 
 
 @dataclass(frozen=True, kw_only=True)

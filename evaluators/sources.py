@@ -23,7 +23,7 @@ from flame_mdm.representations import Representation
 from flame_mdm.safe_io import atomic_write, read_npz, regular_file
 from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.sampling.editing import kept_parts
-from flame_mdm.sampling.request import EditRequest
+from flame_mdm.sampling.motion_request import EditRequest
 from flame_mdm.schemas import Cost
 from flame_mdm.seeds import key, normal
 

@@ -172,7 +172,7 @@ def test_modules_and_public_classes_say_what_they_are():
 
 
 def test_requests_are_checked_before_torch_is_imported():
-    code = "import sys, flame_mdm.sampling.request; sys.exit('torch' in sys.modules or 'numpy' in sys.modules)"
+    code = "import sys, flame_mdm.sampling.motion_request; sys.exit('torch' in sys.modules or 'numpy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
 
 

@@ -36,7 +36,7 @@ from flame_mdm.generator import MotionGenerator
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.rot6d import Rot6D
 from flame_mdm.representations.skeleton import find_joints
-from flame_mdm.sampling.request import EditRequest
+from flame_mdm.sampling.motion_request import EditRequest
 from flame_mdm.schemas import Measured, read_result
 
 pytestmark = pytest.mark.slow

@@ -11,7 +11,7 @@ from torch import Tensor
 from flame_mdm.batch import Edit
 from flame_mdm.config import instantiate, recipes
 from flame_mdm.representations import Representation
-from flame_mdm.sampling.request import METHODS
+from flame_mdm.sampling.motion_request import METHODS
 from flame_mdm.seeds import normal
 
 METERS, FRAMES, MAX_STEPS = 10.0, 60, 50

@@ -19,7 +19,7 @@ from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError
 from flame_mdm.processes.guidance import Positions, reach
 from flame_mdm.processes.windows import blended, cover, spans
-from flame_mdm.sampling.request import read_parts
+from flame_mdm.sampling.motion_request import read_parts
 from flame_mdm.sampling.sequences import overlap
 from flame_mdm.sampling.targets import errors, read_targets
 

@@ -76,7 +76,7 @@ def _sampled(run: Path, texts: list[str], settings: CompareSettings) -> dict[Pro
 
     from flame_mdm.checkpoints.loading import load
     from flame_mdm.sampling.generation import sample_request
-    from flame_mdm.sampling.request import SamplingRequest
+    from flame_mdm.sampling.motion_request import SamplingRequest
 
     model = load(run, "cuda" if torch.cuda.is_available() else "cpu")
     labels = texts[0] in model.facts["actions"]

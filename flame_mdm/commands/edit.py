@@ -10,7 +10,7 @@ from flame_mdm.commands.sample import OutputSettings, check_condition, default_f
 from flame_mdm.errors import say
 from flame_mdm.safe_io import sha256
 from flame_mdm.sampler_options import option, required
-from flame_mdm.sampling.request import EditRequest
+from flame_mdm.sampling.motion_request import EditRequest
 
 
 @dataclass(frozen=True, kw_only=True)

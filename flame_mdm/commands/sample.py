@@ -15,7 +15,14 @@ from flame_mdm.commands import AdaptedSettings, BodySettings, device_name, exist
 from flame_mdm.errors import UserError, say, shortened
 from flame_mdm.safe_io import MEBIBYTE, read_text, sha256
 from flame_mdm.sampler_options import SamplerOptions, option, same_option
-from flame_mdm.sampling.request import TRAINED_ON, EditRequest, SamplingRequest, path_targets, read_path, understood
+from flame_mdm.sampling.motion_request import (
+    TRAINED_ON,
+    EditRequest,
+    SamplingRequest,
+    path_targets,
+    read_path,
+    understood,
+)
 
 if TYPE_CHECKING:
     from flame_mdm.formats.motion import Motion

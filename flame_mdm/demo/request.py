@@ -8,7 +8,7 @@ from urllib.parse import urlencode
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, StringConstraints, ValidationError
 
 from flame_mdm.errors import UserError, did_you_mean, one_line, shortened
-from flame_mdm.sampling.request import path_targets, read_parts, read_path
+from flame_mdm.sampling.motion_request import path_targets, read_parts, read_path
 
 MAX_TEXT, MAX_SECONDS, MAX_SAMPLES, MAX_STEPS, MAX_EDITS = 300, 30, 4, 1000, 8  # limits of a request
 MAX_SEED = 2**31 - 1
@@ -35,7 +35,7 @@ Path = Annotated[
 
 
 class DemoEdit(BaseModel):
-    """An edit of one of the motions so far, by number; see `flame_mdm.sampling.request.EditRequest`.
+    """An edit of one of the motions so far, by number; see `flame_mdm.sampling.motion_request.EditRequest`.
 
     `text` is what the person does in the new part; "" = unconditioned. A variation of the entire motion keeps text,
     parts and path of the request.

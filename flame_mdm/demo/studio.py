@@ -17,7 +17,7 @@ from flame_mdm.formats.motion import Motion
 from flame_mdm.generator import MotionGenerator
 from flame_mdm.sampling.editing import edit
 from flame_mdm.sampling.generation import generate
-from flame_mdm.sampling.request import SamplingRequest, read_parts, understood
+from flame_mdm.sampling.motion_request import SamplingRequest, read_parts, understood
 
 KEPT = 64  # number of requests whose motions stay in memory; a download or an edit of them needs no model
 TIME_LIMIT = 300.0  # maximum number of seconds of one request on the model

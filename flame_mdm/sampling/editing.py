@@ -20,8 +20,8 @@ from flame_mdm.representations import Representation
 from flame_mdm.representations.skeleton import find_joints
 from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.sampling.generation import sample_request
+from flame_mdm.sampling.motion_request import METHODS, EditRequest, Part, SamplingRequest, understood
 from flame_mdm.sampling.reading import read_motion, with_features
-from flame_mdm.sampling.request import METHODS, EditRequest, Part, SamplingRequest, understood
 
 MFM_STEPS = 25
 """Sampling steps of MFM's edits: with `until` = 0.2, "the first 6 time steps" are up to "0.2 time" (i / 25 <= 0.2)."""
@@ -58,7 +58,7 @@ def edit(
         texts: what the person does in the new part; one text or several.
         fps: frames per second of an array or an .npy file; for other files, it overrides that of the file.
         stages: as in `flame_mdm.generate`.
-        keywords: fields of `EditRequest` and `SamplingRequest` in `flame_mdm.sampling.request`, and of
+        keywords: fields of `EditRequest` and `SamplingRequest` in `flame_mdm.sampling.motion_request`, and of
             `flame_mdm.sampler_options.SamplerOptions`. `cleanup` also changes the kept part, by millimeters as a rule;
             `joint_error` says by how much.
 

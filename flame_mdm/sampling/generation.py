@@ -17,8 +17,8 @@ from flame_mdm.formats.cleanup import cleaned
 from flame_mdm.formats.motion import Motion
 from flame_mdm.generator import MotionGenerator
 from flame_mdm.safe_io import atomic_folder
+from flame_mdm.sampling.motion_request import SamplingRequest, check_model, understood
 from flame_mdm.sampling.reading import decoded, read_motion, with_features
-from flame_mdm.sampling.request import SamplingRequest, check_model, understood
 from flame_mdm.sampling.sequences import motion_lengths, overlap, windows
 from flame_mdm.sampling.targets import read_targets
 from flame_mdm.visualize import contact_sheet, write_gif, write_mp4, write_player
@@ -49,7 +49,8 @@ def generate(
         edit: part of a motion of that length to keep in every sample, with `known` and `keep` (1, F, D).
         stages: list that gets the clean estimates along the sampling of the first motion, at equal intervals, and that
             motion itself (MFM, figure 5).
-        keywords: fields of `flame_mdm.sampling.request.SamplingRequest` and `flame_mdm.sampler_options.SamplerOptions`.
+        keywords: fields of `flame_mdm.sampling.motion_request.SamplingRequest` and of
+            `flame_mdm.sampler_options.SamplerOptions`.
 
     Raises `UserError` if the request is invalid, the model cannot do what is requested, or knows no word of a text that
     says what happens.

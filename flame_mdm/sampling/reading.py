@@ -17,7 +17,7 @@ from flame_mdm.formats.readers import ENDINGS, read
 from flame_mdm.formats.resampling import resample as resample_joints
 from flame_mdm.representations import Representation
 from flame_mdm.representations.skeleton import SMPL22
-from flame_mdm.sampling.request import is_range
+from flame_mdm.sampling.motion_request import is_range
 
 
 def read_motion(

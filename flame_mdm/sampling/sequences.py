@@ -7,7 +7,7 @@ import torch
 from flame_mdm.errors import UserError
 from flame_mdm.generator import MotionGenerator
 from flame_mdm.processes.windows import Windows, cover, spans
-from flame_mdm.sampling.request import Part, SamplingRequest
+from flame_mdm.sampling.motion_request import Part, SamplingRequest
 
 OVERLAP = 0.5  # seconds that neighboring windows share; see docs/sequences.md
 MAX_SECONDS = 600  # maximum length of a sequence; all its windows are denoised at the same time

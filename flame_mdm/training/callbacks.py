@@ -28,7 +28,7 @@ from flame_mdm.progress import ProgressBar
 from flame_mdm.reporting.page import number
 from flame_mdm.reporting.report import write_report
 from flame_mdm.sampling.generation import sample_request, write_motions
-from flame_mdm.sampling.request import SamplingRequest
+from flame_mdm.sampling.motion_request import SamplingRequest
 from flame_mdm.signals import StopRequest
 from flame_mdm.task import MotionGeneration, Task
 from flame_mdm.training.loggers import log_video

@@ -8,11 +8,11 @@ from support.fixtures import script
 from support.motions import degrees, frames_array, posed, sway
 
 from flame_mdm.errors import UserError
+from flame_mdm.formats.body import fit_body
 from flame_mdm.formats.motion import Motion
-from flame_mdm.representations.skeleton import KIT21, SMPL22
+from flame_mdm.representations.skeleton import JOINT, KIT21, SMPL22
 from flame_mdm.visualize import player_page, render
-from flame_mdm.visualize.body import ANCHORS, fit_body, load_body, mannequin, sides, try_fit
-from flame_mdm.visualize.posture import JOINT
+from flame_mdm.visualize.body import ANCHORS, load_body, mannequin, sides
 
 
 def test_the_mesh_is_one_closed_symmetric_surface_in_its_stored_pose():
@@ -96,7 +96,7 @@ def test_the_nearest_triangle_is_drawn_and_pictures_show_the_body_in_its_clothes
 
 
 def test_a_motion_that_no_body_fits_says_why():
-    drawn = try_fit(posed())[0]
+    drawn = posed().try_fit()[0]
     for motion, reason in (
         (posed(scale=3.0), r"left_knee is 1\.17 m long, the body's is 0\.392 m\. Is the unit right\?"),
         (sway(3, skeleton=KIT21), "computed only for the 22 joints of SMPL"),
@@ -104,7 +104,7 @@ def test_a_motion_that_no_body_fits_says_why():
     ):
         with pytest.raises(ValueError, match=reason):
             fit_body(motion)
-        assert try_fit(motion)[0] is None
+        assert motion.try_fit()[0] is None
         assert frames_array(motion, 64).shape == (len(motion.joints), 64, 64, 3)  # its skeleton
         assert render._lines(motion, None, 200, 200) == [*render._lines(motion, drawn, 200, 200), "(no body fits)"]
 

@@ -15,6 +15,7 @@ from torch import Tensor
 from flame_mdm.data import amass
 from flame_mdm.errors import UserError
 from flame_mdm.formats import bvh
+from flame_mdm.formats.body import fit_body
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.poses import Poses, solve
 from flame_mdm.formats.readers import read
@@ -23,7 +24,7 @@ from flame_mdm.representations import rotation
 from flame_mdm.representations.rot6d import Rot6D
 from flame_mdm.representations.skeleton import KIT21, SMPL22
 from flame_mdm.representations.smpl import SMPL
-from flame_mdm.visualize.body import fit_body, mannequin
+from flame_mdm.visualize.body import mannequin
 
 FPS = 20.0
 

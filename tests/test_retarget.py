@@ -16,11 +16,11 @@ from flame_mdm.__main__ import main
 from flame_mdm.errors import UserError
 from flame_mdm.formats import characters
 from flame_mdm.formats.motion import Motion
+from flame_mdm.formats.posture import world_rotations
 from flame_mdm.formats.readers import read
 from flame_mdm.formats.retarget import preset, presets, retarget
 from flame_mdm.formats.rig import LIMBS, SIDES
-from flame_mdm.representations.skeleton import SMPL22
-from flame_mdm.visualize.posture import JOINT, world_rotations
+from flame_mdm.representations.skeleton import JOINT, SMPL22
 
 BLENDED = {"cmu": ("spine1", "left_collar", "right_collar"), "100style": ("spine3",)}
 """Joints that the reader of these skeletons places between two of the file's."""

@@ -1,17 +1,21 @@
 import base64
 import sys
+import warnings
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 from support.browser import CHROMIUM, browser
-from support.motions import HOSTILE, Page, frames_array, sway, unpacked
+from support.motions import HOSTILE, Page, frames_array, posed, sway, unpacked
 
 from flame_mdm.errors import UserError
+from flame_mdm.formats import WRITTEN
 from flame_mdm.formats.motion import Motion
-from flame_mdm.representations.skeleton import SKELETONS
+from flame_mdm.representations.skeleton import KIT21, SKELETONS
 from flame_mdm.visualize import contact_sheet, write_gif, write_mp4, write_player
+from flame_mdm.visualize.body import Figure
 from flame_mdm.visualize.render import SIDE_COLORS
 
 try:
@@ -44,6 +48,43 @@ def test_player_is_one_file_that_escapes_all_texts(tmp_path):
     assert page.tags.count("script") == 3
     assert page.texts["title"] == page.texts["h1"] == HOSTILE
     assert (page.motions[0]["caption"], page.motions[0]["id"]) == (HOSTILE, r"a\u2066b")  # it rearranges no text
+
+
+@pytest.mark.parametrize("kind", ["known rotations", "joints of people", "other skeleton"])
+@pytest.mark.parametrize("ending", [*WRITTEN, ".html", ".png", "rigged.bvh", "rigged.glb", "character.glb"])
+def test_nothing_warns_while_a_motion_is_written_or_drawn(tmp_path, ending, kind):
+    if ending == ".mp4":
+        pytest.importorskip("av", reason="av is not installed: pip install flame-mdm[video]")
+    solved = Motion(posed(2, left_knee=(60, 0, 0)).joints, 20)
+    motions = {"known rotations": posed(2), "joints of people": solved, "other skeleton": sway(2, skeleton=KIT21)}
+    posed(2).save(tmp_path / "rig.glb", rig="mixamo")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        _write(motions[kind], tmp_path / f"a{ending}")
+
+
+def _write(motion: Motion, path: Path) -> None:
+    """Writes a file, if files of its kind can contain the motion."""
+    options = {"arigged": {"rig": "unreal"}, "acharacter": {"character": path.with_name("rig.glb")}}
+    try:
+        if path.suffix == ".html":
+            write_player(path, [motion])
+        elif path.suffix == ".png":
+            contact_sheet(path, [motion])
+        else:
+            motion.save(path, **options.get(path.stem, {}))
+    except UserError as error:
+        assert motion.skeleton is KIT21
+        assert "computed only for the 22 joints of SMPL" in str(error)
+
+
+def test_a_figure_of_joints_alone_is_drawn_as_a_skeleton(tmp_path):
+    figure = Figure(posed().joints, 20)
+    write_player(tmp_path / "p.html", [figure, posed()])
+    skeleton, body = Page(tmp_path / "p.html").motions
+    assert skeleton["body"] is None
+    assert "rotations" in skeleton["why"]
+    assert body["body"]
 
 
 # Pixels of both sides and of clothes in the first panel

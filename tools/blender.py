@@ -16,11 +16,10 @@ from pathlib import Path
 
 from flame_mdm.checkpoints.onnx_export import RUNNER, export_onnx
 from flame_mdm.errors import UserError, did_you_mean, say
-from flame_mdm.formats import rig
+from flame_mdm.formats import posture, rig
 from flame_mdm.formats.characters import known_skeletons
 from flame_mdm.representations import skeleton
 from flame_mdm.safe_io import atomic_write, write_json, write_text
-from flame_mdm.visualize import posture
 
 SOURCE = Path(__file__).with_suffix("")
 PYTHON = "3.11"

@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 
 from flame_mdm.errors import UserError, say
-from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.formats.posture import orthonormal, shortest_turns
+from flame_mdm.representations.skeleton import JOINT, SMPL22
 from flame_mdm.representations.smpl import ADULT
 from flame_mdm.safe_io import atomic_write
 from flame_mdm.visualize.body import HAIR, HELPERS, SHIRT, SHOES, SKIN, TROUSERS, largest_weights, mannequin
-from flame_mdm.visualize.posture import JOINT, orthonormal, shortest_turns
 
 SHAPE = {"gender": 0.5, "age": 2 / 3, "height": 0.45, "weight": 0.4}
 """Anny's numbers and their defaults, 0 to 1: male to female, baby to old (2/3: a young adult), small to tall, light to

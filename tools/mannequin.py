@@ -16,7 +16,8 @@ from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 from skimage import measure
 
-from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.formats.posture import orthonormal
+from flame_mdm.representations.skeleton import JOINT, SMPL22
 from flame_mdm.representations.smpl import ADULT
 from flame_mdm.visualize.body import (
     HAIR,
@@ -28,7 +29,6 @@ from flame_mdm.visualize.body import (
     TROUSERS,
     TWISTED,
 )
-from flame_mdm.visualize.posture import JOINT, orthonormal
 
 A_POSE = {"shoulder": (0, 0, -46), "elbow": (0, -14, 0), "hip": (0, 0, 4), "ankle": (0, 0, -4)}
 """Degrees about x, y, z from the rest pose of SMPL to the pose in which the mesh is stored, for the left side. Arms

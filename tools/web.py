@@ -23,12 +23,13 @@ from scipy.spatial.transform import Rotation
 import flame_mdm
 from flame_mdm.checkpoints.onnx_export import export_onnx
 from flame_mdm.errors import UserError, say
+from flame_mdm.formats.body import fit_body
 from flame_mdm.formats.motion import END_SITES, Motion
-from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.formats.posture import TOES
+from flame_mdm.representations.skeleton import JOINT, SMPL22
 from flame_mdm.safe_io import write_json, write_text
-from flame_mdm.visualize.body import HELPERS, fit_body
+from flame_mdm.visualize.body import HELPERS
 from flame_mdm.visualize.player import player_page
-from flame_mdm.visualize.posture import JOINT, TOES
 
 SOURCE = Path(__file__).with_suffix("")
 RUNTIME, INTEGRITY = (

@@ -16,13 +16,13 @@ import numpy as np
 
 from flame_mdm.errors import UserError, did_you_mean
 from flame_mdm.formats import glb
+from flame_mdm.formats.body import PosedFigure, fit_body, local_rotations
 from flame_mdm.formats.layouts import LAYOUTS
+from flame_mdm.formats.posture import world_rotations
 from flame_mdm.formats.retarget import joint_names, presets
 from flame_mdm.formats.rig import RestPose, Rig, follow, matched, plain, recognized, rest_pose
-from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.representations.skeleton import JOINT, SMPL22
 from flame_mdm.safe_io import read_yaml
-from flame_mdm.visualize.body import Shown, fit_body
-from flame_mdm.visualize.posture import JOINT, world_rotations
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,10 +88,10 @@ def _rest(file: glb.Glb, pelvis: int) -> tuple[np.ndarray, np.ndarray]:
     return worlds, points if len(points) else worlds[:, :3, 3]
 
 
-def moved(character: Character, motion: Shown) -> tuple[np.ndarray, np.ndarray, Rig]:
+def moved(character: Character, motion: PosedFigure) -> tuple[np.ndarray, np.ndarray, Rig]:
     """Moves a character as in a motion; see `follow`."""
     body = fit_body(motion)
-    joints, world = motion.joints[:, : len(SMPL22)], world_rotations(body.local()) @ body.neutral
+    joints, world = motion.joints[:, : len(SMPL22)], world_rotations(local_rotations(body)) @ body.neutral
     return follow(character, joints, motion.posed().offsets.numpy(), body.neutral, world)
 
 
@@ -144,7 +144,7 @@ def known_skeletons() -> list[dict[str, str]]:
     return [{plain(name): joint for joint, name in map.items() if isinstance(name, str)} for map in skeletons]
 
 
-def write(path: Path, character: Character, motion: Shown, name: str) -> str:
+def write(path: Path, character: Character, motion: PosedFigure, name: str) -> str:
     """Writes the character's file with a further animation, the first one, and returns a line that describes it."""
     if path.suffix.lower() != ".glb":
         raise UserError(f"{path}: this character is a .glb file, so name a .glb file for the result")

@@ -19,17 +19,18 @@ import torch
 
 from flame_mdm.errors import UserError, shortened
 from flame_mdm.formats import WRITTEN, bvh, characters
+from flame_mdm.formats.body import PosedFigure, local_rotations
 from flame_mdm.formats.characters import Character
 from flame_mdm.formats.glb import Binary, quaternions
-from flame_mdm.formats.poses import Poses, solve
+from flame_mdm.formats.poses import Poses
 from flame_mdm.formats.resampling import frame_rate
 from flame_mdm.formats.retarget import continuous_euler, preset, retarget
 from flame_mdm.formats.rig import CENTIMETER, Rig
 from flame_mdm.representations import rotation
-from flame_mdm.representations.skeleton import SMPL22, Skeleton
+from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.representations.smpl import ADULT
 from flame_mdm.safe_io import atomic_write, write_text
-from flame_mdm.visualize.body import ANCHORS, FittedBody, Mesh, largest_weights, try_fit
+from flame_mdm.visualize.body import ANCHORS, FittedBody, Mesh, largest_weights
 
 AMASS_AXES = torch.tensor([[-1.0, 0, 0], [0, 0, 1], [0, 1, 0]], dtype=torch.float64)
 """Converts AMASS's coordinates, z up, to y up as in HumanML3D: (-x, z, y). It is its own inverse."""
@@ -42,34 +43,22 @@ END_SITES = {
 
 
 @dataclass(eq=False, repr=False)
-class Motion:
+class Motion(PosedFigure):
     """One motion outside the models: generated, real or read from a file.
 
     Attributes:
-        joints: (F, J, 3) float32 joint positions in meters, y up, floor at y = 0.
-        fps: frames per second.
-        skeleton: names and parents of the J joints; the prefixes `left_` and `right_` mark the sides.
-        text: the caption, or the name of the action; "" if there is none.
-        id: name of the motion: a clip, a file, or text and sample number, which determine the noise.
+        joints, fps, skeleton, text, id, contacts: see `flame_mdm.visualize.body.Figure`; joints are float32.
         poses: rotations of SMPL's joints, if they are known.
         features: (F, D) float32 features in the units of the data; empty if they are not known.
         representation: name of the representation of the features.
-        contacts: (F, N) bool, True if a joint of `skeleton.feet` is on the floor; None = unknown.
         cleanup: whether `flame_mdm.formats.cleanup` changed the joints.
         parts: text, first and last frame (exclusive) of each part of a sequence; () = one part.
 
     Raises `UserError` if a shape is wrong, a joint is not finite, or the frame rate is not a positive number.
     """
 
-    joints: np.ndarray
-    fps: float
-    skeleton: Skeleton = SMPL22
-    text: str = ""
-    id: str = ""
-    poses: Poses | None = None
     features: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     representation: str = ""
-    contacts: np.ndarray | None = None
     cleanup: bool = False
     parts: tuple[tuple[str, int, int], ...] = ()
 
@@ -92,15 +81,6 @@ class Motion:
     def __repr__(self) -> str:
         name = shortened(self.text or self.id, 60)
         return f"{type(self).__name__}({name!r}, {len(self.joints)} frames, {self.fps:g} fps, {self.skeleton.name})"
-
-    def posed(self) -> Poses:
-        """Returns the rotations; if they are not known, computes them from joint positions of SMPL's skeleton."""
-        if self.poses is not None:
-            return self.poses
-        joints = torch.from_numpy(self.joints)
-        if self.skeleton.name == "smpl24":
-            joints = joints[:, : len(SMPL22)]  # the last two are the hands
-        return solve(joints, self.fps)
 
     def save(
         self,
@@ -236,10 +216,10 @@ def _write_glb(motion: Motion, path: Path, rig: str | None, body: Mesh | None) -
     The node above the joints lifts the body by the thickness of its soles; its toes bend as in pictures.
     """
     poses = motion.posed()
-    fitted, reason = try_fit(motion, body)
+    fitted, reason = motion.try_fit(body)
     skeleton = preset(rig, poses)
     binary = Binary()
-    moved = poses if fitted is None else Poses(poses.offsets, torch.from_numpy(fitted.local()), poses.root)
+    moved = poses if fitted is None else Poses(poses.offsets, torch.from_numpy(local_rotations(fitted)), poses.root)
     turns, root = retarget(moved, skeleton)
     turns = quaternions(np.concatenate([skeleton.rest()[None], turns]))
     curves = [("rotation", node, turns[1:, node]) for node in range(len(skeleton.joints))]
@@ -312,7 +292,7 @@ def _write_json(motion: Motion, path: Path) -> str:
 def _write_video(motion: Motion, path: Path, body: Mesh | None) -> str:
     from flame_mdm.visualize import write_gif, write_mp4
 
-    _, reason = try_fit(motion, body)
+    _, reason = motion.try_fit(body)
     if path.suffix.lower() == ".mp4":
         write_mp4(path, [motion], body=body)
         what = "H.264 video"

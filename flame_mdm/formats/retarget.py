@@ -12,11 +12,11 @@ from torch import Tensor
 
 from flame_mdm.errors import UserError, did_you_mean
 from flame_mdm.formats.poses import Poses
+from flame_mdm.formats.posture import world_rotations
 from flame_mdm.formats.rig import CENTIMETER, Rig
 from flame_mdm.representations import rotation
-from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.representations.skeleton import JOINT, SMPL22
 from flame_mdm.safe_io import read_yaml
-from flame_mdm.visualize.posture import JOINT, world_rotations
 
 DIRECTIONS = {"up": (0, 1, 0), "down": (0, -1, 0), "forward": (0, 0, 1), "back": (0, 0, -1)}
 SMPL_ORDERS = tuple("YXZ" if name.endswith("shoulder") else "YZX" for name in SMPL22.joints)

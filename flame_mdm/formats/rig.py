@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from flame_mdm.errors import UserError
-from flame_mdm.representations.skeleton import SMPL22
-from flame_mdm.visualize.posture import JOINT, orthonormal, shortest_turns
+from flame_mdm.formats.posture import orthonormal, shortest_turns
+from flame_mdm.representations.skeleton import JOINT, SMPL22
 
 CENTIMETER = 0.01
 SIDES = ("left", "right")

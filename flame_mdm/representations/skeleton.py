@@ -111,6 +111,9 @@ SMPL22 = Skeleton(
     leg=(5, 8),
 )
 
+JOINT = {name: number for number, name in enumerate(SMPL22.joints)}
+"""Joints of `SMPL22` by name."""
+
 SMPL24 = Skeleton(
     name="smpl24",
     joints=(*SMPL22.joints, "left_hand", "right_hand"),

@@ -1,23 +1,17 @@
-"""Motions to draw, and bodies: their mesh, fitted to the bone lengths of a clip and skinned to a motion."""
+"""What is drawn: figures, and bodies, whose mesh is skinned to a motion."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from flame_mdm.errors import UserError
-from flame_mdm.representations.skeleton import SMPL22, Skeleton
+from flame_mdm.representations.skeleton import JOINT, SMPL22, Skeleton
 from flame_mdm.safe_io import naming, read_npz
-from flame_mdm.visualize.posture import JOINT, complete, world_rotations
-
-if TYPE_CHECKING:  # drawing needs numpy and Pillow, not torch
-    from torch import Tensor
 
 TWISTED = {"hip": 0.4, "shoulder": 0.4, "elbow": 0.55}
 """Joints whose limb has a helper bone, and its share of the twist about the limb: the joint's own, or the wrist's."""
@@ -25,41 +19,41 @@ HELPERS = tuple((JOINT[f"{side}_{name}"], share) for side in ("left", "right") f
 """Joint and share of the twist of each bone after the 22 joints."""
 ANCHORS = (*range(len(SMPL22)), *(joint for joint, _ in HELPERS))  # the joint at which each bone begins
 MANNEQUIN = Path(__file__).with_name("mannequin.npz")
-TRUNK = {"pelvis": 0.0, "spine1": 0.35, "spine2": 0.75, "spine3": 1.0}
-"""Joints of the trunk -> how much their width follows the shoulders rather than the hips."""
-WIDER = (0.8, 1.25)  # limits of the width of hips and shoulders relative to that of the limbs
-LONGER = (0.4, 2.5)  # limits of the length of a limb relative to the mesh's
-TALLER = (0.6, 1.6)  # limits of the length of other parts relative to that of the limbs
-LIMBS = tuple(JOINT[f"{side}_{name}"] for side in ("left", "right") for name in ("knee", "ankle", "elbow", "wrist"))
 SKIN, HAIR, SHIRT, TROUSERS, SHOES = MATERIALS = (
     *((222, 186, 160), (96, 80, 70), (132, 164, 196)),
     *((98, 106, 124), (64, 62, 66)),
 )
 
 
-class Posed(Protocol):
-    """A body in motion: `flame_mdm.formats.poses.Poses`."""
+@dataclass(eq=False, repr=False)
+class Figure:
+    """Joints in motion, which players and pictures draw; `flame_mdm.formats.motion.Motion` is one.
 
-    offsets: Tensor
-    rotations: Tensor
-
-
-class Shown(Protocol):
-    """A motion to draw: `flame_mdm.formats.motion.Motion`."""
+    Attributes:
+        joints: (F, J, 3) joint positions in meters, y up, floor at y = 0.
+        fps: frames per second.
+        skeleton: names and parents of the J joints; the prefixes `left_` and `right_` mark the sides.
+        text: the caption, or the name of the action; "" if there is none.
+        id: name of the motion: a clip, a file, or text and sample number, which determine the noise.
+        contacts: (F, N) bool, True if a joint of `skeleton.feet` is on the floor; None = unknown.
+    """
 
     joints: np.ndarray
     fps: float
-    skeleton: Skeleton
-    text: str
-    id: str
-    contacts: np.ndarray | None
+    skeleton: Skeleton = SMPL22
+    text: str = ""
+    id: str = ""
+    contacts: np.ndarray | None = field(default=None, kw_only=True)
 
-    @property
-    def poses(self) -> Posed | None: ...
-    def posed(self) -> Posed: ...
+    def try_fit(self, body: Mesh | None = None) -> tuple[FittedBody | None, str]:
+        """Returns a body that moves like the joints and "", or None and the reason why a skeleton is drawn.
+
+        `body` is the mesh; None = the mannequin. Joints alone show no body.
+        """
+        return None, "the rotations of its joints are unknown"
 
 
-def target(path: str | Path, motions: Sequence[Shown]) -> Path:
+def target(path: str | Path, motions: Sequence[Figure]) -> Path:
     """Returns the path of a file; raises `UserError` if there are no motions to write to it."""
     if not motions:
         raise UserError(f"{path}: no motions to show")
@@ -151,99 +145,3 @@ class FittedBody:
         points = (turned @ self.points[..., None])[..., 0] + blended[:, 9:]
         normals = (turned @ self.mesh.normals[..., None])[..., 0]
         return points, normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
-
-    def local(self) -> np.ndarray:
-        """Returns the rotations (F, 22, 3, 3) of the joints relative to their parents, with the bend of toes."""
-        count = len(SMPL22)
-        world = self.turns[:, :count] @ self.mesh.turns[:count] @ self.neutral.mT
-        local = world.copy()
-        for parent, joint in SMPL22.edges:
-            local[:, joint] = world[:, parent].mT @ world[:, joint]
-        return local
-
-
-def fit_body(motion: Shown, body: Mesh | None = None) -> FittedBody:
-    """Fits a body (None = the mannequin) to a clip and computes the rotations of its bones.
-
-    The body's joints are the motion's, but higher by the thickness of the sole. Rotations that are solved for are
-    completed. Raises `UserError` if the skeleton is not SMPL's, or a limb is much longer or shorter than people's.
-    """
-    poses, body = motion.posed(), body or mannequin()
-    joints = motion.joints[:, : len(SMPL22)].astype(float)
-    world = world_rotations(np.asarray(poses.rotations))
-    offsets = np.array(poses.offsets)
-    fit, wide = proportions(body, offsets)
-    neutral = np.tile(np.eye(3), (len(SMPL22), 1, 1))
-    if motion.poses is None:
-        neutral, world, offsets = complete(joints, offsets, world)
-    lift = wide * body.sole
-    for toe in (JOINT["left_foot"], JOINT["right_foot"]):
-        _, high, long = body.rest[toe]
-        tall = (lift - offsets[toe, 1]) / (body.sole - high)
-        fit[SMPL22.parents[toe]] = np.diag([wide, tall, offsets[toe, 2] / long])
-    turns, rest = body.turns, np.zeros((len(SMPL22), 3))
-    for parent, joint in SMPL22.edges:
-        rest[joint] = rest[parent] + turns[parent] @ offsets[joint]
-    stretched = turns[: len(rest)] @ fit @ turns[: len(rest)].mT
-    anchors = list(ANCHORS)
-    moves = rest - (stretched @ body.joints[..., None])[..., 0]
-    blended = body.weights @ np.concatenate([stretched.reshape(-1, 9), moves], 1)[anchors]
-    points = (blended[:, :9].reshape(-1, 3, 3) @ body.points[..., None])[..., 0] + blended[:, 9:]
-    bones, starts = _with_helpers(world, offsets) @ turns.mT, joints[:, anchors] + [0, lift, 0]
-    return FittedBody(body, stretched, rest, points, neutral, bones, starts, lift)
-
-
-def try_fit(motion: Shown, body: Mesh | None = None) -> tuple[FittedBody | None, str]:
-    """Returns the body of `fit_body` and "", or None and the reason why this motion is drawn as a skeleton."""
-    try:
-        return fit_body(motion, body), ""
-    except UserError as error:
-        return None, str(error)
-
-
-def proportions(body: Mesh, offsets: np.ndarray) -> tuple[np.ndarray, float]:
-    """Returns the map (22, 3, 3) of each part of a body to a clip's `offsets` (22, 3) at rest, and that of widths."""
-    lengths, usual = np.linalg.norm(offsets, axis=1), np.linalg.norm(body.rest, axis=1)
-    ratio = np.divide(lengths, usual, out=np.ones_like(lengths), where=usual > 0)
-    for joint in LIMBS:
-        if not LONGER[0] <= ratio[joint] <= LONGER[1]:
-            raise UserError(
-                f"the bone that ends in {SMPL22.joints[joint]} is {lengths[joint]:.3g} m long, the body's is "
-                f"{usual[joint]:.3g} m. Is the unit right? Such a motion is drawn without a body"
-            )
-    wide = float(lengths[list(LIMBS)].sum() / usual[list(LIMBS)].sum())
-
-    def width(*names: str) -> float:
-        chosen = [JOINT[f"{side}_{name}"] for side in ("left", "right") for name in names]
-        share = np.abs(offsets[chosen, 0]).sum() / np.abs(body.rest[chosen, 0]).sum()
-        return float(np.clip(share, *np.multiply(WIDER, wide)))
-
-    hips, shoulders = width("hip"), width("collar", "shoulder")
-    fit = np.tile(wide * np.eye(3), (len(SMPL22), 1, 1))
-    for joint, name in enumerate(SMPL22.joints):
-        children = [child for child, parent in enumerate(SMPL22.parents) if parent == joint]
-        if name in TRUNK:
-            above = children[-1] if name == "pelvis" else children[0]
-            tall = np.clip(ratio[above], *np.multiply(TALLER, wide))
-            fit[joint] = np.diag([hips + TRUNK[name] * (shoulders - hips), tall, wide])
-        elif children and not name.endswith("ankle"):
-            along = body.rest[children[0]] / usual[children[0]]
-            long = np.clip(ratio[children[0]], *np.multiply(TALLER, wide))
-            fit[joint] += (long - wide) * np.outer(along, along)
-    return fit, wide
-
-
-def _with_helpers(world: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-    """Appends the rotations of the helper bones to those of the joints (F, 22, 3, 3)."""
-    helpers = []
-    for joint, share in HELPERS:
-        child = SMPL22.parents.index(joint)
-        axis = offsets[child] / np.linalg.norm(offsets[child])
-        of_wrist = SMPL22.joints[joint].endswith("elbow")
-        above, below = (joint, child) if of_wrist else (SMPL22.parents[joint], joint)
-        turn = Rotation.from_matrix(world[:, above].mT @ world[:, below]).as_quat()
-        twist = 2 * np.arctan2(turn[:, :3] @ axis, turn[:, 3])
-        twist = (twist + np.pi) % (2 * np.pi) - np.pi
-        back = Rotation.from_rotvec(np.outer((share if of_wrist else share - 1) * twist, axis)).as_matrix()
-        helpers.append(world[:, joint] @ back)
-    return np.concatenate([world, np.stack(helpers, 1)], 1)

@@ -13,16 +13,16 @@ from scipy.spatial.transform import Rotation
 
 from flame_mdm.errors import shortened
 from flame_mdm.safe_io import write_text
-from flame_mdm.visualize.body import ANCHORS, FittedBody, Mesh, Shown, head, mannequin, radii, sides, target, try_fit
+from flame_mdm.visualize.body import ANCHORS, Figure, FittedBody, Mesh, head, mannequin, radii, sides, target
 
 
-def write_player(path: str | Path, motions: Sequence[Shown], title: str = "Motions", **options: Any) -> None:
+def write_player(path: str | Path, motions: Sequence[Figure], title: str = "Motions", **options: Any) -> None:
     """Writes the page of `player_page`, with its options, to a file."""
     write_text(target(path, motions), player_page(motions, title, **options))
 
 
 def player_page(
-    motions: Sequence[Shown],
+    motions: Sequence[Figure],
     title: str = "Motions",
     about: str = "",
     columns: int = 0,
@@ -65,12 +65,12 @@ def player_page(
 
 
 def _packed(
-    motion: Shown, group: str, beside: str, marks: Sequence[tuple[int, int, str, str]], mesh: Mesh | None
+    motion: Figure, group: str, beside: str, marks: Sequence[tuple[int, int, str, str]], mesh: Mesh | None
 ) -> dict[str, Any]:
     low, high = motion.joints.min((0, 1)).astype(float), motion.joints.max((0, 1)).astype(float)
     center = (low + high) / 2
     step = max(0.001, float((high - low).max()) / 65534)
-    body, reason = try_fit(motion, mesh)
+    body, reason = motion.try_fit(mesh)
     return {
         "id": shortened(motion.id),
         "caption": shortened(motion.text),

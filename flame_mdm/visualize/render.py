@@ -14,7 +14,7 @@ from PIL import Image, ImageDraw, ImageFilter, ImageFont
 
 from flame_mdm.errors import UserError, shortened
 from flame_mdm.safe_io import atomic_write
-from flame_mdm.visualize.body import MATERIALS, FittedBody, Mesh, Shown, head, radii, sides, target, try_fit
+from flame_mdm.visualize.body import MATERIALS, Figure, FittedBody, Mesh, head, radii, sides, target
 
 Color = tuple[int, int, int]
 SIDE_COLORS: dict[int, Color] = {1: (47, 127, 209), -1: (226, 112, 42), 0: (140, 149, 163)}
@@ -29,7 +29,7 @@ BT709 = 1  # number of the color space of HD video, which players assume where a
 SMOOTH = 2  # images are drawn this many times larger and then reduced
 
 
-def write_gif(path: str | Path, motions: Sequence[Shown], size: int = 256, body: Mesh | None = None) -> None:
+def write_gif(path: str | Path, motions: Sequence[Figure], size: int = 256, body: Mesh | None = None) -> None:
     """Writes a looping animation of motions side by side, with captions below, in panels of `size` pixels.
 
     It has the highest frame rate of the motions, but at most 50 per second, the limit of the format. A motion that ends
@@ -47,7 +47,7 @@ def write_gif(path: str | Path, motions: Sequence[Shown], size: int = 256, body:
         images[0].save(temporary, format="GIF", save_all=True, **options)
 
 
-def write_mp4(path: str | Path, motions: Sequence[Shown], size: int = 384, body: Mesh | None = None) -> None:
+def write_mp4(path: str | Path, motions: Sequence[Figure], size: int = 384, body: Mesh | None = None) -> None:
     """Writes the animation of `write_gif` as H.264 video (yuv420p), with no limit on the frame rate."""
     path = target(path, motions)
     try:
@@ -70,13 +70,13 @@ def write_mp4(path: str | Path, motions: Sequence[Shown], size: int = 384, body:
 
 
 def contact_sheet(
-    path: str | Path, motions: Sequence[Shown], frames: int = 6, size: int = 192, body: Mesh | None = None
+    path: str | Path, motions: Sequence[Figure], frames: int = 6, size: int = 192, body: Mesh | None = None
 ) -> None:
     """Writes one PNG with a row per motion: `frames` poses of `size` pixels, equally spaced in time, and a caption."""
     path = target(path, motions)
     rows = []
     for motion in motions:
-        fitted, _ = try_fit(motion, body)
+        fitted, _ = motion.try_fit(body)
         row = Image.new("RGB", (frames * size, size), PAPER)
         pen = ImageDraw.Draw(row)
         for k, frame in enumerate(np.rint(np.linspace(0, len(motion.joints) - 1, frames)).astype(int).tolist()):
@@ -93,11 +93,11 @@ def contact_sheet(
         sheet.save(temporary, format="PNG", optimize=True)
 
 
-def thumbnail(motion: Shown, height: int = 120) -> bytes:
+def thumbnail(motion: Figure, height: int = 120) -> bytes:
     """Returns the pose that differs most from the first one as a WebP image, `height` pixels high and 0.7 as wide."""
     poses = motion.joints - motion.joints[:, :1] * [1, 0, 1]
     frame = int(np.linalg.norm(poses - poses[0], axis=2).sum(1).argmax())
-    image = _figure(motion, try_fit(motion)[0], frame, round(height / 0.92))
+    image = _figure(motion, motion.try_fit()[0], frame, round(height / 0.92))
     left, content = (image.width - 0.7 * height) / 2, io.BytesIO()
     image.crop((round(left), 0, round(left + 0.7 * height), height)).save(content, "WEBP", quality=85)
     return content.getvalue()
@@ -115,11 +115,11 @@ def _palette() -> Image.Image:
     return image
 
 
-def _video(motions: Sequence[Shown], fps: float, size: int, mesh: Mesh | None) -> Iterator[Image.Image]:
+def _video(motions: Sequence[Figure], fps: float, size: int, mesh: Mesh | None) -> Iterator[Image.Image]:
     """Yields images of the panels side by side, one every 1 / fps seconds, with a progress bar."""
     seconds = max(len(motion.joints) / motion.fps for motion in motions)
     columns = len(motions) if len(motions) < 4 else min(4, math.ceil(math.sqrt(len(motions))))
-    bodies = [try_fit(motion, mesh)[0] for motion in motions]
+    bodies = [motion.try_fit(mesh)[0] for motion in motions]
     lines = [_lines(motion, body, size, size) for motion, body in zip(motions, bodies, strict=True)]
     captions = [_caption(own, size, max(map(len, lines)), size) for own in lines]
     count = max(1, math.ceil(seconds * fps - 1e-6))
@@ -141,7 +141,7 @@ def _video(motions: Sequence[Shown], fps: float, size: int, mesh: Mesh | None) -
             yield image
 
 
-def _figure(motion: Shown, body: FittedBody | None, frame: int, size: int) -> Image.Image:
+def _figure(motion: Figure, body: FittedBody | None, frame: int, size: int) -> Image.Image:
     """Draws one pose (without a body, the skeleton) on the ground; the camera follows the smoothed root."""
     side = size * SMOOTH
     image = Image.new("RGB", (side, side), PAPER)
@@ -255,7 +255,11 @@ def _points(projected: np.ndarray) -> list[tuple[float, float]]:
 
 
 def _draw_skeleton(
-    pen: ImageDraw.ImageDraw, motion: Shown, joints: np.ndarray, project: Callable[[np.ndarray], np.ndarray], rim: float
+    pen: ImageDraw.ImageDraw,
+    motion: Figure,
+    joints: np.ndarray,
+    project: Callable[[np.ndarray], np.ndarray],
+    rim: float,
 ) -> None:
     """Draws joints (J, 3) and the head, the farthest limb first, with dark rims of `rim` pixels."""
     at, skeleton = project(joints), motion.skeleton
@@ -289,7 +293,7 @@ def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     return ImageFont.load_default(max(10, size // 18))
 
 
-def _lines(motion: Shown, body: FittedBody | None, width: int, size: int) -> list[str]:
+def _lines(motion: Figure, body: FittedBody | None, width: int, size: int) -> list[str]:
     """Returns at most three lines of a motion's caption, and one more if it is drawn as a skeleton."""
     lines, font = [""], _font(size)
     for word in shortened(motion.text or motion.id, width).split():  # more does not fit into three lines

@@ -20,7 +20,6 @@ from flame_mdm.representations.skeleton import SMPL22, Skeleton
 from flame_mdm.representations.smpl import ADULT
 from flame_mdm.seeds import key
 from flame_mdm.visualize import render
-from flame_mdm.visualize.body import try_fit
 
 HOSTILE = "</script><img src=x onerror=alert(1)><!-- __TITLE__ \u2028 \"'&amp; &"
 """A caption that tries to leave the element of a page that it is in."""
@@ -147,5 +146,5 @@ def wander(joints: int, frames: int, seed: int) -> torch.Tensor:
 
 def frames_array(motion: Motion, size: int = 256) -> np.ndarray:
     """Each frame of a motion as an image, (F, size, size, 3) uint8."""
-    fitted, _ = try_fit(motion)
+    fitted, _ = motion.try_fit()
     return np.stack([np.asarray(render._figure(motion, fitted, frame, size)) for frame in range(len(motion.joints))])

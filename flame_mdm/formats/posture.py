@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.representations.skeleton import JOINT, SMPL22
 
-JOINT = {name: number for number, name in enumerate(SMPL22.joints)}
 UPRIGHT = np.cos(np.radians(30))  # cosine of the largest tilt of the chest at which the head is level on average
 STANDING = 0.02  # largest height in meters of a flat foot above its lowest position
 TOES = (0.02, 0.09, np.radians(60))

@@ -13,6 +13,7 @@ import torch.nn.functional as F
 from scipy.stats import hypergeom, mannwhitneyu, rankdata
 from torch import Tensor
 
+from evaluators.evaluation_request import EvaluationRequest
 from evaluators.evaluator import Evaluator, Motions, Rows
 from evaluators.extractors import OwnExtractor
 from evaluators.metrics import alignment, make_metrics, physics, update_metrics
@@ -24,13 +25,13 @@ from evaluators.metrics.samples import MotionMean
 from evaluators.perturbations import BASE, REAL, Inputs, Perturbation, Scene, Text, text_of
 from evaluators.plan import open_data
 from evaluators.protocol import digest, open_protocol
-from evaluators.request import EvaluationRequest
 from evaluators.sources import real_motions
 from flame_mdm.errors import UserError
 from flame_mdm.progress import ProgressBar
+from flame_mdm.records import AuditCard
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.safe_io import atomic_write, read_npz
-from flame_mdm.schemas import AuditCard, check_shape
+from flame_mdm.schemas import check_shape
 from flame_mdm.training.provenance import environment
 
 FORMAT = 1

@@ -12,19 +12,19 @@ from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
 from evaluators.collectives import is_first, processes, shared
+from evaluators.evaluation_request import EvaluationRequest
 from evaluators.evaluator import Evaluator, Motions, Rows, keys_of
 from evaluators.extractors import Extractor
 from evaluators.metrics.distribution import FrechetMotionDistance
 from evaluators.plan import Plan
 from evaluators.protocol import DrawnClip, Protocol
-from evaluators.request import EvaluationRequest
 from evaluators.results import averages, make_result, mean_cost, show
 from evaluators.sources import Generator, Samples, Source, real_motions
 from flame_mdm.data.datamodule import Clips
 from flame_mdm.errors import UserError
+from flame_mdm.records import Measured, Value
 from flame_mdm.representations import Representation
 from flame_mdm.safe_io import write_json
-from flame_mdm.schemas import Measured, Value
 from flame_mdm.seeds import key
 
 Scores = list[tuple[dict[str, float | None], int]]  # values by metric, and number of motions, of each replication

@@ -4,8 +4,8 @@ import os
 from pathlib import Path
 from typing import Any
 
+from evaluators.evaluation_request import EvaluationRequest
 from evaluators.protocol import Protocol, default_protocol, digest, open_protocol
-from evaluators.request import EvaluationRequest
 from evaluators.sources import Baseline, Generator, SampleFolder, Source
 from flame_mdm.checkpoints.loading import find, load
 from flame_mdm.config import instantiate, trust
@@ -13,6 +13,7 @@ from flame_mdm.data.body_model import load_offsets
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.errors import UserError
 from flame_mdm.generator import MotionGenerator
+from flame_mdm.records import UsedSkeleton
 from flame_mdm.representations import Representation
 from flame_mdm.representations.rot6d import Rot6D
 from flame_mdm.representations.smpl import SMPL
@@ -20,7 +21,6 @@ from flame_mdm.safe_io import sha256
 from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.sampling.editing import method_options
 from flame_mdm.sampling.motion_request import EditRequest
-from flame_mdm.schemas import UsedSkeleton
 
 
 class Plan:

@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from evaluators.evaluation_request import EvaluationRequest
 from evaluators.plan import Plan
 from evaluators.protocol import digest
-from evaluators.request import EvaluationRequest
 from evaluators.sources import SampleFolder
 from flame_mdm.errors import say
-from flame_mdm.reporting.audit import card_of
+from flame_mdm.records import Checkpoint, Cost, Data, ExtractorRecord, ProtocolVersion, Result, Value
+from flame_mdm.reporting.audit_cards import card_of
 from flame_mdm.safe_io import sha256
-from flame_mdm.schemas import Checkpoint, Cost, Data, ExtractorRecord, ProtocolVersion, Result, Value
 from flame_mdm.training.provenance import environment
 
 

@@ -19,12 +19,12 @@ from flame_mdm.data.datamodule import Clips
 from flame_mdm.errors import UserError
 from flame_mdm.generator import MotionGenerator
 from flame_mdm.progress import ProgressBar
+from flame_mdm.records import Cost
 from flame_mdm.representations import Representation
 from flame_mdm.safe_io import atomic_write, read_npz, regular_file
 from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.sampling.editing import kept_parts
 from flame_mdm.sampling.motion_request import EditRequest
-from flame_mdm.schemas import Cost
 from flame_mdm.seeds import key, normal
 
 NOISE = 0.5  # standard deviation of the noise in noisy baselines, in normalized features

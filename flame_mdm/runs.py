@@ -11,7 +11,8 @@ from pydantic import AliasPath, ConfigDict, Field
 from flame_mdm import safe_io
 from flame_mdm.config import Config, read_saved
 from flame_mdm.errors import UserError
-from flame_mdm.schemas import Int, Number, Result, Schema, check_shape, read_json, read_result
+from flame_mdm.records import Result, read_result
+from flame_mdm.schemas import Int, Number, Schema, check_shape, read_json
 
 CONFIG, PROVENANCE, FAULT = "config.yaml", "provenance.json", "bad_batch.json"
 HISTORY = "metrics.jsonl"  # training curves, one line per log step

@@ -15,7 +15,7 @@ FILES = sorted([*(ROOT / "flame_mdm").rglob("*.py"), *(ROOT / "evaluators").rglo
 AXES = {"denoisers", "processes", "conditions", "representations"}
 GROUND = {"errors", "signals", "sampler_options", "losses", "safe_io", "config", "batch", "seeds", "progress"}
 MODELS = GROUND | AXES | {"visualize", "formats", "data", "generator", "task"}
-ALL = MODELS | {"sampling", "checkpoints", "schemas", "runs", "reporting", "training"}
+ALL = MODELS | {"sampling", "checkpoints", "schemas", "records", "runs", "reporting", "training"}
 MAY_IMPORT: dict[str, set[str]] = {
     "errors": set(),
     "sampler_options": {"errors"},
@@ -36,8 +36,9 @@ MAY_IMPORT: dict[str, set[str]] = {
     "generator": GROUND | AXES,
     "task": GROUND | AXES | {"data", "generator"},
     "schemas": GROUND,
-    "runs": GROUND | {"schemas"},
-    "reporting": GROUND | {"representations", "visualize", "formats", "data", "schemas", "runs"},
+    "records": GROUND | {"schemas"},
+    "runs": GROUND | {"schemas", "records"},
+    "reporting": GROUND | {"representations", "visualize", "formats", "data", "schemas", "records", "runs"},
     "sampling": MODELS | {"schemas"},
     "checkpoints": MODELS | {"schemas"},
     "training": ALL - {"training"},

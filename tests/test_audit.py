@@ -19,9 +19,10 @@ from evaluators.perturbations import BASE, PERTURBATIONS, REAL, Text
 from evaluators.protocol import load_protocol
 from flame_mdm.__main__ import main
 from flame_mdm.data.synthetic import Synthetic
-from flame_mdm.reporting.audit import PHYSICS, Seen, card_name, findings, read_card, seen, write_card
+from flame_mdm.records import AuditCard, AuditedPerturbation
+from flame_mdm.reporting.audit_cards import PHYSICS, Seen, card_name, findings, read_card, seen, write_card
 from flame_mdm.representations.humanml import HumanML
-from flame_mdm.schemas import AuditCard, AuditedPerturbation, check_shape
+from flame_mdm.schemas import check_shape
 from flame_mdm.seeds import key
 
 

@@ -17,11 +17,11 @@ import torch
 from support.runs import TINY
 
 from evaluators.evaluation import Evaluation
+from evaluators.evaluation_request import EvaluationRequest
 from evaluators.evaluator import Evaluator, Motions, Rows
 from evaluators.extractors import MotionCLIPExtractor
 from evaluators.plan import Plan, sampling_options
 from evaluators.protocol import FOLDER, DrawnClip, default_protocol, load_protocol, protocol_config, protocol_names
-from evaluators.request import EvaluationRequest
 from evaluators.results import _overlaps
 from evaluators.sources import Baseline, Generator, SampleFolder, Samples, read_samples, real_motions
 from flame_mdm.__main__ import main
@@ -33,11 +33,11 @@ from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError
 from flame_mdm.generator import MotionGenerator
+from flame_mdm.records import Measured, read_result
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.rot6d import Rot6D
 from flame_mdm.representations.skeleton import find_joints
 from flame_mdm.sampling.motion_request import EditRequest
-from flame_mdm.schemas import Measured, read_result
 
 pytestmark = pytest.mark.slow
 

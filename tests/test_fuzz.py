@@ -24,12 +24,12 @@ from support.runs import TINY
 from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.hub import export
 from flame_mdm.errors import UserError
+from flame_mdm.records import read_result
 from flame_mdm.reporting.report import write_report
 from flame_mdm.reporting.tables.build import build
 from flame_mdm.reporting.tables.specs import load_spec
 from flame_mdm.runs import read_history
 from flame_mdm.safe_io import read_yaml
-from flame_mdm.schemas import read_result
 from flame_mdm.training.loggers import WandbRun
 
 pytestmark = pytest.mark.slow

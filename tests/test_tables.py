@@ -10,7 +10,7 @@ import torch
 from support.pages import result
 
 import evaluators.evaluation
-from evaluators.request import EvaluationRequest
+from evaluators.evaluation_request import EvaluationRequest
 from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.model_files import FORMAT, FORMAT_KEY, weights_sha256
 from flame_mdm.commands.tables import outdated

@@ -31,6 +31,7 @@ from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError, say
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.readers import read
+from flame_mdm.records import Cost
 from flame_mdm.reporting.plots import Panel, Series, svg
 from flame_mdm.reporting.report import write_report
 from flame_mdm.reporting.tables.format import Cell, Line, Part, Table, comma_separated, draw, rendered, write
@@ -39,7 +40,6 @@ from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.safe_io import atomic_folder, atomic_write, write_json
 from flame_mdm.sampling.generation import write_motions
-from flame_mdm.schemas import Cost
 from flame_mdm.visualize import contact_sheet, player_page, write_gif
 
 pytestmark = pytest.mark.slow

@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 
 from flame_mdm.commands import DataSettings, device_name, model_source
 from flame_mdm.errors import UserError, say
-from flame_mdm.reporting.audit import card_name, read_card, write_card
+from flame_mdm.reporting.audit_cards import card_name, read_card, write_card
 from flame_mdm.safe_io import write_json
 from flame_mdm.sampler_options import option
 
@@ -47,7 +47,7 @@ def main(settings: AuditSettings) -> None:
     if settings.resamples < 100 or (settings.samples or 64) < 8:
         raise UserError(f"resamples={settings.resamples}, samples={settings.samples}: give 100, and 8, or more")
     from evaluators.audit import audit as measure
-    from evaluators.request import EvaluationRequest
+    from evaluators.evaluation_request import EvaluationRequest
 
     protocol = settings.protocol or ("synthetic" if settings.nodes["data"]["name"] == "synthetic" else "text_to_motion")
     request = EvaluationRequest.of(vars(settings) | settings.nodes | {"baseline": "real", "protocol": protocol})

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-from evaluators.request import EvaluationKeys, EvaluationRequest
+from evaluators.evaluation_request import EvaluationKeys, EvaluationRequest
 from flame_mdm.commands import DataSettings, ModelSettings, device_name, model_source
 from flame_mdm.sampler_options import SamplerOptions, same_option
 

@@ -8,13 +8,13 @@ from typing import ClassVar
 
 from flame_mdm.config import Config, compose_data, instantiate
 from flame_mdm.errors import UserError, first_line, say
+from flame_mdm.records import read_result
 from flame_mdm.reporting.page import page, render
 from flame_mdm.reporting.tables.build import NOT_VALID, build
 from flame_mdm.reporting.tables.format import write
 from flame_mdm.reporting.tables.specs import Evaluation, Lengths, evaluations, load_spec, spec_names
 from flame_mdm.safe_io import sha256, write_json, write_text
 from flame_mdm.sampler_options import option
-from flame_mdm.schemas import read_result
 
 INVALID = 3  # exit code if a requested row is not valid
 
@@ -68,8 +68,8 @@ def main(settings: TablesSettings) -> None:
 def evaluate_missing(specs: Mapping[str, Config], results: Path, settings: TablesSettings) -> list[str]:
     """Runs evaluations whose results are missing or outdated, and counts lengths; returns one line per failure."""
     from evaluators.evaluation import evaluate
+    from evaluators.evaluation_request import EvaluationRequest
     from evaluators.protocol import protocol_config
-    from evaluators.request import EvaluationRequest
 
     listed: dict[Path, Evaluation] = {}
     for part in (part for spec in specs.values() for part in spec["parts"].values()):

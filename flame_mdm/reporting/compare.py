@@ -12,11 +12,11 @@ import numpy as np
 
 from flame_mdm.config import flatten
 from flame_mdm.errors import UserError
+from flame_mdm.records import Result, Value
 from flame_mdm.reporting.page import filled, number, page, render
 from flame_mdm.reporting.plots import Curve, chart
 from flame_mdm.reporting.report import charted, evaluation_title, last, marks, printed, sampling
 from flame_mdm.runs import Run, read_run
-from flame_mdm.schemas import Result, Value
 
 if TYPE_CHECKING:
     from markupsafe import Markup

@@ -6,11 +6,12 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from flame_mdm.records import Result, Value
 from flame_mdm.reporting.page import interval, number, page, render
 from flame_mdm.reporting.plots import Curve, chart
 from flame_mdm.runs import FAULT, HISTORY, Fault, Provenance, Run, read_run
 from flame_mdm.safe_io import write_text
-from flame_mdm.schemas import Result, Value, read_json
+from flame_mdm.schemas import read_json
 
 if TYPE_CHECKING:
     from markupsafe import Markup

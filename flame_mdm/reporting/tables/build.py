@@ -13,13 +13,14 @@ import numpy as np
 
 from flame_mdm.config import Config
 from flame_mdm.errors import UserError
-from flame_mdm.reporting.audit import card_of
+from flame_mdm.records import Result, Value, read_result
+from flame_mdm.reporting.audit_cards import card_of
 from flame_mdm.reporting.plots import Histogram
 from flame_mdm.reporting.tables.format import Cell, Line, Part, Table, ranks
 from flame_mdm.reporting.tables.settings import settings_table
 from flame_mdm.reporting.tables.specs import ABOUT, PUBLISHED, SWEPT, Figure, Lengths, evaluations, load_mapping
 from flame_mdm.runs import made_by
-from flame_mdm.schemas import Result, Value, read_json, read_result
+from flame_mdm.schemas import read_json
 
 NOT_VALID = "NOT VALID"  # state of a row that is shown, but not ranked
 PUBLISHED_SPLIT = "published split: test clips are also used for training, or there are no validation clips"

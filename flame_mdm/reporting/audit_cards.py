@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from flame_mdm.errors import markdown_text
+from flame_mdm.records import AuditCard, AuditedPerturbation
 from flame_mdm.reporting.page import interval, number, page, render
 from flame_mdm.safe_io import write_text
-from flame_mdm.schemas import AuditCard, AuditedPerturbation, read_json
+from flame_mdm.schemas import read_json
 
 COMMITTED = "docs/benchmarks/audit"  # folder of the cards that audited.json lists
 PHYSICS = ("foot_skating", "penetration", "floating", "jitter", "static_share")  # do not see the meaning of a motion

@@ -22,7 +22,7 @@ COMMANDS = {
     "browse": "show a prepared data set as a web page",
     "inspect": "find physical faults of motions or of a data set",
     "convert": "convert a motion file",
-    "compare": "compare runs side by side",
+    "compare": "compare runs side by side, or conduct a user study",
     "report": "write the report page of a run",
     "import": "import a checkpoint released by the authors of a paper",
     "export": "write a checkpoint as a model file, or as ONNX graphs",

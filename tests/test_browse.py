@@ -14,6 +14,7 @@ from support.stores import OwnClips
 from flame_mdm.__main__ import main
 from flame_mdm.data import Clip
 from flame_mdm.data.store import Entry, Store, write_store
+from flame_mdm.formats.readers import read
 from flame_mdm.reporting.browse import choose, describe, find, write_page
 from flame_mdm.representations.humanml import HumanML
 
@@ -90,7 +91,7 @@ def test_a_page_shows_every_clip_and_its_texts_as_text(store, tmp_path):
     assert '<tr><td>val</td><td class="number">1</td>' in about
 
 
-def test_the_command_shows_what_is_searched(tmp_path, data_root, capsys):
+def test_the_command_shows_what_is_searched_and_writes_it(tmp_path, data_root, capsys):
     out = tmp_path / "page.html"
 
     def run(*words: str) -> int:
@@ -102,6 +103,23 @@ def test_the_command_shows_what_is_searched(tmp_path, data_root, capsys):
     assert (len(page.motions), page.texts["h1"]) == (10, "synthetic: 10 of 120 clips")
     assert run("split=train", "search=walks") == 0
     assert {("walks" in m["caption"], m["group"]) for m in Page(out).motions} == {(True, "train")}
+
+    folder = tmp_path / "real motions"
+    assert run("split=test", "clips=4", f"motions={folder}") == 0
+    motions, files = Page(out).motions, sorted(folder.glob("*.npz"))
+    assert [path.name for path in files] == [f"motion_{n:03d}_{m['id']}.npz" for n, m in enumerate(motions)]
+    for path, shown in zip(files, motions, strict=True):
+        file = read(path)
+        assert (file.fps, len(file.joints)) == (20, min(shown["frames"], 60)), "cut as for evaluation"
+        assert file.text
+        assert file.text in shown["caption"].split(" · ")
+        with np.load(path) as arrays:
+            assert str(arrays["clip"]) == shown["id"]
+            decoded = HumanML().decode(torch.from_numpy(arrays["features"])).numpy()
+            np.testing.assert_allclose(decoded, arrays["joints"], atol=1e-6)
+
+    assert run("split=test", "clips=1", f"motions={folder}") == 1
+    assert "holds other motions, such as motion_001_" in capsys.readouterr().err
 
 
 @pytest.mark.tools

@@ -1,5 +1,6 @@
-"""Runs side by side."""
+"""Runs side by side, and how people judge their motions."""
 
+import json
 from html import unescape
 from pathlib import Path
 from typing import Any
@@ -7,11 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.stats import ttest_rel
-from support.pages import PROMPTS, a_run, motions, players, put, result
+from support.pages import PROMPTS, a_run, data_of, motions, players, put, result
 from support.runs import TINY
 
 from flame_mdm.__main__ import main
+from flame_mdm.errors import UserError
 from flame_mdm.reporting.compare import paired_difference
+from flame_mdm.reporting.study import tally
 
 
 @pytest.fixture
@@ -102,7 +105,7 @@ def test_what_is_not_paired_has_no_difference(three, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_runs_are_sampled_for_prompts(tmp_path, trained, data_root):
+def test_runs_are_sampled_for_prompts_or_for_the_captions_of_a_folder_of_motions(tmp_path, trained, data_root, capsys):
     model, other = trained.parent.parent, tmp_path / "b"
     words = [*TINY, f"data_root={data_root}", f"run.dir={other}", "run.name=longer", "trainer.max_steps=4"]
     assert main(["train", "quickstart", *words, "callbacks.samples=null", "callbacks.best=null"]) == 0
@@ -114,3 +117,99 @@ def test_runs_are_sampled_for_prompts(tmp_path, trained, data_root):
     assert [motion["caption"] for motion in scene[::2]] == ["a person hops", "a person walks"]
     assert scene[0]["frames"] == 30
     assert scene[0]["joints"] != scene[1]["joints"]
+
+    real = tmp_path / "real"
+    real.mkdir()
+    files = [("a person walks", 20), ("a person jumps", 25), ("a person walks", 20), ("", 20), ("a person turns", 90)]
+    joints = np.random.default_rng(0).random((90, 22, 3)).astype(np.float32)
+    for number, (text, frames) in enumerate(files):
+        np.savez(real / f"motion_{number:03d}.npz", joints=joints[:frames], fps=10.0, text=text)
+    texts = [text for text, _ in files if text]
+
+    (scene,) = players(page([model, real], tmp_path / "out.html"))
+    names = [(motion["caption"], motion["id"]) for motion in scene]
+    assert names == [(text, label) for text in texts for label in ("quickstart", "real")]
+    generated = scene[::2]
+    assert [motion["frames"] for motion in scene[1::2]] == [20, 25, 20, 90]
+    assert [motion["frames"] for motion in generated] == [40, 50, 40, 60], "as long, at 20 frames per second"
+    assert generated[0]["joints"] != generated[2]["joints"], "two motions for a prompt that is there twice"
+    assert "1 of 4 motions are shortened to 3 seconds, the maximum length for quickstart" in capsys.readouterr().out
+
+    items = data_of(page([model, real], tmp_path / "rate.html", "rate=true"))["items"]
+    assert sorted(item["prompt"] for item in items) == sorted(texts)
+
+    (again,) = players(page([model, real], tmp_path / "seed.html", "seed=1", "seconds=1"))
+    assert [motion["frames"] for motion in again[::2]] == [20] * 4
+    assert again[0]["joints"] != generated[0]["joints"]
+
+
+def test_folders_of_motions_are_compared_without_a_run(tmp_path):
+    folders = [motions(tmp_path / name / "walks", PROMPTS, at) for at, name in enumerate("ab")]
+    (scene,) = players(page(folders, tmp_path / "out.html"))
+    assert {motion["id"] for motion in scene} == {str(folder) for folder in folders}, "by path: both are called walks"
+    text = (tmp_path / "out.html").read_text()
+    assert "Configuration differences" not in text
+    assert "No evaluation in common" not in text
+
+
+def test_a_rating_page_hides_whose_motions_it_shows(three, tmp_path):
+    text = page(three, tmp_path / "rate.html", "rate=true")
+    assert "Which animation better fits the following description?" in text
+    items = data_of(text)["items"]
+    pairs = [("mine/two", prompt) for prompt in PROMPTS] + [("mine/three", prompt) for prompt in PROMPTS[1:]]
+    assert sorted((item["b"], item["prompt"]) for item in items) == sorted(pairs)
+    for item in items:
+        scene = data_of(item["player"])
+        assert [motion["id"] for motion in scene] == ["the left one", "the right one"]
+        assert not any(motion["caption"] for motion in scene)
+        assert not any(label in item["player"] for label in ("mine/one", "mine/two", "mine/three"))
+        left, right = (motion["center"][0] for motion in scene)
+        assert (left < right) == (item["left"] == "a"), "a is the first run, which stands at the smallest x"
+    assert page(three, tmp_path / "again.html", "rate=true") == text
+
+
+def test_sides_and_order_are_drawn(tmp_path):
+    prompts = tuple(f"prompt {number}" for number in range(24))
+    folders = [motions(tmp_path / name, prompts, at) for name, at in (("a", 0), ("b", 1))]
+    out = tmp_path / "rate.html"
+    first, other = (data_of(page(folders, out, "rate=true", f"seed={seed}"))["items"] for seed in (0, 1))
+    for items in (first, other):
+        assert 5 < sum(item["left"] == "a" for item in items) < 19
+        assert [item["prompt"] for item in items] != list(prompts)
+    assert [item["prompt"] for item in first] != [item["prompt"] for item in other]
+    assert {item["prompt"]: item["left"] for item in first} != {item["prompt"]: item["left"] for item in other}
+
+
+def test_only_runs_with_a_common_prompt_are_rated(tmp_path, capsys):
+    folders = [motions(tmp_path / name, (name,)) for name in ("a", "b")]
+    words = [f"runs={folders[0]} {folders[1]}", f"out={tmp_path / 'rate.html'}", "rate=true"]
+    assert main(["compare", *words]) == 1
+    assert "a and b have no prompt in common. Give prompts=FILE" in capsys.readouterr().err
+    assert not (tmp_path / "rate.html").exists()
+
+
+def ratings(path: Path, choices: str, rater: str = "ann", a: str = "ours", b: str = "real", study: str = "s") -> Path:
+    answers = [{"prompt": f"p{k}", "a": a, "b": b, "choice": choice} for k, choice in enumerate(choices)]
+    path.write_text(json.dumps({"format": 1, "study": study, "rater": rater, "ratings": answers}))
+    return path
+
+
+def test_ratings_of_several_people_are_counted_once(tmp_path, capsys):
+    files = [
+        ratings(tmp_path / "x.json", "aab"),
+        ratings(tmp_path / "y.json", "abb", rater="bob", a="real", b="ours"),
+        ratings(tmp_path / "z.json", "a", rater="bob", b="other", study="t"),
+    ]
+    out = tmp_path / "ratings.json"
+    assert main(["compare", f"ratings={' '.join(map(str, files))}", f"out={out}"]) == 0
+    first, second = json.loads(out.read_text())["pairs"]
+    assert first == {"a": "ours", "b": "real", "wins_a": 4, "wins_b": 2, "raters": 2}
+    assert second == {"a": "ours", "b": "other", "wins_a": 1, "wins_b": 0, "raters": 1}
+    printed = capsys.readouterr().out
+    assert "ours over real: 4 of 6 answers, 66.7% (30.0% to 90.3%), 2 raters" in printed
+    assert "ours over other: 1 of 1 answers, 100.0% (20.7% to 100.0%), 1 raters" in printed
+
+    with pytest.raises(UserError, match=r"copy\.json: ann also answered this page in .*x\.json"):
+        tally([files[0], ratings(tmp_path / "copy.json", "ab")])
+    with pytest.raises(UserError, match=r"self\.json: rating 1 compares ours with itself"):
+        tally([ratings(tmp_path / "self.json", "a", b="ours")])

@@ -26,6 +26,7 @@ from flame_mdm.checkpoints.hub import export
 from flame_mdm.errors import UserError
 from flame_mdm.records import read_result
 from flame_mdm.reporting.report import write_report
+from flame_mdm.reporting.study import tally
 from flame_mdm.reporting.tables.build import build
 from flame_mdm.reporting.tables.specs import load_spec
 from flame_mdm.runs import read_history
@@ -254,13 +255,18 @@ def reader(name: str, folder: Path) -> tuple[Path, Callable[[], object]]:
     run, path = a_run(folder / "run"), folder / f"{name}{'.yaml' if name in ('spec', 'config') else '.json'}"
     if name in ("provenance", "bad_batch", "config"):
         return run / path.name, lambda: write_report(run)
-    if name == "lengths":
+    if name in ("pairs", "lengths"):
+        part = {"ratings": str(path)} if name == "pairs" else {"lengths": ["lengths"]}
         (folder / "lengths").mkdir()
-        spec = {"title": "x", "parts": {"A": {"lengths": ["lengths"]}}}
-        return folder / "lengths" / path.name, lambda: build("x", spec, folder)
-    if name == "spec":
-        return path, lambda: build("x", load_spec(str(path)), folder)
-    return path, lambda: read_result(path) if name == "result" else WandbRun(str(folder), offline=True)
+        path = path if name == "pairs" else folder / "lengths" / path.name
+        return path, lambda: build("x", {"title": "x", "parts": {"A": part}}, folder)
+    reads: dict[str, Callable[[], object]] = {
+        "spec": lambda: build("x", load_spec(str(path)), folder),
+        "result": lambda: read_result(path),
+        "ratings": lambda: tally([path]),
+        "wandb": lambda: WandbRun(str(folder), offline=True),
+    }
+    return path, reads[name]
 
 
 @pytest.mark.parametrize("name", CASES["files"])

@@ -431,3 +431,21 @@ def test_a_result_is_outdated_when_checkpoint_or_extractor_are_others_now(folder
             assert outdated(path, request) == stand_in
     (folder / "mdm.ckpt").write_bytes(b"trained again")
     assert outdated(path, request)
+
+
+def test_figure_4_of_mdm_shows_the_ratings_of_a_user_study_beside_the_reported_ones(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    spec = load_spec("mdm_figure_4")
+    missing, _ = build("mdm_figure_4", spec, tmp_path / "results").parts
+    assert [line.kind for line in missing.lines] == ["reported"]
+    assert "runs/ratings/mdm_kit.json is missing" in missing.notes[0][1]
+
+    pair = {"a": "kit/mdm", "b": "kit_real", "wins_a": 4, "wins_b": 2, "raters": 2}
+    (tmp_path / "runs" / "ratings").mkdir(parents=True)
+    (tmp_path / "runs" / "ratings" / "mdm_kit.json").write_text(json.dumps({"format": 1, "pairs": [pair]}))
+    table = build("mdm_figure_4", spec, tmp_path / "results")
+    measured, reported = table.parts[0].lines
+    assert [cell.text for cell in measured.cells if cell] == ["66.7% [30.0%, 90.3%]", "6", "2"]
+    assert measured.label == "kit/mdm over kit_real"
+    assert (reported.label, reported.cells[0] and reported.cells[0].text) == ("MDM over Real", "42.3%")
+    assert '<td class="number">66.7% [30.0%, 90.3%]</td>' in rendered(table, "html")

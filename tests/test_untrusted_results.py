@@ -108,13 +108,16 @@ def test_unreadable_files(attacked, bad, trained):
         path.parent.mkdir(parents=True, exist_ok=True)
         make(path)
         attacked("report", str(folder), says=f"{path}: {says}")
-    lengths = bad / "results" / "lengths" / "kit.json"
+    ratings, lengths = bad / "ratings.json", bad / "results" / "lengths" / "kit.json"
+    (bad / "study.yaml").write_text(f"title: t\nparts: {{P: {{ratings: {ratings}}}}}\n")
     (bad / "lengths.yaml").write_text("title: t\nparts: {P: {lengths: [kit]}}\n")
     lengths.parent.mkdir(parents=True)
-    for path in (lengths, bad / "texts.txt"):
+    for path in (ratings, lengths, bad / "texts.txt"):
         os.mkfifo(path)
-    words = [f"table={bad / 'lengths.yaml'}", "evaluate=false", f"results={bad / 'results'}"]
-    attacked("tables", *words, says=f"{lengths}: ")
+    for spec, path in (("study", ratings), ("lengths", lengths)):
+        words = [f"table={bad / spec}.yaml", "evaluate=false", f"results={bad / 'results'}"]
+        attacked("tables", *words, says=f"{path}: ")
+    attacked("compare", f"ratings={ratings}", says=f"{ratings}: ")
     words = [f"runs={trained.parent.parent} {a_run(bad / 'other')}", f"prompts={bad / 'texts.txt'}"]
     attacked("compare", *words, says=f"{bad / 'texts.txt'}: ")
 
@@ -301,7 +304,8 @@ def test_pages_use_no_network_and_play_the_motions_not_the_pages_of_others(tmp_p
     assert main(["compare", f"runs={runs[0]} {runs[1]}", f"out={tmp_path / 'out.html'}"]) == 0
     (runs[0] / "samples" / "step_0000009" / "player.html").write_text("<script>fetch('https://example.com')</script>")
     report = write_report(runs[0])
-    for path in (tmp_path / "out.html", report, _table(tmp_path)):
+    assert main(["compare", f"runs={runs[0]} {runs[1]}", f"out={tmp_path / 'rate.html'}", "rate=true"]) == 0
+    for path in (tmp_path / "out.html", tmp_path / "rate.html", report, _table(tmp_path)):
         assert """<meta http-equiv="Content-Security-Policy" content="default-src 'none'; """ in path.read_text()
     assert "example.com" not in report.read_text()
     assert "a person jumps" in report.read_text()

@@ -14,10 +14,12 @@ from flame_mdm.sampler_options import option
 @dataclass(frozen=True, kw_only=True)
 class BrowseSettings(BodySettings, DataSettings):
     """usage: flame-mdm browse data=NAME [source=PATH] [split=train] [search="waves left"] [clips=200] [out=FILE.html]
+           flame-mdm browse data=NAME split=test clips=10 motions=FOLDER
 
     NAME is a data set, as for `prepare`; of your own motions, data=folder data.name=NAME.
     Writes a single web page that opens from disk. It shows clips of a data set with their captions, mirrored copies
-    next to their originals, a search field, a choice of splits, and statistics.
+    next to their originals, a search field, a choice of splits, and statistics. motions=FOLDER also writes the shown
+    clips as motion files, to compare generated motions with them.
     """
 
     OBJECTS: ClassVar = ("data", "out")
@@ -26,13 +28,14 @@ class BrowseSettings(BodySettings, DataSettings):
     split: Split | None = option(None, "train, val or test; default: all")
     search: str | None = option(None, "words that must occur in the id or the captions of a clip")
     clips: int = option(200, "maximum number, evenly spaced; mirrored copies come with their originals", above_zero)
+    motions: str | None = option(None, "folder: also write the shown clips as motion files")
 
 
 def main(settings: BrowseSettings) -> None:
     node = settings.data_node(settings.source)
 
     from flame_mdm.data.store import Store
-    from flame_mdm.reporting.browse import choose, find, write_page
+    from flame_mdm.reporting.browse import choose, find, write_clips, write_page
     from flame_mdm.visualize.body import load_body
 
     body = load_body(settings.body)
@@ -56,3 +59,6 @@ def main(settings: BrowseSettings) -> None:
     write_page(out, store, representation, clips, title, body)
     say(f"{out}: {len(clips)} of {matching} clips, {out.stat().st_size / 1e6:.1f} MB")
     say(*data.counts(store))
+    if settings.motions is not None:
+        write_clips(Path(settings.motions), store, representation, clips, data.crop.longest())
+        say(f"{settings.motions}: {len(clips)} motions")

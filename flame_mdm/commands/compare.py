@@ -1,19 +1,30 @@
-"""`flame-mdm compare RUN RUN ...`: compares runs on one page."""
+"""`flame-mdm compare RUN RUN ...`: compares runs on one page, or conducts a user study."""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from flame_mdm.commands import BodySettings
 from flame_mdm.commands.sample import read_prompts
-from flame_mdm.errors import say
-from flame_mdm.reporting.compare import HEAD, Prompt, comparison, find, grouped, in_common, tested
-from flame_mdm.safe_io import write_text
-from flame_mdm.sampler_options import option, required
+from flame_mdm.errors import UserError, say
+from flame_mdm.reporting.compare import (
+    HEAD,
+    ComparedRun,
+    Prompt,
+    comparison,
+    find,
+    grouped,
+    in_common,
+    only_runs,
+    read_motions,
+    tested,
+)
+from flame_mdm.reporting.study import Ratings, rating_page, tally
+from flame_mdm.safe_io import write_json, write_text
+from flame_mdm.sampler_options import option
 
 if TYPE_CHECKING:
     from flame_mdm.formats.motion import Motion
@@ -23,31 +34,70 @@ if TYPE_CHECKING:
 @dataclass(frozen=True, kw_only=True)
 class CompareSettings(BodySettings):
     """usage: flame-mdm compare A B C [prompts=FILE.txt] [seconds=3]
+           flame-mdm compare A B FOLDER rate=true [prompts=FILE.txt]
+           flame-mdm compare ratings="ann.json bob.json" out=ratings.json
 
     Compares runs side by side on one page: configuration differences, curves, evaluations and motions for the same
     prompts. If the runs have results of the same protocol, data and extractor, prints the difference of each metric
     with its 95 % interval, and whether it is shown.
+    A run may also be a FOLDER of motion files, such as real motions (`browse motions=FOLDER`) or those of another
+    program. The runs are then sampled for the captions of its motions, at their lengths.
+    rate=true writes a blind user study instead: a page that asks which of two motions fits a text better. ratings=
+    counts the answers.
     """
 
     OBJECTS: ClassVar = ("runs",)
-    runs: list[str] = required("run directories, separated by spaces")
+    runs: list[str] | None = option(None, "run directories or folders of motion files, separated by spaces")
     prompts: str | None = option(
-        None, "a file with one prompt per line, sampled by each last.ckpt; default: the newest samples of each run"
+        None,
+        "a file with one prompt per line, sampled by each last.ckpt; default: the captions of the first folder of "
+        "motion files; without such a folder, the newest samples of each run",
     )
-    seconds: float | None = option(None, "length of the sampled motions; default 3")
-    seed: int = option(0, "seed of sampling")
-    out: str = option("runs/compare.html", "the page")
+    seconds: float | None = option(
+        None, "length of the sampled motions; default 3, or the lengths of the motions in the folder"
+    )
+    seed: int = option(0, "seed of sampling, and of the order in which motions are rated")
+    rate: bool = option(False, "write a rating page: motions of the first run against those of each other run")
+    ratings: list[str] | None = option(None, "files saved by the rating page, to be counted")
+    out: str | None = option(None, "default runs/compare.html, runs/rate.html or runs/ratings.json")
 
 
 def main(settings: CompareSettings) -> None:
-    runs = find([Path(folder) for folder in settings.runs])
+    if (settings.runs is None) == (settings.ratings is None):
+        raise UserError('give either runs="A B" to compare runs, or ratings="x.json y.json" to count ratings')
+    if settings.ratings is not None:
+        _count([Path(file) for file in settings.ratings], settings.out or "runs/ratings.json")
+    else:
+        _compare([Path(folder) for folder in settings.runs or ()], settings)
+
+
+def _count(files: Sequence[Path], out: str) -> None:
+    pairs = tally(files)
+    write_json(out, {"format": 1, **Ratings(pairs=pairs).model_dump()})
+
+    for pair in pairs:
+        share, low, high = pair.share
+        interval = f"{share:.1%} ({low:.1%} to {high:.1%})"
+        say(f"{pair.a} over {pair.b}: {pair.wins_a} of {pair.votes} answers, {interval}, {pair.raters} raters")
+    say(f"written: {out}")
+
+
+def _compare(folders: Sequence[Path], settings: CompareSettings) -> None:
+    compared = find(folders)
     from flame_mdm.visualize.body import load_body
 
-    texts = None if settings.prompts is None else list(dict.fromkeys(read_prompts(settings.prompts)))
-    shown = [_sampled(run.folder, texts, settings) if texts else _newest(run) for run in runs.values()]
-    write_text(settings.out, comparison(runs, shown, load_body(settings.body)))
-    say(*_tested(runs))
-    say(settings.out)
+    body = load_body(settings.body)
+    shown = _motions(compared, settings)
+    if settings.rate:
+        out = settings.out or "runs/rate.html"
+        content = rating_page(compared, shown, settings.seed, body)
+    else:
+        out = settings.out or "runs/compare.html"
+        content = comparison(compared, shown, body)
+        say(*_tested(only_runs(compared)))
+
+    write_text(out, content)
+    say(out)
 
 
 def _tested(runs: Mapping[str, Run]) -> list[str]:
@@ -59,27 +109,63 @@ def _tested(runs: Mapping[str, Run]) -> list[str]:
     return lines
 
 
-def _newest(run: Run) -> dict[Prompt, Motion]:
-    from flame_mdm.formats.readers import read
+def _motions(compared: Sequence[ComparedRun], settings: CompareSettings) -> list[dict[Prompt, Motion]]:
+    """Returns the motions of each run and folder, by prompt.
 
-    numbered: dict[Prompt, Motion] = {}
-    counts: Counter[str] = Counter()
-    for motion in map(read, sorted(run.samples.glob("motion_*.npz")) if run.samples else ()):
-        numbered[motion.text, counts[motion.text]] = motion
-        counts[motion.text] += 1
-    return numbered
+    The last checkpoint of each run is sampled for the requested prompts or else for the captions of the first folder of
+    motions, at the lengths of its motions. Without either, a run shows its newest samples.
+    """
+    from_files = {entry.label: read_motions(entry.folder) for entry in compared if entry.run is None}
+
+    prompts: dict[Prompt, float | None] = {}
+    if settings.prompts is not None:
+        prompts = {(text, 0): settings.seconds for text in read_prompts(settings.prompts)}
+    elif from_files:
+        reference = next(iter(from_files.values()))
+        for prompt, motion in reference.items():
+            if prompt[0]:
+                prompts[prompt] = settings.seconds or len(motion.joints) / motion.fps
+
+    shown = []
+    for entry in compared:
+        if entry.run is None:
+            shown.append(from_files[entry.label])
+        elif prompts:
+            shown.append(_sampled(entry, prompts, settings.seed))
+        else:
+            shown.append(read_motions(entry.run.samples) if entry.run.samples else {})
+    return shown
 
 
-def _sampled(run: Path, texts: list[str], settings: CompareSettings) -> dict[Prompt, Motion]:
-    """Samples the last checkpoint of a run for texts or action labels."""
+def _sampled(entry: ComparedRun, prompts: Mapping[Prompt, float | None], seed: int) -> dict[Prompt, Motion]:
+    """Samples the last checkpoint of a run for texts or action labels.
+
+    Args:
+        entry: the run.
+        prompts: length of each motion in seconds, all of them or none; None = the default of sampling. Motions longer
+            than the model supports are shortened.
+        seed: seed of the noise, which differs between the motions for a prompt that is there twice.
+    """
     import torch
 
     from flame_mdm.checkpoints.loading import load
     from flame_mdm.sampling.generation import sample_request
     from flame_mdm.sampling.motion_request import SamplingRequest
 
-    model = load(run, "cuda" if torch.cuda.is_available() else "cpu")
-    labels = texts[0] in model.facts["actions"]
-    prompts = (None, texts) if labels else (texts, None)
-    request = SamplingRequest(texts=prompts[0], actions=prompts[1], seconds=settings.seconds, seed=settings.seed)
-    return {(text, 0): motion for text, motion in zip(texts, sample_request(model, request), strict=True)}
+    model = load(entry.folder, "cuda" if torch.cuda.is_available() else "cpu")
+    lengths = [seconds for seconds in prompts.values() if seconds is not None]
+    longest = model.facts["max_frames"] / model.representation.fps
+    too_long = sum(seconds > longest for seconds in lengths)
+    if too_long:
+        limit = f"shortened to {longest:g} seconds, the maximum length for {entry.label}"
+        say(f"{too_long} of {len(lengths)} motions are {limit}")
+
+    texts = [text for text, _ in prompts]
+    is_action = texts[0] in model.facts["actions"]
+    request = SamplingRequest(
+        texts=None if is_action else texts,
+        actions=texts if is_action else None,
+        seconds=[min(seconds, longest) for seconds in lengths] or None,
+        seed=seed,
+    )
+    return dict(zip(prompts, sample_request(model, request), strict=True))

@@ -1,5 +1,6 @@
 """Single-page view of a prepared data set: `flame-mdm browse data=bandai search="waves left"`"""
 
+import re
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,9 +10,11 @@ import torch
 from markupsafe import Markup
 
 from flame_mdm.data.store import Entry, Store
+from flame_mdm.errors import UserError
 from flame_mdm.formats.motion import Motion
 from flame_mdm.reporting.page import render
 from flame_mdm.representations import Representation
+from flame_mdm.safe_io import atomic_folder
 from flame_mdm.visualize import write_player
 from flame_mdm.visualize.body import Mesh
 
@@ -69,6 +72,46 @@ def write_page(
         beside=[clip.id[1:] if clip.id.startswith("M") else "" for clip in clips],
         body=body,
     )
+
+
+def write_clips(
+    folder: Path, store: Store, representation: Representation, clips: Sequence[Entry], longest: int
+) -> None:
+    """Writes clips as `motion_000_ID.npz` ..., in the layout of generated motions, each with one caption.
+
+    A clip with several captions gets the first one that no earlier clip has, so that captions are unique if possible.
+
+    Args:
+        folder: the folder to write.
+        store: the prepared data set.
+        representation: the representation of its features.
+        clips: the clips to write.
+        longest: number of frames to which longer clips are cut, as in evaluations.
+
+    Raises:
+        UserError: the folder holds other motions, which would be mistaken for these.
+    """
+    ids = [re.sub(r"[^\w.-]+", "_", clip.id)[:100] for clip in clips]
+    paths = [folder / f"motion_{number:03d}_{name}.npz" for number, name in enumerate(ids)]
+    others = sorted(path for path in folder.glob("*.npz") if path not in paths and path.name[0] != ".")
+    if others:
+        raise UserError(
+            f"motions={folder}: the folder holds other motions, such as {others[0].name}. Delete it, or choose another"
+        )
+
+    used: set[str] = set()
+    with atomic_folder(folder) as temporary:
+        for path, clip in zip(paths, clips, strict=True):
+            captions = clip.captions or ([] if clip.action is None else [store.info["actions"][clip.action]])
+            unused = [caption for caption in captions if caption not in used]
+            caption = [*unused, *captions, ""][0]
+            used.add(caption)
+
+            features = representation.rebase(store.motion(clip)[:longest])
+            joints = representation.decode(torch.from_numpy(features.copy())).numpy()
+            written = Motion(joints, representation.fps, representation.skeleton, caption, clip.id)
+            written.features, written.representation = features, representation.name
+            written.save(temporary / path.name, clip=clip.id, split=clip.split, data=store.fingerprint)
 
 
 def describe(store: Store) -> Markup:

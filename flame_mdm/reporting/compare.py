@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import statistics
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,11 +13,12 @@ import numpy as np
 
 from flame_mdm.config import flatten
 from flame_mdm.errors import UserError
+from flame_mdm.formats import ENDINGS
 from flame_mdm.records import Result, Value
 from flame_mdm.reporting.page import filled, number, page, render
 from flame_mdm.reporting.plots import Curve, chart
 from flame_mdm.reporting.report import charted, evaluation_title, last, marks, printed, sampling
-from flame_mdm.runs import Run, read_run
+from flame_mdm.runs import CONFIG, Run, read_run
 
 if TYPE_CHECKING:
     from markupsafe import Markup
@@ -28,24 +30,83 @@ if TYPE_CHECKING:
 Prompt = tuple[str, int]  # requested caption or action, and the index of the motion among those with the same request
 
 
-def find(folders: Sequence[Path]) -> dict[str, Run]:
-    """Returns two or more runs by recipe and run name, or by folder if these are ambiguous."""
+@dataclass(frozen=True)
+class ComparedRun:
+    """A run, or a folder of motion files, with its label on pages. `run` is None for a folder of motion files."""
+
+    label: str
+    folder: Path
+    run: Run | None
+
+
+def find(folders: Sequence[Path]) -> list[ComparedRun]:
+    """Returns two or more runs and folders of motion files.
+
+    Runs are labeled by recipe and run name, folders of motions by their name, and both by their path if two labels are
+    the same.
+    """
     if len(set(folders)) < 2:
         raise UserError(f'a comparison needs two or more runs: runs="A B", not {" ".join(map(str, folders))}')
-    runs = [read_run(folder) for folder in folders]
-    labels = [run.label for run in runs]
-    return {run.label if labels.count(run.label) == 1 else str(run.folder): run for run in runs}
+
+    compared = []
+    for folder in folders:
+        if not (folder / CONFIG).exists() and folder.is_dir() and _direct_motions(folder):
+            compared.append(ComparedRun(folder.name, folder, None))
+        else:
+            run = read_run(folder)
+            compared.append(ComparedRun(run.label, folder, run))
+
+    labels = Counter(entry.label for entry in compared)
+    return [entry if labels[entry.label] == 1 else replace(entry, label=str(entry.folder)) for entry in compared]
 
 
-def comparison(runs: Mapping[str, Run], shown: Sequence[Mapping[Prompt, Motion]], mesh: Mesh | None = None) -> str:
-    """Returns the page that compares runs side by side. The same runs give the same bytes."""
+def _direct_motions(folder: Path) -> list[Path]:
+    """Returns the motion files that are in a folder itself, sorted, without hidden ones."""
+    files = (path for path in folder.iterdir() if path.suffix.lower() in ENDINGS and path.name[0] != ".")
+    return sorted(file for file in files if file.is_file())
+
+
+def read_motions(folder: Path) -> dict[Prompt, Motion]:
+    """Reads the motion files in a folder, by prompt."""
+    from flame_mdm.formats.readers import read
+
+    numbered: dict[Prompt, Motion] = {}
+    counts: Counter[str] = Counter()
+    for motion in map(read, _direct_motions(folder)):
+        numbered[motion.text, counts[motion.text]] = motion
+        counts[motion.text] += 1
+    return numbered
+
+
+def in_all(shown: Sequence[Mapping[Prompt, Motion]]) -> list[Prompt]:
+    """Returns the prompts for which every run has a motion, in the order of the first run."""
+    return [prompt for prompt in shown[0] if all(prompt in motions for motions in shown)]
+
+
+def only_runs(compared: Sequence[ComparedRun]) -> dict[str, Run]:
+    """Returns the runs by label, without the folders of motions."""
+    return {entry.label: entry.run for entry in compared if entry.run is not None}
+
+
+def comparison(
+    compared: Sequence[ComparedRun], shown: Sequence[Mapping[Prompt, Motion]], mesh: Mesh | None = None
+) -> str:
+    """Returns the page that compares runs side by side. The same runs give the same bytes.
+
+    Args:
+        compared: runs and folders of motions.
+        shown: the motions of each of them, by prompt; the page plays those for the prompts that all have.
+        mesh: the body to draw.
+    """
+    runs = only_runs(compared)
+    labels = [entry.label for entry in compared]
     body = render(
         "compare.html",
-        title=" · ".join(runs),
+        title=" · ".join(labels),
         labels=list(runs),
-        facts=_facts(runs),
+        facts=_facts(runs) if runs else None,
         differences=_differences(runs),
-        player=_player(list(runs), shown, mesh),
+        player=_player(labels, shown, mesh),
         evaluations=_evaluations(runs),
         unpaired=in_common(runs),
         columns=HEAD,
@@ -82,8 +143,7 @@ def _player(labels: Sequence[str], shown: Sequence[Mapping[Prompt, Motion]], bod
 
     scene = [
         replace(motions[prompt], id=label, text=prompt[0] or "unconditioned")
-        for prompt in shown[0]
-        if all(prompt in motions for motions in shown)
+        for prompt in in_all(shown)
         for label, motions in zip(labels, shown, strict=True)
     ]
     return player_page(scene, "", columns=len(labels), body=body) if scene else ""
@@ -150,7 +210,7 @@ def grouped(runs: Mapping[str, Run]) -> dict[str, list[tuple[str, Result]]]:
 def in_common(runs: Mapping[str, Run]) -> list[str]:
     """Returns why no evaluation can be compared; [] if two runs have the same evaluation."""
     groups = grouped(runs)
-    if any(len({label for label, _ in columns}) > 1 for columns in groups.values()):
+    if len(runs) < 2 or any(len({label for label, _ in columns}) > 1 for columns in groups.values()):
         return []
     return ["No evaluation in common: differences need the same protocol, data and extractor.", *groups]
 

@@ -1,4 +1,4 @@
-"""Builds tables from existing results, published numbers, recipes and lengths."""
+"""Builds tables from existing results, published numbers, recipes, lengths and ratings."""
 
 import functools
 import math
@@ -16,6 +16,7 @@ from flame_mdm.errors import UserError
 from flame_mdm.records import Result, Value, read_result
 from flame_mdm.reporting.audit_cards import card_of
 from flame_mdm.reporting.plots import Histogram
+from flame_mdm.reporting.study import Ratings
 from flame_mdm.reporting.tables.format import Cell, Line, Part, Table, ranks
 from flame_mdm.reporting.tables.settings import settings_table
 from flame_mdm.reporting.tables.specs import ABOUT, PUBLISHED, SWEPT, Figure, Lengths, evaluations, load_mapping
@@ -39,6 +40,8 @@ def build(name: str, spec: Config, results: Path) -> Table:
             built = settings_table(part_name, part, published.get(part_name))
         elif "lengths" in part:
             built = _lengths(part_name, part, results)
+        elif "ratings" in part:
+            built = _ratings(part_name, Path(part["ratings"]), published.get(part_name))
         else:
             built = _measured(part_name, part, published.get(part_name), results)
         built.figures = [Figure(**figure) for figure in spec.get("figures", []) if figure["part"] == part_name]
@@ -331,3 +334,26 @@ def _lengths(name: str, part: Config, results: Path) -> Part:
         step = max(1, math.ceil(lengths[-1] / 40))
         histograms[dataset] = Histogram(step, np.bincount([length // step for length in lengths]).tolist())
     return Part(name, dict.fromkeys(formats, "none"), lines, notes, histograms=histograms)
+
+
+def _ratings(name: str, path: Path, reported: Config | None) -> Part:
+    """Builds the table of a user study: how often people preferred one model to another."""
+    columns = {"Preferred": "none", "votes": "none", "raters": "none"}
+    lines: list[Line] = []
+    notes = [("", f'{path} is missing. make compare RUNS="a b" RATE=true writes a page for rating motions')]
+
+    if path.exists():
+        notes = [("", "share of votes, with its 95 % interval (Wilson 1927)")]
+        ratings: Ratings = read_json(path, Ratings, "run `flame-mdm compare ratings=...` to count again")
+        for pair in ratings.pairs:
+            share, low, high = pair.share
+            preferred = Cell(f"{share:.1%} [{low:.1%}, {high:.1%}]", share)
+            votes, raters = Cell(str(pair.votes), pair.votes), Cell(str(pair.raters), pair.raters)
+            lines.append(Line(f"{pair.a} over {pair.b}", "measured", [preferred, votes, raters]))
+
+    if reported is not None:
+        values = [""] * len(columns)
+        reported_lines, sources = _reported(reported, columns, values, name)
+        lines += reported_lines
+        notes += sources
+    return Part(name, columns, lines, notes)

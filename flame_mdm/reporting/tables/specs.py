@@ -84,19 +84,20 @@ class RowSpec(Options):
 
 
 class PartSpec(Options):
-    """A part of a table: either columns and rows, recipes and keys, or lengths."""
+    """A part of a table: either columns and rows, recipes and keys, lengths, or ratings."""
 
     columns: dict[str, ColumnSpec] = Field({}, min_length=1, max_length=MOST_COLUMNS)
     rows: list[RowSpec] = Field([])
     recipes: dict[str, str] = Field({}, min_length=1, max_length=MOST_COLUMNS)
     keys: dict[str, str] = Field({}, min_length=1, max_length=MOST_ROWS)
     lengths: list[str] = Field([], max_length=MOST_COLUMNS)
+    ratings: str = ""
 
     @model_validator(mode="after")
     def _one_kind(self) -> Self:
-        kinds = [{"columns", "rows"}, {"recipes", "keys"}, {"lengths"}]
+        kinds = [{"columns", "rows"}, {"recipes", "keys"}, {"lengths"}, {"ratings"}]
         if sum(kind <= self.model_fields_set for kind in kinds) != 1:
-            raise ValueError("needs columns and rows, or recipes and keys, or lengths")
+            raise ValueError("needs columns and rows, or recipes and keys, or lengths, or ratings")
         options = [[len(as_list(getattr(row, n))) for n in SWEPT if n in row.model_fields_set] for row in self.rows]
         _at_most("rows", sum(map(math.prod, options)), MOST_ROWS)
         if self.rows and not self.protocol:

@@ -31,6 +31,7 @@ from flame_mdm.progress import ProgressBar
 from flame_mdm.records import AuditCard
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.safe_io import atomic_write, read_npz
+from flame_mdm.safe_io.paths import check_within
 from flame_mdm.schemas import check_shape
 from flame_mdm.training.provenance import environment
 
@@ -71,6 +72,7 @@ def audit(request: EvaluationRequest, cache: Path, resamples: int) -> AuditCard:
     texts = [text_of(row, row.text) for row in rows] if protocol.condition == "text" else []
     perturbations = scene.perturbations(bool(texts))
     folder = cache / digest([FORMAT, facts, protocol.sha256])[:16]
+    check_within(folder, cache.parent)
     steps = len(sets) + sum(len(perturbation.grades) for perturbation in perturbations)
     with ProgressBar(total=steps, desc="audit", unit=" sets") as bar:
         inputs: dict[str, Inputs] = {}

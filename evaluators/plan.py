@@ -18,6 +18,7 @@ from flame_mdm.representations import Representation
 from flame_mdm.representations.rot6d import Rot6D
 from flame_mdm.representations.smpl import SMPL
 from flame_mdm.safe_io import sha256
+from flame_mdm.safe_io.paths import check_within
 from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.sampling.editing import method_options
 from flame_mdm.sampling.motion_request import EditRequest
@@ -84,7 +85,9 @@ class Plan:
         used = self.sampling | {"seed": request.seed, "split": request.split, "samples": protocol.samples}
         used |= {"data": self.data.store.fingerprint}
         used |= {"batch_size": self.batch_size} if protocol.batch_size else {}
-        return run / "evaluation" / protocol.title / f"{sha256(file)[:16]}-{digest(used)[:8]}"
+        folder = run / "evaluation" / protocol.title / f"{sha256(file)[:16]}-{digest(used)[:8]}"
+        check_within(folder, run)  # somebody else may have made the run directory
+        return folder
 
 
 def open_data(request: EvaluationRequest, model: MotionGenerator | None) -> MotionDataModule:

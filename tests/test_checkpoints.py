@@ -386,8 +386,8 @@ def test_push_writes_a_card_and_uploads_these_files_alone(trained, tmp_path, cap
     model = model_files.read_model_file(folder / "model.safetensors")
     for dataset, terms in (("bandai", "license: cc-by-nc-4.0"), ("humanml3d", "license: other")):
         model["facts"]["dataset"] = dataset
-        assert terms in hub.card(model, "me/walker")
-    assert "non-commercial" in hub.card(model, "me/walker")
+        assert terms in hub.card(model, "me/walker", "")
+    assert "non-commercial" in hub.card(model, "me/walker", "")
 
     monkeypatch.setattr(huggingface_hub, "HfApi", lambda: api)
     (folder / "notes.txt").write_text("private")

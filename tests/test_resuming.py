@@ -244,7 +244,7 @@ def hold(folder: Path, held: Any) -> None:
 
 def test_a_second_run_in_the_folder_is_refused_and_a_dead_one_taken_over(tmp_path, capsys):
     (tmp_path / "checkpoints").mkdir()
-    for name in (LAST, "step=0000010.partial"):
+    for name in (LAST, ".step=0000010.0123abcd-1-0123456789abcdef.ckpt"):
         (tmp_path / "checkpoints" / name).touch()
     context = multiprocessing.get_context("fork")
     held = context.Event()

@@ -64,7 +64,7 @@ def test_training_learns_and_leaves_what_a_user_looks_for(tiny, tmp_path):
     facts = json.loads((folder / "provenance.json").read_text())["data"]
     assert facts.items() <= checkpoint["facts"].items()
     assert checkpoint["facts"].keys() - facts.keys() == {"vocabulary", "verbs", "captions"}
-    assert not list(folder.rglob("*.partial"))
+    assert not list(folder.rglob(".*"))
 
 
 @pytest.mark.slow

@@ -265,7 +265,7 @@ def test_incomplete_checkpoints(attacked, trained, changed, bad):
     path = model_file(bad / "x.safetensors", trained, origin=None)
     attacked("push", str(path), "a/b", "dry_run=true", says="x.safetensors: damaged")
     facts = {name: value for name, value in whole["facts"].items() if name not in ("dataset", "fingerprint")}
-    assert "| data | unknown |" in card(read_model_file(export(changed(facts=facts), bad)), "a/b")
+    assert "| data | unknown |" in card(read_model_file(export(changed(facts=facts), bad)), "a/b", "")
 
 
 def test_bombs_of_yaml(bad):

@@ -326,4 +326,4 @@ def test_push_takes_names_not_paths_and_overwrites_only_its_own_files(attacked, 
 def test_a_card_is_a_table_of_text(trained, tmp_path):
     model = model_files.read_model_file(hub.export(trained, tmp_path))
     model["origin"]["file"] = HOSTILE
-    assert not re.search("\n# Heading|\x1b", hub.card(model, "me/walker"))
+    assert not re.search("\n# Heading|\x1b", hub.card(model, "me/walker", ""))

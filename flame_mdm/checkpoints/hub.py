@@ -10,11 +10,15 @@ from flame_mdm.checkpoints.locating import find
 from flame_mdm.checkpoints.model_files import FILE, read_model_file, without_own_paths, write_model_file
 from flame_mdm.config import save
 from flame_mdm.errors import UserError, first_line, markdown_text
-from flame_mdm.safe_io import read_text, read_yaml, sha256, write_text
+from flame_mdm.safe_io import atomic_folder, read_text, read_yaml, regular_file, sha256, write_text
 
 CARD = Path(__file__).with_name("card.md")
 WRITTEN = {"README.md": "library_name: flame-mdm", "config.yaml": "The recipe of this model."}
-"""Files that `push` writes next to the model, and a text in each that identifies it as written by `push`."""
+"""Files that `push` writes next to the model, and a text in each that identifies it as written by `push`.
+
+The card also has the hash of the model file.
+"""
+OTHERS = "not overwritten, since it was not written by push. Choose another folder with out=..."
 
 
 def export(source: str | Path, out: str | Path, *, half: bool = False, **adapted: Any) -> Path:
@@ -44,27 +48,40 @@ def push(source: str | Path, repository: str, folder: str | Path, *, upload: boo
     """Writes a folder with model file, recipe and card, and uploads it to the hub as "user/name"; see `export`."""
     if not re.fullmatch(r"\w[\w.-]*/\w[\w.-]*", repository):
         raise UserError(f"{repository}: not a repository name. Write user/name")
-    for name, mark in WRITTEN.items():
-        if (path := Path(folder) / name).exists() and mark not in read_text(path):
-            raise UserError(f"{path}: not overwritten, since it was not written by push. Choose another `folder`")
-    file = export(source, Path(folder) / FILE)
-    model = read_model_file(file)
-    save(model["config"], file.parent / "config.yaml", head=WRITTEN["config.yaml"])
-    write_text(file.parent / "README.md", card(model, repository))
+    folder = Path(folder)
+    _check_written(folder)
+    with atomic_folder(folder) as made:
+        file = export(source, made / FILE)
+        model = read_model_file(file)
+        save(model["config"], made / "config.yaml", head=WRITTEN["config.yaml"])
+        write_text(made / "README.md", card(model, repository, sha256(file)))
     if upload:
         from huggingface_hub import HfApi
 
         try:
             HfApi().create_repo(repository, private=private, exist_ok=True)
-            HfApi().upload_folder(repo_id=repository, folder_path=file.parent, allow_patterns=[FILE, *WRITTEN])
+            HfApi().upload_folder(repo_id=repository, folder_path=folder, allow_patterns=[FILE, *WRITTEN])
         except Exception as error:  # the client raises many kinds: no network, no token, no permission ...
-            message = f"{repository}: upload failed: {first_line(error)}. The files are in {file.parent}"
+            message = f"{repository}: upload failed: {first_line(error)}. The files are in {folder}"
             raise UserError(message) from error
-    return file.parent
+    return folder
 
 
-def card(model: Mapping[str, Any], repository: str) -> str:
-    """Returns the model card of the content of a model file."""
+def _check_written(folder: Path) -> None:
+    """Raises `UserError` if a folder has a file that `push` would overwrite, but has not written."""
+    for name, mark in WRITTEN.items():
+        path = folder / name
+        if path.exists() and mark not in read_text(path):
+            raise UserError(f"{path}: {OTHERS}")
+    file, text = folder / FILE, folder / "README.md"
+    if file.exists():
+        regular_file(file)
+        if not text.exists() or sha256(file) not in read_text(text):
+            raise UserError(f"{file}: {OTHERS}")
+
+
+def card(model: Mapping[str, Any], repository: str, file_sha256: str) -> str:
+    """Returns the model card of the content of a model file, with the hash of the file."""
     from jinja2 import Template
 
     config, facts = model["config"], model["facts"]
@@ -81,6 +98,7 @@ def card(model: Mapping[str, Any], repository: str) -> str:
         "fingerprint of the data": facts.get("fingerprint") or "unknown",
         "longest motion": f"{facts['max_frames']} frames",
         "actions": ", ".join(facts["actions"]) or "none",
+        f"sha256 of {FILE}": file_sha256,
         **{f"weights: {name}": value for name, value in model["origin"].items()},
     }
     template = Template(CARD.read_text(encoding="utf-8"), keep_trailing_newline=True)

@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import ClassVar
 
 from flame_mdm.commands import FileSettings, motion_file, usual_data_root
-from flame_mdm.commands.sample import OutputSettings, check_condition, default_folder, summary
+from flame_mdm.commands.sample import SAMPLES, OutputSettings, check_condition, default_folder, summary
 from flame_mdm.errors import say
 from flame_mdm.safe_io import sha256
+from flame_mdm.safe_io.paths import check_within
 from flame_mdm.sampler_options import option, required
 from flame_mdm.sampling.motion_request import EditRequest
 
@@ -49,6 +50,7 @@ def main(settings: EditSettings) -> None:
     folder = Path(settings.out or default_folder(model, what, digest, replace(request, samples=1), *general))
     shown = replace(original, text=f"original: {original.text or original.id}")
     facts = {"seed": settings.seed, "checkpoint": digest, "keep": edits[0].keep}
+    check_within(folder, settings.out or SAMPLES)
     write_motions(folder, [shown, *edits], facts, stages, settings.mp4, body)
     say(summary(folder, edits, settings))
     changed, moved = max(e.feature_error for e in edits), max(e.joint_error for e in edits)

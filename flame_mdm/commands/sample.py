@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from flame_mdm.commands import AdaptedSettings, BodySettings, device_name, existing, motion_file
 from flame_mdm.errors import UserError, say, shortened
 from flame_mdm.safe_io import MEBIBYTE, read_text, sha256
+from flame_mdm.safe_io.paths import check_within
 from flame_mdm.sampler_options import SamplerOptions, option, same_option
 from flame_mdm.sampling.motion_request import (
     TRAINED_ON,
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from flame_mdm.generator import MotionGenerator
     from flame_mdm.visualize.body import Mesh
 
+SAMPLES = "samples"  # default folder of the motions
 GALLERY = 200  # maximum number of motions on the page of a file of prompts, which has about 20 kB for each
 
 
@@ -130,6 +132,7 @@ def main(settings: SampleSettings) -> None:
     digest = sha256(file)
     folders = _folders(settings, request, model, digest, motions)
     for folder, made in folders.items():
+        check_within(folder, settings.out or SAMPLES)
         facts = {"seed": settings.seed, "checkpoint": digest}
         write_motions(folder, made, facts, stages if made[0] is motions[0] else None, settings.mp4, body)
         if settings.prompts is None:
@@ -194,11 +197,11 @@ def default_folder(model: MotionGenerator, what: str, *request: object) -> Path:
     """Returns `samples/<experiment>/<what>-<hash>`; the hash is that of `what` and of everything in `request`.
 
     Requests for different motions thus go to different folders, also where the file system ignores case. The folder is
-    within `samples`, whatever an untrusted checkpoint calls its experiment.
+    within `SAMPLES`, whatever an untrusted checkpoint calls its experiment.
     """
     digest = hashlib.sha256(repr((what, request)).encode()).hexdigest()[:6]
     name = re.sub(r"[^\w]+", "-", what.lower()).strip("-")[:40].strip("-")
-    return Path("samples", *re.findall(r"[\w-][\w.-]*", str(model.config["experiment"])), f"{name}-{digest}")
+    return Path(SAMPLES, *re.findall(r"[\w-][\w.-]*", str(model.config["experiment"])), f"{name}-{digest}")
 
 
 def check_condition(settings: OutputSettings, request: SamplingRequest, model: MotionGenerator) -> None:

@@ -14,6 +14,7 @@ from flame_mdm.reporting.tables.build import NOT_VALID, build
 from flame_mdm.reporting.tables.format import write
 from flame_mdm.reporting.tables.specs import Evaluation, Lengths, evaluations, load_spec, spec_names
 from flame_mdm.safe_io import sha256, write_json, write_text
+from flame_mdm.safe_io.paths import check_within
 from flame_mdm.sampler_options import option
 
 INVALID = 3  # exit code if a requested row is not valid
@@ -83,6 +84,7 @@ def evaluate_missing(specs: Mapping[str, Config], results: Path, settings: Table
         say(f"evaluating {number + 1} of {len(missing)}: {evaluation.label}")
         keys = dict(evaluation.keys)
         try:
+            check_within(path, results)
             dotted = [f"{name}={keys.pop(name)}" for name in list(keys) if "." in name]
             nodes = compose_data(keys.pop("data"), dotted) if "data" in keys else {}
             names = ("device", "batch_size", "force", "data_root")
@@ -121,4 +123,4 @@ def count_lengths(dataset: str, results: Path, settings: TablesSettings) -> None
     store = data.open()
     facts = {name: store.info[name] for name in ("fingerprint", "fps", "excluded")}
     counted = Lengths(lengths=sorted(clip.length for clip in store.clips), **facts)
-    write_json(results / "lengths" / f"{dataset}.json", counted.model_dump(), indent=None)
+    write_json(results / "lengths" / f"{dataset}.json", counted.model_dump(), indent=None, within=results)

@@ -20,7 +20,8 @@ from flame_mdm.batch import Condition, MotionBatch, sent
 from flame_mdm.conditions import ConditionEncoder
 from flame_mdm.errors import UserError
 from flame_mdm.progress import ProgressBar
-from flame_mdm.safe_io import atomic_write, sha256
+from flame_mdm.safe_io import atomic_write, regular_file, sha256
+from flame_mdm.safe_io.paths import remove_abandoned
 
 CAPTIONS_AT_ONCE = 64
 
@@ -112,7 +113,8 @@ class PretrainedText(ConditionEncoder):
                 warnings.warn(f"{error}; rebuilding it", stacklevel=2)
         device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         encoded = self._encode_frozen(self._distinct(captions), device, quiet=False)
-        with atomic_write(path) as temporary:
+        remove_abandoned(path.parent)
+        with atomic_write(path, within=folder.parent) as temporary:
             encoded.save(temporary)
         del self._pretrained.network  # frees its memory
 
@@ -271,6 +273,7 @@ class EncodedCaptions:
     def open(cls, path: Path) -> "EncodedCaptions":
         """Returns the content of a file; raises `UserError` if it is missing or damaged."""
         try:
+            regular_file(path)
             with safe_open(path, "pt") as file:
                 captions = json.loads(file.metadata()["captions"])
                 return cls(captions, *(file.get_tensor(name) for name in ("pooled", "tokens", "offsets")))

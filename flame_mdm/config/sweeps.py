@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from itertools import groupby
+from pathlib import Path
 
 from hydra import main as hydra_main
 from hydra.core.global_hydra import GlobalHydra
@@ -14,6 +15,7 @@ from flame_mdm.config.command_line import STOP, guarded, make_variables
 from flame_mdm.config.composition import LAUNCH, quoted
 from flame_mdm.config.signatures import Config
 from flame_mdm.errors import UserError, say
+from flame_mdm.safe_io.paths import check_tree
 
 QUIET = ["hydra/job_logging=disabled", "hydra/hydra_logging=disabled", "hydra.output_subdir=null"]
 
@@ -80,6 +82,7 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
     ]
     if launcher:
         say(f"waiting for the jobs; their output is in {config['run']['dir']}/.submitit")
+    check_tree(Path(config["run"]["dir"]))  # Hydra and the launchers open files in it in place
     sys.argv = [sys.argv[0], "--multirun", *output, *overrides, *QUIET]
     GlobalHydra.instance().clear()
     hydra_main(version_base="1.3", config_path=str(recipe.folder), config_name=recipe.stem)(job)()

@@ -4,6 +4,7 @@ Every batch is a function of (seed, step, rank). No generator state needs to be 
 batches as an uninterrupted one.
 """
 
+import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
@@ -26,6 +27,7 @@ from flame_mdm.errors import UserError, say
 from flame_mdm.representations import Representation
 
 MAX_FRAMES = 100_000  # maximum number of frames of a sample; one hour at 20 frames per second has 72,000
+NAME = r"\w[\w .-]*"  # of a data set: part of the name of its folder, which must not leave `root` or be hidden
 Loader = DataLoader[Sample] | ResidentLoader
 
 
@@ -106,7 +108,7 @@ class MotionDataModule(LightningDataModule):
         for key, value, is_valid, remedy in (
             ("batch_size", batch_size, batch_size >= 1, "a batch has at least one clip"),
             ("num_workers", num_workers, num_workers >= 0, "give 0 or more"),
-            ("name", name, bool(name), "give the data set a name"),
+            ("name", name, re.fullmatch(NAME, name), "give a name of letters, digits, _, - and ., such as my_motions"),
             ("resident", resident, isinstance(resident, bool) or resident == "auto", "give true, false or auto"),
             ("pad_multiple", pad_multiple, 1 <= pad_multiple <= MAX_FRAMES, f"give 1 to {MAX_FRAMES:,}"),
             ("crop", crop, is_crop, f"give a rule of flame_mdm.data.crops, of 1 to {MAX_FRAMES:,} frames"),

@@ -22,6 +22,7 @@ from flame_mdm.progress import ProgressBar
 from flame_mdm.representations import Frames
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.safe_io import atomic_write, made_folder, naming, read_npy, read_text
+from flame_mdm.safe_io.paths import remove_abandoned
 
 FPS = 20
 
@@ -177,8 +178,7 @@ class HumanML3D(T2MFolder):
                         write(row, _read_joints(self.humanact12_files[row.key]))
                         progress.update()
         finally:
-            for unfinished in folder.glob(".*.npy"):  # of workers that were stopped
-                unfinished.unlink(missing_ok=True)
+            remove_abandoned(folder)  # of workers that were stopped
 
     def _write_statistics(self) -> None:
         """Writes mean and std over all motions of any length and split, including mirrored ones."""

@@ -14,7 +14,6 @@ Verification adds a report to the folder, `verify.json`.
 import hashlib
 import json
 import os
-import shutil
 import zipfile
 from collections import Counter, deque
 from collections.abc import Generator, Iterable, Iterator, Sequence
@@ -45,8 +44,11 @@ from flame_mdm.safe_io import (
     regular_file,
     sha256,
 )
+from flame_mdm.safe_io.paths import check_within, remove_abandoned
 from flame_mdm.schemas import Int, Schema, check_shape
 
+FILES = ("features.npy", "clips.jsonl", "statistics.npz", "references.npz")
+"""Files that `store.json` lists with their hashes. Others in the folder of a store are never removed."""
 BLOCK = 8192  # frames that are read together for the statistics
 Count = Annotated[int, Field(ge=0, lt=2**63)]
 
@@ -144,18 +146,38 @@ def write_store(folder: Path, source: MotionSource, representation: Representati
     """Encodes every clip of a data set and writes the store, under a temporary name until it is complete.
 
     If another process is writing it, waits and opens the result. If data cannot be read, leaves no files behind.
+    Raises `UserError` if `folder` holds anything but an intact store, which is replaced if it existed before the call.
     """
     total, before = source.count(), (folder / "store.json").exists()
     lock = folder.with_name(folder.name + ".lock")
     waiting = f"{folder}: another process is preparing it; waiting"
     with locked(lock, lambda _: say(waiting), "prepare in one process at a time"):
-        for unfinished in folder.parent.glob(f".{folder.name}.*"):  # of a preparation that was killed
-            shutil.rmtree(unfinished, ignore_errors=True)
+        remove_abandoned(folder.parent)
         if before or not (folder / "store.json").exists():
-            with atomic_folder(folder) as made:
+            replaced = _replaceable(folder)
+            with atomic_folder(folder, within=folder.parent) as made:
                 _write(made, source, representation, total)
-                shutil.rmtree(folder, ignore_errors=True)
+                for file in replaced:
+                    file.unlink()
     return Store(folder)
+
+
+def _replaceable(folder: Path) -> list[Path]:
+    """Returns the files of the store in a folder, `store.json` first; none if the folder does not exist or is empty.
+
+    Raises `UserError` if the folder is a link or holds other files but no store, or if the store is damaged.
+    """
+    check_within(folder, folder.parent)
+    if not folder.is_dir() or not any(folder.iterdir()):
+        return []
+    if not (folder / "store.json").is_file():
+        raise UserError(
+            f"{folder}: exists, and is not a prepared data set. It is not replaced: choose another data_root or "
+            "data.name, or move that folder away"
+        )
+    store = Store(folder)
+    store.verify()
+    return [folder / "store.json", *(folder / name for name in FILES if name in store.info["sha256"])]
 
 
 def _write(folder: Path, source: MotionSource, representation: Representation, total: int) -> None:

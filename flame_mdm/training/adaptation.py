@@ -27,6 +27,7 @@ from flame_mdm.errors import UserError, say
 from flame_mdm.formats.motion import Motion
 from flame_mdm.reporting.page import number, page, render
 from flame_mdm.safe_io import write_text
+from flame_mdm.safe_io.paths import check_tree
 from flame_mdm.sampling.generation import BATCH, generate
 from flame_mdm.sampling.reading import decoded
 from flame_mdm.task import MotionGeneration
@@ -79,6 +80,7 @@ def adapt(
         raise UserError(f"{source}: no captions. Write what happens into NAME.txt next to each motion, or captions.csv")
     if not force:
         check_clips(source, model.representation.fps)
+    check_tree(out)  # the motions of `_prior` are written there before the training begins
     config = _recipe(model, captions, name, out, overrides)
     config["base"], config["adapter"] = str(base), None if full else _about(model, captions, name, rank, file, action)
     model.facts.pop("vocabulary", None)  # with it, texts whose words are taught here would be refused

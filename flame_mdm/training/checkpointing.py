@@ -17,6 +17,7 @@ from torch import Tensor
 from flame_mdm.checkpoints.model_files import FORMAT, FORMAT_KEY, check_weights, read_checkpoint
 from flame_mdm.errors import UserError, say
 from flame_mdm.safe_io import write_failure
+from flame_mdm.safe_io.paths import check_within, temporary_beside
 
 LAST, PREVIOUS = "last.ckpt", "previous.ckpt"
 OLDEST_LIGHTNING = Version("2.6")  # Lightning migrates checkpoints of older versions, by code that trusts them
@@ -51,18 +52,18 @@ class AtomicCheckpoints(TorchCheckpointIO):
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
         """Writes a checkpoint; raises `UserError` if that fails, as on a full disk. Earlier ones stay."""
         path = Path(path)
-        partial = path.with_suffix(".partial")
+        check_within(path.parent, self.folder.parent)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            with partial.open("wb") as file:
-                torch.save(checkpoint | {FORMAT_KEY: FORMAT}, file)
-                file.flush()
-                os.fsync(file.fileno())
-            if path.name == LAST and path.exists():
-                path.replace(path.with_name(PREVIOUS))
-            partial.replace(path)
+            with temporary_beside(path) as temporary:
+                with temporary.open("xb") as file:
+                    torch.save(checkpoint | {FORMAT_KEY: FORMAT}, file)
+                    file.flush()
+                    os.fsync(file.fileno())
+                if path.name == LAST and path.exists():
+                    path.replace(path.with_name(PREVIOUS))
+                temporary.replace(path)
         except (OSError, RuntimeError) as error:  # torch reports a failed write as either
-            partial.unlink(missing_ok=True)
             reason = write_failure(error if isinstance(error, OSError) else error.__context__ or error, path)
             raise UserError(
                 f"{path}: the checkpoint of step {checkpoint['global_step']} cannot be written ({reason}). Earlier "

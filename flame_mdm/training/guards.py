@@ -14,11 +14,15 @@ from torch import Tensor
 from flame_mdm.batch import MotionBatch
 from flame_mdm.errors import UserError, say
 from flame_mdm.safe_io import locked, write_json
+from flame_mdm.safe_io.paths import check_tree, remove_abandoned
 
 
 @contextmanager
 def only_run(folder: Path) -> Iterator[None]:
-    """Holds the lock `run.lock` in the run directory; raises `UserError` if a process on any host holds it."""
+    """Holds the lock `run.lock` in the run directory, which somebody else may have filled.
+
+    Raises `UserError` if a process on any host holds the lock, or links in the directory lead out of it.
+    """
 
     def refuse(owner: str) -> None:
         raise UserError(
@@ -26,12 +30,12 @@ def only_run(folder: Path) -> Iterator[None]:
             "that process"
         )
 
+    check_tree(folder)
     new = not folder.exists()
     with locked(folder / "run.lock", refuse, "do not start a second run in this directory") as dead:
         if dead:
             say(f"{folder}: the previous {dead} died; taking over its run directory")
-            for unfinished in (folder / "checkpoints").glob("*.partial"):
-                unfinished.unlink(missing_ok=True)
+            remove_abandoned(folder / "checkpoints", is_locked=True)
         try:
             yield
         finally:

@@ -15,6 +15,7 @@ from typing_extensions import TypedDict
 from flame_mdm.config import Config
 from flame_mdm.runs import HISTORY, records
 from flame_mdm.safe_io import write_json, write_text
+from flame_mdm.safe_io.paths import open_in_place
 from flame_mdm.schemas import read_json
 
 
@@ -44,7 +45,7 @@ class History(Logger):
             kept = [line for line in records(self.path) if line["step"] <= self.step]
             write_text(self.path, "".join(json.dumps(line) + "\n" for line in kept))
             self.begun = True
-        with self.path.open("a") as file:
+        with open_in_place(self.path) as file:
             file.write(json.dumps({"step": step, **metrics}) + "\n")
 
 

@@ -13,7 +13,6 @@ import hashlib
 import json
 import math
 import os
-import secrets
 import shutil
 import socket
 import stat
@@ -25,6 +24,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from flame_mdm.errors import UserError, first_line, say
+from flame_mdm.safe_io.paths import check_within, open_in_place, remove_abandoned, temporary_beside
 
 if TYPE_CHECKING:  # `--help` must not import NumPy
     import numpy as np
@@ -47,24 +47,41 @@ FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # numbers of errors
 
 
 @contextmanager
-def atomic_write(path: str | Path) -> Iterator[Path]:
+def atomic_write(path: str | Path, *, within: str | Path | None = None) -> Iterator[Path]:
     """Yields a temporary path next to `path` that is renamed to `path` at the end; a failure leaves no files behind.
 
-    The temporary name is unique, so that several processes can write the same file; the last one wins. Raises
-    `UserError` if the file cannot be written, for instance because the disk is full.
+    The temporary name is unique, so that several processes can write the same file; the last one wins. A link at `path`
+    is replaced, and the file it leads to stays as it is.
+
+    Args:
+        path: file to write.
+        within: folder that contains `path`, and that other people may have filled: links must not lead out of it.
+
+    Raises `UserError` if a link leads out of `within`, `path` is a pipe or a device, or the file cannot be written, for
+    instance because the disk is full.
     """
     path = Path(path)
+    if within is not None:
+        check_within(path.parent, within)
     with _temporary(path) as temporary:
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise UserError(f"{path}: a pipe, a socket or a device, not a file. Choose another name")
         yield temporary
         temporary.replace(path)
 
 
 @contextmanager
-def atomic_folder(path: str | Path) -> Iterator[Path]:
-    """Does the same for a folder; if it exists, the new files replace those of the same name, and others are kept."""
+def atomic_folder(path: str | Path, *, within: str | Path | None = None) -> Iterator[Path]:
+    """Does the same for a folder; if it exists, the new files replace those of the same name, and others are kept.
+
+    Temporary folders that killed processes left behind are removed.
+    """
     path = Path(path)
+    if within is not None:
+        check_within(path, within)
     if path.exists() and not path.is_dir():
         raise UserError(f"{path}: a file, not a folder. Choose another folder")
+    remove_abandoned(path.parent, path)
     with _temporary(path) as temporary:
         temporary.mkdir()
         yield temporary
@@ -79,21 +96,15 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def _temporary(path: Path) -> Iterator[Path]:
-    """Yields a unique path next to `path`, and removes what is there at the end.
+    """Yields a unique path next to `path`, in a folder that is created, and removes what is there at the end.
 
     Errors that name it name `path` instead, and an `OSError` that names either of them or a folder above becomes a
     `UserError`.
     """
-    temporary = path.with_name(f".{path.stem[:80]}.{os.getpid()}-{secrets.token_hex(4)}{path.suffix}")
+    temporary = path
     try:
-        with made_folder(path.parent):
-            try:
-                yield temporary
-            finally:
-                if temporary.is_dir():
-                    shutil.rmtree(temporary, ignore_errors=True)
-                else:
-                    temporary.unlink(missing_ok=True)
+        with made_folder(path.parent), temporary_beside(path) as temporary:
+            yield temporary
     except UserError as error:
         if str(temporary) not in str(error):
             raise
@@ -128,14 +139,15 @@ def made_folder(folder: Path) -> Iterator[None]:
                 part.rmdir()
 
 
-def write_text(path: str | Path, text: str) -> None:
-    with atomic_write(path) as temporary:
+def write_text(path: str | Path, text: str, *, within: str | Path | None = None) -> None:
+    """Writes a text file atomically; `within` as for `atomic_write`."""
+    with atomic_write(path, within=within) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
-def write_json(path: str | Path, content: Any, indent: int | None = 2) -> None:
-    """Writes a JSON file atomically; NaN and infinity raise `ValueError`."""
-    write_text(path, json.dumps(content, indent=indent, allow_nan=False) + "\n")
+def write_json(path: str | Path, content: Any, indent: int | None = 2, *, within: str | Path | None = None) -> None:
+    """Writes a JSON file atomically, `within` as for `atomic_write`; NaN and infinity raise `ValueError`."""
+    write_text(path, json.dumps(content, indent=indent, allow_nan=False) + "\n", within=within)
 
 
 @contextmanager
@@ -160,7 +172,7 @@ def locked(path: Path, busy: Callable[[str], object], advice: str) -> Iterator[s
     locks also hold between hosts on NFS and Lustre, unlike the locks of `filelock`. Windows has neither.
     """
     while True:
-        with made_folder(path.parent), path.open("a+") as file:
+        with made_folder(path.parent), open_in_place(path) as file:
             file.seek(0)
             owner = file.read().strip()
             try:

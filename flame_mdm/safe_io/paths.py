@@ -1,0 +1,137 @@
+"""Names under which files may be written in a folder that other people may have filled.
+
+Links must not lead out of the folder, a file that is written in place must have one name only, and temporary names are
+unique.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import os
+import re
+import secrets
+import shutil
+import socket
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import IO
+
+from flame_mdm.errors import UserError
+
+SECOND_NAME = "a file with a second name elsewhere (hard link), which would be changed, too. Replace it by a copy"
+
+_tokens: set[str] = set()
+"""Random parts in the names of temporary files and folders that this process is writing."""
+
+
+def check_within(path: str | Path, root: str | Path) -> None:
+    """Raises `UserError` if links on the way to a path in the folder `root` lead out of that folder."""
+    target = os.path.realpath(path)
+    if not Path(target).is_relative_to(os.path.realpath(root)):
+        raise UserError(f"{path}: a link leads out of {root}, to {target}. Nothing is written there: remove the link")
+
+
+def check_tree(folder: Path) -> None:
+    """Checks a folder of somebody else before libraries write into it, which open their files in place.
+
+    Raises `UserError` if the folder contains a link that leads out of it, a pipe, a device, or a file with a second
+    name (hard link), through which a file elsewhere would be changed.
+    """
+    for parent, folders, files in os.walk(folder):
+        for name in (*folders, *files):
+            path = Path(parent, name)
+            status = path.lstat()
+            if stat.S_ISLNK(status.st_mode):
+                check_within(path, folder)
+            elif stat.S_ISFIFO(status.st_mode) or stat.S_ISBLK(status.st_mode) or stat.S_ISCHR(status.st_mode):
+                raise UserError(f"{path}: a pipe or a device. Remove it")
+            elif stat.S_ISREG(status.st_mode) and status.st_nlink > 1:
+                raise UserError(f"{path}: {SECOND_NAME}")
+
+
+def open_in_place(path: Path) -> IO[str]:
+    """Opens a text file for reading and appending, and creates it if it does not exist.
+
+    Writing in place changes a file that has other names, so that links are not followed. Raises `UserError` if the
+    path is a link, no regular file, or a file with a second name (hard link).
+    """
+    flags = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    try:
+        descriptor = os.open(path, flags, 0o666)
+    except OSError as error:
+        if path.is_symlink():
+            raise UserError(f"{path}: a link, which is not followed for writing. Remove it") from error
+        raise
+    status = os.fstat(descriptor)
+    if not stat.S_ISREG(status.st_mode) or status.st_nlink > 1:
+        os.close(descriptor)
+        kind = SECOND_NAME if stat.S_ISREG(status.st_mode) else "a pipe, a socket or a device, not a file. Remove it"
+        raise UserError(f"{path}: {kind}")
+    return os.fdopen(descriptor, "a+", encoding="utf-8")
+
+
+@contextmanager
+def temporary_beside(path: Path) -> Iterator[Path]:
+    """Yields a unique path next to `path`, and removes what is there at the end."""
+    token = secrets.token_hex(8)
+    temporary = path.with_name(f".{path.stem[:80]}.{_machine()}-{os.getpid()}-{token}{path.suffix}")
+    _tokens.add(token)
+    try:
+        yield temporary
+    finally:
+        _remove(temporary)
+        _tokens.discard(token)
+
+
+@functools.cache
+def _machine() -> str:
+    """Returns eight hexadecimal digits that stand for the host and, in a container, its numbering of processes."""
+    numbering = ""
+    with suppress(OSError):  # a system without /proc
+        numbering = str(Path("/proc/self/ns/pid").readlink())
+    return hashlib.sha256(f"{socket.gethostname()} {numbering}".encode()).hexdigest()[:8]
+
+
+def remove_abandoned(folder: Path, path: Path | None = None, *, is_locked: bool = False) -> None:
+    """Removes temporary files and folders whose process died, so that it could not remove them.
+
+    Args:
+        folder: folder of the temporary files and folders.
+        path: only those written for this file or folder; None = for any.
+        is_locked: whether this process holds the lock under which alone such files are written. Then those of processes
+            on other machines are removed, too. Otherwise they stay, because they may be alive.
+    """
+    if not folder.is_dir():
+        return
+    stem = r".+" if path is None else re.escape(path.stem[:80])
+    suffix = r"(\.\w+)?" if path is None else re.escape(path.suffix)
+    pattern = re.compile(rf"\.{stem}\.([0-9a-f]{{8}})-(\d{{1,10}})-([0-9a-f]{{16}}){suffix}")
+    for entry in folder.iterdir():
+        match = pattern.fullmatch(entry.name)
+        if match and match[3] not in _tokens and (is_locked or (match[1] == _machine() and not _lives(int(match[2])))):
+            with suppress(PermissionError):  # of another user
+                _remove(entry)
+
+
+def _lives(process: int) -> bool:
+    """Returns whether another process of this machine exists."""
+    if process == os.getpid():
+        return False
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:  # of another user
+        return True
+    return True
+
+
+def _remove(path: Path) -> None:
+    """Removes a temporary file or folder; of a link, only the link itself."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)

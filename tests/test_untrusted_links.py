@@ -1,0 +1,294 @@
+"""Folders that somebody else has filled: no link in them makes the product write, empty or remove a file elsewhere."""
+
+import os
+import re
+import signal
+from collections.abc import Callable
+from contextlib import nullcontext
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from support.pages import a_run
+from support.refusals import one_line_error
+from support.stores import OwnClips, clip
+
+from flame_mdm.__main__ import main
+from flame_mdm.checkpoints import hub
+from flame_mdm.conditions.text import EncodedCaptions, PretrainedText
+from flame_mdm.data.store import write_store
+from flame_mdm.errors import UserError
+from flame_mdm.formats.motion import Motion
+from flame_mdm.representations.humanml import HumanML
+from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.safe_io import atomic_folder, atomic_write, locked, paths, write_json
+from flame_mdm.sampling.generation import write_motions
+from flame_mdm.training.checkpointing import AtomicCheckpoints
+from flame_mdm.training.guards import only_run
+from flame_mdm.training.loggers import History
+from flame_mdm.visualize import write_player
+
+VICTIM = b"the only copy of somebody's work\n"
+MOTION = Motion(np.zeros((2, 22, 3), np.float32), 20.0, SMPL22, text="a person walks")
+
+
+def save_checkpoint(run: Path) -> None:
+    for step in (1, 2):  # the second one moves the first to previous.ckpt
+        AtomicCheckpoints(run / "checkpoints").save_checkpoint({"global_step": step}, run / "checkpoints" / "last.ckpt")
+
+
+def train_in(run: Path) -> None:
+    with only_run(run):
+        save_checkpoint(run)
+        History(run).log_metrics({"train/loss": 1.0}, 1)
+        write_json(run / "bad_batch.json", {})
+
+
+def prepare(root: Path) -> None:
+    write_store(root / "mine-humanml", OwnClips(clip("a")), HumanML("smpl22", "clean"))
+
+
+def encode_captions(root: Path) -> None:
+    encoder: Any = object.__new__(PretrainedText)
+    encoded = EncodedCaptions(["a"], torch.zeros(1, 2), torch.zeros(1, 2).half(), torch.tensor([0, 1]))
+    vars(encoder).update(
+        freeze=True,
+        _cache_path=lambda captions, folder: folder / "model-0123.safetensors",
+        _distinct=list,
+        _encode_frozen=lambda *_, **__: encoded,
+        _pretrained=SimpleNamespace(network=None),
+    )
+    with pytest.warns(UserWarning, match="rebuilding it") if (root / "text").is_dir() else nullcontext():
+        PretrainedText.precompute(encoder, ["a"], root / "text")
+
+
+def sample(out: Path) -> None:
+    paths.check_within(out / "walk", out)
+    write_motions(out / "walk", [MOTION], {"seed": 0})
+
+
+def page(out: Path) -> None:
+    write_player(out / "player.html", [MOTION])
+
+
+def any_file(out: Path) -> None:
+    with atomic_write(out / "part" / "any.npz", within=out) as temporary:
+        np.savez(temporary, a=np.zeros(1))
+
+
+SAMPLES = [f"walk/{name}" for name in ("motion_000.npz", "motions.gif", "motions.png", "player.html")]
+WRITERS: dict[str, tuple[Callable[[Path], None], list[str]]] = {
+    "train": (
+        train_in,
+        ["run.lock", "metrics.jsonl", "bad_batch.json", "checkpoints/last.ckpt", "checkpoints/previous.ckpt"],
+    ),
+    "checkpoint": (save_checkpoint, ["checkpoints/last.ckpt", "checkpoints/previous.ckpt"]),
+    "prepare": (prepare, ["mine-humanml.lock", "mine-humanml/store.json", "mine-humanml/features.npy"]),
+    "text cache": (encode_captions, ["text/model-0123.safetensors"]),
+    "sample": (sample, SAMPLES),
+    "page": (page, ["player.html"]),
+    "any": (any_file, ["part/any.npz"]),
+}
+"""What the product writes in a folder of others, and the names of the files."""
+
+CASES = [(writer, name) for writer, (_, names) in WRITERS.items() for name in names]
+FOLDERS = sorted({(writer, name.partition("/")[0]) for writer, name in CASES if "/" in name})
+
+
+def plant(kind: str, path: Path, victim: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if kind == "link":
+        path.symlink_to(victim)
+    elif kind == "hard link":
+        path.hardlink_to(victim)
+    else:
+        os.mkfifo(path)
+
+
+def attempt(write: Callable[[Path], None], folder: Path) -> None:
+    """The files are written, or refused in one line, within seconds."""
+
+    def late(*_: object) -> None:
+        raise AssertionError("it waits for a pipe")
+
+    handler, refusal = signal.signal(signal.SIGALRM, late), str(folder)
+    signal.alarm(60)
+    try:
+        write(folder)
+    except (UserError, OSError) as error:
+        refusal = str(error)
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, handler)
+    assert str(folder) in refusal
+    assert "\n" not in refusal
+
+
+@pytest.mark.parametrize("kind", ["link", "hard link", "pipe"])
+@pytest.mark.parametrize(("writer", "name"), CASES)
+def test_a_link_at_the_name_of_a_file_does_not_lead_to_the_file_of_somebody_else(tmp_path, writer, name, kind):
+    victim, folder = tmp_path / "victim", tmp_path / "folder"
+    victim.write_bytes(VICTIM)
+    plant(kind, folder / name, victim)
+    attempt(WRITERS[writer][0], folder)
+    assert victim.read_bytes() == VICTIM
+    assert sorted(tmp_path.iterdir()) == [folder, victim]
+    assert not [path for path in folder.rglob(".*") if path.name.startswith(".")], "nothing half-written stays"
+
+
+@pytest.mark.parametrize(("writer", "name"), FOLDERS)
+def test_a_link_at_the_name_of_a_folder_does_not_lead_to_the_files_of_somebody_else(tmp_path, writer, name):
+    victim, folder = tmp_path / "victim", tmp_path / "folder"
+    write, names = WRITERS[writer]
+    contents = {Path(file).name for file in names} | {"thesis.doc", "motion_007.npz"}
+    victim.mkdir()
+    folder.mkdir()
+    for file in contents:
+        (victim / file).write_bytes(VICTIM)
+    (folder / name).symlink_to(victim)
+    with one_line_error("a link leads out of|is not a prepared data set"):
+        write(folder)
+    assert {path.name: path.read_bytes() for path in victim.iterdir()} == dict.fromkeys(contents, VICTIM)
+
+
+@pytest.mark.parametrize("kind", ["link", "hard link", "pipe"])
+def test_libraries_write_into_a_run_only_if_nothing_in_it_leads_elsewhere(tmp_path, kind):
+    victim, run = tmp_path / "victim", tmp_path / "run"
+    victim.write_bytes(VICTIM)
+    plant(kind, run / "csv" / "metrics.csv", victim)
+    with one_line_error(r"csv/metrics\.csv: "), only_run(run):
+        (run / "csv" / "metrics.csv").write_text("of Lightning")
+    assert victim.read_bytes() == VICTIM
+    inside = tmp_path / "other"
+    (inside / "wandb" / "run-1").mkdir(parents=True)
+    (inside / "wandb" / "latest-run").symlink_to("run-1")  # as wandb does
+    with only_run(inside):
+        pass
+
+
+def test_a_device_is_not_replaced_by_a_file(tmp_path):
+    os.mkfifo(tmp_path / "out.html")
+    with one_line_error("a pipe, a socket or a device"):
+        page_of = tmp_path / "out.html"
+        write_player(page_of, [MOTION])
+    assert page_of.is_fifo()
+
+
+def test_prepare_replaces_an_intact_store_only_and_keeps_the_files_of_others(tmp_path):
+    folder = tmp_path / "mine-humanml"
+    (folder / "clips").mkdir(parents=True)
+    (folder / "clips" / "walk.bvh").write_bytes(VICTIM)
+    with one_line_error(f"{folder}: exists, and is not a prepared data set"):
+        prepare(tmp_path)
+    assert (folder / "clips" / "walk.bvh").read_bytes() == VICTIM
+    folder.rename(tmp_path / "source")
+    prepare(tmp_path)
+    (folder / "notes.txt").write_bytes(VICTIM)
+    before = (folder / "features.npy").read_bytes()
+    write_store(folder, OwnClips(clip("b", motion=clip("a").motion[:30])), HumanML("smpl22", "clean"))
+    assert (folder / "notes.txt").read_bytes() == VICTIM
+    assert (folder / "features.npy").read_bytes() != before
+    features = (folder / "features.npy").read_bytes()
+    (folder / "features.npy").write_bytes(features[:-4] + b"\0\0\0\1")
+    with one_line_error(r"features\.npy: damaged: .* Delete .* and prepare"):
+        prepare(tmp_path)
+    assert (folder / "features.npy").stat().st_size == len(features)
+
+
+@pytest.mark.parametrize("name", ["*", "../x", "/tmp/x", "..", ".hidden", "a/b", "", "-x"])
+def test_the_name_of_a_data_set_names_a_folder_in_the_data_root(tmp_path, monkeypatch, capsys, name):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / ".mine.keep").mkdir()
+    words = ["prepare", "synthetic", f"data.name='{name}'", "data.source.clips=8", "data_root=data"]
+    assert main(words) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"error: data.name={name}: give a name of letters, digits")
+    assert [path.name for path in (tmp_path / "data").iterdir()] == [".mine.keep"]
+    assert [path.name for path in tmp_path.iterdir()] == ["data"]
+
+
+def test_temporary_files_of_living_processes_stay_and_abandoned_ones_go(tmp_path):
+    machine, token = paths._machine(), "0123456789abcdef"
+    dead = next(number for number in range(99_999, 1, -1) if not Path(f"/proc/{number}").exists())
+    names = {
+        "alive": f".a.{machine}-{os.getppid()}-{token}.npz",
+        "dead": f".a.{machine}-{dead}-{token}.npz",
+        "elsewhere": f".a.00000000-{dead}-{token}.npz",
+        "former": f".b.{machine}-{os.getpid()}-{token}.npz",  # in a container, each process may have the same number
+        "not ours": ".a.backup-7-old.npz",
+    }
+    for name in names.values():
+        (tmp_path / name).touch()
+    (tmp_path / f".c.{machine}-{dead}-{token}").mkdir()
+    (tmp_path / f".d.{machine}-{dead}-{token}").symlink_to(tmp_path / names["alive"])
+    with paths.temporary_beside(tmp_path / "own.npz") as own:
+        own.touch()
+        paths.remove_abandoned(tmp_path)
+        assert own.exists()
+    assert {path.name for path in tmp_path.iterdir()} == {names[key] for key in ("alive", "elsewhere", "not ours")}
+    paths.remove_abandoned(tmp_path, is_locked=True)
+    assert {path.name for path in tmp_path.iterdir()} == {names["not ours"]}
+
+
+def test_a_folder_that_a_killed_command_left_is_removed_by_the_next_one(tmp_path):
+    if not (child := os.fork()):
+        with atomic_folder(tmp_path / "out") as made:
+            (made / "motion_000.npz").touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+    os.waitpid(child, 0)
+    assert [path.name[:5] for path in tmp_path.iterdir()] == [".out."]
+    with atomic_folder(tmp_path / "out") as made:
+        (made / "motion_000.npz").touch()
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.slow
+def test_push_overwrites_the_model_file_that_it_wrote_only(tmp_path, trained):
+    model = hub.export(trained, tmp_path)
+    before = model.read_bytes()
+    with one_line_error(r"model\.safetensors: not overwritten, since it was not written by push"):
+        hub.push(trained, "me/walker", tmp_path, upload=False, private=False)
+    assert [path.name for path in tmp_path.iterdir()] == ["model.safetensors"]
+    assert model.read_bytes() == before
+    model.unlink()
+    for _ in range(2):
+        hub.push(trained, "me/walker", tmp_path, upload=False, private=False)
+    model.write_bytes(b"of somebody else")
+    with one_line_error("not written by push"):
+        hub.push(trained, "me/walker", tmp_path, upload=False, private=False)
+    assert model.read_bytes() == b"of somebody else"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["evaluation", "evaluation/synthetic"])
+def test_an_evaluation_stays_in_the_run(tmp_path, trained, data_root, name, capsys):
+    run, victim = tmp_path / "run", tmp_path / "victim"
+    victim.mkdir()
+    (run / "checkpoints").mkdir(parents=True)
+    (run / "checkpoints" / "last.ckpt").write_bytes(trained.read_bytes())
+    (run / name).parent.mkdir(parents=True, exist_ok=True)
+    (run / name).symlink_to(victim)
+    words = [f"ckpt={run}", "protocol=synthetic", "extractor=none", "quick=true", f"data_root={data_root}"]
+    assert main(["evaluate", *words]) == 1
+    assert "a link leads out of" in capsys.readouterr().err
+    assert not list(victim.iterdir())
+
+
+def test_a_report_replaces_a_link_and_not_the_file_behind_it(tmp_path):
+    run, victim = a_run(tmp_path / "run"), tmp_path / "victim"
+    victim.write_bytes(VICTIM)
+    (run / "report.html").symlink_to(victim)
+    assert main(["report", f"runs='{run}'"]) == 0
+    assert victim.read_bytes() == VICTIM
+    assert not (run / "report.html").is_symlink()
+
+
+def test_a_lock_is_no_link_but_is_taken_over_from_a_dead_process(tmp_path):
+    (tmp_path / "run.lock").write_text("process 7 on here\n")
+    with locked(tmp_path / "run.lock", lambda _: None, "") as dead:
+        assert re.fullmatch("process 7 on here", dead)
+    assert not list(tmp_path.iterdir())

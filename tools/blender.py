@@ -16,7 +16,7 @@ from pathlib import Path
 
 from flame_mdm.checkpoints.onnx_export import RUNNER, export_onnx
 from flame_mdm.errors import UserError, did_you_mean, say
-from flame_mdm.formats import posture, rig
+from flame_mdm.formats import names, posture, rig
 from flame_mdm.formats.characters import known_skeletons
 from flame_mdm.representations import skeleton
 from flame_mdm.safe_io import atomic_write, write_json, write_text
@@ -32,7 +32,7 @@ PLATFORMS = {
 """Names of Blender -> tags of wheels."""
 MODULES = (
     RUNNER,
-    *(Path(str(module.__file__)) for module in (skeleton, posture, rig, sys.modules[UserError.__module__])),
+    *(Path(str(module.__file__)) for module in (skeleton, names, posture, rig, sys.modules[UserError.__module__])),
 )
 """Modules that the extension contains as they are here; they need numpy alone."""
 

@@ -132,7 +132,7 @@ def read(path: str | Path) -> Bvh:
                 source.fail("joint or end site without OFFSET")
             blocks.pop()
         else:
-            name = source.word("SITE" if keyword == "END" else "")
+            name = source.word("SITE") if keyword == "END" else source.name_of_joint()
             blocks.append(len(nodes))
             nodes.append(_Node(f"{node.name}.end", parent, _IN_END) if keyword == "END" else _Node(name, parent))
             source.word("{")
@@ -188,7 +188,7 @@ class Lines:
             self.line = data.count(b"\n", 0, error.start) + 1
             self.fail("not UTF-8 text")
         self.lines = ((number, line.split()) for number, line in enumerate(lines, 1) if not line.startswith("#"))
-        self.words = (word for words in self for word in words)
+        self.pending: list[str] = []  # words of the current line that are not read yet, the last one first
 
     def __iter__(self) -> Iterator[list[str]]:
         for number, words in self.lines:
@@ -201,12 +201,21 @@ class Lines:
 
     def word(self, expected: str = "") -> str:
         """Returns the next word of the hierarchy; it must be `expected` (case-insensitive) if that is not empty."""
-        word = next(self.words, "")
-        if not word:
+        if not self.pending:
+            self.pending = next(iter(self), [])[::-1]
+        if not self.pending:
             self.fail("the file ends inside the hierarchy")
+        word = self.pending.pop()
         if expected and word.upper() != expected:
             self.fail(f"expected {expected}, found {word[:40]}")
         return word
+
+    def name_of_joint(self) -> str:
+        """Returns the rest of the line up to a brace: names may contain spaces."""
+        words = [self.word()]
+        while self.pending and self.pending[-1] != "{":
+            words.append(self.pending.pop())
+        return " ".join(words)
 
     def numbers(self, words: Sequence[str], count: int) -> list[float]:
         """Returns the words as `count` finite numbers."""

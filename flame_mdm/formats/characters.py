@@ -10,6 +10,7 @@ import copy
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +18,10 @@ import numpy as np
 from flame_mdm.errors import UserError, did_you_mean
 from flame_mdm.formats import glb
 from flame_mdm.formats.body import PosedFigure, fit_body, local_rotations
-from flame_mdm.formats.layouts import LAYOUTS
+from flame_mdm.formats.layouts import LAYOUTS, opposite
+from flame_mdm.formats.names import spelled
 from flame_mdm.formats.posture import world_rotations
-from flame_mdm.formats.retarget import joint_names, presets
-from flame_mdm.formats.rig import RestPose, Rig, follow, matched, plain, recognized, rest_pose
+from flame_mdm.formats.rig import RestPose, Rig, follow, matched, recognized, rest_pose
 from flame_mdm.representations.skeleton import JOINT, SMPL22
 from flame_mdm.safe_io import read_yaml
 
@@ -138,10 +139,15 @@ def _listed(path: Path, listed: Path, chosen: object, names: Mapping[int, str]) 
     return candidates
 
 
+@cache
 def known_skeletons() -> list[dict[str, str]]:
-    """Returns the joints of known skeletons: `plain` name -> joint of SMPL."""
-    skeletons = [*map(joint_names, presets().values()), LAYOUTS["SMPL"].map, LAYOUTS["Bandai-Namco"].map]
-    return [{plain(name): joint for joint, name in map.items() if isinstance(name, str)} for map in skeletons]
+    """Returns the bones of known skeletons: spellings of names -> joint of SMPL."""
+    skeletons = []
+    for layout in LAYOUTS.values():
+        joints = {name: joint for joint, name in layout.bones.items()}
+        others = {name: layout.bones[opposite(joint)] for name, joint in joints.items()}
+        skeletons.append({spelling: joints[name] for spelling, name in spelled(others).items()})
+    return skeletons
 
 
 def write(path: Path, character: Character, motion: PosedFigure, name: str) -> str:

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import math
 import os
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PrivateAttr, ValidationError
 
 from flame_mdm.errors import UserError
 from flame_mdm.formats import asf, bvh
+from flame_mdm.formats.names import Match, best_match, spelled
 from flame_mdm.formats.resampling import RATES
 from flame_mdm.formats.retarget import joint_names, presets
 from flame_mdm.representations.skeleton import SKELETONS, SMPL22
@@ -28,6 +29,7 @@ UP = {
 LEG, USUAL_LEG = (0.6, 1.2), 0.83  # shortest, longest and usual leg of an adult, in meters: hip to knee to ankle
 CHILD = 0.25  # shortest leg of a child in meters, at about one year
 FOOT = 0.02  # shortest foot in meters, ankle to toes
+SIDES = ("left_", "right_")  # prefixes of SMPL's joints
 UNITS = {  # in meters
     **{"meters": 1.0, "centimeters": 0.01, "millimeters": 0.001, "inches": 0.0254, "feet": 0.3048},
     **{"the unit of CMU's recordings": 0.0564444},
@@ -47,16 +49,42 @@ class Layout(BaseModel):
     fps: Annotated[float, Field(ge=RATES[0], le=RATES[1])] | None = None  # of files that do not contain it
     mirrored: bool = False  # the files contain mirrored motion; the sign of x is changed
     children: bool = False  # the bodies may be those of children
+    _name: str = PrivateAttr("own map")
+    _bones: dict[str, str] = PrivateAttr(default_factory=dict)
 
     @property
     def used(self) -> set[str]:
         """The joints of files that the mapping uses."""
         return {name for source in self.map.values() for name in _shares(source)}
 
-    def without_toes(self) -> Layout:
-        """Returns the layout of the same skeleton with the end sites of the ankles instead of toes."""
-        ends = {f"{side}_foot": f"{self.map[f'{side}_ankle']}.end" for side in ("left", "right")}
-        return self.model_copy(update={"map": {**self.map, **ends}})
+    @property
+    def name(self) -> str:
+        """The name of a known layout, or "own map"."""
+        return self._name
+
+    @property
+    def bones(self) -> Mapping[str, str]:
+        """SMPL's joints -> the bones that follow them; a map of positions may use means of several joints instead."""
+        return self._bones
+
+    def named(self, name: str, map: Mapping[str, Source]) -> Layout:
+        """Returns the layout with another map, as a known one."""
+        layout = self.model_copy(update={"map": dict(map)})
+        layout._name = name
+        return layout
+
+    def ending(self, **ends: str) -> dict[str, Source]:
+        """Returns a map with the end sites of joints instead of the joints that follow: SMPL's joint=its parent."""
+        return {side + joint: f"{self.map[side + parent]}.end" for joint, parent in ends.items() for side in SIDES}
+
+    def pairs(self) -> dict[str, str]:
+        """Returns the joints of files that the mapping uses -> their counterparts on the other side, or themselves."""
+        pairs: dict[str, str] = {}
+        for joint, source in self.map.items():
+            other = self.map[opposite(joint)]
+            shares, others = list(_shares(source)), list(_shares(other))
+            pairs |= dict(zip(shares, others if len(others) == len(shares) else shares, strict=True))
+        return pairs
 
     def apply(self, positions: np.ndarray, names: Sequence[str]) -> np.ndarray:
         """Maps joints (F, J, 3) of a file with these names to (F, 22, 3) float32, meters, y up."""
@@ -68,6 +96,14 @@ class Layout(BaseModel):
         return (turned * [-1 if self.mirrored else 1, 1, 1]).astype(np.float32)
 
 
+def opposite(joint: str) -> str:
+    """Returns the joint of SMPL on the other side of the body, or the joint itself."""
+    for side, other in (SIDES, SIDES[::-1]):
+        if joint.startswith(side):
+            return other + joint.removeprefix(side)
+    return joint
+
+
 def _shares(source: Source) -> Mapping[str, float]:
     return {source: 1.0} if isinstance(source, str) else source
 
@@ -76,20 +112,46 @@ def _layout(joints: str | Sequence[str] = (), rig: str = "", map: Mapping = {}, 
     """Returns a layout of `layouts.yaml`, which describes the arguments."""
     parts = {key: fields.pop(key) for key in ("sides", "trunk", "arm", "leg") if key in fields}
     skeleton = presets()[rig] if rig else parts
-    sources: dict[str, Source] = dict(joint_names(skeleton)) if skeleton else dict(Layout().map)
+    bones = joint_names(skeleton) if skeleton else {joint: joint for joint in SMPL22.joints}
+    sources: dict[str, Source] = dict(bones)
     for joint, shares in map.items():
         sides = [("", "")] if joint in SMPL22.joints else zip(("left_", "right_"), skeleton["sides"], strict=True)
         for side, mark in sides:
             sources[side + joint] = {name.replace("*", mark): share for name, share in shares.items()}
     names = SKELETONS[joints].joints if isinstance(joints, str) else joints
-    return Layout(map={joint: sources[joint] for joint in SMPL22.joints}, joints=list(names), **fields)
+    layout = Layout(map={joint: sources[joint] for joint in SMPL22.joints}, joints=list(names), **fields)
+    layout._bones = bones
+    return layout
 
 
 LAYOUTS: dict[str, Layout] = {
     name: _layout(**fields) for name, fields in read_yaml(Path(__file__).with_name("layouts.yaml")).items()
 }
 """Known skeletons, recognized by the names of their joints."""
-_TOELESS = {f"{name} without toes": layout.without_toes() for name, layout in LAYOUTS.items()}
+
+
+@cache
+def _variants() -> dict[str, Layout]:
+    """Returns the known layouts, and these with end sites instead of toes, of hands, or of both, by name."""
+    variants = {name: layout.named(name, layout.map) for name, layout in LAYOUTS.items()}
+    toes, hands = {"foot": "ankle"}, {"wrist": "elbow"}
+    for parts, ends in (("toes", toes), ("hands", hands), ("toes and hands", toes | hands)):
+        for name, layout in LAYOUTS.items():
+            label = f"{name} without {parts}"
+            variants[label] = layout.named(label, layout.map | layout.ending(**ends))
+    return variants
+
+
+@cache
+def _spelled() -> dict[str, dict[str, str]]:
+    """Returns for each of `_variants` spellings -> names of the joints that it uses."""
+    return {name: spelled(layout.pairs()) for name, layout in _variants().items()}
+
+
+@lru_cache(64)
+def _nearest(names: tuple[str, ...]) -> Match:
+    """Returns the known layout that fits names best."""
+    return best_match(names, _spelled())
 
 
 def read_tree(path: Path, rate: float | None = None) -> bvh.Bvh:
@@ -107,14 +169,11 @@ def map_bvh(file: bvh.Bvh, fps: float | None, fields: Mapping[str, Any]) -> tupl
     `fields` of `Layout` override the known ones. Known skeletons whose arrays are in meters are in centimeters in BVH
     files, as written by `flame_mdm.formats`.
     """
-    names = [name.rpartition(":")[2] for name in file.joints]
-    if "map" not in fields:
-        names = [re.sub(r"^mixamorig\d*_?", "", name) for name in names]
-    layout = find_layout(names, fields)
-    if layout.unit == 1 and not {"map", "unit"} & set(fields):
+    layout = find_layout(file.joints, fields)
+    if "map" not in fields and "unit" not in layout.model_fields_set:
         layout = layout.model_copy(update={"unit": 0.01})
     positions = file.positions() if fps is None else bvh.forward_kinematics(file.parents, *file.resample(fps))[0]
-    return layout.apply(positions, names), layout
+    return layout.apply(positions, file.joints), layout
 
 
 def array_layout(joints: np.ndarray, fields: Mapping[str, Any]) -> tuple[Layout, Sequence[str]]:
@@ -135,20 +194,46 @@ def array_layout(joints: np.ndarray, fields: Mapping[str, Any]) -> tuple[Layout,
 
 def layout_name(layout: Layout) -> str:
     """Returns the name of a known layout, or "own map"."""
-    return next((name for name, own in (LAYOUTS | _TOELESS).items() if own.map is layout.map), "own map")
+    return layout.name
 
 
 def find_layout(names: Sequence[str], fields: Mapping[str, Any]) -> Layout:
-    """Returns the known layout for joints with these names, overridden by `fields`."""
-    candidates = {"the map": Layout(map=fields["map"])} if "map" in fields else LAYOUTS | _TOELESS
-    name, nearest = min(candidates.items(), key=lambda item: len(item[1].used - set(names)))
-    if missing := sorted(nearest.used - set(names)):
-        lacking, own = ", ".join(missing)[:500], ", ".join(names)[:1000]
-        which = f"unknown skeleton. {name} is the nearest known one; missing: {lacking}"
-        if "map" in fields:
-            which = f"the map in skeleton.yaml uses joints that the file lacks: {lacking}"
-        raise UserError(f"{which}. Map SMPL's joints in skeleton.yaml (docs/own-data.md) to those of the file: {own}")
-    return nearest.model_copy(update=dict(fields))
+    """Returns the known layout for joints with these names, overridden by `fields`; its map uses these names.
+
+    Names are matched as in `flame_mdm.formats.names`. Raises `UserError` if no layout fits, or several joints may be
+    meant by a name.
+    """
+    joints, known = ", ".join(names)[:1000], "map" not in fields
+    advice = f"Map SMPL's joints in skeleton.yaml (docs/own-data.md) to those of the file: {joints}"
+    if known:
+        match = _nearest(tuple(names))
+        layout = _variants()[match.skeleton]
+    else:
+        layout = Layout(map=fields["map"])
+        match = best_match(names, {"": spelled(layout.pairs())})
+    if match.missing:
+        lacking = ", ".join(sorted(match.missing))[:500]
+        reason = f"unknown skeleton. {match.skeleton} is the nearest known one; missing: {lacking}"
+        if not known:
+            reason = f"the map in skeleton.yaml uses joints that the file lacks: {lacking}"
+        raise UserError(f"{reason}. {advice}")
+    chosen = {name: _one(name, [names[number] for number in numbers]) for name, numbers in match.numbers.items()}
+    map = {joint: _renamed(source, chosen) for joint, source in layout.map.items()}
+    return layout.named(layout.name, map).model_copy(update={**fields, "map": map})
+
+
+def _one(name: str, candidates: Sequence[str]) -> str:
+    """Returns the joint of a file that is meant by a name: among different ones, the one with exactly this name."""
+    if len(set(candidates)) == 1 or name in candidates:
+        return name if name in candidates else candidates[0]
+    listed = " or ".join(dict.fromkeys(candidates))[:500]
+    raise UserError(f"{name} may be {listed}. Remove one from the file, or map SMPL's joints in skeleton.yaml")
+
+
+def _renamed(source: Source, names: Mapping[str, str]) -> Source:
+    if isinstance(source, str):
+        return names[source]
+    return {names[name]: share for name, share in source.items()}
 
 
 def skeleton_file(path: Path) -> Path | None:

@@ -1,12 +1,12 @@
 """Skeletons of other programs and characters in motion. Blender's extension contains it, so it needs numpy alone."""
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from flame_mdm.errors import UserError
+from flame_mdm.formats.names import best_match
 from flame_mdm.formats.posture import orthonormal, shortest_turns
 from flame_mdm.representations.skeleton import JOINT, SMPL22
 
@@ -90,18 +90,14 @@ class Rig:
         return positions
 
 
-def plain(name: str) -> str:
-    """Returns a name in lower case, without signs, Mixamo's prefix and the part before a colon."""
-    return re.sub(r"[\W_]", "", re.sub(r"^mixamorig\d*[_:]?", "", name.rpartition(":")[2])).lower()
-
-
 def recognized(names: Mapping[int, str], skeletons: Sequence[Mapping[str, str]]) -> dict[str, list[int]]:
-    """Returns the numbers of the joints that the most similar skeleton names: joint of SMPL -> numbers."""
-    numbers: dict[str, list[int]] = {}
-    for number, name in names.items():
-        numbers.setdefault(plain(name), []).append(number)
-    nearest = max(skeletons, key=lambda skeleton: len(skeleton.keys() & numbers.keys()))
-    return {joint: numbers[name] for name, joint in nearest.items() if name in numbers}
+    """Returns the numbers of the joints that the most similar skeleton names: joint of SMPL -> numbers.
+
+    `skeletons` are spellings of joints -> joints of SMPL, as in `flame_mdm.formats.names.best_match`.
+    """
+    numbers = list(names)
+    match = best_match(list(names.values()), {str(key): skeleton for key, skeleton in enumerate(skeletons)})
+    return {joint: [numbers[index] for index in indices] for joint, indices in match.numbers.items()}
 
 
 def matched(

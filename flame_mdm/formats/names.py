@@ -1,0 +1,113 @@
+"""Names of joints: one way to match them. Blender's extension contains this file, which needs the standard library.
+
+Programs write the same joint in many ways: `mixamorig:LeftUpLeg`, `Character1_LeftUpLeg`, `Actor left up leg`,
+`L_UpLeg`. Case, separators, a prefix that many joints share and the place and length of the mark of the side (left, L)
+make no difference.
+"""
+
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+SIDES = (("left", "l"), ("right", "r"))  # marks of the left and of the right side in names
+SHARED = 10  # joints that have a prefix at least; a skeleton without hands has about 20
+PREFIXES = 16  # maximum number of prefixes that are tried
+JOINED = re.compile(r"mixamorig\d*")  # a prefix that may lack a separator
+
+
+class Match(NamedTuple):
+    """The skeleton that fits names best.
+
+    Attributes:
+        skeleton: its key.
+        numbers: name in the skeleton -> indices of the joints that may be meant, more than one if this is ambiguous.
+        missing: names of the skeleton that no joint has.
+    """
+
+    skeleton: str
+    numbers: dict[str, list[int]]
+    missing: list[str]
+
+
+def plain(name: str) -> str:
+    """Returns a name in lower case, without separators and other signs."""
+    return re.sub(r"[\W_]", "", name).lower()
+
+
+def spellings(name: str, opposite: str) -> list[str]:
+    """Returns the `plain` spellings of a name, whose counterpart on the other side is `opposite`, the name itself first.
+
+    The mark of the side is spelled in either length, before or after the rest: LeftHip, L_Hip, hip.L.
+    """
+    name, opposite = plain(name), plain(opposite)
+    options = [name]
+    for marks, others in (SIDES, SIDES[::-1]):
+        for mark, other in zip(marks, others, strict=True):
+            for start in [match.start() for match in re.finditer(f"(?={mark})", name)]:
+                before, after = name[:start], name[start + len(mark) :]
+                if before + other + after == opposite:
+                    options += [mark + before + after for mark in marks] + [before + after + mark for mark in marks]
+    return list(dict.fromkeys(options))
+
+
+def spelled(pairs: Mapping[str, str]) -> dict[str, str]:
+    """Returns `spellings` of names -> names, from names -> their counterparts on the other side, or themselves.
+
+    A spelling of two names means the one that is spelled so itself.
+    """
+    variants = {name: spellings(name, opposite) for name, opposite in pairs.items()}
+    names: dict[str, str] = {}
+    for name, options in variants.items():
+        names.setdefault(options[0], name)
+    for name, options in variants.items():
+        for option in options[1:]:
+            names.setdefault(option, name)
+    return names
+
+
+def best_match(names: Sequence[str], skeletons: Mapping[str, Mapping[str, str]]) -> Match:
+    """Returns the skeleton that names of joints fit best: without missing joints, then with the most.
+
+    Among equals, the first skeleton counts. Prefixes that fit equally well make the match ambiguous.
+
+    Args:
+        names: of the joints of a file, at least one.
+        skeletons: for each key, spelling of a joint -> name in the skeleton; the first spelling is preferred.
+    """
+    best: list[Match] = []
+    score = (False, -1)
+    for prefix in _prefixes(names):
+        by_name: dict[str, list[int]] = {}
+        for number, name in enumerate(names):
+            by_name.setdefault(plain(name.removeprefix(prefix)), []).append(number)
+        for key, skeleton in skeletons.items():
+            match = _match(key, skeleton, by_name)
+            rank = (not match.missing, len(match.numbers))
+            if rank > score:
+                best, score = [match], rank
+            elif rank == score and match.skeleton == best[0].skeleton:
+                best.append(match)
+    chosen = best[0]
+    for other in best[1:]:
+        for name, numbers in other.numbers.items():
+            chosen.numbers[name] = sorted({*chosen.numbers.get(name, []), *numbers})
+    return chosen
+
+
+def _match(key: str, skeleton: Mapping[str, str], by_name: Mapping[str, list[int]]) -> Match:
+    numbers: dict[str, list[int]] = {}
+    for spelling, name in skeleton.items():
+        if spelling in by_name:
+            numbers.setdefault(name, by_name[spelling])
+    return Match(key, dict(numbers), [name for name in dict.fromkeys(skeleton.values()) if name not in numbers])
+
+
+def _prefixes(names: Sequence[str]) -> list[str]:
+    """Returns "" and the prefixes that at least `SHARED` names have, up to a separator, the most frequent first."""
+    counts: Counter[str] = Counter()
+    for name in set(names):
+        counts.update({name[: end.end()] for end in re.finditer(r"[\W_]+", name) if end.end() < len(name)})
+        counts.update(match[0] for match in [JOINED.match(name)] if match)
+    shared = [prefix for prefix, count in counts.most_common() if count >= SHARED]
+    return ["", *shared[:PREFIXES]]

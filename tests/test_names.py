@@ -1,0 +1,146 @@
+"""Names of joints: every spelling of a known skeleton is recognized, and ambiguous ones are refused."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.motions import synthetic
+
+from flame_mdm.errors import UserError
+from flame_mdm.formats import bvh
+from flame_mdm.formats.layouts import LAYOUTS, find_layout
+from flame_mdm.formats.names import best_match, spelled, spellings
+from flame_mdm.formats.readers import read
+from flame_mdm.representations.skeleton import SMPL22
+
+MIXAMO = [str(LAYOUTS["Mixamo"].map[joint]) for joint in SMPL22.joints]
+
+
+def _short(name: str) -> str:
+    return name.replace("left_", "L_").replace("right_", "R_")
+
+
+def _side_last(name: str) -> str:
+    for side in ("Left", "Right"):
+        if name.startswith(side):
+            return f"{name.removeprefix(side)}.{side[0]}"
+    return name
+
+
+SPELLINGS: dict[str, tuple[list[str], Callable[[str], str], str]] = {
+    "namespace": (MIXAMO, lambda name: f"mixamorig:{name}", "Mixamo"),
+    "numbered namespace": (MIXAMO, lambda name: f"mixamorig12:{name}", "Mixamo"),
+    "joined prefix": (MIXAMO, lambda name: f"mixamorig{name}", "Mixamo"),
+    "nested namespaces": (MIXAMO, lambda name: f"scene:hero:{name}", "Mixamo"),
+    "underscore": (MIXAMO, lambda name: f"Character1_{name}", "Mixamo"),
+    "space": (MIXAMO, lambda name: f"Actor {name}", "Mixamo"),
+    "path": (MIXAMO, lambda name: f"Armature|{name}", "Mixamo"),
+    "capitals": (MIXAMO, str.upper, "Mixamo"),
+    "side last": (MIXAMO, _side_last, "Mixamo"),
+    "SMPL's in capitals": (list(SMPL22.joints), str.capitalize, "SMPL"),
+    "SMPL's with L and R": (list(SMPL22.joints), lambda name: _short(name).title(), "SMPL"),
+    "SMPL's of a body": (list(SMPL22.joints), lambda name: f"m_avg_{_short(name).title()}", "SMPL"),
+    "SMPL's in words": (list(SMPL22.joints), lambda name: name.replace("_", " "), "SMPL"),
+}
+
+
+@pytest.mark.parametrize("case", SPELLINGS)
+def test_a_skeleton_is_recognized_in_every_spelling(case: str):
+    names, spell, skeleton = SPELLINGS[case]
+    spelled_names = [spell(name) for name in names]
+    layout = find_layout(spelled_names, {})
+    assert layout.name == skeleton
+    assert layout.map == dict(zip(SMPL22.joints, spelled_names, strict=True))
+
+
+@pytest.mark.parametrize("skeleton", LAYOUTS)
+def test_no_known_skeleton_is_taken_for_another(skeleton: str):
+    layout = LAYOUTS[skeleton]
+    names = list(layout.joints or layout.pairs())
+    recognized = find_layout(names, {})
+    assert recognized.map == layout.map
+    assert recognized.name == ("SOMA" if skeleton == "SOMA 30" else skeleton)
+    assert find_layout([f"Bip001 {name}" for name in names], {}).name == recognized.name
+
+
+@pytest.mark.parametrize(
+    ("names", "skeleton"),
+    [
+        (
+            "Hips Spine1 Spine2 Spine3 Spine4 Neck Head LeftShoulder LeftArm LeftForeArm LeftHand RightShoulder "
+            "RightArm RightForeArm RightHand LeftThigh LeftShin LeftFoot LeftToe LeftToeTip RightThigh RightShin RightFoot "
+            "RightToe RightToeTip",
+            "Rokoko",
+        ),
+        (
+            "Hips Chest Chest2 LeftCollar LeftShoulder LeftElbow LeftWrist LeftWrist.end RightCollar RightShoulder "
+            "RightElbow RightWrist RightWrist.end Neck Head Head.end LeftHip LeftKnee LeftAnkle LeftAnkle.end RightHip "
+            "RightKnee RightAnkle RightAnkle.end",
+            "mocapbank without toes",
+        ),
+        (
+            "Hips Chest Neck Head Head.end LeftCollar LeftUpArm LeftLowArm LeftHand LeftHand.end RightCollar "
+            "RightUpArm RightLowArm RightHand RightHand.end LeftUpLeg LeftLowLeg LeftFoot LeftFoot.end RightUpLeg RightLowLeg "
+            "RightFoot RightFoot.end",
+            "Biovision limbs without toes",
+        ),
+        (
+            "pelvis spine.001 neck face thigh.L shin.L foot.L foot.L.end thigh.R shin.R foot.R foot.R.end upper_arm.L "
+            "forearm.L forearm.L.end upper_arm.R forearm.R forearm.R.end",
+            "Rigify trunk of two without toes and hands",
+        ),
+        (
+            "spine spine.001 spine.002 spine.003 spine.004 spine.005 spine.006 shoulder.L upper_arm.L forearm.L "
+            "forearm.L.end shoulder.R upper_arm.R forearm.R forearm.R.end thigh.L shin.L foot.L toe.L thigh.R shin.R "
+            "foot.R toe.R",
+            "Rigify without hands",
+        ),
+    ],
+)
+def test_skeletons_of_other_programs_are_recognized(names: str, skeleton: str):
+    assert find_layout(names.split(), {}).name == skeleton
+
+
+@pytest.mark.parametrize(
+    ("names", "candidates"),
+    [
+        ([f"{person}:{name}" for person in ("A", "B") for name in MIXAMO], "Hips may be A:Hips or B:Hips"),
+        ([*map(str.upper, MIXAMO), "Left_Leg"], "LeftLeg may be LEFTLEG or Left_Leg"),
+    ],
+)
+def test_names_that_may_mean_two_joints_are_refused_with_both(names: list[str], candidates: str):
+    with pytest.raises(UserError, match=candidates):
+        find_layout(names, {})
+
+
+def test_an_exact_name_is_preferred():
+    assert find_layout([*map(str.upper, MIXAMO), *MIXAMO], {}).map == LAYOUTS["Mixamo"].map
+
+
+def test_a_map_of_the_user_is_matched_like_a_known_skeleton():
+    map = {joint: name.lower() for joint, name in zip(SMPL22.joints, MIXAMO, strict=True)}
+    layout = find_layout([f"Character1_{name}" for name in MIXAMO], {"map": map})
+    assert layout.map["left_hip"] == "Character1_LeftUpLeg"
+    assert layout.name == "own map"
+
+
+def test_the_side_is_marked_in_four_ways():
+    left, right = spellings("clavicle_l", "clavicle_r"), spellings("RightClavicle", "LeftClavicle")
+    assert set(left) == {"claviclel", "clavicleleft", "lclavicle", "leftclavicle"}
+    assert set(right) == {"clavicler", "clavicleright", "rclavicle", "rightclavicle"}
+    assert spelled({"lowerback": "lowerback"}) == {"lowerback": "lowerback"}
+    assert best_match(["Head"], {"a": {"neck": "neck"}, "b": {"head": "top"}}) == ("b", {"top": [0]}, [])
+
+
+@pytest.mark.parametrize("text", ["ROOT {name}\n", "ROOT {name} {{ "])
+def test_names_of_bvh_files_are_the_rest_of_the_line(text: str, tmp_path: Path):
+    synthetic().save(tmp_path / "a.bvh", rig="mixamo")
+    content = (tmp_path / "a.bvh").read_text().replace("mixamorig:", "Actor  One ")
+    if "{{" in text:
+        content = content.replace("\n{\n", " {\n", 1)
+    (tmp_path / "b.bvh").write_text(content)
+    assert bvh.read(tmp_path / "b.bvh").joints[0] == "Actor One Hips"
+    np.testing.assert_array_equal(read(tmp_path / "b.bvh").joints, read(tmp_path / "a.bvh").joints)
+    bvh.write(bvh.read(tmp_path / "b.bvh"), tmp_path / "c.bvh")
+    assert bvh.read(tmp_path / "c.bvh").joints == bvh.read(tmp_path / "b.bvh").joints

@@ -69,8 +69,8 @@ def test_no_known_skeleton_is_taken_for_another(skeleton: str):
     [
         (
             "Hips Spine1 Spine2 Spine3 Spine4 Neck Head LeftShoulder LeftArm LeftForeArm LeftHand RightShoulder "
-            "RightArm RightForeArm RightHand LeftThigh LeftShin LeftFoot LeftToe LeftToeTip RightThigh RightShin RightFoot "
-            "RightToe RightToeTip",
+            "RightArm RightForeArm RightHand LeftThigh LeftShin LeftFoot LeftToe LeftToeTip RightThigh "
+            "RightShin RightFoot RightToe RightToeTip",
             "Rokoko",
         ),
         (
@@ -81,8 +81,8 @@ def test_no_known_skeleton_is_taken_for_another(skeleton: str):
         ),
         (
             "Hips Chest Neck Head Head.end LeftCollar LeftUpArm LeftLowArm LeftHand LeftHand.end RightCollar "
-            "RightUpArm RightLowArm RightHand RightHand.end LeftUpLeg LeftLowLeg LeftFoot LeftFoot.end RightUpLeg RightLowLeg "
-            "RightFoot RightFoot.end",
+            "RightUpArm RightLowArm RightHand RightHand.end LeftUpLeg LeftLowLeg LeftFoot LeftFoot.end "
+            "RightUpLeg RightLowLeg RightFoot RightFoot.end",
             "Biovision limbs without toes",
         ),
         (

@@ -187,7 +187,7 @@ def array_layout(joints: np.ndarray, fields: Mapping[str, Any]) -> tuple[Layout,
     elif not names:
         names = next((layout.joints for layout in LAYOUTS.values() if count == len(layout.joints)), ())
     if len(names) != count:
-        rest = f"but skeleton.yaml names {len(names)}" if names else "not the 22, 24 or 52 of SMPL or 77 of SOMA"
+        rest = f"but skeleton.yaml names {len(names)}" if names else "not the 22, 24 or 52 of SMPL or 30 or 77 of SOMA"
         raise UserError(f"{count} joints, {rest}: write the names of all joints and a map into skeleton.yaml")
     return find_layout(names, fields), names
 

@@ -36,7 +36,7 @@ def plain(name: str) -> str:
 
 
 def spellings(name: str, opposite: str) -> list[str]:
-    """Returns the `plain` spellings of a name, whose counterpart on the other side is `opposite`, the name itself first.
+    """Returns the `plain` spellings of a name, itself first; `opposite` is its counterpart on the other side.
 
     The mark of the side is spelled in either length, before or after the rest: LeftHip, L_Hip, hip.L.
     """

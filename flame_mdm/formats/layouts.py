@@ -203,18 +203,18 @@ def find_layout(names: Sequence[str], fields: Mapping[str, Any]) -> Layout:
     Names are matched as in `flame_mdm.formats.names`. Raises `UserError` if no layout fits, or several joints may be
     meant by a name.
     """
-    joints, known = ", ".join(names)[:1000], "map" not in fields
+    joints, mapped = ", ".join(names)[:1000], "map" in fields
     advice = f"Map SMPL's joints in skeleton.yaml (docs/own-data.md) to those of the file: {joints}"
-    if known:
-        match = _nearest(tuple(names))
-        layout = _variants()[match.skeleton]
-    else:
+    if mapped:
         layout = Layout(map=fields["map"])
         match = best_match(names, {"": spelled(layout.pairs())})
+    else:
+        match = _nearest(tuple(names))
+        layout = _variants()[match.skeleton]
     if match.missing:
         lacking = ", ".join(sorted(match.missing))[:500]
         reason = f"unknown skeleton. {match.skeleton} is the nearest known one; missing: {lacking}"
-        if not known:
+        if mapped:
             reason = f"the map in skeleton.yaml uses joints that the file lacks: {lacking}"
         raise UserError(f"{reason}. {advice}")
     chosen = {name: _one(name, [names[number] for number in numbers]) for name, numbers in match.numbers.items()}

@@ -21,6 +21,8 @@ from flame_mdm.safe_io import MEBIBYTE, atomic_write, parse_json, regular_file
 
 UNSIGNED_BYTE, UNSIGNED_SHORT, FLOAT = 5121, 5123, 5126
 WHOLE = {5120: 127, UNSIGNED_BYTE: 255, 5122: 32767, UNSIGNED_SHORT: 65535}  # integers that mean 1, if normalized
+COMPONENTS = {5120: "<i1", UNSIGNED_BYTE: "<u1", 5122: "<i2", UNSIGNED_SHORT: "<u2", 5125: "<u4", FLOAT: "<f4"}
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}  # numbers per item
 KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 LIMIT = 512 * MEBIBYTE  # maximum size of a file that is read
 DOCUMENT_LIMIT = 16 * MEBIBYTE  # maximum size of its JSON part, which takes many times its size in memory
@@ -240,6 +242,33 @@ def _binds(parts: _Document, skin: _Skin, data: bytes) -> np.ndarray:
     if not ((np.abs(binds) <= LARGEST).all() and (np.abs(np.linalg.det(binds)) > 1e-30).all()):
         raise ValueError("inverse bind matrices are not finite, or have no inverse")
     return binds
+
+
+def numbers(file: Glb, accessor: int, kind: str) -> np.ndarray:
+    """Returns the numbers (N, C) of an accessor as float64; normalized integers become numbers up to 1.
+
+    Args:
+        file: the file.
+        accessor: index of the accessor in the document.
+        kind: type that the accessor must have, such as "VEC3".
+
+    Raises `ValueError` if the file does not contain such numbers.
+    """
+    item = _Accessor.model_validate(_item(file.document["accessors"], accessor, "accessor"))
+    view = _View.model_validate(_item(file.document["bufferViews"], item.bufferView, "bufferView"))
+    if item.type != kind or item.componentType not in COMPONENTS or view.buffer:
+        raise ValueError(f"accessor {accessor}: not {kind} in the binary part of the file")
+    dtype = np.dtype(COMPONENTS[item.componentType])
+    width = WIDTHS[kind]
+    stride = view.byteStride or dtype.itemsize * width
+    start = view.byteOffset + item.byteOffset
+    size = stride * (item.count - 1) + dtype.itemsize * width if item.count else 0
+    if stride < dtype.itemsize * width or start + size > len(file.data):
+        raise ValueError(f"accessor {accessor}: ends outside the file")
+    values = np.ndarray((item.count, width), dtype, file.data, start, (stride, dtype.itemsize)).astype(float)
+    if item.normalized and item.componentType in WHOLE:
+        values = np.maximum(values / WHOLE[item.componentType], -1)
+    return values
 
 
 class Binary:

@@ -18,23 +18,22 @@ import numpy as np
 import torch
 
 from flame_mdm.errors import UserError, shortened
-from flame_mdm.formats import WRITTEN, bvh, characters
-from flame_mdm.formats.body import PosedFigure, local_rotations
+from flame_mdm.formats import RIGGED, WRITTEN, bvh, characters, fbx_writer, glb_writer, usd, vrma
+from flame_mdm.formats.body import PosedFigure
 from flame_mdm.formats.characters import Character
-from flame_mdm.formats.glb import Binary, quaternions
 from flame_mdm.formats.poses import Poses
 from flame_mdm.formats.resampling import frame_rate
 from flame_mdm.formats.retarget import continuous_euler, preset, retarget
-from flame_mdm.formats.rig import CENTIMETER, Rig
+from flame_mdm.formats.rig import CENTIMETER
+from flame_mdm.formats.rigged import rigged
 from flame_mdm.representations import rotation
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.representations.smpl import ADULT
 from flame_mdm.safe_io import atomic_write, write_text
-from flame_mdm.visualize.body import ANCHORS, FittedBody, Mesh, largest_weights
+from flame_mdm.visualize.body import Mesh
 
 AMASS_AXES = torch.tensor([[-1.0, 0, 0], [0, 0, 1], [0, 1, 0]], dtype=torch.float64)
 """Converts AMASS's coordinates, z up, to y up as in HumanML3D: (-x, z, y). It is its own inverse."""
-VERTICES, INDICES = 34962, 34963  # uses of a buffer view in glTF
 END_SITES = {
     **{"head": (0.0, 0.18, 0.0), "left_foot": (0.0, 0.0, 0.06), "right_foot": (0.0, 0.0, 0.06)},
     **{"left_wrist": ADULT[22], "right_wrist": ADULT[23]},
@@ -107,18 +106,20 @@ class Motion(PosedFigure):
         ending = path.suffix.lower()
         if ending not in WRITTEN:
             raise UserError(f"{path}: unknown kind of motion file. Use one of {', '.join(WRITTEN)}")
-        rigged = character is None and ending in (".bvh", ".glb")
-        if (rig is not None and not rigged) or (rest_pose and (ending != ".bvh" or not rigged)):
+        on_a_rig = character is None and ending in RIGGED
+        if (rig is not None and not on_a_rig) or (rest_pose and (ending != ".bvh" or not on_a_rig)):
             raise UserError(
-                f"{path}: rig is only for .bvh and .glb files, rest_pose only for .bvh, neither for characters"
+                f"{path}: rig is only for .bvh, .glb and .fbx files, rest_pose only for .bvh, neither for characters"
             )
         if character is not None:
             character = character if isinstance(character, Character) else characters.read(character)
             what = characters.write(path, character, self, self.text or self.id or "motion")
         elif ending == ".bvh":
             what = _write_bvh(self, path, rest_pose, rig)
-        elif ending == ".glb":
-            what = _write_glb(self, path, rig, body)
+        elif ending == ".vrma":
+            what = _write_vrma(self, path)
+        elif ending in RIGGED:
+            what = _write_rigged(self, path, rig, body)
         elif ending == ".npz":
             what = _write_npz(self, path, facts)
         elif ending == ".json":
@@ -210,75 +211,29 @@ def _write_bvh(motion: Motion, path: Path, rest_pose: bool, rig: str | None) -> 
     return f"{unit}, y up; {_error(motion, poses)}" + "; the first frame is the rest pose" * rest_pose
 
 
-def _write_glb(motion: Motion, path: Path, rig: str | None, body: Mesh | None) -> str:
-    """Writes a .glb file in meters, y up, facing +z at rest, with a node per joint and a skinned body, if one fits.
-
-    The node above the joints lifts the body by the thickness of its soles; its toes bend as in pictures.
-    """
+def _write_rigged(motion: Motion, path: Path, rig: str | None, body: Mesh | None) -> str:
+    """Writes a .glb, .fbx or USD file: the skeleton in motion, with a skinned body, if one fits."""
     poses = motion.posed()
     fitted, reason = motion.try_fit(body)
-    skeleton = preset(rig, poses)
-    binary = Binary()
-    moved = poses if fitted is None else Poses(poses.offsets, torch.from_numpy(local_rotations(fitted)), poses.root)
-    turns, root = retarget(moved, skeleton)
-    turns = quaternions(np.concatenate([skeleton.rest()[None], turns]))
-    curves = [("rotation", node, turns[1:, node]) for node in range(len(skeleton.joints))]
-    curves.append(("translation", skeleton.hips, root.astype("f4")))
-    nodes: list[dict[str, Any]] = [
-        {"name": name, "translation": offset.tolist(), "rotation": turn.tolist()}
-        for name, offset, turn in zip(skeleton.joints, skeleton.offsets(), turns[0], strict=True)
-    ]
-    for joint, parent in enumerate(skeleton.parents):
-        if parent >= 0:
-            nodes[parent].setdefault("children", []).append(joint)
-    animation = binary.animation(motion.text or motion.id or "motion", motion.fps, curves)
-    figure: dict[str, Any] = {}
-    if fitted is not None:
-        nodes.append({"name": "figure", "mesh": 0, "skin": 0})
-        figure = _skin(binary, fitted, skeleton)
-    nodes.append({"name": "lifted", "children": [0], "translation": [0, fitted.lift if fitted else 0, 0]})
-    document = {
-        "asset": {"version": "2.0", "generator": "flame_mdm", "extras": {"fps": motion.fps, "text": motion.text}},
-        "scene": 0,
-        "scenes": [{"nodes": list(range(len(skeleton.joints), len(nodes)))}],
-        "nodes": nodes,
-        "animations": [animation],
-        **figure,
-    }
-    binary.save(path, document)
-    return f"meters, y up; {_error(motion, poses)}" + (reason and f"; without a body: {reason}")
+    clip = rigged(poses, motion.text or motion.id or "motion", motion.fps, preset(rig, poses), fitted)
+    ending = path.suffix.lower()
+    if ending == ".fbx":
+        fbx_writer.write(path, clip)
+    elif ending == ".glb":
+        glb_writer.write(path, clip, motion.text)
+    else:
+        usd.write(path, clip)
+    unit = "centimeters" if ending == ".fbx" else "meters"
+    return f"{unit}, y up; {_error(motion, poses)}" + (reason and f"; without a body: {reason}")
 
 
-def _skin(binary: Binary, body: FittedBody, rig: Rig) -> dict[str, Any]:
-    """Appends a body in its stored pose, lifted onto the floor, and returns the document's parts that describe it."""
-    mesh, floor = body.mesh, np.array([0, body.points[:, 1].min(), 0])
-    weights = mesh.weights[:, : len(SMPL22)].copy()  # helper bones join their joints
-    np.add.at(weights.T, list(ANCHORS[len(SMPL22) :]), mesh.weights[:, len(SMPL22) :].T)
-    joint, weight = largest_weights(weights)
-    light = np.rint(255 * (mesh.colors / 255) ** 2.2)  # colors of screens to linear ones
-    light = np.pad(light, ((0, 0), (0, 1)), constant_values=255).astype("u1")
-    attributes = {
-        "POSITION": binary.add((body.points - floor).astype("<f4"), VERTICES, bounds=True),
-        "NORMAL": binary.add(mesh.normals.astype("<f4"), VERTICES),
-        "COLOR_0": binary.add(light, VERTICES, normalized=True),
-        "JOINTS_0": binary.add(joint, VERTICES),
-        "WEIGHTS_0": binary.add(weight, VERTICES, normalized=True),
-    }
-    indices = binary.add(mesh.triangles.astype("<u2").ravel(), INDICES)
-    skinned = [rig.sources.index(number) for number in range(len(SMPL22))]
-    others = [joint for joint, source in enumerate(rig.sources) if source < 0]
-    bind = np.tile(np.eye(4), (len(rig.joints), 1, 1))
-    stored = body.neutral @ mesh.turns[: len(SMPL22)].mT
-    moves = -(stored @ (body.joints - floor)[..., None])
-    bind[: len(SMPL22), :3] = rig.neutral[skinned].mT @ np.concatenate([stored, moves], -1)
-    bind[len(SMPL22) :, :3, :3] = rig.turns[others].mT
-    bind[len(SMPL22) :, :3, 3:] = -(rig.turns[others].mT @ rig.positions[others, :, None])
-    matrices = binary.add(bind.mT.reshape(-1, 16).astype("<f4"))  # matrices are stored in column-major order
-    return {
-        "meshes": [{"primitives": [{"attributes": attributes, "indices": indices, "material": 0}]}],
-        "materials": [{"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.8}}],
-        "skins": [{"joints": skinned + others, "skeleton": 0, "inverseBindMatrices": matrices}],
-    }
+def _write_vrma(motion: Motion, path: Path) -> str:
+    """Writes a .vrma file: a motion for VRM avatars, without a body."""
+    poses = motion.posed()
+    fitted, _ = motion.try_fit()
+    name = motion.text or motion.id or "motion"
+    vrma.write(path, rigged(poses, name, motion.fps, vrma.rest_rig(poses), fitted))
+    return f"meters, y up; for VRM avatars; {_error(motion, poses)}"
 
 
 def _write_json(motion: Motion, path: Path) -> str:

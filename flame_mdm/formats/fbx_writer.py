@@ -1,0 +1,329 @@
+"""Writes a motion with its skeleton and skin as an FBX file: binary 7.4, centimeters, y up.
+
+The structure of the scene follows files of Autodesk's FBX SDK. Programs differ in what they need; the comments name the
+reader that fails without a detail. The bones are at the top level, since Unreal and Unity take a node above them for a
+bone. Their rest pose is in `PreRotation`, so that rotations of 0 are the rest pose in every program.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from flame_mdm.formats import fbx
+from flame_mdm.formats.fbx import Int, Record
+from flame_mdm.formats.fbx_scene import TICKS, TIME_MODES
+from flame_mdm.formats.retarget import continuous_euler
+from flame_mdm.formats.rigged import MATERIAL_NAMES, RiggedClip, Skin
+from flame_mdm.visualize.body import MATERIALS
+
+PER_METER = 100  # the files are in centimeters
+CUSTOM_RATE = 14  # `TimeMode` of a rate in `CustomFrameRate`
+CREATED = "1970-01-01 10:00:00:000"  # equal files for equal motions; readers check the time against `FileId`
+FILE_ID = bytes.fromhex("28b32aebb624ccc2bfc8b02aa92bfcf1")
+EULER = "ZYX"  # R = Rz Ry Rx, the order that FBX calls eEulerXYZ
+LINEAR_KEY = 0x4 | 0x100 | 0x2000 | 0x4000  # interpolation and tangents of a key, as Blender and the SDK write them
+ROOT_BACK = (
+    1e-4  # meters by which a root is moved back: Blender keeps a pelvis in place that is at the tail of its root
+)
+AXES = ("d|X", "d|Y", "d|Z")
+
+
+def write(path: Path, clip: RiggedClip) -> None:
+    """Writes a motion, with the skin of its person if it has one."""
+    fbx.write(path, _Writer(clip).scene())
+
+
+class _Writer:
+    """Collects the objects of a scene and their connections."""
+
+    def __init__(self, clip: RiggedClip) -> None:
+        self.clip = clip
+        self.objects = Record("Objects")
+        self.connections = Record("Connections")
+        self.last_id = 1_000_000
+        self.offsets, self.moves = self._lifted()
+
+    def scene(self) -> Record:
+        """Returns the record that contains all others."""
+        clip = self.clip
+        duration = round((len(clip.turns) - 1) / clip.fps * TICKS)
+        bones = self._skeleton()
+        if clip.skin is not None:
+            self._mesh(clip.skin, bones)
+        self._animation(bones, duration)
+
+        root = Record("")
+        _header(root)
+        root.children.append(_settings(clip.fps, duration))
+        documents = root.add("Documents")
+        documents.add("Count", Int(1))
+        document = documents.add("Document", self._new(), "Scene", "Scene")
+        document.add("RootNode", 0)
+        root.add("References", block=True)
+        root.children.append(_definitions(self.objects))
+        root.children += [self.objects, self.connections]
+        takes = root.add("Takes")
+        takes.add("Current", clip.name)
+        take = takes.add("Take", clip.name)
+        take.add("FileName", "motion.tak")
+        take.add("LocalTime", 0, duration)
+        take.add("ReferenceTime", 0, duration)
+        return root
+
+    def _new(self) -> int:
+        """Returns the id of a new object; some readers fail on negative or small ones."""
+        self.last_id += 1
+        return self.last_id
+
+    def _object(self, kind: str, name: str, category: str, label: str | None = None) -> tuple[int, Record]:
+        number = self._new()
+        return number, self.objects.add(kind, number, f"{name}\x00\x01{label or kind}", category)
+
+    def _connect(self, child: int, parent: int, target: str | None = None) -> None:
+        if target is None:
+            self.connections.add("C", "OO", child, parent)
+        else:
+            self.connections.add("C", "OP", child, parent, target)
+
+    def _lifted(self) -> tuple[np.ndarray, dict[int, np.ndarray]]:
+        """Returns the offsets (J, 3) and the moves of the clip in centimeters, with the person on its soles.
+
+        A root on the floor is moved back by `ROOT_BACK`, and the hips forward by the same distance.
+        """
+        clip = self.clip
+        offsets = clip.offsets.copy()
+        moves = {joint: moved.copy() for joint, moved in clip.moves.items()}
+        hips = max(moves)
+        root = clip.parents[hips]
+        up = np.array([0, clip.lift, 0])
+        if root < 0:
+            offsets[hips] += up
+            moves[hips] += up
+        else:
+            turns = clip.turns[:, root]
+            back = clip.rest[root].T @ [0, 0, ROOT_BACK]
+            offsets[root] -= clip.rest[root] @ back
+            offsets[hips] += back + clip.rest[root].T @ up
+            moves[hips] += back + (turns.mT @ up[:, None])[..., 0]
+            if root in moves:
+                moves[root] -= turns @ back
+        return PER_METER * offsets, {joint: PER_METER * moved for joint, moved in moves.items()}
+
+    def _skeleton(self) -> list[int]:
+        """Adds the bones in the rest pose; returns their ids."""
+        clip, bones = self.clip, []
+        before = _degrees(clip.rest[None])[0]
+        for joint, name in enumerate(clip.joints):
+            attribute, record = self._object("NodeAttribute", name, "LimbNode")
+            record.add("TypeFlags", "Skeleton")
+            number, record = self._object("Model", name, "LimbNode")
+            _model(record, self.offsets[joint], before[joint])
+            bones.append(number)
+            self._connect(attribute, number)
+            parent = clip.parents[joint]
+            self._connect(number, bones[parent] if parent >= 0 else 0)
+        return bones
+
+    def _mesh(self, skin: Skin, bones: Sequence[int]) -> None:
+        """Adds the mesh in the pose in which it is bound, its materials, the skin and the bind pose."""
+        geometry, record = self._object("Geometry", "person", "Mesh")
+        _geometry(record, skin)
+        model, record = self._object("Model", "person", "Mesh")
+        _model(record, np.zeros(3), np.zeros(3))
+        self._connect(model, 0)
+        self._connect(geometry, model)
+        for name, color in zip(MATERIAL_NAMES, MATERIALS, strict=True):
+            material, record = self._object("Material", name, "")
+            _material(record, np.array(color) / 255)
+            self._connect(material, model)
+
+        deformer, record = self._object("Deformer", "skin", "Skin")
+        record.add("Version", Int(101))
+        record.add("Link_DeformAcuracy", 50.0)
+        self._connect(deformer, geometry)
+        poses = {model: np.eye(4)}
+        for index, joint in enumerate(skin.ordered):
+            bind = skin.binds[index].copy()
+            bind[:3, 3] *= PER_METER
+            poses[bones[joint]] = np.linalg.inv(bind)
+            rows, columns = np.nonzero((skin.bones == index) & (skin.weights > 0))
+            if len(rows):
+                name = self.clip.joints[joint]
+                cluster, record = self._object("Deformer", name, "Cluster", "SubDeformer")
+                record.add("Version", Int(100))
+                record.add("UserData", "", "")
+                record.add("Indexes", rows.astype("<i4"))
+                record.add("Weights", skin.weights[rows, columns] / 255)
+                record.add("Transform", _matrix(bind))
+                record.add("TransformLink", _matrix(poses[bones[joint]]))
+                self._connect(cluster, deformer)
+                self._connect(bones[joint], cluster)
+
+        _, record = self._object("Pose", "bind pose", "BindPose")
+        record.add("Type", "BindPose")
+        record.add("Version", Int(100))
+        record.add("NbPoseNodes", Int(len(poses)))
+        for number, matrix in poses.items():
+            node = record.add("PoseNode")
+            node.add("Node", number)
+            node.add("Matrix", _matrix(matrix))
+
+    def _animation(self, bones: Sequence[int], duration: int) -> None:
+        """Adds one key per frame for the rotations of all bones, and for the positions of those that move."""
+        clip = self.clip
+        stack, record = self._object("AnimationStack", clip.name, "", "AnimStack")
+        record.block = True  # without a block, assimp finds no animation
+        properties = record.add("Properties70")
+        for name, value in (("LocalStop", duration), ("ReferenceStop", duration)):
+            properties.add("P", name, "KTime", "Time", "", value)
+        layer, record = self._object("AnimationLayer", "base layer", "", "AnimLayer")
+        record.block = True
+        self._connect(layer, stack)
+
+        times = np.round(np.arange(len(clip.turns)) / clip.fps * TICKS).astype("<i8")
+        angles = _degrees(clip.rest.mT @ clip.turns)
+        for joint, bone in enumerate(bones):
+            self._curves(layer, bone, "Lcl Rotation", "R", times, angles[:, joint])
+        for joint, moved in self.moves.items():
+            self._curves(layer, bones[joint], "Lcl Translation", "T", times, moved)
+
+    def _curves(self, layer: int, bone: int, target: str, label: str, times: np.ndarray, values: np.ndarray) -> None:
+        """Adds the three curves of a property, values (F, 3)."""
+        node, record = self._object("AnimationCurveNode", label, "", "AnimCurveNode")
+        properties = record.add("Properties70")
+        self._connect(node, layer)
+        self._connect(node, bone, target)
+        for axis, name in enumerate(AXES):
+            properties.add("P", name, "Number", "", "A", float(values[0, axis]))
+            curve, record = self._object("AnimationCurve", "", "", "AnimCurve")
+            record.add("Default", float(values[0, axis]))
+            record.add("KeyVer", Int(4008))
+            record.add("KeyTime", times)
+            record.add("KeyValueFloat", values[:, axis].astype("<f4"))
+            record.add("KeyAttrFlags", np.array([LINEAR_KEY], "<i4"))
+            record.add("KeyAttrDataFloat", np.zeros(4, "<f4"))
+            record.add("KeyAttrRefCount", np.array([len(times)], "<i4"))
+            self._connect(curve, node, name)
+
+
+def _degrees(turns: np.ndarray) -> np.ndarray:
+    """Converts rotations (F, J, 3, 3) to angles (F, J, 3) about x, y and z in degrees, without jumps."""
+    angles = continuous_euler(torch.from_numpy(turns), [EULER] * turns.shape[1])
+    return np.degrees(angles.flip(-1).numpy())
+
+
+def _matrix(matrix: np.ndarray) -> np.ndarray:
+    """Returns the 16 numbers of a matrix; the translation is in the last four."""
+    return matrix.T.astype("<f8").ravel()
+
+
+def _vector(properties: Record, name: str, kind: str, flags: str, values: Sequence[float] | np.ndarray) -> None:
+    properties.add("P", name, kind, "Vector" if kind == "Vector3D" else "", flags, *map(float, values))
+
+
+def _model(record: Record, offset: np.ndarray, before: np.ndarray) -> None:
+    record.add("Version", Int(232))
+    properties = record.add("Properties70")
+    properties.add("P", "RotationActive", "bool", "", "", Int(1))
+    properties.add("P", "InheritType", "enum", "", "", Int(1))
+    # Autodesk's SDK drops meshes without this property.
+    properties.add("P", "DefaultAttributeIndex", "int", "Integer", "", Int(0))
+    _vector(properties, "PreRotation", "Vector3D", "", before)
+    _vector(properties, "Lcl Translation", "Lcl Translation", "A", offset)
+    _vector(properties, "Lcl Rotation", "Lcl Rotation", "A", (0, 0, 0))
+    _vector(properties, "Lcl Scaling", "Lcl Scaling", "A", (1, 1, 1))
+    record.add("Shading", True)
+    record.add("Culling", "CullingOff")
+
+
+def _material(record: Record, color: np.ndarray) -> None:
+    record.add("Version", Int(102))
+    record.add("ShadingModel", "lambert")
+    record.add("MultiLayer", Int(0))
+    properties = record.add("Properties70")
+    properties.add("P", "DiffuseColor", "Color", "", "A", *map(float, color))
+    properties.add("P", "DiffuseFactor", "Number", "", "A", 1.0)
+
+
+def _geometry(record: Record, skin: Skin) -> None:
+    record.add("GeometryVersion", Int(124))
+    record.add("Vertices", (PER_METER * skin.points).astype("<f8").ravel())
+    corners = skin.triangles.astype("<i4").copy()
+    corners[:, 2] = ~corners[:, 2]  # the last corner of a polygon is stored as its complement
+    record.add("PolygonVertexIndex", corners.ravel())
+
+    normals = record.add("LayerElementNormal", Int(0))
+    normals.add("Version", Int(101))
+    normals.add("Name", "")
+    normals.add("MappingInformationType", "ByPolygonVertex")
+    normals.add("ReferenceInformationType", "IndexToDirect")
+    normals.add("Normals", np.round(skin.normals, 5).astype("<f8").ravel())
+    normals.add("NormalsIndex", skin.triangles.astype("<i4").ravel())
+
+    materials = record.add("LayerElementMaterial", Int(0))
+    materials.add("Version", Int(101))
+    materials.add("Name", "")
+    materials.add("MappingInformationType", "ByPolygon")
+    materials.add("ReferenceInformationType", "IndexToDirect")
+    materials.add("Materials", skin.materials.astype("<i4"))
+
+    layer = record.add("Layer", Int(0))
+    layer.add("Version", Int(100))
+    for kind in ("LayerElementNormal", "LayerElementMaterial"):
+        element = layer.add("LayerElement")
+        element.add("Type", kind)
+        element.add("TypedIndex", Int(0))
+
+
+def _header(root: Record) -> None:
+    header = root.add("FBXHeaderExtension")
+    header.add("FBXHeaderVersion", Int(1003))
+    header.add("FBXVersion", Int(fbx.VERSION))
+    header.add("EncryptionType", Int(0))
+    stamp = header.add("CreationTimeStamp")
+    stamp.add("Version", Int(1000))
+    date = {"Year": 1970, "Month": 1, "Day": 1, "Hour": 10, "Minute": 0, "Second": 0, "Millisecond": 0}
+    for name, value in date.items():
+        stamp.add(name, Int(value))
+    header.add("Creator", "flame_mdm")
+    root.add("FileId", FILE_ID)
+    root.add("CreationTime", CREATED)
+    root.add("Creator", "flame_mdm")
+
+
+def _settings(fps: float, duration: int) -> Record:
+    settings = Record("GlobalSettings")
+    settings.add("Version", Int(1000))
+    properties = settings.add("Properties70")
+
+    def add(name: str, kind: str, label: str, value: Any) -> None:
+        properties.add("P", name, kind, label, "", value)
+
+    for name, axis in (("Up", 1), ("Front", 2), ("Coord", 0)):
+        add(f"{name}Axis", "int", "Integer", Int(axis))
+        add(f"{name}AxisSign", "int", "Integer", Int(1))
+    add("OriginalUpAxis", "int", "Integer", Int(1))
+    add("OriginalUpAxisSign", "int", "Integer", Int(1))
+    add("UnitScaleFactor", "double", "Number", 1.0)
+    add("OriginalUnitScaleFactor", "double", "Number", 1.0)
+    mode = next((mode for mode, rate in TIME_MODES.items() if abs(rate - fps) < 1e-6), CUSTOM_RATE)
+    add("TimeMode", "enum", "", Int(mode))
+    add("TimeSpanStart", "KTime", "Time", 0)
+    add("TimeSpanStop", "KTime", "Time", duration)
+    add("CustomFrameRate", "double", "Number", float(fps))
+    return settings
+
+
+def _definitions(objects: Record) -> Record:
+    counts = Counter(record.name for record in objects.children)
+    definitions = Record("Definitions")
+    definitions.add("Version", Int(100))
+    definitions.add("Count", Int(1 + sum(counts.values())))
+    definitions.add("ObjectType", "GlobalSettings").add("Count", Int(1))
+    for name, count in counts.items():
+        definitions.add("ObjectType", name).add("Count", Int(count))
+    return definitions

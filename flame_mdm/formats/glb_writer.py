@@ -1,0 +1,64 @@
+"""Writes a motion with its skeleton and skin as a .glb file: meters, y up, facing +z at rest."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flame_mdm.formats.glb import Binary, quaternions
+from flame_mdm.formats.rigged import RiggedClip, Skin
+
+VERTICES, INDICES = 34962, 34963  # uses of a buffer view in glTF
+
+
+def write(path: Path, clip: RiggedClip, text: str) -> None:
+    """Writes a clip with one node per joint, and the skin if it has one; `text` is stored in the file.
+
+    The node above the joints lifts the person by the thickness of the soles.
+    """
+    binary = Binary()
+    turns = quaternions(np.concatenate([clip.rest[None], clip.turns]))
+    curves = [("rotation", node, turns[1:, node]) for node in range(len(clip.joints))]
+    curves += [("translation", node, moved.astype("f4")) for node, moved in clip.moves.items()]
+    nodes: list[dict[str, Any]] = [
+        {"name": name, "translation": offset.tolist(), "rotation": turn.tolist()}
+        for name, offset, turn in zip(clip.joints, clip.offsets, turns[0], strict=True)
+    ]
+    for joint, parent in enumerate(clip.parents):
+        if parent >= 0:
+            nodes[parent].setdefault("children", []).append(joint)
+    animation = binary.animation(clip.name, clip.fps, curves)
+    figure: dict[str, Any] = {}
+    if clip.skin is not None:
+        nodes.append({"name": "figure", "mesh": 0, "skin": 0})
+        figure = _skin(binary, clip.skin)
+    nodes.append({"name": "lifted", "children": [0], "translation": [0, clip.lift, 0]})
+    document = {
+        "asset": {"version": "2.0", "generator": "flame_mdm", "extras": {"fps": clip.fps, "text": text}},
+        "scene": 0,
+        "scenes": [{"nodes": list(range(len(clip.joints), len(nodes)))}],
+        "nodes": nodes,
+        "animations": [animation],
+        **figure,
+    }
+    binary.save(path, document)
+
+
+def _skin(binary: Binary, skin: Skin) -> dict[str, Any]:
+    """Appends the mesh of a person, and returns the parts of the document that describe it."""
+    light = np.rint(255 * (skin.colors / 255) ** 2.2)  # colors of screens to linear ones
+    light = np.pad(light, ((0, 0), (0, 1)), constant_values=255).astype("u1")
+    attributes = {
+        "POSITION": binary.add(skin.points.astype("<f4"), VERTICES, bounds=True),
+        "NORMAL": binary.add(skin.normals.astype("<f4"), VERTICES),
+        "COLOR_0": binary.add(light, VERTICES, normalized=True),
+        "JOINTS_0": binary.add(skin.bones, VERTICES),
+        "WEIGHTS_0": binary.add(skin.weights, VERTICES, normalized=True),
+    }
+    indices = binary.add(skin.triangles.astype("<u2").ravel(), INDICES)
+    matrices = binary.add(skin.binds.mT.reshape(-1, 16).astype("<f4"))  # matrices are stored in column-major order
+    return {
+        "meshes": [{"primitives": [{"attributes": attributes, "indices": indices, "material": 0}]}],
+        "materials": [{"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.8}}],
+        "skins": [{"joints": list(skin.ordered), "skeleton": 0, "inverseBindMatrices": matrices}],
+    }

@@ -1,0 +1,185 @@
+"""A motion on a skeleton of another program, with the skin of a person, for the writers of .glb, .fbx and .usd files.
+
+Lengths are in meters, y up; the rest pose faces +z. Frames, joints and vertices are counted by F, J and V.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from flame_mdm.errors import UserError
+from flame_mdm.formats.body import local_rotations
+from flame_mdm.formats.poses import Poses
+from flame_mdm.formats.retarget import retarget
+from flame_mdm.formats.rig import Rig
+from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.visualize.body import ANCHORS, MATERIALS, FittedBody, largest_weights
+
+MATERIAL_NAMES = ("skin", "hair", "shirt", "trousers", "shoes")  # in the order of `MATERIALS`
+
+
+@dataclass(frozen=True, eq=False)
+class Skin:
+    """A skinned mesh in the pose in which it is bound to the skeleton.
+
+    Attributes:
+        points: (V, 3), with the soles on the floor; `normals` (V, 3) of length 1.
+        colors: (V, 3) from 0 to 255, as screens show them.
+        triangles: (T, 3), counterclockwise seen from outside.
+        materials: (T,), index into `MATERIAL_NAMES` of each triangle.
+        ordered: indices of all joints of the skeleton; those that follow a joint of SMPL come first, in its order.
+        bones: (V, 4), the joints that move a vertex, as indices into `ordered`.
+        weights: (V, 4) integers that add up to 255: the share of each of these joints.
+        binds: (J, 4, 4), matrices from the coordinates of the mesh to the coordinates of each joint in `ordered`.
+    """
+
+    points: np.ndarray
+    normals: np.ndarray
+    colors: np.ndarray
+    triangles: np.ndarray
+    materials: np.ndarray
+    ordered: tuple[int, ...]
+    bones: np.ndarray
+    weights: np.ndarray
+    binds: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class RiggedClip:
+    """A skeleton in motion.
+
+    Attributes:
+        name: the name of the animation.
+        fps: frames per second.
+        joints: names of the J joints.
+        parents: index of the parent of each joint, smaller than the index of the joint; -1 for the root.
+        offsets: (J, 3), position of each joint relative to its parent in the rest pose.
+        rest: (J, 3, 3), rotation of each joint relative to its parent in the rest pose.
+        turns: (F, J, 3, 3), rotations relative to parents.
+        moves: joints that move relative to their parents -> positions (F, 3) relative to their parents.
+        lift: height by which the person in `skin` is above these positions: the thickness of the soles.
+        skin: the mesh of a person; None if the motion does not fit one.
+    """
+
+    name: str
+    fps: float
+    joints: tuple[str, ...]
+    parents: tuple[int, ...]
+    offsets: np.ndarray
+    rest: np.ndarray
+    turns: np.ndarray
+    moves: dict[int, np.ndarray]
+    lift: float
+    skin: Skin | None
+
+    def world(self) -> tuple[np.ndarray, np.ndarray]:
+        """Returns positions (F, J, 3) and rotations (F, J, 3, 3) of the joints in the world, not lifted."""
+        positions = np.tile(self.offsets, (len(self.turns), 1, 1))
+        for joint, moved in self.moves.items():
+            positions[:, joint] = moved
+        turns = self.turns.copy()
+        for joint, parent in enumerate(self.parents):
+            if parent >= 0:
+                bone = turns[:, parent] @ positions[:, joint, :, None]
+                positions[:, joint] = positions[:, parent] + bone[..., 0]
+                turns[:, joint] = turns[:, parent] @ turns[:, joint]
+        return positions, turns
+
+
+def rigged(
+    poses: Poses,
+    name: str,
+    fps: float,
+    skeleton: Rig,
+    fitted: FittedBody | None = None,
+    root_motion: bool = False,
+) -> RiggedClip:
+    """Returns a body in motion as a clip of a skeleton.
+
+    Args:
+        poses: the body.
+        name: name of the animation.
+        fps: frames per second.
+        skeleton: the skeleton, with the bone lengths of the body.
+        fitted: the body of the person, whose toes bend as in pictures; None = no skin.
+        root_motion: the root on the floor follows the hips and their direction; otherwise it stays in place.
+
+    Raises `UserError` for `root_motion` of a skeleton without a root on the floor.
+    """
+    moved = poses if fitted is None else Poses(poses.offsets, torch.from_numpy(local_rotations(fitted)), poses.root)
+    turns, hips = retarget(moved, skeleton)
+    moves = {skeleton.hips: hips}
+    if root_motion:
+        if skeleton.parents[skeleton.hips] < 0:
+            raise UserError("root_motion=true: this skeleton has no root on the floor. Use rig=unreal or rig=soma")
+        turns, moves = _with_root_motion(turns, hips, skeleton)
+    return RiggedClip(
+        name=name,
+        fps=fps,
+        joints=skeleton.joints,
+        parents=skeleton.parents,
+        offsets=skeleton.offsets(),
+        rest=skeleton.rest(),
+        turns=turns,
+        moves=moves,
+        lift=fitted.lift if fitted else 0.0,
+        skin=None if fitted is None else _skin(fitted, skeleton),
+    )
+
+
+def _with_root_motion(turns: np.ndarray, hips: np.ndarray, skeleton: Rig) -> tuple[np.ndarray, dict[int, np.ndarray]]:
+    """Moves the path of the hips on the floor, and their direction, to the root, the joint above the hips.
+
+    The direction is the heading of the hips relative to the first frame's axes, a turn about the vertical.
+    """
+    root, joint = skeleton.parents[skeleton.hips], skeleton.hips
+    above = skeleton.turns[root]
+    world = above @ turns[:, joint] @ skeleton.turns[joint].T  # from the rest pose
+    left = world[:, :, 0]
+    heading = np.unwrap(np.arctan2(-left[:, 2], left[:, 0]))
+    cosine, sine = np.cos(heading), np.sin(heading)
+    facing = np.tile(np.eye(3), (len(turns), 1, 1))
+    facing[:, 0, 0] = facing[:, 2, 2] = cosine
+    facing[:, 0, 2] = sine
+    facing[:, 2, 0] = -sine
+
+    path = hips * [1, 0, 1]
+    turns = turns.copy()
+    turned_root = facing @ above
+    turns[:, joint] = turned_root.mT @ (above @ turns[:, joint])
+    turns[:, root] = turned_root
+    local_hips = (turned_root.mT @ (hips - path)[..., None])[..., 0]
+    return turns, {root: path, joint: local_hips}
+
+
+def _skin(body: FittedBody, rig: Rig) -> Skin:
+    """Returns the mesh of a body in its stored pose, lifted onto the floor."""
+    mesh, floor = body.mesh, np.array([0, body.points[:, 1].min(), 0])
+    weights = mesh.weights[:, : len(SMPL22)].copy()  # helper bones join their joints
+    np.add.at(weights.T, list(ANCHORS[len(SMPL22) :]), mesh.weights[:, len(SMPL22) :].T)
+    bones, shares = largest_weights(weights)
+
+    skinned = [rig.sources.index(number) for number in range(len(SMPL22))]
+    others = [joint for joint, source in enumerate(rig.sources) if source < 0]
+    binds = np.tile(np.eye(4), (len(rig.joints), 1, 1))
+    stored = body.neutral @ mesh.turns[: len(SMPL22)].mT
+    moves = -(stored @ (body.joints - floor)[..., None])
+    count = len(skinned)
+    binds[:count, :3] = rig.neutral[skinned].mT @ np.concatenate([stored, moves], -1)
+    binds[count:, :3, :3] = rig.turns[others].mT
+    binds[count:, :3, 3:] = -(rig.turns[others].mT @ rig.positions[others, :, None])
+
+    faces = mesh.colors[mesh.triangles].mean(1)
+    differences = np.linalg.norm(faces[:, None] - np.array(MATERIALS, float), axis=-1)
+    return Skin(
+        points=body.points - floor,
+        normals=mesh.normals,
+        colors=mesh.colors,
+        triangles=mesh.triangles,
+        materials=differences.argmin(1),
+        ordered=(*skinned, *others),
+        bones=bones,
+        weights=shares,
+        binds=binds,
+    )

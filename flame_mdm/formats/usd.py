@@ -1,0 +1,154 @@
+# pyright: reportAttributeAccessIssue=false
+# The modules of usd-core come from C++ and have no types.
+"""Writes a motion with its skeleton and skin as Universal Scene Description: .usda, .usdc or .usdz, with UsdSkel.
+
+Pixar, "UsdSkel", https://openusd.org/release/api/usd_skel_page_front.html. Needs the package usd-core, extra `usd`.
+"""
+
+import re
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flame_mdm.errors import UserError
+from flame_mdm.formats.glb import quaternions
+from flame_mdm.formats.rigged import MATERIAL_NAMES, RiggedClip, Skin
+from flame_mdm.safe_io import atomic_write
+from flame_mdm.visualize.body import MATERIALS
+
+INFLUENCES = 4  # joints per vertex
+
+
+def write(path: Path, clip: RiggedClip) -> None:
+    """Writes a clip in meters, y up; raises `UserError` if usd-core is not installed."""
+    try:
+        from pxr import Sdf, Usd, UsdGeom, UsdSkel, UsdUtils
+    except ImportError as error:
+        advice = 'install it with pip install "flame-mdm[usd]"'
+        raise UserError(f"{path}: {path.suffix} files need the package usd-core: {advice}") from error
+
+    with atomic_write(path) as temporary, tempfile.TemporaryDirectory() as folder:
+        ending = ".usdc" if path.suffix == ".usdz" else path.suffix
+        file = Path(folder) / f"motion{ending}"
+        stage = Usd.Stage.CreateNew(str(file))
+        UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+        UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+        stage.SetTimeCodesPerSecond(clip.fps)
+        stage.SetFramesPerSecond(clip.fps)
+        stage.SetStartTimeCode(0)
+        stage.SetEndTimeCode(len(clip.turns) - 1)
+        root = UsdSkel.Root.Define(stage, "/person")
+        stage.SetDefaultPrim(root.GetPrim())
+
+        _skeleton(stage, clip)
+        if clip.skin is not None:
+            _mesh(stage, clip.skin)
+        _extent(stage, root, clip)
+        stage.GetRootLayer().Save()
+        if path.suffix == ".usdz":
+            package = Path(folder) / "motion.usdz"
+            UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(file)), str(package))
+            file = package
+        temporary.write_bytes(file.read_bytes())
+
+
+def _paths(clip: RiggedClip) -> list[str]:
+    """Returns the joints as paths from the root, in which names have letters, digits and underscores only."""
+    paths: list[str] = []
+    for name, parent in zip(clip.joints, clip.parents, strict=True):
+        plain = re.sub(r"\W", "_", name)
+        plain = f"_{plain}" if plain[0].isdigit() else plain
+        paths.append(f"{paths[parent]}/{plain}" if parent >= 0 else plain)
+    return paths
+
+
+def _matrices(values: np.ndarray) -> Any:
+    """Returns matrices (N, 4, 4) as USD stores them, with the translation in the last row."""
+    from pxr import Gf, Vt
+
+    return Vt.Matrix4dArray([Gf.Matrix4d(matrix.T.tolist()) for matrix in values])
+
+
+def _skeleton(stage: Any, clip: RiggedClip) -> None:
+    from pxr import Gf, UsdSkel, Vt
+
+    skeleton = UsdSkel.Skeleton.Define(stage, "/person/skeleton")
+    paths = _paths(clip)
+    skeleton.CreateJointsAttr(paths)
+    rest = np.tile(np.eye(4), (len(paths), 1, 1))
+    rest[:, :3, :3] = clip.rest
+    rest[:, :3, 3] = clip.offsets
+    skeleton.CreateRestTransformsAttr(_matrices(rest))
+    bound = rest.copy()
+    for joint, parent in enumerate(clip.parents):
+        if parent >= 0:
+            bound[joint] = bound[parent] @ rest[joint]
+    if clip.skin is not None:
+        bound[list(clip.skin.ordered)] = np.linalg.inv(clip.skin.binds)
+    skeleton.CreateBindTransformsAttr(_matrices(bound))
+
+    animation = UsdSkel.Animation.Define(stage, "/person/skeleton/animation")
+    animation.CreateJointsAttr(paths)
+    animation.CreateScalesAttr(Vt.Vec3hArray([Gf.Vec3h(1, 1, 1)] * len(paths)))
+    turns = quaternions(clip.turns)
+    moved = np.tile(clip.offsets, (len(clip.turns), 1, 1))
+    for joint, path in clip.moves.items():
+        moved[:, joint] = path
+    moved[:, 0] += [0, clip.lift, 0]
+    rotations, translations = animation.CreateRotationsAttr(), animation.CreateTranslationsAttr()
+    for frame in range(len(turns)):
+        values = [Gf.Quatf(float(w), float(x), float(y), float(z)) for x, y, z, w in turns[frame]]
+        rotations.Set(Vt.QuatfArray(values), frame)
+        translations.Set(Vt.Vec3fArray.FromNumpy(moved[frame].astype("f4")), frame)
+    binding = UsdSkel.BindingAPI.Apply(skeleton.GetPrim())
+    binding.CreateAnimationSourceRel().SetTargets([animation.GetPath()])
+
+
+def _mesh(stage: Any, skin: Skin) -> None:
+    from pxr import Gf, Sdf, UsdGeom, UsdShade, UsdSkel, Vt
+
+    mesh = UsdGeom.Mesh.Define(stage, "/person/mesh")
+    mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(skin.points.astype("f4")))
+    mesh.CreateFaceVertexCountsAttr([3] * len(skin.triangles))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(skin.triangles.astype("i4").ravel()))
+    mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(skin.normals.astype("f4")))
+    mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    mesh.CreateExtentAttr(UsdGeom.PointBased.ComputeExtent(mesh.GetPointsAttr().Get()))
+
+    binding = UsdSkel.BindingAPI.Apply(mesh.GetPrim())
+    binding.CreateSkeletonRel().SetTargets([Sdf.Path("/person/skeleton")])
+    joints = np.array(skin.ordered, "i4")[skin.bones]
+    shares = skin.weights.astype("f4") / 255
+    binding.CreateJointIndicesPrimvar(False, INFLUENCES).Set(Vt.IntArray.FromNumpy(joints.ravel()))
+    binding.CreateJointWeightsPrimvar(False, INFLUENCES).Set(Vt.FloatArray.FromNumpy(shares.ravel()))
+    binding.CreateGeomBindTransformAttr(Gf.Matrix4d(1))
+
+    for number, (name, color) in enumerate(zip(MATERIAL_NAMES, MATERIALS, strict=True)):
+        material = UsdShade.Material.Define(stage, f"/person/materials/{name}")
+        shader = UsdShade.Shader.Define(stage, f"/person/materials/{name}/surface")
+        shader.CreateIdAttr("UsdPreviewSurface")
+        linear = (np.array(color) / 255) ** 2.2
+        shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).Set(Gf.Vec3f(*linear.tolist()))
+        shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(0.8)
+        material.CreateSurfaceOutput().ConnectToSource(shader.ConnectableAPI(), "surface")
+        triangles = np.nonzero(skin.materials == number)[0].astype("i4")
+        subset = UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).CreateMaterialBindSubset(
+            name, Vt.IntArray.FromNumpy(triangles)
+        )
+        UsdShade.MaterialBindingAPI.Apply(subset.GetPrim()).Bind(material)
+
+
+def _extent(stage: Any, root: Any, clip: RiggedClip) -> None:
+    """Declares the box around the person in each frame, from the joints."""
+    from pxr import UsdGeom, Vt
+
+    positions, _ = clip.world()
+    positions[..., 1] += clip.lift
+    margin = 0.25  # meters from joints to the farthest point of the surface, the tips of hands and head
+    boxes = UsdGeom.Boundable(root.GetPrim()).CreateExtentAttr()
+    for frame, points in enumerate(positions):
+        box = np.stack([points.min(0) - margin, points.max(0) + margin]).astype("f4")
+        boxes.Set(Vt.Vec3fArray.FromNumpy(box), frame)

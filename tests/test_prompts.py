@@ -19,11 +19,11 @@ import flame_mdm
 from evaluators.metrics.attributes import read_attributes
 from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.locating import find
-from flame_mdm.commands.sample import default_folder
 from flame_mdm.conditions.vocabulary import check_known
 from flame_mdm.errors import UserError
 from flame_mdm.formats.readers import read
 from flame_mdm.safe_io import read_yaml, sha256
+from flame_mdm.sampling.output import default_folder
 
 SENTENCES = read_yaml(ROOT / "tests" / "fixtures" / "sentences.yaml")
 PROMPTS = ["a person walks", "a person jumps: 100%, twice", "人が歩く, waving"]

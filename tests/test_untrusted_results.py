@@ -39,7 +39,7 @@ from flame_mdm.reporting.tables.specs import Figure
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.safe_io import atomic_folder, atomic_write, write_json
-from flame_mdm.sampling.generation import write_motions
+from flame_mdm.sampling.output import write_motions
 from flame_mdm.visualize import contact_sheet, player_page, write_gif
 
 pytestmark = pytest.mark.slow
@@ -202,7 +202,7 @@ def test_a_sample_folder_is_whole_or_absent(attacked, bad, trained, monkeypatch)
     for name in ("Motion.save", "write_player"):
         with monkeypatch.context() as patch:
             full = Mock(side_effect=OSError(28, "No space left on device"))
-            patch.setattr(f"flame_mdm.sampling.generation.{name}", full)
+            patch.setattr(f"flame_mdm.sampling.output.{name}", full)
             attacked(*words, "out=new/folder", says="No space left on device")
     (bad / "file").write_text("mine")
     attacked(*words, f"out={bad / 'file'}", says="file: a file, not a folder")

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from evaluators.extractors.action_gru import ActionGRU
@@ -22,6 +23,7 @@ from flame_mdm.checkpoints.released_weights import load_strictly, read_weights
 from flame_mdm.conditions.vocabulary import words
 from flame_mdm.data.humanact12 import read_unconstrained
 from flame_mdm.errors import UserError
+from flame_mdm.formats.motion import Motion
 from flame_mdm.representations import Representation
 from flame_mdm.safe_io import sha256
 from flame_mdm.seeds import key
@@ -99,6 +101,23 @@ class MotionCLIPExtractor(OwnExtractor):
         if new:
             self.encoded |= dict(zip(new, self.task.text(new), strict=True))
         return torch.stack([self.encoded[caption] for caption in captions])
+
+    @torch.no_grad()
+    def fit(self, motions: Sequence[Motion]) -> list[float]:
+        """Returns how well motions fit their texts: the cosine similarity, its mean over the parts of a motion.
+
+        Motions that were selected by a motion-CLIP have a better score of it: evaluate them with a different one.
+        """
+        scores = []
+        for motion in motions:
+            parts = motion.parts or ((motion.text, 0, len(motion.features)),)
+            texts = self.texts([text for text, _, _ in parts], [None] * len(parts))
+            features = []
+            for _, begin, end in parts:
+                x = torch.from_numpy(motion.features[None, begin:end]).to(texts.device)
+                features.append(self.task(x, torch.ones_like(x[..., 0], dtype=torch.bool)))
+            scores.append(float(F.cosine_similarity(torch.cat(features), texts).mean()))
+        return scores
 
 
 class OwnT2MExtractor(OwnExtractor):

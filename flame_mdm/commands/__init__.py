@@ -1,18 +1,27 @@
 """Commands, one file each; `flame_mdm.__main__` lists them. This module has the keys that several commands share."""
 
+from __future__ import annotations
+
 import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from flame_mdm.checkpoints.locating import Which, find
 from flame_mdm.config import EXPERIMENTS, Config, compose_data
 from flame_mdm.errors import UserError, did_you_mean
 from flame_mdm.formats import ENDINGS
-from flame_mdm.sampler_options import option, required
+from flame_mdm.safe_io import sha256
+from flame_mdm.sampler_options import SamplerOptions, option, required, same_option
+from flame_mdm.sampling.motion_request import EditRequest, SamplingRequest
+
+if TYPE_CHECKING:
+    from flame_mdm.generator import MotionGenerator
+    from flame_mdm.visualize.body import Mesh
 
 STORE = "store.json"
 
@@ -53,6 +62,12 @@ def device_name(key: str, device: str) -> None:
     if not re.fullmatch(r"cpu|mps|xpu|cuda(:\d+)?", device):
         near = did_you_mean(device, ["cpu", "cuda"])
         raise UserError(f"{key}={device}: unknown.{near} Give cpu, cuda or cuda:NUMBER")
+
+
+def video(key: str, requested: bool) -> None:
+    """Checks that MP4 files can be written."""
+    if requested and find_spec("av") is None:
+        raise UserError(f'{key}=true: MP4 needs the package av. Run pip install "flame-mdm[video]", or write a GIF')
 
 
 def above_zero(key: str, number: int) -> None:
@@ -97,6 +112,75 @@ class BodySettings:
     """The body in pictures, pages and files."""
 
     body: str = option("mannequin", "or the file of another body: docs/formats.md", body_name)
+
+
+@dataclass(frozen=True)
+class LoadedModel:
+    """A model for sampling, the hash of its file, and the body to draw."""
+
+    model: MotionGenerator
+    sha256: str
+    body: Mesh
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
+    """Keys that `sample` and `edit` share."""
+
+    text: str | None = same_option(SamplingRequest, "texts")
+    action: str | None = same_option(SamplingRequest, "actions")
+    unconditioned: bool = option(False, "true = neither text nor action")
+    samples: int = same_option(SamplingRequest, "samples", default=3)
+    seed: int = same_option(SamplingRequest, "seed")
+    cleanup: bool = same_option(SamplingRequest, "cleanup")
+    targets: str | None = same_option(SamplingRequest, "targets", existing)
+    trajectory: bool = option(False, "draw the clean estimates along the sampling of the first motion: trajectory.png")
+    mp4: bool = option(False, 'also write motions.mp4; needs pip install "flame-mdm[video]"', video)
+    device: str | None = option(None, "default: cuda if available", device_name)
+
+    def conditions(self) -> list[str]:
+        """Returns the keys given that say what motions show."""
+        names = [name for name in ("text", "action") if getattr(self, name) is not None]
+        return names + (["unconditioned"] if self.unconditioned else [])
+
+    def request(self, **values: Any) -> SamplingRequest:
+        """Returns what is requested of the model; `values` replace values of these keys.
+
+        Raises `UserError` if more than one condition is requested, or a value is invalid.
+        """
+        if len(conditions := self.conditions()) > 1:
+            raise UserError(f"{' and '.join(conditions)} exclude each other. Give only one of them")
+        keywords: dict[str, Any] = {
+            **self._fields(SamplingRequest),
+            "texts": self.text,
+            "actions": self.action,
+            **values,
+        }
+        return SamplingRequest(
+            **keywords,
+            options=SamplerOptions(**self._fields(SamplerOptions)),
+            editing=EditRequest(**self._fields(EditRequest)) if isinstance(self, EditRequest) else None,
+        )
+
+    def _fields(self, kind: type[Any]) -> dict[str, Any]:
+        """Returns the values of the keys that are fields of a dataclass."""
+        return {entry.name: getattr(self, entry.name) for entry in fields(kind) if hasattr(self, entry.name)}
+
+    def load(self, request: SamplingRequest) -> LoadedModel:
+        """Loads the model and the body; raises `UserError` with examples if the request names no condition."""
+        import torch
+
+        from flame_mdm.checkpoints.loading import load
+        from flame_mdm.sampling.output import refuse_no_condition
+        from flame_mdm.visualize.body import load_body
+
+        adapters = self.adapters()
+        device = self.device or ("cuda" if torch.cuda.is_available() else "cpu")
+        file = find(self.ckpt, self.which)
+        model = load(file, device, **adapters)
+        if request.kind == "none" and not self.unconditioned:
+            refuse_no_condition(model)
+        return LoadedModel(model, sha256(file), load_body(self.body))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from flame_mdm.commands import BodySettings
-from flame_mdm.commands.sample import read_prompts
 from flame_mdm.errors import UserError, say
 from flame_mdm.reporting.compare import (
     HEAD,
@@ -25,6 +24,7 @@ from flame_mdm.reporting.compare import (
 from flame_mdm.reporting.study import Ratings, rating_page, tally
 from flame_mdm.safe_io import write_json, write_text
 from flame_mdm.sampler_options import option
+from flame_mdm.sampling.prompt_file import PromptFile
 
 if TYPE_CHECKING:
     from flame_mdm.formats.motion import Motion
@@ -119,7 +119,7 @@ def _motions(compared: Sequence[ComparedRun], settings: CompareSettings) -> list
 
     prompts: dict[Prompt, float | None] = {}
     if settings.prompts is not None:
-        prompts = {(text, 0): settings.seconds for text in read_prompts(settings.prompts)}
+        prompts = {(text, 0): settings.seconds for text in _texts(PromptFile.read(settings.prompts))}
     elif from_files:
         reference = next(iter(from_files.values()))
         for prompt, motion in reference.items():
@@ -137,6 +137,13 @@ def _motions(compared: Sequence[ComparedRun], settings: CompareSettings) -> list
     return shown
 
 
+def _texts(prompts: PromptFile) -> list[str]:
+    """Returns the prompts of a file; raises the error of the first one that no model can sample."""
+    for number in sorted(prompts.refused):
+        raise prompts.refused[number]
+    return list(prompts.lines.values())
+
+
 def _sampled(entry: ComparedRun, prompts: Mapping[Prompt, float | None], seed: int) -> dict[Prompt, Motion]:
     """Samples the last checkpoint of a run for texts or action labels.
 
@@ -149,8 +156,9 @@ def _sampled(entry: ComparedRun, prompts: Mapping[Prompt, float | None], seed: i
     import torch
 
     from flame_mdm.checkpoints.loading import load
-    from flame_mdm.sampling.generation import sample_request
+    from flame_mdm.sampling.generation import sample
     from flame_mdm.sampling.motion_request import SamplingRequest
+    from flame_mdm.sampling.resolution import resolve
 
     model = load(entry.folder, "cuda" if torch.cuda.is_available() else "cpu")
     lengths = [seconds for seconds in prompts.values() if seconds is not None]
@@ -167,5 +175,8 @@ def _sampled(entry: ComparedRun, prompts: Mapping[Prompt, float | None], seed: i
         actions=texts if is_action else None,
         seconds=[min(seconds, longest) for seconds in lengths] or None,
         seed=seed,
+        split=False,
     )
-    return dict(zip(prompts, sample_request(model, request), strict=True))
+    # Runs may know different words: each is compared on all prompts.
+    motions = sample(model, resolve(request, model, check_words=False))
+    return dict(zip(prompts, motions, strict=True))

@@ -5,10 +5,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
 
-from flame_mdm.commands import FileSettings, motion_file, usual_data_root
-from flame_mdm.commands.sample import SAMPLES, OutputSettings, check_condition, default_folder, summary
+from flame_mdm.commands import FileSettings, OutputSettings, motion_file, usual_data_root
 from flame_mdm.errors import say
-from flame_mdm.safe_io import sha256
 from flame_mdm.safe_io.paths import check_within
 from flame_mdm.sampler_options import option, required
 from flame_mdm.sampling.motion_request import EditRequest
@@ -33,27 +31,37 @@ class EditSettings(OutputSettings, EditRequest, FileSettings):
 
 def main(settings: EditSettings) -> None:
     request = settings.request()
-    file = settings.model_file()
 
-    from flame_mdm.sampling.editing import edit_request
-    from flame_mdm.sampling.generation import write_motions
+    from flame_mdm.sampling.editing import resolve_edit, sample_edit
+    from flame_mdm.sampling.output import SAMPLES, default_folder, summary, write_motions
     from flame_mdm.sampling.reading import read_motion
 
-    model, body = settings.load(file)
-    check_condition(settings, request, model)
-    facts = {key: getattr(settings, key) for key in ("fps", "unit", "up", "cut", "data_root")}
-    original = read_motion(model.representation, settings.motion, **facts)
+    loaded = settings.load(request)
+    model, digest = loaded.model, loaded.sha256
+    original = read_motion(
+        model.representation,
+        settings.motion,
+        fps=settings.fps,
+        unit=settings.unit,
+        up=settings.up,
+        cut=settings.cut,
+        data_root=settings.data_root,
+    )
+    resolved = resolve_edit(request, model, original)
+    say(*(f"warning: {line}" for line in resolved.resolved.warnings(model)))
     stages = [] if settings.trajectory else None
-    edits = edit_request(model, original, request, stages=stages)
-    digest, what = sha256(file), f"edit {Path(original.id).stem} {edits[0].text}"
+    edits = sample_edit(model, resolved, stages=stages)
+
+    title = f"edit {Path(original.id).stem} {edits[0].text}"
     general = (settings.motion, settings.cut, settings.adapter, settings.adapter_strength)
-    folder = Path(settings.out or default_folder(model, what, digest, replace(request, samples=1), *general))
+    folder = Path(settings.out or default_folder(model, title, digest, replace(request, samples=1), *general))
     shown = replace(original, text=f"original: {original.text or original.id}")
     facts = {"seed": settings.seed, "checkpoint": digest, "keep": edits[0].keep}
     check_within(folder, settings.out or SAMPLES)
-    write_motions(folder, [shown, *edits], facts, stages, settings.mp4, body)
-    say(summary(folder, edits, settings))
-    changed, moved = max(e.feature_error for e in edits), max(e.joint_error for e in edits)
+    write_motions(folder, [shown, *edits], facts, stages, settings.mp4, loaded.body)
+    say(summary(folder, edits, mp4=settings.mp4))
+
+    changed, moved = max(edit.feature_error for edit in edits), max(edit.joint_error for edit in edits)
     largest = f"{changed:.3g} in normalized features, {moved:.3g} m in world joint positions"
     say(f"{edits[0].keep.mean():.0%} of the features are kept. Largest change in the kept part: {largest}")
     if moved > 0.01:

@@ -17,7 +17,8 @@ from flame_mdm.formats.motion import Motion
 from flame_mdm.generator import MotionGenerator
 from flame_mdm.sampling.editing import edit
 from flame_mdm.sampling.generation import generate
-from flame_mdm.sampling.motion_request import SamplingRequest, read_parts, understood
+from flame_mdm.sampling.motion_request import SamplingRequest, read_parts
+from flame_mdm.sampling.resolution import resolve
 
 KEPT = 64  # number of requests whose motions stay in memory; a download or an edit of them needs no model
 TIME_LIMIT = 300.0  # maximum number of seconds of one request on the model
@@ -86,7 +87,8 @@ class Studio:
         """Returns the request with a sentence of several actions as a sequence; errors as for `generate`."""
         if not request.text or (model := self.model(request.model)).conditioned_on != "text":
             return request
-        text = understood(SamplingRequest(texts=request.text, split=request.split), model).prompts[0]
+        sentence = SamplingRequest(texts=request.text, split=request.split, seconds=request.seconds)
+        text = resolve(sentence, model).prompts[0].text
         return checked(request.model_dump() | {"text": text})
 
     def advice(self, request: DemoRequest) -> list[str]:

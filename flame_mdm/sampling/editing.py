@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 import torch
@@ -19,9 +19,11 @@ from flame_mdm.processes import Process
 from flame_mdm.representations import Representation
 from flame_mdm.representations.skeleton import find_joints
 from flame_mdm.sampler_options import SamplerOptions
-from flame_mdm.sampling.generation import sample_request
-from flame_mdm.sampling.motion_request import METHODS, EditRequest, Part, SamplingRequest, understood
-from flame_mdm.sampling.reading import read_motion, with_features
+from flame_mdm.sampling.generation import sample
+from flame_mdm.sampling.keywords import EditKeywords
+from flame_mdm.sampling.motion_request import METHODS, EditRequest, Part, SamplingRequest
+from flame_mdm.sampling.reading import part_of, read_motion, with_features
+from flame_mdm.sampling.resolution import ResolvedRequest, resolve
 
 MFM_STEPS = 25
 """Sampling steps of MFM's edits: with `until` = 0.2, "the first 6 time steps" are up to "0.2 time" (i / 25 <= 0.2)."""
@@ -41,88 +43,149 @@ class Edited(Motion):
     joint_error: float  # maximum distance in meters between the world positions of a kept joint before and after
 
 
+@dataclass(frozen=True)
+class ResolvedEdit:
+    """An edit for one model, whose motion has been read.
+
+    Attributes:
+        resolved: the request, with the part that is kept.
+        original: the motion, with the features of the model.
+        keep: (F, D) bool, features to keep.
+        kept_joints: (F, J) bool, joints to keep.
+    """
+
+    resolved: ResolvedRequest
+    original: Motion
+    keep: Tensor
+    kept_joints: Tensor
+
+
 def edit(
     model: MotionGenerator,
     motion: str | Path | Motion | np.ndarray | Tensor,
     texts: str | Sequence[str] | None = None,
     *,
     fps: float | None = None,
+    cut: Sequence[float] | None = None,
     stages: list[Motion] | None = None,
-    **keywords: Any,
+    **keywords: Unpack[EditKeywords],
 ) -> list[Edited]:
     """Resamples part of a motion: `joints` in `region`, each by default all; with `strength`, as a variation of it.
 
     Args:
+        model: the model, from `flame_mdm.load`.
         motion: a file or clip that `read_motion` reads; a motion, generated or read; or joints (F, J, 3) in meters, y
             up, in the order of a known skeleton.
-        texts: what the person does in the new part; one text or several.
-        fps: frames per second of an array or an .npy file; for other files, it overrides that of the file.
-        stages: as in `flame_mdm.generate`.
-        keywords: fields of `EditRequest` and `SamplingRequest` in `flame_mdm.sampling.motion_request`, and of
-            `flame_mdm.sampler_options.SamplerOptions`. `cleanup` also changes the kept part, by millimeters as a rule;
-            `joint_error` says by how much.
+        texts: what the person does in the new part; one text or several. Default: unconditioned, unless `actions` are
+            given.
+        fps: frames per second of an array or an .npy file; for other files, it overrides the rate in the file.
+        cut: [begin, end] in seconds of the part of the motion to use. Default: all of it.
+        stages: list that gets the clean estimates along the sampling, as in `flame_mdm.generate`.
+        keywords: what is resampled: `region` or `region_seconds`, `joints`, and `strength`; how: `method`, `until`,
+            and `resample`; and keywords of `flame_mdm.generate`, such as `samples` (1), `seed` (0) and
+            `guidance_scale`. `flame_mdm.sampling.motion_request.EditRequest` describes the first ones. `cleanup` also
+            changes the kept part, by millimeters as a rule; `joint_error` says by how much.
 
-    Raises `UserError` if the request is invalid, the process does not support the method, or the motion cannot be read
-    or is longer than those in training.
+    Returns:
+        One edited motion per sample, `samples` for each text: all samples of the first text, in the order of their
+        numbers, then those of the second text, and so on. The original is not among them, but in their attribute
+        `original`.
+
+    Raises:
+        UserError: If the request is invalid, the process does not support the method, or the motion cannot be read or
+            is longer than the motions in training.
     """
-    request = SamplingRequest.of("edit", True, texts=texts, **keywords)
-    return edit_request(model, motion, request, fps=fps, stages=stages)
+    request = SamplingRequest.of("edit", {"texts": texts, **keywords}, editing=True)
+    return sample_edit(model, resolve_edit(request, model, motion, fps=fps, cut=cut), stages=stages)
 
 
-def edit_request(
+def resolve_edit(
+    request: SamplingRequest,
     model: MotionGenerator,
     motion: str | Path | Motion | np.ndarray | Tensor,
-    request: SamplingRequest,
     *,
     fps: float | None = None,
-    stages: list[Motion] | None = None,
-) -> list[Edited]:
-    """Edits a motion as `request.editing` says; for the other arguments, see `edit`."""
-    request = understood(request, model)
+    cut: Sequence[float] | None = None,
+) -> ResolvedEdit:
+    """Finds out which features of a motion `request.editing` keeps; see `edit` for the other arguments."""
     representation, editing = model.representation, request.editing or EditRequest()
-    if isinstance(motion, str | Path):
-        motion = read_motion(representation, motion, fps=fps)
-    elif not isinstance(motion, Motion):
-        motion = from_array(motion, fps)
-    elif fps is not None and fps != motion.fps:
-        raise UserError(f"fps={fps:g}: this motion has {motion.fps:g} frames per second. Omit fps")
-    original = with_features(representation, motion)
-    length = len(original.features)
-    if length > (longest := model.facts["max_frames"]) and not request.is_sequence:
-        what = f"{length} frames, but the model was trained on at most {longest} ({longest / original.fps:g} seconds)"
-        raise UserError(f"{original.id or 'the motion'}: {what}: select a part with cut=[begin, end] in seconds")
+    original = _original(representation, motion, fps, cut)
+    length, longest = len(original.features), model.facts["max_frames"]
+    if length > longest and not request.is_sequence:
+        raise UserError(
+            f"{original.id or 'the motion'}: {length} frames, but the model was trained on at most {longest} "
+            f"({longest / original.fps:g} seconds): select a part with cut=[begin, end] in seconds"
+        )
     keep, kept_joints = kept_parts(representation, length, editing)
     if not keep.any() and editing.strength is None:
         advice = "choose region=..., region_seconds=... or joints=..., or vary all of it with strength=0.5"
         raise UserError(f"no part of the motion is kept: {advice}")
-    frames = tuple(_part_length(parts, length, original.fps) for parts in request.parts)
-    how, options = method_options(model.process, editing, request.options)
-    normalized = representation.normalize(torch.from_numpy(original.features).to(model.device))
-    results = sample_request(
-        model,
-        replace(request, frames=frames, options=options, editing=None, cleanup=False),
-        stages=stages,
-        edit=Edit(normalized[None], keep[None].to(model.device), **how),
-    )
+
+    edit_options, options = method_options(model.process, editing, request.options)
+    frames = [_part_length(parts, length, original.fps) for parts in request.parts]
+    # A sentence stays one action, since the edit keeps a single motion.
+    fitted = replace(request, frames=frames, options=options, editing=None, split=False)
+    known = representation.normalize(torch.from_numpy(original.features).to(model.device))[None]
+    resolved = resolve(fitted, model)
+    resolved = replace(resolved, edit=Edit(known, keep[None].to(model.device), **edit_options))
+    return ResolvedEdit(resolved, original, keep, kept_joints)
+
+
+def sample_edit(model: MotionGenerator, edit: ResolvedEdit, *, stages: list[Motion] | None = None) -> list[Edited]:
+    """Samples the motions of a resolved edit, and measures how well each kept what it was to keep."""
+    representation, original, request = model.representation, edit.original, edit.resolved.request
+    keep, kept_joints = edit.keep.numpy(), edit.kept_joints.numpy()
     # Normalization rounds, so kept values are compared with the input of the sampler.
-    exact, std = representation.denormalize(normalized).cpu().numpy(), representation.std.cpu().numpy()
+    assert edit.resolved.edit is not None
+    exact = representation.denormalize(edit.resolved.edit.known[0]).cpu().numpy()
+    std = representation.std.cpu().numpy()
+    # The features are compared before cleanup, after which a motion has none.
+    uncleaned = replace(edit.resolved, request=replace(request, cleanup=False))
     edits = []
-    for result in results:
-        error = float((np.abs(result.features - exact) / std)[keep.numpy()].max(initial=0))
-        result = cleaned(result, representation.contacts(result.features)) if request.cleanup else result
-        moved = np.linalg.norm(result.joints - original.joints, axis=-1)[kept_joints.numpy()].max(initial=0)
-        facts = {"original": original, "keep": keep.numpy(), "feature_error": error, "joint_error": float(moved)}
-        edits.append(Edited(**vars(result), **facts))
+    for motion in sample(model, uncleaned, stages=stages):
+        feature_error = (np.abs(motion.features - exact) / std)[keep].max(initial=0)
+        if request.cleanup:
+            motion = cleaned(motion, representation.contacts(motion.features))
+        joint_error = np.linalg.norm(motion.joints - original.joints, axis=-1)[kept_joints].max(initial=0)
+        edits.append(
+            Edited(
+                **vars(motion),
+                original=original,
+                keep=keep,
+                feature_error=float(feature_error),
+                joint_error=float(joint_error),
+            )
+        )
     return edits
+
+
+def _original(
+    representation: Representation,
+    motion: str | Path | Motion | np.ndarray | Tensor,
+    fps: float | None,
+    cut: Sequence[float] | None,
+) -> Motion:
+    """Returns the motion to edit, or the part `cut` of it, with the features of a representation."""
+    if isinstance(motion, str | Path):
+        return read_motion(representation, motion, fps=fps, cut=cut)
+    if not isinstance(motion, Motion):
+        motion = from_array(motion, fps)
+    elif fps is not None and fps != motion.fps:
+        raise UserError(f"fps={fps:g}: this motion has {motion.fps:g} frames per second. Omit fps")
+    motion = with_features(representation, motion)
+    return motion if cut is None else part_of(representation, motion, cut)
 
 
 def _part_length(parts: Sequence[Part], length: int, fps: float) -> int:
     """Returns the frames of each part that gives no seconds, so that all parts are as long as the motion."""
     timed = [round(seconds * fps) for _, seconds in parts if seconds is not None]
     rest, others = length - sum(timed), len(parts) - len(timed)
-    if rest < others or (rest % others if others else rest):
-        what = f"the parts are not as long as the motion, which has {length / fps:g} seconds"
-        raise UserError(f"{what}. Give each part its seconds, as in 'walks @2 | sits @1'")
+    fits = rest == 0 if others == 0 else rest >= others and rest % others == 0
+    if not fits:
+        raise UserError(
+            f"the parts are not as long as the motion, which has {length / fps:g} seconds. Give each part its "
+            "seconds, as in 'walks @2 | sits @1'"
+        )
     return rest // max(1, others)
 
 
@@ -162,11 +225,12 @@ def method_options(
     process: Process, editing: EditRequest, options: SamplerOptions
 ) -> tuple[dict[str, Any], SamplerOptions]:
     """Returns the options of `Edit` for the requested method, by default that of the process, and of the sampler."""
-    possible = [name for name, how in METHODS.items() if how["mode"] in process.edit_modes]
+    possible = [name for name, method_edit in METHODS.items() if method_edit["mode"] in process.edit_modes]
     method = editing.method or next(name for name in possible if METHODS[name]["mode"] == process.edit_modes[0])
     if method not in possible:
-        what = f"is not supported by {type(process).__name__}; this model supports: {', '.join(possible)}"
-        raise UserError(f"method={method} {what}")
+        raise UserError(
+            f"method={method} is not supported by {type(process).__name__}; this model supports: {', '.join(possible)}"
+        )
     if METHODS[method]["mode"] == "trajectory" and options.num_inference_steps is None:
         options = replace(options, num_inference_steps=MFM_STEPS)
     return editing.method_options(method), options

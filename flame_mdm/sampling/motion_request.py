@@ -1,10 +1,10 @@
-"""Requests for motions and edits, checked once. The checks do not import torch, so wrong input is refused at once."""
+"""Requests for motions and edits. Their checks do not import torch, so that wrong input is refused at once."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from itertools import accumulate, pairwise
 from numbers import Integral, Real
@@ -16,7 +16,6 @@ from flame_mdm.sampler_options import SamplerOptions, option
 
 if TYPE_CHECKING:
     from flame_mdm.formats.motion import Motion
-    from flame_mdm.generator import MotionGenerator
 
 MAX_SAMPLES = 10_000  # maximum number of samples per request; they are kept in memory until all are complete
 MAX_TEXT_LENGTH = 2000  # maximum number of characters of a text; captions of the data sets are far shorter
@@ -35,6 +34,7 @@ METHODS: dict[str, dict[str, Any]] = {
 REGIONS = ("in_between", "prediction", "prefix", "suffix", "interpolate")  # tasks that name the frames to resample
 
 Part = tuple[str, float | None]  # text of a part of a sequence, and its seconds if the text gives them
+WayPoints = Sequence[tuple[float, float]]  # x and z in meters
 Ranges = Sequence[float] | Sequence[Sequence[float]]
 ARRIVAL = 0.2  # seconds before the end of a motion at which the last way point of a path is reached
 
@@ -44,17 +44,28 @@ class EditRequest:
     """Which part of a motion to resample, and how; raises `UserError` if a value is invalid for every motion."""
 
     region: str | Ranges | None = option(
-        None, "frames to resample: in_between, prediction (= prefix), suffix, interpolate, or one or more [begin, end]"
+        None,
+        "frames to resample: in_between (keeps the first and the last quarter), prediction = prefix (keeps the first "
+        "quarter), suffix (keeps the last quarter), interpolate (keeps every fifth frame), or one or more [begin, end]",
     )
     region_seconds: Ranges | None = option(None, "one or more [begin, end] in seconds, instead of region")
-    joints: str | Sequence[str] | None = option(None, "joints to resample: upper_body, left_arm, ... or [names]")
+    joints: str | Sequence[str] | None = option(
+        None,
+        "joints to resample: upper_body, lower_body, arms, legs, left_arm, right_arm, left_leg, right_leg, or a list "
+        "of these and of joint names. Default: all",
+    )
     method: str | None = option(
-        None, "mdm and flame (keep exactly), flame_code, mfm. Default: mdm for diffusion, mfm for flow matching"
+        None,
+        "mdm overwrites the clean estimate with the kept part (exact); flame replaces the kept part after each step, "
+        "as in the paper (exact); flame_code replaces it before each call of the denoiser, as in FLAME's code; mfm "
+        "overwrites the early part of the flow's path. Default: mdm for diffusion, mfm for flow matching",
     )
     until: float | None = option(None, "for mfm: flow time up to which the path is overwritten, default 0.2")
     resample: int = option(1, "for flame and flame_code: how many times each sampling step is taken")
     strength: float | None = option(
-        None, "starts from the noised motion, and takes this fraction of the steps, up to 1: the smaller, the closer"
+        None,
+        "starts from the motion with noise added, and takes this fraction of the sampling steps, above 0 and up to 1: "
+        "the smaller, the closer to the motion",
     )
 
     def __post_init__(self) -> None:
@@ -104,8 +115,10 @@ class SamplingRequest:
 
     A text or action may have several parts, "walks forward @3 | turns left | sits down @2", with their seconds. They
     are generated together as one motion, in windows that overlap; see docs/sequences.md. So is a single part with
-    seconds, "walks forward @10", which may be longer than the motions in training. Raises `UserError` if a value is
-    invalid for every model, or two values contradict each other.
+    seconds, "walks forward @10", which may be longer than the motions in training.
+
+    Raises `UserError` if a value is invalid for every model, or two values contradict each other.
+    `flame_mdm.sampling.resolution.resolve` adds what depends on a model.
     """
 
     texts: str | Sequence[str] | None = option(
@@ -113,31 +126,50 @@ class SamplingRequest:
     )
     actions: str | Sequence[str] | None = option(None, "a label, for models trained on labels")
     seconds: float | Sequence[float] | None = option(
-        None, "length, or a list with one per text; of a sequence, of each part that gives none. Default: up to 3"
+        None,
+        "length of the motion, or a list with one length per text; in a sequence, length of each part that has no "
+        "seconds of its own. Default: 3, or the longest motion in training if that is shorter",
     )
-    frames: int | Sequence[int] | None = option(None, "the same in frames, instead of seconds")
+    frames: int | Sequence[int] | None = option(None, "length in frames, or a list of lengths, instead of seconds")
     samples: int = option(1, "motions per text or action")
+    candidates: int = option(
+        1, "motions generated for each one that is kept: the best without faults, if there is one without"
+    )
     seed: int = option(0, "seed of the noise")
     after: str | Path | Motion | None = option(None, "FILE or dataset:id: a motion that the result continues")
     split: bool = option(True, 'sentences with several actions, "walks, then sits", become sequences, "walks | sits"')
     loop: bool = option(False, "the last frame leads to the first one")
-    targets: str | Path | Mapping[str, Any] | None = option(None, "a JSON file of places to reach: docs/targets.md")
+    targets: str | Path | Mapping[str, Any] | None = option(
+        None, "a JSON file of way points, joint positions and poses to reach: docs/targets.md"
+    )
+    path: str | WayPoints | None = option(
+        None, 'way points on the floor, x,z in meters, instead of targets: "0,1 0.5,2"'
+    )
     shared_noise: bool = option(False, "the same noise for all motions: they differ by texts and lengths alone")
     cleanup: bool = option(False, "smooth motions, constant bone lengths, feet that do not slide")
     options: SamplerOptions = field(default_factory=SamplerOptions)
     editing: EditRequest | None = None
 
     @classmethod
-    def of(cls, function: str, editing: bool = False, /, **keywords: Any) -> SamplingRequest:
-        """Returns the request of keywords: fields of this class, `SamplerOptions` and, of edits, `EditRequest`."""
-        names = {kind: {entry.name for entry in fields(kind)} for kind in (cls, SamplerOptions, EditRequest)}
-        names[cls] -= {"options", "editing"}
-        possible = names[cls] | names[SamplerOptions] | (names[EditRequest] if editing else set())
+    def of(cls, function: str, keywords: Mapping[str, Any], *, editing: bool = False) -> SamplingRequest:
+        """Returns the request of the keywords of a function, `generate` or `edit`.
+
+        Raises `UserError` if a keyword is no field of this class, of `SamplerOptions` or, with `editing`, of
+        `EditRequest`.
+        """
+        request_names = _names(cls) - {"options", "editing"}
+        option_names = _names(SamplerOptions)
+        edit_names = _names(EditRequest) if editing else set()
+        possible = request_names | option_names | edit_names
         for keyword in keywords:
             if keyword not in possible:
                 raise UserError(f"{function} has no option {keyword}.{did_you_mean(keyword, sorted(possible))}")
-        own, options, edit = ({name: keywords[name] for name in of & keywords.keys()} for of in names.values())
-        return cls(**own, options=SamplerOptions(**options), editing=EditRequest(**edit) if editing else None)
+
+        return cls(
+            **_selected(keywords, request_names),
+            options=SamplerOptions(**_selected(keywords, option_names)),
+            editing=EditRequest(**_selected(keywords, edit_names)) if editing else None,
+        )
 
     def __post_init__(self) -> None:
         for name in ("texts", "actions", "seconds", "frames"):
@@ -146,16 +178,24 @@ class SamplingRequest:
             if isinstance(value, str) and name in ("texts", "actions"):
                 value = (value,)
             object.__setattr__(self, name, tuple(value) if isinstance(value, list | tuple) else value)
-        if not isinstance(self.samples, Integral) or not 1 <= int(self.samples) <= MAX_SAMPLES:
-            raise UserError(f"samples={self.samples}: give 1 to {MAX_SAMPLES:,}")
+        for name in ("samples", "candidates"):
+            value = getattr(self, name)
+            if not isinstance(value, Integral) or not 1 <= int(value) <= MAX_SAMPLES:
+                raise UserError(f"{name}={value}: give 1 to {MAX_SAMPLES:,}")
         if not isinstance(self.seed, Integral):
             raise UserError(f"seed={self.seed!r}: give a whole number")
         self._check_prompts()
         self._check_lengths()
-        other = "loop" if self.loop else "targets" if self.targets is not None else None
+        if self.path is not None:
+            if self.targets is not None:
+                raise UserError(f"path={self.path}: targets cannot be given with a path. Give one of the two")
+            object.__setattr__(self, "path", read_path(self.path))
+
+        other = "loop" if self.loop else "targets" if self.has_targets else None
         if self.after is not None and other is not None:
             name = self.after if isinstance(self.after, str | Path) else self.after.id
             raise UserError(f"after={name}: a motion that continues another cannot have {other}. Give one of the two")
+
         if (edit := self.editing) is not None:
             is_whole = edit.region is edit.region_seconds is edit.joints is None
             self.check_edit(edit.strength is not None and is_whole)
@@ -168,13 +208,14 @@ class SamplingRequest:
         for prompt in self.prompts:
             if not isinstance(prompt, str):
                 raise UserError(f"{self.kind}={prompt!r} is not a string. Give a string, such as {self.kind}='walk'")
-            if len(prompt) > MAX_TEXT_LENGTH:
-                size = f"{len(prompt):,} characters are too many. Give at most {MAX_TEXT_LENGTH:,}"
-                raise UserError(f"{shortened(prompt, 60)}: {size}")
+            check_length(prompt)
         if self.texts is not None and not all(text.strip() for text in self.prompts):
             raise UserError("empty text. Omit the text to sample without condition")
-        if len(self.prompts) * self.samples > MAX_SAMPLES:
-            raise UserError(f"samples={self.samples} of each text: at most {MAX_SAMPLES:,} motions per request")
+
+        copies = self.samples * self.candidates
+        if len(self.prompts) * copies > MAX_SAMPLES:
+            key = "samples" if self.candidates == 1 else "samples times candidates"
+            raise UserError(f"{key}={copies} of each text: at most {MAX_SAMPLES:,} motions per request")
         _ = self.parts  # raises if a part is invalid
 
     def _check_lengths(self) -> None:
@@ -193,7 +234,7 @@ class SamplingRequest:
 
     def check_edit(self, varies: bool) -> None:
         """Raises `UserError` if a request to edit a motion, or to vary all of it, asks for more than that."""
-        if self.after is not None or (not varies and (self.is_sequence or self.targets is not None)):
+        if self.after is not None or (not varies and (self.is_sequence or self.has_targets)):
             advice = "Variations of an entire motion (strength=0.5) may have parts, loop and targets"
             raise UserError(f"an edit keeps a single motion: omit parts (|), after, loop and targets. {advice}")
 
@@ -201,6 +242,11 @@ class SamplingRequest:
     def kind(self) -> Literal["text", "action", "none"]:
         """The condition of the motions."""
         return "text" if self.texts is not None else "action" if self.actions is not None else "none"
+
+    @property
+    def has_targets(self) -> bool:
+        """Whether motions have places to reach."""
+        return self.targets is not None or self.path is not None
 
     @property
     def prompts(self) -> tuple[str, ...]:
@@ -215,8 +261,7 @@ class SamplingRequest:
     @property
     def is_sequence(self) -> bool:
         """Whether motions are generated in windows: prompts have parts or seconds, or they loop or continue one."""
-        timed = any(len(parts) > 1 or parts[0][1] is not None for parts in self.parts)
-        return self.loop or self.after is not None or timed
+        return self.loop or self.after is not None or any(is_timed(parts) for parts in self.parts)
 
     def lengths(self, fps: float) -> list[float | None]:
         """Returns the length of each prompt in frames, not rounded; None where the request gives none."""
@@ -225,36 +270,25 @@ class SamplingRequest:
         return [None if length is None else length * (1.0 if self.seconds is None else fps) for length in lengths]
 
 
-def understood(request: SamplingRequest, model: MotionGenerator) -> SamplingRequest:
-    """Returns the request with its sentences of several actions as sequences, if `split` says so and the model can.
-
-    Raises `UserError` if the model knows no word of a text that says what happens.
-    """
-    if request.kind != "text" or model.conditioned_on != "text":
-        return request
-    from flame_mdm.conditions.vocabulary import check_known, in_parts  # its package imports torch
-
-    if request.split and request.editing is None and model.representation.relative:
-        verbs = model.facts.get("verbs", ())
-        texts = [t if "|" in t or "@" in t else " | ".join(in_parts(t, verbs)) for t in request.prompts]
-        request = replace(request, texts=texts)
-    for text in dict.fromkeys(name for parts in request.parts for name, _ in parts):
-        check_known(text, model.facts)
-    return request
+def _names(kind: type[Any]) -> set[str]:
+    return {entry.name for entry in fields(kind)}
 
 
-def check_model(request: SamplingRequest, model: MotionGenerator) -> None:
-    """Checks that a model can do what is requested; the planning of a sampling run also checks the lengths."""
-    model.process.find_sampler(request.options.over(model.sampler_options))
-    if request.kind not in ("none", model.conditioned_on):
-        trained, instead = TRAINED_ON[model.conditioned_on]
-        raise UserError(f"{request.kind}={shortened(request.prompts[0], 60)}: this model {trained}. Give {instead}")
-    if request.is_sequence and not model.representation.relative:
-        what = "has positions in the world, so that windows of a sequence do not fit together"
-        raise UserError(f"representation {model.representation.name} {what}. Use a model of humanml3d features")
-    for name in [name for parts in request.parts for name, _ in parts] if request.kind == "action" else ():
-        if name not in (actions := model.facts["actions"]):
-            raise UserError(f"unknown action '{name}'; this model knows: {', '.join(actions) or 'none'}")
+def _selected(keywords: Mapping[str, Any], names: set[str]) -> dict[str, Any]:
+    return {name: value for name, value in keywords.items() if name in names}
+
+
+def check_length(text: str) -> None:
+    """Raises `UserError` if a text has too many characters."""
+    if len(text) > MAX_TEXT_LENGTH:
+        raise UserError(
+            f"{shortened(text, 60)}: {len(text):,} characters are too many. Give at most {MAX_TEXT_LENGTH:,}"
+        )
+
+
+def is_timed(parts: Sequence[Part]) -> bool:
+    """Returns whether a prompt has several parts, or seconds."""
+    return len(parts) > 1 or parts[0][1] is not None
 
 
 def read_parts(text: str) -> list[Part]:
@@ -280,20 +314,23 @@ def is_range(value: Any) -> bool:
     return pair and all(isinstance(v, int | float) and math.isfinite(v) for v in value)
 
 
-def read_path(text: str) -> list[tuple[float, float]]:
-    """Returns the way points of "x,z x,z ...", in meters; raises `UserError` if the text is not of this form."""
+def read_path(path: str | WayPoints) -> tuple[tuple[float, float], ...]:
+    """Returns the way points (x, z) in meters of "x,z x,z ...", or of pairs; raises `UserError` if there are none."""
+    pairs = [point.split(",") for point in path.split()] if isinstance(path, str) else path
     try:
-        points = [(float(x), float(z)) for x, z in (point.split(",") for point in text.split())]
-    except ValueError:
-        points = []
+        points = tuple((float(x), float(z)) for x, z in pairs)
+    except (TypeError, ValueError):
+        points = ()
     if not points:
-        shown = shortened(one_line(text[:500]), 60)
+        shown = shortened(one_line(str(path)[:500]), 60)
         raise UserError(f"path={shown}: give way points as x,z in meters, such as 0,1 0.5,2")
     return points
 
 
-def path_targets(path: Sequence[tuple[float, float]], seconds: float) -> dict[str, Any]:
+def path_targets(path: WayPoints, seconds: float) -> dict[str, Any]:
     """Returns targets that lead a motion of `seconds` along a path from x = z = 0, at an even speed."""
-    way = list(accumulate(math.dist(*pair) for pair in pairwise([(0.0, 0.0), *path])))
-    times = [round((seconds - ARRIVAL) * done / (way[-1] or 1.0), 3) for done in way]
-    return {"root": [{"time": time, "position": list(at)} for time, at in zip(times, path, strict=True)]}
+    steps = pairwise([(0.0, 0.0), *path])
+    distances = list(accumulate(math.dist(*step) for step in steps))
+    total = distances[-1] or 1.0
+    times = [round((seconds - ARRIVAL) * distance / total, 3) for distance in distances]
+    return {"root": [{"time": time, "position": list(point)} for time, point in zip(times, path, strict=True)]}

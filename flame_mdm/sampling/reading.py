@@ -53,16 +53,22 @@ def read_motion(
         motion = decoded(representation, torch.from_numpy(features), next(iter(captions), ""), name)
     else:
         raise UserError(f"{name}: not a motion. Give a {', '.join(ENDINGS)} file, or dataset:id for a prepared clip")
-    if cut is not None:
-        if not is_range(cut):
-            raise UserError(f"cut={cut}: write [begin, end], in seconds")
-        begin, end = (round(second * representation.fps) for second in cut)
-        if not 0 <= begin < end <= len(motion.features):
-            seconds = len(motion.features) / representation.fps
-            raise UserError(f"cut=[{cut[0]:g}, {cut[1]:g}] is not a range of {name}, which lasts {seconds:g} seconds")
-        features = torch.from_numpy(representation.rebase(motion.features[begin:end]))
-        motion = decoded(representation, features, motion.text, name)
-    return motion
+    return motion if cut is None else part_of(representation, motion, cut)
+
+
+def part_of(representation: Representation, motion: Motion, cut: Sequence[float]) -> Motion:
+    """Returns the part [begin, end], in seconds, of a motion with features; it begins at the origin.
+
+    Raises `UserError` if it is not a range of the motion.
+    """
+    if not is_range(cut):
+        raise UserError(f"cut={cut}: write [begin, end], in seconds")
+    begin, end = (round(second * representation.fps) for second in cut)
+    if not 0 <= begin < end <= len(motion.features):
+        seconds, name = len(motion.features) / representation.fps, motion.id or "the motion"
+        raise UserError(f"cut=[{cut[0]:g}, {cut[1]:g}] is not a range of {name}, which lasts {seconds:g} seconds")
+    features = torch.from_numpy(representation.rebase(motion.features[begin:end]))
+    return decoded(representation, features, motion.text, motion.id)
 
 
 def with_features(representation: Representation, motion: Motion) -> Motion:

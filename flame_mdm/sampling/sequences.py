@@ -18,30 +18,38 @@ def overlap(model: MotionGenerator) -> int:
     return 2 * round(min(OVERLAP * model.representation.fps, model.facts["max_frames"] / 3) / 2)
 
 
-def motion_lengths(model: MotionGenerator, request: SamplingRequest) -> list[list[int]]:
-    """Returns the frames of each part of the motion of each prompt, none too short or too long for the model."""
+def part_frames(
+    model: MotionGenerator, text: str, parts: Sequence[Part], usual: float | None, *, is_sequence: bool, loop: bool
+) -> list[int]:
+    """Returns the number of frames of each part of a prompt.
+
+    Args:
+        model: the model that samples the motion; `UserError` if a part is too short or too long for it.
+        text: the prompt, for messages.
+        parts: its parts, with their seconds if the prompt gives them.
+        usual: frames of a part without seconds, not rounded. Default: 3 seconds, or what fits into one window.
+        is_sequence: whether the motion is sampled in windows; otherwise, it has a single part.
+        loop: whether the last frame leads to the first one.
+    """
     fps, longest = model.representation.fps, model.facts["max_frames"]
-    frames = request.lengths(fps)
-    if request.is_sequence:
-        rows = zip(request.prompts, request.parts, frames, strict=True)
-        return [_part_lengths(model, text, parts, usual, request.loop) for text, parts, usual in rows]
-    lengths = [min(round(3 * fps), longest) if length is None else round(length) for length in frames]
-    for length in lengths:
-        shown = f"{length / fps:g} seconds ({length} frames)"
-        if length < 2:
-            raise UserError(f"{shown} are too short: give at least {2 / fps:g} seconds")
-        if length > longest:
-            raise UserError(
-                f"{shown} cannot be sampled: the model was trained on motions of up to {longest / fps:g} seconds. "
-                f"Overlapping windows make longer ones: write the seconds in the text, 'walks @{length / fps:g}'"
-            )
-    return [[length] for length in lengths]
+    if is_sequence:
+        return _sequence_frames(model, text, parts, usual, loop)
+
+    length = min(round(3 * fps), longest) if usual is None else round(usual)
+    shown = f"{length / fps:g} seconds ({length} frames)"
+    if length < 2:
+        raise UserError(f"{shown} are too short: give at least {2 / fps:g} seconds")
+    if length > longest:
+        raise UserError(
+            f"{shown} cannot be sampled: the model was trained on motions of up to {longest / fps:g} seconds. "
+            f"Overlapping windows make longer ones: write the seconds in the text, 'walks @{length / fps:g}'"
+        )
+    return [length]
 
 
-def _part_lengths(
+def _sequence_frames(
     model: MotionGenerator, text: str, parts: Sequence[Part], usual: float | None, loop: bool
 ) -> list[int]:
-    """Returns the frames of each part of a sequence; parts without seconds have `usual` ones, by default 3 s."""
     fps, shared = model.representation.fps, overlap(model)
     if usual is None:
         usual = min(3 * fps, model.facts["max_frames"] - shared * (loop or len(parts) > 1))
@@ -56,7 +64,10 @@ def _part_lengths(
 
 
 def windows(
-    model: MotionGenerator, request: SamplingRequest, conditions: Sequence[Sequence[str]], lengths: list[list[int]]
+    model: MotionGenerator,
+    request: SamplingRequest,
+    conditions: Sequence[Sequence[str]],
+    lengths: Sequence[Sequence[int]],
 ) -> Windows:
     """Returns the windows of several sequences, by text or action and frames of each part."""
     longest, shared, device = model.facts["max_frames"], overlap(model), model.device

@@ -93,14 +93,18 @@ class Targets:
     positions: Positions  # coordinates in the world
     poses: tuple[tuple[int, Tensor], ...]  # frames, and features (D,) in the data's units, of poses of any place
 
-    def edit(self, representation: Representation, lengths: Sequence[int], device: torch.device) -> Edit:
-        """Returns the edit of motions of these lengths: poses are imposed, positions guide the clean estimates."""
+    def check_end(self, frames: int, fps: float) -> None:
+        """Raises `UserError` if a motion of this number of frames ends before a target."""
         last = max([0, *self.positions.frames.tolist(), *(frame for frame, _ in self.poses)])
-        if last >= min(lengths):
-            late, end = (f"{frame / representation.fps:g} seconds" for frame in (last, min(lengths) - 1))
-            what = f"{late} is after the end of the motion, whose last frame is at {end}"
-            raise UserError(f"targets: {what}. Give an earlier time, or more seconds")
-        imposed = torch.zeros(1, max(lengths), representation.features, device=device)
+        if last >= frames:
+            raise UserError(
+                f"targets: {last / fps:g} seconds is after the end of the motion, whose last frame is at "
+                f"{(frames - 1) / fps:g} seconds. Give an earlier time, or more seconds"
+            )
+
+    def edit(self, representation: Representation, frames: int, device: torch.device) -> Edit:
+        """Returns the edit (1, F, D) that leads to the targets: poses are imposed, positions guide the estimates."""
+        imposed = torch.zeros(1, frames, representation.features, device=device)
         keep = torch.zeros_like(imposed, dtype=torch.bool)
         for frame, features in self.poses:
             imposed[0, frame] = representation.normalize(features.to(device))

@@ -27,8 +27,10 @@ from flame_mdm.formats.motion import Motion
 from flame_mdm.progress import ProgressBar
 from flame_mdm.reporting.page import number
 from flame_mdm.reporting.report import write_report
-from flame_mdm.sampling.generation import sample_request, write_motions
+from flame_mdm.sampling.generation import sample
 from flame_mdm.sampling.motion_request import SamplingRequest
+from flame_mdm.sampling.output import write_motions
+from flame_mdm.sampling.resolution import resolve
 from flame_mdm.signals import StopRequest
 from flame_mdm.task import MotionGeneration, Task
 from flame_mdm.training.loggers import log_video
@@ -320,8 +322,9 @@ class SampleMotions(Callback):
             frames=min(round(self.seconds * model.representation.fps), model.facts["max_frames"]),
             samples=1 if texts and kind != "none" else count,
             seed=0,
+            split=False,
         )
-        return sample_request(model, request)
+        return sample(model, resolve(request, model, check_words=False))
 
     def _measure_real(self, clips: Clips, task: LightningModule) -> Values:
         """Computes all metrics of up to `REAL` training clips, which have the attributes that all prompts request."""

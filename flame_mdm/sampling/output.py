@@ -1,0 +1,77 @@
+"""Output of the commands that sample: folders, files, and the lines that tell what was written."""
+
+import hashlib
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from flame_mdm.errors import UserError
+from flame_mdm.formats.motion import Motion
+from flame_mdm.generator import MotionGenerator
+from flame_mdm.safe_io import atomic_folder
+from flame_mdm.sampling.motion_request import TRAINED_ON
+from flame_mdm.visualize import contact_sheet, write_gif, write_mp4, write_player
+from flame_mdm.visualize.body import Mesh
+
+SAMPLES = "samples"  # default folder of the motions
+REQUEST_FILES = re.compile(r"motion_\d{3,}\.npz|motions\.mp4|trajectory\.png")
+"""Files that some requests write and others do not."""
+
+
+def refuse_no_condition(model: MotionGenerator) -> None:
+    """Raises the `UserError` of a command that names no condition, with examples that the model knows."""
+    examples = list(model.facts["actions"] if model.conditioned_on == "action" else model.facts.get("captions", ()))
+    shown = "; ".join(examples[:: max(1, len(examples) // 5)][:5])
+    key = TRAINED_ON[model.conditioned_on][1]
+    raise UserError(f"say what to sample: {key}" + (f". Examples: {shown}" if shown else ""))
+
+
+def default_folder(model: MotionGenerator, title: str, *request: object) -> Path:
+    """Returns `samples/<experiment>/<title>-<hash>`; the hash is that of the title and of everything in `request`.
+
+    Requests for different motions thus go to different folders, also where the file system ignores case. The folder is
+    within `SAMPLES`, whatever an untrusted checkpoint calls its experiment.
+    """
+    digest = hashlib.sha256(repr((title, request)).encode()).hexdigest()[:6]
+    name = re.sub(r"[^\w]+", "-", title.lower()).strip("-")[:40].strip("-")
+    return Path(SAMPLES, *re.findall(r"[\w-][\w.-]*", str(model.config["experiment"])), f"{name}-{digest}")
+
+
+def summary(folder: Path, motions: Sequence[Motion], *, mp4: bool) -> str:
+    """Returns the line that tells what `write_motions` wrote to a folder."""
+    count = "1 motion" if len(motions) == 1 else f"{len(motions)} motions"
+    files = f"{folder / 'player.html'}, motions.gif" + (", motions.mp4" if mp4 else "")
+    return f"{count} of {len(motions[0].joints)} frames: {files}"
+
+
+def write_motions(
+    folder: Path,
+    motions: Sequence[Motion],
+    facts: dict[str, Any],
+    stages: Sequence[Motion] | None = None,
+    mp4: bool = False,
+    body: Mesh | None = None,
+) -> None:
+    """Writes `motion_000.npz` ..., `motions.gif`, `motions.png` and `player.html` into a folder, all or none.
+
+    Such files of an earlier request that are not written again are removed. The first eight motions are drawn, and the
+    stages of a sampling run in `trajectory.png`; `facts` are added to each `.npz`.
+    """
+    scene = [replace(motion, text=motion.text or "unconditioned") for motion in motions]
+    title = motions[0].text if len({motion.text for motion in motions}) == 1 else ""
+    with atomic_folder(folder) as temporary:
+        write_player(temporary / "player.html", scene, title or "Motions", body=body)
+        for number, motion in enumerate(motions):
+            motion.save(temporary / f"motion_{number:03d}.npz", **facts)
+        write_gif(temporary / "motions.gif", scene[:8], body=body)
+        if mp4:
+            write_mp4(temporary / "motions.mp4", scene[:8], body=body)
+        contact_sheet(temporary / "motions.png", scene[:8], body=body)
+        if stages:
+            contact_sheet(temporary / "trajectory.png", stages, body=body)
+        written = {path.name for path in temporary.iterdir()}
+    for path in list(folder.iterdir()):
+        if REQUEST_FILES.fullmatch(path.name) and path.name not in written:
+            path.unlink()

@@ -1,0 +1,68 @@
+"""Files of prompts. Nothing here imports torch, so that wrong files are refused at once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from flame_mdm.errors import UserError, first_line
+from flame_mdm.safe_io import MEBIBYTE, read_text
+from flame_mdm.sampling.motion_request import check_length, read_parts
+
+
+@dataclass(frozen=True)
+class PromptFile:
+    """A text file with one prompt per line, of which some may be refused while the others are sampled.
+
+    Attributes:
+        path: its name, as the user typed it.
+        lines: the prompts by the numbers of their lines, from 1; blank lines are left out.
+        refused: why a prompt cannot be sampled, by the number of its line.
+    """
+
+    path: str
+    lines: dict[int, str]
+    refused: dict[int, UserError] = field(default_factory=dict)
+
+    @classmethod
+    def read(cls, path: str) -> PromptFile:
+        """Reads a file, and refuses prompts that no model can sample; raises `UserError` if it has no prompts."""
+        text = read_text(path, MEBIBYTE)
+        lines = enumerate(text.removeprefix("\ufeff").splitlines(), start=1)
+        prompts = {number: line.strip() for number, line in lines if line.strip()}
+        if not prompts or "\0" in text:
+            raise UserError(f"{path}: no prompts. Write one per line")
+
+        file = cls(path, prompts)
+        for number, prompt in prompts.items():
+            try:
+                check_length(prompt)
+                read_parts(prompt)
+            except UserError as error:
+                file.refused[number] = error
+        return file
+
+    @property
+    def accepted(self) -> dict[int, str]:
+        """The prompts that are not refused, by the numbers of their lines."""
+        return {number: prompt for number, prompt in self.lines.items() if number not in self.refused}
+
+    def refuse(self, errors: Mapping[int, UserError]) -> None:
+        """Refuses prompts for errors by their positions among the accepted ones."""
+        numbers = list(self.accepted)
+        self.refused.update({numbers[position]: error for position, error in errors.items()})
+
+    def lengths(self, key: str, lengths: Any) -> Any:
+        """Returns the lengths of the accepted prompts if `lengths` lists one per prompt, otherwise `lengths` itself."""
+        if not isinstance(lengths, Sequence):
+            return lengths
+        if len(lengths) != len(self.lines):
+            counts = f"lengths: {len(lengths)}, prompts: {len(self.lines)}"
+            raise UserError(f"{key}={list(lengths)}: {counts}. Give one length, or one per prompt")
+        return [length for number, length in zip(self.lines, lengths, strict=True) if number not in self.refused]
+
+    def report(self) -> list[str]:
+        """Returns the lines that name the refused prompts; empty if there are none."""
+        errors = [f"{self.path}, line {number}: {first_line(self.refused[number])}" for number in sorted(self.refused)]
+        return [f"error: {line}" for line in errors]

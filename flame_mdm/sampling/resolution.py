@@ -1,0 +1,204 @@
+"""Resolution of requests: what a request means for one model, found out once, before anything is sampled."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from flame_mdm.batch import Edit
+from flame_mdm.conditions.vocabulary import advice, check_known, in_parts
+from flame_mdm.errors import UserError, shortened
+from flame_mdm.formats.motion import Motion
+from flame_mdm.generator import MotionGenerator
+from flame_mdm.sampling.motion_request import (
+    TRAINED_ON,
+    Part,
+    SamplingRequest,
+    is_timed,
+    path_targets,
+    read_parts,
+    read_path,
+)
+from flame_mdm.sampling.reading import read_motion, with_features
+from flame_mdm.sampling.sequences import overlap, part_frames
+from flame_mdm.sampling.targets import Targets, read_targets
+
+
+@dataclass(frozen=True)
+class ResolvedPrompt:
+    """A text or an action, as a model samples it.
+
+    Attributes:
+        text: the prompt; a sentence of several actions is written as a sequence, "walks | sits".
+        is_split: whether the prompt was such a sentence.
+        conditions: text or action of each part.
+        frames: number of frames of each part. In a continued motion, the first part includes the frames that overlap
+            with the motion before.
+    """
+
+    text: str
+    is_split: bool
+    conditions: tuple[str, ...]
+    frames: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class ResolvedRequest:
+    """A request for one model: sentences are split, lengths are frames, and motions and targets have been read.
+
+    Attributes:
+        request: what was requested.
+        prompts: its texts or actions in their order, without refused ones.
+        is_sequence: whether the motions are sampled in overlapping windows.
+        before: features (F, D), in the data's units, of the motion that all motions continue.
+        targets: places in the world to reach.
+        edit: part of a motion that all motions keep, with `known` and `keep` (1, F, D).
+    """
+
+    request: SamplingRequest
+    prompts: tuple[ResolvedPrompt, ...]
+    is_sequence: bool
+    before: Tensor | None = None
+    targets: Targets | None = None
+    edit: Edit | None = None
+
+    def warnings(self, model: MotionGenerator) -> list[str]:
+        """Returns lines about words that the model has never seen in training, or does not read."""
+        if self.request.kind != "text":
+            return []
+        lines = []
+        texts = dict.fromkeys(text for prompt in self.prompts for text in prompt.conditions)
+        for text in texts:
+            is_only_text = len(self.prompts) == 1 and text == self.prompts[0].text
+            about = "" if is_only_text else f"'{shortened(text, 60)}': "
+            lines += [f"{about}{line}" for line in advice(text, model.facts, model.condition.max_words)]
+        return lines
+
+
+def resolve(
+    request: SamplingRequest,
+    model: MotionGenerator,
+    refused: dict[int, UserError] | None = None,
+    *,
+    check_words: bool = True,
+) -> ResolvedRequest:
+    """Finds out what a request means for a model.
+
+    Args:
+        request: what is requested.
+        model: the model that samples the motions.
+        refused: gets the error of each prompt that the model cannot sample, by the number of the prompt; the others
+            are resolved. Default: the first error is raised.
+        check_words: whether to refuse a text of which the model knows no word that says what happens.
+
+    Raises `UserError` if the model cannot do what is requested.
+    """
+    _check_model(request, model)
+    parts: dict[int, list[Part]] = {}
+    for number, prompt in enumerate(request.prompts):
+        with _collected(refused, number):
+            parts[number] = _parts(request, model, prompt, check_words)
+
+    is_sequence = request.loop or request.after is not None or any(is_timed(prompt) for prompt in parts.values())
+    before, edit = _continued(request, model)
+    shared = 0 if before is None else overlap(model)
+    usual_lengths = request.lengths(model.representation.fps)
+    resolved: dict[int, ResolvedPrompt] = {}
+    for number, prompt_parts in parts.items():
+        with _collected(refused, number):
+            typed, conditions = request.prompts[number], tuple(condition for condition, _ in prompt_parts)
+            is_split = prompt_parts != request.parts[number]
+            text = " | ".join(conditions) if is_split else typed
+            first, *others = part_frames(
+                model, text, prompt_parts, usual_lengths[number], is_sequence=is_sequence, loop=request.loop
+            )
+            resolved[number] = ResolvedPrompt(text, is_split, conditions, (shared + first, *others))
+
+    targets = _targets(request, model, list(resolved.values()))
+    for number, prompt in resolved.items():
+        with _collected(refused, number):
+            if targets is not None:
+                targets.check_end(sum(prompt.frames), model.representation.fps)
+    prompts = [prompt for number, prompt in resolved.items() if number not in (refused or {})]
+    return ResolvedRequest(request, tuple(prompts), is_sequence, before, targets, edit)
+
+
+@contextmanager
+def _collected(refused: dict[int, UserError] | None, number: int) -> Iterator[None]:
+    """Stores a `UserError` about a prompt in `refused`, unless that is None."""
+    try:
+        yield
+    except UserError as error:
+        if refused is None:
+            raise
+        refused[number] = error
+
+
+def _check_model(request: SamplingRequest, model: MotionGenerator) -> None:
+    """Checks what holds for all prompts: sampler, kind of condition, and windows."""
+    model.process.find_sampler(request.options.over(model.sampler_options))
+    if request.kind not in ("none", model.conditioned_on):
+        trained, instead = TRAINED_ON[model.conditioned_on]
+        raise UserError(f"{request.kind}={shortened(request.prompts[0], 60)}: this model {trained}. Give {instead}")
+    if request.loop or request.after is not None:
+        _check_windows(model)
+
+
+def _check_windows(model: MotionGenerator) -> None:
+    if not model.representation.relative:
+        name = model.representation.name
+        raise UserError(
+            f"representation {name} has positions in the world, so that windows of a sequence do not fit together. "
+            "Use a model of humanml3d features"
+        )
+
+
+def _parts(request: SamplingRequest, model: MotionGenerator, prompt: str, check_words: bool) -> list[Part]:
+    """Returns the parts of a prompt; a sentence with several actions has a part per action."""
+    if request.kind == "none":
+        return [(prompt, None)]
+    splits = request.kind == "text" and request.split and model.representation.relative
+    if splits and "|" not in prompt and "@" not in prompt:
+        sentences = in_parts(prompt, model.facts.get("verbs", ()))
+        parts: list[Part] = [(sentence, None) for sentence in sentences] if len(sentences) > 1 else read_parts(prompt)
+    else:
+        parts = read_parts(prompt)
+    if is_timed(parts):
+        _check_windows(model)
+
+    for condition, _ in parts:
+        if request.kind == "text" and check_words:
+            check_known(condition, model.facts)
+        if request.kind == "action" and condition not in (actions := model.facts["actions"]):
+            raise UserError(f"unknown action '{condition}'; this model knows: {', '.join(actions) or 'none'}")
+    return parts
+
+
+def _continued(request: SamplingRequest, model: MotionGenerator) -> tuple[Tensor | None, Edit | None]:
+    """Returns the features (F, D) of the motion to continue, and the edit that keeps its last frames.
+
+    These frames are generated again, so that the new frames fit to them.
+    """
+    if request.after is None:
+        return None, None
+    representation, shared = model.representation, overlap(model)
+    motion = request.after if isinstance(request.after, Motion) else read_motion(representation, request.after)
+    motion = with_features(representation, motion)
+    before = torch.from_numpy(motion.features)
+    if len(before) < shared:
+        raise UserError(f"after={motion.id}: {len(before)} frames are too short. Give at least {shared}")
+    ending = representation.normalize(before[-shared:].to(model.device))[None]
+    return before, Edit(ending, torch.ones_like(ending, dtype=torch.bool))
+
+
+def _targets(request: SamplingRequest, model: MotionGenerator, prompts: Sequence[ResolvedPrompt]) -> Targets | None:
+    """Reads the targets of a request; way points of a path are reached at an even speed."""
+    if request.path is not None and prompts:
+        lengths = {sum(prompt.frames) for prompt in prompts}
+        if len(lengths) > 1:
+            raise UserError(f"path={request.path}: motions of different lengths cannot share a path. Give one length")
+        seconds = lengths.pop() / model.representation.fps
+        return read_targets(model.representation, path_targets(read_path(request.path), seconds))
+    return None if request.targets is None else read_targets(model.representation, request.targets)

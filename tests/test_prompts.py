@@ -81,14 +81,36 @@ def test_a_bad_request_is_one_line_and_writes_nothing(here, trained, capsys, mon
         (b"walks", ["mp4=true"], 'mp4=true: MP4 needs the package av. Run pip install "flame-mdm[video]"'),
         (b"walks", ["text=jumps"], "text and prompts exclude each other. Give only one of them"),
         (b"walks\njumps", ["seconds=[1,2,3]"], "seconds=[1, 2, 3]: lengths: 3, prompts: 2. Give one length, or one"),
-        (b"walks\njumps", ["seconds=[1,30]"], "30 seconds (600 frames) cannot be sampled"),
-        (b"walks\n" + b"a" * 3000, [], "3,000 characters are too many"),
+        (b"walks | | sits\n\n" + b"a" * 3000, [], "p.txt: 2 of 2 prompts cannot be sampled. Correct the lines above"),
+        (b"\nwalks", ["seconds=30"], "p.txt: 1 of 1 prompts cannot be sampled"),
     ):
         Path("p.txt").unlink(missing_ok=True)
         if content is not None:
             Path("p.txt").write_bytes(content)
         assert message in error_of(capsys, "sample", trained, "prompts=p.txt", *words)
         assert not Path("samples").exists()
+
+
+@pytest.mark.slow
+def test_refused_lines_of_a_file_are_named_at_the_end_and_the_others_are_written(here, trained, capsys):
+    lines = ["a person walks", "", "a" * 3000, "walks | | sits", "a person jumps", "un uomo cammina", "a person waves"]
+    Path("p.txt").write_text("\n".join(lines))
+    words = ["prompts=p.txt", "seconds=[1,1,1,30,1,1.5]", "samples=1", "num_inference_steps=2"]
+    assert main(["sample", str(trained), *words]) == 1
+    printed = capsys.readouterr()
+    assert "2 motions for 2 prompts, a folder for each: samples/quickstart/p.html" in printed.out
+    *errors, total = printed.err.splitlines()[-5:]
+    assert total == "error: p.txt: 4 of 6 prompts cannot be sampled. Correct the lines above"
+    for line, number, message in zip(
+        errors,
+        (3, 4, 5, 6),
+        ("3,000 characters are too many", "part 2 is empty", "30 seconds (600 frames)", "knows no word of it"),
+        strict=True,
+    ):
+        assert line.startswith(f"p.txt, line {number}: ")
+        assert message in line
+    motions = [read(path) for path in sorted(here.rglob("motion_*.npz"))]
+    assert {motion.text: len(motion.joints) for motion in motions} == {"a person walks": 20, "a person waves": 30}
 
 
 def test_each_prompt_has_a_length_of_its_own(trained):

@@ -213,11 +213,12 @@ def test_the_command_prints_the_distance_and_bad_words_are_one_line(tmp_path, mo
     words = [f"text={TEXT}", "samples=1", "seconds=2", "num_inference_steps=4"]
     assert main(["sample", "quickstart", *words, "path=0,0.5 0.5,0.5"]) == 0
     assert "distance from the targets: mean " in capsys.readouterr().out
+    (tmp_path / "t.json").write_text("{}")
     for options, message in (
         ([], "say what to sample: text="),
         (["text=walks", "unconditioned=true"], "text and unconditioned exclude each other"),
         (["text=walks", "path=0,1 2"], "path=0,1 2: give way points as x,z in meters"),
-        (["text=walks", "path=0,1", "frames=40"], "frames cannot be given with a path"),
+        (["text=walks", "path=0,1", "targets=t.json"], "targets cannot be given with a path"),
     ):
         assert message in error_of(capsys, "sample", "quickstart", *options)
 
@@ -272,8 +273,9 @@ def test_a_text_without_a_known_word_is_refused(model, tmp_path, monkeypatch, ca
         with pytest.raises(UserError, match=r"the model knows no word of it that says what happens\. Did you mean"):
             flame_mdm.generate(model, text)
         vocabulary.check_known(text, {})  # models without a vocabulary read every word
+    walk = flame_mdm.generate(model, TEXT, seconds=1, **FAST)[0]
     with pytest.raises(UserError, match="knows no word"):
-        flame_mdm.edit(model, np.zeros((30, 22, 3)), text, fps=20, region="prefix")
+        flame_mdm.edit(model, walk, text, region="prefix")
     assert "knows no word of it" in error_of(capsys, "sample", "quickstart", f"text={text}")
     assert list(tmp_path.iterdir()) == []
 

@@ -180,7 +180,8 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
         model = load(file, device, **adapters)
         if request.kind == "none" and not self.unconditioned:
             refuse_no_condition(model)
-        return LoadedModel(model, sha256(file), load_body(self.body))
+        body = load_body(self.body)
+        return LoadedModel(model, sha256(file), body)
 
 
 @dataclass(frozen=True, kw_only=True)

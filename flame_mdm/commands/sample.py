@@ -78,7 +78,8 @@ def main(settings: SampleSettings) -> None:
         _sample(settings, settings.request_for(prompts), prompts)
     if prompts is not None and prompts.refused:
         say(*prompts.report(), error=True)
-        raise SystemExit(1)
+        count = f"{len(prompts.refused)} of {len(prompts.lines)} prompts"
+        raise UserError(f"{prompts.path}: {count} cannot be sampled. Correct the lines above")
 
 
 def _sample(settings: SampleSettings, request: SamplingRequest, prompts: PromptFile | None) -> None:

@@ -70,16 +70,16 @@ def advice(text: str, facts: Mapping[str, Any], max_words: int | None = None) ->
     Imported models have no vocabulary, so their words are not checked; `max_words` None = no limit.
     """
     lines = []
-    if unknown := _unknown(text, facts):
+    if unknown := unknown_words(text, facts):
         lines.append(f"never seen in training: {', '.join(unknown)}.{_suggested(text, facts)}")
-    if max_words is not None and (unread := words(text)[max_words:]):
+    if unread := unread_words(text, max_words):
         lines.append(f"only the first {max_words} words are read, not '{' '.join(unread)}'")
     return lines
 
 
 def check_known(text: str, facts: Mapping[str, Any]) -> None:
     """Raises `UserError` if a model knows no word of a text that says what happens."""
-    if facts.get("vocabulary") and _unknown(text, facts) == _content(text):
+    if facts.get("vocabulary") and unknown_words(text, facts) == _content(text):
         instead = _suggested(text, facts) or " Use words of its training captions"
         raise UserError(f"'{shortened(text, 60)}': the model knows no word of it that says what happens.{instead}")
 
@@ -88,8 +88,13 @@ def _content(text: str) -> list[str]:
     return [word for word in dict.fromkeys(words(text)) if word not in FUNCTION_WORDS]
 
 
-def _unknown(text: str, facts: Mapping[str, Any]) -> list[str]:
-    """Returns the content words of a text of which the model knows no form."""
+def unread_words(text: str, max_words: int | None) -> list[str]:
+    """Returns the words of a text after the first `max_words`; None = no limit."""
+    return [] if max_words is None else words(text)[max_words:]
+
+
+def unknown_words(text: str, facts: Mapping[str, Any]) -> list[str]:
+    """Returns the content words of a text of which a model, of these facts, knows no form."""
     seen = facts.get("vocabulary")
     return [] if seen is None else [word for word in _content(text) if known_form(word, seen) is None]
 
@@ -97,7 +102,7 @@ def _unknown(text: str, facts: Mapping[str, Any]) -> list[str]:
 def _suggested(text: str, facts: Mapping[str, Any]) -> str:
     """Returns " Did you mean '...'?": the text with similar known words, or the nearest training caption, if any."""
     fixed = text.lower()
-    for word in (unknown := _unknown(text, facts)):
+    for word in (unknown := unknown_words(text, facts)):
         similar = [other for other in facts["vocabulary"] if other[0] == word[0]]
         if not (near := difflib.get_close_matches(word, similar, 1, 0.75)):
             break

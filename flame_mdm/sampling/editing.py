@@ -125,9 +125,10 @@ def resolve_edit(
     frames = [_part_length(parts, length, original.fps) for parts in request.parts]
     # A sentence stays one action, since the edit keeps a single motion.
     fitted = replace(request, frames=frames, options=options, editing=None, split=False)
-    known = representation.normalize(torch.from_numpy(original.features).to(model.device))[None]
+    features = torch.from_numpy(original.features).to(model.device)
+    normalized = representation.normalize(features)[None]
     resolved = resolve(fitted, model)
-    resolved = replace(resolved, edit=Edit(known, keep[None].to(model.device), **edit_options))
+    resolved = replace(resolved, edit=Edit(normalized, keep[None].to(model.device), **edit_options))
     return ResolvedEdit(resolved, original, keep, kept_joints)
 
 

@@ -179,8 +179,8 @@ def _edit(model: MotionGenerator, resolved: ResolvedRequest, x: Tensor) -> Edit 
         edit = replace(goal, known=start, strength=None if edit is None else edit.strength)
     if edit is None:
         return None
-    known, keep = pad_to(edit.known, frames), pad_to(edit.keep, frames)
-    return replace(edit, known=known.expand_as(x), keep=keep.expand_as(x))
+    features, keep = pad_to(edit.known, frames), pad_to(edit.keep, frames)
+    return replace(edit, known=features.expand_as(x), keep=keep.expand_as(x))
 
 
 def _decoded(model: MotionGenerator, resolved: ResolvedRequest, row: _Row, x: Tensor) -> Motion:

@@ -64,5 +64,4 @@ class PromptFile:
 
     def report(self) -> list[str]:
         """Returns the lines that name the refused prompts; empty if there are none."""
-        errors = [f"{self.path}, line {number}: {first_line(self.refused[number])}" for number in sorted(self.refused)]
-        return [f"error: {line}" for line in errors]
+        return [f"{self.path}, line {number}: {first_line(self.refused[number])}" for number in sorted(self.refused)]

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from flame_mdm.batch import Edit
-from flame_mdm.conditions.vocabulary import advice, check_known, in_parts
+from flame_mdm.conditions.vocabulary import advice, check_known, in_parts, unknown_words, unread_words
 from flame_mdm.errors import UserError, shortened
 from flame_mdm.formats.motion import Motion
 from flame_mdm.generator import MotionGenerator
@@ -36,12 +36,14 @@ class ResolvedPrompt:
         conditions: text or action of each part.
         frames: number of frames of each part. In a continued motion, the first part includes the frames that overlap
             with the motion before.
+        unknown: words of the text that the model has never seen in training, or does not read.
     """
 
     text: str
     is_split: bool
     conditions: tuple[str, ...]
     frames: tuple[int, ...]
+    unknown: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -66,10 +68,8 @@ class ResolvedRequest:
 
     def warnings(self, model: MotionGenerator) -> list[str]:
         """Returns lines about words that the model has never seen in training, or does not read."""
-        if self.request.kind != "text":
-            return []
         lines = []
-        texts = dict.fromkeys(text for prompt in self.prompts for text in prompt.conditions)
+        texts = dict.fromkeys(text for prompt in self.prompts if prompt.unknown for text in prompt.conditions)
         for text in texts:
             is_only_text = len(self.prompts) == 1 and text == self.prompts[0].text
             about = "" if is_only_text else f"'{shortened(text, 60)}': "
@@ -108,13 +108,14 @@ def resolve(
     resolved: dict[int, ResolvedPrompt] = {}
     for number, prompt_parts in parts.items():
         with _collected(refused, number):
-            typed, conditions = request.prompts[number], tuple(condition for condition, _ in prompt_parts)
+            conditions = tuple(condition for condition, _ in prompt_parts)
             is_split = prompt_parts != request.parts[number]
-            text = " | ".join(conditions) if is_split else typed
+            text = " | ".join(conditions) if is_split else request.prompts[number]
             first, *others = part_frames(
                 model, text, prompt_parts, usual_lengths[number], is_sequence=is_sequence, loop=request.loop
             )
-            resolved[number] = ResolvedPrompt(text, is_split, conditions, (shared + first, *others))
+            unknown = _unknown_words(conditions, model) if request.kind == "text" else ()
+            resolved[number] = ResolvedPrompt(text, is_split, conditions, (shared + first, *others), unknown)
 
     targets = _targets(request, model, list(resolved.values()))
     for number, prompt in resolved.items():
@@ -165,15 +166,22 @@ def _parts(request: SamplingRequest, model: MotionGenerator, prompt: str, check_
         parts: list[Part] = [(sentence, None) for sentence in sentences] if len(sentences) > 1 else read_parts(prompt)
     else:
         parts = read_parts(prompt)
-    if is_timed(parts):
-        _check_windows(model)
-
     for condition, _ in parts:
         if request.kind == "text" and check_words:
             check_known(condition, model.facts)
         if request.kind == "action" and condition not in (actions := model.facts["actions"]):
             raise UserError(f"unknown action '{condition}'; this model knows: {', '.join(actions) or 'none'}")
+    if is_timed(parts):
+        _check_windows(model)
     return parts
+
+
+def _unknown_words(texts: Sequence[str], model: MotionGenerator) -> tuple[str, ...]:
+    words: list[str] = []
+    for text in texts:
+        words += unknown_words(text, model.facts)
+        words += unread_words(text, model.condition.max_words)
+    return tuple(words)
 
 
 def _continued(request: SamplingRequest, model: MotionGenerator) -> tuple[Tensor | None, Edit | None]:

@@ -1,0 +1,192 @@
+"""Requests: keywords of Python, what a request means for a model, and the best of several candidates."""
+
+from collections.abc import Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, get_type_hints
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+from support.motions import synthetic
+from support.refusals import error_of, one_line_error
+
+import flame_mdm
+from flame_mdm.__main__ import main
+from flame_mdm.errors import UserError
+from flame_mdm.formats.faults import find_faults
+from flame_mdm.formats.motion import Motion
+from flame_mdm.sampler_options import SamplerOptions
+from flame_mdm.sampling import motion_request, resolution
+from flame_mdm.sampling.generation import best
+from flame_mdm.sampling.keywords import EditKeywords, SamplerKeywords, SamplingKeywords
+from flame_mdm.sampling.motion_request import EditRequest, SamplingRequest
+from flame_mdm.sampling.resolution import resolve
+from flame_mdm.sampling.targets import read_targets
+
+TEXT = "a person walks forward"
+FAST: dict[str, Any] = {"seconds": 1.5, "num_inference_steps": 4}
+
+
+@pytest.fixture(scope="module")
+def model() -> flame_mdm.MotionGenerator:
+    return flame_mdm.load("quickstart")
+
+
+def hints(kind: type, without: Sequence[str] = ()) -> dict[str, Any]:
+    annotations = get_type_hints(kind, {**vars(motion_request), "Motion": Motion})
+    return {entry.name: annotations[entry.name] for entry in fields(kind) if entry.name not in without}
+
+
+def test_keywords_of_generate_and_edit_have_the_names_and_types_of_the_fields_of_requests():
+    options, editing = hints(SamplerOptions), hints(EditRequest)
+    sampling = hints(SamplingRequest, without=["texts", "options", "editing"])
+    assert get_type_hints(SamplerKeywords) == options
+    assert get_type_hints(SamplingKeywords) == sampling | options
+    assert get_type_hints(EditKeywords) == editing | sampling | options
+
+
+@pytest.mark.parametrize("function", [flame_mdm.generate, flame_mdm.edit], ids=["generate", "edit"])
+def test_the_docstring_names_every_keyword(function):
+    names = get_type_hints(EditKeywords if function is flame_mdm.edit else SamplingKeywords)
+    described = f"{flame_mdm.generate.__doc__} {function.__doc__}"
+    assert [name for name in names if f"`{name}`" not in described] == []
+
+
+def test_keywords_go_to_the_request_that_has_them():
+    keywords = {"texts": TEXT, "eta": 0.5, "samples": 2, "joints": "left_arm", "seed": 3}
+    request = SamplingRequest.of("edit", keywords, editing=True)
+    assert (request.prompts, request.samples, request.seed) == ((TEXT,), 2, 3)
+    assert request.options == SamplerOptions(eta=0.5)
+    assert request.editing == EditRequest(joints="left_arm")
+    with one_line_error("generate has no option joints"):
+        SamplingRequest.of("generate", keywords)
+
+
+def test_a_request_is_resolved_once_and_reads_its_targets_once(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "t.json").write_text('{"root": [{"time": 1, "position": [0.2, 0.6]}]}')
+    words = [f"text={TEXT}", "seconds=1.5", "num_inference_steps=2", "samples=1", "targets=t.json"]
+    with (
+        patch.object(resolution, "read_targets", wraps=read_targets) as read,
+        patch.object(resolution, "in_parts", wraps=resolution.in_parts) as split,
+    ):
+        assert main(["sample", "quickstart", *words]) == 0
+    assert (read.call_count, split.call_count) == (1, 1)
+
+
+def test_prompts_have_parts_frames_and_unknown_words(model):
+    texts = ["a man walks forward, then jumps moonily", "a person bows @2"]
+    resolved = resolve(SamplingRequest(texts=texts, seconds=1.5), model)
+    sentence, bow = resolved.prompts
+    assert sentence.text == "a man walks forward | jumps moonily"
+    assert sentence.conditions == ("a man walks forward", "jumps moonily")
+    assert (sentence.frames, bow.frames) == ((30, 30), (40,))
+    assert (sentence.is_split, bow.is_split, resolved.is_sequence) == (True, False, True)
+    assert (sentence.unknown, bow.unknown) == (("moonily",), ())
+    (warning,) = resolved.warnings(model)
+    assert warning.startswith("'jumps moonily': never seen in training: moonily.")
+
+
+def test_a_path_is_as_long_as_the_motion_whose_sentence_becomes_a_sequence(model):
+    """The last way point is reached 0.2 seconds before the end of all parts."""
+    sentence = "a man walks forward, then turns left"
+    request = SamplingRequest(texts=sentence, seconds=2, path=[(0, 1), (0.5, 2)])
+    targets = resolve(request, model).targets
+    assert targets is not None
+    assert int(targets.positions.frames.max()) == 20 * 4 - 4
+    with one_line_error("motions of different lengths cannot share a path"):
+        resolve(SamplingRequest(texts=[TEXT, TEXT], seconds=[1, 2], path="0,1"), model)
+
+
+@pytest.mark.parametrize(("time", "frame"), [(0.99, 20), (1.02, 20), (1.03, 21), (0.29, 6), (1.149, 23)])
+def test_a_target_is_at_the_frame_nearest_to_its_time(model, tmp_path, time, frame):
+    """At 20 frames per second, 0.99 s is nearest to frame 20, not to frame 19."""
+    flame_mdm.generate(model, TEXT, seconds=1, num_inference_steps=2)[0].save(tmp_path / "walk.npz")
+    pose = {"time": time, "file": str(tmp_path / "walk.npz")}
+    content = {
+        "root": [{"time": time, "position": [0.1, 0.2]}],
+        "joints": [{"time": time, "joint": "head", "position": [None, 1.5, None]}],
+        "poses": [pose, pose | {"position": [0.1, 0.2]}],
+    }
+    targets = read_targets(model.representation, content)
+    assert set(targets.positions.frames.tolist()) == {frame}
+    assert [number for number, _ in targets.poses] == [frame]
+
+
+def test_the_best_of_several_candidates_is_kept(model):
+    groups = list[int]()
+
+    def score(motions: Sequence[Motion]) -> list[float]:
+        """How far the root goes."""
+        groups.append(len(motions))
+        return [float(np.linalg.norm(motion.joints[-1, 0])) for motion in motions]
+
+    several = flame_mdm.generate(model, TEXT, samples=6, **FAST)
+    chosen = flame_mdm.generate(model, TEXT, samples=2, candidates=3, score=score, **FAST)
+    assert len(chosen) == len(groups) == 2
+    for motion, group in zip(chosen, (several[:3], several[3:]), strict=True):
+        faultless = [motion for motion in group if not find_faults(motion)] or group
+        np.testing.assert_allclose(motion.joints, faultless[int(np.argmax(score(faultless)))].joints, atol=1e-4)
+
+
+def test_without_a_score_the_fewest_faulty_frames_decide():
+    worse, better = synthetic(), synthetic()
+    worse.joints[[5, 9], 3, 0] += 5
+    better.joints[5, 3, 0] += 5
+    assert best([worse, better]) is better
+    assert best([worse, better], lambda motions: [2.0, 1.0]) is worse
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"candidates": 0}, "candidates=0: give 1 to"),
+        ({"candidates": 2, "stages": []}, "single motion"),
+        ({"samples": 5_000, "candidates": 3}, "samples times candidates=15000 of each text: at most 10,000 motions"),
+    ],
+    ids=str,
+)
+def test_bad_numbers_of_candidates_are_one_line(model, options, message):
+    with one_line_error(message):
+        flame_mdm.generate(model, TEXT, **options)
+
+
+@pytest.mark.slow
+def test_the_command_chooses_by_a_motion_clip(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    words = [f"text={TEXT}", "seconds=1.5", "num_inference_steps=4", "samples=1"]
+    assert main(["sample", "quickstart", *words, "samples=4", "out=all"]) == 0
+    assert main(["sample", "quickstart", *words, "candidates=4", "scorer=motion_clip_synthetic", "out=best"]) == 0
+    (chosen,) = Path("best").glob("*.npz")
+    joints = np.load(chosen)["joints"]
+    candidates = [np.load(file)["joints"] for file in sorted(Path("all").glob("*.npz"))]
+    assert sum(np.allclose(joints, candidate, atol=1e-4) for candidate in candidates) == 1
+    for options, message in (
+        (["scorer=quickstart"], "scorer=quickstart chooses among motions for a text: give text=... and candidates=8"),
+        (["scorer=none.ckpt", "candidates=2"], "scorer: none.ckpt: no such checkpoint. Give a run"),
+        (["scorer=quickstart", "candidates=2"], "holds a motion generator, not a motion-CLIP"),
+    ):
+        assert message in error_of(capsys, "sample", "quickstart", *words, *options)
+
+
+def test_edit_takes_a_part_of_any_motion(model, tmp_path):
+    """A motion, its joints and its file are cut in the same way; without cut, the error says so."""
+    motion = flame_mdm.generate(model, f"{TEXT} @4", num_inference_steps=2)[0]
+    motion.save(tmp_path / "walk.npz")
+    options: dict[str, Any] = {"region": "prefix", "num_inference_steps": 2}
+    sources: list[tuple[Any, dict[str, Any]]] = [
+        (motion, {}),
+        (motion.joints, {"fps": 20}),
+        (tmp_path / "walk.npz", {}),
+    ]
+    for source, file_options in sources:
+        with pytest.raises(UserError, match=r"at most 60 \(3 seconds\): select a part with cut=\[begin, end\]"):
+            flame_mdm.edit(model, source, TEXT, **options, **file_options)
+        edited = flame_mdm.edit(model, source, TEXT, cut=[1, 2.5], **options, **file_options)[0]
+        assert len(edited.joints) == 30
+        np.testing.assert_allclose(edited.original.joints[0, 0, [0, 2]], 0, atol=1e-5)
+        pose = motion.joints[20] - motion.joints[20, 0]
+        np.testing.assert_allclose(edited.original.joints[0, :, 1], pose[:, 1] + motion.joints[20, 0, 1], atol=0.02)
+    with one_line_error(r"cut=\[3, 9\] is not a range of .*, which lasts 4 seconds"):
+        flame_mdm.edit(model, motion, TEXT, cut=[3, 9], **options)

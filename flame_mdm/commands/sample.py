@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from flame_mdm.commands import OutputSettings, model_source, motion_file
 from flame_mdm.errors import UserError, say
+from flame_mdm.safe_io.paths import check_within
 from flame_mdm.sampler_options import option, same_option
 from flame_mdm.sampling.motion_request import SamplingRequest
 from flame_mdm.sampling.prompt_file import PromptFile
@@ -85,7 +86,7 @@ def main(settings: SampleSettings) -> None:
 def _sample(settings: SampleSettings, request: SamplingRequest, prompts: PromptFile | None) -> None:
     """Samples and writes the motions of a request; prompts of a file that the model cannot sample are refused."""
     from flame_mdm.sampling.generation import sample
-    from flame_mdm.sampling.output import summary, write_motions
+    from flame_mdm.sampling.output import SAMPLES, summary, write_motions
     from flame_mdm.sampling.resolution import resolve
 
     loaded = settings.load(request)
@@ -107,6 +108,7 @@ def _sample(settings: SampleSettings, request: SamplingRequest, prompts: PromptF
     folders = _folders(settings, resolved, model, loaded.sha256, motions)
     facts = {"seed": settings.seed, "checkpoint": loaded.sha256}
     for folder, written in folders.items():
+        check_within(folder, settings.out or SAMPLES)
         stages_shown = stages if written[0] is motions[0] else None
         write_motions(folder, written, facts, stages_shown, settings.mp4, loaded.body)
         if prompts is None:

@@ -32,6 +32,11 @@ from flame_mdm.training.fit import check_devices
 PARTS = ("task", "representation", "process", "condition", "denoiser", "data")
 
 
+def is_optimizer(name: str) -> bool:
+    value = getattr(torch.optim, name)
+    return isinstance(value, type) and issubclass(value, torch.optim.Optimizer) and value is not torch.optim.Optimizer
+
+
 def test_every_recipe_composes_is_short_and_says_what_it_is():
     wrong = []
     for name in recipes():
@@ -100,6 +105,57 @@ def test_recipes_outside_the_repository(tmp_path):
             compose(name)
 
 
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ("losses: {nope: 1}", "unknown config key 'losses.nope'"),
+        ("losses: {joints: x}", "losses.joints=x: must be a finite number"),
+        ("losses: null", "losses=None: must be a mapping"),
+        ("losses: {feet: [1]}", "unknown config key 'losses.feet'"),
+        ("ema: 1", "ema=1: must be a mapping of keys or null"),
+        ("ema: {decay: x}", "ema.decay=x: must be a finite number"),
+        ("ema: {decays: 0.9}", "unknown config key 'ema.decays'"),
+        ("seed: abc", "seed=abc: must be a whole number"),
+        ("seed: -1", "seed=-1: must be from 0 to"),
+        ("lr_decay: x", "lr_decay=x: must be a finite number or null"),
+        ("data_root: [a]", "data_root=['a']: must be a text"),
+        ("run: {dir: 3}", "run.dir=3: must be a text"),
+        ("callbacks: 3", "callbacks=3: must be a mapping"),
+        ("logger: x", "logger=x: must be a mapping"),
+        ("losess: {joints: 1.0}", "unknown config key 'losess'. Did you mean losses"),
+        ("optimizer: {lr: abc}", "optimizer.lr=abc: must be a finite number"),
+        ("condition: {buckets: 0}", "condition.buckets=0: must be at least 1"),
+    ],
+)
+def test_a_recipe_file_is_checked_like_the_command_line(tmp_path, monkeypatch, capsys, line, says):
+    monkeypatch.chdir(tmp_path)
+    head = "# @package _global_\ndefaults: [/quickstart, _self_]\n"
+    (tmp_path / "mine.yaml").write_text(f"{head}{line}\n")
+    overrides = ["data.source.clips=8"] if "buckets" in line else []
+    assert main(["train", "mine.yaml", *overrides]) == 1
+    assert says in one_error(capsys)
+    assert "buckets" in line or [path.name for path in tmp_path.iterdir()] == ["mine.yaml"]
+
+
+def test_a_recipe_file_may_have_keys_of_its_own_to_which_others_refer(tmp_path):
+    head = "# @package _global_\ndefaults: [/quickstart, _self_]\n"
+    (tmp_path / "mine.yaml").write_text(f"{head}width: 32\nlr_decay: 0.5\ndenoiser: {{latent_dim: '${{width}}'}}\n")
+    assert compose(str(tmp_path / "mine.yaml"))["denoiser"]["latent_dim"] == 32
+
+
+@pytest.mark.parametrize("name", [name for name in dir(torch.optim) if is_optimizer(name)])
+def test_each_argument_of_an_optimizer_of_a_wrong_type_is_named_with_its_value(name):
+    target = f"torch.optim.{name}"
+    for key in parameters(target) - {"params", "line_search_fn", "adjust_lr_fn"}:  # the latter are texts
+        with pytest.raises(UserError, match=rf"^optimizer\.{key}=abc: must be "):
+            check({"optimizer": {"_target_": target, key: "abc"}})
+    for value in ([0.9], [0.9, "x"], 0.9):
+        if "betas" in parameters(target) and name != "Adafactor":
+            with pytest.raises(UserError, match=r"^optimizer\.betas=.*: must be a list"):
+                check({"optimizer": {"_target_": target, "betas": value}})
+    check({"optimizer": {"_target_": target, **({"betas": [0.9, 0.99]} if "betas" in parameters(target) else {})}})
+
+
 def test_signatures_are_read_through_reexports_bases_and_dataclasses():
     assert {"lr", "weight_decay", "fused"} <= parameters("torch.optim.AdamW")
     assert {"monitor", "save_top_k"} <= parameters("lightning.pytorch.callbacks.ModelCheckpoint")
@@ -123,7 +179,7 @@ def test_values_are_checked_against_annotations():
         ("Sequence[float] | Sequence[Sequence[float]]", [[1, 2], [[1, 2], [3, 4]]], [["x"], [[None]], 3]),
         ("'int'", [3], ["x"]),
         ("Denoiser", ["x", {}], [3, None, True]),
-        ("dict[str, Any]", [{}, 3], []),
+        ("dict[str, Any]", [{}, {"a": 1}], [3, "x", None]),
         ("", [None, 3], []),
     ):
         for value in legal:

@@ -47,6 +47,9 @@ class LearnedTokens(ConditionEncoder):
         dropout: float = 0.1,
         pretrain_steps: int = 0,
     ):
+        for name, value in (("features", features), ("buckets", buckets), ("max_words", max_words), ("heads", heads)):
+            if value < 1:
+                raise UserError(f"condition.{name}={value}: must be at least 1")
         super().__init__()
         self.features, self.buckets, self.max_words, self.pretrain_steps = features, buckets, max_words, pretrain_steps
         self.words = nn.Embedding(buckets, features)

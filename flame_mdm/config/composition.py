@@ -15,7 +15,15 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from flame_mdm.config.building import EXPERIMENTS, RUN_DIR, plain
-from flame_mdm.config.signatures import Config, check, check_same_kinds, parameters, source_file, unknown_key
+from flame_mdm.config.signatures import (
+    Config,
+    check,
+    check_same_kinds,
+    check_top_level,
+    parameters,
+    source_file,
+    unknown_key,
+)
 from flame_mdm.errors import UserError, did_you_mean, first_line
 from flame_mdm.safe_io import read_yaml
 
@@ -164,6 +172,7 @@ def resolve(source: ConfigSource, overrides: list[str], base: Config | None = No
     config: Config = {str(key): value for key, value in resolved.items()}  # type: ignore[union-attr]
     if base is not None:
         check_same_kinds(base, config)
+        check_top_level(config)
         check(config)
     return config
 

@@ -43,17 +43,63 @@ KINDS: dict[str, tuple[type | tuple[type, ...], str]] = {
     "None": (type(None), "null"),
 }
 """The values that an annotation allows: their types, and a description."""
+SEQUENCES, TUPLES = ("list", "List", "Sequence"), ("tuple", "Tuple")
+
+
+TOP_LEVEL = {
+    "experiment": "str | None",
+    "seed": "int",
+    "data_root": "str",
+    "run": "dict[str, Any]",
+    "run.name": "str | int | float",
+    "run.dir": "str",
+    "run.speed": "str",
+    "callbacks": "dict[str, Any]",
+    "losses": "dict[str, Any] | None",
+    "lr_decay": "float | None",
+    "ema": "dict[str, Any] | None",
+    "logger": "dict[str, Any] | None",
+}
+"""The kinds of values of the keys of a recipe that are no argument of a `_target_`."""
+
+ARGUMENTS = {"losses": "flame_mdm.losses.MotionLosses", "ema": "flame_mdm.training.averaging.MovingAverage"}
+"""Keys of a recipe whose mapping has arguments of a class: the class."""
+
+DERIVED = ("to_joints", "feet", "edges")  # arguments of these classes that no recipe has
+
+
+def check_top_level(config: Config) -> None:
+    """Raises `UserError` if a key of a recipe that is no argument of a `_target_` is unknown, or has a wrong value."""
+    for key, annotation in TOP_LEVEL.items():
+        group, _, name = key.rpartition(".")
+        node = config.get(group) if group else config
+        if isinstance(node, Mapping) and name in node:
+            check_kind(key, node[name], annotation)
+    task = (config.get("task") or {}).get("_target_")
+    if config.get("losses", {}) is None and task is not None and "losses" in parameters(task):
+        raise UserError("losses=None: must be a mapping of keys")
+    for key, target in ARGUMENTS.items():
+        legal = {name: kind for name, kind in _signature(target).items() if name not in DERIVED}
+        for name, value in (config.get(key) or {}).items():
+            if name not in legal:
+                raise UserError(f"unknown config key '{key}.{name}'. Available: {', '.join(legal)}")
+            check_kind(f"{key}.{name}", value, legal[name])
+    for key in config.keys() - TOP_LEVEL.keys():  # a recipe may have keys of its own, to which others refer
+        if near := difflib.get_close_matches(str(key), TOP_LEVEL, 1, 0.75):
+            raise UserError(f"unknown config key '{key}'. Did you mean {near[0]}?")
 
 
 def check_kind(key: str, value: Any, annotation: str) -> None:
     """Raises `UserError` if the annotation of a parameter rules out a value. Unknown annotations allow any value."""
     required = []
-    for kind in _alternatives(ast.parse(annotation or "Any", mode="eval").body):
+    kinds = _alternatives(ast.parse(annotation or "Any", mode="eval").body)
+    for kind in [kind for kind in kinds if _name(kind) != "Tensor"]:  # no configuration holds a tensor
         description = _mismatch(value, kind)
         if not description:
             return
         required.append(description)
-    raise UserError(f"{key}={value}: must be {' or '.join(dict.fromkeys(required))}")
+    if required:
+        raise UserError(f"{key}={value}: must be {' or '.join(dict.fromkeys(required))}")
 
 
 def _alternatives(annotation: ast.expr) -> list[ast.expr]:
@@ -83,15 +129,32 @@ def _mismatch(value: Any, kind: ast.expr) -> str:
             members = kind.slice.elts if isinstance(kind.slice, ast.Tuple) else [kind.slice]
             choices = [ast.literal_eval(member) for member in members]
             return "" if value in choices else f"one of {', '.join(map(str, choices))}"
-        if outer not in ("list", "Sequence") or (isinstance(value, Mapping) and "_target_" in value):
+        if outer in ("dict", "Dict", "Mapping"):
+            return "" if isinstance(value, Mapping) else "a mapping of keys"
+        if outer not in (*SEQUENCES, *TUPLES) or (isinstance(value, Mapping) and "_target_" in value):
             return ""
         if not isinstance(value, list | tuple):
             return "a list"
+        if outer in TUPLES and isinstance(kind.slice, ast.Tuple):
+            return _mismatch_of_items(value, kind.slice.elts)
         required = [[_mismatch(item, member) for member in _alternatives(kind.slice)] for item in value]
         wrong = [descriptions for descriptions in required if all(descriptions)]
         return f"a list, each item {' or '.join(dict.fromkeys(wrong[0]))}" if wrong else ""
     if re.fullmatch(r"[A-Z]\w+", name) and name != "Any" and (value is None or isinstance(value, int | float)):
         return "a part"  # a class
+    return ""
+
+
+def _mismatch_of_items(items: Sequence[Any], kinds: Sequence[ast.expr]) -> str:
+    """Returns what the annotation of a tuple requires, such as `tuple[float, float]`, if the items do not meet it."""
+    if isinstance(kinds[-1], ast.Constant) and kinds[-1].value is ...:
+        kinds = [kinds[0]] * len(items)
+    if len(items) != len(kinds):
+        return f"a list of {len(kinds)}"
+    for item, kind in zip(items, kinds, strict=True):
+        required = [_mismatch(item, member) for member in _alternatives(kind) if _name(member) != "Tensor"]
+        if required and all(required):
+            return f"a list of {len(kinds)}, each item {' or '.join(dict.fromkeys(required))}"
     return ""
 
 

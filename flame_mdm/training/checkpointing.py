@@ -4,6 +4,7 @@ A run directory may come from somebody else. Reading a checkpoint runs no code a
 and only files in the folder of the checkpoints are removed, even if the state of a callback names others.
 """
 
+import math
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,12 +16,14 @@ from packaging.version import Version
 from torch import Tensor
 
 from flame_mdm.checkpoints.model_files import FORMAT, FORMAT_KEY, check_weights, read_checkpoint
-from flame_mdm.errors import UserError, say
+from flame_mdm.errors import UserError, first_line, say
 from flame_mdm.safe_io import write_failure
 from flame_mdm.safe_io.paths import check_within, temporary_beside
 
 LAST, PREVIOUS = "last.ckpt", "previous.ckpt"
 OLDEST_LIGHTNING = Version("2.6")  # Lightning migrates checkpoints of older versions, by code that trusts them
+
+SCHEDULE = {"base_lrs", "_last_lr", "last_epoch", "_step_count"}  # numbers in the state of a learning rate's schedule
 
 
 class Resumed(NamedTuple):
@@ -91,6 +94,67 @@ def newest(folder: Path) -> Resumed | None:
                 say(f"{path}: resuming from step {step}")
             return Resumed(path, step, content)
     return None
+
+
+def check_optimizers(resumed: Resumed, optimizer: torch.optim.Optimizer) -> None:
+    """Raises `UserError` if the saved state of the optimizer and its schedule does not fit the one of the recipe.
+
+    PyTorch takes over any values, and would fail in the first step of the training.
+    """
+    try:
+        misfits = list(_misfits(resumed.content, optimizer))
+    except (AttributeError, IndexError, KeyError, TypeError) as error:
+        misfits = [f"the optimizer's state does not fit the recipe: {first_line(error)}"]
+    if misfits:
+        reason = f"damaged: {misfits[0]}. Delete this file to resume from another checkpoint"
+        raise UserError(f"{resumed.path}: {reason}")
+
+
+def _misfits(content: dict[str, Any], optimizer: torch.optim.Optimizer) -> Iterator[str]:
+    """Yields what is wrong with the saved state of the optimizer and its schedule."""
+    usual = optimizer.param_groups[0]
+    weights = [weight for group in optimizer.param_groups for weight in group["params"]]
+    for state in content.get("optimizer_states") or []:
+        for group in state["param_groups"]:
+            for key, value in group.items():
+                if key != "params" and not _is_alike(value, usual.get(key, 0.0)):
+                    yield f"the optimizer's {key} is {str(value)[:40]}"
+        for row, entry in state["state"].items():
+            for key, value in entry.items():
+                if not _is_state(value, weights[row]):
+                    yield f"the optimizer's {key} of weight {row} is {str(value)[:40]}"
+    for schedule in content.get("lr_schedulers") or []:
+        for key in SCHEDULE & schedule.keys():
+            if not all(isinstance(item, int | float) for item in _leaves(schedule[key])):
+                yield f"the {key} of the learning rate's schedule is {str(schedule[key])[:40]}"
+
+
+def _is_alike(value: Any, usual: Any) -> bool:
+    """Returns whether a saved option of an optimizer has the kind of the usual value."""
+    if isinstance(usual, bool) or usual is None:
+        return value is None or isinstance(value, bool)
+    if isinstance(usual, int | float):
+        return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    if isinstance(usual, tuple | list):
+        is_same_length = isinstance(value, tuple | list) and len(value) == len(usual)
+        return is_same_length and all(map(_is_alike, value, usual))
+    return isinstance(value, type(usual))
+
+
+def _is_state(value: Any, weight: Tensor) -> bool:
+    """Returns whether a saved value can be the state of a weight: a number, or a tensor no larger than the weight."""
+    if isinstance(value, Tensor):
+        return value.numel() <= max(1, weight.numel()) and not value.dtype.is_complex
+    return isinstance(value, int | float)
+
+
+def _leaves(value: Any) -> Iterator[Any]:
+    """Yields the values in nested mappings and lists."""
+    if isinstance(value, dict | list | tuple):
+        for item in value.values() if isinstance(value, dict) else value:
+            yield from _leaves(item)
+    else:
+        yield value
 
 
 def _check_version(version: Any, path: Path) -> None:

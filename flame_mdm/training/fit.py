@@ -23,7 +23,7 @@ from flame_mdm.errors import UserError, first_line, say
 from flame_mdm.task import MotionGeneration, Task
 from flame_mdm.training.averaging import MovingAverage
 from flame_mdm.training.callbacks import Interrupted, Measurements, Progress, Report
-from flame_mdm.training.checkpointing import AtomicCheckpoints, Resumed, newest
+from flame_mdm.training.checkpointing import AtomicCheckpoints, Resumed, check_optimizers, newest
 from flame_mdm.training.guards import lost_worker, out_of_memory
 from flame_mdm.training.loggers import History
 from flame_mdm.training.provenance import WriteProvenance
@@ -75,6 +75,8 @@ def fit(folder: Path, config: Config) -> None:
         enable_model_summary=False,
     )
     try:
+        if resumed:
+            check_optimizers(resumed, task.make_optimizer())
         trainer.fit(task, data, ckpt_path=resumed.path if resumed else None, weights_only=True)
     except Interrupted as stop:
         if not trainer.is_global_zero:  # the first process reports it; launchers treat any other exit code as a crash

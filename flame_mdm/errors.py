@@ -2,10 +2,12 @@
 
 import difflib
 import html
+import os
 import re
 import sys
 import unicodedata
 from collections.abc import Iterable
+from typing import TextIO
 
 MAX_LINE = 2_000
 """Maximum length of an error line, whose middle is left out beyond; the framework's own messages are shorter."""
@@ -55,12 +57,26 @@ def markdown_text(text: str) -> str:
 
 
 def say(*lines: object, error: bool = False) -> None:
-    """Prints each argument as one `printable` line, because any name or text may come from an untrusted file."""
+    """Prints each argument as one `printable` line, because any name or text may come from an untrusted file.
+
+    If the reader of the output has ended, as `head` does, further lines are dropped, and the command finishes its work.
+    """
+    stream = sys.stderr if error else sys.stdout
     for line in lines:
         text = str(line)
         if error and len(text) > MAX_LINE:
             text = f"{text[: MAX_LINE // 2]} … {text[-MAX_LINE // 2 :]}"
-        print(printable(text), file=sys.stderr if error else sys.stdout, flush=True)
+        try:
+            print(printable(text), file=stream, flush=True)
+        except BrokenPipeError:
+            drop(stream)
+
+
+def drop(stream: TextIO) -> None:
+    """Sends what is written to a standard stream from now on, and what it still holds, to the null device."""
+    null = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, stream.fileno())
+    os.close(null)
 
 
 def _escaped(char: str) -> str:

@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from typing import IO, Any
 
 from tqdm import tqdm
@@ -38,8 +39,9 @@ class ProgressBar(tqdm):
         def write(text: str) -> None:
             nonlocal end
             if text:
-                file.write(end + text.rstrip())
-                file.flush()
+                with suppress(BrokenPipeError):  # the reader of the output has ended, as `head` does
+                    file.write(end + text.rstrip())
+                    file.flush()
                 end = "\n"
 
         return write

@@ -5,7 +5,7 @@ import signal
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from multiprocessing import active_children
 from types import FrameType
 from typing import Any, NoReturn
@@ -75,7 +75,8 @@ class StopRequest:
             raise SystemExit(128 + signum)
         self.signum, self.time = signum, time.monotonic()
         # print is not reentrant, and the signal may have interrupted another print.
-        os.write(1, b"\nstopping at the end of this step; press Ctrl-C or send SIGTERM again to stop immediately\n")
+        with suppress(BrokenPipeError):
+            os.write(1, b"\nstopping at the end of this step; press Ctrl-C or send SIGTERM again to stop immediately\n")
 
 
 def kill_children() -> None:

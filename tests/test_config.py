@@ -25,7 +25,10 @@ from flame_mdm.commands.inspect import InspectSettings
 from flame_mdm.config import check, compose, compose_data, guarded, instantiate, parameters, recipes, sweeps, trust
 from flame_mdm.config.command_line import make_variables, read_settings, run
 from flame_mdm.config.signatures import check_kind, source_file
+from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError
+from flame_mdm.formats.motion import Motion
+from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.sampler_options import option
 from flame_mdm.training.fit import check_devices
 
@@ -218,7 +221,7 @@ def test_a_checkpoint_names_only_own_classes_and_those_that_the_user_trusts(monk
             for part in ("denoiser", "callbacks"):
                 with pytest.raises(UserError, match=rf"names .* at {part}.*\. Its code is only run if you trust it"):
                     trust({part: hidden})
-    monkeypatch.setenv("FLAME_MDM_TRUST", "fractions")
+    monkeypatch.setenv("FLAME_MDM_TRUST", "decimal, fractions ")
     trust({"denoiser": {"_target_": "fractions.Fraction"}})
 
 
@@ -277,6 +280,8 @@ def test_wrong_words_are_one_line(capsys):
         (["which=first"], "which=first: must be one of last, best"),
         (["names='a"], "No closing quotation"),
         (["--fast"], "unknown option --fast"),
+        (["=", "x"], "'=' has no key. Write key=value, without spaces around the = sign"),
+        (["=x"], "'=x' has no key"),
     ):
         assert run(lambda _: pytest.fail("it ran"), Example, words) == 1
         assert message in one_error(capsys)
@@ -337,6 +342,30 @@ trian"""
 
 
 @pytest.mark.slow
+def into_a_closed_pipe(*words: str) -> tuple[int, str]:
+    """Exit code, and what is written to stderr, of a command whose output nobody reads."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-m", "flame_mdm", *words]
+    result = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(writer)
+    return result.returncode, result.stderr
+
+
+@pytest.mark.parametrize("words", [["--help"], ["train", "--help"], ["sample", "--help"], ["inspect", "--help"]])
+def test_help_may_be_read_in_part(words):
+    assert into_a_closed_pipe(*words) == (0, "")
+
+
+def test_a_command_finishes_its_work_if_nobody_reads_its_output(tmp_path):
+    joints = next(iter(Synthetic(clips=1).clips(20.0))).motion
+    Motion(joints, 20.0, SMPL22).save(tmp_path / "walk.npz")
+    code, err = into_a_closed_pipe("inspect", str(tmp_path / "walk.npz"), f"out={tmp_path / 'out.html'}")
+    assert code in (0, 3)  # 3 = the motion has faults
+    assert err == ""
+    assert "</html>" in (tmp_path / "out.html").read_text()
+
+
 def test_help_and_wrong_words_do_not_wait_for_torch():
     program = f"""
         import sys

@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Iterable
+from dataclasses import replace
 from functools import partial
 from itertools import islice, product
 from pathlib import Path
@@ -86,6 +87,27 @@ def test_the_same_input_gives_the_same_fingerprint(store, tmp_path, monkeypatch)
     assert print_of(mean=store.mean) == print_of(mean=store.mean - 1e-9) == store.fingerprint, "nor does rounding"
     assert print_of(mean=zero + 4e-23) == print_of(mean=zero - 3e-22)
     assert print_of(mean=store.mean + 0.01) != store.fingerprint
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"captions": ["a person runs"]},
+        {"captions": ["a person walks", "somebody walks"]},
+        {"captions": []},
+        {"id": "c"},
+        {"source": "c"},
+        {"split": "val"},
+        {"window": (0, 20)},
+        {"attributes": {"speed": "slow"}},
+    ],
+)
+def test_the_fingerprint_tells_each_field_of_a_clip(tmp_path, changed):
+    def fingerprint(name: str, **fields: Any) -> str:
+        clips = OwnClips(clip("a"), replace(clip("b"), **fields))
+        return write_store(tmp_path / name, clips, HumanML("smpl22", "clean")).fingerprint
+
+    assert fingerprint("one") != fingerprint("other", **changed)
 
 
 def test_damaged_files_are_named(store, tmp_path):

@@ -139,7 +139,8 @@ def trust(config: Config) -> None:
     in the folder of `experiments/` for this part. The environment variable FLAME_MDM_TRUST adds packages, separated by
     commas. Nothing that the configuration names is imported here.
     """
-    added = [name for name in os.environ.get("FLAME_MDM_TRUST", "").split(",") if name]
+    names = [name.strip() for name in os.environ.get("FLAME_MDM_TRUST", "").split(",")]
+    added = [name for name in names if name]
     for path, node in walk(config):
         target = node.get("_target_", "")
         if "_target_" not in node or (isinstance(target, str) and _is_of_kind(target, path[0] if path else "")):

@@ -15,7 +15,7 @@ from typing import Any, TypeVar, get_type_hints
 
 from flame_mdm.config.composition import parse
 from flame_mdm.config.signatures import check_kind
-from flame_mdm.errors import UserError, did_you_mean, first_line, say
+from flame_mdm.errors import UserError, did_you_mean, first_line, say, shortened
 from flame_mdm.safe_io import FULL
 from flame_mdm.signals import stoppable
 
@@ -64,6 +64,8 @@ def read_settings(kind: type[Settings], words: Sequence[str]) -> Settings:
             raise UserError(f"unknown option {word}. Available: --help, and keys as key=value")
         if not separator:
             raise UserError(f"unexpected word '{word}'. Write key=value, and quote text: key='a b'")
+        if not key:
+            raise UserError(f"'{shortened(word, 60)}' has no key. Write key=value, without spaces around the = sign")
         if key in annotations:
             values[key] = _value(key, text, annotations[key])
         elif takes_composed and ("." in key or key in getattr(kind, "COMPOSED", ())):

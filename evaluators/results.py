@@ -65,7 +65,11 @@ def make_result(request: EvaluationRequest, plan: Plan) -> Result:
         ),
         seed=request.seed,
         extractor=extractor
-        and ExtractorRecord(sha256=extractor.sha256, path=str(request.extractor), data=extractor.fingerprint),
+        and ExtractorRecord(
+            sha256=extractor.sha256,
+            path=str(request.extractor or (protocol.extractor or {})["path"]),
+            data=extractor.fingerprint,
+        ),
         checkpoint=_checkpoint(plan),
         samples_sha256=plan.source.sha256 if isinstance(plan.source, SampleFolder) else None,
         baseline=request.baseline,

@@ -35,6 +35,7 @@ from evaluators.metrics.retrieval import (
     plain_caption,
     whole_set_retrieval,
 )
+from flame_mdm.errors import UserError
 from flame_mdm.representations import rotation
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.seeds import key
@@ -216,17 +217,16 @@ def test_ranks_equal_tmrs(group: str):
 
 
 @golden_case("tmr_retrieval")
-def test_retrieval_in_small_batches_and_by_protocol_equals_tmrs(stem: str, monkeypatch):
+def test_retrieval_in_small_batches_and_by_protocol_equals_tmrs(stem: str, tmp_path, monkeypatch):
     similarity, batches = torch.from_numpy(TMR["in/sims"]).double(), torch.from_numpy(TMR["out/guo/batches"])
     assert_recall(batched_retrieval(similarity, batches), TMR, tmr("out/guo"))
 
     ids, chosen = TMR["in/keyids"].tolist(), TMR["in/nsim_idx"]
     vectors = dict(zip(ids, torch.from_numpy(TMR["in/sent_emb"]), strict=True))
     monkeypatch.setattr("evaluators.metrics.retrieval.embedding", lambda encoder, caption: vectors[caption])
-    by_key = sorted(ids, key=key)
-    theirs_chosen = [by_key.index(ids[i]) for i in chosen]
-    monkeypatch.setattr("evaluators.metrics.retrieval.dissimilar", lambda meaning: theirs_chosen)
-    metric = TMRRetrieval(encoder={"_target_": "stand-in"})
+    listed = tmp_path / "nsim_test.txt"
+    listed.write_text("\n".join([*(ids[i] for i in chosen), "not_evaluated"]) + "\n")
+    metric = TMRRetrieval(encoder={"_target_": "stand-in"}, ids=str(listed))
     motion, text = (torch.from_numpy(TMR[f"in/{kind}_latent"]) for kind in ("motion", "text"))
     metric.update(motion, text, ids, torch.tensor([key(name) for name in ids]))
     values = metric.compute()
@@ -234,6 +234,14 @@ def test_retrieval_in_small_batches_and_by_protocol_equals_tmrs(stem: str, monke
         part = {name.removeprefix(f"{ours}_"): value for name, value in values.items() if name.startswith(ours)}
         # Their similarities are float32, which moves single queries whose answers are nearly equal.
         assert_recall(part, TMR, tmr(f"out/driver_bs256/{theirs}"), within=1.01 * 100 / len(ids))
+
+
+def test_a_list_of_dissimilar_motions_needs_ids(tmp_path):
+    (tmp_path / "empty.txt").write_text("\n")
+    with pytest.raises(UserError, match=r"empty\.txt: contains no ids. Write one per line"):
+        TMRRetrieval(ids=str(tmp_path / "empty.txt"))
+    with pytest.raises(FileNotFoundError):
+        TMRRetrieval(ids=str(tmp_path / "none.txt"))
 
 
 def test_multi_positive_r_precision_of_an_example_and_dissimilar_captions():

@@ -13,7 +13,7 @@ import evaluators.evaluation
 from evaluators.evaluation_request import EvaluationRequest
 from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.model_files import FORMAT, FORMAT_KEY, weights_sha256
-from flame_mdm.commands.tables import outdated
+from flame_mdm.commands.tables import outdated, shows_multimodality
 from flame_mdm.errors import UserError
 from flame_mdm.reporting.tables import build as builder
 from flame_mdm.reporting.tables.build import build
@@ -378,6 +378,84 @@ def test_an_index_lists_the_tables_with_their_measured_rows(tmp_path, capsys):
     assert text.index("FLAME, table 9: sampling steps of DDPM and DDIM") < text.index(row)
     names = spec_names()
     assert names.index("flame_9") + 1 == names.index("flame_10")
+
+
+def test_a_corrected_table_is_ranked_by_its_own_real_row_and_names_its_own_evaluator(folder, monkeypatch):
+    published = folder / "published.yaml"
+    theirs = {"source": "their repository", "evaluator": "a corrected evaluator"}
+    printed = [
+        {"label": "Real", "real": True, "values": {"Diversity": "9.5"}},
+        {"label": "near", "values": {"Diversity": "9.4"}},
+        {"label": "far", "values": {"Diversity": "8.1"}},
+        {"label": "Real, corrected", "real": True, "values": {"Diversity": "8.0"}, **theirs},
+        {"label": "near, corrected", "values": {"Diversity": "8.1"}, **theirs},
+        {"label": "far, corrected", "values": {"Diversity": "9.4"}, **theirs},
+    ]
+    part = {"evaluator": "an evaluator", "source": "a paper", "rows": printed}
+    published.write_text(json.dumps({"spec": {"Text-to-motion": part}}))
+    monkeypatch.setattr(builder, "PUBLISHED", published)
+    lines = rows(folder)
+    index = 2  # of the column Diversity
+    ranked = {
+        line.label: cell.rank for line in lines.values() if line.kind == "reported" and (cell := line.cells[index])
+    }
+    assert ranked == {"near": 1, "far": 2, "near, corrected": 1, "far, corrected": 2}
+    text = rendered(made(folder), "md")
+    assert "†: as reported: a paper; measured with an evaluator" in text
+    assert "††: as reported: their repository; measured with a corrected evaluator" in text
+
+
+def test_a_legend_names_the_rows_that_are_not_ranked(folder):
+    legend = "of the rows with the same mark"
+    table = made(folder)
+    assert f"{legend}." in rendered(table, "html")
+    table.parts[0].lines[1].facts["baseline"] = "real"
+    for suffix in ("md", "html", "tex"):
+        assert f"{legend}, except sanity-check baselines." in rendered(table, suffix), suffix
+    table.parts[0].lines[2].state = "QUICK"
+    both = f"{legend}, except sanity-check baselines and rows that are not valid or quick."
+    assert both in rendered(table, "md")
+
+
+def test_notes_of_a_latex_table_are_in_its_threeparttable(folder):
+    text = rendered(made(folder), "tex")
+    lines = text.splitlines()
+    assert [line for line in lines if line.startswith("%")] == [r"% \usepackage{booktabs,threeparttable}"]
+    notes = text.split(r"\begin{tablenotes}")[1].split(r"\end{tablenotes}")[0]
+    assert r"\item[] A note." in notes
+    assert r"\item[] $\uparrow$ higher is better" in notes
+    assert text.count(r"\begin{threeparttable}") == text.count(r"\end{tablenotes}") == 2
+
+
+def test_footnotes_of_rows_with_several_protocols_name_their_columns(tmp_path):
+    spec = load_spec("mfm_figure_4")
+    for _, needed in evaluations(spec["parts"]["HumanML3D"]):
+        for evaluation in needed:
+            protocol = evaluation.keys["protocol"]
+            write_json(evaluation.path(tmp_path), result(protocol={"name": protocol, "version": 1}))
+    (part,) = build("mfm_figure_4", spec, tmp_path).parts
+    notes = dict(note for note in part.notes if note[0])
+    assert notes["a"].startswith("NFE, FID, Training hours, Peak memory of training, GiB: protocol text_to_motion_t2m")
+    assert notes["b"].startswith("Seconds per motion: ")
+    assert notes["†"].endswith("as run by Hu et al. on an unnamed device")
+    assert notes["††"].endswith("as run by Chen et al. on one V100"), "the value that Hu et al. quote"
+
+
+def test_multimodality_is_measured_for_tables_that_show_it_alone(folder):
+    path, keys = folder / "result.json", {"protocol": "synthetic", "ckpt": f"{folder}/mdm.ckpt"}
+    evaluation = Evaluation("MDM", keys)
+    assert shows_multimodality(evaluation, {"fid", "multimodality"})
+    assert not shows_multimodality(evaluation, {"fid", "diversity"})
+    write_json(path, measured(0.5, 0.7, 9.0, changed={"multimodality": False}, checkpoint=None))
+    (folder / "mdm.ckpt").unlink()
+    assert not outdated(path, evaluation, {"fid"})
+    assert outdated(path, evaluation, {"fid", "multimodality"}), "was not measured for a table without it"
+    assert not outdated(path, Evaluation("MDM", keys | {"multimodality": False}), {"multimodality"}), "as the spec says"
+
+    change(folder, "MFM", changed={"multimodality": False})
+    assert "differs from the protocol" not in rendered(made(folder), "md"), "no column shows it"
+    change(folder, "MFM", changed={"samples": 5})
+    assert "differs from the protocol: samples = 5" in rendered(made(folder), "md")
 
 
 def test_ranks():

@@ -15,6 +15,8 @@ from evaluators.metrics.samples import SampleMetric
 from flame_mdm.batch import MotionBatch
 from flame_mdm.conditions import ConditionEncoder
 from flame_mdm.config import Config, instantiate
+from flame_mdm.errors import UserError
+from flame_mdm.safe_io import MEBIBYTE, read_text
 from flame_mdm.seeds import key
 
 SAME = 0.9  # cosine above which TMR considers captions the same: its threshold 0.95 is of (cosine + 1) / 2
@@ -137,8 +139,14 @@ class TMRRetrieval(CaptionMetric):
     [0, 1] and median rank `t2m_median` (1 = best) of motions for texts, and `m2t_` of texts for motions.
 
     TMR's encoder of captions is all-mpnet-base-v2; its dissimilar motions and batches are lists for HumanML3D and KIT.
-    Here, batches are drawn, and each dissimilar motion is that whose caption is the least similar to those before it,
-    after the first by key.
+    Here, batches are drawn. Without `ids`, the dissimilar subset starts with the first motion by key; the motion whose
+    caption is least similar to those already chosen is added next.
+
+    Args:
+        encoder: mapping with the `_target_` of a text encoder; None = captions are compared as text.
+        seed: seed of the batches.
+        ids: file with the ids of the dissimilar motions, one per line, such as TMR's `nsim_test.txt`. Ids that were not
+            evaluated are ignored.
     """
 
     names = tuple(
@@ -148,12 +156,23 @@ class TMRRetrieval(CaptionMetric):
         for value in (*(f"top{k}" for k in TMR_TOP), "median")
     )
 
+    def __init__(self, encoder: Config | None = None, seed: int = 0, ids: str | None = None):
+        super().__init__(encoder, seed)
+        listed = [] if ids is None else read_text(ids, MEBIBYTE).split()
+        if ids is not None and not listed:
+            raise UserError(f"{ids}: contains no ids. Write one per line")
+        self.ids = torch.tensor([key(name) for name in listed], dtype=torch.long)
+
     def value(self, motion: Tensor, text: Tensor, caption_keys: Tensor, meaning: Tensor) -> dict[str, float | None]:
         similarity = F.normalize(text, dim=-1) @ F.normalize(motion, dim=-1).T
         same = (caption_keys[None] == caption_keys[:, None]) | (meaning @ meaning.T > SAME)
         values = {"all": whole_set_retrieval(similarity), "threshold": whole_set_retrieval(similarity, same)}
-        if meaning.shape[1]:
-            chosen = dissimilar(meaning)
+        if len(self.ids):
+            (keys,) = self.rows("keys", "keys")
+            chosen = torch.isin(keys, self.ids.to(keys.device)).nonzero()[:, 0].tolist()
+        else:
+            chosen = dissimilar(meaning) if meaning.shape[1] else []
+        if chosen:
             values["dissimilar"] = whole_set_retrieval(similarity[chosen][:, chosen])
         order = np.random.default_rng(self.seed).permutation(len(motion))
         batches = torch.from_numpy(order[: len(order) // BATCH * BATCH]).view(-1, BATCH)

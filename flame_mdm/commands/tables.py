@@ -1,7 +1,7 @@
 """`flame-mdm tables [NAME ...]`: renders tables and figures from results, and evaluates what is missing."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -73,18 +73,28 @@ def evaluate_missing(specs: Mapping[str, Config], results: Path, settings: Table
     from evaluators.protocol import protocol_config
 
     listed: dict[Path, Evaluation] = {}
+    shown: dict[Path, set[str]] = {}  # values that the tables show of each result
     for part in (part for spec in specs.values() for part in spec["parts"].values()):
         for dataset in part.get("lengths", []):
             count_lengths(dataset, results, settings)
         for _, row in evaluations(part) if "columns" in part else ():
-            listed |= {evaluation.path(results): evaluation for evaluation in row if not evaluation.absent}
-    missing = {path: listed[path] for path in listed if not path.exists() or outdated(path, listed[path])}
+            for evaluation, column in zip(row, part["columns"].values(), strict=True):
+                if not evaluation.absent:
+                    listed[evaluation.path(results)] = evaluation
+                    shown.setdefault(evaluation.path(results), set()).add(column["value"])
+
+    missing = {
+        path: evaluation
+        for path, evaluation in listed.items()
+        if not path.exists() or outdated(path, evaluation, shown[path])
+    }
     failed = []
     for number, (path, evaluation) in enumerate(missing.items()):
         say(f"evaluating {number + 1} of {len(missing)}: {evaluation.label}")
         keys = dict(evaluation.keys)
         try:
             check_within(path, results)
+            keys.setdefault("multimodality", shows_multimodality(evaluation, shown[path]))
             dotted = [f"{name}={keys.pop(name)}" for name in list(keys) if "." in name]
             nodes = compose_data(keys.pop("data"), dotted) if "data" in keys else {}
             names = ("device", "batch_size", "force", "data_root")
@@ -98,11 +108,31 @@ def evaluate_missing(specs: Mapping[str, Config], results: Path, settings: Table
     return failed
 
 
-def outdated(path: Path, evaluation: Evaluation) -> bool:
-    """Returns whether the checkpoint or extractor of a result has changed, or SMPL's model file is now available."""
+def shows_multimodality(evaluation: Evaluation, values: Set[str]) -> bool:
+    """Returns whether `values` need several motions per prompt, which take most of the time of an evaluation."""
+    from evaluators.protocol import protocol_config
+
+    several = protocol_config(evaluation.keys["protocol"]).get("multimodality") or {"metrics": {}}
+    return any(value.partition("/")[0] in several["metrics"] for value in values)
+
+
+def outdated(path: Path, evaluation: Evaluation, values: Set[str] = frozenset()) -> bool:
+    """Returns whether a result must be measured again.
+
+    That is the case if its checkpoint or extractor has changed, if SMPL's model file is now available, or if it lacks
+    metrics that need several motions per prompt.
+
+    Args:
+        path: the result.
+        evaluation: the evaluation that a table needs.
+        values: the values that tables show of the result.
+    """
     from flame_mdm.checkpoints.model_files import weights_sha256
 
     result = read_result(path)
+    was_skipped = "multimodality" in result.changed and "multimodality" not in evaluation.keys
+    if was_skipped and shows_multimodality(evaluation, values):
+        return True
     if result.stand_in_skeleton and os.environ.get("FLAME_MDM_SMPL"):
         return True
     for used, key in ((result.checkpoint, "ckpt"), (result.extractor, "extractor")):

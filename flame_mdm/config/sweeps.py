@@ -1,5 +1,6 @@
 """The command line of `train`, which Hydra composes; sweeps; and jobs that Hydra's launchers start."""
 
+import shutil
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from itertools import groupby
@@ -51,6 +52,9 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
     parsed = composition.parse(overrides)
     launcher = [str(o.value()) for o in parsed if o.key_or_group == LAUNCH]
     sweep = bool(launcher or flags)
+    lists = [str(o.input_line) for o in parsed if o.is_sweep_override()]
+    if lists and not sweep:
+        raise UserError(f"{lists[0]}: several values make a sweep, one run for each. Add --multirun, or give one value")
     config = composition.resolve(recipe, [composition.first_choice(o) for o in parsed] if sweep else overrides, base)
     _check_whole(config, name)
     if "local" in launcher and config["trainer"].get("devices", 1) != 1:
@@ -80,6 +84,10 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
         "hydra.sweep.subdir=${hydra.job.override_dirname}",
         f"hydra.job.config.override_dirname.exclude_keys=[{','.join(fixed)}]",
     ]
+    if "slurm" in launcher and shutil.which("srun") is None:
+        raise UserError(
+            "launch=slurm: srun is not on this machine. Run the command where SLURM is, or use launch=local"
+        )
     if launcher:
         say(f"waiting for the jobs; their output is in {config['run']['dir']}/.submitit")
     check_tree(Path(config["run"]["dir"]))  # Hydra and the launchers open files in it in place

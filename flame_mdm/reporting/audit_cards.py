@@ -148,14 +148,24 @@ def findings(card: AuditCard) -> list[str]:
 
 def _cell(card: AuditCard, perturbation: AuditedPerturbation, metric: str) -> tuple[str, str]:
     response = seen(card, perturbation, metric)
-    if response is None or response.grade is None:
-        return ("not computed", "faint") if response is None else ("–", "faint")
+    if response is None:
+        return _not_computed(card, perturbation, metric), "faint"
+    if response.grade is None:
+        return "–", "faint"
     graded = len(perturbation.grades) > 1
     first, then = (("–" if g is None else f"{g:g}" if graded else "yes") for g in (response.grade, response.outside))
     text = first if first == then else f"{first} → {then}"
     if not response.monotone:
         text += " ~"
     return text, "bad" if response.rewarded else "seen" if first == then else "weak"
+
+
+def _not_computed(card: AuditCard, perturbation: AuditedPerturbation, metric: str) -> str:
+    """Returns at which grades a metric lacks a value, if it has one at others."""
+    grades = [grade.grade for grade in perturbation.grades if None in grade.values[metric][2:]]
+    if None in card.real[metric] or len(grades) == len(perturbation.grades):
+        return "not computed"
+    return f"not computed at {', '.join(f'{grade:g}' for grade in grades)}"
 
 
 def _curve(card: AuditCard, perturbation: AuditedPerturbation, metric: str) -> dict[str, str] | None:

@@ -62,6 +62,8 @@ def _measured(name: str, part: Config, reported: Config | None, results: Path) -
     lines: list[Line] = []
     truths: dict[str, Line] = {}
     missing: list[tuple[str, str]] = []
+    measured_under: dict[str, dict[str, None]] = {}  # columns of each footnote, where rows have several footnotes
+    shows_multimodality = any(value.startswith("multimodality") for value in values)
     for row, needed in evaluations(part):
         paths = [evaluation.path(results) for evaluation in needed]
         read = [read_result(path) if path.exists() else None for path in paths]
@@ -74,14 +76,24 @@ def _measured(name: str, part: Config, reported: Config | None, results: Path) -
                 commands = [made_by(path) for path in evaluation.absent.values()] or ["make tables evaluates it"]
                 missing += [(line.label, command) for command in commands]
         timed = {path for path, value in zip(paths, values, strict=True) if value == "seconds_per_sample"}
-        facts = [_conditions(r, path in timed) for path, r in zip(paths, read, strict=True) if r is not None]
-        line.marks = ",".join(dict.fromkeys(_letter(fact, conditions) for fact in facts))
+        letters: dict[str, str] = {}  # by column
+        for label, path, result in zip(columns, paths, read, strict=True):
+            if result is not None:
+                letters[label] = _letter(_conditions(result, path in timed, shows_multimodality), conditions)
+        line.marks = ",".join(dict.fromkeys(letters.values()))
+        if len(set(letters.values())) > 1:
+            for label, letter in letters.items():
+                measured_under.setdefault(letter, {})[label] = None
         if line.marks and line.marks not in truths:
             pairs = zip(read, values, strict=True)
             cells = [_entry(r.ground_truth, v) if r and v not in ABOUT else None for r, v in pairs]
             truths[line.marks] = Line("Real motions", "real", cells, line.marks)
     lines = [line for line in truths.values() if any(line.cells)] + lines
-    notes = [*_condition_notes(conditions), *_by_text(missing), *_warnings(lines, values, list(columns))]
+    notes = [
+        *_condition_notes(conditions, measured_under),
+        *_by_text(missing),
+        *_warnings(lines, values, list(columns)),
+    ]
     if reported is not None:
         more, sources = _reported(reported, columns, values, name)
         lines, notes = lines + more, notes + sources
@@ -98,15 +110,25 @@ def _letter(facts: dict[str, str], conditions: list[dict[str, str]]) -> str:
     return string.ascii_lowercase[index] * (1 + again)
 
 
-def _condition_notes(conditions: list[dict[str, str]]) -> list[tuple[str, str]]:
-    """Returns the footnotes on conditions. One with up to three differences from the first lists only these."""
+def _condition_notes(
+    conditions: list[dict[str, str]], columns: Mapping[str, Mapping[str, None]]
+) -> list[tuple[str, str]]:
+    """Returns the footnotes on conditions. One with up to three differences from the first lists only these.
+
+    Args:
+        conditions: the conditions, in the order of their letters.
+        columns: the columns that were measured under the conditions of a letter; not listed if these are all columns.
+    """
     notes = []
     for facts in conditions:
         different = [text or f"no {name}" for name, text in facts.items() if text != conditions[0][name]]
         text = (
             f"as a, but {'; '.join(different)}" if 0 < len(different) <= 3 else "; ".join(filter(None, facts.values()))
         )
-        notes.append((_letter(facts, conditions), text))
+        letter = _letter(facts, conditions)
+        if letter in columns:
+            text = f"{', '.join(columns[letter])}: {text}"
+        notes.append((letter, text))
     return notes
 
 
@@ -132,12 +154,19 @@ def _by_text(lines: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
     return [("", f"{'; '.join(rows)}: {text}") for text, rows in labels.items()]
 
 
-def _conditions(result: Result, timed: bool) -> dict[str, str]:
-    """Describes how a result was measured, with its timing if that is shown. Only rows with equal ones are compared."""
+def _conditions(result: Result, timed: bool, shows_multimodality: bool) -> dict[str, str]:
+    """Describes how a result was measured. Only rows with equal conditions are compared.
+
+    Args:
+        result: the result.
+        timed: whether the table shows its seconds per motion.
+        shows_multimodality: whether the table shows multimodality; if not, whether it was measured does not matter.
+    """
     protocol, data, extractor, cost = result.protocol, result.data, result.extractor, result.cost
     card = card_of(data.dataset, extractor.sha256 if extractor else None)
     first = next((v for v in (result.values or {}).values() if v and v.n), None)  # later ones may have fewer motions
-    changed = ", ".join(f"{k} = {v}" for k, v in result.changed.items())
+    shown = {k: v for k, v in result.changed.items() if k != "multimodality" or shows_multimodality}
+    changed = ", ".join(f"{k} = {v}" for k, v in shown.items())
     smpl = result.skeleton and result.skeleton.smpl_sha256
     skeleton = f"joints of SMPL's model file, sha256 {smpl[:12]}" if smpl else ""
     if result.stand_in_skeleton:
@@ -275,9 +304,11 @@ def _rank(lines: Sequence[Line], columns: Mapping[str, str]) -> None:
     """Marks best and second best among rows of the same kind with the same marks."""
     for kind, real in (("measured", "real"), ("reported", "reported real")):
         for marks in {line.marks for line in lines}:
-            same = [x for x in lines if x.marks == marks or x.kind == "reported real"]
+            same = [x for x in lines if x.marks == marks]
             rows = [x for x in same if x.kind == kind and not x.state and not x.facts.get("baseline")]
             truths = [x for x in same if x.kind == real]
+            if kind == "reported" and not truths:  # from a source that does not report real motions
+                truths = [x for x in lines if x.kind == real]
             for index, better in enumerate(columns.values()):
                 numbers = [cell.value if (cell := row.cells[index]) else None for row in rows]
                 reals = [c.value for x in truths if (c := x.cells[index]) is not None]
@@ -296,7 +327,8 @@ def _reported(
         unknown = row["values"].keys() - columns.keys()
         if unknown:
             raise UserError(f"{PUBLISHED}: {part}, {row['label']}: no column is called {', '.join(sorted(unknown))}")
-        text = f"as reported: {row.get('source') or reported['source']}; measured with {reported['evaluator']}"
+        source, evaluator = (row.get(key) or reported[key] for key in ("source", "evaluator"))
+        text = f"as reported: {source}; measured with {evaluator}"
         mark = notes.setdefault(text, "†" * (len(notes) + 1))
         cells = [Cell(str(v), _leading(str(v))) if (v := row["values"].get(c)) is not None else None for c in columns]
         line = Line(row["label"], "reported real" if row.get("real") else "reported", cells, mark)

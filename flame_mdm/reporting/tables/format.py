@@ -105,10 +105,22 @@ def rendered(table: Table, suffix: str) -> Markup:
         "several": len(table.parts) > 1,
         "sources": _sources(table),
         "ranked": any(better != "none" for part in table.parts for better in part.columns.values()),
+        "unranked": _unranked(table),
         "bad": NO_RESULTS,
     }
     functions = {"blocks": _blocks, "head": _head, "label": _label, "linked": _linked, "tex": _tex}
     return render(f"table.{suffix}", table=table, **values, **functions)
+
+
+def _unranked(table: Table) -> str:
+    """Returns which rows of a table are not ranked among those with the same mark; "" if all are."""
+    lines = [line for part in table.parts for line in part.lines]
+    kinds = []
+    if any(line.facts.get("baseline") for line in lines):
+        kinds.append("sanity-check baselines")
+    if any(line.state in NO_RESULTS for line in lines):
+        kinds.append("rows that are not valid or quick")
+    return " and ".join(kinds)
 
 
 def _linked(table: Table, text: str) -> list[tuple[str, str]]:

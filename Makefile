@@ -51,8 +51,8 @@ lint: $(READY) ## check style and types
 	@$(VENV)/bin/ruff format --check .
 	@$(VENV)/bin/pyright
 
-bench: $(READY) ## measure the speed of training, write docs/benchmarks/speed.md; DEVICE=cuda adds a GPU
-	@$(VENV)/bin/python benchmarks/steps.py $(or $(DEVICE),cpu)
+bench: $(READY) ## measure the speed, write docs/benchmarks/speed.md; ONLY=steps,host; DEVICE=cuda adds a GPU; MDM_REPO=PATH the authors' step
+	@$(VENV)/bin/python benchmarks/run.py "only=$(ONLY)" "device=$(DEVICE)" "mdm_repo=$(MDM_REPO)" "runs=$(RUNS)"
 
 docs: $(READY) ## write the pages that are generated from the code, and build the site in build/docs
 	@$(VENV)/bin/python docs/generate.py

@@ -1,22 +1,15 @@
-"""Training steps in both speeds, compared to plain PyTorch: `make bench` writes docs/benchmarks/speed.md.
+"""Training steps in both speeds, compared to the authors' step and to plain PyTorch: `python benchmarks/steps.py`.
 
-The full-size step is that of humanml3d/mdm with lengths as in HumanML3D. A plain PyTorch loop trains
-`nn.TransformerEncoder` of the same size on the same clips, padded to 196 frames, as the published codes do. Then follow
-a step of every network in its size for CPU runs, and on the CPU the quickstart by the complete framework. All take
-turns in one run. The section of a GPU is next to that of the CPU, and sections that were measured once, by a script of
-an earlier commit, keep their figures.
+The full-size step is that of humanml3d/mdm with lengths as in HumanML3D. The authors' step, from a clone of their
+code, and a plain PyTorch loop, which trains `nn.TransformerEncoder` of the same size, take the same clips, padded
+to 196 frames as in the published codes. Then follow a step of every network in its size for CPU runs, and on the
+CPU the quickstart by the complete framework. All take turns in one run.
 """
 
-import datetime
-import json
-import os
-import platform
 import statistics
-import sys
 import tempfile
-import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from functools import partial
 from pathlib import Path
@@ -25,6 +18,8 @@ from typing import Any
 
 import numpy as np
 import torch
+from authors import authors_step
+from sections import QUIET, Row, Section, Settings, section, show, take_turns
 from torch import Tensor, nn
 
 from flame_mdm.batch import Condition, MotionBatch, padded_length
@@ -33,23 +28,11 @@ from flame_mdm.data.datamodule import TrainingBatches
 from flame_mdm.runs import read_history
 from flame_mdm.task import MotionGeneration
 from flame_mdm.training.fit import fit
-from flame_mdm.training.provenance import environment
 from flame_mdm.training.speed import accelerate
-
-Row = dict[str, str | float | None]
-Section = dict[str, Any]  # a title, a text, a summary in one sentence, and tables by caption
-
-PAGE = Path(__file__).parent.parent / "docs" / "benchmarks" / "speed.md"
-HEAD = """# Speed
-
-`make bench` measures the speed of training steps and writes this page and [speed.json](speed.json). Every comparison is
-a ratio of two measurements in one run, on an idle machine unless the section says otherwise; the absolute figures next
-to it hold for that machine alone. `make bench DEVICE=cuda` adds the section of a GPU. Sections that name a commit were
-measured once, by a script of that commit. [Which options to choose](../speed.md) is a page of its own.
-"""
 
 WIDTH, LONGEST = 263, 196
 TOKENS = 30  # tokens of a caption
+ROUNDS, BATCHES = 2, 8  # of the full-size step: each batch is trained on twice by everybody in turn
 BACKBONES = {
     "MDM, encoder": ["synthetic/mdm"],
     "MDM, decoder": ["synthetic/mdm_decoder"],
@@ -60,10 +43,6 @@ BACKBONES = {
     "MFM": ["synthetic/mfm"],
 }
 SPEEDS = ("reference", "fast")
-QUIET = [
-    *("trainer.accelerator=cpu", "trainer.enable_progress_bar=false", "trainer.val_check_interval=1000000"),
-    *("callbacks.samples=null", "callbacks.best=null", "callbacks.checkpoints.every_n_steps=1000000", "logger=csv"),
-]
 
 
 def training_step(task: MotionGeneration, batch: MotionBatch) -> Tensor:
@@ -92,6 +71,7 @@ class Peer(nn.Module):
 
 
 def peer_step(width: int, layers: int, device: str) -> Callable[[MotionBatch], None]:
+    """Returns a training step of `Peer` with AdamW."""
     model = Peer(width, layers).to(device).train()
     optimizer = torch.optim.AdamW(model.parameters(), 1e-4)
 
@@ -135,51 +115,51 @@ def batch_of(lengths: np.ndarray, frames: int, device: str) -> MotionBatch:
     return MotionBatch(x.to(device), mask.to(device), [str(i) for i in range(len(lengths))])
 
 
-def take_turns(runs: Mapping[str, Callable[[], object]], rounds: int, device: str = "cpu") -> dict[str, float]:
-    """Returns the median seconds of functions, which take turns, since machines may be busy; one round warms up."""
-    times: dict[str, list[float]] = {name: [] for name in runs}
-    for _ in range(rounds + 1):
-        for name, run in runs.items():
-            start = time.perf_counter()
-            run()
-            if device == "cuda":
-                torch.cuda.synchronize()
-            times[name].append(time.perf_counter() - start)
-    return {name: statistics.median(taken[1:]) for name, taken in times.items()}
-
-
-def full_size(size: list[str], batches: int, device: str) -> tuple[list[Row], str]:
-    """Returns rows of the full-size step, and a text about the batches."""
-    config = compose("humanml3d/mdm", ["data.batch_size=16", *size])
-    rows = config["data"]["batch_size"]
+def drawn_lengths(rows: int, batches: int) -> list[np.ndarray]:
+    """Returns the lengths (rows,) of batches as the framework's sampler draws them."""
     lengths = 4 * np.random.default_rng(0).integers(10, 50, TrainingBatches.BUCKETS * rows)
     world = TrainingBatches.BUCKETS // batches
     sampler = iter(TrainingBatches(lengths, rows, seed=0, first=0, rank=0, world=world))
-    drawn = [lengths[[index for index, _ in next(sampler)]] for _ in range(batches)]
-    real = sum(int(chosen.sum()) for chosen in drawn)
-    padded = [padded_length(int(chosen.max()), 1, LONGEST) for chosen in drawn]
+    return [lengths[[index for index, _ in next(sampler)]] for _ in range(batches)]
 
-    def on_batches(step: Callable[[MotionBatch], None], multiple: int) -> Callable[[], None]:
-        """Returns a function that trains on all batches, padded to a multiple of frames."""
-        ready = [batch_of(c, padded_length(int(c.max()), multiple, LONGEST), device) for c in drawn]
 
-        def run() -> None:
-            for batch in ready:
-                step(batch)
+def full_size(settings: Settings) -> tuple[list[Row], str]:
+    """Returns rows of the full-size step, and a text about the batches."""
+    words = ["data.batch_size=16"]
+    if settings.quick:
+        words = ["data.batch_size=2", "denoiser.latent_dim=16", "denoiser.ff_size=32", "denoiser.num_layers=1"]
+    config, device = compose("humanml3d/mdm", words), settings.device
+    rows, width, layers = (
+        config["data"]["batch_size"],
+        config["denoiser"]["latent_dim"],
+        config["denoiser"]["num_layers"],
+    )
 
-        return run
+    steps = {"plain PyTorch, padded to 196": (peer_step(width, layers, device), LONGEST)}
+    if settings.mdm_repo:
+        authors = authors_step(settings.mdm_repo, width, layers, device)
+        steps = {"the authors' code, padded to 196": (authors, LONGEST)} | steps
+    steps |= {f"speed={speed}": recipe_step(config, speed, device) for speed in SPEEDS}
 
-    width, layers = config["denoiser"]["latent_dim"], config["denoiser"]["num_layers"]
-    runs = {"plain PyTorch, padded to 196": on_batches(peer_step(width, layers, device), LONGEST)}
-    runs |= {f"speed={speed}": on_batches(*recipe_step(config, speed, device)) for speed in SPEEDS}
-    times = take_turns(runs, 3, device)
-    slowest = next(iter(times.values()))
+    drawn = drawn_lengths(rows, 1 if settings.quick else BATCHES)
+    seconds = dict.fromkeys(steps, 0.0)
+    for lengths in drawn:
+        turns = {}
+        for name, (step, multiple) in steps.items():
+            frames = padded_length(int(lengths.max()), multiple, LONGEST)
+            turns[name] = partial(step, batch_of(lengths, frames, device))
+        for name, taken in take_turns(turns, ROUNDS, device).items():
+            seconds[name] += taken / len(drawn)
+
+    slowest = next(iter(seconds.values()))
+    real = sum(int(lengths.sum()) for lengths in drawn) / len(drawn)
     table: list[Row] = []
-    for name, taken in times.items():
-        row: Row = {"training": name, "ms per step": 1000 * taken / batches, "times as fast": slowest / taken}
+    for name, taken in seconds.items():
+        row: Row = {"training": name, "ms per step": 1000 * taken, "times as fast": slowest / taken}
         table.append(row | {"frames per second": real / taken})
-    mean = sum(padded) / batches
-    text = f"{rows} clips of {real / rows / batches:.0f} frames on average, padded to {mean:.0f} by the framework"
+
+    padded = statistics.mean(padded_length(int(lengths.max()), 1, LONGEST) for lengths in drawn)
+    text = f"{rows} clips of {real / rows:.0f} frames on average, padded to {padded:.0f} by the framework"
     return table, text
 
 
@@ -191,8 +171,10 @@ def backbones(names: Sequence[str], rounds: int, device: str) -> list[Row]:
         config = compose(BACKBONES[name][0], ["condition=none", *BACKBONES[name][1:]])
         batch = batch_of(lengths, int(lengths.max()), device)
         parameters = sum(p.numel() for p in build_task(config).parameters() if p.requires_grad)
+
         steps = {speed: recipe_step(config, speed, device)[0] for speed in SPEEDS}
         times = take_turns({speed: partial(step, batch) for speed, step in steps.items()}, rounds, device)
+
         row: Row = {"network": name, "parameters, M": parameters / 1e6}
         row |= {f"ms, {speed}": 1000 * taken for speed, taken in times.items()}
         row["times as fast"] = times["reference"] / times["fast"]
@@ -210,98 +192,59 @@ def quickstart(clips: int, steps: int, rounds: int) -> list[Row]:
         for speed in SPEEDS * rounds:
             folder = Path(tempfile.mkdtemp(dir=name))
             fit(folder, compose("quickstart", [*words, f"run.dir={folder}", f"speed={speed}"]))
-            taken = read_history(folder)["train/seconds_per_step"]
-            times[speed] += [1000 * value for step, value in taken.items() if step >= steps // 3]  # the first warm up
+            history = read_history(folder)["train/seconds_per_step"]
+            times[speed] += [value for step, value in history.items() if step >= steps // 3]  # the first warm up
+
     medians = {speed: statistics.median(taken) for speed, taken in times.items()}
-    slow = medians["reference"]
-    return [{"training": f"speed={s}", "ms per step": t, "times as fast": slow / t} for s, t in medians.items()]
+    return [
+        {"training": f"speed={speed}", "ms per step": 1000 * taken, "times as fast": medians["reference"] / taken}
+        for speed, taken in medians.items()
+    ]
 
 
-def measure(device: str = "cpu", quick: bool = False) -> Section:
-    """Returns the section of a device, cpu or cuda; `quick` takes tiny sizes, which show only that everything runs."""
+def summary(rows: Sequence[Row]) -> str:
+    """Returns how many times as fast both speeds are as the first row, the slowest peer."""
+    peer = str(rows[0]["training"]).partition(",")[0]
+    reference, fast = (row["times as fast"] for row in rows[-2:])
+    return (
+        f"At full size, `speed=reference` is {reference:.1f} times as fast as {peer}, "
+        f"and `speed=fast` {fast:.1f} times."
+    )
+
+
+def measure(settings: Settings) -> Section:
     warnings.filterwarnings("ignore")
     torch.manual_seed(0)
     torch.set_float32_matmul_precision("high")  # as in training
-    size = ["data.batch_size=2", "denoiser.latent_dim=16", "denoiser.ff_size=32", "denoiser.num_layers=1"]
-    full, batches = full_size(size if quick else [], 1 if quick else 8, device)
-    tables = {"full size": full}
+    quick, device = settings.quick, settings.device
+
+    full, batches = full_size(settings)
+    tables: dict[str, list[Row]] = {"full size": full}
     if device == "cuda":
         memory = torch.cuda.max_memory_allocated() / 2**30
-        batches += f"; at most {memory:.1f} GiB of memory for all three models together"
+        batches += f"; at most {memory:.1f} GiB of memory for all models together"
     names = ["FLAME", "MFM"] if quick else list(BACKBONES)
     tables["networks in their size for CPU runs"] = backbones(names, 1 if quick else 15, device)
     if device == "cpu":
         tables["quickstart"] = quickstart(60, 4, 1) if quick else quickstart(600, 150, 2)
-    reference, fast = full[1]["times as fast"], full[2]["times as fast"]
-    return {
-        "title": "Training steps",
-        "text": "The full-size step is that of `humanml3d/mdm` (8 layers of 512, dropout 0.1), "
-        f"{batches}. Lengths are uniform from 40 to 196 frames, in units of 4, as a stand-in for HumanML3D's, and "
-        "batches are those of the framework's sampler. Plain PyTorch trains `nn.TransformerEncoder` with AdamW on the "
-        "same clips, padded to 196 frames as in the published codes, in float32. Everything takes turns; medians of 3 "
-        "rounds over all batches. The small networks have 32 clips per batch and no text encoder; the quickstart is "
-        "trained by the complete framework, with its text encoder.",
-        "summary": f"At full size, `speed=reference` is {reference:.1f} times as fast as plain PyTorch, "
-        f"and `speed=fast` {fast:.1f} times.",
-        "tables": tables,
-    }
 
-
-def machine() -> dict[str, str | int]:
-    has, software = torch.cpu.get_capabilities(), environment()
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return {
-        "processor": has.get("cpu_name") or platform.processor(),
-        "cores": cores,
-        "bfloat16 instructions": " ".join(name for name in ("avx512_bf16", "amx_bf16") if has.get(name)) or "none",
-        "threads": torch.get_num_threads(),
-        "torch": software["packages"]["torch"],
-        "lightning": software["packages"]["lightning"],
-        "python": software["python"],
-        **({"GPU": torch.cuda.get_device_name()} if torch.cuda.is_available() else {}),
-    }
-
-
-def cell(value: str | float | None) -> str:
-    """Returns text with three significant digits."""
-    if value is None or isinstance(value, str):
-        return value or ""
-    return f"{value:,.0f}" if abs(value) >= 100 or value == round(value) else f"{value:#.3g}".rstrip(".")
-
-
-def table(rows: list[Row]) -> str:
-    lines = [list(rows[0]), ["---", *["---:"] * (len(rows[0]) - 1)], *([cell(v) for v in row.values()] for row in rows)]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
-def render(sections: dict[str, Any]) -> str:
-    order = sorted(sections, key=lambda name: ("script" in sections[name], name.endswith("_cuda")))
-    machines = list(dict.fromkeys(json.dumps(sections[name]["machine"]) for name in order))
-    lines = [HEAD, "## In short\n", *(f"- {sections[name]['summary']}" for name in order), "\n## Machine\n"]
-    for number, facts in enumerate(machines, 1):
-        lines.append(f"{number}. " + ", ".join(f"{key}: {value}" for key, value in json.loads(facts).items()))
-    for name in order:
-        section = sections[name]
-        where = machines.index(json.dumps(section["machine"])) + 1
-        script = section.get("script", "benchmarks/steps.py")
-        title = section["title"] + (" on a GPU" if name.endswith("_cuda") else "")
-        lines += [f"\n## {title}\n", section["text"]]
-        lines += [f"\n{name[:1].upper()}{name[1:]}:\n\n{table(rows)}" for name, rows in section["tables"].items()]
-        lines.append(f"\n`{script}`, {section['date']}, machine {where}.")
-    return "\n".join(lines) + "\n"
-
-
-def main(device: str = "cpu") -> None:
-    if device not in ("cpu", "cuda") or (device == "cuda" and not torch.cuda.is_available()):
-        raise SystemExit(f"DEVICE={device}: give cpu, or cuda on a machine with a CUDA GPU")
-    data = PAGE.with_suffix(".json")
-    sections: dict[str, Any] = json.loads(data.read_text()) if data.exists() else {}
-    section = measure(device) | {"date": datetime.date.today().isoformat(), "machine": machine()}
-    sections["steps_cuda" if device == "cuda" else "steps"] = section
-    data.write_text(json.dumps(sections, indent=1) + "\n")
-    PAGE.write_text(render(sections))
-    print(f"{section['summary']}\npage: {PAGE}")
+    authors = (
+        "The authors' step is that of their code without CLIP, whose features are zeros. "
+        if settings.mdm_repo
+        else "The authors' code was not measured in this run. "
+    )
+    return section(
+        "Training steps",
+        f"""The full-size step is that of `humanml3d/mdm` (8 layers of 512, dropout 0.1), {batches}. Lengths are
+        uniform from 40 to 196 frames, in units of 4, as a stand-in for HumanML3D's, and batches are drawn by the
+        framework's sampler. {authors}Plain PyTorch trains `nn.TransformerEncoder` with AdamW on the same clips,
+        padded to 196 frames as in the published codes, in float32. All alternate on each of {BATCHES} batches,
+        {ROUNDS} times after one that warms up. The small networks have 32 clips per batch and no text encoder, and
+        alternate 15 times; the quickstart is trained by the complete framework, with its text encoder.""",
+        summary(full),
+        tables,
+    )
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    show(measure(Settings()))

@@ -1,0 +1,216 @@
+"""Cost of the framework per training step, compared to bare Lightning: `python benchmarks/host.py`.
+
+A transformer of one layer and width 16 without a text encoder is trained, so that most of the time is spent outside
+of the network. Bare Lightning trains the same network with the same loss, optimizer and batches, without averaged
+weights, logger and checkpoints. All run on one thread and alternate. Times are those of the thread, which exclude
+other programs on the machine, between the ends of two steps. The parts of the framework's step are timed one by
+one, without Lightning.
+"""
+
+import itertools
+import statistics
+import tempfile
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import torch
+from hydra.utils import get_class
+from lightning import Callback, LightningModule, Trainer
+from sections import QUIET, Row, Section, Settings, ratios, section, show
+from torch import Tensor, nn
+from torch.optim.swa_utils import AveragedModel
+from torch.utils.data import DataLoader
+
+from flame_mdm.batch import MotionBatch
+from flame_mdm.config import compose, instantiate
+from flame_mdm.seeds import seed_generator
+from flame_mdm.task import MotionGeneration
+from flame_mdm.training.averaging import MovingAverage
+from flame_mdm.training.fit import fit
+
+WARM = 50  # steps that are not counted
+TINY = [
+    "data.source.clips=200",
+    "data.batch_size=4",
+    "denoiser.latent_dim=16",
+    "denoiser.ff_size=16",
+    "denoiser.num_layers=1",
+    "denoiser.num_heads=2",
+    "losses.velocity=0",
+    "speed=reference",
+    "condition=none",
+]
+BARE, FRAMEWORK = "bare Lightning, the same network", "framework"
+BATCHES = 16  # distinct batches of bare Lightning and of the plain loop
+
+
+class Clock(Callback):
+    """Records the time of the thread after every step."""
+
+    def __init__(self) -> None:
+        self.times: list[float] = []
+
+    def on_train_batch_end(self, *_: Any) -> None:
+        self.times.append(time.thread_time())
+
+    def median(self) -> float:
+        """Returns the median seconds between steps, without the first ones."""
+        times = self.times[min(WARM, len(self.times) // 2) :]
+        return statistics.median(after - before for before, after in itertools.pairwise(times))
+
+
+def built(folder: Path) -> tuple[list[MotionBatch], MotionGeneration]:
+    """Returns batches and task of the framework's training."""
+    config = compose("quickstart", [*QUIET, *TINY, f"data_root={folder / 'data'}"])
+    representation = instantiate(config["representation"])
+    data: Any = instantiate(config["data"], representation=representation, seed=0)
+    data.prepare_data()
+    data.setup("fit")
+    task = get_class(config["task"]["_target_"]).build(config, representation).train()
+    return list(itertools.islice(data.train_dataloader(), BATCHES)), task
+
+
+def loss_of(task: MotionGeneration, batch: MotionBatch) -> Tensor:
+    return task.process.loss(task.denoiser, batch.x, batch.mask, task.condition(batch), auxiliary=task.losses)[
+        "loss"
+    ].mean()
+
+
+class Bare(LightningModule):
+    """The framework's network, loss and optimizer in a module of Lightning."""
+
+    def __init__(self, task: MotionGeneration):
+        super().__init__()
+        self.denoiser, self.task = task.denoiser, [task]  # in a list, so that its parameters are not registered twice
+
+    def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
+        loss = loss_of(self.task[0], batch)
+        self.log("loss", loss, batch_size=len(batch))
+        return loss
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        return self.task[0].make_optimizer()
+
+
+def bare(steps: int, folder: Path) -> float:
+    """Returns seconds per step of bare Lightning."""
+    batches, task = built(folder)
+    stream = itertools.islice(itertools.cycle(batches), steps)
+    clock = Clock()
+    trainer = Trainer(
+        max_steps=steps,
+        accelerator="cpu",
+        logger=False,
+        callbacks=[clock],
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        default_root_dir=folder,
+        gradient_clip_val=1.0,
+    )
+    trainer.fit(Bare(task), DataLoader(list(stream), batch_size=None))  # type: ignore[arg-type]
+    return clock.median()
+
+
+def framework(steps: int, folder: Path, *words: str) -> float:
+    """Returns seconds per step of the complete framework."""
+    run = Path(tempfile.mkdtemp(dir=folder))
+    words = (*QUIET, *TINY, f"data_root={folder / 'data'}", f"run.dir={run}", f"trainer.max_steps={steps}", *words)
+    clock = Clock()
+    config = compose("quickstart", words)
+    config["callbacks"]["clock"] = {"_target_": f"{__name__}.clock"}
+    globals()["clock"] = lambda: clock
+    fit(run, config)
+    return clock.median()
+
+
+def loop(steps: int, folder: Path) -> float:
+    """Returns seconds per step of a plain PyTorch loop that trains the same network."""
+    batches, task = built(folder)
+    optimizer, parameters = task.make_optimizer(), list(task.parameters())
+    clock = Clock()
+    for batch in itertools.islice(itertools.cycle(batches), steps):
+        loss_of(task, batch).backward()
+        nn.utils.clip_grad_norm_(parameters, 1.0)
+        optimizer.step()
+        optimizer.zero_grad()
+        clock.on_train_batch_end()
+    return clock.median()
+
+
+def parts(steps: int, folder: Path) -> dict[str, float]:
+    """Returns the median seconds of each part of a step."""
+    batches, task = built(folder)
+    optimizer, parameters = task.make_optimizer(), list(task.parameters())
+    average: Any = MovingAverage(0.998)
+    average._average_model = AveragedModel(task)
+    average.on_train_start(SimpleNamespace(), task)
+    times: dict[str, list[float]] = {}
+
+    for step, batch in enumerate(itertools.islice(itertools.cycle(batches), steps)):
+        laps = {"": time.thread_time()}
+        seed_generator(step, torch.device("cpu"))
+        laps["seeding"] = time.thread_time()
+        cond = task.condition(batch)
+        laps["condition"] = time.thread_time()
+        loss = task.process.loss(task.denoiser, batch.x, batch.mask, cond, auxiliary=task.losses)["loss"].mean()
+        laps["forward pass and loss"] = time.thread_time()
+        loss.backward()
+        laps["backward pass"] = time.thread_time()
+        nn.utils.clip_grad_norm_(parameters, 1.0)
+        laps["clipping gradients"] = time.thread_time()
+        optimizer.step()
+        optimizer.zero_grad()
+        laps["optimizer"] = time.thread_time()
+        average.on_train_batch_end(SimpleNamespace(global_step=step + 1), task, None, None, 0)
+        laps["averaging weights"] = time.thread_time()
+
+        for (_, before), (name, after) in itertools.pairwise(laps.items()):
+            times.setdefault(name, []).append(after - before)
+    return {name: statistics.median(taken[len(taken) // 4 :]) for name, taken in times.items()}
+
+
+def measure(settings: Settings) -> Section:
+    steps, rounds = (12, 1) if settings.quick else (150, 10)
+    warnings.filterwarnings("ignore")
+    torch.set_num_threads(1)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        runs: dict[str, Callable[[], float]] = {
+            BARE: lambda: bare(steps, folder),
+            "framework without averaged weights": lambda: framework(steps, folder, "ema=null"),
+            FRAMEWORK: lambda: framework(steps, folder),
+            "plain PyTorch loop": lambda: loop(steps, folder),
+        }
+        taken: dict[str, list[float]] = {name: [] for name in runs}
+        for _ in range(rounds):
+            for name, run in runs.items():
+                taken[name].append(run())
+        split = parts(4 * steps, folder)
+
+    times = {name: statistics.median(values) for name, values in taken.items()}
+    split["everything else, mostly batches and Lightning"] = times[FRAMEWORK] - sum(split.values())
+    shares: list[Row] = [
+        {"part": name, "ms": 1000 * value, "share": f"{value / times[FRAMEWORK]:.0%}"} for name, value in split.items()
+    ]
+    ratio, without = (times[name] / times[BARE] for name in (FRAMEWORK, "framework without averaged weights"))
+    return section(
+        "Host cost of a training step",
+        f"""An almost empty network: one transformer layer of width 16, 4 clips per batch, no text encoder. Its step
+        has almost no arithmetic: it is the time of calling torch, the framework and Lightning. Bare Lightning
+        trains the same network with the same loss, optimizer and clipping on batches that are in memory, without
+        averaged weights, logger and checkpoints. The framework is complete: batches, callbacks, logger. One thread,
+        medians of {rounds} alternating runs of {steps} steps, time of the thread between the ends of two steps. The
+        second table times the parts of the framework's step one by one, outside of Lightning.""",
+        f"An almost empty training step takes {1000 * times[FRAMEWORK]:.1f} ms: {ratio:.2f} times bare Lightning with "
+        f"the same network, and {without:.2f} times without averaged weights.",
+        {"steps": ratios(times, BARE, "training"), "parts of the framework": shares},
+    )
+
+
+if __name__ == "__main__":
+    show(measure(Settings()))

@@ -1,0 +1,111 @@
+"""Speed of both ways to load batches compared to a training step: `python benchmarks/loading.py`.
+
+A synthetic data set is packed into a temporary folder. Batches gathered from memory (data.resident=true), batches
+of the data loader in the training process, and forward pass, backward pass and update of the small MDM encoder
+alternate; they are measured in processor time of one core, which excludes other programs on the machine. Loading
+with workers is measured in wall time, which includes passing batches between processes and the load of the machine.
+"""
+
+import itertools
+import statistics
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+
+import torch
+from sections import Row, Section, Settings, section, show, take_turns
+
+from flame_mdm.batch import Condition, MotionBatch
+from flame_mdm.data.crops import Units
+from flame_mdm.data.datamodule import MotionDataModule
+from flame_mdm.data.synthetic import Synthetic
+from flame_mdm.denoisers.mdm import MDMEncoder
+from flame_mdm.losses import masked_mse
+from flame_mdm.representations.humanml import HumanML
+
+BATCH = 64
+GOAL = 5000  # target clips per second and worker
+STEP, LOADER, RESIDENT = "step", "loader, one core", "resident, one core"
+
+
+def training(features: int) -> Callable[[MotionBatch], None]:
+    """Returns a training step (forward, backward, update) of MDM's encoder in its size for CPU runs."""
+    model = MDMEncoder(features, features, 512, latent_dim=128, ff_size=256, num_layers=4, num_heads=4, dropout=0.0)
+    optimizer = torch.optim.AdamW(model.parameters(), fused=True)
+
+    def step(batch: MotionBatch) -> None:
+        cond = Condition(torch.zeros(len(batch), 512), torch.zeros(len(batch), 0, 512), None)
+        output = model(torch.randn_like(batch.x), torch.rand(len(batch)) * 1000, batch.mask, cond)
+        masked_mse(output, batch.x, batch.mask).mean().backward()
+        optimizer.step()
+        optimizer.zero_grad()
+
+    return step
+
+
+def batches_of(data: MotionDataModule, resident: bool, workers: int = 0) -> Iterator[MotionBatch]:
+    data.resident, data.num_workers = resident, workers
+    data.setup("fit")
+    return iter(data.train_dataloader())
+
+
+def measure(settings: Settings) -> Section:
+    clips, count, rounds = (100, 3, 1) if settings.quick else (1000, 20, 10)
+    torch.manual_seed(0)
+    torch.set_num_threads(1)
+
+    def several(batches: Iterator[MotionBatch]) -> Callable[[], object]:
+        return lambda: [next(batches) for _ in range(count)]
+
+    with tempfile.TemporaryDirectory() as folder:
+        source, crop = Synthetic(clips), Units(24, 60, 4)
+        data = MotionDataModule(source, HumanML(), root=folder, name="s", batch_size=BATCH, crop=crop)
+        data.prepare_data()
+        loaded, gathered = batches_of(data, resident=False), batches_of(data, resident=True)
+
+        shown = [next(loaded) for _ in range(8)]
+        step, endless = training(shown[0].x.shape[2]), itertools.cycle(shown)
+        turns = {
+            RESIDENT: several(gathered),
+            LOADER: several(loaded),
+            STEP: lambda: [step(next(endless)) for _ in range(len(shown))],
+        }
+        times = take_turns(turns, rounds, clock=time.process_time)
+        wait = times.pop(STEP) / len(shown)
+
+        rows = [_row(name, taken / count, wait, 1) for name, taken in times.items()]
+        for workers in (1, 2):
+            name = f"loader, {workers} worker{'s' if workers > 1 else ''}, wall time"
+            taken = take_turns({name: several(batches_of(data, resident=False, workers=workers))}, rounds)[name]
+            rows.append(_row(name, taken / count, wait, workers))
+
+    lengths = torch.cat([batch.lengths for batch in shown]).float().mean()
+    frames = statistics.mean(batch.x.shape[1] for batch in shown)
+    gather, load = times[RESIDENT] / count, times[LOADER] / count
+    return section(
+        "Loading of batches",
+        f"""{BATCH} clips per batch, {lengths:.0f} frames of {shown[0].x.shape[2]} features on average, padded to
+        {frames:.0f}. Resident batches (`data.resident=true`) are gathered from memory; the loader collates clips,
+        in the training process or in workers. A training step of the small MDM encoder takes {1000 * wait:.0f} ms
+        of one core. The target is {GOAL:,} clips per second and worker. Medians of {rounds} alternating rounds of
+        {count} batches.""",
+        f"A resident batch is ready {load / gather:.1f} times as fast as one of the loader, and takes "
+        f"{gather / wait:.1%} of the time of a small training step.",
+        {"batches": rows},
+    )
+
+
+def _row(name: str, seconds: float, step: float, workers: int) -> Row:
+    """Returns the speed of one loader, and its ratios to a training step and to the target."""
+    rate = BATCH / seconds
+    return {
+        "batches": name,
+        "ms per batch": 1000 * seconds,
+        "share of a step": f"{seconds / step:.1%}",
+        "clips per second": rate,
+        "ratio to the target": rate / workers / GOAL,
+    }
+
+
+if __name__ == "__main__":
+    show(measure(Settings()))

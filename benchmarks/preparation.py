@@ -1,0 +1,104 @@
+"""Speed and memory of `make prepare` at several sizes: `python benchmarks/preparation.py`.
+
+For each size, a fresh process prepares synthetic clips of about 51 frames in a temporary folder (1.1 KB of disk per
+frame), with one worker per core. Gives the processor time of all processes together, the maximum resident memory of
+the process and of its largest worker, of each the part that is not shared with other processes (sampled), and by
+how many bytes the process grows per frame.
+"""
+
+import json
+import multiprocessing
+import resource
+import subprocess
+import sys
+import tempfile
+import threading
+from pathlib import Path
+
+from sections import Row, Section, Settings, section, show
+
+FRAMES_PER_CLIP = 51
+MEBIBYTE = 2**20
+MEMORY = ("main process, MiB", "worker, MiB", "private to main, MiB", "private to worker, MiB")
+
+
+def private(process: int) -> int:
+    """Returns the bytes of memory that a process shares with no other; 0 after its end, and on other systems."""
+    try:
+        lines = Path(f"/proc/{process}/smaps_rollup").read_text().splitlines()
+    except OSError:
+        return 0
+    return sum(1024 * int(line.split()[1]) for line in lines if line.startswith("Private_"))
+
+
+class Peaks(threading.Thread):
+    """Samples the private memory of this process and of its largest worker."""
+
+    def __init__(self) -> None:
+        super().__init__(daemon=True)
+        self.main, self.worker = 0, 0
+        self.done = threading.Event()
+
+    def run(self) -> None:
+        while not self.done.wait(0.5):
+            workers = [private(child.pid or 0) for child in multiprocessing.active_children()]
+            self.main = max(self.main, private(multiprocessing.current_process().pid or 0))
+            self.worker = max(self.worker, *workers, 0)
+
+
+def prepare(clips: int) -> None:
+    """Prepares clips in this process; prints frames, seconds of processor time, and bytes of memory as JSON."""
+    from flame_mdm.data.store import write_store
+    from flame_mdm.data.synthetic import Synthetic
+    from flame_mdm.representations.humanml import HumanML
+
+    kinds = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+
+    def spent() -> float:
+        return sum(used.ru_utime + used.ru_stime for used in map(resource.getrusage, kinds))
+
+    peaks = Peaks()
+    peaks.start()
+    with tempfile.TemporaryDirectory() as folder:
+        start = spent()
+        store = write_store(Path(folder, "store"), Synthetic(clips), HumanML())
+        seconds = spent() - start
+        frames = store.info["shape"][0]
+    peaks.done.set()
+
+    resident = [1024 * resource.getrusage(kind).ru_maxrss for kind in kinds]
+    print(json.dumps([frames, seconds, *resident, peaks.main, peaks.worker]))
+
+
+def measure(settings: Settings) -> Section:
+    rows: list[Row] = []
+    growth: list[tuple[float, float]] = []
+    for size in [2000] if settings.quick else [250_000, 1_000_000]:
+        clips = size // FRAMES_PER_CLIP
+        command = [sys.executable, __file__, "--clips", str(clips)]
+        finished = subprocess.run(command, capture_output=True, text=True, check=False)
+        if finished.returncode:
+            raise SystemExit(finished.stderr)
+
+        frames, seconds, *memory = json.loads(finished.stdout.splitlines()[-1])
+        row: Row = {"frames": frames, "processor seconds": seconds, "clips per second and core": clips / seconds}
+        rows.append(row | {name: part / MEBIBYTE for name, part in zip(MEMORY, memory, strict=True)})
+        growth.append((frames, memory[0]))
+
+    (few, small), (many, large) = growth[0], growth[-1]
+    per_frame = (large - small) / (many - few) if many > few else 0
+    return section(
+        "Preparation of a data set",
+        f"""`make prepare` with synthetic clips of about {FRAMES_PER_CLIP} frames, one worker per core. Seconds are
+        those of all processes together, in processor time. Memory is the maximum during the run.""",
+        f"One core prepares {rows[-1]['clips per second and core']:,.0f} clips per second; the memory grows by "
+        f"{per_frame:.0f} bytes per frame.",
+        {"sizes": rows},
+    )
+
+
+if __name__ == "__main__":
+    if "--clips" in sys.argv:
+        prepare(int(sys.argv[-1]))
+    else:
+        show(measure(Settings()))

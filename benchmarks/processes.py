@@ -1,0 +1,91 @@
+"""Scaling of DDP: seconds per step of two gloo processes and of one, `python benchmarks/processes.py`.
+
+Both train on the same batches of 16 clips, one process with all 16 and two processes with 8 each, one thread per
+process. With one core per process, the ideal ratio is 0.5; two processes on one core cannot be below 1. The
+overhead is reducing the gradients and waiting for the slower process. Times are between steps, so they do not
+include imports.
+"""
+
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from sections import QUIET, Section, Settings, ratios, section, show
+
+CLIPS = 16  # per step
+SMALL = [
+    "data.source.clips=60",
+    "denoiser.latent_dim=128",
+    "denoiser.ff_size=256",
+    "denoiser.num_layers=4",
+    "denoiser.num_heads=4",
+    "data_root=data",
+]
+CLOCK = """
+import itertools
+import json
+import time
+from pathlib import Path
+
+from lightning import Callback
+
+
+class Clock(Callback):
+    def __init__(self, warm: int):
+        self.warm, self.times = warm, []
+
+    def on_train_batch_end(self, trainer, *_):
+        self.times.append(time.perf_counter())
+
+    def on_train_end(self, trainer, *_):
+        if trainer.is_global_zero:
+            steps = [after - before for before, after in itertools.pairwise(self.times[self.warm :])]
+            Path("steps.json").write_text(json.dumps(steps))
+"""
+
+
+def step_seconds(folder: Path, processes: int, steps: int, number: int) -> float:
+    """Returns the median time between steps in seconds."""
+    words = ["quickstart", *QUIET, *SMALL, f"trainer.max_steps={steps}", f"run.dir=run{processes}-{number}"]
+    words += [
+        f"data.batch_size={CLIPS // processes}",
+        f"+callbacks.clock={{_target_: clock.Clock, warm: {steps // 5}}}",
+    ]
+    if processes == 2:
+        words += ["trainer.devices=2", "trainer.strategy=ddp"]
+
+    paths = [str(folder), os.environ.get("PYTHONPATH", "")]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(paths)}
+    environment |= {"GLOO_SOCKET_IFNAME": "lo"}
+    command = [sys.executable, "-m", "flame_mdm", "train", *words]
+    finished = subprocess.run(command, capture_output=True, text=True, cwd=folder, env=environment, check=False)
+    if finished.returncode:
+        raise SystemExit(finished.stdout + finished.stderr)
+    return statistics.median(json.loads((folder / "steps.json").read_text()))
+
+
+def measure(settings: Settings) -> Section:
+    rounds, steps = (1, 10) if settings.quick else (4, 50)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "clock.py").write_text(CLOCK)
+        pairs = [[step_seconds(folder, count, steps, number) for count in (1, 2)] for number in range(rounds)]
+
+    one, two = (statistics.median(values) for values in zip(*pairs, strict=True))
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return section(
+        "Two processes",
+        f"""The same batches of {CLIPS} clips, by one process and by two with {CLIPS // 2} clips each (DDP, gloo), one
+        thread per process, on {cores} cores. With one core per process, the ideal ratio is 0.5. Medians of {rounds}
+        alternating runs of {steps} steps.""",
+        f"Two processes take {two / one:.2f} times the time of one for the same batch.",
+        {"steps": ratios({"one": one, "two": two}, "one", "processes")},
+    )
+
+
+if __name__ == "__main__":
+    show(measure(Settings()))

@@ -1,0 +1,105 @@
+"""Quality of models trained in both speeds: `make bench ONLY=quality RUNS=FOLDER`.
+
+Trains nothing: reads the runs in a folder, each trained by `make train ... speed=...` and evaluated by `make evaluate`,
+with two or more seeds per data set and speed. Gives the mean over the seeds and its 95 % interval by Student's t. The
+differences are between runs with the same seed, which begin with the same weights and see the same batches.
+"""
+
+import statistics
+from collections.abc import Sequence
+from pathlib import Path
+
+from scipy.stats import t
+from sections import Row, Section, Settings, section
+
+from flame_mdm.reporting.compare import paired_difference
+from flame_mdm.runs import CONFIG, Run, read_run
+
+METRICS = {
+    "attributes/all": "requested attributes, share right",
+    "sides/all": "side, share right",
+    "fid": "FID",
+    "texts_for_motion/top3": "R precision, top 3",
+    "foot_skating": "foot skating, share of frames",
+    "jitter": "jitter, m/s³",
+}
+SPEEDS = ("reference", "fast")
+BySeed = dict[int, dict[str, float]]  # seed -> metric -> value
+
+
+def values(run: Run) -> dict[str, float]:
+    """Returns the final validation loss of a run and the metrics of its newest result."""
+    losses = run.curves.get("val/loss", {})
+    result = list(run.results.values())[-1].values if run.results else None
+    if not losses or not result:
+        raise SystemExit(f"{run.folder}: not validated or not evaluated. Run `make evaluate CKPT={run.folder}`")
+
+    numbers = {"val/loss": losses[max(losses)]}
+    for name, label in METRICS.items():
+        value = result.get(name)
+        if value is not None and value.mean is not None:
+            numbers[label] = value.mean
+    return numbers
+
+
+def read_runs(folder: Path) -> dict[str, dict[str, BySeed]]:
+    """Returns the values of the runs in a folder, by data set and training, speed, and seed."""
+    runs: dict[str, dict[str, BySeed]] = {}
+    for path in sorted(folder.glob(f"*/{CONFIG}")):
+        run = read_run(path.parent)
+        config = run.config
+        steps, decay = config["trainer"]["max_steps"], config["ema"]["decay"]
+        name = f"{config['data']['name']}, {steps:,} steps, ema.decay={decay}"
+        speeds = runs.setdefault(name, {speed: {} for speed in SPEEDS})
+        speeds[config["run"].get("speed", "reference")][config["seed"]] = values(run)
+    if not runs:
+        raise SystemExit(f"{folder}: contains no runs. docs/speed.md has the commands that train and evaluate them")
+    return runs
+
+
+def shown(mean: float, half: float, sign: str = "") -> str:
+    """Returns mean and half width with as many decimals as the half width has in two significant digits."""
+    decimals = next((count for count in range(6) if half >= 10 ** (1 - count)), 6 if half else 2)
+    return f"{mean:{sign},.{decimals}f} ± {half:,.{decimals}f}"
+
+
+def interval(sample: Sequence[float]) -> tuple[float, float]:
+    """Returns the mean of two or more numbers, and the half width of its 95 % interval by Student's t."""
+    count = len(sample)
+    quantile = float(t.ppf(0.975, count - 1))
+    return statistics.mean(sample), quantile * statistics.stdev(sample) / count**0.5
+
+
+def measure(settings: Settings) -> Section:
+    folder = Path(settings.runs or ".")
+    tables: dict[str, list[Row]] = {}
+    differing: list[str] = []
+    for name, speeds in read_runs(folder).items():
+        seeds = sorted(speeds["reference"])
+        if len(seeds) < 2 or seeds != sorted(speeds["fast"]):
+            raise SystemExit(f"{folder}: {name}: needs the same two or more seeds in both speeds")
+
+        rows = tables.setdefault(f"{name}, {len(seeds)} seeds", [])
+        for metric in speeds["reference"][seeds[0]]:
+            slow, fast = ([speeds[speed][seed][metric] for seed in seeds] for speed in SPEEDS)
+            mean, low, high = paired_difference(slow, fast)
+            row: Row = {
+                "metric": metric,
+                "speed=reference": shown(*interval(slow)),
+                "speed=fast": shown(*interval(fast)),
+            }
+            rows.append(row | {"fast − reference": shown(mean, (high - low) / 2, "+")})
+            if not low <= 0 <= high:
+                differing.append(f"{metric} ({name.split(',')[0]})")
+
+    total = sum(map(len, tables.values()))
+    equal = total - len(differing)
+    others = f"; the others: {', '.join(differing)}" if differing else ""
+    return section(
+        "Quality in both speeds",
+        """Each speed is trained with several seeds, and evaluated once on the test motions. Means over the seeds, with
+        95 % intervals by Student's t. The differences are between runs with the same seed, which begin with the same
+        weights and see the same batches. [Commands](../speed.md#quality).""",
+        f"In {equal} of {total} figures of quality, the interval of `fast` − `reference` contains 0{others}.",
+        tables,
+    )

@@ -1,0 +1,99 @@
+"""Form of the benchmarks: each script has a function `measure`, which returns a section of the page of speed."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+Row = dict[str, str | float | None]
+Section = dict[str, Any]
+"""A title, a text, a summary in one sentence, and tables by caption."""
+
+QUIET = [
+    "trainer.accelerator=cpu",
+    "trainer.enable_progress_bar=false",
+    "trainer.val_check_interval=1000000",
+    "callbacks.samples=null",
+    "callbacks.best=null",
+    "callbacks.checkpoints.every_n_steps=1000000",
+    "logger=csv",
+]
+"""Settings of runs whose steps are measured: nothing but steps."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What `make bench` passes to each script."""
+
+    quick: bool = False  # tiny sizes, which show only that everything runs
+    device: str = "cpu"  # or cuda
+    mdm_repo: str | None = None  # path of a clone of the authors' code, GuyTevet/motion-diffusion-model
+    runs: str | None = None  # folder of trained and evaluated runs, for quality.py
+
+
+def section(title: str, text: str, summary: str, tables: Mapping[str, Sequence[Row]]) -> Section:
+    return {"title": title, "text": " ".join(text.split()), "summary": summary, "tables": dict(tables)}
+
+
+def ratios(times: Mapping[str, float], reference: str, name: str, unit: str = "ms per step") -> list[Row]:
+    """Returns rows of times in milliseconds, with their ratios to one of them."""
+    return [{name: key, unit: 1000 * taken, "ratio": taken / times[reference]} for key, taken in times.items()]
+
+
+def cell(value: str | float | None) -> str:
+    """Returns text with three significant digits."""
+    if value is None or isinstance(value, str):
+        return value or ""
+    if abs(value) >= 100 or value == round(value):
+        return f"{value:,.0f}"
+    return f"{value:#.3g}".rstrip(".")
+
+
+def table(rows: Sequence[Row]) -> str:
+    """Returns a Markdown table with the columns of the first row."""
+    head = list(rows[0])
+    lines = [head, ["---", *["---:"] * (len(head) - 1)]]
+    lines += [[cell(value) for value in row.values()] for row in rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def body(content: Section) -> str:
+    """Returns the text and tables of a section as Markdown."""
+    tables = [f"{caption[:1].upper()}{caption[1:]}:\n\n{table(rows)}" for caption, rows in content["tables"].items()]
+    return "\n\n".join([content["text"], *tables])
+
+
+def show(content: Section) -> None:
+    print(f"{body(content)}\n\n{content['summary']}")
+
+
+def take_turns(
+    runs: Mapping[str, Callable[[], object]],
+    rounds: int,
+    device: str = "cpu",
+    clock: Callable[[], float] = time.perf_counter,
+) -> dict[str, float]:
+    """Returns the median seconds of each function.
+
+    The functions alternate, so that a busy machine slows all of them. A first round, which warms up, is not counted.
+
+    Args:
+        runs: the functions, by name.
+        rounds: number of counted calls of each function.
+        device: cuda waits for the GPU at the end of each call.
+        clock: returns seconds; `time.process_time` excludes other programs on the machine.
+    """
+    times: dict[str, list[float]] = {name: [] for name in runs}
+    for _ in range(rounds + 1):
+        for name, run in runs.items():
+            start = clock()
+            run()
+            if device == "cuda":
+                torch.cuda.synchronize()
+            times[name].append(clock() - start)
+    return {name: statistics.median(taken[1:]) for name, taken in times.items()}

@@ -1,0 +1,96 @@
+"""Startup time of commands: `python benchmarks/startup.py`.
+
+`--help` and a misspelled key answer without importing torch. The work itself is minimal (one training step, one
+motion, one replication of eight motions), so that mainly imports and preparation are measured. Ratios are relative
+to `python -c "import torch"`, to compare machines.
+"""
+
+import itertools
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from sections import Row, Section, Settings, section, show, take_turns
+
+TINY = [
+    "data.source.clips=60",
+    "data.batch_size=8",
+    "denoiser.latent_dim=16",
+    "denoiser.ff_size=16",
+    "denoiser.num_layers=1",
+    "denoiser.num_heads=2",
+    "condition.features=16",
+    "process.num_train_timesteps=10",
+    "task.num_inference_steps=5",
+    "trainer.accelerator=cpu",
+    "trainer.enable_progress_bar=false",
+    "logger=csv",
+    "callbacks.samples=null",
+    "callbacks.best=null",
+    "trainer.max_steps=1",
+    "data_root=data",
+]
+CHECKPOINT = "ckpt=first/checkpoints/last.ckpt"
+EVALUATION = ["protocol=synthetic", "extractor=none", "quick=true", "replications=1", "samples=8", "data_root=data"]
+WORK: dict[str, tuple[list[str], list[str]]] = {
+    "train": (["quickstart", *TINY], ["run.dir=run{}"]),
+    "sample": ([CHECKPOINT, "text=a person walks", "samples=1", "seconds=0.5"], ["out=samples{}"]),
+    "evaluate": ([CHECKPOINT, *EVALUATION], ["seed={}", "out=result{}.json"]),
+}
+"""Words of each command; those in the second list differ from run to run."""
+TORCH = "python -c 'import torch'"
+
+
+def run(folder: Path, *words: str) -> None:
+    """Runs one process from start to end."""
+    command = [sys.executable, *words]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    finished = subprocess.run(command, capture_output=True, text=True, cwd=folder, env=environment, check=False)
+    if "Traceback" in finished.stderr:
+        raise SystemExit(finished.stderr)
+
+
+def minimal_work(folder: Path, command: str, numbers: itertools.count) -> None:
+    words, varying = WORK[command]
+    number = next(numbers)
+    run(folder, "-m", "flame_mdm", command, *words, *(word.format(number) for word in varying))
+
+
+def measure(settings: Settings) -> Section:
+    commands = ["sample"] if settings.quick else list(WORK)
+    rounds = 1 if settings.quick else 3
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        run(folder, "-m", "flame_mdm", "train", "quickstart", *TINY, "run.dir=first")  # also prepares the data
+
+        turns: dict[str, Callable[[], object]] = {TORCH: partial(run, folder, "-c", "import torch")}
+        for command in commands:
+            recipe = ["quickstart"] if command == "train" else []
+            module = ["-m", "flame_mdm", command]
+            turns[f"{command} --help"] = partial(run, folder, *module, "--help")
+            turns[f"{command}, misspelled key"] = partial(run, folder, *module, *recipe, "seeed=1")
+            turns[f"{command}, minimal work"] = partial(minimal_work, folder, command, itertools.count())
+        times = take_turns(turns, rounds)
+
+    rows: list[Row] = [
+        {"command": f"`{name}`", "seconds": taken, "ratio": taken / times[TORCH]} for name, taken in times.items()
+    ]
+    answered = times[f"{commands[0]} --help"]
+    started = times[f"{commands[0]}, minimal work"] / times[TORCH]
+    return section(
+        "Start of the commands",
+        f"""From the start of a process to its end, one thread. The work is minimal (one training step, one motion,
+        one replication of eight motions), so that mainly imports are measured. Medians of {rounds} alternating
+        runs; ratios to importing torch.""",
+        f"`--help` answers in {answered:.1f} s, and `{commands[0]}` with minimal work takes {started:.1f} times the "
+        "time of importing torch.",
+        {"commands": rows},
+    )
+
+
+if __name__ == "__main__":
+    show(measure(Settings()))

@@ -26,7 +26,7 @@ from flame_mdm.batch import Condition, MotionBatch, padded_length
 from flame_mdm.config import compose, instantiate
 from flame_mdm.data.datamodule import TrainingBatches
 from flame_mdm.runs import read_history
-from flame_mdm.task import MotionGeneration
+from flame_mdm.task import GeneratorTask
 from flame_mdm.training.fit import fit
 from flame_mdm.training.speed import accelerate
 
@@ -45,13 +45,14 @@ BACKBONES = {
 SPEEDS = ("reference", "fast")
 
 
-def training_step(task: MotionGeneration, batch: MotionBatch) -> Tensor:
+def training_step(task: GeneratorTask, batch: MotionBatch) -> Tensor:
     """Returns the loss of a step, with a condition of the right shape instead of an encoded text."""
-    rows, features = len(batch), task.condition.features
+    generator = task.generator
+    rows, features = len(batch), generator.condition.features
     real = torch.ones(rows, TOKENS, dtype=torch.bool)
     null = Condition(torch.zeros(1, features), torch.zeros(1, TOKENS, features), real[:1])
     cond = Condition(torch.zeros(rows, features), torch.zeros(rows, TOKENS, features), real, null)
-    return task.process.loss(task.denoiser, batch.x, batch.mask, cond, auxiliary=task.losses)["loss"].mean()
+    return generator.process.loss(generator.denoiser, batch.x, batch.mask, cond, auxiliary=task.losses)["loss"].mean()
 
 
 class Peer(nn.Module):
@@ -84,8 +85,8 @@ def peer_step(width: int, layers: int, device: str) -> Callable[[MotionBatch], N
     return step
 
 
-def build_task(config: dict[str, Any]) -> MotionGeneration:
-    return MotionGeneration.build(config, instantiate(config["representation"]))
+def build_task(config: dict[str, Any]) -> GeneratorTask:
+    return GeneratorTask.build(config, instantiate(config["representation"]))
 
 
 def recipe_step(config: dict[str, Any], speed: str, device: str) -> tuple[Callable[[MotionBatch], None], int]:

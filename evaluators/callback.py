@@ -12,7 +12,7 @@ from evaluators.sources import Generator
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.errors import UserError
 from flame_mdm.runs import made_by
-from flame_mdm.task import MotionGeneration
+from flame_mdm.task import GeneratorTask
 from flame_mdm.training.loggers import log_table
 
 
@@ -51,11 +51,12 @@ class Evaluate(Callback):
         self.values: dict[str, float] = {}
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        assert isinstance(pl_module, MotionGeneration)
+        assert isinstance(pl_module, GeneratorTask)
         data: MotionDataModule = trainer.datamodule  # type: ignore[attr-defined]
-        clips, representation = data.clips("val"), pl_module.representation
+        model = pl_module.generator
+        clips, representation = data.clips("val"), model.representation
         size = {"replications": self.replications, "samples": self.samples, "multimodality": False}
-        protocol, _ = open_protocol(self.name, clips, representation, pl_module, **size)
+        protocol, _ = open_protocol(self.name, clips, representation, model, **size)
         extractor = protocol.open_extractor(self.path, representation, data.store.info["dataset"])
         self.evaluation = Evaluation(protocol, clips, extractor, representation, batch_size=self.batch_size)
         self.next = trainer.global_step
@@ -63,12 +64,12 @@ class Evaluate(Callback):
     def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if trainer.global_step < self.next or not hasattr(self, "evaluation"):
             return
-        assert isinstance(pl_module, MotionGeneration)
+        assert isinstance(pl_module, GeneratorTask)
         self.next = (trainer.global_step // self.every_n_steps + 1) * self.every_n_steps
         protocol = self.evaluation.protocol
-        options, edit = sampling_options(protocol, pl_module)
+        options, edit = sampling_options(protocol, pl_module.generator)
         size: dict[str, Any] = {"seed": 0, "batch_size": self.batch_size, "progress": False}
-        source = Generator(pl_module, protocol, self.evaluation.clips, options, edit, **size)
+        source = Generator(pl_module.generator, protocol, self.evaluation.clips, options, edit, **size)
         values = self.evaluation.run(source, ground_truth=False).values or {}
         numbers = {name: v.mean for name, v in values.items() if v is not None and v.mean is not None}
         widths = {f"{name}/ci": v.ci for name, v in values.items() if v is not None and v.ci is not None}

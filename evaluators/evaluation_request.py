@@ -8,8 +8,9 @@ from typing import Literal
 
 from flame_mdm.checkpoints.locating import Which
 from flame_mdm.config import Config
+from flame_mdm.config.options import option, same_option
 from flame_mdm.errors import UserError
-from flame_mdm.sampler_options import SamplerOptions, option, same_option
+from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.sampling.motion_request import EditRequest
 
 

@@ -1,33 +1,15 @@
 """Options of the samplers, shared by Python, command line, demo, evaluation and tables."""
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import MISSING, dataclass, field, fields, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any, Self
 
+from flame_mdm.config.options import option
 from flame_mdm.errors import UserError
 
 MAX_STEPS = 100_000  # maximum number of steps of a diffusion or sampler
 SPACINGS = ("linspace", "stride")  # how diffusion places steps; see `flame_mdm.processes.schedules.timesteps`
-Check = Callable[[str, Any], None]
-"""Check of the value of a key, by name and value; raises `UserError` or `FileNotFoundError`."""
-
-
-def option(default: Any, help: str, check: Check | None = None) -> Any:
-    """Returns a dataclass field with a help text and a check for the command line; a function `default` computes it."""
-    default = {"default_factory" if callable(default) else "default": default}
-    return field(**default, metadata={"help": help, "check": check})
-
-
-def required(help: str, check: Check | None = None) -> Any:
-    """Returns a dataclass field as `option` does, but without a default."""
-    return option(MISSING, help, check)
-
-
-def same_option(kind: type[Any], name: str, check: Check | None = None, **default: Any) -> Any:
-    """Returns a dataclass field with the help text, and unless given the default, of the field of another dataclass."""
-    original = next(entry for entry in fields(kind) if entry.name == name)
-    return option(default.get("default", original.default), original.metadata["help"], check)
 
 
 @dataclass(frozen=True, kw_only=True)

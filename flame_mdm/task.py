@@ -1,6 +1,7 @@
-"""Lightning modules that combine denoiser, process, condition and representation."""
+# pyright: standard
+"""Lightning modules: what trains a model, while the model itself is `flame_mdm.generator.MotionGenerator`."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -11,17 +12,14 @@ from torch import Tensor
 from torch.optim.lr_scheduler import LambdaLR
 from torchmetrics import MeanMetric
 
-from flame_mdm.batch import Condition, MotionBatch, sent
+from flame_mdm.batch import Condition, MotionBatch
 from flame_mdm.conditions import ConditionEncoder
 from flame_mdm.conditions.vocabulary import vocabulary
 from flame_mdm.config import Config, instantiate
-from flame_mdm.data.adaptation import KEPT
 from flame_mdm.data.datamodule import MotionDataModule
-from flame_mdm.denoisers import Denoiser
 from flame_mdm.errors import UserError
-from flame_mdm.generator import Model, MotionGenerator
+from flame_mdm.generator import Model, MotionGenerator, Parts, sampling_defaults
 from flame_mdm.losses import MotionLosses
-from flame_mdm.processes import Process
 from flame_mdm.representations import Representation
 from flame_mdm.seeds import key, normal, seed_generator, seeded_noise, uniform
 
@@ -29,44 +27,54 @@ from flame_mdm.seeds import key, normal, seed_generator, seeded_noise, uniform
 class Task(Model, LightningModule):
     """Base class of all models that `make train` trains; a recipe names the class in `task._target_`."""
 
-    def __init__(self, condition: ConditionEncoder, representation: Representation, *, optimizer: Config, seed: int):
+    def __init__(self, *, optimizer: Config, seed: int):
         super().__init__()
-        self.condition, self.representation = condition, representation
         self.optimizer, self.seed = optimizer, seed
         self.config, self.facts = {}, {}
         self.prepare_data_per_node = False  # the machines of a cluster share the data folder
 
     @classmethod
     def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:
-        """Builds the parts of a recipe and combines them. Derives sizes that depend on other parts."""
+        """Builds the task of a recipe, with the sizes that depend on other parts."""
         raise NotImplementedError
+
+    def encoder(self) -> ConditionEncoder:
+        """Returns the encoder of the captions or actions in the data."""
+        raise NotImplementedError
+
+    @property
+    def data(self) -> MotionDataModule:
+        """The data that the trainer trains with."""
+        return self.trainer.datamodule  # type: ignore[attr-defined]
 
     def describe(self) -> str:
         return type(getattr(self, "network", self)).__name__
 
     def prepare_data(self) -> None:
         """Encodes all captions of the data once, in one process, if the text encoder is frozen."""
-        self.condition.precompute(*self._captions())
+        self.encoder().precompute(*self._captions())
 
     def setup(self, stage: str) -> None:
         """Opens the captions encoded by `prepare_data`, and adds the facts about the data to `facts`."""
-        size = self.condition.load_cache(*self._captions())
-        data: MotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
+        data, encoder = self.data, self.encoder()
+        size = encoder.load_cache(*self._captions())
         if device := data.choose_device(size):
-            self.condition.move_cache(device)
+            encoder.move_cache(device)
         # Buffers are equal in all processes. If DDP broadcast them in each forward pass, processes with more validation
         # batches than others would wait forever.
         self._ddp_params_and_buffers_to_ignore = [name for name, _ in self.named_buffers()]
-        self.facts |= {
-            "dataset": data.store.info["dataset"],
-            "fingerprint": data.store.fingerprint,
-            "max_frames": data.crop.longest(),
-        }
+        self.add_facts(
+            {
+                "dataset": data.store.info["dataset"],
+                "fingerprint": data.store.fingerprint,
+                "max_frames": data.crop.longest(),
+            }
+        )
 
     def _captions(self) -> tuple[list[str], Path]:
-        data: MotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
+        """Returns the captions of the data and the prompts of callbacks, and the folder of their encodings."""
         prompts = [text for c in self.trainer.callbacks for text in getattr(c, "texts", ())]  # type: ignore[attr-defined]
-        return sorted({*data.captions(), *prompts}), data.folder.parent / "text"
+        return sorted({*self.data.captions(), *prompts}), self.data.folder.parent / "text"
 
     def make_optimizer(self) -> torch.optim.Optimizer:
         return instantiate(self.optimizer, params=[p for p in self.parameters() if p.requires_grad])
@@ -95,25 +103,27 @@ class Task(Model, LightningModule):
         checkpoint["config"], checkpoint["facts"] = self.config, self.facts
 
 
-class MotionGeneration(MotionGenerator, Task):
-    """Trains any denoiser with any process, and samples from it.
+class GeneratorTask(Task):
+    """Trains a `MotionGenerator`: any denoiser with any process.
+
+    Checkpoints hold the weights under the names that they have in the generator.
 
     Args:
-        denoiser, process, condition, representation: the four parts.
+        parts: the four parts of the generator.
         losses: weights of `MotionLosses` on the clean estimate.
         optimizer: a mapping with the `_target_` of a torch optimizer and its arguments.
         cond_drop_prob: probability that a training sample gets the null condition.
         guidance_scale, sampler, num_inference_steps: defaults of `generate`; see `SamplerOptions`.
         seed: of all random draws in training, which are functions of (seed, batch number, rank).
-        compile: compile the denoiser with torch.compile.
+        compile: compile the denoiser with torch.compile, when training begins.
     """
+
+    noun = MotionGenerator.noun
+    kind: type[MotionGenerator] = MotionGenerator  # class of the generator
 
     def __init__(
         self,
-        denoiser: Denoiser,
-        process: Process,
-        condition: ConditionEncoder,
-        representation: Representation,
+        parts: Parts,
         *,
         losses: dict[str, Any],
         optimizer: Config,
@@ -124,66 +134,92 @@ class MotionGeneration(MotionGenerator, Task):
         seed: int = 0,
         compile: bool = False,
     ):
-        super().__init__(condition, representation, optimizer=optimizer, seed=seed)
+        super().__init__(optimizer=optimizer, seed=seed)
         if not 0 <= cond_drop_prob <= 1:
             raise UserError(f"task.cond_drop_prob={cond_drop_prob}: give a probability from 0 to 1")
-        options = {"guidance_scale": guidance_scale, "sampler": sampler, "num_inference_steps": num_inference_steps}
-        self.combine(denoiser, process, condition, representation, **options)
+        defaults = sampling_defaults(
+            guidance_scale=guidance_scale, sampler=sampler, num_inference_steps=num_inference_steps
+        )
+        self.generator = self.kind(parts, defaults)
+        self.register_state_dict_post_hook(_name_as_generator)
+        self.register_load_state_dict_pre_hook(_name_as_task)
+        representation = parts.representation
         skeleton = representation.skeleton
         self.losses = MotionLosses(representation.to_joints, skeleton.feet, skeleton.edges, **losses)
-        self.cond_drop_prob = cond_drop_prob
+        self.cond_drop_prob, self.compiles = cond_drop_prob, compile
         self.val_losses = torch.nn.ModuleDict()
-        if compile:
-            self.denoiser.compile()
 
     @classmethod
-    def of_parts(cls, config: Config, *parts: Any) -> Self:
-        options = {k: v for k, v in config["task"].items() if k != "_target_"}
-        return cls(*parts, **options, **{name: config[name] for name in ("losses", "optimizer", "seed")})
+    def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:
+        """Builds the task of a recipe; `actions` are the names of the actions in its data."""
+        parts = Parts.build(config, representation, len(actions))
+        section = {name: value for name, value in config["task"].items() if name != "_target_"}
+        task = cls(parts, losses=config["losses"], optimizer=config["optimizer"], seed=config["seed"], **section)
+        # The same objects: what training adds to the facts, sampling reads.
+        task.config = task.generator.config = config
+        task.facts = task.generator.facts = {"actions": list(actions)}
+        return task
+
+    def encoder(self) -> ConditionEncoder:
+        """Returns the encoder of the captions or actions in the data."""
+        return self.generator.condition
+
+    def add_facts(self, facts: Mapping[str, Any]) -> None:
+        """Adds facts about the training data to the generator, which shares them."""
+        self.generator.add_facts(facts)
+
+    def describe(self) -> str:
+        return self.generator.describe()
 
     def setup(self, stage: str) -> None:
         """Also stores the vocabulary of the training captions, and tells it to the text encoder."""
         super().setup(stage)
-        data: MotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
-        if self.conditioned_on == "text":
+        data = self.data
+        if self.generator.conditioned_on == "text":
             captions = (caption for clip in data.train.clips for caption in clip.captions)
-            self.facts |= vocabulary(captions, share=data.source.captions_may_be_shared)
-            self.facts |= {"verbs": list(data.source.verbs)} if data.source.verbs else {}
-            self.condition.seen = frozenset(self.facts["vocabulary"])
+            self.add_facts(vocabulary(captions, share=data.source.captions_may_be_shared))
+            if data.source.verbs:
+                self.add_facts({"verbs": list(data.source.verbs)})
+        if self.compiles:
+            self.generator.denoiser.compile()
 
     def on_fit_start(self) -> None:
         """Runs the sampler with a denoiser that returns 0, so that invalid sampling options fail at the start."""
-        like = torch.zeros(1, 2, self.representation.features, device=self.device)
+        process = self.generator.process
+        like = torch.zeros(1, 2, self.generator.representation.features, device=self.device)
         mask = torch.ones(1, 2, dtype=torch.bool, device=self.device)
-        self.process.sample(
-            lambda x_t, *_: x_t.new_zeros(1, 2, self.process.out_features(x_t.shape[-1])),
+        process.sample(
+            lambda x_t, *_: x_t.new_zeros(1, 2, process.out_features(x_t.shape[-1])),
             seeded_noise(["trial"], 2, like.shape[-1], seed=0, replication=0, like=like),
             mask,
             Condition(like[:, 0], like, mask),
-            self.sampler_options,
+            self.generator.sampler_options,
         )
 
     def on_train_start(self) -> None:
-        """Trains the text encoder on the captions alone, if the recipe says so and the training begins from nothing."""
         super().on_train_start()
-        if self.global_step == 0 and not self.config.keys() & {"base", "distillation"}:
-            data: MotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
-            self.condition.pretrain([clip.captions for clip in data.train.clips], self.seed)
+        if self.global_step == 0:
+            self.pretrain()
+
+    def pretrain(self) -> None:
+        """Trains the text encoder on the captions alone, if the recipe says so, before the first step."""
+        self.encoder().pretrain([clip.captions for clip in self.data.train.clips], self.seed)
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
         """Returns the loss of one batch. Random draws are functions of (seed, batch number, rank)."""
         seed_generator(key("step", self.seed, batch_idx, self.global_rank), self.device)
-        cond = self.condition(batch)
+        cond = self.generator.condition(batch)
         if cond.null is not None:  # even if the probability is 0, since DDP requires a gradient for every parameter
-            dropped = torch.rand(len(batch), device=self.device) < self.cond_drop_prob
-            if self.config.get("base"):  # guidance would lead away from the clips that are taught
-                dropped &= sent(torch.tensor([name.startswith(KEPT) for name in batch.ids]), self.device)
-            cond = cond.drop(dropped)
+            cond = cond.drop(self.dropped(batch))
         terms = self.loss_terms(batch, cond)
         trainer = self._trainer  # None where a step is computed without one
         if trainer is None or (trainer.global_step + 1) % trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
             self.log_dict({f"train/{name}": value.mean() for name, value in terms.items()}, batch_size=len(batch))
         return terms["loss"].mean()
+
+    def dropped(self, batch: MotionBatch) -> Tensor:
+        """Draws which motions (B,) of a batch get the null condition."""
+        return torch.rand(len(batch), device=self.device) < self.cond_drop_prob
 
     def loss_terms(
         self, batch: MotionBatch, cond: Condition, u: Tensor | None = None, noise: Tensor | None = None
@@ -192,14 +228,15 @@ class MotionGeneration(MotionGenerator, Task):
 
         Uniform numbers u (B,) in (0, 1), which decide on the times, and noise (B, F, D) are drawn if not given.
         """
-        t = None if u is None else self.process.training_times(u)
-        return self.process.loss(self.denoiser, batch.x, batch.mask, cond, t=t, noise=noise, auxiliary=self.losses)
+        process = self.generator.process
+        t = None if u is None else process.training_times(u)
+        return process.loss(self.generator.denoiser, batch.x, batch.mask, cond, t=t, noise=noise, auxiliary=self.losses)
 
     def losses_of(self, batch: MotionBatch) -> dict[str, Tensor]:
         """Returns the losses (B,) of clips. Each clip always gets the same time and noise."""
         keys = torch.tensor([key("validation", name) for name in batch.ids], device=self.device)
         u, noise = uniform(keys, (1,))[0][:, 0], normal(keys, *batch.x.shape[1:])
-        return self.loss_terms(batch, self.condition(batch), u, noise)
+        return self.loss_terms(batch, self.generator.condition(batch), u, noise)
 
     def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:
         for name, value in self.losses_of(batch).items():
@@ -213,3 +250,15 @@ class MotionGeneration(MotionGenerator, Task):
             assert isinstance(metric, MeanMetric)
             self.log(f"val/{name}", metric.compute(), prog_bar=name == "loss")
             metric.reset()
+
+
+def _name_as_generator(task: GeneratorTask, state: dict[str, Any], prefix: str, *_: object) -> None:
+    """Removes "generator." from the names of the weights that are written."""
+    for name in [name for name in state if name.startswith(f"{prefix}generator.")]:
+        state[prefix + name.removeprefix(f"{prefix}generator.")] = state.pop(name)
+
+
+def _name_as_task(task: GeneratorTask, state: dict[str, Any], prefix: str, *_: object) -> None:
+    """Adds "generator." to the names of the weights that are read."""
+    for name in [name for name in state if name.startswith(prefix)]:
+        state[f"{prefix}generator.{name.removeprefix(prefix)}"] = state.pop(name)

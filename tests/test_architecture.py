@@ -18,7 +18,7 @@ MODELS = GROUND | AXES | {"visualize", "formats", "data", "generator", "task"}
 ALL = MODELS | {"sampling", "checkpoints", "schemas", "records", "runs", "reporting", "training"}
 MAY_IMPORT: dict[str, set[str]] = {
     "errors": set(),
-    "sampler_options": {"errors"},
+    "sampler_options": {"errors", "config"},
     "losses": set(),
     "signals": set(),
     "progress": {"signals"},

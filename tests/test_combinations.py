@@ -13,7 +13,7 @@ from flame_mdm.config import EXPERIMENTS, compose, instantiate, parameters
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.processes.flow_matching import FlowMatching
 from flame_mdm.sampler_options import SamplerOptions
-from flame_mdm.task import MotionGeneration
+from flame_mdm.task import GeneratorTask
 
 TINY = {"latent_dim": 16, "ff_size": 16, "num_layers": 1, "num_heads": 2, "channels": [8, 8], "num_groups": 4}
 FLOW = "flow_matching"
@@ -51,7 +51,7 @@ def denoisers() -> Iterator[tuple[str, dict[str, Any]]]:
 DENOISERS = dict(denoisers())
 
 
-def build(denoiser: str, process: str, condition: str = "learned") -> MotionGeneration:
+def build(denoiser: str, process: str, condition: str = "learned") -> GeneratorTask:
     """A tiny task in float64, so that only real differences show."""
     config = recipe() | {"denoiser": DENOISERS[denoiser]}
     options = dict(PROCESSES[process])
@@ -67,7 +67,7 @@ def build(denoiser: str, process: str, condition: str = "learned") -> MotionGene
     representation = instantiate(config["representation"])
     representation.mean.normal_()
     representation.std.uniform_(0.5, 1.5)
-    return MotionGeneration.build(config, representation, actions=ACTIONS).double()
+    return GeneratorTask.build(config, representation, actions=ACTIONS).double()
 
 
 def samplers(process: str) -> list[str]:
@@ -94,7 +94,7 @@ def test_trains_and_samples(denoiser, process, condition, monkeypatch):
     task, motions = build(denoiser, process, condition), batch()
     if condition == "none" and DENOISERS[denoiser].get("max_tokens"):  # reads tokens in place of the pooled vector
         with pytest.raises(ValueError, match="needs condition tokens, but the condition encoder has none"):
-            task.generate(motions)
+            task.generator.generate(motions)
         return
     logged: dict[str, Tensor] = {}
     monkeypatch.setattr(task, "log_dict", lambda values, **_: logged.update(values))
@@ -112,7 +112,7 @@ def test_trains_and_samples(denoiser, process, condition, monkeypatch):
     assert {"train/loss", "train/mse"} <= logged.keys()
     assert ("train/vlb" in logged) == (process == "learned_range")
     for sampler in samplers(process):
-        x = task.generate(motions, SamplerOptions(sampler=sampler))
+        x = task.generator.generate(motions, SamplerOptions(sampler=sampler))
         assert x.shape == motions.x.shape
         assert x.isfinite().all()
         assert (x[~motions.mask] == 0).all()
@@ -124,9 +124,9 @@ def test_trains_and_samples(denoiser, process, condition, monkeypatch):
 @each_denoiser
 def test_a_motion_does_not_depend_on_padding_or_neighbors(denoiser, process):
     task = build(denoiser, process)
-    together, longer = task.generate(batch()), task.generate(batch(frames=17))
+    together, longer = task.generator.generate(batch()), task.generator.generate(batch(frames=17))
     for row, length in enumerate(LENGTHS):
-        alone = task.generate(batch(slice(row, row + 1)))
+        alone = task.generator.generate(batch(slice(row, row + 1)))
         for other in (longer[row, :length], alone[0, :length]):
             torch.testing.assert_close(other, together[row, :length], rtol=0, atol=1e-8)
 
@@ -135,9 +135,11 @@ def test_a_motion_does_not_depend_on_padding_or_neighbors(denoiser, process):
 def test_one_encoding_a_run_and_one_forward_a_call(process, sampler):
     for guidance_scale, copies in ((2.5, 2), (1.0, 1)):
         task, encodings, forwards = build("mdm_decoder_text", process), [], []
-        task.condition.register_forward_hook(lambda *_, calls=encodings: calls.append(1))
-        task.denoiser.register_forward_hook(lambda _, x, __, calls=forwards: calls.append(len(x[0])))
-        task.generate(batch(), SamplerOptions(sampler=sampler, num_inference_steps=5, guidance_scale=guidance_scale))
+        model = task.generator
+        model.condition.register_forward_hook(lambda *_, calls=encodings: calls.append(1))
+        model.denoiser.register_forward_hook(lambda _, x, __, calls=forwards: calls.append(len(x[0])))
+        options = SamplerOptions(sampler=sampler, num_inference_steps=5, guidance_scale=guidance_scale)
+        model.generate(batch(), options)
         assert len(encodings) == 1
         assert set(forwards) == {copies * len(LENGTHS)}
         assert sampler == "dopri5" or len(forwards) == 5 * CALLS_A_STEP.get(sampler, 1)

@@ -24,12 +24,12 @@ from flame_mdm.commands.evaluate import EvaluateSettings
 from flame_mdm.commands.inspect import InspectSettings
 from flame_mdm.config import check, compose, compose_data, guarded, instantiate, parameters, recipes, sweeps, trust
 from flame_mdm.config.command_line import make_variables, read_settings, run
+from flame_mdm.config.options import option
 from flame_mdm.config.signatures import check_kind, source_file
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError
 from flame_mdm.formats.motion import Motion
 from flame_mdm.representations.skeleton import SMPL22
-from flame_mdm.sampler_options import option
 from flame_mdm.training.fit import check_devices
 
 PARTS = ("task", "representation", "process", "condition", "denoiser", "data")

@@ -17,7 +17,7 @@ from torch import Tensor
 
 import flame_mdm
 from flame_mdm.__main__ import main
-from flame_mdm.batch import Denoise
+from flame_mdm.batch import Denoise, MotionBatch
 from flame_mdm.checkpoints.adapters import About, attach, copy_weights, word_rows, write_adapter
 from flame_mdm.checkpoints.hub import export
 from flame_mdm.checkpoints.model_files import read_checkpoint, weights_sha256, write_model_file
@@ -29,11 +29,11 @@ from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.demo.request import DemoRequest
 from flame_mdm.demo.studio import Studio
 from flame_mdm.errors import UserError
+from flame_mdm.generator import MotionGenerator
 from flame_mdm.processes import Process
 from flame_mdm.processes.consistency import consistency_terms
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.processes.flow_matching import FlowMatching
-from flame_mdm.task import MotionGeneration
 from flame_mdm.training import adaptation
 
 MEAN, VARIANCE = torch.tensor([0.5, -1.0, 0.0]).double(), torch.tensor([0.3, 1.0, 2.0]).double()
@@ -160,6 +160,18 @@ def test_a_student_is_sampled_edited_led_chained_and_exported_without_its_teache
         flame_mdm.generate(model)
 
 
+def as_version_0_2(run: Path, name: str, old_name: str) -> None:
+    """Gives the task in the files of a run the name that it had in version 0.2."""
+    last = run / "checkpoints" / "last.ckpt"
+    content = torch.load(last, weights_only=True)
+    assert name in content["config"]["task"]["_target_"]
+    content["config"]["task"]["_target_"] = content["config"]["task"]["_target_"].replace(name, old_name)
+    torch.save(content, last)
+    config = (run / "config.yaml").read_text()
+    assert name in config
+    (run / "config.yaml").write_text(config.replace(name, old_name))
+
+
 @pytest.mark.slow
 def test_a_resumed_distillation_ends_in_the_same_weights(trained, data_root, tmp_path, capsys):
     run, last = tmp_path / "run", tmp_path / "run" / "checkpoints" / "last.ckpt"
@@ -168,6 +180,7 @@ def test_a_resumed_distillation_ends_in_the_same_weights(trained, data_root, tmp
     assert main(words) == 0
     once = read_checkpoint(last)
     last.with_name("previous.ckpt").rename(last)
+    as_version_0_2(run, "DistillationTask", "ConsistencyDistillation")
     assert read_checkpoint(last)["global_step"] == 2
     assert main(words) == 0
     again = torch.load(last, weights_only=True)
@@ -215,14 +228,14 @@ def test_a_model_that_cannot_be_a_teacher_gets_one_line(trained, student, data_r
 ABOUT: About = {"name": "", "action": False, "rank": 2, "words": [], "rows": [], "captions": [], "base": ""}
 
 
-def build(*words: str) -> MotionGeneration:
+def build(*words: str) -> MotionGenerator:
     config = compose("quickstart", [*TINY, *words])
-    task = MotionGeneration.build(config, instantiate(config["representation"]))
+    task = MotionGenerator.build(config, instantiate(config["representation"]))
     task.facts |= {"max_frames": 40, "vocabulary": ["a", "person", "walks"], "captions": ["a person walks"]}
     return task.eval()
 
 
-def write(task: MotionGeneration, about: About, file: Path) -> None:
+def write(task: MotionGenerator, about: About, file: Path) -> None:
     """Writes the checkpoint of an adaptation, and its adapter next to it."""
     content = {"config": task.config | {"adapter": about}, "facts": task.facts, "state_dict": task.state_dict()}
     torch.save(content | {"global_step": 3, "flame_mdm_format": 2}, file.with_suffix(".ckpt"))
@@ -350,6 +363,8 @@ def test_from_clips_to_a_prompt_and_resumed(trained, clips, tmp_path, monkeypatc
     words = ["adapt", str(trained), "whole", f"source={clips}", "name=limp", *STEPS]
     for steps, out in ((4, "whole"), (2, "parts"), (4, "parts")):
         words[2] = out
+        if (Path(out) / "config.yaml").exists():
+            as_version_0_2(Path(out), "training.adaptation.AdaptationTask", "task.MotionGeneration")
         assert main([*words, f"trainer.max_steps={steps}"]) == 0
     whole, parts = (load_file(Path(out) / "limp.safetensors") for out in ("whole", "parts"))
     torch.testing.assert_close(parts, whole, rtol=0, atol=0)
@@ -362,6 +377,15 @@ def test_from_clips_to_a_prompt_and_resumed(trained, clips, tmp_path, monkeypatc
     assert {clip.captions[0] for clip in store.clips if not clip.source.startswith("prior/")} == {STYLED}
     assert main(["sample", str(trained), "out", f"text={STYLED}", "adapter=whole/limp.safetensors", "samples=1"]) == 0
     assert "never seen" not in capsys.readouterr().out
+
+
+def test_an_adaptation_keeps_the_captions_of_the_users_clips_and_the_text_encoder(monkeypatch):
+    config = compose("quickstart", [*TINY, "task.cond_drop_prob=1"])
+    task = adaptation.AdaptationTask.build(config, instantiate(config["representation"]))
+    batch = MotionBatch(torch.zeros(3, 2, 263), torch.ones(3, 2, dtype=torch.bool), ["limp", "prior/limp", "a/prior/b"])
+    assert task.dropped(batch).tolist() == [False, True, False]
+    monkeypatch.setattr(task.generator.condition, "pretrain", lambda *_: pytest.fail("trained"))
+    task.pretrain()
 
 
 @pytest.mark.slow

@@ -25,7 +25,7 @@ from flame_mdm.config import Config, compose, instantiate
 from flame_mdm.config.sweeps import run_recipe
 from flame_mdm.errors import UserError
 from flame_mdm.runs import read_history
-from flame_mdm.task import MotionGeneration
+from flame_mdm.task import GeneratorTask
 
 
 @pytest.mark.slow
@@ -43,9 +43,9 @@ def test_two_processes_are_one_with_both_batches(tiny, tmp_path):
 
     # Validation: 5 clips in batches of one, so 3 batches on one process, 2 on the other.
     config = compose("quickstart", words)
-    task = load_task(tmp_path / "run" / "checkpoints" / "last.ckpt", MotionGeneration)
+    task = load_task(tmp_path / "run" / "checkpoints" / "last.ckpt", GeneratorTask)
     task.load_state_dict(expected)
-    data = instantiate(config["data"], representation=task.representation, seed=config["seed"])
+    data = instantiate(config["data"], representation=task.generator.representation, seed=config["seed"])
     data.setup("fit")
     with torch.no_grad():
         for index, batch in enumerate(data.val_dataloader()):
@@ -83,7 +83,7 @@ def test_data_is_prepared_once_and_no_process_is_without_a_validation_batch(tiny
     config = compose("quickstart", [*tiny, "data.batch_size=1"])
     representation = instantiate(config["representation"])
     data = instantiate(config["data"], representation=representation, seed=0)
-    for part in (data, MotionGeneration.build(config, representation)):
+    for part in (data, GeneratorTask.build(config, representation)):
         assert part.prepare_data_per_node is False  # by which Lightning asks the first process of the first machine
     data.prepare_data()
     data.setup("fit")

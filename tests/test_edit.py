@@ -16,6 +16,7 @@ from flame_mdm.__main__ import main
 from flame_mdm.data.store import write_store
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.formats.motion import Motion
+from flame_mdm.generator import MotionGenerator
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.rot6d import Rot6D
 from flame_mdm.representations.skeleton import KIT21, SMPL22, SMPL24, find_joints, part_names
@@ -23,12 +24,11 @@ from flame_mdm.representations.smpl import SMPL
 from flame_mdm.sampling.editing import Edited, edit
 from flame_mdm.sampling.reading import decoded, read_motion
 from flame_mdm.seeds import seeded_noise
-from flame_mdm.task import MotionGeneration
 
 CLIP = "synthetic:synthetic_0_000003"
 
 
-def build(overrides: list[str], max_frames: int = 60) -> MotionGeneration:
+def build(overrides: list[str], max_frames: int = 60) -> MotionGenerator:
     model = untrained(overrides, max_frames)
     model.representation.std.uniform_(0.5, 2)
     model.representation.mean.normal_()
@@ -36,12 +36,12 @@ def build(overrides: list[str], max_frames: int = 60) -> MotionGeneration:
 
 
 @pytest.fixture(scope="module")
-def diffusion() -> MotionGeneration:
+def diffusion() -> MotionGenerator:
     return build(TINY)
 
 
 @pytest.fixture(scope="module")
-def flow() -> MotionGeneration:
+def flow() -> MotionGenerator:
     shared = [override for override in TINY if "num_train_timesteps" not in override]
     return build([*shared, "process=flow_matching", "task.sampler=euler"])
 
@@ -217,7 +217,7 @@ def test_joints_of_any_rate_and_facing(diffusion, motion, tmp_path, fps, turned)
 
 def test_bad_edits_are_one_line(diffusion, flow, motion):
     short, suffix = build(TINY, max_frames=36), {"region": "suffix"}
-    cases: list[tuple[MotionGeneration, dict, str]] = [
+    cases: list[tuple[MotionGenerator, dict, str]] = [
         (diffusion, {}, r"no part of the motion is kept: choose region.*strength=0\.5"),
         (diffusion, {"region": [0, 40]}, "no part of the motion is kept"),
         (diffusion, {"region": [5, 5]}, r"region=\[5, 5\] is not a range of this motion, which has 40 frames \(2 sec"),

@@ -17,10 +17,10 @@ from flame_mdm.data.folder import Folder
 from flame_mdm.errors import UserError
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.readers import read
+from flame_mdm.generator import MotionGenerator
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.sampling.editing import edit
 from flame_mdm.sampling.reading import read_motion
-from flame_mdm.task import MotionGeneration
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def folder(walk: Motion, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def model() -> MotionGeneration:
+def model() -> MotionGenerator:
     return untrained(TINY, max_frames=196)
 
 
@@ -95,7 +95,7 @@ def test_a_motion_is_shown(walk: Motion, monkeypatch):
     assert "<script" not in shown
 
 
-def test_arrays_are_edited_and_what_cannot_be_edited_is_refused_in_one_line(walk: Motion, model: MotionGeneration):
+def test_arrays_are_edited_and_what_cannot_be_edited_is_refused_in_one_line(walk: Motion, model: MotionGenerator):
     how: dict[str, Any] = {"region": "prediction", "num_inference_steps": 2}
     expected, joints = edit(model, walk, "a person jumps", **how)[0], walk.joints
     for array in (joints, torch.from_numpy(joints), joints.tolist()):

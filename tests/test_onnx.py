@@ -29,13 +29,13 @@ from flame_mdm.conditions import vocabulary
 from flame_mdm.errors import UserError
 from flame_mdm.formats.poses import solve
 from flame_mdm.formats.readers import read
+from flame_mdm.generator import MotionGenerator
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.processes.flow_matching import FlowMatching
 from flame_mdm.representations import rotation
 from flame_mdm.safe_io import read_yaml
 from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.seeds import key, seeded_noise
-from flame_mdm.task import MotionGeneration
 
 SIZES = {"latent_dim": 16, "ff_size": 24, "num_layers": 1, "num_heads": 2, "channels": [8, 16], "num_groups": 4}
 RECIPES = sorted((ROOT / "experiments" / "denoiser").glob("*.yaml"))
@@ -109,7 +109,7 @@ def test_noise_and_words_of_the_runner_are_those_of_the_package() -> None:
     assert all(runner.hashed(word, 97) == vocabulary.hashed(word, 97) for word in runner.words(text))
 
 
-def tiny(name: str, condition: str) -> MotionGeneration:
+def tiny(name: str, condition: str) -> MotionGenerator:
     """A model with random weights."""
     config = dict(recipe("quickstart"))
     denoiser: Any = read_yaml(ROOT / "experiments" / "denoiser" / f"{name}.yaml")
@@ -119,7 +119,7 @@ def tiny(name: str, condition: str) -> MotionGeneration:
     config["condition"] = {"_target_": f"flame_mdm.conditions.{target}", **sizes[condition]}
     config["representation"] = {"_target_": "flame_mdm.representations.essential.Essential"}
     torch.manual_seed(0)
-    model = MotionGeneration.build(config, instantiate(config["representation"]), actions=["walk", "run", "sit"])
+    model = MotionGenerator.build(config, instantiate(config["representation"]), actions=["walk", "run", "sit"])
     model.facts |= {"max_frames": 20}
     return model.eval()
 

@@ -14,7 +14,7 @@ from flame_mdm.config import instantiate, recipes
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.processes.flow_matching import FlowMatching
 from flame_mdm.reporting.tables.settings import value
-from flame_mdm.task import MotionGeneration
+from flame_mdm.task import GeneratorTask
 
 generate = script("docs/generate.py")
 pytestmark = pytest.mark.usefixtures("composed_once")
@@ -105,14 +105,15 @@ def decisive(name: str) -> str:
     return repr([config[part] for part in ("denoiser", "process", "condition", "representation")] + options)
 
 
-def built(name: str) -> MotionGeneration:
+def built(name: str) -> GeneratorTask:
     torch.manual_seed(0)
     config = shortened(name)
     actions = [f"action {label}" for label in range(40)]
-    task = MotionGeneration.build(config, instantiate(config["representation"]), actions=actions)
+    task = GeneratorTask.build(config, instantiate(config["representation"]), actions=actions)
     condition = config["condition"]
     if condition["_target_"].endswith("PretrainedText"):
-        task.condition = Drawn(condition["features"], condition["max_tokens"] if condition.get("tokens") else 0)
+        max_tokens = condition["max_tokens"] if condition.get("tokens") else 0
+        task.generator.condition = Drawn(condition["features"], max_tokens)
     task.log_dict = task.log = lambda *_, **__: None  # type: ignore[method-assign]
     return task
 
@@ -120,7 +121,7 @@ def built(name: str) -> MotionGeneration:
 def step(name: str) -> None:
     task = built(name)
     mask = length_mask(torch.tensor([24, 16]))
-    x = torch.randn(*mask.shape, task.representation.features) * mask[..., None]
+    x = torch.randn(*mask.shape, task.generator.representation.features) * mask[..., None]
     batch = MotionBatch(x, mask, ["a", "b"], ["a person walks", "a person jumps"], torch.tensor([0, 1]))
     optimizer = task.make_optimizer()
     before = [parameter.detach().clone() for parameter in task.parameters()]

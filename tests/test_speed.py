@@ -18,7 +18,7 @@ from flame_mdm.config import Config, compose, instantiate
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.denoisers.layers import Transformer
 from flame_mdm.seeds import seed_generator
-from flame_mdm.task import MotionGeneration
+from flame_mdm.task import GeneratorTask
 from flame_mdm.training import speed
 from flame_mdm.training.averaging import MovingAverage
 from flame_mdm.training.speed import CheapDropout, attention
@@ -156,9 +156,9 @@ def test_bfloat16_is_chosen_where_the_processor_computes_with_it(monkeypatch):
         assert speed.accelerate(*parts(config), config) == chosen
 
 
-def parts(config: Config) -> tuple[MotionGeneration, MotionDataModule]:
+def parts(config: Config) -> tuple[GeneratorTask, MotionDataModule]:
     representation = instantiate(config["representation"])
-    return MotionGeneration.build(config, representation), instantiate(config["data"], representation=representation)
+    return GeneratorTask.build(config, representation), instantiate(config["data"], representation=representation)
 
 
 @pytest.mark.parametrize(
@@ -176,7 +176,7 @@ def test_long_runs_on_cuda_are_compiled_for_few_lengths(words, multiple, monkeyp
     assert options == [{"dynamic": False}] * (multiple > 0)
     assert data.pad_multiple == max(multiple, 1)
     assert ("compiling the network" in capsys.readouterr().out) == (multiple > 0)
-    assert any(isinstance(module, nn.Dropout) for module in task.denoiser.modules())
+    assert any(isinstance(module, nn.Dropout) for module in task.generator.denoiser.modules())
 
 
 def test_a_seed_gives_the_numbers_of_torch_manual_seed():

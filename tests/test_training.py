@@ -26,7 +26,7 @@ from flame_mdm.progress import ProgressBar
 from flame_mdm.runs import read_history
 from flame_mdm.sampling.editing import edit
 from flame_mdm.sampling.generation import generate
-from flame_mdm.task import MotionGeneration
+from flame_mdm.task import GeneratorTask
 
 STEPS = ["trainer.val_check_interval=4", "callbacks.checkpoints.every_n_steps=4", "callbacks.samples=null"]
 
@@ -166,8 +166,8 @@ def test_validation_does_not_depend_on_the_batch_size(trained, data_root):
     values = []
     for size in (3, 8):
         overrides = [TINY[0], f"data_root={data_root}", f"data.batch_size={size}"]
-        task = load_task(trained, MotionGeneration)
-        data = instantiate(compose("quickstart", overrides)["data"], representation=task.representation)
+        task = load_task(trained, GeneratorTask)
+        data = instantiate(compose("quickstart", overrides)["data"], representation=task.generator.representation)
         data.setup("fit")
         with torch.no_grad():
             for index, batch in enumerate(data.val_dataloader()):

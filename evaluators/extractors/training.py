@@ -32,7 +32,9 @@ class ExtractorTask(Task):
         optimizer: Config,
         seed: int = 0,
     ):
-        super().__init__(condition, representation, optimizer=optimizer, seed=seed)
+        super().__init__(optimizer=optimizer, seed=seed)
+        # Optimizer states in checkpoints number the parameters in this order.
+        self.condition, self.representation = condition, representation
         self.network, self.val_metrics = network, nn.ModuleDict()
 
     @classmethod
@@ -42,6 +44,10 @@ class ExtractorTask(Task):
         task = cls(**options | cls.parts(config, representation, actions))
         task.config, task.facts = config, {"actions": list(actions)}
         return task
+
+    def encoder(self) -> ConditionEncoder:
+        """Returns the encoder of the captions in the data."""
+        return self.condition
 
     @classmethod
     def parts(cls, config: Config, representation: Representation, actions: Sequence[str]) -> dict[str, Any]:

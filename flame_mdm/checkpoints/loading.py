@@ -1,3 +1,4 @@
+# pyright: standard
 """Loading of models: builds the parts, loads the weights."""
 
 from __future__ import annotations
@@ -23,10 +24,11 @@ if TYPE_CHECKING:
 
 PARTS = ("task", "representation", "process", "condition", "denoiser")  # parts of a recipe from which a model is built
 GENERATORS = {
-    "flame_mdm.task.MotionGeneration": MotionGenerator,
-    "flame_mdm.training.distillation.ConsistencyDistillation": DistilledGenerator,
+    "flame_mdm.task.GeneratorTask": MotionGenerator,
+    "flame_mdm.training.adaptation.AdaptationTask": MotionGenerator,
+    "flame_mdm.training.distillation.DistillationTask": DistilledGenerator,
 }
-"""Classes of the task in recipes of generators, and those that are loaded instead, without Lightning."""
+"""Classes of the task in recipes, and the generators that they train, which are loaded without Lightning."""
 Trained = TypeVar("Trained", bound="Task | MotionGenerator")
 NO_GPU = "PyTorch finds no GPU" if torch.version.cuda or torch.version.hip else "this PyTorch was built without CUDA"
 """Why no GPU can be used, if PyTorch has none."""
@@ -78,7 +80,7 @@ def check_device(device: str | torch.device) -> None:
 
 
 def _build(checkpoint: dict[str, Any], kind: type[Trained]) -> Trained:
-    """Builds the task of a checkpoint with its weights, without compiling it.
+    """Builds the model of a checkpoint with its weights.
 
     Networks of this project are built on the meta device, so that a recipe takes no more memory than the weights in the
     file. Other classes, which the user must trust, are built as in training.
@@ -90,30 +92,29 @@ def _build(checkpoint: dict[str, Any], kind: type[Trained]) -> Trained:
     targets = [str(node["_target_"]) for _, node in walk(parts) if "_target_" in node]
     # imports modules here, since tensors that they create must not be on the meta device
     classes |= {target: get_class(target) for target in targets if target not in classes}
-    task_class = classes[config["task"]["_target_"]]
-    if not issubclass(task_class, kind):
-        noun = getattr(task_class, "noun", task_class.__name__)
+    model_class = classes[config["task"]["_target_"]]
+    if kind is MotionGenerator:  # a class of the user's
+        model_class = getattr(model_class, "kind", model_class)
+    if not issubclass(model_class, kind):
+        noun = getattr(model_class, "noun", model_class.__name__)
         raise UserError(f"holds {noun}, not {kind.noun}. Give another checkpoint")
     own = all(target.startswith(("flame_mdm.", "evaluators.")) for target in targets)
-    uncompiled = config | {"task": {name: value for name, value in config["task"].items() if name != "compile"}}
     with ExitStack() as stack:
         if own:
             stack.enter_context(torch.device("meta"))
             stack.enter_context(_CallLimit(20_000 + 50 * len(state)))
         representation = instantiate(config["representation"])
-        task = task_class.build(uncompiled, representation, actions=checkpoint["facts"]["actions"])
-    task.config, task.facts = config, checkpoint["facts"]
-    if "vocabulary" in task.facts:
-        task.condition.seen = frozenset(task.facts["vocabulary"])
-    kinds = {name: value.dtype for name, value in task.state_dict().items()}
+        model = model_class.build(config, representation, actions=checkpoint["facts"]["actions"])
+    model.add_facts(checkpoint["facts"])
+    kinds = {name: value.dtype for name, value in model.state_dict().items()}
     state = {name: value.to(kinds.get(name, value.dtype)) for name, value in state.items()}
     try:
-        task.load_state_dict(state, strict=True, assign=own)
+        model.load_state_dict(state, strict=True, assign=own)
     except RuntimeError as error:
         what = str(error).splitlines()[1].strip()
         raise UserError(f"the weights do not match the recipe saved with them: {what}") from error
-    task.steps = checkpoint.get("global_step", (checkpoint.get("origin") or {}).get("steps"))
-    return task
+    model.steps = checkpoint.get("global_step", (checkpoint.get("origin") or {}).get("steps"))
+    return model
 
 
 class _CallLimit(TorchFunctionMode):

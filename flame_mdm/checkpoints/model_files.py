@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NotRequired, Required
 from pydantic import Field
 from typing_extensions import TypedDict
 
-from flame_mdm.config import moved, plain
+from flame_mdm.config import moved, plain, renamed
 from flame_mdm.errors import UserError
 from flame_mdm.safe_io import atomic_write, parse_json, read_torch
 from flame_mdm.schemas import Number, check_shape
@@ -134,7 +134,7 @@ def checked(path: Path, content: Any) -> dict[str, Any]:
     if not isinstance(content["state_dict"], dict):
         raise UserError(f"{path}: damaged: its weights are not a mapping of tensors")
     check_weights(content["state_dict"], path)
-    return content
+    return content | {"config": renamed(content["config"])}
 
 
 def check_weights(weights: Mapping[Any, Any], path: Path) -> None:

@@ -21,10 +21,11 @@ from flame_mdm.denoisers.flame import FLAME
 from flame_mdm.denoisers.gru import MDMGRU
 from flame_mdm.denoisers.mdm import MDMDecoder, MDMEncoder
 from flame_mdm.errors import UserError, first_line
+from flame_mdm.generator import MotionGenerator
 from flame_mdm.safe_io import read_npy, read_yaml, sha256
 from flame_mdm.sampler_options import MAX_STEPS
 from flame_mdm.schemas import Number, Schema, check_shape
-from flame_mdm.task import MotionGeneration, Task
+from flame_mdm.task import Task
 
 NETWORKS = {
     "trans_enc": (MDMEncoder, "seqTransEncoder", theirs.ENCODER_LAYER),
@@ -219,7 +220,9 @@ def import_released(
         if kind == "mclip":
             sizes = [] if num_heads is None else [f"task.network.num_heads={num_heads}"]
             config = compose("motion_clip/humanml3d_smpl", sizes)
-            model: Task = get_class(config["task"]["_target_"]).import_released(state, without_own_paths(config))
+            model: Task | MotionGenerator = get_class(config["task"]["_target_"]).import_released(
+                state, without_own_paths(config)
+            )
         elif kind == "flame":
             released = import_flame(state, num_heads=num_heads or 8)
             pooler = {f"condition.pooler_{name}": state.get(POOLER + name) for name in ("weight", "bias")}
@@ -255,7 +258,7 @@ def _options(path: str | Path | None, changes: dict[str, Any]) -> Options:
 
 def _model(
     released: Released, config: Config, facts: dict[str, Any], stats: str | Path | None, extra: dict[str, Any]
-) -> MotionGeneration:
+) -> MotionGenerator:
     """Builds a model of a recipe with its weights, `extra` besides the network's, and the statistics in a folder."""
     plain(config, "the options of the released model")
     representation, width, dataset = instantiate(config["representation"]), released.features[0], facts["dataset"]
@@ -273,8 +276,8 @@ def _model(
             what = f"shape {tuple(value.shape)}, expected ({width},) finite numbers, positive in Std.npy"
             raise ValueError(f"{file}: {what}")
         extra[f"representation.{name}"] = torch.from_numpy(value).float()
-    model = MotionGeneration.build(config, representation, actions=facts["actions"])
-    model.facts = facts
+    model = MotionGenerator.build(config, representation, actions=facts["actions"])
+    model.add_facts(facts)
     model.denoiser.load_state_dict(released.state)
     model.load_state_dict(extra, strict=False)
     return model.eval()

@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Any
 
 from flame_mdm.checkpoints.locating import Which, find
 from flame_mdm.config import EXPERIMENTS, Config, compose_data
+from flame_mdm.config.options import option, required, same_option
 from flame_mdm.errors import UserError, did_you_mean
 from flame_mdm.formats import ENDINGS
 from flame_mdm.safe_io import sha256
-from flame_mdm.sampler_options import SamplerOptions, option, required, same_option
+from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.sampling.motion_request import EditRequest, SamplingRequest
 
 if TYPE_CHECKING:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from flame_mdm.commands import ModelSettings, above_zero, usual_data_root
-from flame_mdm.sampler_options import option, required
+from flame_mdm.config.options import option, required
 
 
 @dataclass(frozen=True, kw_only=True)

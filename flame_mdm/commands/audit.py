@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import ClassVar, Literal
 
 from flame_mdm.commands import DataSettings, device_name, model_source
+from flame_mdm.config.options import option
 from flame_mdm.errors import UserError, say
 from flame_mdm.reporting.audit_cards import card_name, read_card, write_card
 from flame_mdm.safe_io import write_json
-from flame_mdm.sampler_options import option
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,12 +9,12 @@ from typing import ClassVar
 
 from flame_mdm.commands.tables import TablesSettings, evaluate_missing
 from flame_mdm.config import EXPERIMENTS
+from flame_mdm.config.options import option, required
 from flame_mdm.errors import UserError, say
 from flame_mdm.reporting.tables.build import build
 from flame_mdm.reporting.tables.format import Table, write
 from flame_mdm.reporting.tables.specs import load_spec
 from flame_mdm.safe_io import read_yaml
-from flame_mdm.sampler_options import option, required
 
 
 @dataclass(frozen=True, kw_only=True)

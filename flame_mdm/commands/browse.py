@@ -6,9 +6,9 @@ from typing import ClassVar
 
 from flame_mdm.commands import STORE, BodySettings, DataSettings, above_zero
 from flame_mdm.config import instantiate
+from flame_mdm.config.options import option
 from flame_mdm.data import Split
 from flame_mdm.errors import UserError, say
-from flame_mdm.sampler_options import option
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from flame_mdm.commands import BodySettings
+from flame_mdm.config.options import option
 from flame_mdm.errors import UserError, say
 from flame_mdm.reporting.compare import (
     HEAD,
@@ -23,7 +24,6 @@ from flame_mdm.reporting.compare import (
 )
 from flame_mdm.reporting.study import Ratings, rating_page, tally
 from flame_mdm.safe_io import write_json, write_text
-from flame_mdm.sampler_options import option
 from flame_mdm.sampling.prompt_file import PromptFile
 
 if TYPE_CHECKING:

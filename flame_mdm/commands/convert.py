@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from flame_mdm.commands import BodySettings, FileSettings, existing, motion_file
+from flame_mdm.config.options import option, required
 from flame_mdm.errors import UserError, say
 from flame_mdm.formats import motion_files
 from flame_mdm.progress import ProgressBar
-from flame_mdm.sampler_options import option, required
 
 if TYPE_CHECKING:
     from flame_mdm.formats.characters import Character

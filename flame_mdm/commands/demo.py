@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import ClassVar
 
+from flame_mdm.config.options import option
 from flame_mdm.errors import UserError
-from flame_mdm.sampler_options import option
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,10 +11,10 @@ from omegaconf import OmegaConf
 from flame_mdm.commands import ModelSettings
 from flame_mdm.commands.train import USAGE, train
 from flame_mdm.config import EXPERIMENTS, Config, movable, save
+from flame_mdm.config.options import option
 from flame_mdm.config.sweeps import run_recipe
 from flame_mdm.errors import UserError
 from flame_mdm.safe_io import read_yaml
-from flame_mdm.sampler_options import option
 
 SHARE_OF_STEPS, SHARE_OF_RATE = 0.2, 0.1
 

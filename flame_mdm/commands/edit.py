@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import ClassVar
 
 from flame_mdm.commands import FileSettings, OutputSettings, motion_file, usual_data_root
+from flame_mdm.config.options import option, required
 from flame_mdm.errors import say
 from flame_mdm.safe_io.paths import check_within
-from flame_mdm.sampler_options import option, required
 from flame_mdm.sampling.motion_request import EditRequest
 
 

@@ -5,7 +5,8 @@ from typing import ClassVar
 
 from evaluators.evaluation_request import EvaluationKeys, EvaluationRequest
 from flame_mdm.commands import DataSettings, ModelSettings, device_name, model_source
-from flame_mdm.sampler_options import SamplerOptions, same_option
+from flame_mdm.config.options import same_option
+from flame_mdm.sampler_options import SamplerOptions
 
 
 @dataclass(frozen=True, kw_only=True)

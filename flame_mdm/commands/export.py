@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from flame_mdm.commands import AdaptedSettings
+from flame_mdm.config.options import option, required
 from flame_mdm.errors import say
-from flame_mdm.sampler_options import option, required
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,8 +5,8 @@ from typing import ClassVar
 
 from flame_mdm.commands import STORE, DataSettings
 from flame_mdm.config import instantiate
+from flame_mdm.config.options import option
 from flame_mdm.errors import say
-from flame_mdm.sampler_options import option
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import ClassVar
 
 from flame_mdm.commands import ModelSettings
+from flame_mdm.config.options import option, required
 from flame_mdm.errors import say
-from flame_mdm.sampler_options import option, required
 
 
 @dataclass(frozen=True, kw_only=True)

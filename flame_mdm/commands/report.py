@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import ClassVar
 
 from flame_mdm.commands import BodySettings
+from flame_mdm.config.options import required
 from flame_mdm.errors import say
 from flame_mdm.reporting.report import write_report
 from flame_mdm.runs import check_run
-from flame_mdm.sampler_options import required
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,9 +9,9 @@ from statistics import mean
 from typing import TYPE_CHECKING, ClassVar
 
 from flame_mdm.commands import OutputSettings, model_source, motion_file
+from flame_mdm.config.options import option, same_option
 from flame_mdm.errors import UserError, say
 from flame_mdm.safe_io.paths import check_within
-from flame_mdm.sampler_options import option, same_option
 from flame_mdm.sampling.motion_request import SamplingRequest
 from flame_mdm.sampling.prompt_file import PromptFile
 

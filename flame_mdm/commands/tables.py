@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from flame_mdm.config import Config, compose_data, instantiate
+from flame_mdm.config.options import option
 from flame_mdm.errors import UserError, first_line, say
 from flame_mdm.records import read_result
 from flame_mdm.reporting.page import page, render
@@ -15,7 +16,6 @@ from flame_mdm.reporting.tables.format import write
 from flame_mdm.reporting.tables.specs import Evaluation, Lengths, evaluations, load_spec, spec_names
 from flame_mdm.safe_io import sha256, write_json, write_text
 from flame_mdm.safe_io.paths import check_within
-from flame_mdm.sampler_options import option
 
 INVALID = 3  # exit code if a requested row is not valid
 

@@ -3,7 +3,18 @@
 Nothing here imports torch or Lightning, so that `--help` and errors about misspelled keys are immediate.
 """
 
-from flame_mdm.config.building import EXPERIMENTS, flatten, instantiate, movable, moved, plain, read_saved, save, trust
+from flame_mdm.config.building import (
+    EXPERIMENTS,
+    flatten,
+    instantiate,
+    movable,
+    moved,
+    plain,
+    read_saved,
+    renamed,
+    save,
+    trust,
+)
 from flame_mdm.config.command_line import guarded, run
 from flame_mdm.config.composition import compose, compose_data, groups, recipes
 from flame_mdm.config.signatures import Config, check, parameters

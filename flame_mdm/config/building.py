@@ -20,7 +20,7 @@ EXPERIMENTS = _PACKAGE / "experiments" if (_PACKAGE / "experiments").is_dir() el
 """Folder of the recipes: inside the installed package, or next to it in a clone."""
 
 MODULES = {
-    "task": ("flame_mdm.task", "flame_mdm.training.distillation"),
+    "task": ("flame_mdm.task", "flame_mdm.training.adaptation", "flame_mdm.training.distillation"),
     "denoiser": ("flame_mdm.denoisers",),
     "process": ("flame_mdm.processes",),
     "condition": ("flame_mdm.conditions",),
@@ -28,6 +28,13 @@ MODULES = {
     "data": ("flame_mdm.data",),
 }
 """Modules whose classes a configuration from a checkpoint may name, by part of the configuration."""
+RENAMED = {
+    "flame_mdm.task.MotionGeneration": "flame_mdm.task.GeneratorTask",
+    "flame_mdm.training.distillation.ConsistencyDistillation": "flame_mdm.training.distillation.DistillationTask",
+}
+"""Names of classes in configurations of version 0.2, and their names today."""
+ADAPTED = {"flame_mdm.task.GeneratorTask": "flame_mdm.training.adaptation.AdaptationTask"}
+"""Tasks of adaptations, whose configurations have a key `base`: in version 0.2, and today."""
 MOST_VALUES, MOST_LEVELS = 1_000_000, 50
 """Limits of a configuration in a file: number of values, and depth of nested mappings and lists."""
 RUN_DIR = "${run.dir}"
@@ -65,13 +72,25 @@ def plain(config: Any, where: str | Path, *, but: str = "") -> None:
     check_value(config, ())
 
 
+def renamed(config: Config) -> Config:
+    """Returns a configuration, which an earlier version may have written, with today's names of the classes."""
+    task = config.get("task")
+    if not isinstance(task, Mapping):
+        return config
+    target = task.get("_target_")
+    name = RENAMED.get(str(target), target)
+    if config.get("base"):
+        name = ADAPTED.get(str(name), name)
+    return config if name == target else config | {"task": {**task, "_target_": name}}
+
+
 def read_saved(path: Path) -> Config:
     """Returns the saved configuration of a run, with `RUN_DIR` for its directory."""
     config = read_yaml(path)
     if not isinstance(config, dict) or not isinstance(config.get("run"), dict):
         raise UserError(f"{path}: not the configuration of a run: it has no key `run`")
     plain(config, path, but=RUN_DIR)
-    return config
+    return renamed(config)
 
 
 def movable(config: Config) -> Config:

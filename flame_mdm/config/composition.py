@@ -14,7 +14,7 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from flame_mdm.config.building import EXPERIMENTS, RUN_DIR, plain
+from flame_mdm.config.building import EXPERIMENTS, RUN_DIR, plain, renamed
 from flame_mdm.config.signatures import (
     Config,
     check,
@@ -169,7 +169,7 @@ def resolve(source: ConfigSource, overrides: list[str], base: Config | None = No
             resolved = OmegaConf.to_container(composed, resolve=True, throw_on_missing=True)
     except (HydraException, OmegaConfBaseException, ValueError, TypeError, RecursionError) as error:
         raise UserError(f"{source.stem or 'data'}: {first_line(error)}") from error
-    config: Config = {str(key): value for key, value in resolved.items()}  # type: ignore[union-attr]
+    config: Config = renamed({str(key): value for key, value in resolved.items()})  # type: ignore[union-attr]
     if base is not None:
         check_same_kinds(base, config)
         check_top_level(config)

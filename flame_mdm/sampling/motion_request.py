@@ -11,8 +11,9 @@ from numbers import Integral, Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from flame_mdm.config.options import option
 from flame_mdm.errors import UserError, did_you_mean, one_line, shortened
-from flame_mdm.sampler_options import SamplerOptions, option
+from flame_mdm.sampler_options import SamplerOptions
 
 if TYPE_CHECKING:
     from flame_mdm.formats.motion import Motion

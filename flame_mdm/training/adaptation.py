@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import torch
 from lightning.pytorch.utilities import rank_zero_only
+from torch import Tensor
 
-from flame_mdm.batch import collate
+from flame_mdm.batch import MotionBatch, collate, sent
 from flame_mdm.checkpoints.adapters import About, read_merged, word_rows, write_adapter
 from flame_mdm.checkpoints.hub import export
-from flame_mdm.checkpoints.loading import load_task
+from flame_mdm.checkpoints.loading import GENERATORS, load_task
 from flame_mdm.checkpoints.locating import find
 from flame_mdm.checkpoints.model_files import state_sha256
 from flame_mdm.conditions.tokens import LearnedTokens
@@ -20,23 +21,42 @@ from flame_mdm.conditions.vocabulary import words
 from flame_mdm.config import EXPERIMENTS, Config, check, instantiate
 from flame_mdm.config.composition import ConfigSource, prepare_overrides, quoted, resolve
 from flame_mdm.data import Clip, MotionSource
-from flame_mdm.data.adaptation import LessonData, check_clips, styled
+from flame_mdm.data.adaptation import KEPT, LessonData, check_clips, styled
 from flame_mdm.data.folder import Folder
 from flame_mdm.data.store import Store, write_store
 from flame_mdm.errors import UserError, say
 from flame_mdm.formats.motion import Motion
+from flame_mdm.generator import MotionGenerator
 from flame_mdm.reporting.page import number, page, render
 from flame_mdm.safe_io import write_text
 from flame_mdm.safe_io.paths import check_tree
 from flame_mdm.sampling.generation import BATCH, generate
 from flame_mdm.sampling.reading import decoded
-from flame_mdm.task import MotionGeneration
+from flame_mdm.task import GeneratorTask
 from flame_mdm.training.start import train
 from flame_mdm.visualize import player_page
 
 SAMPLED = 300  # motions sampled from a model whose training data are not there
 COMPARED = 32  # clips with which the page compares models
 OF_BASE = ("task", "losses", "representation", "process", "condition", "denoiser")  # parts of the base's recipe
+
+
+class AdaptationTask(GeneratorTask):
+    """Trains a model further on a few clips of the user, and on clips of what it knows."""
+
+    def pretrain(self) -> None:
+        """Does nothing: the text encoder is trained already."""
+
+    def dropped(self, batch: MotionBatch) -> Tensor:
+        """Draws as in other training, but keeps the captions of the user's clips.
+
+        With the null condition for them, guidance would lead away from the clips that are taught.
+        """
+        is_kept = torch.tensor([name.startswith(KEPT) for name in batch.ids])
+        return super().dropped(batch) & sent(is_kept, self.device)
+
+
+TASK = f"{AdaptationTask.__module__}.{AdaptationTask.__name__}"
 
 
 def adapt(
@@ -70,7 +90,8 @@ def adapt(
     file, out = find(base), Path(out or f"runs/adapt/{name}")
     if not re.fullmatch(r"[^\W_]+", name):
         raise UserError(f"name={name}: give one word of letters and digits, since prompts say 'in {name} style'")
-    model = load_task(file, MotionGeneration)
+    task = load_task(file, GeneratorTask)
+    model = task.generator
     if "distillation" in model.config:
         raise UserError(f"{base}: a distilled model. Adapt its teacher, and distill the result")
     if model.conditioned_on != "text":
@@ -92,8 +113,8 @@ def adapt(
     if rank_zero_only.rank == 0:
         export(last, path) if full else write_adapter(path, last)
         data = instantiate(config["data"], representation=model.representation)
-        made = load_task(path if full else file, MotionGeneration, adapter=() if full else path)
-        body = _comparison(name, data, model, made)
+        adapted = load_task(path if full else file, GeneratorTask, adapter=() if full else path)
+        body = _comparison(name, data, task, adapted)
         write_text(out / "adaptation.html", page(f"Adaptation: {name}", body))
         say(f"written: {path}", f"before and after: {out / 'adaptation.html'} (open in any browser)")
     if torch.distributed.is_initialized():  # the launcher ends all processes when the first one exits
@@ -101,7 +122,7 @@ def adapt(
     return path
 
 
-def _about(model: MotionGeneration, captions: Sequence[str], name: str, rank: int, file: Path, action: bool) -> About:
+def _about(model: MotionGenerator, captions: Sequence[str], name: str, rank: int, file: Path, action: bool) -> About:
     texts, seen = [styled(text, name) for text in captions], model.facts.get("vocabulary", ())
     new = [word for word in dict.fromkeys(words(" ".join(texts))) if word not in seen]
     return {
@@ -115,12 +136,14 @@ def _about(model: MotionGeneration, captions: Sequence[str], name: str, rank: in
     }
 
 
-def _recipe(model: MotionGeneration, captions: Sequence[str], name: str, out: Path, overrides: Sequence[str]) -> Config:
+def _recipe(model: MotionGenerator, captions: Sequence[str], name: str, out: Path, overrides: Sequence[str]) -> Config:
     if own := [word for word in overrides if word.partition(".")[0] in OF_BASE]:
         raise UserError(f"{own[0]}: an adaptation keeps the {own[0].partition('.')[0]} of its base. Drop it")
     recipe = ConfigSource(EXPERIMENTS, "adapt")  # checked by the caller, once it is complete
     config = resolve(recipe, *prepare_overrides(recipe, [quoted(f"run.dir={out}"), *overrides]))
     config |= {part: model.config[part] for part in OF_BASE if part in model.config}
+    if config["task"]["_target_"] in GENERATORS:  # not a class of the user's
+        config["task"] = config["task"] | {"_target_": TASK}
     config["experiment"], config["run"]["name"], config["data"]["name"] = f"adapt/{name}", name, name
     data, longest = model.config.get("data") or {}, model.facts["max_frames"] // 4 * 4
     config["data"]["crop"] = data.get("crop") or config["data"]["crop"] | {"max_frames": longest}
@@ -132,7 +155,7 @@ def _recipe(model: MotionGeneration, captions: Sequence[str], name: str, out: Pa
     return config
 
 
-def _prior(model: MotionGeneration, root: Path, own: Path, captions: Sequence[str]) -> Path:
+def _prior(model: MotionGenerator, root: Path, own: Path, captions: Sequence[str]) -> Path:
     representation = model.representation
     folder = root / f"{(model.config.get('data') or {}).get('name')}-{representation.name}"
     if (folder / "store.json").exists() and Store(folder).fingerprint == model.facts.get("fingerprint"):
@@ -149,7 +172,7 @@ class _Samples(MotionSource):
 
     name, workers = "prior", 1
 
-    def __init__(self, model: MotionGeneration, captions: Sequence[str]):
+    def __init__(self, model: MotionGenerator, captions: Sequence[str]):
         self.model = model
         self.captions = [captions[row * len(captions) // SAMPLED] for row in range(SAMPLED)]
 
@@ -168,8 +191,10 @@ class _Samples(MotionSource):
                 yield Clip(name, motion.features, [motion.text], split, name, encoded=encoded)
 
 
-def _comparison(name: str, data: LessonData, before: MotionGeneration, after: MotionGeneration) -> str:
+def _comparison(name: str, data: LessonData, *tasks: GeneratorTask) -> str:
+    """Returns the page that compares the base with the adapted model, by motions and by losses."""
     data.setup("fit")
+    before, after = (task.generator for task in tasks)
     clips = data.train.clips
     own, kept = (rows[:: -(-len(rows) // COMPARED)] for rows in data.halves())
     plain, taught = ({clips[row].captions[0]: clips[row] for row in rows} for rows in (kept, own))
@@ -186,7 +211,7 @@ def _comparison(name: str, data: LessonData, before: MotionGeneration, after: Mo
     for what, chosen in ((f"loss on {len(own)} of your clips", own), (f"loss on {len(kept)} clips it knew", kept)):
         batch = collate(data.train.__getitems__([(int(row), -1) for row in chosen]))
         with torch.no_grad():
-            losses = [float(model.losses_of(batch)["loss"].mean()) for model in (before, after)]
+            losses = [float(task.losses_of(batch)["loss"].mean()) for task in tasks]
         rows.append([what, *map(number, losses)])
     players = {"prompts": player_page(pairs, "", columns=2), "clips": player_page(beside, "", columns=2)}
     return render("adaptation.html", name=name, rows=rows, **players)

@@ -24,6 +24,7 @@ from flame_mdm.conditions.vocabulary import plainest
 from flame_mdm.data.datamodule import Clips, MotionDataModule
 from flame_mdm.errors import UserError, say
 from flame_mdm.formats.motion import Motion
+from flame_mdm.generator import MotionGenerator
 from flame_mdm.progress import ProgressBar
 from flame_mdm.reporting.page import number
 from flame_mdm.reporting.report import write_report
@@ -32,7 +33,7 @@ from flame_mdm.sampling.motion_request import SamplingRequest
 from flame_mdm.sampling.output import write_motions
 from flame_mdm.sampling.resolution import resolve
 from flame_mdm.signals import StopRequest
-from flame_mdm.task import MotionGeneration, Task
+from flame_mdm.task import GeneratorTask, Task
 from flame_mdm.training.loggers import log_video
 from flame_mdm.training.provenance import device_name
 
@@ -170,12 +171,12 @@ class Report(Callback):
         if losses := ", ".join(f"{values[name]:.4g} {text}" for name, text in texts.items() if name in values):
             say(f"loss after {trainer.global_step} steps: {losses} (lower is better; comparable within a recipe only)")
         say(f"report: {write_report(self.folder)}")
-        if isinstance(pl_module, MotionGeneration):
+        if isinstance(pl_module, GeneratorTask):
             example = {
                 "text": f"text={next(iter(plainest(pl_module.facts.get('captions', ()))), 'a person walks')}",
                 "action": f"action={next(iter(pl_module.facts['actions']), '')}",
                 "none": "unconditioned=true",
-            }[pl_module.conditioned_on]
+            }[pl_module.generator.conditioned_on]
             say(f"next: {shlex.join(['flame-mdm', 'sample', str(self.folder), example])}")
             say(f"      {shlex.join(['flame-mdm', 'evaluate', str(self.folder), 'extractor=none', 'quick=true'])}")
 
@@ -262,9 +263,9 @@ class SampleMotions(Callback):
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self.next = trainer.global_step + self.every_n_steps
-        assert isinstance(pl_module, MotionGeneration)
+        assert isinstance(pl_module, GeneratorTask)
         actions = pl_module.facts["actions"]
-        if isinstance(pl_module.condition, ActionLabels) and not set(self.texts) & set(actions):
+        if isinstance(pl_module.generator.condition, ActionLabels) and not set(self.texts) & set(actions):
             # a text-to-motion recipe was overridden with condition=action, so its prompts are texts
             self.prompts = [(action, {"action": action}) for action in actions[: len(self.prompts)]]
 
@@ -291,10 +292,10 @@ class SampleMotions(Callback):
 
     def write(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Samples a share of the motions on each process; the first process measures, writes and logs them."""
-        assert isinstance(pl_module, MotionGeneration)
+        assert isinstance(pl_module, GeneratorTask)
         step = trainer.global_step
         folder = self.folder / f"step_{step:07d}"
-        motions = self._sample(pl_module, trainer.global_rank, trainer.world_size)
+        motions = self._sample(pl_module.generator, trainer.global_rank, trainer.world_size)
         if trainer.world_size > 1:
             parts: list[Any] = [None] * trainer.world_size
             torch.distributed.all_gather_object(parts, motions)
@@ -310,7 +311,7 @@ class SampleMotions(Callback):
                 logger.log_metrics({f"samples/{name}": value for name, value in values.items()}, step - 1)
         self.written = (step, folder, values)
 
-    def _sample(self, model: MotionGeneration, rank: int, world: int) -> list[Motion]:
+    def _sample(self, model: MotionGenerator, rank: int, world: int) -> list[Motion]:
         """Samples every `world`-th prompt, starting at `rank`; without prompts, all motions on the first process."""
         texts, kind = self.texts[rank::world], model.conditioned_on
         count = len(texts) if self.texts else UNCONDITIONED * (rank == 0)
@@ -328,12 +329,12 @@ class SampleMotions(Callback):
 
     def _measure_real(self, clips: Clips, task: LightningModule) -> Values:
         """Computes all metrics of up to `REAL` training clips, which have the attributes that all prompts request."""
-        assert isinstance(task, MotionGeneration)
+        assert isinstance(task, GeneratorTask)
         names = [set(requested) for _, requested in self.prompts]
         common, all_names = (set.intersection(*names), set.union(*names)) if names else (set(), set())
         usable = [k for k, clip in enumerate(clips.clips) if common <= clip.attributes.keys()]
         chosen = usable[:: -(-len(usable) // REAL) or 1]
-        representation = task.representation
+        representation = task.generator.representation
         features = (clips[k, -1][1][None].to(representation.mean.device) for k in chosen)
         joints = [representation.to_joints(x)[0].cpu() for x in features]
         attributes = [{name: v for name, v in clips.clips[k].attributes.items() if name in all_names} for k in chosen]

@@ -1,13 +1,15 @@
+# pyright: standard
 """Training of models that sample in one to four steps, from a teacher that takes more."""
 
 import copy
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Self
 
 import torch
 from torch import Tensor
 
-from flame_mdm.batch import Condition, MotionBatch
+from flame_mdm.batch import Condition, Denoise, MotionBatch
 from flame_mdm.checkpoints.loading import PARTS, find, load_task
 from flame_mdm.checkpoints.model_files import weights_sha256
 from flame_mdm.config import Config, flatten
@@ -15,21 +17,26 @@ from flame_mdm.errors import UserError
 from flame_mdm.generator import DistilledGenerator, MotionGenerator
 from flame_mdm.processes.consistency import consistency_terms
 from flame_mdm.processes.guidance import classifier_free_guidance
-from flame_mdm.task import MotionGeneration, Task
+from flame_mdm.representations import Representation
+from flame_mdm.task import GeneratorTask
 from flame_mdm.training.averaging import MovingAverage
 
 
-class ConsistencyDistillation(DistilledGenerator, MotionGeneration):
-    """A student that starts as its teacher and learns to sample in one to four steps, with the guidance built in.
+class DistillationTask(GeneratorTask):
+    """Trains a student to sample in one to four steps, with the guidance built in.
 
-    Its parts, data and captions are those of the teacher, which is only needed in training. The text encoder is not
-    trained, and nothing has dropout. `experiments/distillation/consistency.yaml` explains the section `distillation`.
+    The student starts as its teacher, with the same parts, data and captions; the teacher is only needed in training.
+    The text encoder is not trained, and nothing has dropout. `experiments/distillation/consistency.yaml` explains the
+    section `distillation`.
     """
 
+    kind = DistilledGenerator
+
     @classmethod
-    def of_parts(cls, config: Config, *parts: Any) -> Self:
-        task = super().of_parts(config, *parts)
-        task.condition.requires_grad_(False)
+    def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:
+        """Builds the task of a recipe, with a text encoder that is not trained."""
+        task = super().build(config, representation, actions=actions)
+        task.generator.condition.requires_grad_(False)
         return task.eval()
 
     def train(self, mode: bool = True) -> Self:
@@ -49,7 +56,7 @@ class ConsistencyDistillation(DistilledGenerator, MotionGeneration):
         except FileNotFoundError as error:
             raise UserError(f"distillation.teacher={error}. Train it first, or name another") from error
         teacher = read_teacher(path)
-        theirs, ours = (flatten({part: task.config[part] for part in PARTS[1:]}) for task in (teacher, self))
+        theirs, ours = (flatten({part: model.config[part] for part in PARTS[1:]}) for model in (teacher, self))
         for key in sorted(theirs.keys() | ours.keys()):
             if theirs.get(key) != ours.get(key):
                 what = f"has {key}={theirs.get(key)}, but the student has {ours.get(key)}. Both need the same parts"
@@ -58,12 +65,13 @@ class ConsistencyDistillation(DistilledGenerator, MotionGeneration):
         if None not in (before, now) and before != now:
             what = f"trained on data with fingerprint {before}, but {self.facts['dataset']} has {now}"
             raise UserError(f"distillation.teacher={name}: {what}. Give the data of the teacher")
-        self.load_state_dict(teacher.state_dict())
+        self.generator.load_state_dict(teacher.state_dict())
         self.facts["teacher"] = weights_sha256(path)
         scale = options["guidance_scale"]
         self.teacher_guidance = teacher.sampler_options.guidance_scale if scale is None else scale
         # In lists, since they are no parts of the student.
-        self.teacher, self.target = [copy.deepcopy(self.denoiser).requires_grad_(False)], [self.denoiser]
+        denoiser = self.generator.denoiser
+        self.teacher, self.target = [copy.deepcopy(denoiser).requires_grad_(False)], [denoiser]
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Raises `UserError` if the weights of the teacher have changed since the run began."""
@@ -77,32 +85,50 @@ class ConsistencyDistillation(DistilledGenerator, MotionGeneration):
 
     def on_train_start(self) -> None:
         """Takes the targets from the moving average of the weights, if the recipe has one."""
-        Task.on_train_start(self)  # and does not pretrain the text encoder, which is the teacher's
+        super().on_train_start()
         for callback in self.trainer.callbacks:  # type: ignore[attr-defined]
             if isinstance(callback, MovingAverage):
                 average = callback.averaged()
                 if not self.trainer.global_step:  # it was copied before the weights of the teacher came
                     average.load_state_dict(self.state_dict())
-                self.target = [average.denoiser]
+                self.target = [average.generator.denoiser]
+
+    def pretrain(self) -> None:
+        """Does nothing: the text encoder is the teacher's."""
 
     def loss_terms(
         self, batch: MotionBatch, cond: Condition, u: Tensor | None = None, noise: Tensor | None = None
     ) -> dict[str, Tensor]:
-        """See `MotionGeneration.loss_terms`. Validation, which gives u, is at the times of the last grid."""
+        """See `GeneratorTask.loss_terms`. Validation, which gives u, is at the times of the last grid."""
         trainer, counts = self._trainer, self.config["distillation"]["intervals"]
         progress, is_validation = 1.0, u is not None
         if not is_validation and trainer is not None and trainer.max_steps > 0:
             progress = trainer.global_step / trainer.max_steps
-        times = torch.tensor(self.process.grid(counts[min(int(progress * len(counts)), len(counts) - 1)]))
+
+        student = self.generator
+        process = student.process
+        times = torch.tensor(process.grid(counts[min(int(progress * len(counts)), len(counts) - 1)]))
         u = torch.rand(len(batch), device=self.device) if u is None else u
         index = (u * len(times)).long().clamp(max=len(times) - 1)
         noise = torch.randn_like(batch.x) if noise is None else noise
-        draws: dict[str, Tensor] = {"times": times.to(self.device), "index": index, "noise": noise}
-        teacher, target = self.teacher[0], self.denoiser if is_validation else self.target[0]
-        if cond.null is not None and self.condition.features and self.teacher_guidance is not None:
-            teacher = classifier_free_guidance(teacher, self.teacher_guidance, self.representation.features)
-        networks = self.denoiser, target, teacher
-        return consistency_terms(self.process, *networks, batch.x, batch.mask, cond, **draws, auxiliary=self.losses)
+
+        target = student.denoiser if is_validation else self.target[0]
+        teacher: Denoise = self.teacher[0]
+        if cond.null is not None and student.condition.features and self.teacher_guidance is not None:
+            teacher = classifier_free_guidance(teacher, self.teacher_guidance, student.representation.features)
+        return consistency_terms(
+            process,
+            student.denoiser,
+            target,
+            teacher,
+            batch.x,
+            batch.mask,
+            cond,
+            times=times.to(self.device),
+            index=index,
+            noise=noise,
+            auxiliary=self.losses,
+        )
 
 
 def read_teacher(path: Path) -> MotionGenerator:

@@ -20,7 +20,7 @@ from flame_mdm.checkpoints.loading import NO_GPU
 from flame_mdm.config import Config, instantiate
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.errors import UserError, first_line, say
-from flame_mdm.task import MotionGeneration, Task
+from flame_mdm.task import GeneratorTask, Task
 from flame_mdm.training.averaging import MovingAverage
 from flame_mdm.training.callbacks import Interrupted, Measurements, Progress, Report
 from flame_mdm.training.checkpointing import AtomicCheckpoints, Resumed, check_optimizers, newest
@@ -46,11 +46,11 @@ def fit(folder: Path, config: Config) -> None:
     if resumed:
         _check_same_data(resumed, data)
     task: Task = get_class(config["task"]["_target_"]).build(config, representation, actions=data.actions)
-    if isinstance(task, MotionGeneration):
+    if isinstance(task, GeneratorTask):
         if config.get("adapter"):
-            attach(task, config["adapter"])
+            attach(task.generator, config["adapter"])
         if config.get("base") and not resumed:
-            copy_weights(task, config["base"])
+            copy_weights(task.generator, config["base"])
     precision = config["trainer"]["precision"]
     if config["run"].get("speed") == "fast":
         precision = accelerate(task, data, config)

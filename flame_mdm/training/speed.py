@@ -7,7 +7,7 @@ from flame_mdm.config import Config
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.denoisers.layers import Attention
 from flame_mdm.errors import say
-from flame_mdm.task import MotionGeneration, Task
+from flame_mdm.task import GeneratorTask, Task
 
 COMPILED_FROM = 5000
 """Minimum number of training steps for which the network is compiled: shorter runs would not make up for the time."""
@@ -32,12 +32,13 @@ def accelerate(task: Task, data: MotionDataModule, config: Config) -> str:
         device = "cuda" if torch.cuda.is_available() else "mps" if torch.backends.mps.is_available() else "cpu"
     if device == "cuda":
         supported = torch.cuda.is_bf16_supported(including_emulation=False)
-        if isinstance(task, MotionGeneration) and trainer["max_steps"] >= COMPILED_FROM:
+        if isinstance(task, GeneratorTask) and trainer["max_steps"] >= COMPILED_FROM:
             say("compiling the network: the first steps take longer, and less so in later runs")
-            if task.denoiser.mask_padding:  # otherwise, padding changes what it learns
+            denoiser = task.generator.denoiser
+            if denoiser.mask_padding:  # otherwise, padding changes what it learns
                 data.pad_multiple = max(data.pad_multiple, PAD_MULTIPLE)
             torch._dynamo.config.recompile_limit = MOST_SHAPES
-            task.denoiser.compile(dynamic=False)
+            denoiser.compile(dynamic=False)
     elif device == "cpu":
         has = torch.cpu.get_capabilities()
         supported = has.get("avx512_bf16") or has.get("amx_bf16")

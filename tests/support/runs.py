@@ -21,8 +21,9 @@ from hydra.utils import get_class
 from flame_mdm.batch import MotionBatch, collate
 from flame_mdm.config import compose, instantiate
 from flame_mdm.data.datamodule import TrainingBatches
-from flame_mdm.task import MotionGeneration
-from flame_mdm.training.distillation import ConsistencyDistillation
+from flame_mdm.generator import MotionGenerator
+from flame_mdm.task import GeneratorTask
+from flame_mdm.training.distillation import DistillationTask
 
 SECONDS = 120
 
@@ -83,11 +84,11 @@ def reference(words: list[str], steps: int, name: str = "quickstart") -> dict[st
     data.setup("fit")
     torch.manual_seed(config["seed"])
     kind = get_class(config["task"]["_target_"])
-    task: MotionGeneration = kind.build(config, representation)
-    if isinstance(task, ConsistencyDistillation):
+    task: GeneratorTask = kind.build(config, representation)
+    if isinstance(task, DistillationTask):
         task.start_from_teacher()
     else:
-        task.condition.pretrain([clip.captions for clip in data.train.clips], task.seed)
+        task.generator.condition.pretrain([clip.captions for clip in data.train.clips], task.seed)
     rank = 0
     task.__class__ = type("OfRank", (kind,), {"global_rank": property(lambda self: rank)})  # type: ignore[arg-type]
     task.log_dict = lambda *_, **__: None  # type: ignore[method-assign]
@@ -106,11 +107,11 @@ def reference(words: list[str], steps: int, name: str = "quickstart") -> dict[st
     return task.state_dict()
 
 
-def untrained(words: list[str], max_frames: int) -> MotionGeneration:
+def untrained(words: list[str], max_frames: int) -> MotionGenerator:
     """The model of the quick-start experiment with random weights."""
     config = compose("quickstart", words)
     torch.manual_seed(0)
-    model = MotionGeneration.build(config, instantiate(config["representation"]))
+    model = MotionGenerator.build(config, instantiate(config["representation"]))
     model.facts |= {"max_frames": max_frames, "dataset": "synthetic", "fingerprint": "f00d"}
     return model.eval()
 

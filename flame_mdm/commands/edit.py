@@ -47,6 +47,7 @@ def main(settings: EditSettings) -> None:
         cut=settings.cut,
         data_root=settings.data_root,
     )
+    say(*(f"{settings.motion}: {note}" for note in original.notes))
     resolved = resolve_edit(request, model, original)
     say(*(f"warning: {line}" for line in resolved.resolved.warnings(model)))
     stages = [] if settings.trajectory else None

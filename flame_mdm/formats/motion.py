@@ -52,6 +52,7 @@ class Motion(PosedFigure):
         representation: name of the representation of the features.
         cleanup: whether `flame_mdm.formats.cleanup` changed the joints.
         parts: text, first and last frame (exclusive) of each part of a sequence; () = one part.
+        notes: lines for the user about the file that was read, such as frames that were left out.
 
     Raises `UserError` if a shape is wrong, a joint is not finite, or the frame rate is not a positive number.
     """
@@ -60,6 +61,7 @@ class Motion(PosedFigure):
     representation: str = ""
     cleanup: bool = False
     parts: tuple[tuple[str, int, int], ...] = ()
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         name, skeleton = f"motion {self.id!r}", self.skeleton

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from flame_mdm.data.store import Store
 from flame_mdm.errors import UserError, did_you_mean
+from flame_mdm.formats.conversion import raw_motion
 from flame_mdm.formats.layouts import check_size, find_skeleton
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.readers import ENDINGS, read
-from flame_mdm.formats.resampling import resample as resample_joints
 from flame_mdm.representations import Representation
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.sampling.motion_request import is_range
@@ -32,10 +32,11 @@ def read_motion(
 ) -> Motion:
     """Reads a motion file, or `dataset:id`, a clip of a prepared data set, and computes the features of a model.
 
-    Features of the same representation and frame rate are kept. Other joints are resampled to the frame rate of the
-    model and made canonical. `fps`, `unit` and `up` (y, z or -y) describe the file, as in
-    `flame_mdm.formats.readers.read`; `cut` is begin and end of the part to use, in seconds. Raises `FileNotFoundError`
-    or `UserError` if the motion does not exist or is damaged, `cut` is outside of it, or it cannot be encoded.
+    Features of the same representation and frame rate are kept. Other motions are converted as in
+    `flame_mdm.formats.conversion` and made canonical; `notes` of the result tell what was fitted, with the error.
+    `fps`, `unit` and `up` (y, z or -y) describe the file, as in `flame_mdm.formats.readers.read`; `cut` is begin and
+    end of the part to use, in seconds. Raises `FileNotFoundError` or `UserError` if the motion does not exist or is
+    damaged, `cut` is outside of it, or it cannot be encoded.
     """
     name = str(source)
     if Path(source).suffix.lower() in ENDINGS:
@@ -68,7 +69,7 @@ def part_of(representation: Representation, motion: Motion, cut: Sequence[float]
         seconds, name = len(motion.features) / representation.fps, motion.id or "the motion"
         raise UserError(f"cut=[{cut[0]:g}, {cut[1]:g}] is not a range of {name}, which lasts {seconds:g} seconds")
     features = torch.from_numpy(representation.rebase(motion.features[begin:end]))
-    return decoded(representation, features, motion.text, motion.id)
+    return replace(decoded(representation, features, motion.text, motion.id), notes=motion.notes)
 
 
 def with_features(representation: Representation, motion: Motion) -> Motion:
@@ -79,20 +80,19 @@ def with_features(representation: Representation, motion: Motion) -> Motion:
         if shape[1:] != (size,) or not np.isfinite(motion.features).all():
             raise UserError(f"{name}features of shape {shape}, not (frames, {size}), or not finite")
         return motion
-    joints, skeleton = motion.joints.astype(float), representation.skeleton
-    if skeleton.joints == motion.skeleton.joints[: len(skeleton)]:
-        joints = joints[:, : len(skeleton)]  # without the hands
     try:
-        joints = resample_joints(joints, motion.fps, representation.fps, cubic=True)
-        features = representation.encode(torch.from_numpy(joints))
-        if len(features) < len(joints):  # one row per step between frames: a further step keeps the number of frames
-            longer = np.concatenate([joints, joints[-1:] + [1, 0, 1] * (joints[-1:] - joints[-2:-1])])
-            features = representation.encode(torch.from_numpy(longer))
         if motion.skeleton.joints[: len(SMPL22)] == SMPL22.joints:
-            check_size(joints, 1.0, children=True)
+            check_size(motion.joints, 1.0, children=True)
+        raw = raw_motion(motion, representation)
+        features = representation.encode(raw.values)
+        if len(features) < len(raw.values):  # one row per step between frames: a step more keeps the number of frames
+            step = (raw.values[-1:] - raw.values[-2:-1]) * raw.values.new_tensor([1.0, 0.0, 1.0])
+            features = representation.encode(torch.cat([raw.values, raw.values[-1:] + step]))
     except ValueError as error:
         raise UserError(f"{name}{error}") from error
-    return decoded(representation, features, motion.text, motion.id)
+    encoded = decoded(representation, features, motion.text, motion.id)
+    encoded.notes = (*motion.notes, *([raw.note] if raw.note else []))
+    return encoded
 
 
 def decoded(representation: Representation, features: Tensor, text: str, name: str) -> Motion:

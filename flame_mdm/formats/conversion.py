@@ -1,0 +1,111 @@
+"""Motions as the raw motions that representations encode: joints, or rotations of SMPL's body."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from flame_mdm.errors import UserError
+from flame_mdm.formats.motion import AMASS_AXES, Motion
+from flame_mdm.formats.poses import Poses
+from flame_mdm.formats.resampling import frame_pairs, resample
+from flame_mdm.representations import Representation, rotation
+from flame_mdm.representations.motion272 import Motion272
+from flame_mdm.representations.rot6d import Rot6D
+from flame_mdm.representations.skeleton import KIT21, SMPL22, forward_kinematics
+from flame_mdm.representations.smpl import ADULT, SMPL
+
+CAMERA_AXES = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))
+"""Converts the camera's coordinates of the action data sets, y down, to y up. It is its own inverse."""
+KIT_SOURCES = {"root": "pelvis", "belly": "spine2", "thorax": "spine3"}
+KIT_SOURCES |= {f"{side}_toes": f"{side}_foot" for side in ("left", "right")}
+"""Joints of KIT-ML -> joints of SMPL at the same point of the body, where names differ."""
+LEGS = tuple(SMPL22.joints.index(f"{side}_{name}") for side in ("left", "right") for name in ("knee", "ankle"))
+
+
+@dataclass(frozen=True, eq=False)
+class RawMotion:
+    """A motion that `Representation.encode` takes.
+
+    Attributes:
+        values: joints (F, J, 3) in meters, y up, or rotations of SMPL (F, 75) as in `representations.smpl.read_pose`.
+        note: a line for the user if rotations were fitted to joints, with the error; "" otherwise.
+    """
+
+    values: Tensor
+    note: str = ""
+
+
+def raw_motion(motion: Motion, representation: Representation) -> RawMotion:
+    """Returns a motion at the frame rate of a representation, as the representation encodes motions.
+
+    Joints are resampled with cubic splines, rotations on the sphere. KIT-ML's 21 joints are taken from SMPL's.
+    Rotations of SMPL that are not known are solved for; the body then has the bones of an adult, and its path is scaled
+    by the length of the legs. Raises `UserError` if the skeleton of the motion does not fit the representation.
+    """
+    if isinstance(representation, SMPL | Motion272):
+        return _rotations(motion, representation.fps, AMASS_AXES)
+    if isinstance(representation, Rot6D):
+        return _rotations(motion, representation.fps, CAMERA_AXES)
+    joints, skeleton = motion.joints.astype(float), representation.skeleton
+    if skeleton.joints == motion.skeleton.joints[: len(skeleton)]:
+        joints = joints[:, : len(skeleton)]  # without the hands
+    elif skeleton is KIT21 and motion.skeleton.joints[: len(SMPL22)] == SMPL22.joints:
+        joints = kit_joints(joints)
+    return RawMotion(torch.from_numpy(resample(joints, motion.fps, representation.fps, cubic=True)))
+
+
+def kit_joints(joints: np.ndarray) -> np.ndarray:
+    """Converts joints (F, 22 or more, 3) of SMPL to the 21 joints (F, 21, 3) of KIT-ML, mirrored as KIT-ML is.
+
+    The middle of KIT-ML's feet is taken to be halfway between ankle and toes.
+    """
+    at = {name: joints[:, number] for number, name in enumerate(SMPL22.joints)}
+    feet = {f"{side}_foot": (at[f"{side}_ankle"] + at[f"{side}_foot"]) / 2 for side in ("left", "right")}
+    points = [feet[name] if name in feet else at[KIT_SOURCES.get(name, name)] for name in KIT21.joints]
+    return np.stack(points, 1) * [-1.0, 1.0, 1.0]
+
+
+def _rotations(motion: Motion, fps: float, axes: Tensor) -> RawMotion:
+    """Returns rotations of SMPL in coordinates that `axes` (3, 3) converts to y up."""
+    if motion.skeleton.joints[: len(SMPL22)] != SMPL22.joints:
+        raise UserError(
+            f"the model needs rotations of SMPL's joints, which {motion.skeleton.name} does not determine. Give a "
+            "motion of SMPL's 22 joints"
+        )
+    note = ""
+    if motion.poses is None:
+        moved = Motion(resample(motion.joints.astype(float), motion.fps, fps, cubic=True), fps, motion.skeleton)
+        poses, note = _adult(moved)
+    else:
+        poses = _resampled(motion.poses, motion.fps, fps)
+    rotations = poses.rotations.clone()
+    rotations[:, 0] = axes.T @ rotations[:, 0]
+    vectors = rotation.matrix_to_axis_angle(rotations).flatten(1)
+    hands = vectors.new_zeros(len(vectors), 6)
+    translation = poses.root @ axes - vectors.new_tensor(ADULT[0])
+    return RawMotion(torch.cat([translation, vectors, hands], 1), note)
+
+
+def _adult(motion: Motion) -> tuple[Poses, str]:
+    """Returns the motion on the body of an adult, and a line with the distance of its joints from the motion's."""
+    solved = motion.posed()
+    adult = solved.offsets.new_tensor(ADULT[: len(SMPL22)])
+    scale = float(adult[list(LEGS)].norm(dim=1).sum() / solved.offsets[list(LEGS)].norm(dim=1).sum())
+    poses = Poses(adult, solved.rotations, scale * solved.root)
+    joints = forward_kinematics(SMPL22, poses.rotations, adult, poses.root).numpy()
+    apart = 100 * np.linalg.norm(joints - scale * motion.joints[:, : len(SMPL22)], axis=-1)
+    note = "rotations were fitted to joints, on the body of an adult"
+    return poses, f"{note}: mean error {apart.mean():.1f} cm, max {apart.max():.1f} cm"
+
+
+def _resampled(poses: Poses, rate: float, fps: float) -> Poses:
+    if math.isclose(rate, fps):
+        return poses
+    before, after, share = frame_pairs(len(poses.root), rate, fps, len(SMPL22))
+    quaternions = rotation.matrix_to_quaternion(poses.rotations)
+    turns = rotation.slerp(quaternions[before], quaternions[after], torch.from_numpy(share)[:, None, None])
+    root = torch.from_numpy(resample(poses.root.numpy(), rate, fps, cubic=True))
+    return Poses(poses.offsets, rotation.quaternion_to_matrix(turns), root)

@@ -34,7 +34,7 @@ def canonical(joints: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", ROTATED)
-def test_known_rotations_are_kept(kind: type[Representation]):
+def test_known_rotations_are_kept(kind: type[SMPL] | type[Rot6D] | type[Motion272]):
     turns = np.linspace((0, 0, 0), (40, 10, 5), 31)
     path = np.linspace((0, 0.955, 0), (0.5, 0.955, 1.0), 31)
     motion = posed(31, root=path, left_hip=-turns, right_elbow=turns[:, [1, 0, 2]], left_shoulder=(0, 0, -60))
@@ -46,7 +46,7 @@ def test_known_rotations_are_kept(kind: type[Representation]):
 @pytest.mark.parametrize("kind", ROTATED)
 @pytest.mark.parametrize("ending", ["npz", "bvh", "json", "npy"])
 def test_files_of_joints_alone_are_fitted_and_the_error_is_stated(
-    ending: str, kind: type[Representation], tmp_path: Path
+    ending: str, kind: type[SMPL] | type[Rot6D] | type[Motion272], tmp_path: Path
 ):
     synthetic("walk").save(tmp_path / f"a.{ending}")
     motion = read_motion(kind(20.0), tmp_path / f"a.{ending}", fps=20 if ending == "npy" else None)

@@ -9,7 +9,7 @@ from support.motions import synthetic
 
 from flame_mdm.errors import UserError
 from flame_mdm.formats import bvh
-from flame_mdm.formats.layouts import LAYOUTS, find_layout
+from flame_mdm.formats.layouts import LAYOUTS, check_size, find_layout
 from flame_mdm.formats.names import best_match, spelled, spellings
 from flame_mdm.formats.readers import read
 from flame_mdm.representations.skeleton import SMPL22
@@ -144,3 +144,18 @@ def test_names_of_bvh_files_are_the_rest_of_the_line(text: str, tmp_path: Path):
     np.testing.assert_array_equal(read(tmp_path / "b.bvh").joints, read(tmp_path / "a.bvh").joints)
     bvh.write(bvh.read(tmp_path / "b.bvh"), tmp_path / "c.bvh")
     assert bvh.read(tmp_path / "c.bvh").joints == bvh.read(tmp_path / "b.bvh").joints
+
+
+def test_a_unit_is_proposed_for_figures_that_have_no_usual_one():
+    joints = synthetic().joints
+    with pytest.raises(UserError, match=r"The unit may be 0\.01 \(centimeters\)"):
+        check_size(100 * joints, 1.0)
+    figure = 0.26 * joints  # legs of about 0.2 m in centimeters, as of drawn figures
+    with pytest.raises(
+        UserError, match=r"The file has no usual unit; 0\.0\d+ gives the usual legs of 0\.83 m"
+    ) as error:
+        check_size(figure, 0.01)
+    unit = float(str(error.value).partition("usual unit; ")[2].split()[0])
+    check_size(figure * unit / 0.01, unit)
+    with pytest.raises(UserError, match=r"The unit is wrong"):
+        check_size(0 * joints, 0.01)

@@ -283,12 +283,20 @@ def check_size(joints: np.ndarray, unit: float, children: bool = False) -> None:
         return
     fitting = {name: u for name, u in UNITS.items() if LEG[0] <= leg / unit * u <= LEG[1]}
     name = min(fitting, key=lambda name: abs(math.log(leg / unit * fitting[name] / USUAL_LEG)), default=None)
-    advice = f"The unit may be {fitting[name]:.6g} ({name})" if name else "The unit is wrong"
+    advice = f"The unit may be {fitting[name]:.6g} ({name})" if name else _usual_unit(leg, unit)
     small = " If these are children, set `children: true`." if not children and CHILD <= leg < LEG[0] else ""
     raise UserError(
         f"the legs are {leg:.3g} m long (unit {unit:.6g}), but people's are {shortest:g} to {LEG[1]:g} m.{small} "
         f"{advice}: set `unit` in skeleton.yaml, or unit=... of convert and edit"
     )
+
+
+def _usual_unit(leg: float, unit: float) -> str:
+    """Returns advice on the unit of a file whose legs are `leg` meters long with `unit` and have no usual unit."""
+    usual = unit * USUAL_LEG / leg if leg > 0 else 0.0
+    if not 0 < usual < math.inf:
+        return "The unit is wrong"
+    return f"The file has no usual unit; {usual:.3g} gives the usual legs of {USUAL_LEG:g} m"
 
 
 def check_feet(joints: np.ndarray) -> None:

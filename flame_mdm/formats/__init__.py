@@ -6,9 +6,9 @@ from flame_mdm.errors import UserError
 
 ENDINGS = (".npz", ".bvh", ".amc", ".json", ".npy")  # of motion files that are read
 TREES = (".bvh", ".amc")  # of those that contain a tree of joints and their rotations
-WRITTEN = (".bvh", ".glb", ".fbx", ".npz", ".json", ".npy", ".gif", ".mp4")  # of the files that `Motion.save` writes
-WRITTEN += (".vrma", ".usda", ".usdc", ".usdz")
-RIGGED = (".bvh", ".glb", ".fbx", ".usda", ".usdc", ".usdz")  # of those with the skeleton of another program
+USD = (".usda", ".usdc", ".usdz")  # Universal Scene Description
+RIGGED = (".bvh", ".glb", ".fbx", *USD)  # of files that can have the skeleton of another program
+WRITTEN = (*RIGGED, ".vrma", ".npz", ".json", ".npy", ".gif", ".mp4")  # of the files that `Motion.save` writes
 
 
 def motion_files(folder: Path) -> list[Path]:

@@ -153,7 +153,9 @@ def known_skeletons() -> list[dict[str, str]]:
 def write(path: Path, character: Character, motion: PosedFigure, name: str) -> str:
     """Writes the character's file with a further animation, the first one, and returns a line that describes it."""
     if path.suffix.lower() != ".glb":
-        raise UserError(f"{path}: this character is a .glb file, so name a .glb file for the result")
+        raise UserError(
+            f"{path}: this character is a .glb file, so name a .glb, .fbx, .usda, .usdc or .usdz file for the result"
+        )
     file, (world, positions, rig) = character.file, moved(character, motion)
     document, hips = copy.deepcopy(file.document), rig.hips
     binary = glb.Binary(file.data, document["bufferViews"], document["accessors"])

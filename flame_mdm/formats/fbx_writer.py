@@ -17,8 +17,7 @@ from flame_mdm.formats import fbx
 from flame_mdm.formats.fbx import Int, Record
 from flame_mdm.formats.fbx_scene import TICKS, TIME_MODES
 from flame_mdm.formats.retarget import continuous_euler
-from flame_mdm.formats.rigged import MATERIAL_NAMES, RiggedClip, Skin
-from flame_mdm.visualize.body import MATERIALS
+from flame_mdm.formats.rigged import Material, RiggedClip, Skin
 
 PER_METER = 100  # the files are in centimeters
 CUSTOM_RATE = 14  # `TimeMode` of a rate in `CustomFrameRate`
@@ -52,8 +51,12 @@ class _Writer:
         clip = self.clip
         duration = round((len(clip.turns) - 1) / clip.fps * TICKS)
         bones = self._skeleton()
-        if clip.skin is not None:
-            self._mesh(clip.skin, bones)
+        materials: dict[Material, int] = {}
+        poses: dict[int, np.ndarray] = {}
+        for skin in clip.skins:
+            poses |= self._mesh(skin, bones, materials)
+        if poses:
+            self._bind_pose(poses)
         self._animation(bones, duration)
 
         root = Record("")
@@ -98,19 +101,18 @@ class _Writer:
         offsets = clip.offsets.copy()
         moves = {joint: moved.copy() for joint, moved in clip.moves.items()}
         hips = max(moves)
-        root = clip.parents[hips]
         up = np.array([0, clip.lift, 0])
-        if root < 0:
+        if clip.root < 0:
             offsets[hips] += up
             moves[hips] += up
         else:
-            turns = clip.turns[:, root]
-            back = clip.rest[root].T @ [0, 0, ROOT_BACK]
-            offsets[root] -= clip.rest[root] @ back
-            offsets[hips] += back + clip.rest[root].T @ up
+            turns = clip.turns[:, clip.root]
+            back = clip.rest[clip.root].T @ [0, 0, ROOT_BACK]
+            offsets[clip.root] -= clip.rest[clip.root] @ back
+            offsets[hips] += back + clip.rest[clip.root].T @ up
             moves[hips] += back + (turns.mT @ up[:, None])[..., 0]
-            if root in moves:
-                moves[root] -= turns @ back
+            if clip.root in moves:
+                moves[clip.root] -= turns @ back
         return PER_METER * offsets, {joint: PER_METER * moved for joint, moved in moves.items()}
 
     def _skeleton(self) -> list[int]:
@@ -121,27 +123,31 @@ class _Writer:
             attribute, record = self._object("NodeAttribute", name, "LimbNode")
             record.add("TypeFlags", "Skeleton")
             number, record = self._object("Model", name, "LimbNode")
-            _model(record, self.offsets[joint], before[joint])
+            _model(record, self.offsets[joint], before[joint], clip.scales[joint])
             bones.append(number)
             self._connect(attribute, number)
             parent = clip.parents[joint]
             self._connect(number, bones[parent] if parent >= 0 else 0)
         return bones
 
-    def _mesh(self, skin: Skin, bones: Sequence[int]) -> None:
-        """Adds the mesh in the pose in which it is bound, its materials, the skin and the bind pose."""
-        geometry, record = self._object("Geometry", "person", "Mesh")
+    def _mesh(self, skin: Skin, bones: Sequence[int], materials: dict[Material, int]) -> dict[int, np.ndarray]:
+        """Adds a mesh in the pose in which it is bound, with its materials and its skin.
+
+        `materials` holds the ids of the materials that the file has so far. Returns the matrix (4, 4) of each object,
+        by id, in this pose.
+        """
+        geometry, record = self._object("Geometry", skin.name, "Mesh")
         _geometry(record, skin)
-        model, record = self._object("Model", "person", "Mesh")
+        model, record = self._object("Model", skin.name, "Mesh")
         _model(record, np.zeros(3), np.zeros(3))
         self._connect(model, 0)
         self._connect(geometry, model)
-        for name, color in zip(MATERIAL_NAMES, MATERIALS, strict=True):
-            material, record = self._object("Material", name, "")
-            _material(record, np.array(color) / 255)
-            self._connect(material, model)
+        for material in skin.palette:
+            if material not in materials:
+                materials[material] = self._material(material)
+            self._connect(materials[material], model)
 
-        deformer, record = self._object("Deformer", "skin", "Skin")
+        deformer, record = self._object("Deformer", skin.name, "Skin")
         record.add("Version", Int(101))
         record.add("Link_DeformAcuracy", 50.0)
         self._connect(deformer, geometry)
@@ -157,12 +163,44 @@ class _Writer:
                 record.add("Version", Int(100))
                 record.add("UserData", "", "")
                 record.add("Indexes", rows.astype("<i4"))
-                record.add("Weights", skin.weights[rows, columns] / 255)
+                record.add("Weights", skin.weights[rows, columns].astype("<f8"))
                 record.add("Transform", _matrix(bind))
                 record.add("TransformLink", _matrix(poses[bones[joint]]))
                 self._connect(cluster, deformer)
                 self._connect(bones[joint], cluster)
+        return poses
 
+    def _material(self, material: Material) -> int:
+        """Adds a material, and its image if it has one; returns the id."""
+        number, record = self._object("Material", material.name, "")
+        record.add("Version", Int(102))
+        record.add("ShadingModel", "lambert")
+        record.add("MultiLayer", Int(0))
+        properties = record.add("Properties70")
+        properties.add("P", "DiffuseColor", "Color", "", "A", *map(float, material.color))
+        properties.add("P", "DiffuseFactor", "Number", "", "A", 1.0)
+        if material.image:
+            ending = "png" if material.image.startswith(b"\x89PNG") else "jpg"
+            file = f"{material.name}.{ending}"
+            video, record = self._object("Video", material.name, "Clip")
+            record.add("Type", "Clip")
+            record.add("UseMipMap", Int(0))
+            record.add("Filename", file)
+            record.add("RelativeFilename", file)
+            record.add("Content", material.image)
+            texture, record = self._object("Texture", material.name, "")
+            record.add("Type", "TextureVideoClip")
+            record.add("Version", Int(202))
+            record.add("TextureName", f"{material.name}\x00\x01Texture")
+            record.add("Media", f"{material.name}\x00\x01Video")
+            record.add("FileName", file)
+            record.add("RelativeFilename", file)
+            self._connect(video, texture)
+            self._connect(texture, number, "DiffuseColor")
+        return number
+
+    def _bind_pose(self, poses: dict[int, np.ndarray]) -> None:
+        """Adds the matrices (4, 4) of objects, by id, in the pose in which the meshes are bound."""
         _, record = self._object("Pose", "bind pose", "BindPose")
         record.add("Type", "BindPose")
         record.add("Version", Int(100))
@@ -225,7 +263,7 @@ def _vector(properties: Record, name: str, kind: str, flags: str, values: Sequen
     properties.add("P", name, kind, "Vector" if kind == "Vector3D" else "", flags, *map(float, values))
 
 
-def _model(record: Record, offset: np.ndarray, before: np.ndarray) -> None:
+def _model(record: Record, offset: np.ndarray, before: np.ndarray, scale: float = 1.0) -> None:
     record.add("Version", Int(232))
     properties = record.add("Properties70")
     properties.add("P", "RotationActive", "bool", "", "", Int(1))
@@ -235,18 +273,9 @@ def _model(record: Record, offset: np.ndarray, before: np.ndarray) -> None:
     _vector(properties, "PreRotation", "Vector3D", "", before)
     _vector(properties, "Lcl Translation", "Lcl Translation", "A", offset)
     _vector(properties, "Lcl Rotation", "Lcl Rotation", "A", (0, 0, 0))
-    _vector(properties, "Lcl Scaling", "Lcl Scaling", "A", (1, 1, 1))
+    _vector(properties, "Lcl Scaling", "Lcl Scaling", "A", (scale, scale, scale))
     record.add("Shading", True)
     record.add("Culling", "CullingOff")
-
-
-def _material(record: Record, color: np.ndarray) -> None:
-    record.add("Version", Int(102))
-    record.add("ShadingModel", "lambert")
-    record.add("MultiLayer", Int(0))
-    properties = record.add("Properties70")
-    properties.add("P", "DiffuseColor", "Color", "", "A", *map(float, color))
-    properties.add("P", "DiffuseFactor", "Number", "", "A", 1.0)
 
 
 def _geometry(record: Record, skin: Skin) -> None:
@@ -271,9 +300,20 @@ def _geometry(record: Record, skin: Skin) -> None:
     materials.add("ReferenceInformationType", "IndexToDirect")
     materials.add("Materials", skin.materials.astype("<i4"))
 
+    kinds = ["LayerElementNormal", "LayerElementMaterial"]
+    if len(skin.uvs):
+        kinds.append("LayerElementUV")
+        places = record.add("LayerElementUV", Int(0))
+        places.add("Version", Int(101))
+        places.add("Name", "uv")
+        places.add("MappingInformationType", "ByPolygonVertex")
+        places.add("ReferenceInformationType", "IndexToDirect")
+        places.add("UV", skin.uvs.astype("<f8").ravel())
+        places.add("UVIndex", skin.triangles.astype("<i4").ravel())
+
     layer = record.add("Layer", Int(0))
     layer.add("Version", Int(100))
-    for kind in ("LayerElementNormal", "LayerElementMaterial"):
+    for kind in kinds:
         element = layer.add("LayerElement")
         element.add("Type", kind)
         element.add("TypedIndex", Int(0))

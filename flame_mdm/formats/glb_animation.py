@@ -165,6 +165,21 @@ def _animations(file: glb.Glb) -> list[tuple[str, _Animation]]:
 def _motion(file: glb.Glb, animation: str | int | None) -> AnimatedNodes:
     candidates = _animations(file)
     name, chosen = choose(candidates, animation)
+    worlds, fps = _worlds(file, chosen, candidates)
+    return AnimatedNodes(file.names, file.parents, worlds[..., :3, 3], fps, name, humanoid(file))
+
+
+def world_matrices_of(path: Path) -> np.ndarray:
+    """Returns the matrices (F, N, 4, 4) from nodes to the world in the first animation of a valid file."""
+    file = glb.read(path)
+    candidates = _animations(file)
+    return _worlds(file, candidates[0][1], candidates)[0]
+
+
+def _worlds(
+    file: glb.Glb, chosen: _Animation, candidates: Sequence[tuple[str, _Animation]]
+) -> tuple[np.ndarray, float]:
+    """Returns the matrices (F, N, 4, 4) from nodes to the world in each frame of an animation, and the frame rate."""
     tracks = _tracks(file, chosen)
     fps = _rate(file, [item for _, item in candidates])
     last = max(track.times[-1] for properties in tracks.values() for track in properties.values())
@@ -178,8 +193,7 @@ def _motion(file: glb.Glb, animation: str | int | None) -> AnimatedNodes:
     for number, properties in tracks.items():
         local[:, number] = _animated(nodes[file.nodes[number]], properties, times)
     with np.errstate(all="ignore"):
-        worlds = world_matrices(file.parents, local)
-    return AnimatedNodes(file.names, file.parents, worlds[..., :3, 3], fps, name, humanoid(file))
+        return world_matrices(file.parents, local), fps
 
 
 def _animated(node: dict[str, Any], tracks: dict[str, Track], times: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ VERTICES, INDICES = 34962, 34963  # uses of a buffer view in glTF
 
 
 def write(path: Path, clip: RiggedClip, text: str) -> None:
-    """Writes a clip with one node per joint, and the skin if it has one; `text` is stored in the file.
+    """Writes a clip with one node per joint, and the skin of a person if it has one; `text` is stored in the file.
 
     The node above the joints lifts the person by the thickness of the soles.
     """
@@ -29,9 +29,9 @@ def write(path: Path, clip: RiggedClip, text: str) -> None:
             nodes[parent].setdefault("children", []).append(joint)
     animation = binary.animation(clip.name, clip.fps, curves)
     figure: dict[str, Any] = {}
-    if clip.skin is not None:
+    for skin in clip.skins:
         nodes.append({"name": "figure", "mesh": 0, "skin": 0})
-        figure = _skin(binary, clip.skin)
+        figure = _skin(binary, skin)
     nodes.append({"name": "lifted", "children": [0], "translation": [0, clip.lift, 0]})
     document = {
         "asset": {"version": "2.0", "generator": "flame_mdm", "extras": {"fps": clip.fps, "text": text}},
@@ -53,7 +53,7 @@ def _skin(binary: Binary, skin: Skin) -> dict[str, Any]:
         "NORMAL": binary.add(skin.normals.astype("<f4"), VERTICES),
         "COLOR_0": binary.add(light, VERTICES, normalized=True),
         "JOINTS_0": binary.add(skin.bones, VERTICES),
-        "WEIGHTS_0": binary.add(skin.weights, VERTICES, normalized=True),
+        "WEIGHTS_0": binary.add(np.rint(255 * skin.weights).astype("u1"), VERTICES, normalized=True),
     }
     indices = binary.add(skin.triangles.astype("<u2").ravel(), INDICES)
     matrices = binary.add(skin.binds.mT.reshape(-1, 16).astype("<f4"))  # matrices are stored in column-major order

@@ -18,8 +18,9 @@ import numpy as np
 import torch
 
 from flame_mdm.errors import UserError, shortened
-from flame_mdm.formats import RIGGED, WRITTEN, bvh, characters, fbx_writer, glb_writer, usd, vrma
+from flame_mdm.formats import RIGGED, USD, WRITTEN, bvh, characters, fbx_writer, glb_writer, usd, vrma
 from flame_mdm.formats.body import PosedFigure
+from flame_mdm.formats.character_meshes import character_clip
 from flame_mdm.formats.characters import Character
 from flame_mdm.formats.poses import Poses
 from flame_mdm.formats.resampling import frame_rate
@@ -115,7 +116,7 @@ class Motion(PosedFigure):
             )
         if character is not None:
             character = character if isinstance(character, Character) else characters.read(character)
-            what = characters.write(path, character, self, self.text or self.id or "motion")
+            what = _write_character(self, path, character)
         elif ending == ".bvh":
             what = _write_bvh(self, path, rest_pose, rig)
         elif ending == ".vrma":
@@ -227,6 +228,17 @@ def _write_rigged(motion: Motion, path: Path, rig: str | None, body: Mesh | None
         usd.write(path, clip)
     unit = "centimeters" if ending == ".fbx" else "meters"
     return f"{unit}, y up; {_error(motion, poses)}" + (reason and f"; without a body: {reason}")
+
+
+def _write_character(motion: Motion, path: Path, character: Character) -> str:
+    """Writes a .glb file, which keeps all that the file of the character contains, or an .fbx or USD file."""
+    name = motion.text or motion.id or "motion"
+    ending = path.suffix.lower()
+    if ending not in (".fbx", *USD):
+        return characters.write(path, character, motion, name)
+    clip = character_clip(character, motion, name)
+    (fbx_writer if ending == ".fbx" else usd).write(path, clip)
+    return f"{len(clip.joints)} joints, {len(clip.skins)} meshes"
 
 
 def _write_vrma(motion: Motion, path: Path) -> str:

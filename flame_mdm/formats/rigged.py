@@ -3,7 +3,7 @@
 Lengths are in meters, y up; the rest pose faces +z. Frames, joints and vertices are counted by F, J and V.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -20,29 +20,57 @@ MATERIAL_NAMES = ("skin", "hair", "shirt", "trousers", "shoes")  # in the order 
 
 
 @dataclass(frozen=True, eq=False)
+class Material:
+    """A material of a mesh.
+
+    Attributes:
+        name: its name.
+        color: red, green and blue from 0 to 1, as screens show them.
+        image: content of a PNG or JPEG file that is multiplied with the color; empty without one.
+    """
+
+    name: str
+    color: tuple[float, float, float]
+    image: bytes = b""
+
+
+PALETTE = tuple(
+    Material(name, (red / 255, green / 255, blue / 255))
+    for name, (red, green, blue) in zip(MATERIAL_NAMES, MATERIALS, strict=True)
+)
+"""Materials of the package's person."""
+
+
+@dataclass(frozen=True, eq=False)
 class Skin:
     """A skinned mesh in the pose in which it is bound to the skeleton.
 
     Attributes:
-        points: (V, 3), with the soles on the floor; `normals` (V, 3) of length 1.
-        colors: (V, 3) from 0 to 255, as screens show them.
+        name: the name of the mesh.
+        points: (V, 3) in the coordinates of the mesh; `normals` (V, 3) of length 1.
         triangles: (T, 3), counterclockwise seen from outside.
-        materials: (T,), index into `MATERIAL_NAMES` of each triangle.
-        ordered: indices of all joints of the skeleton; those that follow a joint of SMPL come first, in its order.
-        bones: (V, 4), the joints that move a vertex, as indices into `ordered`.
-        weights: (V, 4) integers that add up to 255: the share of each of these joints.
-        binds: (J, 4, 4), matrices from the coordinates of the mesh to the coordinates of each joint in `ordered`.
+        palette: the materials.
+        materials: (T,), index into `palette` of each triangle.
+        ordered: indices of joints of the skeleton. For a person, joints that follow SMPL's come first, in its order.
+        bones: (V, K), the joints that move a vertex, as indices into `ordered`.
+        weights: (V, K), the share of each of these joints; a row adds up to 1.
+        binds: (len(ordered), 4, 4), matrices from the coordinates of the mesh to the coordinates of each joint.
+        colors: (V, 3) from 0 to 255, as screens show them; (0, 3) if the materials alone have colors.
+        uvs: (V, 2), places in the images, from the lower left corner; (0, 2) without images.
     """
 
+    name: str
     points: np.ndarray
     normals: np.ndarray
-    colors: np.ndarray
     triangles: np.ndarray
+    palette: tuple[Material, ...]
     materials: np.ndarray
     ordered: tuple[int, ...]
     bones: np.ndarray
     weights: np.ndarray
     binds: np.ndarray
+    colors: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    uvs: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,8 +86,10 @@ class RiggedClip:
         rest: (J, 3, 3), rotation of each joint relative to its parent in the rest pose.
         turns: (F, J, 3, 3), rotations relative to parents.
         moves: joints that move relative to their parents -> positions (F, 3) relative to their parents.
-        lift: height by which the person in `skin` is above these positions: the thickness of the soles.
-        skin: the mesh of a person; None if the motion does not fit one.
+        lift: height by which a person is above these positions: the thickness of the soles.
+        skins: the meshes; () if the motion does not fit a person.
+        scales: (J,), units of the parent per unit of each joint.
+        root: index of the joint on the floor above the hips; -1 if there is none.
     """
 
     name: str
@@ -71,10 +101,15 @@ class RiggedClip:
     turns: np.ndarray
     moves: dict[int, np.ndarray]
     lift: float
-    skin: Skin | None
+    skins: tuple[Skin, ...]
+    scales: np.ndarray
+    root: int = -1
 
     def world(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns positions (F, J, 3) and rotations (F, J, 3, 3) of the joints in the world, not lifted."""
+        """Returns positions (F, J, 3) and rotations (F, J, 3, 3) of the joints in the world, not lifted.
+
+        For skeletons whose joints all have the scale 1.
+        """
         positions = np.tile(self.offsets, (len(self.turns), 1, 1))
         for joint, moved in self.moves.items():
             positions[:, joint] = moved
@@ -124,7 +159,9 @@ def rigged(
         turns=turns,
         moves=moves,
         lift=fitted.lift if fitted else 0.0,
-        skin=None if fitted is None else _skin(fitted, skeleton),
+        skins=() if fitted is None else (_skin(fitted, skeleton),),
+        scales=np.ones(len(skeleton.joints)),
+        root=skeleton.parents[skeleton.hips],
     )
 
 
@@ -173,13 +210,15 @@ def _skin(body: FittedBody, rig: Rig) -> Skin:
     faces = mesh.colors[mesh.triangles].mean(1)
     differences = np.linalg.norm(faces[:, None] - np.array(MATERIALS, float), axis=-1)
     return Skin(
+        name="person",
         points=body.points - floor,
         normals=mesh.normals,
-        colors=mesh.colors,
         triangles=mesh.triangles,
+        palette=PALETTE,
         materials=differences.argmin(1),
         ordered=(*skinned, *others),
         bones=bones,
-        weights=shares,
+        weights=shares / 255,
         binds=binds,
+        colors=mesh.colors,
     )

@@ -14,11 +14,8 @@ import numpy as np
 
 from flame_mdm.errors import UserError
 from flame_mdm.formats.glb import quaternions
-from flame_mdm.formats.rigged import MATERIAL_NAMES, RiggedClip, Skin
+from flame_mdm.formats.rigged import RiggedClip, Skin
 from flame_mdm.safe_io import atomic_write
-from flame_mdm.visualize.body import MATERIALS
-
-INFLUENCES = 4  # joints per vertex
 
 
 def write(path: Path, clip: RiggedClip) -> None:
@@ -43,8 +40,8 @@ def write(path: Path, clip: RiggedClip) -> None:
         stage.SetDefaultPrim(root.GetPrim())
 
         _skeleton(stage, clip)
-        if clip.skin is not None:
-            _mesh(stage, clip.skin)
+        for skin in clip.skins:
+            _mesh(stage, skin)
         _extent(stage, root, clip)
         stage.GetRootLayer().Save()
         if path.suffix == ".usdz":
@@ -58,10 +55,14 @@ def _paths(clip: RiggedClip) -> list[str]:
     """Returns the joints as paths from the root, in which names have letters, digits and underscores only."""
     paths: list[str] = []
     for name, parent in zip(clip.joints, clip.parents, strict=True):
-        plain = re.sub(r"\W", "_", name)
-        plain = f"_{plain}" if plain[0].isdigit() else plain
-        paths.append(f"{paths[parent]}/{plain}" if parent >= 0 else plain)
+        paths.append(f"{paths[parent]}/{_name(name)}" if parent >= 0 else _name(name))
     return paths
+
+
+def _name(name: str) -> str:
+    """Returns a name with letters, digits and underscores only, which does not begin with a digit."""
+    plain = re.sub(r"[^A-Za-z0-9_]", "_", name) or "_"
+    return f"_{plain}" if plain[0].isdigit() else plain
 
 
 def _matrices(values: np.ndarray) -> Any:
@@ -78,20 +79,20 @@ def _skeleton(stage: Any, clip: RiggedClip) -> None:
     paths = _paths(clip)
     skeleton.CreateJointsAttr(paths)
     rest = np.tile(np.eye(4), (len(paths), 1, 1))
-    rest[:, :3, :3] = clip.rest
+    rest[:, :3, :3] = clip.rest * clip.scales[:, None, None]
     rest[:, :3, 3] = clip.offsets
     skeleton.CreateRestTransformsAttr(_matrices(rest))
     bound = rest.copy()
     for joint, parent in enumerate(clip.parents):
         if parent >= 0:
             bound[joint] = bound[parent] @ rest[joint]
-    if clip.skin is not None:
-        bound[list(clip.skin.ordered)] = np.linalg.inv(clip.skin.binds)
+    for skin in clip.skins:
+        bound[list(skin.ordered)] = np.linalg.inv(skin.binds)
     skeleton.CreateBindTransformsAttr(_matrices(bound))
 
     animation = UsdSkel.Animation.Define(stage, "/person/skeleton/animation")
     animation.CreateJointsAttr(paths)
-    animation.CreateScalesAttr(Vt.Vec3hArray([Gf.Vec3h(1, 1, 1)] * len(paths)))
+    animation.CreateScalesAttr(Vt.Vec3hArray([Gf.Vec3h(size, size, size) for size in clip.scales.tolist()]))
     turns = quaternions(clip.turns)
     moved = np.tile(clip.offsets, (len(clip.turns), 1, 1))
     for joint, path in clip.moves.items():
@@ -109,7 +110,7 @@ def _skeleton(stage: Any, clip: RiggedClip) -> None:
 def _mesh(stage: Any, skin: Skin) -> None:
     from pxr import Gf, Sdf, UsdGeom, UsdShade, UsdSkel, Vt
 
-    mesh = UsdGeom.Mesh.Define(stage, "/person/mesh")
+    mesh = UsdGeom.Mesh.Define(stage, f"/person/{_name(skin.name)}")
     mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(skin.points.astype("f4")))
     mesh.CreateFaceVertexCountsAttr([3] * len(skin.triangles))
     mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(skin.triangles.astype("i4").ravel()))
@@ -121,22 +122,22 @@ def _mesh(stage: Any, skin: Skin) -> None:
     binding = UsdSkel.BindingAPI.Apply(mesh.GetPrim())
     binding.CreateSkeletonRel().SetTargets([Sdf.Path("/person/skeleton")])
     joints = np.array(skin.ordered, "i4")[skin.bones]
-    shares = skin.weights.astype("f4") / 255
-    binding.CreateJointIndicesPrimvar(False, INFLUENCES).Set(Vt.IntArray.FromNumpy(joints.ravel()))
-    binding.CreateJointWeightsPrimvar(False, INFLUENCES).Set(Vt.FloatArray.FromNumpy(shares.ravel()))
+    shares = skin.weights.astype("f4")
+    binding.CreateJointIndicesPrimvar(False, skin.bones.shape[1]).Set(Vt.IntArray.FromNumpy(joints.ravel()))
+    binding.CreateJointWeightsPrimvar(False, skin.bones.shape[1]).Set(Vt.FloatArray.FromNumpy(shares.ravel()))
     binding.CreateGeomBindTransformAttr(Gf.Matrix4d(1))
 
-    for number, (name, color) in enumerate(zip(MATERIAL_NAMES, MATERIALS, strict=True)):
-        material = UsdShade.Material.Define(stage, f"/person/materials/{name}")
-        shader = UsdShade.Shader.Define(stage, f"/person/materials/{name}/surface")
+    for number, paint in enumerate(skin.palette):
+        material = UsdShade.Material.Define(stage, f"/person/materials/{_name(paint.name)}")
+        shader = UsdShade.Shader.Define(stage, f"/person/materials/{_name(paint.name)}/surface")
         shader.CreateIdAttr("UsdPreviewSurface")
-        linear = (np.array(color) / 255) ** 2.2
+        linear = np.array(paint.color) ** 2.2
         shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).Set(Gf.Vec3f(*linear.tolist()))
         shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(0.8)
         material.CreateSurfaceOutput().ConnectToSource(shader.ConnectableAPI(), "surface")
         triangles = np.nonzero(skin.materials == number)[0].astype("i4")
         subset = UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).CreateMaterialBindSubset(
-            name, Vt.IntArray.FromNumpy(triangles)
+            _name(paint.name), Vt.IntArray.FromNumpy(triangles)
         )
         UsdShade.MaterialBindingAPI.Apply(subset.GetPrim()).Bind(material)
 
@@ -145,7 +146,7 @@ def _extent(stage: Any, root: Any, clip: RiggedClip) -> None:
     """Declares the box around the person in each frame, from the joints."""
     from pxr import UsdGeom, Vt
 
-    positions, _ = clip.world()
+    positions, _ = clip.world()  # scales are ignored: the box only has to be large enough
     positions[..., 1] += clip.lift
     margin = 0.25  # meters from joints to the farthest point of the surface, the tips of hands and head
     boxes = UsdGeom.Boundable(root.GetPrim()).CreateExtentAttr()

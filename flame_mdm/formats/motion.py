@@ -6,6 +6,7 @@ features and files that contain SMPL's.
 """
 
 import json
+import math
 import sys
 import tempfile
 from dataclasses import dataclass, field
@@ -23,7 +24,7 @@ from flame_mdm.formats.body import PosedFigure
 from flame_mdm.formats.character_meshes import character_clip
 from flame_mdm.formats.characters import Character
 from flame_mdm.formats.poses import Poses
-from flame_mdm.formats.resampling import frame_rate
+from flame_mdm.formats.resampling import frame_pairs, frame_rate, resample
 from flame_mdm.formats.retarget import continuous_euler, preset, retarget
 from flame_mdm.formats.rig import CENTIMETER
 from flame_mdm.formats.rigged import rigged
@@ -91,6 +92,7 @@ class Motion(PosedFigure):
         rig: str | None = None,
         character: str | Path | Character | None = None,
         body: Mesh | None = None,
+        root_motion: bool = False,
         **facts: Any,
     ) -> str:
         """Writes a motion file and returns a line that describes it.
@@ -98,9 +100,14 @@ class Motion(PosedFigure):
         Args:
             path: the file; its extension selects the format (docs/formats.md).
             rest_pose: begin a `.bvh` file with a frame of the rest pose, arms out, which some programs expect.
-            rig: the skeleton of a `.bvh` or `.glb` file, one of `flame_mdm.formats.retarget.presets`; default: SMPL's.
-            character: a `.glb` file with a skin, or what `characters.read` returned, to be written with this motion.
-            body: the body in `.glb`, `.gif` and `.mp4` files, from `visualize.body.load_body`; default: the mannequin.
+            rig: the skeleton of a `.bvh`, `.glb`, `.fbx` or USD file, one of `flame_mdm.formats.retarget.presets`;
+                default: SMPL's.
+            character: a `.glb` file with a skin, or what `characters.read` returned, to be written with this motion
+                as a `.glb`, `.fbx` or USD file.
+            body: the body in `.glb`, `.fbx`, USD, `.gif` and `.mp4` files, from `visualize.body.load_body`; default:
+                the mannequin.
+            root_motion: the joint on the floor of `rig` follows the hips in a `.glb`, `.fbx` or USD file; otherwise
+                it stays in place. For `rig="unreal"` and `rig="soma"`.
             facts: additional entries of an `.npz` file, such as the seed.
 
         Raises `UserError` if an argument is unknown, or does not fit the file or the motion, or if `.mp4` needs av.
@@ -110,10 +117,12 @@ class Motion(PosedFigure):
         if ending not in WRITTEN:
             raise UserError(f"{path}: unknown kind of motion file. Use one of {', '.join(WRITTEN)}")
         on_a_rig = character is None and ending in RIGGED
-        if (rig is not None and not on_a_rig) or (rest_pose and (ending != ".bvh" or not on_a_rig)):
-            raise UserError(
-                f"{path}: rig is only for .bvh, .glb and .fbx files, rest_pose only for .bvh, neither for characters"
-            )
+        if rig is not None and not on_a_rig:
+            raise UserError(f"{path}: rig is only for {', '.join(RIGGED)} files, and not for characters")
+        if rest_pose and (ending != ".bvh" or not on_a_rig):
+            raise UserError(f"{path}: rest_pose is only for .bvh files, and not for characters")
+        if root_motion and (ending == ".bvh" or not on_a_rig or rig is None):
+            raise UserError(f"{path}: root_motion is only for .glb, .fbx and USD files with rig=unreal or rig=soma")
         if character is not None:
             character = character if isinstance(character, Character) else characters.read(character)
             what = _write_character(self, path, character)
@@ -122,7 +131,7 @@ class Motion(PosedFigure):
         elif ending == ".vrma":
             what = _write_vrma(self, path)
         elif ending in RIGGED:
-            what = _write_rigged(self, path, rig, body)
+            what = _write_rigged(self, path, rig, body, root_motion)
         elif ending == ".npz":
             what = _write_npz(self, path, facts)
         elif ending == ".json":
@@ -134,6 +143,38 @@ class Motion(PosedFigure):
         else:
             what = _write_video(self, path, body)
         return f"{path}: {len(self.joints)} frames at {self.fps:g} per second, {what}"
+
+    def resampled(self, fps: float) -> "Motion":
+        """Returns this motion at another frame rate, over the same time.
+
+        Rotations that are known are interpolated on the sphere, so that bones keep their length; joints alone are
+        interpolated by cubic splines. Features belong to one frame rate and are left out.
+        """
+        if math.isclose(self.fps, fps):
+            return self
+        before, after, share = frame_pairs(len(self.joints), self.fps, fps, len(self.skeleton))
+        nearest = np.where(share < 0.5, before, after)
+        contacts = None if self.contacts is None else self.contacts[nearest]
+        ratio = fps / self.fps
+        parts = tuple((text, round(begin * ratio), round(end * ratio)) for text, begin, end in self.parts)
+        joints, poses = resample(self.joints.astype(float), self.fps, fps, cubic=True), None
+        if self.poses is not None:
+            turns = rotation.matrix_to_quaternion(self.poses.rotations)
+            turns = rotation.slerp(turns[before], turns[after], torch.from_numpy(share)[:, None, None])
+            path = torch.from_numpy(resample(self.poses.root.numpy(), self.fps, fps, cubic=True))
+            poses = Poses(self.poses.offsets, rotation.quaternion_to_matrix(turns), path)
+            joints[:, : len(SMPL22)] = poses.joints().numpy()
+        return Motion(
+            joints=joints,
+            fps=fps,
+            skeleton=self.skeleton,
+            text=self.text,
+            id=self.id,
+            contacts=contacts,
+            poses=poses,
+            cleanup=self.cleanup,
+            parts=parts,
+        )
 
     def show(self) -> Any:
         """Returns a player: a display in a Jupyter notebook, otherwise the path of a page to open in any browser."""
@@ -214,11 +255,12 @@ def _write_bvh(motion: Motion, path: Path, rest_pose: bool, rig: str | None) -> 
     return f"{unit}, y up; {_error(motion, poses)}" + "; the first frame is the rest pose" * rest_pose
 
 
-def _write_rigged(motion: Motion, path: Path, rig: str | None, body: Mesh | None) -> str:
+def _write_rigged(motion: Motion, path: Path, rig: str | None, body: Mesh | None, root_motion: bool) -> str:
     """Writes a .glb, .fbx or USD file: the skeleton in motion, with a skinned body, if one fits."""
     poses = motion.posed()
     fitted, reason = motion.try_fit(body)
-    clip = rigged(poses, motion.text or motion.id or "motion", motion.fps, preset(rig, poses), fitted)
+    name = motion.text or motion.id or "motion"
+    clip = rigged(poses, name, motion.fps, preset(rig, poses), fitted, root_motion)
     ending = path.suffix.lower()
     if ending == ".fbx":
         fbx_writer.write(path, clip)

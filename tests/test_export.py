@@ -227,7 +227,7 @@ def test_what_does_not_fit_a_file_is_refused(tmp_path, circle):
     options: dict[str, Any]
     kit = sway(5, 12.5, KIT21)
     for motion, name, options, message in (
-        (circle, "a.glb", {"rest_pose": True}, "rest_pose only for .bvh"),
+        (circle, "a.glb", {"rest_pose": True}, "rest_pose is only for .bvh"),
         (circle, "a.bvh", {"rig": "miximo"}, r"rig=miximo: unknown\. Did you mean mixamo\? Use one of mixamo, unreal"),
         (circle, "a.npz", {"rig": "mixamo"}, r"rig is only for"),
         (kit, "a.bvh", {}, r"\.json or \.npy"),

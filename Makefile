@@ -30,7 +30,7 @@ setup: $(READY) ## install into .venv
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(VENV)/bin/python -m pip install -q -c constraints.txt -e '.[dev,offline,video,demo,docs,onnx]'
+	$(VENV)/bin/python -m pip install -q -c constraints.txt -e '.[dev,offline,video,demo,docs,onnx,usd]'
 	@touch $@
 
 test: $(READY) ## run all tests, except those that need outside tools

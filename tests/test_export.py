@@ -231,7 +231,7 @@ def test_what_does_not_fit_a_file_is_refused(tmp_path, circle):
         (circle, "a.bvh", {"rig": "miximo"}, r"rig=miximo: unknown\. Did you mean mixamo\? Use one of mixamo, unreal"),
         (circle, "a.npz", {"rig": "mixamo"}, r"rig is only for"),
         (kit, "a.bvh", {}, r"\.json or \.npy"),
-        (circle, "walk.npz.txt", {}, "unknown kind of motion file. Use one of .bvh, .glb, .npz, .json, .npy, .gif"),
+        (circle, "walk.npz.txt", {}, "unknown kind of motion file. Use one of .bvh, .glb, .fbx, .usda"),
     ):
         with pytest.raises(UserError, match=message):
             motion.save(tmp_path / name, **options)

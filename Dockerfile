@@ -14,8 +14,9 @@ RUN apt-get update \
 
 WORKDIR /flame_mdm
 COPY constraints.txt ./
-# The index of torch holds packages of other names in other versions, so it is asked for torch alone.
-RUN pip install --no-cache-dir -c constraints.txt --index-url "$TORCH_INDEX" --extra-index-url https://pypi.org/simple torch
+# The index of torch holds packages of other names in other versions, so it is asked for torch alone. What torch needs
+# is installed below, from PyPI.
+RUN pip install --no-cache-dir --no-deps -c constraints.txt --index-url "$TORCH_INDEX" torch
 COPY pyproject.toml README.md LICENSE ./
 COPY flame_mdm flame_mdm
 COPY evaluators evaluators

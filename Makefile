@@ -30,6 +30,7 @@ setup: $(READY) ## install into .venv
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
+	$(VENV)/bin/python -m pip install -q --upgrade pip
 	$(VENV)/bin/python -m pip install -q -c constraints.txt -e '.[dev,offline,video,demo,docs,onnx,usd]'
 	@touch $@
 

@@ -56,6 +56,14 @@ def markdown_text(text: str) -> str:
     return html.escape(re.sub(r"([|*_`~#\[\]\\])", r"\\\1", one_line(text)), quote=False)
 
 
+_shown: dict[str, str] = {}
+
+
+def show_as(path: str, name: str) -> None:
+    """Prints a name instead of a path from now on: what the user typed instead of a temporary copy of it."""
+    _shown[path] = name
+
+
 def say(*lines: object, error: bool = False) -> None:
     """Prints each argument as one `printable` line, because any name or text may come from an untrusted file.
 
@@ -64,6 +72,8 @@ def say(*lines: object, error: bool = False) -> None:
     stream = sys.stderr if error else sys.stdout
     for line in lines:
         text = str(line)
+        for path, name in _shown.items():
+            text = text.replace(path, name)
         if error and len(text) > MAX_LINE:
             text = f"{text[: MAX_LINE // 2]} … {text[-MAX_LINE // 2 :]}"
         try:

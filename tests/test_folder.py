@@ -165,7 +165,7 @@ def test_the_table_gives_captions_actions_splits_and_sources(tmp_path: Path):
 
 HEADLESS = {joint: f"{joint} b" for joint in SMPL22.joints}
 BAD = {
-    "no motion": (lambda f: [p.unlink() for p in f.rglob("*.np*")], "no motions in it; give a folder"),
+    "no motion": (lambda f: [p.unlink() for p in f.rglob("*.np*")], "mine: no motions in this folder. Give a folder"),
     "twice": (lambda f: np.savez(f / "one.npz", joints=WALK, fps=30), r"one\.npz: has the same name as one\.npy"),
     "no caption": (lambda f: (f / "one.txt").unlink(), "1 of 3 motions have no caption, such as one"),
     "unknown id": (lambda f: write_table(f, [{"id": "once", "text": "a"}]), r"captions\.csv, line 2: .*'once'"),

@@ -12,7 +12,7 @@ from tempfile import mkdtemp
 from typing import IO, Any
 from weakref import finalize
 
-from flame_mdm.errors import UserError
+from flame_mdm.errors import UserError, show_as
 from flame_mdm.safe_io import MEBIBYTE, ZIP_ERRORS, check_expansion, check_member, naming, regular_file
 
 MEMBER_LIMIT = 512 * MEBIBYTE
@@ -53,6 +53,7 @@ def as_folder(path: Path, owner: object, is_wanted: Callable[[str], bool]) -> Pa
     finalize(owner, rmtree, temporary, ignore_errors=True)
     folder = temporary / path.name
     folder.mkdir()
+    show_as(str(folder), str(path))
     for name, content in members(path, is_wanted):
         if ".." in PurePosixPath(name).parts or PurePosixPath(name).is_absolute():
             raise UserError(f"{path}: {name[:80]} leads out of the archive")

@@ -139,9 +139,8 @@ class Folder(MotionSource):
                     raise UserError(f"{path}: has the same name as {files[name].name}; each motion needs its own name")
                 files[name] = path
         if not files:
-            raise FileNotFoundError(
-                f"{self.path}: no such folder, or no motions in it; give a folder of {', '.join(ENDINGS)} files"
-            )
+            reason = "no motions in this folder" if self.path.is_dir() else "no such folder"
+            raise FileNotFoundError(f"{self.path}: {reason}. Give a folder of {', '.join(ENDINGS)} files")
         return self.not_excluded(dict(sorted(files.items())), self.path)
 
     def changed(self, store: Path) -> list[str]:

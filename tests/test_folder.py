@@ -165,7 +165,7 @@ def test_the_table_gives_captions_actions_splits_and_sources(tmp_path: Path):
 
 HEADLESS = {joint: f"{joint} b" for joint in SMPL22.joints}
 BAD = {
-    "no motion": (lambda f: [p.unlink() for p in f.rglob("*.np*")], "mine: no motions in this folder. Give a folder"),
+    "no motion": (lambda f: [p.unlink() for p in f.rglob("*.np*")], "no motions in this folder. Give a folder"),
     "twice": (lambda f: np.savez(f / "one.npz", joints=WALK, fps=30), r"one\.npz: has the same name as one\.npy"),
     "no caption": (lambda f: (f / "one.txt").unlink(), "1 of 3 motions have no caption, such as one"),
     "unknown id": (lambda f: write_table(f, [{"id": "once", "text": "a"}]), r"captions\.csv, line 2: .*'once'"),
@@ -331,3 +331,10 @@ def test_the_skeleton_file_in_the_documentation_is_legal(tmp_path: Path):
     (block,) = (block for block in blocks if "skeleton.yaml" in block.splitlines()[0])
     (tmp_path / "skeleton.yaml").write_text(block)
     assert set(read_skeleton(tmp_path / "skeleton.yaml")["map"]) == set(SMPL22.joints)
+
+
+def test_an_empty_folder_and_a_missing_one_are_told_apart(tmp_path):
+    (tmp_path / "empty").mkdir()
+    for name, says in (("empty", "no motions in this folder"), ("absent", "no such folder")):
+        with pytest.raises(FileNotFoundError, match=rf"{name}: {says}\. Give a folder of"):
+            Folder(str(tmp_path / name)).count()

@@ -3,6 +3,7 @@
 import os
 import re
 import signal
+import zipfile
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
@@ -19,13 +20,14 @@ from support.stores import OwnClips, clip
 from flame_mdm.__main__ import main
 from flame_mdm.checkpoints import hub
 from flame_mdm.conditions.text import EncodedCaptions, PretrainedText
+from flame_mdm.data import archives
 from flame_mdm.data.store import write_store
-from flame_mdm.errors import UserError
+from flame_mdm.errors import UserError, say
 from flame_mdm.formats.motion import Motion
 from flame_mdm.representations.humanml import HumanML
-from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.representations.skeleton import KIT21, SMPL22
 from flame_mdm.safe_io import atomic_folder, atomic_write, locked, paths, write_json
-from flame_mdm.sampling.generation import write_motions
+from flame_mdm.sampling.output import write_motions
 from flame_mdm.training.checkpointing import AtomicCheckpoints
 from flame_mdm.training.guards import only_run
 from flame_mdm.training.loggers import History
@@ -292,3 +294,20 @@ def test_a_lock_is_no_link_but_is_taken_over_from_a_dead_process(tmp_path):
     with locked(tmp_path / "run.lock", lambda _: None, "") as dead:
         assert re.fullmatch("process 7 on here", dead)
     assert not list(tmp_path.iterdir())
+
+
+def test_errors_in_an_archive_name_the_archive_and_not_its_unpacked_copy(tmp_path, capsys):
+    archive = tmp_path / "motions.zip"
+    with zipfile.ZipFile(archive, "w") as file:
+        file.writestr("deep/walk.bvh", "HIERARCHY")
+    owner = OwnClips()
+    folder = archives.as_folder(archive, owner, lambda _: True)
+    say(f"{folder}/walk.bvh: damaged", error=True)
+    assert capsys.readouterr().err == f"{archive}/deep/walk.bvh: damaged\n"
+
+
+def test_an_error_of_a_motion_names_the_file_that_was_typed(tmp_path, capsys):
+    Motion(np.zeros((20, 21, 3), np.float32), 20.0, KIT21).save(tmp_path / "kit.npz")
+    for ending in ("bvh", "glb"):
+        assert main(["convert", str(tmp_path / "kit.npz"), str(tmp_path / f"out.{ending}")]) == 1
+        assert capsys.readouterr().err.startswith(f"error: {tmp_path}/kit.npz: ")

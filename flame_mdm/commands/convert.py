@@ -82,6 +82,11 @@ def _convert(settings: ConvertSettings, path: Path, out: Path, character: Charac
         raise UserError(f"{out}: the same file as the input, which stays as it is. Choose another name for the output")
     if out.suffix.lower() == ".npz":
         motion.poses = motion.posed()  # other programs expect AMASS's keys
-    say(motion.save(out, settings.rest_pose, settings.rig, character, body))
+    try:
+        say(motion.save(out, settings.rest_pose, settings.rig, character, body))
+    except UserError as error:  # of the motion, if not of the output
+        if str(out) in str(error):
+            raise
+        raise UserError(f"{path}: {error}") from error
     if motion.skeleton.joints[: len(SMPL22)] == SMPL22.joints:
         say(f"legs {leg_length(motion.joints):.2f} m, head joint at {head_height(motion.joints):.2f} m")

@@ -25,7 +25,8 @@ from flame_mdm.__main__ import main
 from flame_mdm.batch import Condition, MotionBatch
 from flame_mdm.checkpoints import hub, model_files
 from flame_mdm.checkpoints.loading import load
-from flame_mdm.checkpoints.released import Options, import_flame, import_mdm
+from flame_mdm.checkpoints.released import Options, _options, import_flame, import_mdm
+from flame_mdm.errors import UserError
 from flame_mdm.generator import MotionGenerator
 from flame_mdm.sampling.generation import generate
 
@@ -226,6 +227,18 @@ def test_every_weight_is_used_or_the_import_fails() -> None:
     ):
         with pytest.raises(ValueError, match=message):
             import_mdm(weights_, options)
+
+
+@pytest.mark.parametrize(
+    "option", [{"context_len": 20}, {"pred_len": 40}, {"emb_policy": "concat"}, {"multi_target_cond": True}]
+)
+def test_options_of_a_network_with_prefix_or_targets_are_refused(tmp_path, option):
+    (name, value), path = *option.items(), tmp_path / "args.json"
+    path.write_text(json.dumps({"arch": "trans_dec", **option}))
+    with pytest.raises(UserError, match=f"{name}={value}: a model with a prefix of clean frames or targets"):
+        _options(path, {})
+    path.write_text(json.dumps({"context_len": 0, "pred_len": 0, "emb_policy": "add", "multi_target_cond": False}))
+    assert _options(path, {}) == Options()
 
 
 def test_options_of_mdm(tmp_path):

@@ -172,6 +172,21 @@ def test_oracle_has_no_loss_and_padding_has_no_say(name):
     torch.testing.assert_close(other["loss"], terms["loss"])
 
 
+@pytest.mark.parametrize("prediction", ["x0", "epsilon", "velocity"])
+def test_min_snr_weighs_an_error_of_the_clean_motion_alike_in_every_prediction(prediction):
+    """Hang et al. 2023, arXiv:2303.09556: the weight of the squared error of the clean motion is min(SNR, 5)."""
+    process = GaussianDiffusion(50, prediction=prediction, min_snr=5.0)
+    t = torch.tensor([2, 10, 25, 40, 45])
+    x, noise, mask = torch.randn(5, 4, 3).double(), torch.randn(5, 4, 3).double(), torch.ones(5, 4, dtype=torch.bool)
+    x_t = process.corrupt(x, noise, t)
+    zero, one = torch.zeros_like(x), torch.ones_like(x)
+    signal, sigma = process.corrupt(one, zero, t), process.corrupt(zero, one, t)
+    estimate = x + 0.1
+    output = process.target(estimate, (x_t - signal * estimate) / sigma, t)
+    expected = 0.01 * ((signal / sigma)[:, 0, 0] ** 2).clamp(max=5)
+    torch.testing.assert_close(process.terms(output, x, noise, x_t, t, mask)["mse"], expected)
+
+
 def test_weights_of_the_error_and_the_skip_are_those_of_the_noise():
     """At T = 1000 and step 900, SNR < 1: the error of the noise counts 1, and min(SNR, 5) / SNR at step 10."""
     torch.manual_seed(0)

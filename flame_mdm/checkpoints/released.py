@@ -20,7 +20,7 @@ from flame_mdm.denoisers import Denoiser
 from flame_mdm.denoisers.flame import FLAME
 from flame_mdm.denoisers.gru import MDMGRU
 from flame_mdm.denoisers.mdm import MDMDecoder, MDMEncoder
-from flame_mdm.errors import UserError, first_line
+from flame_mdm.errors import UserError, first_line, shortened
 from flame_mdm.generator import MotionGenerator
 from flame_mdm.safe_io import read_npy, read_yaml, sha256
 from flame_mdm.sampler_options import MAX_STEPS
@@ -37,6 +37,10 @@ NORMALIZED = ("humanml3d", "kit")
 PADDED_FRAMES, ACTION_FRAMES = 196, 60
 ENCODERS = {"clip": "clip", "bert": "distilbert"}
 POOLER, ACTIONS = "lm.pooler.dense.", "embed_action.action_embedding"
+
+
+NEUTRAL = {"context_len": 0, "pred_len": 0, "emb_policy": "add", "multi_target_cond": False, "lambda_target_loc": 0}
+"""Options that change the network or its input in a way that ours does not have, and their value without effect."""
 
 
 class Solver(Schema):
@@ -250,6 +254,10 @@ def _options(path: str | Path | None, changes: dict[str, Any]) -> Options:
     # In a composed configuration of MFM, options of network and training are one level down.
     groups = [value for name, value in options.items() if name in ("model", "training") and isinstance(value, dict)]
     flat = {k: v for part in (*groups, options) for k, v in part.items() if isinstance(k, str) and v is not None}
+    for name, neutral in NEUTRAL.items():
+        if flat.get(name, neutral) != neutral:
+            what = "a model with a prefix of clean frames or targets, such as DiP, which is not imported"
+            raise UserError(f"{path}: {name}={shortened(str(flat[name]), 40)}: {what}. Import a model without it")
     try:
         return check_shape(flat | changes, Options)
     except ValueError as error:

@@ -28,7 +28,7 @@ from torch.utils.data import DataLoader
 from flame_mdm.batch import MotionBatch
 from flame_mdm.config import compose, instantiate
 from flame_mdm.seeds import seed_generator
-from flame_mdm.task import MotionGeneration
+from flame_mdm.task import GeneratorTask
 from flame_mdm.training.averaging import MovingAverage
 from flame_mdm.training.fit import fit
 
@@ -63,7 +63,7 @@ class Clock(Callback):
         return statistics.median(after - before for before, after in itertools.pairwise(times))
 
 
-def built(folder: Path) -> tuple[list[MotionBatch], MotionGeneration]:
+def built(folder: Path) -> tuple[list[MotionBatch], GeneratorTask]:
     """Returns batches and task of the framework's training."""
     config = compose("quickstart", [*QUIET, *TINY, f"data_root={folder / 'data'}"])
     representation = instantiate(config["representation"])
@@ -74,18 +74,21 @@ def built(folder: Path) -> tuple[list[MotionBatch], MotionGeneration]:
     return list(itertools.islice(data.train_dataloader(), BATCHES)), task
 
 
-def loss_of(task: MotionGeneration, batch: MotionBatch) -> Tensor:
-    return task.process.loss(task.denoiser, batch.x, batch.mask, task.condition(batch), auxiliary=task.losses)[
-        "loss"
-    ].mean()
+def loss_of(task: GeneratorTask, batch: MotionBatch) -> Tensor:
+    model = task.generator
+    cond = model.condition(batch)
+    return model.process.loss(model.denoiser, batch.x, batch.mask, cond, auxiliary=task.losses)["loss"].mean()
 
 
 class Bare(LightningModule):
     """The framework's network, loss and optimizer in a module of Lightning."""
 
-    def __init__(self, task: MotionGeneration):
+    def __init__(self, task: GeneratorTask):
         super().__init__()
-        self.denoiser, self.task = task.denoiser, [task]  # in a list, so that its parameters are not registered twice
+        self.denoiser, self.task = (
+            task.generator.denoiser,
+            [task],
+        )  # in a list, so that its parameters are not registered twice
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
         loss = loss_of(self.task[0], batch)
@@ -145,6 +148,7 @@ def loop(steps: int, folder: Path) -> float:
 def parts(steps: int, folder: Path) -> dict[str, float]:
     """Returns the median seconds of each part of a step."""
     batches, task = built(folder)
+    model = task.generator
     optimizer, parameters = task.make_optimizer(), list(task.parameters())
     average: Any = MovingAverage(0.998)
     average._average_model = AveragedModel(task)
@@ -155,9 +159,9 @@ def parts(steps: int, folder: Path) -> dict[str, float]:
         laps = {"": time.thread_time()}
         seed_generator(step, torch.device("cpu"))
         laps["seeding"] = time.thread_time()
-        cond = task.condition(batch)
+        cond = model.condition(batch)
         laps["condition"] = time.thread_time()
-        loss = task.process.loss(task.denoiser, batch.x, batch.mask, cond, auxiliary=task.losses)["loss"].mean()
+        loss = model.process.loss(model.denoiser, batch.x, batch.mask, cond, auxiliary=task.losses)["loss"].mean()
         laps["forward pass and loss"] = time.thread_time()
         loss.backward()
         laps["backward pass"] = time.thread_time()

@@ -303,13 +303,13 @@ def _geometry(record: Record, skin: Skin) -> None:
     kinds = ["LayerElementNormal", "LayerElementMaterial"]
     if len(skin.uvs):
         kinds.append("LayerElementUV")
-        places = record.add("LayerElementUV", Int(0))
-        places.add("Version", Int(101))
-        places.add("Name", "uv")
-        places.add("MappingInformationType", "ByPolygonVertex")
-        places.add("ReferenceInformationType", "IndexToDirect")
-        places.add("UV", skin.uvs.astype("<f8").ravel())
-        places.add("UVIndex", skin.triangles.astype("<i4").ravel())
+        coordinates = record.add("LayerElementUV", Int(0))
+        coordinates.add("Version", Int(101))
+        coordinates.add("Name", "uv")
+        coordinates.add("MappingInformationType", "ByPolygonVertex")
+        coordinates.add("ReferenceInformationType", "IndexToDirect")
+        coordinates.add("UV", skin.uvs.astype("<f8").ravel())
+        coordinates.add("UVIndex", skin.triangles.astype("<i4").ravel())
 
     layer = record.add("Layer", Int(0))
     layer.add("Version", Int(100))

@@ -89,7 +89,7 @@ def test_joints_in_closed_form_and_missing_skeletons_and_rates(files):
         ("arm 40 50", "leg 40 50", "line 12: leg is no moving bone"),
         ("arm 40 50\n", "", "line 11: frame 3 ends without arm"),
         (MOTION, "", "line 1: not an AMC file"),
-        (MOTION, "version https://git-lfs.github.com/spec/v1\n", "line 1: version is no moving bone"),
+        (MOTION, "version https://git-lfs.github.com/spec/v1\n", "a Git LFS pointer instead of the file"),
         ("dof rx rz", "dof rx l", "07.asf, line 19: degrees of freedom must be among rx, ry and rz"),
         ("axis 0 0 90 XYZ", "axis 0 0 90 XXZ", "line 19: an order of axes is needed"),
         ("    arm hand", "    arm foot", "line 29: bone foot is unknown"),

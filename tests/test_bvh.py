@@ -147,9 +147,9 @@ def test_damaged_files_are_named_with_the_line(parse):
         (ARM.replace("Frames:\t3", "Frames: many"), 15, "expected Frames:"),
         (ARM.replace("0.0333333", "0"), 16, "frame time"),
         (ARM.replace("0.0333333", "fast"), 16, "expected Frame Time:"),
-        (ARM.replace("Frames:\t3", "Frames:\t4"), 19, "ends after 3 frames"),
-        (ARM.replace("Frames:\t3", "Frames:\t2"), 19, "after 3 frames"),
-        (ARM[: ARM.index("0 0 0 0")].replace("Frames:\t3", "Frames:\t0"), 16, "ends after 0 frames"),
+        (ARM.replace("Frames:\t3", "Frames:\t4"), 19, "contains 3 frames, but says 4"),
+        (ARM.replace("Frames:\t3", "Frames:\t2"), 19, "contains 3 frames, but says 2"),
+        (ARM[: ARM.index("0 0 0 0")].replace("Frames:\t3", "Frames:\t0"), 16, "contains 0 frames, but says 0"),
         (ARM.replace("50 60 9.5", "50 60 oops"), 19, "expected 10 finite"),
         (ARM.replace("0 90 -3 90", "0 90 inf 90"), 18, "expected 10 finite"),
     ):

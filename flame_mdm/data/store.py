@@ -186,8 +186,8 @@ def _write(folder: Path, source: MotionSource, representation: Representation, t
         entries, frames = _pack(folder, source.name, encoded, representation.features)
     splits = Counter(entry.split for entry in entries)
     if not splits["train"]:
-        advice = "For your own data, add a `split` column to captions.csv"
-        raise UserError(f"{source.name}: no clip is in the training split. {advice}")
+        advice = " Add a `split` column to captions.csv" if source.named_by_recipe else ""
+        raise UserError(f"{source.name}: no clip is in the training split.{advice}")
     index = (json.dumps(asdict(entry), ensure_ascii=False, sort_keys=True) + "\n" for entry in entries)
     (folder / "clips.jsonl").write_text("".join(index), encoding="utf-8")
     mean, std = source.statistics() or training_statistics(folder, entries, frames, representation)

@@ -152,7 +152,7 @@ def read(path: str | Path) -> Bvh:
     width = sum(len(node.channels) for node in nodes)
     frames = [source.numbers(words, width) for words in source]
     if len(frames) != count or not frames:
-        source.fail(f"the file ends after {len(frames)} frames, but must have {max(count, 1)}")
+        source.fail(f"the file contains {len(frames)} frames, but says {count}")
     return Bvh(
         tuple(node.name for node in nodes),
         tuple(node.parent for node in nodes),

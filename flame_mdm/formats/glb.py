@@ -4,6 +4,7 @@ Khronos Group, "glTF 2.0 Specification", https://registry.khronos.org/glTF/specs
 """
 
 import json
+import re
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,6 +29,8 @@ LIMIT = 512 * MEBIBYTE  # maximum size of a file that is read
 DOCUMENT_LIMIT = 16 * MEBIBYTE  # maximum size of its JSON part, which takes many times its size in memory
 MAX_NODES, MAX_ITEMS = 4096, 65_536  # maximum number of nodes, and of all other items of one list
 LARGEST = 1e9  # largest coordinate or matrix entry that is read
+HARMLESS = re.compile(r"KHR_(materials|texture|lights|mesh|draco)_|EXT_texture_|VRM")
+"""Required extensions that change neither nodes, skins nor bounds: a character is read, and written with them."""
 
 Item = TypeVar("Item")
 Index = Annotated[int, Field(ge=0, lt=2**40)]  # into another list, or a number of bytes; -1 if it is missing
@@ -103,6 +106,7 @@ class _Asset(_Object):
 
 class _Document(_Object):
     asset: _Asset
+    extensionsRequired: Annotated[list[str], Field(max_length=256)] = []
     nodes: NodeItems[_Node] = []
     meshes: NodeItems[_Mesh] = []
     skins: Annotated[list[_Skin], Field(max_length=256), FailFast()] = []
@@ -164,6 +168,8 @@ def read(path: Path) -> Glb:
     try:
         document, data = _chunks(content)
         parts = _Document.model_validate(document)
+        if unread := [name for name in parts.extensionsRequired if not HARMLESS.match(name)]:
+            raise UserError(f"it requires {unread[0][:80]}, which is not read. Export it without this compression")
         order, above = _ordered(parts.nodes)
         rank = np.argsort(order).tolist()  # index in the document -> number
         parents = tuple(rank[above[number]] if number in above else -1 for number in order)
@@ -175,6 +181,8 @@ def read(path: Path) -> Glb:
         if not (np.abs(worlds) <= LARGEST).all():
             raise ValueError("numbers are not finite, or too large")
         skins = _skins(parts, data, rank)
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from error
     except (ValueError, struct.error) as error:
         reason = first_line(error)
         if isinstance(error, ValidationError):

@@ -40,6 +40,8 @@ ARRAYS_LIMIT = 128 * MEBIBYTE
 """Total size that the arrays of a compressed file may always have. Beyond that, they may have up to `INFLATION` times
 the size of the file; motion data compresses less than 10 times."""
 INFLATION = 20
+GIT_LFS = b"version https://git-lfs.github.com/spec/"  # beginning of the file that replaces one in Git LFS
+POINTER_LIMIT = 1024  # size in bytes below which such files are
 
 ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError)
 """Errors that `zipfile` raises for damaged, encrypted and unusually compressed archives."""
@@ -217,7 +219,18 @@ def regular_file(path: str | Path, limit: int | None = None) -> int:
         raise UserError(f"{path}: {kind}, not a file")
     if limit is not None and status.st_size > limit:
         raise UserError(f"{path}: {_size(status.st_size)}, but such a file may have at most {_size(limit)}")
+    if status.st_size < POINTER_LIMIT and _begins(path, GIT_LFS):
+        raise UserError(f"{path}: a Git LFS pointer instead of the file. Run `git lfs pull` in its repository")
     return status.st_size
+
+
+def _begins(path: str | Path, content: bytes) -> bool:
+    """Returns whether a file that can be read begins with `content`."""
+    try:
+        with Path(path).open("rb") as file:
+            return file.read(len(content)) == content
+    except OSError:  # its reader says why
+        return False
 
 
 def read_text(path: str | Path, limit: int = TEXT_LIMIT) -> str:

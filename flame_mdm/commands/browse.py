@@ -42,7 +42,8 @@ def main(settings: BrowseSettings) -> None:
     representation = instantiate(settings.nodes["representation"])
     data = instantiate(node, representation=representation)
     if (data.folder / STORE).exists() and data.source.named_by_recipe:
-        data.source.options = Store(data.folder).info.get("source", {})  # own data are shown as they were prepared
+        info = Store(data.folder).info  # own data are shown as they were prepared
+        data.source.options, data.source.version = info.get("source", {}), info.get("version", 1)
         if settings.source is not None:
             say(f"{data.folder}: already prepared; source={settings.source} is not read (prepare it with force=true)")
     data.prepare_data()

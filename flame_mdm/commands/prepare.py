@@ -33,7 +33,9 @@ def main(settings: PrepareSettings) -> None:
     representation = instantiate(settings.nodes["representation"])
     data = instantiate(node, representation=representation)
     if settings.check:
-        say(*data.source.check())
+        say(*data.source.check(representation.fps))
+        if data.source.failures:
+            raise SystemExit(1)
         return
     if settings.verify:
         checked = report(data)
@@ -54,4 +56,7 @@ def main(settings: PrepareSettings) -> None:
     say(*data.counts(store))
     if info["excluded"]:
         say("excluded: " + ", ".join(f"{count} {reason}" for reason, count in info["excluded"].items()))
-    say(f"{info['shape'][0]} frames with {info['shape'][1]} features, fingerprint {store.fingerprint}: {data.folder}")
+    size = f"{info['shape'][0]} frames with {info['shape'][1]} features"
+    say(f"{size}, fingerprint {store.fingerprint}: {data.folder}", *data.source.failure_lines())
+    if data.source.failures:
+        raise SystemExit(1)

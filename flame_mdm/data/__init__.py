@@ -57,6 +57,11 @@ class MotionSource(ABC):
     published_split: bool = False
     """Whether the split is the one used in papers although it tests on clips seen in training or leaves no validation
     clips. Saved in the store and in every result."""
+    version: int = 1
+    """Version of the way in which motions are read, part of the fingerprint: a store of another one is not used."""
+    failures: Sequence[str] = ()
+    """Lines about motions that could not be read and are not prepared, complete once `clips` is exhausted; the user
+    should correct them, so that commands end with exit code 1."""
     workers: int = 0  # processes that read and encode; 0 = one per core, 1 = this process only
     exclude: Collection[str] = ()  # names to leave out
 
@@ -97,8 +102,12 @@ class MotionSource(ABC):
         damaged or an option does not fit the data.
         """
 
-    def check(self) -> list[str]:
-        """Returns lines to print about the files that are present and missing; prepares nothing."""
+    def failure_lines(self) -> list[str]:
+        """Returns lines to print about `failures`, none if there are none."""
+        return [f"error: {failure}" for failure in self.failures]
+
+    def check(self, fps: float) -> list[str]:
+        """Returns lines to print about the files that are present and missing, at `fps`; prepares nothing."""
         return [f"{self.name}: {self.count()} clips can be prepared"]
 
     def statistics(self) -> tuple[np.ndarray, np.ndarray] | None:

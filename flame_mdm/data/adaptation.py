@@ -53,6 +53,7 @@ class Lesson(MotionSource):
     def clips(self, fps: float) -> Iterator[Clip]:
         for clip in self.folder.clips(fps):
             yield replace(clip, captions=[styled(caption, self.name) for caption in clip.captions])
+        self.folder.require_all()  # of a few clips, none is left out
         for entry in self.kept():
             features, name, encoded = self.store.motion(entry), KEPT + entry.id, self.store.info["representation"]
             yield Clip(name, features, entry.captions, entry.split, name, encoded=encoded)
@@ -63,8 +64,10 @@ def styled(caption: str, name: str) -> str:
 
 
 def check_clips(path: str | Path, fps: float) -> None:
-    """Raises `UserError` if the floor of motions in a folder rises, or their bodies float above it."""
-    faults = (f"{clip.id} {fault}" for clip in Folder(str(path)).clips(fps) if (fault := fault_of(clip.motion, fps)))
+    """Raises `UserError` if motions in a folder cannot be read, their floor rises, or their bodies float above it."""
+    folder = Folder(str(path))
+    faults = [f"{clip.id} {fault}" for clip in folder.clips(fps) if (fault := fault_of(clip.motion, fps))]
+    folder.require_all()
     if listed := some(faults):
         raise UserError(f"{path}: {listed}. The model would learn that: correct these clips, or add force=true")
 

@@ -21,9 +21,11 @@ from flame_mdm.data.parallel import in_order
 from flame_mdm.data.t2m import MAX_LENGTH, Cut, Description, cuts
 from flame_mdm.errors import UserError
 from flame_mdm.formats.bvh import Bvh
-from flame_mdm.formats.layouts import LAYOUTS, check_feet, check_size, find_skeleton, leg_length, map_bvh, read_tree
+from flame_mdm.formats.layouts import LAYOUTS, leg_length
 from flame_mdm.formats.motion import amass_parameters
 from flame_mdm.formats.poses import solve
+from flame_mdm.formats.readers import read_recording
+from flame_mdm.formats.recordings import is_at_60
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.representations.smpl import ADULT
 from flame_mdm.safe_io import naming, read_json, read_yaml
@@ -35,7 +37,6 @@ RATES = (120.0, 60.0)  # frame rates of the recordings, the usual one first
 SLACK = 0.05  # seconds, one frame at 20 fps, by which durations may differ
 SHORTEST = 40  # rows of features of a clip, as in HumanML3D
 BLENDED = 3  # frames after the T-pose of a Daz-friendly file that are blended with it
-FASTEST = 15.0  # m/s of the pelvis, above which a conversion is damaged; sprinters reach 12
 Evidence = tuple[float | None, int | None, bool]  # arguments of `decide_rate` that the captions give
 MAP = {**LAYOUTS["CMU ASF"].map, "pelvis": "pelvis", "neck": {"lowerneck": 0.5, "head": 0.5}, "head": "face"}
 _HIP, _KNEE, _ANKLE, _HEAD = (ADULT[SMPL22.joints.index(n)] for n in ("left_hip", "left_knee", "left_ankle", "head"))
@@ -177,7 +178,7 @@ class CMU(MotionSource):
         self.check_fps(fps, FPS)
         last = {_recording(row.key): row.end for row in sorted(self.humanml3d[0], key=lambda row: row.end)}
         seconds = {trial: length for _, trial, _, length in self.kit}
-        evidence = {trial: (seconds.get(trial), last.get(trial), _is_in("sixty", trial)) for trial in self.items}
+        evidence = {trial: (seconds.get(trial), last.get(trial), is_at_60(trial)) for trial in self.items}
         tasks = [(self.files[trial], evidence[trial], items) for trial, items in self.items.items()]
         for trial, motions in zip(self.items, in_order(partial(_read, self.motion), tasks, self.workers), strict=True):
             if isinstance(motions, str):
@@ -287,21 +288,25 @@ def _read(kind: str, task: tuple[list[Path], Evidence, list[Item]]) -> list[np.n
     files, evidence, items = task
     errors = []
     for file in files:
+        is_original = _rank(file) == 0
+        standard = partial(_standardized, is_original, evidence)
         try:
-            is_original = _rank(file) == 0
-            tree, fields = standardize(read_tree(file, RATES[0] if is_original else None))
-            rate = decide_rate(len(tree.frames), None if is_original else tree.fps, *evidence)
-            with naming(file):
-                joints, layout = map_bvh(replace(tree, fps=rate), FPS, fields or find_skeleton(file))
-                check_size(joints, layout.unit)
-                check_feet(joints)
-                if (speed := np.linalg.norm(np.diff(joints[:, 0], axis=0), axis=1).max(initial=0.0) * FPS) > FASTEST:
-                    raise UserError(f"the body jumps, it moves at {speed:.0f} m/s: a damaged conversion")
+            recording = read_recording(file, FPS, fps=RATES[0] if is_original else None, standard=standard)
+            if recording.doubts.jump:
+                raise UserError(f"{file}: {recording.doubts.jump}")
         except (UserError, OSError) as error:
             errors.append(str(error))
         else:
+            joints = recording.motion.joints
             return [_part(joints[item.start : item.end], item.mirrored, kind) for item in items]
     return errors[0]
+
+
+def _standardized(is_original: bool, evidence: Evidence, tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
+    """Returns a recording as `standardize` does, at its frame rate."""
+    tree, fields = standardize(tree)
+    rate = decide_rate(len(tree.frames), None if is_original else tree.fps, *evidence)
+    return replace(tree, fps=rate), fields
 
 
 def _part(joints: np.ndarray, mirrored: bool, kind: str) -> np.ndarray:

@@ -131,6 +131,7 @@ class MotionDataModule(LightningDataModule):
             say(*self.source.changed(self.folder / "store.json"))
         else:
             write_store(self.folder, self.source, self.representation)
+            say(*self.source.failure_lines())
 
     @property
     def actions(self) -> Sequence[str]:
@@ -150,9 +151,10 @@ class MotionDataModule(LightningDataModule):
             "representation": self.representation.name,
             "fps": self.representation.fps,
             "published_split": self.source.published_split,
+            "version": self.source.version,
             **self.source.options,
         }
-        prepared = store.info | store.info.get("source", {})
+        prepared = {"version": 1} | store.info | store.info.get("source", {})
         if differing := [name for name in recipe if prepared.get(name) != recipe[name]]:
             there, here = (", ".join(f"{name}={of.get(name)}" for name in differing) for of in (prepared, recipe))
             advice = "Prepare it again with force=true, choose another data_root or data.name, or change the recipe"

@@ -9,33 +9,22 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
 
 from flame_mdm.data import SPLITS, Clip, MotionSource, Split, hashed_split, mirrored, name_hash, some
 from flame_mdm.data.parallel import in_order
-from flame_mdm.errors import UserError, printable
-from flame_mdm.formats import ENDINGS, TREES
-from flame_mdm.formats.layouts import (
-    array_layout,
-    check_feet,
-    check_size,
-    layout_name,
-    map_bvh,
-    read_skeleton,
-    read_tree,
-    skeleton_file,
-)
-from flame_mdm.formats.readers import read_arrays, smpl_motion
-from flame_mdm.formats.resampling import resample
+from flame_mdm.errors import UserError, first_line, printable
+from flame_mdm.formats import ENDINGS, motions_in
+from flame_mdm.formats.checks import LYING
+from flame_mdm.formats.readers import read_recording
 from flame_mdm.representations import rotation
 from flame_mdm.representations.skeleton import SMPL22
-from flame_mdm.representations.smpl import SMPL
-from flame_mdm.safe_io import naming, read_text, regular_file
+from flame_mdm.safe_io import naming, read_text
 
-LOOK_FPS = 20.0  # frame rate to which `Folder.check` resamples motions
+SHORTEST = 3  # frames that representations need at least
 SPLITTABLE = 10  # number of motions from which on each split has at least one
 TABLE = "captions.csv"
 COLUMNS = ("id", "text", "action", "split", "source")
@@ -67,6 +56,7 @@ class Folder(MotionSource):
 
     name = "folder"
     named_by_recipe = True
+    version = 2  # 1: joints of arrays were interpolated linearly
 
     def __init__(
         self,
@@ -81,63 +71,84 @@ class Folder(MotionSource):
         self.path, self.motion, self.mirror, self.exclude = Path(path), motion, mirror, tuple(exclude)
         self.workers = workers
         self.options = {"motion": motion, "mirror": mirror, "exclude": list(exclude)}
-        self._upright: defaultdict[str, list[float]] = defaultdict(list)  # of the motions read so far, by skeleton
+        self._uprights: defaultdict[str, list[float]] = defaultdict(list)  # of the motions read so far, by layout
+        self._notes: Counter[str] = Counter()  # lines about the motions read so far
 
     def count(self) -> int:
         splits = Counter(self.splits.values())
         return sum(splits.values()) + (splits["train"] if self.mirror else 0)
 
     def clips(self, fps: float) -> Iterator[Clip]:
+        """Yields the clips of all motions that can be read; `failures` lists the others."""
         self.actions = tuple(sorted({note.action for note in self.notes.values() if note.action is not None}))
-        read = in_order(partial(_read, self.motion, fps), self.files.values(), self.workers)
-        for name, (motion, skeleton, upright) in zip(self.files, read, strict=True):
-            self._upright[skeleton].append(upright)
+        for name, motion in self._motions(fps):
             note, split = self.notes[name], self.splits[name]
             action = None if note.action is None else self.actions.index(note.action)
             clip = Clip(name.replace("/", "_"), motion, note.texts, split, note.source or name, action)
             yield clip
             if self.mirror and split == "train":
                 yield mirrored(clip, SMPL22.mirror(torch.from_numpy(motion)).numpy(), self.actions)
+        if len(self.failures) == len(self.files):
+            self.require_all()
+        self.leave_out("motions that cannot be read", len(self.failures))
         self._check_upright()
+
+    def _motions(self, fps: float) -> Iterator[tuple[str, np.ndarray]]:
+        """Yields name and motion of each file that can be read, and keeps what was learned of all."""
+        self.failures = failures = list[str]()
+        self._uprights, self._notes = defaultdict(list), Counter()
+        attempts = in_order(partial(_read, self.motion, fps), self.files.values(), self.workers)
+        for name, attempt in zip(self.files, attempts, strict=True):
+            if attempt.error:
+                failures.append(attempt.error)
+                continue
+            self._uprights[attempt.layout].append(attempt.upright)
+            self._notes.update(attempt.notes)
+            yield name, attempt.motion
 
     def findings(self) -> list[str]:
-        """Returns the skeletons of the motions read so far."""
-        return [f"{skeleton}: {len(motions)} motions" for skeleton, motions in self._upright.items()]
+        """Returns the skeletons of the motions read so far, and what was left out of them."""
+        skeletons = [f"{layout}: {len(motions)} motions" for layout, motions in self._uprights.items()]
+        return skeletons + [f"{count} motions: {note}" for note, count in self._notes.items()]
 
-    def check(self) -> list[str]:
+    def check(self, fps: float) -> list[str]:
         """Reads all captions and motions; returns lines on skeletons and failures."""
-        errors = []
-        for error, skeleton, upright in in_order(partial(_look, self.motion), self.files.values(), self.workers):
-            if error:
-                errors.append(f"error: {error}")
-            else:
-                self._upright[skeleton].append(upright)
-        if errors:
-            summary = f"error: {len(errors)} of {len(self.files)} motions of {self.path} cannot be prepared"
-            return [*self.findings(), *errors, summary]
+        splits = Counter(self.splits[name] for name, _ in self._motions(fps))
+        if self.failures:
+            return [*self.findings(), *self.failure_lines()]
         self._check_upright()
-        splits = ", ".join(f"{list(self.splits.values()).count(split)} {split}" for split in SPLITS)
-        return [*self.findings(), f"{self.name}: {self.count()} clips can be prepared (motions: {splits})"]
+        motions = ", ".join(f"{splits[split]} {split}" for split in SPLITS)
+        return [*self.findings(), f"{self.name}: {self.count()} clips can be prepared (motions: {motions})"]
+
+    def failure_lines(self) -> list[str]:
+        if not self.failures:
+            return []
+        summary = f"error: {len(self.failures)} of {len(self.files)} motions of {self.path} cannot be prepared"
+        return [*(f"error: {failure}" for failure in self.failures), summary]
+
+    def require_all(self) -> None:
+        """Raises `UserError` if a motion could not be read."""
+        if self.failures:
+            more = f" (and {len(self.failures) - 1} more)" if len(self.failures) > 1 else ""
+            raise UserError(f"{self.failures[0]}{more}")
 
     def _check_upright(self) -> None:
-        for skeleton, motions in self._upright.items():
-            if np.median(motions) < 0.3:
-                what = f"the body is lying down in most motions ({skeleton})"
-                raise UserError(f"{self.path}: {what}; set the axis `up` in skeleton.yaml")
+        for layout, uprights in self._uprights.items():
+            if np.median(uprights) < LYING:
+                where = f"{self.path}: the body is lying down in most motions ({layout})"
+                raise UserError(f"{where}; set the axis `up` in skeleton.yaml")
 
     @cached_property
     def files(self) -> dict[str, Path]:
         """Path in the folder without extension -> file, sorted."""
         files: dict[str, Path] = {}
-        for path in sorted(self.path.rglob("*")):
-            if path.suffix.lower() in ENDINGS:
-                name = path.relative_to(self.path).with_suffix("").as_posix()
-                if (shown := printable(name)) != name:
-                    raise UserError(f"{shown}: its name contains control characters or is not UTF-8. Rename it")
-                regular_file(path)
-                if name in files:
-                    raise UserError(f"{path}: has the same name as {files[name].name}; each motion needs its own name")
-                files[name] = path
+        for path in motions_in(self.path):
+            name = path.relative_to(self.path).with_suffix("").as_posix()
+            if (shown := printable(name)) != name:
+                raise UserError(f"{shown}: its name contains control characters or is not UTF-8. Rename it")
+            if name in files:
+                raise UserError(f"{path}: has the same name as {files[name].name}; each motion needs its own name")
+            files[name] = path
         if not files:
             reason = "no motions in this folder" if self.path.is_dir() else "no such folder"
             raise FileNotFoundError(f"{self.path}: {reason}. Give a folder of {', '.join(ENDINGS)} files")
@@ -220,52 +231,35 @@ def _add(notes: dict[str, Note], cells: dict[str, str]) -> None:
             setattr(note, key, value)
 
 
-def _look(kind: str, path: Path) -> tuple[str, str, float]:
-    """Returns what is wrong with a motion, or "", and what `_read` returns beside it."""
+@dataclass
+class _Attempt:
+    """A motion that was read for a data set, or the line that says why it cannot be used."""
+
+    error: str = ""
+    motion: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    layout: str = ""  # skeleton, unit and frame rate of the file
+    upright: float = math.nan  # as in `Recording`
+    notes: Sequence[str] = ()
+
+
+def _read(kind: str, fps: float, path: Path) -> _Attempt:
+    """Reads joints or, if `kind` is "smpl", a raw motion of SMPL's rotations, at `fps` frames per second."""
     try:
-        return "", *_read(kind, LOOK_FPS, path)[1:]
-    except ValueError as error:
-        return str(error), "", math.nan
-
-
-def _read(kind: str, fps: float, path: Path) -> tuple[np.ndarray, str, float]:
-    """Reads and checks joints or, if `kind` is "smpl", a raw motion.
-
-    Also returns its skeleton with unit and frame rate, and the mean vertical component of the direction of its trunk,
-    which is NaN for rotations of SMPL.
-    """
-    skeleton = skeleton_file(path)
-    fields = read_skeleton(skeleton) if skeleton else {}
-    where = f" ({os.path.relpath(skeleton)})" if skeleton else ""
-    with naming(path, ValueError):
-        if path.suffix.lower() in TREES:
-            file = read_tree(path, fields.get("fps") if path.suffix.lower() == ".amc" else None)
-            rate = file.fps
-            joints, layout = map_bvh(file, fps, fields)
+        recording = read_recording(path, fps, as_smpl=True)
+        joints, doubts = recording.motion.joints, recording.doubts
+        if doubts.jump:
+            raise UserError(f"{path}: {doubts.jump}")
+        if len(joints) < SHORTEST:
+            raise UserError(f"{path}: {len(joints)} frames at {fps:g} per second, but a motion has at least {SHORTEST}")
+        if kind == "joints":
+            motion = joints
+        elif recording.smpl is None:
+            raise UserError(f"{path}: contains no SMPL rotations; use AMASS .npz files, or set motion=joints")
         else:
-            data = read_arrays(path)
-            rate = data.setdefault("fps", fields.get("fps"))
-            if rate is None:
-                raise UserError("no frame rate in the file. Write it into skeleton.yaml, for example `fps: 30`")
-            if "poses" in data:
-                return _from_smpl(kind, data, fps), f"AMASS, {rate:g} fps{where}", math.nan
-            layout, names = array_layout(data["joints"], fields)
-            joints = layout.apply(resample(data["joints"].astype(float), rate, fps), names)
-        if kind == "smpl":
-            raise UserError("contains no SMPL rotations; use AMASS .npz files, or set motion=joints")
-        check_size(joints, layout.unit, layout.children)
-        check_feet(joints)
-    trunk = joints[:, SMPL22.joints.index("neck")] - joints[:, 0]
-    upright = float((trunk[:, 1] / np.linalg.norm(trunk, axis=1)).mean())
-    return joints, f"{layout_name(layout)}, unit {layout.unit:.4g}, {rate:g} fps{where}", upright
-
-
-def _from_smpl(kind: str, data: dict[str, Any], fps: float) -> np.ndarray:
-    translation, turns = smpl_motion(data, fps)
-    angles = rotation.quaternion_to_axis_angle(turns).flatten(1).numpy()
-    motion = np.concatenate([translation.numpy(), angles], 1).astype(np.float32)
-    if kind == "smpl":
-        return motion
-    representation = SMPL()
-    joints = representation.decode(representation.encode(torch.from_numpy(motion)))
-    return joints[:, : len(SMPL22)].numpy()
+            translation, turns = recording.smpl
+            angles = rotation.quaternion_to_axis_angle(turns).flatten(1)
+            motion = torch.cat([translation, angles], 1).numpy().astype(np.float32)
+    except (ValueError, OSError) as error:
+        return _Attempt(first_line(error))
+    notes = [note for note in recording.motion.notes if note not in doubts.lines]
+    return _Attempt("", motion, recording.layout, doubts.upright, notes)

@@ -112,9 +112,9 @@ class HumanML3D(T2MFolder):
             self._make(self.amass)
         return super().count()
 
-    def check(self) -> list[str]:
+    def check(self, fps: float) -> list[str]:
         if not self.amass:
-            return super().check()
+            return super().check(fps)
         todo = self._todo()
         done = f"{len(self.rows) - len(todo)} of {len(self.rows)} motions and their mirrored copies are created"
         return [done, *(f"missing: {line}" for line in self._missing(self.amass, todo))]

@@ -77,6 +77,7 @@ class Contents(Schema):
     published_split: bool
     actions: list[str]
     shape: Annotated[list[Count], Field(min_length=2, max_length=2)]
+    version: Int = 1
     clips: Annotated[dict[Split, Int], Field(min_length=len(SPLITS))]
     excluded: dict[str, Int]
     sha256: dict[str, str]
@@ -115,7 +116,8 @@ class Store:
                 raise ValueError(f"not a mean and std of {width} features")
         name, fps = self.info["representation"], self.info["fps"]
         with _intact(contents):
-            if _fingerprint(self.folder, name, fps, self.mean, self.std) != self.fingerprint:
+            version = self.info.get("version", 1)
+            if _fingerprint(self.folder, name, fps, self.mean, self.std, version) != self.fingerprint:
                 raise ValueError("its fingerprint does not match the clips")
 
     def motion(self, clip: Entry) -> np.ndarray:
@@ -206,7 +208,8 @@ def _write(folder: Path, source: MotionSource, representation: Representation, t
         "clips": {split: splits[split] for split in SPLITS},
         "shape": [frames, representation.features],
         "hours": round(frames / representation.fps / 3600, 3),
-        "fingerprint": _fingerprint(folder, representation.name, representation.fps, mean, std),
+        **({"version": source.version} if source.version > 1 else {}),
+        "fingerprint": _fingerprint(folder, representation.name, representation.fps, mean, std, source.version),
         "sha256": {path.name: sha256(path) for path in sorted(folder.iterdir())},
     }
     (folder / "store.json").write_text(json.dumps(info, indent=2) + "\n")
@@ -307,12 +310,13 @@ def _encode(encoder: Representation, named: tuple[str, str, np.ndarray]) -> np.n
     return features
 
 
-def _fingerprint(folder: Path, representation: str, fps: float, mean: np.ndarray, std: np.ndarray) -> str:
+def _fingerprint(folder: Path, representation: str, fps: float, mean: np.ndarray, std: np.ndarray, version: int) -> str:
     digest = hashlib.sha256((folder / "clips.jsonl").read_bytes())
     # Features differ in their last bits between processors and thread counts, so the fingerprint depends on them only
     # through statistics rounded to a fixed number of decimals. Adding 0.0 makes -0.0 and 0.0 equal.
     rounded = [round(float(value), 4) + 0.0 for value in np.concatenate([mean, std])]
-    digest.update(json.dumps([representation, fps, rounded]).encode())
+    versions = [version] if version > 1 else []  # fingerprints of version 1 do not contain it
+    digest.update(json.dumps([representation, fps, rounded, *versions]).encode())
     return digest.hexdigest()[:16]
 
 

@@ -1,5 +1,6 @@
 """Motion files for exchange with other programs. `docs/formats.md` lists units, axes and joints of each format."""
 
+import re
 from pathlib import Path
 
 from flame_mdm.errors import UserError
@@ -10,10 +11,65 @@ USD = (".usda", ".usdc", ".usdz")  # Universal Scene Description
 RIGGED = (".bvh", ".glb", ".fbx", *USD)  # of files that can have the skeleton of another program
 WRITTEN = (*RIGGED, ".vrma", ".npz", ".json", ".npy", ".gif", ".mp4")  # of the files that `Motion.save` writes
 
+ADVICE = {
+    ".fbx": "Open it in Blender and export BVH (File > Export > Motion Capture)",
+    ".glb": "Open it in Blender and export BVH (File > Export > Motion Capture)",
+    ".gltf": "Open it in Blender and export BVH (File > Export > Motion Capture)",
+    ".blend": "Open it in Blender and export BVH (File > Export > Motion Capture)",
+    ".c3d": "It contains markers, not joints: fit a skeleton with your motion capture program and export BVH",
+    ".trc": "It contains markers, not joints: fit a skeleton with your motion capture program and export BVH",
+    ".pkl": "A pickle can run code and is never opened: save its arrays with numpy.savez as poses, trans and fps",
+    ".pt": "Save its arrays with numpy.savez as joints and fps, or as poses, trans and mocap_framerate",
+    ".csv": "Save joints (frames, joints, 3) with numpy.savez as joints and fps",
+}
+"""Ending of motion files that are not read -> what to do."""
+
+NO_MOTIONS = ("shape.npz", "_stagei.npz")
+"""Ends of the names of AMASS's files that contain the shape of a body and no motion."""
+JOINTS_IN_JSON = re.compile(rb'"(joints|posed_joints)"\s*:\s*\[\s*\[')  # as other JSON files lack
+
+
+def unread(path: Path) -> UserError:
+    """Returns the error for a file whose ending is none of a motion file."""
+    advice = ADVICE.get(path.suffix.lower(), f"Use one of {', '.join(ENDINGS)}")
+    return UserError(f"{path}: {path.suffix or 'a file without ending'} is not read as a motion. {advice}")
+
+
+def motions_in(folder: Path) -> list[Path]:
+    """Returns the motion files in a folder and the folders below it, sorted.
+
+    Hidden files, as macOS and editors leave them, and files of AMASS without motion are left out. Of JSON files, only
+    those with an array of joints are motions.
+    """
+    return sorted(file for file in folder.rglob("*") if _is_motion(file, folder))
+
 
 def motion_files(folder: Path) -> list[Path]:
-    """Returns the motion files in a folder and the folders below it, sorted."""
-    files = sorted(file for file in folder.rglob("*") if file.suffix.lower() in ENDINGS and file.is_file())
+    """Returns the same files; raises `UserError` if there are none."""
+    files = motions_in(folder)
     if not files:
         raise UserError(f"{folder}: no motion files ({', '.join(ENDINGS)})")
     return files
+
+
+def _is_motion(file: Path, folder: Path) -> bool:
+    parts, suffix = file.relative_to(folder).parts, file.suffix.lower()
+    if suffix not in ENDINGS or "__MACOSX" in parts or any(part.startswith(".") for part in parts):
+        return False
+    if file.name.lower().endswith(NO_MOTIONS):
+        return False
+    return suffix != ".json" or not file.is_file() or _has_joints(file)
+
+
+def _has_joints(file: Path) -> bool:
+    """Returns whether a JSON file has an array of joints; a file that cannot be read is left to its reader."""
+    tail = b""
+    try:
+        with file.open("rb") as content:
+            while block := content.read(2**20):
+                if JOINTS_IN_JSON.search(tail + block):
+                    return True
+                tail = block[-100:]
+    except OSError:
+        return True
+    return False

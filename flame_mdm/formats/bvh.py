@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flame_mdm.errors import UserError
-from flame_mdm.formats.resampling import RATES, frame_pairs
+from flame_mdm.formats.resampling import RATES, frame_pairs, interpolate
 from flame_mdm.safe_io import TEXT_LIMIT, regular_file, write_text
 
 CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "XYZ")
@@ -67,15 +67,19 @@ class Bvh:
         """Returns the position (F, J, 3) of each joint in the world."""
         return forward_kinematics(self.parents, self.rotations(), self.translations())[0]
 
-    def resample(self, fps: float) -> tuple[np.ndarray, np.ndarray]:
+    def resample(self, fps: float, cubic: bool = False) -> tuple[np.ndarray, np.ndarray]:
         """Returns rotations (F', J, 3, 3) and translations (F', J, 3) at times 0, 1/fps, ... up to the last frame.
 
-        Rotations are interpolated on the sphere (slerp), so that bones keep their length, and translations linearly.
+        Rotations are interpolated on the sphere (slerp), so that bones keep their length. Translations are interpolated
+        linearly, or with `cubic` splines.
         """
         before, after, share = frame_pairs(len(self.frames), self.fps, fps, len(self.joints), slack=0)
         translations = self.translations()
         share = share[:, None, None]
-        moved = (1 - share) * translations[before] + share * translations[after]
+        if cubic:
+            moved = interpolate(translations, before + share[:, 0, 0])
+        else:
+            moved = (1 - share) * translations[before] + share * translations[after]
         rotations = self.rotations()
         turn = rotations[before].mT @ rotations[after]
         vectors = Rotation.from_matrix(turn.reshape(-1, 3, 3)).as_rotvec().reshape(turn.shape[:3])

@@ -92,8 +92,11 @@ class Layout(BaseModel):
         for row, joint in zip(weights, SMPL22.joints, strict=True):
             for name, share in _shares(self.map[joint]).items():
                 row[names.index(name)] = share
-        turned = self.unit * (weights @ positions) @ np.array(UP[self.up], float).T
-        return (turned * [-1 if self.mirrored else 1, 1, 1]).astype(np.float32)
+        return self.turn(weights @ positions).astype(np.float32)
+
+    def turn(self, positions: np.ndarray) -> np.ndarray:
+        """Returns positions (F, J, 3) of a file in meters, y up, of the same joints."""
+        return self.unit * positions @ np.array(UP[self.up], float).T * [-1 if self.mirrored else 1, 1, 1]
 
 
 def opposite(joint: str) -> str:
@@ -162,18 +165,16 @@ def read_tree(path: Path, rate: float | None = None) -> bvh.Bvh:
     return file if rate is None else replace(file, fps=rate)
 
 
-def map_bvh(file: bvh.Bvh, fps: float | None, fields: Mapping[str, Any]) -> tuple[np.ndarray, Layout]:
-    """Returns the joints of SMPL, (F, 22, 3) float32 in meters, y up, in a file of `read_tree`, and their layout.
+def tree_layout(file: bvh.Bvh, fields: Mapping[str, Any]) -> tuple[Layout, Sequence[str]]:
+    """Returns the layout of a file of `read_tree`, and the names of its joints as the layout has them.
 
-    They are resampled to `fps` by interpolating rotations, so bones keep their length; None = the rate of the file.
     `fields` of `Layout` override the known ones. Known skeletons whose arrays are in meters are in centimeters in BVH
     files, as written by `flame_mdm.formats`.
     """
     layout = find_layout(file.joints, fields)
     if "map" not in fields and "unit" not in layout.model_fields_set:
         layout = layout.model_copy(update={"unit": 0.01})
-    positions = file.positions() if fps is None else bvh.forward_kinematics(file.parents, *file.resample(fps))[0]
-    return layout.apply(positions, file.joints), layout
+    return layout, file.joints
 
 
 def array_layout(joints: np.ndarray, fields: Mapping[str, Any]) -> tuple[Layout, Sequence[str]]:
@@ -306,8 +307,11 @@ def check_feet(joints: np.ndarray) -> None:
         if _bone(joints, f"{side}_ankle", f"{side}_foot") < FOOT:
             advice = "to the toes, or to the end site of the ankle, such as LeftAnkle.end"
             raise UserError(f"the {side} foot has no length. Map {side}_foot in skeleton.yaml {advice}")
+    # The toes of a foot in the air may point backwards, as while running: of each frame, the lower foot counts.
     across, trunk = at["left_hip"] - at["right_hip"], at["neck"] - at["pelvis"]
-    toes = at["left_foot"] + at["right_foot"] - at["left_ankle"] - at["right_ankle"]
+    depths = [((at[f"{side}_hip"] - at[f"{side}_ankle"]) * trunk).sum(1) for side in ("left", "right")]
+    left, right = (at[f"{side}_foot"] - at[f"{side}_ankle"] for side in ("left", "right"))
+    toes = np.where((depths[0] > depths[1])[:, None], left, right)
     if np.median((np.cross(across, trunk) * toes).sum(1)) < 0:
         raise UserError("the toes point backwards. Exchange left and right in skeleton.yaml, or set `mirrored: true`")
 

@@ -1,7 +1,12 @@
-"""Readers of motion files; writers are in `flame_mdm.formats.motion`. `docs/formats.md` describes the files."""
+"""The reader of motion files; writers are in `flame_mdm.formats.motion`. `docs/formats.md` describes the files.
+
+Commands, data sets and Python read motions here, so that each file gets the same skeleton, frame rate and checks.
+"""
 
 import math
-from collections.abc import Mapping
+import os
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,174 +15,348 @@ import torch
 from torch import Tensor
 
 from flame_mdm.errors import UserError
-from flame_mdm.formats import ENDINGS, TREES
-from flame_mdm.formats.layouts import array_layout, check_size, map_bvh, read_tree
+from flame_mdm.formats import ENDINGS, TREES, checks, unread
+from flame_mdm.formats.arrays import check_numbers, is_real, read_arrays, smpl_motion
+from flame_mdm.formats.bvh import Bvh, forward_kinematics
+from flame_mdm.formats.layouts import (
+    UP,
+    Layout,
+    array_layout,
+    find_skeleton,
+    layout_name,
+    read_tree,
+    skeleton_file,
+    tree_layout,
+)
 from flame_mdm.formats.motion import AMASS_AXES, Motion, motion_of_poses
 from flame_mdm.formats.poses import Poses
-from flame_mdm.formats.resampling import check_frames, frame_pairs, frame_rate, resample
+from flame_mdm.formats.recordings import known_rate
+from flame_mdm.formats.resampling import frame_rate, resample
 from flame_mdm.representations import rotation
 from flame_mdm.representations.motion272 import Motion272
 from flame_mdm.representations.skeleton import SKELETONS, SMPL22, Skeleton
-from flame_mdm.representations.smpl import ADULT, read_pose
-from flame_mdm.safe_io import MEBIBYTE, naming, read_json, read_npy, read_npz, regular_file
+from flame_mdm.representations.smpl import ADULT
+from flame_mdm.safe_io import naming, regular_file
 
 CAMERA_AXES = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))  # of the action data sets: y down to y up
 ROTATED = {"smpl147": 147, "rot6d-25": 150, "motion272": 272}  # with SMPL's rotations -> number of features
-JSON_LIMIT = 128 * MEBIBYTE  # maximum size of a `.json` motion; parsed, it takes many times its size
+BODY_AXES = {"z": AMASS_AXES, "y": torch.eye(3, dtype=torch.float64), "-y": CAMERA_AXES}
+"""Axis that points up in a file of SMPL's rotations -> the rotation to y up; as in AMASS, it is z by default."""
+PELVIS = (0.0, -0.223, 0.028)
+"""Pelvis of SMPL's template in meters: a body is there at translation 0, in the axes of the file, however it turns."""
+
+Standard = Callable[[Bvh], tuple[Bvh, Mapping[str, Any]]]
+"""A change of the tree of a published data set; returns it with fields of `Layout`, none for those of the file."""
+
+
+@dataclass(frozen=True)
+class Doubts:
+    """What looks wrong in a motion and may yet be meant.
+
+    Attributes:
+        upright: mean vertical component of the direction of the trunk, -1 to 1; NaN if it was not measured, in files of
+            this project and with KIT-ML's skeleton.
+        lying: a line if the body lies, "" otherwise.
+        jump: a line if the body jumps or a leg flips, "" otherwise.
+    """
+
+    upright: float = math.nan
+    lying: str = ""
+    jump: str = ""
+
+    @property
+    def lines(self) -> list[str]:
+        return [line for line in (self.lying, self.jump) if line]
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """A motion that was read from a file, and what the reader learned.
+
+    Attributes:
+        motion: the motion; its notes are lines for the user.
+        layout: skeleton, unit and frame rate of the file, as `prepare` lists them.
+        doubts: what looks wrong; its lines are among the notes of the motion.
+        smpl: translation (F, 3) and quaternions (F, 24, 4) of SMPL's joints in AMASS's axes, if the file has them.
+        tree: the tree of joints, without rest pose, at the frame rate of the file, if the file has one.
+    """
+
+    motion: Motion
+    layout: str
+    doubts: Doubts = field(default_factory=Doubts)
+    smpl: tuple[Tensor, Tensor] | None = None
+    tree: Bvh | None = None
 
 
 def read(
     path: str | Path,
     fps: float | None = None,
     unit: float | None = None,
+    up: str | None = None,
     resample_to: float | None = None,
-    fields: Mapping[str, Any] = {},
 ) -> Motion:
     """Reads a motion: `.npz` of this project, of AMASS or with joints and fps, `.bvh`, `.amc`, `.json`, or `.npy`.
 
     Args:
-        path: the file.
+        path: the file. The nearest `skeleton.yaml` in its folder or above describes it, except files written by this
+            project; `fps`, `unit` and `up` override it.
         fps: frames per second, overrides the rate in the file; .npy and .amc files have none.
-        unit: meters per unit of length in .bvh, .amc (default: that of the skeleton) and .npy (default 1) files.
-        resample_to: target frame rate, None = that of the file; rotations of .bvh and AMASS files are interpolated on
-            the sphere, joints with cubic splines.
-        fields: fields of `Layout` that override those of a known skeleton, as from `find_skeleton`; `fps` and `unit`
-            override them in turn. Not for files written by this project, nor for AMASS.
+        unit: meters per unit of length in the file, not for files with SMPL's rotations, such as AMASS.
+        up: the axis of the file that points up: y, z or -y.
+        resample_to: target frame rate, None = that of the file. Rotations are interpolated on the sphere, joints and
+            translations with cubic splines.
 
-    Raises `FileNotFoundError`, or `UserError` if the file is damaged, of another kind, in a wrong unit or without rate.
+    Returns the motion; its `notes` say what was left out or looks wrong. Raises `FileNotFoundError`, or `UserError` if
+    the file is damaged, of another kind, without rate, not of a person's size, or if a key has no effect on it.
+    """
+    return read_recording(path, resample_to, fps=fps, unit=unit, up=up).motion
+
+
+def read_recording(
+    path: str | Path,
+    resample_to: float | None = None,
+    *,
+    fps: float | None = None,
+    unit: float | None = None,
+    up: str | None = None,
+    as_smpl: bool = False,
+    standard: Standard | None = None,
+) -> Recording:
+    """Reads and checks a motion; arguments and errors are those of `read`.
+
+    `as_smpl` maps all arrays to SMPL's 22 joints, otherwise KIT-ML's 21 joints and SMPL's hands are kept. `standard`
+    changes the tree of a published data set, whose root is then resampled linearly, as published.
     """
     path = Path(path)
-    suffix = path.suffix.lower()
-    if suffix not in ENDINGS:
-        raise UserError(f"{path}: unknown kind of motion file. Use one of {', '.join(ENDINGS)}")
+    if path.suffix.lower() not in ENDINGS:
+        raise unread(path)
     regular_file(path)
-    if unit is not None and suffix in (".npz", ".json"):
-        raise UserError(f"{path}: lengths in {suffix} files are in meters; unit is only for .bvh, .amc and .npy")
-    fields = fields if unit is None else {**fields, "unit": unit}
-    with naming(path):
-        rate = None if fps is None else frame_rate(fps)
-        if suffix not in TREES:
-            return _of_arrays(path, rate, resample_to, fields)
-        file = read_tree(path, fields.get("fps") if suffix == ".amc" and rate is None else rate)
-        joints, layout = map_bvh(file, resample_to, fields)
-        check_size(joints, layout.unit, layout.children)
-        return Motion(joints, resample_to or file.fps, id=path.stem)
-
-
-def _of_arrays(path: Path, rate: float | None, resample_to: float | None, fields: Mapping[str, Any]) -> Motion:
-    """Returns the motion in an .npz, .json or .npy file; the arguments are those of `read`."""
-    data = read_arrays(path)
-    if "text" in data:  # written by this project
-        fields = {}
-    rate = data.get("fps", fields.get("fps")) if rate is None else rate
-    if rate is None:
-        raise UserError("no frame rate in the file: set it, for example with fps=20")
-    data["fps"] = frame_rate(rate)
-    text = str(data.get("text", ""))
-    if "joints" not in data:
-        translation, turns = smpl_motion(data, resample_to)
-        poses = _smpl_poses(translation, rotation.quaternion_to_matrix(turns), AMASS_AXES)
-        return motion_of_poses(poses, resample_to or data["fps"], text, path.stem)
-    if {"joints", "map", "up", "mirrored"} & set(fields) or data["joints"].shape[1:2] in ((52,), (77,)):
-        layout, names = array_layout(data["joints"], fields)
-        data = {"fps": data["fps"], "joints": layout.apply(data["joints"].astype(float), names)}
-        fields = {"unit": layout.unit, "children": layout.children}
-    elif "unit" in fields:
-        data["joints"] = data["joints"] * fields["unit"]
-    if fields and data["joints"].shape[1:] == (len(SMPL22), 3):
-        check_size(data["joints"], fields.get("unit", 1.0), fields.get("children", False))
-    joints, fps = data["joints"], data["fps"]
-    skeleton = _skeleton(joints)
-    if resample_to is not None and not math.isclose(fps, resample_to):
-        joints = resample(joints.astype(float), fps, resample_to, cubic=True)
-        return Motion(joints, resample_to, skeleton, text, path.stem)
-    motion = Motion(joints, fps, skeleton, text, path.stem, _poses(data))
-    if "features" in data:
-        motion.features = data["features"].astype(np.float32)
-        motion.representation = str(data.get("representation", ""))
-    return motion
+    said = {key: value for key, value in (("unit", unit), ("up", up)) if value is not None}
+    rate = None if fps is None else frame_rate(fps)
+    fields = find_skeleton(path, up) | said
+    with naming(path, ValueError):
+        if path.suffix.lower() in TREES:
+            return _of_tree(path, rate, resample_to, fields, standard)
+        data = read_arrays(path)
+        if data["ours"]:
+            return _of_ours(path, data, rate, resample_to, fields, said, as_smpl)
+        if "joints" in data:
+            return _of_joints(path, data, rate, resample_to, fields, said, as_smpl)
+        return _of_smpl(path, data, rate, resample_to, fields)
 
 
 def from_array(joints: Any, fps: float | None) -> Motion:
     """Returns a motion of joints (F, J, 3) in meters, y up, of the built-in skeleton with this number of joints."""
     values = joints.detach().cpu().numpy() if isinstance(joints, Tensor) else np.asarray(joints)
-    if not _is_real(values):
+    if not is_real(values):
         name = type(joints).__name__
         raise UserError(f"{name}: not a motion. Give a path, a Motion, or an array of joints (frames, joints, 3)")
-    _check_numbers("joints", values)
+    check_numbers("joints", values)
     skeleton = _skeleton(values)
     if fps is None:
         raise UserError("an array has no frame rate: set it, for example with fps=20")
     return Motion(values, frame_rate(fps), skeleton)
 
 
-def read_arrays(path: Path) -> dict[str, Any]:
-    """Reads the arrays of an .npz, .json or .npy motion: joints, or poses and trans as in AMASS; and fps if present."""
-    suffix = path.suffix.lower()
-    if suffix == ".npz":
-        data: dict[str, Any] = read_npz(path, skip=("dmpls",))
-    elif suffix == ".npy":
-        data = {"joints": read_npy(path)}
+def _of_tree(
+    path: Path,
+    rate: float | None,
+    resample_to: float | None,
+    fields: Mapping[str, Any],
+    standard: Standard | None,
+) -> Recording:
+    _refuse(fields, ["joints"], "BVH and AMC files contain the names of their joints")
+    tree = read_tree(path, fields.get("fps") if rate is None and path.suffix.lower() == ".amc" else rate)
+    notes = []
+    if (people := tree.parents.count(-1)) > 1:
+        notes.append(f"{people} people in the file (ROOT): the first one is read")
+
+    if standard is not None:
+        tree, own = standard(tree)
+        fields = own or fields
+    layout, names = tree_layout(tree, fields)
+    if standard is None and rate is None and (known := known_rate(path.stem, layout_name(layout), tree.fps)):
+        notes.append(f"CMU recorded it at {known:g} frames per second, not {tree.fps:g} as the file says: read at that")
+        tree = replace(tree, fps=known)
+
+    joints = layout.apply(tree.positions(), names)
+    if start := checks.rest_frames(joints, tree.fps):
+        notes.append(_rest_note(start))
+        tree, joints = replace(tree, frames=tree.frames[start:]), joints[start:]
+    checks.check_body(joints, layout.unit, layout.children)
+    doubts = _doubts(joints, tree.fps, layout.up, np.array(UP[layout.up], float))
+    label = _label(path, layout, tree.fps)
+
+    fps = tree.fps if resample_to is None else resample_to
+    if not math.isclose(fps, tree.fps):
+        local = tree.resample(fps, cubic=standard is None)
+        joints = layout.apply(forward_kinematics(tree.parents, *local)[0], names)
+    motion = Motion(joints, fps, id=path.stem, notes=(*notes, *doubts.lines))
+    return Recording(motion, label, doubts, tree=tree)
+
+
+def _of_joints(
+    path: Path,
+    data: dict[str, Any],
+    rate: float | None,
+    resample_to: float | None,
+    fields: dict[str, Any],
+    said: Mapping[str, Any],
+    as_smpl: bool,
+) -> Recording:
+    """Returns the recording of an array of joints; `said` has the keys of the command, which override the file's."""
+    rate, joints = _rate(data, rate, fields), data["joints"]
+    stated = {key: data[key] for key in ("up", "unit") if key in data}
+    fields = _checked(fields | stated | said)
+    names = tuple(data.get("names", ()))
+    if names and not {"joints", "map"} & fields.keys() and all(names != s.joints for s in SKELETONS.values()):
+        fields["joints"] = list(names)
+
+    if as_smpl or {"joints", "map"} & fields.keys() or joints.shape[1:2] not in [(len(s),) for s in SKELETONS.values()]:
+        layout, names = array_layout(joints, fields)
+        joints, skeleton = layout.apply(joints.astype(float), names), SMPL22
     else:
-        data = _read_json(path)
-    if "posed_joints" in data:  # of NVIDIA's Kimodo, whose files do not contain their rate
-        data = {"fps": 30.0, **data, "joints": data["posed_joints"]}
-    if not {"joints", "poses"} & set(data):
-        names = ", ".join(data) or "nothing"
-        raise UserError(f"contains {names}; a motion has joints and fps, or poses, trans and mocap_framerate")
-    for name in {"joints", "poses", "trans"} & set(data):
-        _check_numbers(name, data[name])
-    if "features" in data and (not _is_real(data["features"]) or data["features"].ndim != 2):
-        raise UserError("features are not an array (frames, features) of real numbers")
-    if "poses" in data and data.get("trans", np.zeros(0)).shape != (len(data["poses"]), 3):
-        raise UserError("AMASS files have poses (F, 3 K), trans (F, 3) and mocap_framerate")
-    for key in ("fps", "mocap_framerate", "mocap_frame_rate"):
-        if key in data:
-            data["fps"] = frame_rate(data[key], key)
-    return data
+        layout, skeleton = Layout(**fields), _skeleton(joints)
+        joints = layout.turn(joints.astype(float)).astype(np.float32)
+
+    notes, doubts, start = [], Doubts(), 0
+    if skeleton.joints[: len(SMPL22)] == SMPL22.joints:
+        body = joints[:, : len(SMPL22)]
+        if start := checks.rest_frames(body, rate):
+            notes.append(_rest_note(start))
+        body = body[start:]
+        checks.check_body(body, layout.unit, layout.children)
+        doubts = _doubts(body, rate, layout.up, np.array(UP[layout.up], float))
+    notes += doubts.lines
+    motion = Motion(joints[start:], rate, skeleton, data.get("text", ""), path.stem, notes=tuple(notes))
+    return Recording(_resampled(motion, resample_to), _label(path, layout, rate), doubts)
 
 
-def _is_real(values: np.ndarray) -> bool:
-    return values.dtype.kind in "fiu" and values.dtype.itemsize <= 8
+def _of_smpl(
+    path: Path, data: dict[str, Any], rate: float | None, resample_to: float | None, fields: Mapping[str, Any]
+) -> Recording:
+    others = [key for key in Layout.model_fields if key not in ("up", "fps")]
+    _refuse(fields, others, "the joints and lengths of SMPL's rotations are known")
+    data["fps"] = rate = _rate(data, rate, fields)
+    up = fields.get("up", "z")
+    axes = BODY_AXES[up]
+
+    poses = _smpl_poses(*_matrices(smpl_motion(data)), axes)
+    joints, notes = poses.joints().float().numpy(), []
+    if start := checks.rest_frames(joints, rate):
+        notes.append(_rest_note(start))
+        data |= {name: data[name][start:] for name in ("poses", "trans")}
+        joints = joints[start:]
+    doubts = _doubts(joints, rate, up, axes.numpy())
+    notes += [line for line in (*doubts.lines, checks.below_floor(joints)) if line]
+
+    fps = rate if resample_to is None else resample_to
+    translation, turns = smpl_motion(data, fps)
+    poses = _smpl_poses(*_matrices((translation, turns)), axes)
+    motion = motion_of_poses(poses, fps, data.get("text", ""), path.stem)
+    motion.notes = tuple(notes)
+    label = f"AMASS, {rate:g} fps{_described(path)}"
+    return Recording(motion, label, doubts, _in_amass_axes(translation, turns, axes))
 
 
-def _check_numbers(name: str, values: np.ndarray) -> None:
-    if not _is_real(values):
-        raise UserError(f"{name} are not an array of real numbers")
-    if not values.ndim or not len(values):
-        raise UserError(f"{name} of shape {values.shape} have no frames")
-    check_frames(len(values))
-    if (beyond := ~(np.abs(values) < 1e6)).any():
-        raise UserError(f"numbers of {name} in frame {np.argwhere(beyond)[0][0]} are not finite, or exceed a million")
+def _of_ours(
+    path: Path,
+    data: dict[str, Any],
+    rate: float | None,
+    resample_to: float | None,
+    fields: Mapping[str, Any],
+    said: Mapping[str, Any],
+    as_smpl: bool,
+) -> Recording:
+    """Returns the recording of a file that this project wrote: in meters, y up, with rotations and features."""
+    for key, value in said.items():
+        raise UserError(f"{key}={value} has no effect: this project wrote the file, in meters, y up. Drop {key}=")
+    rate = _rate(data, rate, {})
+    notes = ("skeleton.yaml does not apply: this project wrote the file",) if fields else ()
+    joints, layout = data["joints"], Layout()
+    if as_smpl:
+        layout, names = array_layout(joints, {})
+        joints = layout.apply(joints.astype(float), names)
+    motion = Motion(joints, rate, _skeleton(joints), str(data["text"]), path.stem, _poses(data), notes=notes)
+    if "features" in data:
+        motion.features = data["features"].astype(np.float32)
+        motion.representation = str(data.get("representation", ""))
+    return Recording(_resampled(motion, resample_to), _label(path, layout, rate))
 
 
-def _read_json(path: Path) -> dict[str, Any]:
-    data = read_json(path, JSON_LIMIT)
+def _rate(data: Mapping[str, Any], rate: float | None, fields: Mapping[str, Any]) -> float:
+    """Returns the frame rate of arrays: that of the command, of the file, or of skeleton.yaml."""
+    rate = data.get("fps", fields.get("fps")) if rate is None else rate
+    if rate is None:
+        raise UserError("no frame rate in the file: give fps=20, or write `fps: 20` into skeleton.yaml")
+    return frame_rate(rate)
+
+
+def _checked(fields: dict[str, Any]) -> dict[str, Any]:
+    """Returns fields of `Layout`, some of which a JSON file states, if they are valid."""
     try:
-        return {"joints": np.array(data["joints"], float), "fps": data["fps"], "text": str(data.get("caption", ""))}
-    except (ValueError, TypeError, KeyError, OverflowError) as error:
-        raise UserError(f"not a motion in JSON, which is an object with joints and fps: {error}") from error
+        Layout(**{key: value for key, value in fields.items() if key in ("up", "unit")})
+    except ValueError as error:
+        raise UserError(
+            f"up is y, z or -y, and unit a number of meters, metre, centimetre or millimetre: {fields}"
+        ) from error
+    return fields
 
 
-def smpl_motion(data: dict[str, Any], fps: float | None = None) -> tuple[Tensor, Tensor]:
-    """Returns translation (F, 3) and quaternions (F, 24, 4), float64, of AMASS arrays, resampled to `fps` if given."""
-    poses = data["poses"].reshape(len(data["poses"]), -1)
-    frames = None if fps is None else frame_pairs(len(poses), data["fps"], fps, poses.shape[1] // 3)
-    translation, rotations = read_pose(torch.from_numpy(np.concatenate([data["trans"], poses], 1)))
-    turns = rotation.matrix_to_quaternion(rotations)
-    if fps is None or frames is None:
+def _refuse(fields: Mapping[str, Any], without_effect: Collection[str], reason: str) -> None:
+    """Raises `UserError` if a key cannot have an effect on the file."""
+    for key in without_effect:
+        if key in fields:
+            raise UserError(f"{key} has no effect, because {reason}. Remove it from the command or from skeleton.yaml")
+
+
+def _rest_note(frames: int) -> str:
+    if frames == 1:
+        return "the first frame is a rest pose and is left out"
+    return f"the first {frames} frames lead from a rest pose to the motion and are left out"
+
+
+def _doubts(joints: np.ndarray, fps: float, up: str, axes: np.ndarray) -> Doubts:
+    return Doubts(checks.uprightness(joints), checks.lying(joints, up, axes), checks.jump(joints, fps))
+
+
+def _described(path: Path) -> str:
+    skeleton = skeleton_file(path)
+    return f" ({os.path.relpath(skeleton)})" if skeleton else ""
+
+
+def _label(path: Path, layout: Layout, rate: float) -> str:
+    return f"{layout_name(layout)}, unit {layout.unit:.4g}, {rate:g} fps{_described(path)}"
+
+
+def _resampled(motion: Motion, fps: float | None) -> Motion:
+    """Returns a motion at another frame rate, with joints alone, or unchanged if it has this rate."""
+    if fps is None or math.isclose(motion.fps, fps):
+        return motion
+    joints = resample(motion.joints.astype(float), motion.fps, fps, cubic=True)
+    return Motion(joints, fps, motion.skeleton, motion.text, motion.id, notes=motion.notes)
+
+
+def _matrices(smpl: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    """Returns the position of the pelvis (F, 3) and rotations (F, 24, 3, 3) of a translation and quaternions."""
+    translation, turns = smpl
+    return translation + torch.tensor(PELVIS, dtype=torch.float64), rotation.quaternion_to_matrix(turns)
+
+
+def _in_amass_axes(translation: Tensor, turns: Tensor, axes: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns a translation (F, 3) and quaternions (F, 24, 4) in axes of AMASS, z up; `axes` turns the file's to y up."""
+    if torch.equal(axes, AMASS_AXES):
         return translation, turns
-    before, after, share = frames
-    turns = rotation.slerp(turns[before], turns[after], torch.from_numpy(share)[:, None, None])
-    return torch.from_numpy(resample(translation.numpy(), data["fps"], fps)), turns
+    turn, pelvis = AMASS_AXES @ axes, torch.tensor(PELVIS, dtype=torch.float64)
+    root = rotation.matrix_to_quaternion(turn @ rotation.quaternion_to_matrix(turns[:, 0]))
+    return (translation + pelvis) @ turn.T - pelvis, torch.cat([root[:, None], turns[:, 1:]], 1)
 
 
-def _smpl_poses(translation: Tensor, rotations: Tensor, axes: Tensor) -> Poses:
+def _smpl_poses(pelvis: Tensor, rotations: Tensor, axes: Tensor) -> Poses:
     """Returns poses of SMPL's mean body, rotated to y up by `axes` (3, 3)."""
-    offsets = torch.tensor(ADULT, dtype=torch.float64)
     rotations = rotations[:, : len(SMPL22)].clone()
     rotations[:, 0] = axes @ rotations[:, 0]
-    return Poses(offsets[: len(SMPL22)], rotations, (translation + offsets[0]) @ axes.T)
+    return Poses(torch.tensor(ADULT[: len(SMPL22)], dtype=torch.float64), rotations, pelvis @ axes.T)
 
 
 def _poses(data: dict[str, Any]) -> Poses | None:
@@ -185,7 +364,7 @@ def _poses(data: dict[str, Any]) -> Poses | None:
     if "poses" in data:
         if len(data["poses"]) != len(data["joints"]):
             raise UserError(f"{len(data['poses'])} frames of poses, but {len(data['joints'])} of joints")
-        translation, turns = smpl_motion(data)
+        translation, turns = smpl_motion(data)  # written without the template's pelvis
         return _smpl_poses(translation, rotation.quaternion_to_matrix(turns), AMASS_AXES)
     representation = str(data.get("representation", ""))
     if "features" not in data or representation not in ROTATED:

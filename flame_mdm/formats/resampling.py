@@ -15,6 +15,7 @@ MAX_RESAMPLED = 1_000_000  # maximum number of joint positions after upsampling:
 def frame_rate(value: Any, name: str = "fps") -> float:
     """Returns a frame rate, `name` in its file, as a float; raises `UserError` unless it is a number in `RATES`."""
     number = np.asarray(value)
+    number = number.reshape(()) if number.size == 1 else number  # some programs write an array of one number
     if number.shape or number.dtype.kind not in "fiu" or not RATES[0] <= float(number) <= RATES[1]:
         limits = f"from {RATES[0]:g} to {RATES[1]:g}"
         raise UserError(f"{name} is {str(value)[:40]}, not a number of frames per second {limits}")
@@ -50,9 +51,16 @@ def frame_pairs(
 def resample(values: np.ndarray, rate: float, fps: float, cubic: bool = False) -> np.ndarray:
     """Resamples positions (F, ...) from `rate` to `fps`, linearly, or `cubic`: bones keep their length to 0.1 %."""
     before, after, share = frame_pairs(len(values), rate, fps, math.prod(values.shape[1:-1]))
-    if cubic and len(values) > 1:
-        from scipy.interpolate import CubicSpline  # here, because few motions need it
-
-        return CubicSpline(np.arange(len(values)), values)(before + share)
+    if cubic:
+        return interpolate(values, before + share)
     share = share.reshape(-1, *[1] * (values.ndim - 1))
     return (1 - share) * values[before] + share * values[after]
+
+
+def interpolate(values: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Returns the cubic spline through values (F, ...) in frames 0, 1, ... at `times` (N,), which are frames, too."""
+    from scipy.interpolate import CubicSpline  # here, because few motions need it
+
+    if len(values) < 2:
+        return values[np.zeros(len(times), int)]
+    return CubicSpline(np.arange(len(values)), values)(times)

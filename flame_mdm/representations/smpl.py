@@ -22,14 +22,20 @@ ADULT = (
 It replaces the licensed model files: bone lengths of HumanML3D's reference clip, rounded and symmetric."""
 
 
+AXIS_ANGLES = {66: 22, 72: 24, 156: 52, 165: 55}
+"""Numbers per frame of axis-angle vectors -> joints: the body alone, SMPL, SMPL+H and SMPL-X."""
+
+
 def read_pose(motion: Tensor) -> tuple[Tensor, Tensor]:
     """Splits a raw SMPL motion (F, 3 + 3 K) into translation (F, 3) and matrices (F, 24, 3, 3), float64.
 
-    It is a translation in meters, then K >= 24 axis-angle vectors. Of SMPL+H's 52, the first 24 are used, as in FLAME's
-    code, so that the hands are its left_index1 and left_index2. Raises `UserError` if a number is not finite.
+    It is a translation in meters, then axis-angle vectors of K = 24, 52 or 55 joints. Of SMPL+H's 52, the first 24 are
+    used, as in FLAME's code, so that the hands are its left_index1 and left_index2. Raises `UserError` if the shape is
+    another one, such as 24 rotation matrices, or a number is not finite.
     """
-    if motion.ndim != 2 or not len(motion) or motion.shape[1] < 75 or motion.shape[1] % 3:
-        raise UserError(f"motion: shape {tuple(motion.shape)}, expected (frames, 3 + 3 x joints), 24 joints or more")
+    widths = [3 + numbers for numbers, joints in AXIS_ANGLES.items() if joints >= 24]
+    if motion.ndim != 2 or not len(motion) or motion.shape[1] not in widths:
+        raise UserError(f"motion: shape {tuple(motion.shape)}, expected (frames, 3 + 3 x joints), 24, 52 or 55 joints")
     check_finite(motion)
     motion = motion.double()
     return motion[:, :3], rotation.axis_angle_to_matrix(motion[:, 3:75].unflatten(1, (24, 3)))

@@ -12,7 +12,7 @@ from torch import Tensor
 from flame_mdm.data.store import Store
 from flame_mdm.errors import UserError, did_you_mean
 from flame_mdm.formats.conversion import raw_motion
-from flame_mdm.formats.layouts import check_size, find_skeleton
+from flame_mdm.formats.layouts import check_size
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.readers import ENDINGS, read
 from flame_mdm.representations import Representation
@@ -40,7 +40,7 @@ def read_motion(
     """
     name = str(source)
     if Path(source).suffix.lower() in ENDINGS:
-        motion = read(source, fps, unit, representation.fps, find_skeleton(Path(source), up))
+        motion = read(source, fps, unit, up, representation.fps)
         motion = with_features(representation, replace(motion, id=name))
     elif ":" in name:
         dataset, _, clip_id = name.partition(":")

@@ -1,0 +1,121 @@
+"""Motion files of arrays: `.npz`, `.npy` and `.json`, with joints, or rotations of SMPL as in AMASS."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from flame_mdm.errors import UserError
+from flame_mdm.formats.resampling import check_frames, frame_pairs, frame_rate, resample
+from flame_mdm.representations import rotation
+from flame_mdm.representations.smpl import AXIS_ANGLES, read_pose
+from flame_mdm.safe_io import MEBIBYTE, read_json, read_npy, read_npz
+
+JSON_LIMIT = 128 * MEBIBYTE  # maximum size of a `.json` motion; parsed, it takes many times its size
+RATES = ("fps", "mocap_framerate", "mocap_frame_rate")  # names of the frame rate
+BODY = ("root_orient", "pose_body")  # names of parts of `poses` in AMASS's SMPL-X files
+NEEDED = {"joints", "posed_joints", "poses", "trans", *BODY, *RATES, "text", "features", "representation"}
+"""Arrays of an .npz file that are read. Others, which may hold pickled objects, are never opened."""
+LENGTHS = {"m": 1.0, "meter": 1.0, "metre": 1.0, "cm": 0.01, "centimeter": 0.01, "centimetre": 0.01, "mm": 0.001}
+"""Names of units in `.json` files, in meters."""
+NUMBERS = ", ".join(map(str, AXIS_ANGLES))
+
+
+def read_arrays(path: Path) -> dict[str, Any]:
+    """Reads the arrays of an .npz, .json or .npy motion.
+
+    Returns joints, or poses (F, 72) and trans (F, 3) as in AMASS. Also returns fps, text, features and representation
+    if the file has them, and of `.json` files up, unit and names. `ours` is whether this project wrote the file.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".npz":
+        data: dict[str, Any] = read_npz(path, only=NEEDED)
+        data["ours"] = {"text", "joints"} <= data.keys()
+    elif suffix == ".npy":
+        data = {"joints": read_npy(path), "ours": False}
+    else:
+        data = _read_json(path)
+
+    if "posed_joints" in data:  # of NVIDIA's Kimodo, whose files do not contain their rate
+        data = {"fps": 30.0, **data, "joints": data["posed_joints"]}
+    if "poses" not in data and set(BODY) <= data.keys():
+        data["poses"] = _joined([data[name] for name in BODY])
+    if not {"joints", "poses"} & data.keys():
+        raise UserError("contains neither joints nor poses; a motion has joints and fps, or poses, trans and a rate")
+    for name in {"joints", "poses", "trans"} & data.keys():
+        check_numbers(name, data[name])
+    if "features" in data and (not is_real(data["features"]) or data["features"].ndim != 2):
+        raise UserError("features are not an array (frames, features) of real numbers")
+    if "poses" in data:
+        data["poses"] = _axis_angles(data["poses"])
+        if data.get("trans", np.zeros(0)).shape != (len(data["poses"]), 3):
+            raise UserError("AMASS files have poses (F, 3 K), trans (F, 3) and mocap_framerate")
+    for key in RATES:
+        if key in data:
+            data["fps"] = frame_rate(data[key], key)
+    return data
+
+
+def is_real(values: np.ndarray) -> bool:
+    """Returns whether an array contains integers or floats that PyTorch can convert."""
+    return values.dtype.kind in "fiu" and values.dtype.itemsize <= 8
+
+
+def smpl_motion(data: dict[str, Any], fps: float | None = None) -> tuple[Tensor, Tensor]:
+    """Returns translation (F, 3) and quaternions (F, 24, 4), float64, of AMASS arrays, resampled to `fps` if given."""
+    poses = data["poses"]
+    frames = None if fps is None else frame_pairs(len(poses), data["fps"], fps, poses.shape[1] // 3)
+    translation, rotations = read_pose(torch.from_numpy(np.concatenate([data["trans"], poses], 1)))
+    turns = rotation.matrix_to_quaternion(rotations)
+    if fps is None or frames is None:
+        return translation, turns
+    before, after, share = frames
+    turns = rotation.slerp(turns[before], turns[after], torch.from_numpy(share)[:, None, None])
+    return torch.from_numpy(resample(translation.numpy(), data["fps"], fps, cubic=True)), turns
+
+
+def _joined(parts: list[np.ndarray]) -> np.ndarray:
+    try:
+        return np.concatenate([part.reshape(len(part), -1) for part in parts], 1)
+    except (TypeError, ValueError) as error:
+        raise UserError(f"{' and '.join(BODY)} are not arrays of equally many frames") from error
+
+
+def _axis_angles(poses: np.ndarray) -> np.ndarray:
+    """Returns axis-angle vectors (F, 72) of SMPL's joints; without hands, theirs are 0."""
+    count = int(np.prod(poses.shape[1:]))
+    if poses.ndim > 3 or (poses.ndim == 3 and poses.shape[2] != 3) or count not in AXIS_ANGLES:
+        advice = ""
+        if count in (9 * joints for joints in AXIS_ANGLES.values()):
+            advice = ". They seem to be rotation matrices: convert them to axis-angle vectors"
+        elif count in (6 * joints for joints in AXIS_ANGLES.values()):
+            advice = ". They seem to be 6D rotations: convert them to axis-angle vectors"
+        raise UserError(f"poses of shape {poses.shape}, not {NUMBERS} axis-angle numbers per frame{advice}")
+    vectors = poses.reshape(len(poses), count)[:, :72].astype(float)
+    return np.pad(vectors, ((0, 0), (0, 72 - vectors.shape[1])))
+
+
+def check_numbers(name: str, values: np.ndarray) -> None:
+    """Raises `UserError` unless an array (F, ...) contains real numbers below a million, in few enough frames."""
+    if not is_real(values):
+        raise UserError(f"{name} are not an array of real numbers")
+    if not values.ndim or not len(values):
+        raise UserError(f"{name} of shape {values.shape} have no frames")
+    check_frames(len(values))
+    if (beyond := ~(np.abs(values.astype(float)) < 1e6)).any():
+        raise UserError(f"numbers of {name} in frame {np.argwhere(beyond)[0][0]} are not finite, or exceed a million")
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    content = read_json(path, JSON_LIMIT)
+    try:
+        data: dict[str, Any] = {"joints": np.array(content["joints"], float), "text": str(content.get("caption", ""))}
+        data |= {key: content[key] for key in ("fps", "up", "names") if key in content}
+        if "unit" in content:
+            data["unit"] = LENGTHS.get(str(content["unit"]).lower(), content["unit"])
+    except (AttributeError, ValueError, TypeError, KeyError, OverflowError) as error:
+        raise UserError(f"not a motion in JSON, which is an object with joints and fps: {error}") from error
+    data["ours"] = "caption" in content and (data.get("up"), data.get("unit")) == ("y", 1.0)
+    return data

@@ -1,0 +1,123 @@
+"""Checks of motions on SMPL's joints: their size, their feet, where up is, legs that flip, and a rest pose in front."""
+
+import numpy as np
+
+from flame_mdm.formats.layouts import UP, check_feet, check_size
+from flame_mdm.representations.skeleton import SMPL22
+
+LYING = 0.3  # mean vertical component of the direction of the trunk below which a body lies
+STANDING = 0.7  # the same, above which it would stand with another axis up
+FASTEST = 15.0  # m/s of the pelvis, above which a file is damaged; sprinters reach 12
+AVERAGED = 0.05  # seconds over which the speed of the pelvis is averaged
+KICK = 30.0  # m/s of an ankle relative to the pelvis, above which a leg has flipped; the fastest kicks reach 20
+UNDER = 0.02  # depth in meters below the floor at which the file's body is called smaller
+
+BLEND = 0.04  # seconds from a rest pose in front of a motion to the motion; some conversions blend a few frames
+CALM = 8  # number of the following frames with which the first steps are compared
+JUMP = (0.15, 3.0)  # meters from the rest pose to the motion, and how much longer than the following steps
+STRAIGHT = np.cos(np.radians(25))  # of arms and legs in a rest pose
+HANGING = np.cos(np.radians(25))  # arms in a rest pose are raised from the trunk by at least 25 degrees
+SYMMETRIC = 0.2  # largest difference of the cosines of left and right arm
+
+_NUMBER = {joint: number for number, joint in enumerate(SMPL22.joints)}
+_LIMBS = (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle"))
+
+
+def check_body(joints: np.ndarray, unit: float = 1.0, children: bool = False) -> None:
+    """Raises `UserError` if joints (F, 22, 3) are not those of a person: wrong size, or feet of no length or backwards.
+
+    The advice on the size needs the `unit` of the file in meters; `children` may be smaller.
+    """
+    check_size(joints, unit, children)
+    check_feet(joints)
+
+
+def uprightness(joints: np.ndarray) -> float:
+    """Returns the mean vertical component of the direction of the trunk, -1 to 1, of joints (F, 22, 3), y up."""
+    return float(_trunk(joints)[:, 1].mean())
+
+
+def lying(joints: np.ndarray, up: str, axes: np.ndarray) -> str:
+    """Returns a line if the body lies in most frames, with the axis that would make it stand, or "".
+
+    Joints (F, 22, 3) are y up, turned by `axes` (3, 3) from the axes of the file, in which `up` was up.
+    """
+    if uprightness(joints) >= LYING:
+        return ""
+    backwards = _trunk(joints).mean(0) @ axes  # in the axes of the file
+    heights = {axis: float(backwards @ np.array(rows, float)[1]) for axis, rows in UP.items() if axis != up}
+    axis = max(heights, key=lambda axis: heights[axis])
+    if heights[axis] < STANDING:
+        return "the body lies, its trunk is not upright"
+    return (
+        f"the body lies, its trunk is not upright. If it should stand, set up={axis}, or `up: {axis}` in skeleton.yaml"
+    )
+
+
+def jump(joints: np.ndarray, fps: float) -> str:
+    """Returns a line if the pelvis or a leg of joints (F, 22, 3) moves faster than people do, or ""."""
+    ankles = joints[:, [_NUMBER["left_ankle"], _NUMBER["right_ankle"]]] - joints[:, :1]
+    # a body that shakes for a frame is no jump, but a leg that flips does so within a frame
+    apart = max(1, round(fps * AVERAGED))
+    for verb, points, frames, fastest in (
+        ("the body jumps", joints[:, :1], apart, FASTEST),
+        ("a leg flips", ankles, 1, KICK),
+    ):
+        speeds = np.linalg.norm((points[frames:] - points[:-frames]).astype(float), axis=-1) * fps / frames
+        if speeds.max(initial=0.0) > fastest:
+            frame = int(speeds.max(1).argmax())
+            return f"{verb}, it moves at {speeds.max():.0f} m/s in frame {frame} ({fps:g} per second): a damaged file"
+    return ""
+
+
+def below_floor(joints: np.ndarray) -> str:
+    """Returns a line if a body with the bones of an adult stands below the floor, because the file's is smaller."""
+    lowest = float(np.median(joints[..., 1].min(1)))
+    if lowest > -UNDER:
+        return ""
+    return (
+        f"the feet are {-100 * lowest:.0f} cm below the floor: the file's body is smaller than the adult body that gets "
+        "its rotations"
+    )
+
+
+def rest_frames(joints: np.ndarray, fps: float) -> int:
+    """Returns the number of frames in front of a motion that show a rest pose, or lead from it to the motion.
+
+    Several programs write a T- or A-pose as the first frame. In motion that was recorded from a rest pose on, the first
+    step is no longer than the following ones.
+    """
+    if len(joints) < 3 or not _is_rest_pose(joints[0].astype(float)):
+        return 0
+    blend = max(1, round(BLEND * fps))
+    relative = (joints[: blend + CALM + 1] - joints[: blend + CALM + 1, :1]).astype(float)
+    steps = np.linalg.norm(np.diff(relative, axis=0), axis=-1).max(1)
+    calm = steps[blend:].max(initial=0.0)
+    jumps = np.append(steps[:blend] > max(JUMP[1] * calm, JUMP[0] / (2 * blend)), False)
+    first = int(jumps.argmin())
+    return first if steps[:first].sum() > JUMP[0] else 0
+
+
+def _is_rest_pose(pose: np.ndarray) -> bool:
+    """Returns whether joints (22, 3) stand with straight legs and straight, equally raised arms."""
+    trunk = _trunk(pose[None])[0]
+    raised = []
+    for side in ("left", "right"):
+        for limb in _LIMBS:
+            start, middle, end = (pose[_NUMBER[f"{side}_{name}"]] for name in limb)
+            upper, lower = _unit(middle - start), _unit(end - middle)
+            if upper @ lower < STRAIGHT:
+                return False
+            raised.append(-upper @ trunk)
+    left_arm, left_leg, right_arm, right_leg = raised  # cosine of the angle to the direction down the trunk
+    legs_hang = min(left_leg, right_leg) > STRAIGHT
+    return bool(legs_hang and max(left_arm, right_arm) < HANGING and abs(left_arm - right_arm) < SYMMETRIC)
+
+
+def _trunk(joints: np.ndarray) -> np.ndarray:
+    """Returns the directions (F, 3) from pelvis to neck."""
+    return _unit(joints[:, _NUMBER["neck"]].astype(float) - joints[:, 0])
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)

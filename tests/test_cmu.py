@@ -18,7 +18,8 @@ from flame_mdm.data import archives, cmu
 from flame_mdm.data.store import Store, write_store
 from flame_mdm.errors import UserError
 from flame_mdm.formats import asf, bvh
-from flame_mdm.formats.layouts import map_bvh
+from flame_mdm.formats.layouts import tree_layout
+from flame_mdm.formats.recordings import is_at_60
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.representations.smpl import SMPL
@@ -69,6 +70,12 @@ def motionbuilder(tree: bvh.Bvh) -> bvh.Bvh:
     return replace(tree, joints=tuple(names.get(name, name) for name in tree.joints), offsets=offsets, frames=frames)
 
 
+def mapped(tree: bvh.Bvh, fields: dict) -> np.ndarray:
+    """The 22 joints of SMPL in a recording."""
+    layout, names = tree_layout(tree, fields)
+    return layout.apply(tree.positions(), names)
+
+
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """Motions in `motions` and a clone of HumanML3D in `clone`."""
@@ -117,7 +124,7 @@ def test_clips_have_their_motion_captions_and_splits(folder):
     assert store.info["counts"]["clips of HumanML3D"] == 3
     recording = asf.read(folder / "motions/02/02_02.amc", 120)
     tree, fields = cmu.standardize(recording)
-    joints = map_bvh(tree, 20, fields)[0][6:66]
+    joints = mapped(replace(tree, frames=tree.frames[::6]), fields)[6:66]
     for name, motion in (("000002", joints), ("M000002", SMPL22.mirror(torch.from_numpy(joints)).numpy())):
         expected = humanml.encode(torch.from_numpy(motion))
         np.testing.assert_allclose(store.motion(clips[name]), expected, atol=1e-5)
@@ -136,7 +143,7 @@ def test_conversions_have_the_joints_of_the_original(folder):
     original, _ = cmu.standardize(asf.read(folder / "motions/02/02_02.amc", 120))
     converted, fields = cmu.standardize(bvh.read(folder / "motions/60/60_01.bvh"))
     assert len(converted.frames) == len(original.frames) == 400
-    both = [map_bvh(tree, None, fields)[0] for tree in (original, converted)]
+    both = [mapped(tree, fields) for tree in (original, converted)]
     np.testing.assert_allclose(both[0], both[1], atol=1e-5)
     hips = both[0][:, [1, 2]].mean(1) - both[0][:, 0]
     scale = 0.82 / cmu.ADULT_LEG
@@ -220,7 +227,7 @@ def test_angles_are_those_of_the_public_conversion(real):
 def test_the_archive(real):
     """Rates as CMU lists them; Daz-friendly files agree with the original ones at the same bone lengths."""
     listed = json.loads((real / "cmu_fps.json").read_text())
-    assert {t for t, entry in listed.items() if entry["fps"] == 60} == {t for t in listed if cmu._is_in("sixty", t)}
+    assert {t for t, entry in listed.items() if entry["fps"] == 60} == {t for t in listed if is_at_60(t)}
     names = ["02_04", "02_05", "02_07", "02_08", "02_09"]
     for name in names:
         whole = cmu.Item("a", "test", "a", [])

@@ -266,7 +266,7 @@ def made(root):
 
 def test_the_set_is_made_from_amass_and_an_interrupted_run_is_taken_up(mine):
     source = raw(mine)
-    assert source.check() == ["0 of 6 motions and their mirrored copies are created"]
+    assert source.check(20) == ["0 of 6 motions and their mirrored copies are created"]
     assert source.count() == 2 * 6
     expected, result = expected_features(mine), made(mine)
     assert result.keys() == expected.keys()
@@ -280,7 +280,7 @@ def test_the_set_is_made_from_amass_and_an_interrupted_run_is_taken_up(mine):
     (folder / "M000003.npy").unlink()
     np.save(folder / "000005.npy", np.zeros((44, 263), np.float32))
     again = raw(mine)
-    assert again.check() == ["5 of 6 motions and their mirrored copies are created"]
+    assert again.check(20) == ["5 of 6 motions and their mirrored copies are created"]
     again.count()
     np.testing.assert_array_equal(made(mine)["M000003"], result["M000003"])
     assert not made(mine)["000005"].any(), "what is there is not made again"

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 from flame_mdm.checkpoints.locating import Which, find
 from flame_mdm.config import EXPERIMENTS, Config, compose_data
 from flame_mdm.config.options import option, required, same_option
-from flame_mdm.errors import UserError, did_you_mean
-from flame_mdm.formats import ENDINGS
+from flame_mdm.errors import UserError, did_you_mean, say
+from flame_mdm.formats import ADVICE, ENDINGS, unread
 from flame_mdm.safe_io import sha256
 from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.sampling.motion_request import EditRequest, SamplingRequest
@@ -41,8 +41,18 @@ def motion_file(key: str, source: str) -> None:
     """Checks that a motion file exists and has a known ending; `dataset:id` is left to its reader."""
     if Path(source).suffix.lower() in ENDINGS:
         existing(key, source)
+    elif Path(source).suffix.lower() in ADVICE:
+        raise unread(Path(source))
     elif ":" not in source:
         raise UserError(f"{key}={source}: neither a motion file ({', '.join(ENDINGS)}) nor dataset:id")
+
+
+def finish(failures: Sequence[str], total: int, done: str) -> None:
+    """Prints the errors of files of a folder, of which the others were `done`, and exits with 1 if there are any."""
+    if failures:
+        say(*(f"error: {failure}" for failure in failures), error=True)
+        say(f"error: {len(failures)} of {total} motions could not be {done}", error=True)
+        raise SystemExit(1)
 
 
 def model_source(key: str, source: str) -> None:

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from flame_mdm.commands import BodySettings, FileSettings, existing, motion_file
+from flame_mdm.commands import BodySettings, FileSettings, existing, finish, motion_file
 from flame_mdm.config.options import option, required
-from flame_mdm.errors import UserError, say
+from flame_mdm.errors import UserError, first_line, say
 from flame_mdm.formats import motion_files
 from flame_mdm.progress import ProgressBar
 
@@ -55,8 +55,16 @@ def main(settings: ConvertSettings) -> None:
     except characters.UnknownJoints as error:
         say(*error.template)
         raise
-    for target, file in ProgressBar(targets.items(), desc="convert", unit="file", disable=not path.is_dir()):
-        _convert(settings, file, target, character)
+    if not path.is_dir():
+        _convert(settings, path, out, character)
+        return
+    failures = []
+    for target, file in ProgressBar(targets.items(), desc="convert", unit="file"):
+        try:
+            _convert(settings, file, target, character)
+        except (UserError, OSError) as error:
+            failures.append(first_line(error))
+    finish(failures, len(targets), "converted")
 
 
 def _targets(settings: ConvertSettings, folder: Path, out: Path) -> dict[Path, Path]:
@@ -71,13 +79,13 @@ def _targets(settings: ConvertSettings, folder: Path, out: Path) -> dict[Path, P
 
 
 def _convert(settings: ConvertSettings, path: Path, out: Path, character: Character | None) -> None:
-    from flame_mdm.formats.layouts import find_skeleton, head_height, leg_length
+    from flame_mdm.formats.layouts import head_height, leg_length
     from flame_mdm.formats.readers import read
     from flame_mdm.representations.skeleton import SMPL22
     from flame_mdm.visualize.body import load_body
 
     body = load_body(settings.body)
-    motion = read(path, settings.fps, settings.unit, fields=find_skeleton(path, settings.up))
+    motion = read(path, settings.fps, settings.unit, settings.up)
     if out.exists() and out.samefile(path):
         raise UserError(f"{out}: the same file as the input, which stays as it is. Choose another name for the output")
     if out.suffix.lower() == ".npz":
@@ -88,5 +96,6 @@ def _convert(settings: ConvertSettings, path: Path, out: Path, character: Charac
         if str(out) in str(error):
             raise
         raise UserError(f"{path}: {error}") from error
+    say(*(f"{path}: {note}" for note in motion.notes))
     if motion.skeleton.joints[: len(SMPL22)] == SMPL22.joints:
         say(f"legs {leg_length(motion.joints):.2f} m, head joint at {head_height(motion.joints):.2f} m")

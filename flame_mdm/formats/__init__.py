@@ -38,8 +38,8 @@ def unread(path: Path) -> UserError:
 def motions_in(folder: Path) -> list[Path]:
     """Returns the motion files in a folder and the folders below it, sorted.
 
-    Hidden files, as macOS and editors leave them, and files of AMASS without motion are left out. Of JSON files, only
-    those with an array of joints are motions.
+    Hidden files, as macOS and editors leave them, folders and files of AMASS without motion are left out. Of JSON
+    files, only those with an array of joints are motions.
     """
     return sorted(file for file in folder.rglob("*") if _is_motion(file, folder))
 
@@ -54,7 +54,7 @@ def motion_files(folder: Path) -> list[Path]:
 
 def _is_motion(file: Path, folder: Path) -> bool:
     parts, suffix = file.relative_to(folder).parts, file.suffix.lower()
-    if suffix not in ENDINGS or "__MACOSX" in parts or any(part.startswith(".") for part in parts):
+    if suffix not in ENDINGS or file.is_dir() or "__MACOSX" in parts or any(part.startswith(".") for part in parts):
         return False
     if file.name.lower().endswith(NO_MOTIONS):
         return False

@@ -48,10 +48,8 @@ def lying(joints: np.ndarray, up: str, axes: np.ndarray) -> str:
     heights = {axis: float(backwards @ np.array(rows, float)[1]) for axis, rows in UP.items() if axis != up}
     axis = max(heights, key=lambda axis: heights[axis])
     if heights[axis] < STANDING:
-        return "the body lies, its trunk is not upright"
-    return (
-        f"the body lies, its trunk is not upright. If it should stand, set up={axis}, or `up: {axis}` in skeleton.yaml"
-    )
+        return "the body is lying down"
+    return f"the body is lying down. If it should stand, set up={axis}, or `up: {axis}` in skeleton.yaml"
 
 
 def jump(joints: np.ndarray, fps: float) -> str:
@@ -75,10 +73,8 @@ def below_floor(joints: np.ndarray) -> str:
     lowest = float(np.median(joints[..., 1].min(1)))
     if lowest > -UNDER:
         return ""
-    return (
-        f"the feet are {-100 * lowest:.0f} cm below the floor: the file's body is smaller than the adult body that gets "
-        "its rotations"
-    )
+    depth = f"the feet are {-100 * lowest:.0f} cm below the floor"
+    return f"{depth}: rotations are shown on an adult body, and the body in the file is smaller"
 
 
 def rest_frames(joints: np.ndarray, fps: float) -> int:

@@ -297,9 +297,8 @@ def _checked(fields: dict[str, Any]) -> dict[str, Any]:
     try:
         Layout(**{key: value for key, value in fields.items() if key in ("up", "unit")})
     except ValueError as error:
-        raise UserError(
-            f"up is y, z or -y, and unit a number of meters, metre, centimetre or millimetre: {fields}"
-        ) from error
+        stated = ", ".join(f"{key}: {fields[key]}" for key in ("up", "unit") if key in fields)
+        raise UserError(f"{stated[:80]}: up is y, z or -y, and unit a number of meters, or m, cm or mm") from error
     return fields
 
 
@@ -344,7 +343,7 @@ def _matrices(smpl: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
 
 
 def _in_amass_axes(translation: Tensor, turns: Tensor, axes: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns a translation (F, 3) and quaternions (F, 24, 4) in axes of AMASS, z up; `axes` turns the file's to y up."""
+    """Returns a translation (F, 3) and quaternions (F, 24, 4) in AMASS's axes; `axes` turns the file's to y up."""
     if torch.equal(axes, AMASS_AXES):
         return translation, turns
     turn, pelvis = AMASS_AXES @ axes, torch.tensor(PELVIS, dtype=torch.float64)

@@ -1,0 +1,402 @@
+"""Motion files of other programs: what is read, refused with a way out, left out or said, at every entrance."""
+
+import json
+import re
+import shutil
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.fixtures import SHARED
+from support.glb import changed
+from support.motions import posed, synthetic
+
+from flame_mdm.__main__ import main
+from flame_mdm.data.adaptation import check_clips
+from flame_mdm.data.folder import Folder
+from flame_mdm.data.store import Store
+from flame_mdm.errors import UserError
+from flame_mdm.formats import bvh, glb
+from flame_mdm.formats.layouts import head_height
+from flame_mdm.formats.motion import AMASS_AXES, Motion, amass_parameters
+from flame_mdm.formats.readers import PELVIS, read, read_recording
+from flame_mdm.representations.humanml import HumanML
+from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.sampling.reading import read_motion
+
+POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n"
+TURNED = {"z": [[1, 0, 0], [0, 0, -1], [0, 1, 0]], "-y": [[1, 0, 0], [0, -1, 0], [0, 0, -1]], "y": np.eye(3)}
+"""Axis that points up -> rows of the rotation of joints with y up to these axes."""
+
+
+def walk(frames: int = 40) -> Motion:
+    """A body whose arms hang, which turns a little and swings its legs."""
+    swing = np.sin(np.arange(frames) / 6)[:, None] * [20.0, 0, 0]
+    legs = {"left_hip": swing, "right_hip": -swing}
+    arms = {"left_shoulder": [0, 0, -70.0], "right_shoulder": [0, 0, 70.0]}
+    return posed(frames, heading=np.sin(np.arange(frames) / 9), **legs, **arms)
+
+
+def amass(motion: Motion, up: str = "z", numbers: int = 156) -> dict[str, Any]:
+    """The motion as SMPL's rotations in axes of which `up` points up, with the pelvis of SMPL's template."""
+    poses = motion.posed()
+    turn = np.array(TURNED[up]) @ AMASS_AXES.numpy() if up != "z" else np.eye(3)
+    vectors, pelvis = amass_parameters(poses)
+    root = np.array(TURNED[up], float) @ poses.rotations[:, 0].numpy() if up != "z" else None
+    if root is not None:
+        from scipy.spatial.transform import Rotation
+
+        vectors[:, :3], pelvis = Rotation.from_matrix(root).as_rotvec(), pelvis @ turn.T
+    padded = np.pad(vectors, ((0, 0), (0, numbers - 66)))
+    return {"poses": padded, "trans": pelvis - np.array(PELVIS), "mocap_framerate": motion.fps}
+
+
+def write_bvh(path: Path, motion: Motion, turn: Any = None, first: Any = None) -> None:
+    """A BVH file with position channels; `first` (22, 3) is a frame in front."""
+    joints = motion.joints.astype(float)
+    if first is not None:
+        joints = np.concatenate([np.asarray(first, float)[None], joints])
+    local = 100 * joints @ np.array(TURNED[turn or "y"], float).T
+    local[:, 1:] -= local[:, :1]
+    frames = np.concatenate([local, np.zeros_like(local)], 2).reshape(len(local), -1)
+    channels = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "XYZ")
+    tree = bvh.Bvh(SMPL22.joints, (-1, *[0] * 21), np.zeros((22, 3)), (channels,) * 22, frames, motion.fps)
+    bvh.write(tree, path)
+
+
+def test_arrays_that_are_not_needed_are_never_opened(tmp_path: Path):
+    parts = amass(walk())
+    np.savez(tmp_path / "plain.npz", **parts)
+    np.savez(tmp_path / "a_stageii.npz", **parts, markers_latent_vids=np.array({"a": 1}, dtype=object))
+    np.testing.assert_array_equal(read(tmp_path / "a_stageii.npz").joints, read(tmp_path / "plain.npz").joints)
+    np.testing.assert_allclose(read(tmp_path / "plain.npz").joints, walk().joints, atol=1e-5)
+    np.savez(tmp_path / "b.npz", **(parts | {"poses": np.array([{}])}))
+    with pytest.raises(UserError, match="an array of Python objects"):
+        read(tmp_path / "b.npz")
+
+
+def test_shapes_are_read_by_their_layout_and_rates_of_one_element_are_rates(tmp_path: Path):
+    path, expected = tmp_path / "a.npz", walk().joints
+    for numbers in (66, 72, 156, 165):
+        parts = amass(walk(), numbers=numbers)
+        np.savez(path, **parts)
+        np.testing.assert_allclose(read(path).joints, expected, atol=1e-5)
+        np.savez(path, **(parts | {"poses": parts["poses"].reshape(len(expected), -1, 3)}))
+        np.testing.assert_allclose(read(path).joints, expected, atol=1e-5)
+    poses = parts.pop("poses")
+    np.savez(path, root_orient=poses[:, :3], pose_body=poses[:, 3:66], **parts)
+    np.testing.assert_allclose(read(path).joints, expected, atol=1e-5)
+    for numbers, advice in ((216, "rotation matrices"), (144, "6D rotations"), (69, "not 66, 72, 156, 165")):
+        np.savez(path, poses=np.zeros((40, numbers)), **parts)
+        with pytest.raises(UserError, match=advice):
+            read(path)
+    np.savez(path, poses=poses, trans=parts["trans"], mocap_framerate=np.array([60.0]))
+    assert read(path).fps == 60
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        np.savez(path, **{name: np.asarray(values, np.float16) for name, values in amass(walk()).items()})
+        np.testing.assert_allclose(read(path).joints, expected, atol=0.02)
+
+
+KEYS: dict[str, Any] = {
+    "unit": 0.02,
+    "up": "z",
+    "mirrored": True,
+    "children": True,
+    "joints": list(SMPL22.joints[::-1]),
+    "map": {joint: joint for joint in SMPL22.joints} | {"spine2": "spine1"},
+    "fps": 7.0,
+}
+KINDS = ("bvh", "npz", "npy", "json", "kimodo", "amass")
+
+
+def write_kind(kind: str, folder: Path) -> Path:
+    """A file of a kind; it contains its frame rate, except `.npy`."""
+    joints, path = walk().joints, folder / f"a.{kind if kind in KINDS[:4] else 'npz'}"
+    if kind == "bvh":
+        write_bvh(path, walk())
+    elif kind == "npz":
+        np.savez(path, joints=joints, fps=20)
+    elif kind == "npy":
+        np.save(path, joints)
+    elif kind == "json":
+        path.write_text(json.dumps({"joints": joints.tolist(), "fps": 20}))
+    elif kind == "kimodo":
+        np.savez(path, posed_joints=joints)
+    else:
+        np.savez(path, **amass(walk()))
+    return path
+
+
+def outcome(path: Path, **keys: Any) -> tuple[str, Motion | None]:
+    """The error's message, or the motion."""
+    try:
+        return "", read(path, **keys)
+    except UserError as error:
+        return str(error), None
+
+
+@pytest.mark.parametrize(("key", "kind"), product(KEYS, KINDS))
+def test_a_key_acts_or_is_refused(key: str, kind: str, tmp_path: Path):
+    path = write_kind(kind, tmp_path)
+    rate = {"fps": 20} if kind == "npy" else {}
+    before = read(path, **rate)
+    skeleton = {key: KEYS[key]}
+    if key == "map" and kind != "bvh" and kind != "amass":
+        skeleton["joints"] = list(SMPL22.joints)
+    (tmp_path / "skeleton.yaml").write_text(json.dumps(skeleton))
+    if key == "children":  # a permission, which acts on children
+        small = 0.5 * walk().joints
+        if kind == "npz":
+            np.savez(path, joints=small, fps=20)
+            assert head_height(read(path).joints) < 0.9
+            return
+        if kind != "amass":
+            return
+    if key == "fps" and kind == "npy":
+        assert read(path).fps == 7
+        return
+    if key == "fps":  # of files without a rate
+        assert read(path).fps == before.fps
+        return
+    if (key, kind) == ("up", "amass"):  # z is up in AMASS
+        (tmp_path / "skeleton.yaml").write_text("up: y")
+    message, after = outcome(path, **rate)
+    if after is None:
+        assert any(word in message for word in (key, "unit", "toes", "legs")), message
+    else:
+        assert after.joints.shape != before.joints.shape or np.abs(after.joints - before.joints).max() > 0.01
+
+
+def test_up_of_commands_and_of_json_files_acts(tmp_path: Path):
+    motion = walk()
+    np.savez(tmp_path / "a.npz", **amass(motion, "y"))
+    assert any("lying down" in note and "up=y" in note for note in read(tmp_path / "a.npz").notes)
+    upright = read(tmp_path / "a.npz", up="y")
+    assert not upright.notes
+    assert head_height(upright.joints) == pytest.approx(head_height(motion.joints), abs=1e-4)
+    assert np.median(upright.joints[..., 1].min(1)) == pytest.approx(0, abs=0.02), "feet on the floor"
+    recording = read_recording(tmp_path / "a.npz", up="y", as_smpl=True)
+    assert recording.smpl is not None
+    turned = motion.joints @ np.array(TURNED["z"], float).T
+    content = {"joints": turned.tolist(), "fps": 20, "caption": "", "names": SMPL22.joints, "unit": "metre"}
+    for stated, key in (({"up": "z"}, None), ({}, "z"), ({"up": "z"}, "z")):
+        (tmp_path / "a.json").write_text(json.dumps(content | stated))
+        np.testing.assert_allclose(read(tmp_path / "a.json", up=key).joints, motion.joints, atol=1e-4)
+    (tmp_path / "a.json").write_text(json.dumps(content | {"up": "down"}))
+    with pytest.raises(UserError, match="up: down"):
+        read(tmp_path / "a.json")
+    motion.save(tmp_path / "ours.npz")
+    with pytest.raises(UserError, match="up=z has no effect: this project wrote the file"):
+        read(tmp_path / "ours.npz", up="z")
+
+
+SWAPPED = [
+    SMPL22.joints.index(name.replace("left", "x").replace("right", "left").replace("x", "right"))
+    for name in SMPL22.joints
+]
+
+
+def test_every_entrance_checks_sides_size_and_orientation(tmp_path: Path, capsys):
+    folder = tmp_path / "in"
+    folder.mkdir()
+    path = folder / "a.bvh"
+    entrances = {
+        "convert": lambda: main(["convert", str(path), str(tmp_path / "o.npy")]),
+        "inspect": lambda: main(["inspect", str(path), str(tmp_path / "o.html")]),
+        "edit, after": lambda: read_motion(HumanML(), path).notes,
+        "prepare": lambda: main(["prepare", "folder", f"source={folder}", f"data_root={tmp_path}", "check=true"]),
+        "adapt": lambda: check_clips(folder, 20.0),
+    }
+
+    def said(enter: Callable[[], Any]) -> str:
+        try:
+            return f"{enter()} {''.join(capsys.readouterr())}"
+        except UserError as error:
+            return str(error)
+
+    swapped, small = replace(walk(), joints=walk().joints[:, SWAPPED]), replace(walk(), joints=0.4 * walk().joints)
+    for motion, words in ((swapped, "the toes point backwards"), (small, "people's are")):
+        write_bvh(path, motion)
+        for name, enter in entrances.items():
+            assert words in said(enter), name
+    write_bvh(path, walk(), turn="z")
+    for name, enter in entrances.items():
+        assert re.search("lying down.*up", said(enter), re.DOTALL), name
+
+
+def test_a_rest_pose_in_front_is_left_out_and_said(tmp_path: Path, capsys):
+    motion, rest = walk(30), posed(1).joints[0]
+    write_bvh(tmp_path / "a.bvh", motion, first=rest)
+    np.savez(tmp_path / "b.npz", joints=np.concatenate([rest[None], motion.joints]), fps=20)
+    parts = amass(motion)
+    still = {name: np.concatenate([parts[name][:1] * (name == "trans"), parts[name]]) for name in ("poses", "trans")}
+    still["poses"][0, 0] = np.pi / 2
+    np.savez(tmp_path / "c.npz", **(parts | still))
+    motion.save(tmp_path / "d.bvh", rest_pose=True, rig="lafan1")
+    for name in ("a.bvh", "b.npz", "c.npz", "d.bvh"):
+        again = read(tmp_path / name)
+        assert any("the first frame is a rest pose" in note for note in again.notes), name
+        np.testing.assert_allclose(again.joints, motion.joints, atol=0.01)
+    source = Folder(str(tmp_path), workers=1)
+    assert [len(clip.motion) for clip in source.clips(20.0)] == [30] * 4
+    assert "4 motions: the first frame is a rest pose and is left out" in source.findings()
+    smooth = posed(30, left_shoulder=np.linspace([0, 0, 0], [0, 0, -70], 30), right_shoulder=[0, 0, 0])
+    smooth.save(tmp_path / "e.json")
+    kept = json.loads((tmp_path / "e.json").read_text())
+    (tmp_path / "e.json").write_text(json.dumps({"joints": kept["joints"], "fps": 20}))
+    assert len(read(tmp_path / "e.json").joints) == 30, "a motion that begins in a rest pose is kept"
+
+
+def test_legs_that_flip_are_noticed(tmp_path: Path):
+    motion = walk(40)
+    angles = np.zeros((40, 3))
+    angles[20:] = [170, 0, 0]
+    flipped = posed(40, left_hip=angles)
+    flipped = replace(flipped, fps=60.0)
+    np.savez(tmp_path / "a.npz", joints=flipped.joints, fps=60)
+    np.savez(tmp_path / "b.npz", joints=motion.joints, fps=60)
+    assert any("a leg flips, it moves at" in note for note in read(tmp_path / "a.npz").notes)
+    source = Folder(str(tmp_path), workers=1)
+    assert [clip.id for clip in source.clips(20.0)] == ["b"]
+    assert "a leg flips" in source.failures[0]
+
+
+def test_check_and_preparation_agree_and_one_bad_file_stops_nothing(tmp_path: Path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("mine").mkdir()
+    np.savez("mine/a.npz", joints=walk(60).joints, fps=20)
+    np.savez("mine/c.npz", joints=walk(50).joints, fps=20)
+    np.savez("mine/one.npz", joints=walk(1).joints, fps=20)
+    Path("mine/b.bvh").write_text("HIERARCHY\n")
+    words = ["prepare", "folder", "source=mine", "data.name=ours", "data_root=data", "data.source.workers=1"]
+    assert main([*words, "check=true"]) == 1
+    checked = capsys.readouterr().out
+    assert main(words) == 1
+    prepared = capsys.readouterr().out
+    for said in (checked, prepared):
+        assert "mine/b.bvh, line 1" in said
+        assert "mine/one.npz: 1 frames at 20 per second, but a motion has at least 3" in said
+        assert "error: 2 of 4 motions of mine cannot be prepared" in said
+    store = Store(Path("data/ours-humanml-clean-smpl22"))
+    assert [clip.id for clip in store.clips] == ["a", "c"]
+    assert store.info["excluded"] == {"motions that cannot be read": 2}
+    assert store.info["version"] == 2
+
+    assert main(["inspect", "ours", "data_root=data"]) in (0, 3), "a data set prepared under its name"
+    assert "of 2 motions" in capsys.readouterr().out
+    Path("mine/one.npz").unlink()
+    assert main(["inspect", "mine/", "page.html"]) == 1
+    printed = capsys.readouterr()
+    assert "of 2 motions" in printed.out
+    assert "error: 1 of 3 motions could not be read" in printed.err
+    assert main(["convert", "mine", "out", "format=npy"]) == 1
+    assert sorted(path.name for path in Path("out").iterdir()) == ["a.npy", "c.npy"]
+    assert "error: mine/b.bvh, line 1" in capsys.readouterr().err
+
+
+def test_files_that_are_no_motions_are_left_out_of_folders(tmp_path: Path):
+    np.savez(tmp_path / "a.npz", joints=walk().joints, fps=20)
+    (tmp_path / "meta.json").write_text('{"joints": ["Hips"], "license": "CC0"}')
+    (tmp_path / "b.json").write_text(json.dumps({"fps": 20, "joints": walk().joints.tolist()}, indent=1))
+    (tmp_path / "__MACOSX").mkdir()
+    for name in ("._a.bvh", "__MACOSX/._a.bvh", "__MACOSX/a.bvh", "shape.npz", "neutral_stagei.npz"):
+        (tmp_path / name).write_bytes(b"\0\5\26\7")
+    assert list(Folder(str(tmp_path), workers=1).files) == ["a", "b"]
+    assert main(["convert", str(tmp_path), str(tmp_path / "out"), "format=npy"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("a.blend", "export BVH"),
+        ("a.c3d", "markers"),
+        ("a.pkl", "numpy.savez"),
+        ("a.xyz", "neither a motion file (.npz"),
+    ],
+)
+def test_files_of_other_kinds_are_refused_with_a_way_out(name: str, says: str, tmp_path: Path, capsys):
+    (tmp_path / name).write_bytes(b"x")
+    assert main(["convert", str(tmp_path / name), str(tmp_path / "o.npy")]) == 1
+    assert says in capsys.readouterr().err
+
+
+def test_pointers_of_git_lfs_are_named(tmp_path: Path):
+    for name in ("a.bvh", "a.npz", "a.json", "a.npy", "a.amc", "a.glb"):
+        (tmp_path / name).write_text(POINTER)
+        with pytest.raises(UserError, match=r"a Git LFS pointer .*git lfs pull"):
+            (glb.read if name.endswith("glb") else read)(tmp_path / name)
+
+
+def test_extensions_that_compress_a_character_are_named(tmp_path: Path):
+    synthetic("kick").save(tmp_path / "a.glb", rig="mixamo")
+    for name, is_read in (("EXT_meshopt_compression", False), ("KHR_materials_unlit", True)):
+        shutil.copy(tmp_path / "a.glb", tmp_path / "b.glb")
+        changed(tmp_path / "b.glb", partial(dict.update, extensionsRequired=[name]))
+        if is_read:
+            glb.read(tmp_path / "b.glb")
+            continue
+        with pytest.raises(UserError, match=rf"b\.glb: it requires {name}, .* without this compression\Z"):
+            glb.read(tmp_path / "b.glb")
+
+
+def test_two_people_and_rates_of_cmu_are_said(tmp_path: Path):
+    write_bvh(tmp_path / "a.bvh", walk())
+    head, table = (tmp_path / "a.bvh").read_text().split("MOTION")
+    second = head.replace("HIERARCHY\n", "").replace("ROOT pelvis", "ROOT other")
+    rows = table.splitlines()
+    numbered = [*rows[:3], *(f"{row} {row}" for row in rows[3:])]
+    (tmp_path / "two.bvh").write_text(head + second + "MOTION" + "\n".join(numbered) + "\n")
+    two = read(tmp_path / "two.bvh")
+    assert two.notes == ("2 people in the file (ROOT): the first one is read",)
+    np.testing.assert_allclose(two.joints, walk().joints, atol=1e-5)
+    motion = replace(walk(), fps=120.0)
+    motion.save(tmp_path / "60_01.bvh", rig="cmu")
+    motion.save(tmp_path / "02_01.bvh", rig="cmu")
+    assert (read(tmp_path / "60_01.bvh").fps, read(tmp_path / "02_01.bvh").fps) == (60, 120)
+    assert "CMU recorded it at 60 frames per second, not 120" in read(tmp_path / "60_01.bvh").notes[0]
+    assert read(tmp_path / "60_01.bvh", fps=120).fps == 120
+
+
+def test_a_smaller_body_is_said_and_cubic_splines_resample_own_files_everywhere(tmp_path: Path):
+    parts = amass(walk())
+    np.savez(tmp_path / "a.npz", **(parts | {"trans": parts["trans"] - [0, 0, 0.09]}))
+    assert "the feet are 9 cm below the floor" in read(tmp_path / "a.npz").notes[0]
+    joints = synthetic("kick", 30.0).joints
+    np.savez(tmp_path / "a.npz", joints=joints, fps=30)
+    (clip,) = Folder(str(tmp_path), workers=1).clips(20.0)
+    np.testing.assert_array_equal(clip.motion, read(tmp_path / "a.npz", resample_to=20).joints)
+
+
+FILES = SHARED / "data" / "files-of-others"
+
+
+@pytest.mark.skipif(not FILES.exists(), reason="the files of other programs are outside of the repository")
+@pytest.mark.parametrize(
+    ("name", "keys", "head", "note"),
+    [
+        ("f01_stageii.npz", {}, 1.57, ""),
+        ("f02_y_up.npz", {"up": "y"}, 1.57, ""),
+        ("f02_y_up.npz", {}, 0.23, "up=y"),
+        ("f03_z_up.bvh", {}, 0.25, "up=z"),
+        ("f03_z_up.bvh", {"up": "z"}, 1.54, ""),
+        ("f05_json_z_up.json", {}, 1.54, ""),
+        ("f05_json_z_up.json", {"up": "z"}, 1.54, ""),
+        ("f06_tpose_first.bvh", {}, 1.54, "rest pose"),
+        ("f12_body_only_66.npz", {}, 1.57, ""),
+        ("f12_rate_of_one_element.npz", {}, 1.57, ""),
+        ("f13_shorter_person.npz", {}, 1.57, "smaller"),
+        ("f14_two_people.bvh", {}, 1.54, "2 people"),
+        ("f15_half.npz", {}, 1.57, ""),
+    ],
+)
+def test_the_collected_files_have_their_heights(name: str, keys: dict, head: float, note: str):
+    motion = read(FILES / name, **keys)
+    assert head_height(motion.joints) == pytest.approx(head, abs=0.02)
+    assert note in " ".join(motion.notes)

@@ -32,7 +32,7 @@ def read_arrays(path: Path) -> dict[str, Any]:
     suffix = path.suffix.lower()
     if suffix == ".npz":
         data: dict[str, Any] = read_npz(path, only=NEEDED)
-        data["ours"] = {"text", "joints"} <= data.keys()
+        data["ours"] = "joints" in data and bool({"text", "features"} & data.keys())
     elif suffix == ".npy":
         data = {"joints": read_npy(path), "ours": False}
     else:

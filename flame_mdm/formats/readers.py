@@ -201,7 +201,7 @@ def _of_joints(
     rate: float | None,
     resample_to: float | None,
     fields: dict[str, Any],
-    said: Mapping[str, Any],
+    said: dict[str, Any],
     as_smpl: bool,
 ) -> Recording:
     """Returns the recording of an array of joints; `said` has the keys of the command, which override the file's."""
@@ -265,7 +265,7 @@ def _of_ours(
     rate: float | None,
     resample_to: float | None,
     fields: Mapping[str, Any],
-    said: Mapping[str, Any],
+    said: dict[str, Any],
     as_smpl: bool,
 ) -> Recording:
     """Returns the recording of a file that this project wrote: in meters, y up, with rotations and features."""
@@ -277,7 +277,7 @@ def _of_ours(
     if as_smpl:
         layout, names = array_layout(joints, {})
         joints = layout.apply(joints.astype(float), names)
-    motion = Motion(joints, rate, _skeleton(joints), str(data["text"]), path.stem, _poses(data), notes=notes)
+    motion = Motion(joints, rate, _skeleton(joints), str(data.get("text", "")), path.stem, _poses(data), notes=notes)
     if "features" in data:
         motion.features = data["features"].astype(np.float32)
         motion.representation = str(data.get("representation", ""))

@@ -338,7 +338,7 @@ def synthetic_take(seed: int, frames: int) -> bvh.Bvh:
     joints, offsets = tuple(BONES), np.stack(list(BONES.values()))
     time = np.arange(frames)[:, None, None] / 30
     phase, size = rng.uniform(0, 6, (2, 22, 3))
-    values = np.concatenate([np.tile(offsets, (frames, 1, 1)), 8 * size * np.sin(3 * time + phase)], 2)
+    values = np.concatenate([np.tile(offsets, (frames, 1, 1)), 20 * size * np.sin(3 * time + phase)], 2)
     values[:, 0] = 0
     values[:, 1, :3] += 30 * np.sin(2 * time[:, 0] + phase[1])
     channels = ("Xposition", "Yposition", "Zposition", "Zrotation", "Xrotation", "Yrotation")

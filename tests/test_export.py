@@ -16,9 +16,9 @@ from flame_mdm.data import amass
 from flame_mdm.errors import UserError
 from flame_mdm.formats import bvh
 from flame_mdm.formats.body import fit_body
+from flame_mdm.formats.layouts import tree_layout
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.poses import Poses, solve
-from flame_mdm.formats.layouts import tree_layout
 from flame_mdm.formats.readers import read
 from flame_mdm.formats.retarget import continuous_euler
 from flame_mdm.representations import rotation

@@ -2,29 +2,34 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-import torch.nn.functional as F
-from scipy.stats import hypergeom, mannwhitneyu, rankdata
+from scipy.stats import mannwhitneyu, rankdata
 from torch import Tensor
 
 from evaluators.evaluation_request import EvaluationRequest
-from evaluators.evaluator import Evaluator, Motions, Rows
+from evaluators.evaluator import Evaluator, keys_of
+from evaluators.evaluator import Motions as MotionsOf
 from evaluators.extractors import OwnExtractor
-from evaluators.metrics import alignment, make_metrics, physics, update_metrics
-from evaluators.metrics.attributes import AttributeAccuracy, read_attributes, right_attributes
-from evaluators.metrics.distribution import FrechetMotionDistance, frechet_distance
-from evaluators.metrics.diversity import Diversity
-from evaluators.metrics.published_physics import PublishedPhysics
-from evaluators.metrics.samples import MotionMean
-from evaluators.perturbations import BASE, REAL, Inputs, Perturbation, Scene, Text, text_of
+from evaluators.metrics import make_metrics, required_inputs
+from evaluators.metrics.samples import SampleMetric
+from evaluators.perturbations import (
+    BASE,
+    REAL,
+    STORED,
+    Inputs,
+    Motions,
+    Perturbation,
+    base_motions,
+    perturbations_of,
+)
 from evaluators.plan import open_data
 from evaluators.protocol import digest, open_protocol
+from evaluators.scene import Scene, Text, text_of
 from evaluators.sources import real_motions
 from flame_mdm.errors import UserError
 from flame_mdm.progress import ProgressBar
@@ -36,8 +41,11 @@ from flame_mdm.schemas import check_shape
 from flame_mdm.training.provenance import environment
 
 FORMAT = 1
-TRUTH = "attributes/all"  # share of motions that show every requested attribute
-PHYSICS = (physics.FootSkating, physics.StaticShare, physics.Penetration, physics.Jitter, PublishedPhysics)
+CACHE = 2  # version of the cached metric inputs
+OF_TEXTS = {"text", "text_keys", "requested"}
+"""Inputs that depend on the captions of the motions."""
+AVAILABLE = OF_TEXTS | {"keys", "joints", "mask", "contacts", "generated", "real"}
+"""Inputs that an audit has; metrics that require others are not audited."""
 
 
 def audit(request: EvaluationRequest, cache: Path, resamples: int) -> AuditCard:
@@ -68,10 +76,16 @@ def audit(request: EvaluationRequest, cache: Path, resamples: int) -> AuditCard:
     }
     evaluator = Evaluator(extractor, protocol.metrics, representation, batch_size=request.batch_size or 64)
     scene = Scene(data, rows, real_motions(clips, rows), representation, request.seed)
-    sets = {REAL: lambda: real_motions(clips, [again[row.clip.id] for row in rows])} | scene.motions()
     texts = [text_of(row, row.text) for row in rows] if protocol.condition == "text" else []
-    perturbations = scene.perturbations(bool(texts))
-    folder = cache / digest([FORMAT, facts, protocol.sha256])[:16]
+    perturbations = perturbations_of(scene, bool(texts))
+    sets: dict[str, Motions] = {
+        REAL: lambda: real_motions(clips, [again[row.clip.id] for row in rows]),
+        BASE: lambda: base_motions(scene),
+        STORED: lambda: scene.features,
+    }
+    for perturbation in perturbations:
+        sets |= perturbation.motions(scene)
+    folder = cache / digest([CACHE, facts, protocol.sha256])[:16]
     check_within(folder, cache.parent)
     steps = len(sets) + sum(len(perturbation.grades) for perturbation in perturbations)
     with ProgressBar(total=steps, desc="audit", unit=" sets") as bar:
@@ -88,13 +102,14 @@ def audit(request: EvaluationRequest, cache: Path, resamples: int) -> AuditCard:
 def _measured(
     measure: _Measure, scene: Scene, perturbations: Sequence[Perturbation], texts: Sequence[Text], bar: ProgressBar
 ) -> dict[str, Any]:
+    """Returns what a card says about the metrics and about each perturbation at each grade."""
     base = measure(measure.inputs[BASE], texts)
     scores, listed = [measure.scores(measure.inputs[BASE], texts)], []
     for perturbation in perturbations:
         grades = []
         changed, wrong = measure.inputs[BASE], texts
         for grade in perturbation.grades:
-            changed, wrong = scene.condition(perturbation, grade, measure.inputs, texts)
+            changed, wrong = perturbation.apply(scene, grade, measure.inputs, texts)
             grades.append({"grade": float(grade), "values": _differences(measure(changed, wrong), base)})
             bar.update()
         if perturbation.group == "meaning":
@@ -102,43 +117,38 @@ def _measured(
         about = {name: getattr(perturbation, name) for name in ("name", "group", "about", "unit")}
         listed.append({**about, "grades": grades})
     return {
-        "metrics": {name: measure.higher_is_better(name) for name in base},
+        "metrics": {name: measure.direction_of(name) for name in base},
+        "facts": {name: measure.facts_of(name) for name in base},
         "real": {name: _interval(values) for name, values in base.items()},
         "perturbations": listed,
         "not_computed": measure.reasons,
-        "truth": _agreement(scores, listed),
+        "truth": _agreement(measure, scores, listed),
     }
 
 
-def _inputs(evaluator: Evaluator, path: Path, ids: list[str], make: Callable[[], list[np.ndarray]]) -> Inputs:
+def _inputs(evaluator: Evaluator, path: Path, ids: list[str], make: Motions) -> Inputs:
     """Returns the metric inputs of motions, from the cache or else from one feature pass."""
     if path.exists():
         return read_npz(path)
-    extracted = evaluator.extract(Motions(ids, make()))
+    extracted = evaluator.extract(MotionsOf(ids, make()))
     features = extracted.get("generated")
     inputs: Inputs = {} if features is None else {"features": features.double().numpy()}
-    for name, metric in make_metrics(evaluator.metrics).items():
-        if isinstance(metric, AttributeAccuracy):
-            inputs["seen"] = np.array([json.dumps(read_attributes(x.numpy(), metric.fps)) for x in extracted["joints"]])
-        elif isinstance(metric, PHYSICS):
-            inputs |= _ratios(name, metric, extracted)
+    for name, metric in audited_metrics(evaluator).items():
+        inputs |= {_named(name, part): values for part, values in metric.readings(extracted).items()}
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as temporary:
         np.savez(temporary, allow_pickle=False, **inputs)
     return inputs
 
 
-def _ratios(name: str, metric: MotionMean, extracted: Rows) -> Inputs:
-    """Returns value and weight (N, 2) of each motion, by metric; nothing if it is defined at another frame rate."""
-    if isinstance(metric, PublishedPhysics) and metric.required_fps not in (None, metric.fps):
-        return {}
-    for i, joints in enumerate(extracted["joints"]):
-        rows = {"joints": joints[None], "mask": torch.ones(1, len(joints), dtype=torch.bool)}
-        rows |= {"contacts": extracted["contacts"][i][None]} if "contacts" in extracted else {}
-        update_metrics({name: metric}, keys=extracted["keys"][i : i + 1], **rows)
-    pairs = torch.stack([torch.cat(getattr(metric, state)) for state in metric.states], 1).numpy()
-    parts = [f"{name}/{part}" for part in metric.parts or metric.names] or [name]
-    return {part: pairs[..., k] for k, part in enumerate(parts) if pairs[:, 1, k].any()}
+def audited_metrics(evaluator: Evaluator) -> dict[str, SampleMetric]:
+    """Returns the metrics of an evaluator whose inputs an audit has, by name."""
+    metrics = make_metrics(evaluator.metrics)
+    return {name: metric for name, metric in metrics.items() if AVAILABLE.issuperset(required_inputs(metric))}
+
+
+def _named(metric: str, part: str) -> str:
+    return f"{metric}/{part}" if part else metric
 
 
 class _Measure:
@@ -156,88 +166,103 @@ class _Measure:
         draws: np.random.Generator,
         resamples: int,
     ):
-        self.metrics, self.extractor, self.inputs = make_metrics(evaluator.metrics), evaluator.extractor, inputs
+        self.metrics, self.extractor, self.inputs = audited_metrics(evaluator), evaluator.extractor, inputs
         count = len(next(iter(inputs[BASE].values())))
         resampled = draws.multinomial(count, np.full(count, 1 / count), resamples)
         self.weights = np.concatenate([np.ones((1, count), int), resampled])
         self.reasons: dict[str, str] = {} if self.extractor else {"extractor": "metrics that need features"}
         self.encoded: dict[str, Tensor] = {}
-        self.real_texts, self.base_sets = texts, self._sets(inputs[BASE])
+        self.real_texts, self.of_motions = texts, {}
 
     def __call__(self, inputs: Inputs, texts: Sequence[Text]) -> dict[str, np.ndarray]:
         """Returns the values (1 + R,) of each metric."""
-        values = {}
-        for name, pair in self._pairs(inputs, texts).items():
-            weights = self.weights[:, : len(pair)]
-            with np.errstate(invalid="ignore"):
-                values[name] = weights @ pair[:, 0] / (weights @ pair[:, 1])
-        values |= self.base_sets if inputs is self.inputs[BASE] else self._sets(inputs)  # the same for other captions
-        order = list(self.metrics)
-        return dict(sorted(values.items(), key=lambda item: order.index(item[0].partition("/")[0])))
-
-    def scores(self, inputs: Inputs, texts: Sequence[Text]) -> dict[str, np.ndarray]:
-        """Returns the values (N,) of single pairs, by metric."""
-        return {name: pair[:, 0] for name, pair in self._pairs(inputs, texts).items()}
-
-    def higher_is_better(self, name: str) -> bool | None:
-        metric, _, part = name.partition("/")
-        directions = getattr(self.metrics[metric], "DIRECTIONS", {})
-        return directions.get(part, self.metrics[metric].higher_is_better)
-
-    def _sets(self, inputs: Inputs) -> dict[str, np.ndarray]:
-        """Returns the values (1 + R,) of metrics of sets, by name."""
         values: dict[str, np.ndarray] = {}
-        if "features" not in inputs:
-            return values
-        x, real = (torch.from_numpy(group["features"]) for group in (inputs, self.inputs[REAL]))
         for name, metric in self.metrics.items():
-            if isinstance(metric, Diversity):
-                weights = self.weights[:, : len(x)]
-                values[name] = ((weights @ _distances(x, x).numpy()) * weights).sum(1) / weights.sum(1) ** 2
-            elif isinstance(metric, FrechetMotionDistance):
-                repeats = [(torch.from_numpy(w[: len(x)]), torch.from_numpy(w)) for w in self.weights]
-                drawn = ((x.repeat_interleave(a, 0), real.repeat_interleave(b, 0)) for a, b in repeats)
-                values[name] = np.array([frechet_distance(*sets).item() for sets in drawn])
+            reused = self.of_motions.get(name) if inputs is self.inputs[BASE] else None
+            values |= reused or self._weighted(name, metric, inputs, texts)
         return values
 
-    def _pairs(self, inputs: Inputs, texts: Sequence[Text]) -> dict[str, np.ndarray]:
-        """Returns value and weight (N, 2) of each motion or pair, by metric."""
-        pairs = {name: pair for name, pair in inputs.items() if name.partition("/")[0] in self.metrics}
-        if texts and "seen" in inputs and all("action" in text.requested for text in texts):
-            read = [(json.loads(str(seen)), text.requested) for seen, text in zip(inputs["seen"], texts, strict=True)]
-            right = [right_attributes(*pair) for pair in read]
-            name = next(name for name, metric in self.metrics.items() if isinstance(metric, AttributeAccuracy))
-            for part in AttributeAccuracy.names:
-                if any(part in shown for shown in right):
-                    weighted = [[shown.get(part, False), part in shown] for shown in right]
-                    pairs[f"{name}/{part}"] = np.array(weighted, float)
-        if not texts or "features" not in inputs:
-            return pairs
-        motion, text = torch.from_numpy(inputs["features"]), self._encoded(texts)
-        unit = F.normalize(motion, dim=-1), F.normalize(text, dim=-1)
-        values: dict[str, np.ndarray | Tensor] = {}
+    def _weighted(
+        self, name: str, metric: SampleMetric, inputs: Inputs, texts: Sequence[Text]
+    ) -> dict[str, np.ndarray]:
+        rows = self._rows(name, metric, inputs, texts)
+        if rows is None:
+            return {}
+        try:
+            computed = metric.weighted(rows, self.weights)
+        except UserError as error:
+            self.reasons[name] = str(error)
+            return {}
+        values = {_named(name, part): x for part, x in computed.items() if _is_audited(metric, part)}
+        if inputs is self.inputs[BASE] and not OF_TEXTS.intersection(required_inputs(metric)):
+            self.of_motions[name] = values  # the same for other captions
+        return values
+
+    def scores(self, inputs: Inputs, texts: Sequence[Text]) -> dict[str, np.ndarray]:
+        """Returns the values (N,) of single motions or pairs, by metric."""
+        values = {}
         for name, metric in self.metrics.items():
-            pair = unit if getattr(metric, "normalize", False) else (motion, text)
-            if isinstance(metric, alignment.TextsForMotion):
-                candidates = {text.caption: text for text in texts}
-                columns = list(candidates)
-                own = torch.tensor([columns.index(text.caption) for text in texts])
-                distance = _distances(motion, self._encoded(list(candidates.values())))
-                values |= self._top(name, metric, distance, own)
-            elif isinstance(metric, alignment.MotionsForText):
-                values |= self._top(name, metric, _distances(pair[1], pair[0]), torch.arange(len(motion)))
-            elif isinstance(metric, alignment.MultimodalDistance):
-                values[name] = torch.linalg.vector_norm(pair[0] - pair[1], dim=-1)
-            elif isinstance(metric, alignment.MotionCLIPScore):
-                values[name] = (unit[0] * unit[1]).sum(1)
-            elif isinstance(metric, alignment.MutualInformationDivergence):
-                real, real_text = torch.from_numpy(self.inputs["as stored"]["features"]), self._encoded(self.real_texts)
-                if len(real) > real.shape[1] + real_text.shape[1]:
-                    sets = (real, real_text, motion, text)
-                    values[name] = alignment.pointwise_mutual_information(*sets, metric.eps)
-                else:
-                    self.reasons[name] = f"{len(real)} motions are too few for its covariances"
-        return pairs | {name: np.stack([value, np.ones(len(value))], 1) for name, value in values.items()}
+            rows = self._rows(name, metric, inputs, texts)
+            if rows is not None and name not in self.reasons:
+                pairs = metric.per_sample(rows)
+                values |= {_named(name, part): np.asarray(x)[:, 0] for part, x in pairs.items()}
+        return values
+
+    def direction_of(self, name: str) -> bool | None:
+        metric, _, part = name.partition("/")
+        return self.metrics[metric].direction_of(part)
+
+    def facts_of(self, name: str) -> dict[str, Any]:
+        """Returns what a card says about a value besides its direction; see `AuditedMetric`."""
+        metric, _, part = name.partition("/")
+        declared = self.metrics[metric]
+        return {
+            "unit": declared.unit_of(part),
+            "sees_meaning": declared.sees_meaning,
+            "sums_up": part == declared.summary,
+            "exact": declared.exact is not None,
+            "depends_on_count": declared.depends_on_count,
+        }
+
+    @property
+    def truth(self) -> str | None:
+        """Name of the value that reads every requested attribute exactly; None if no metric does."""
+        exact = {name: metric.exact for name, metric in self.metrics.items() if metric.exact is not None}
+        return next((_named(name, part) for name, part in exact.items()), None)
+
+    @property
+    def judges(self) -> dict[str, int]:
+        """Values that judge pairs of motion and text by features, and 1, or -1 if lower values are better."""
+        names = {}
+        for name, metric in self.metrics.items():
+            if "text" in required_inputs(metric):
+                part = metric.names[0] if metric.names else ""
+                names[_named(name, part)] = -1 if metric.direction_of(part) is False else 1
+        return names
+
+    def _rows(self, name: str, metric: SampleMetric, inputs: Inputs, texts: Sequence[Text]) -> dict[str, Any] | None:
+        """Returns the inputs of a metric, float64, with its readings; None if they are not known."""
+        required = set(required_inputs(metric)) | ({"generated"} if "generated" in metric.states else set())
+        rows: dict[str, Any] = {}
+        if "generated" in required:
+            if "features" not in inputs:
+                return None
+            rows = {
+                "generated": torch.from_numpy(inputs["features"]),
+                "real": torch.from_numpy(self.inputs[REAL]["features"]),
+            }
+        if required & OF_TEXTS:
+            if not texts or ("requested" in required and not all("action" in text.requested for text in texts)):
+                return None
+            rows["requested"] = [text.requested for text in texts]
+        if "text" in required:
+            rows["text"] = self._encoded(texts)
+            rows["text_keys"] = keys_of([text.caption for text in texts])
+            rows["paired"] = torch.from_numpy(self.inputs[STORED]["features"])
+            rows["paired_text"] = self._encoded(self.real_texts)
+        prefix = f"{name}/"
+        own = {key: values for key, values in inputs.items() if key == name or key.startswith(prefix)}
+        return rows | {key.removeprefix(name).removeprefix("/"): values for key, values in own.items()}
 
     def _encoded(self, texts: Sequence[Text]) -> Tensor:
         """Returns features (N, E) of texts, float64; each caption is encoded once."""
@@ -249,21 +274,9 @@ class _Measure:
             self.encoded |= dict(zip(new, features.detach().cpu().double(), strict=True))
         return torch.stack([self.encoded[text.caption] for text in texts])
 
-    def _top(
-        self, name: str, metric: alignment.TextsForMotion | alignment.MotionsForText, distance: Tensor, own: Tensor
-    ) -> dict[str, np.ndarray]:
-        """Returns how probable it is that the own candidate is among the top 1 and 3 of a random pool, by query."""
-        others = distance.shape[1] - 1
-        if others + 1 < metric.pool:
-            self.reasons[name] = f"{others + 1} candidates are fewer than a pool of {metric.pool}"
-            return {}
-        at = distance.gather(1, own[:, None])
-        closer = (distance < at).sum(1) + ((distance == at).sum(1) - 1) // 2
-        return {f"{name}/top{k}": hypergeom.cdf(k - 1, others, closer.numpy(), metric.pool - 1) for k in (1, 3)}
 
-
-def _distances(a: Tensor, b: Tensor) -> Tensor:
-    return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
+def _is_audited(metric: SampleMetric, part: str) -> bool:
+    return metric.audited is None or part in metric.audited
 
 
 def _interval(values: np.ndarray) -> list[float | None]:
@@ -279,23 +292,24 @@ def _differences(values: Mapping[str, np.ndarray], base: Mapping[str, np.ndarray
 
 
 def _agreement(
-    scores: Sequence[Mapping[str, np.ndarray]], perturbations: Sequence[Mapping[str, Any]]
+    measure: _Measure, scores: Sequence[Mapping[str, np.ndarray]], perturbations: Sequence[Mapping[str, Any]]
 ) -> dict[str, dict[str, float | None]]:
     """Returns how well metrics of pairs agree with exact attributes, by metric; {} if these are not known.
 
     "auc" is the probability that a pair with every requested attribute has a better score than one without, among real
     motions and the strongest perturbations of the meaning; "correlation" is Spearman's over all of them and grades.
     """
-    if TRUTH not in scores[0]:
+    truth = measure.truth
+    if truth is None or truth not in scores[0]:
         return {}
-    right = np.concatenate([of_set[TRUTH] for of_set in scores]) > 0
+    right = np.concatenate([of_set[truth] for of_set in scores]) > 0
     grades = [grade["values"] for perturbation in perturbations for grade in perturbation["grades"]]
     agreement = {}
-    for name in scores[0]:
-        if name.endswith("/top1") or name in ("mm_dist", "mclip_score", "mid"):
-            score = np.concatenate([of_set[name] for of_set in scores]) * (-1 if name == "mm_dist" else 1)
+    for name, sign in measure.judges.items():
+        if name in scores[0]:
+            score = np.concatenate([of_set[name] for of_set in scores]) * sign
             larger = mannwhitneyu(score[right], score[~right], method="asymptotic")[0]
-            both = [(grade[name][0], grade[TRUTH][0]) for grade in grades if grade[name][0] is not None]
+            both = [(grade[name][0], grade[truth][0]) for grade in grades if grade[name][0] is not None]
             agreement[name] = {
                 "auc": float(larger / (right.sum() * (~right).sum())),
                 "correlation": float(np.corrcoef(rankdata(both, axis=0).T)[0, 1]),

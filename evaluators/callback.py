@@ -9,8 +9,10 @@ from evaluators.evaluation import Evaluation
 from evaluators.plan import sampling_options
 from evaluators.protocol import open_protocol
 from evaluators.sources import Generator
+from flame_mdm.checkpoints.locating import find
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.errors import UserError
+from flame_mdm.records import Value
 from flame_mdm.runs import made_by
 from flame_mdm.task import GeneratorTask
 from flame_mdm.training.loggers import log_table
@@ -19,13 +21,15 @@ from flame_mdm.training.loggers import log_table
 class Evaluate(Callback):
     """Evaluates the model on the validation split under a protocol, and logs val/<protocol>/<metric>.
 
-    Checkpoints can be selected by these values. With several replications, val/<protocol>/<metric>/ci is the half width
-    of the 95 % interval. The evaluation runs at the first validation and then at multiples of `every_n_steps`, with
+    Checkpoints can be selected by these values. Dashboards show them with their units, as val/<protocol>/<metric>
+    (<unit>), beside the value of real motions, .../real. With several replications, .../ci is the half width of the
+    95 % interval. The evaluation runs at the first validation and then at multiples of `every_n_steps`, with
     averaged weights if the recipe averages them. The motions are divided among all processes.
 
     Args:
         protocol: a name in experiments/evaluation, or the path of a file.
-        extractor: path from which the protocol's extractor is loaded; "none" skips metrics of features.
+        extractor: file, folder, model in the package or run directory from which the protocol's extractor is loaded, as
+            for `flame-mdm evaluate`; None = the protocol's own; "none" skips metrics of features.
         samples: motions per replication; None = the protocol's number.
 
     Raises `UserError` before training begins if the extractor does not exist.
@@ -41,14 +45,13 @@ class Evaluate(Callback):
         batch_size: int = 64,
     ):
         if extractor not in (None, "none") and not Path(extractor).exists():
-            raise UserError(
-                f"callbacks.evaluate.extractor={extractor}: no such file, but it is needed to choose the best "
-                f"checkpoint: {made_by(extractor)}. Or choose by the validation loss: selection=loss"
-            )
+            _find_extractor(extractor)
         self.name, self.path, self.every_n_steps = protocol, extractor, every_n_steps
         self.samples, self.replications, self.batch_size = samples, replications, batch_size
         self.next = 0
         self.values: dict[str, float] = {}
+        self.curves: dict[str, float] = {}
+        self.real: dict[str, Value | None] = {}
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         assert isinstance(pl_module, GeneratorTask)
@@ -70,17 +73,46 @@ class Evaluate(Callback):
         options, edit = sampling_options(protocol, pl_module.generator)
         size: dict[str, Any] = {"seed": 0, "batch_size": self.batch_size, "progress": False}
         source = Generator(pl_module.generator, protocol, self.evaluation.clips, options, edit, **size)
-        values = self.evaluation.run(source, ground_truth=False).values or {}
-        numbers = {name: v.mean for name, v in values.items() if v is not None and v.mean is not None}
-        widths = {f"{name}/ci": v.ci for name, v in values.items() if v is not None and v.ci is not None}
-        logged = numbers | (widths if self.replications > 1 else {})
-        self.values = {f"val/{protocol.name}/{name}": value for name, value in logged.items()}
+        measured = self.evaluation.run(source, ground_truth=not self.real, force=True)
+        values = measured.values or {}
+        self.real = self.real or measured.ground_truth or {}
+        for name, value in values.items():
+            if value is not None and value.mean is not None:
+                self._add(f"val/{protocol.name}/{name}", value, self.real.get(name))
         if trainer.is_global_zero:
-            columns = ("mean", "ci", "replications", "n")
-            rows = [[metric, *(getattr(value, column) for column in columns)] for metric, value in values.items()]
+            columns = ("mean", "ci", "replications", "n", "unit")
+            rows = []
+            for metric, value in values.items():
+                real = self.real.get(metric)
+                rows.append([metric, *(getattr(value, column) for column in columns), real and real.mean])
+            head = ["metric", *columns, "real motions"]
             for logger in trainer.loggers:
-                log_table(logger, f"evaluation/{protocol.name}", ["metric", *columns], rows, trainer.global_step - 1)
+                log_table(logger, f"evaluation/{protocol.name}", head, rows, trainer.global_step - 1)
+
+    def _add(self, name: str, value: Value, real: Value | None) -> None:
+        """Adds the value by which checkpoints are selected, and the curves of dashboards."""
+        assert value.mean is not None
+        self.values[name] = value.mean
+        label = f"{name} ({value.unit})" if value.unit else name
+        self.curves[label] = value.mean
+        if value.ci is not None:
+            self.values[f"{name}/ci"] = self.curves[f"{label}/ci"] = value.ci
+        if real is not None and real.mean is not None:
+            self.curves[f"{label}/real"] = real.mean
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        pl_module.log_dict(self.values)  # computed at the start, since averaged weights are swapped out by now
-        self.values = {}
+        # Computed at the start, since averaged weights are swapped out by now.
+        pl_module.log_dict(self.curves)
+        pl_module.log_dict({name: x for name, x in self.values.items() if name not in self.curves}, logger=False)
+        self.values, self.curves = {}, {}
+
+
+def _find_extractor(source: str) -> None:
+    """Raises `UserError` if an extractor does not exist, and says how to get it."""
+    try:
+        find(source)
+    except (UserError, FileNotFoundError) as error:
+        raise UserError(
+            f"callbacks.evaluate.extractor={source}: no such file, but it is needed to choose the best checkpoint: "
+            f"{made_by(source)}. Or choose by the validation loss: selection=loss"
+        ) from error

@@ -18,7 +18,7 @@ from evaluators.extractors import Extractor
 from evaluators.metrics.distribution import FrechetMotionDistance
 from evaluators.plan import Plan
 from evaluators.protocol import DrawnClip, Protocol
-from evaluators.results import averages, make_result, mean_cost, show
+from evaluators.results import Outcome, Scores, make_result, mean_cost, show
 from evaluators.sources import Generator, Samples, Source, real_motions
 from flame_mdm.data.datamodule import Clips
 from flame_mdm.errors import UserError
@@ -26,8 +26,6 @@ from flame_mdm.records import Measured, Value
 from flame_mdm.representations import Representation
 from flame_mdm.safe_io import write_json
 from flame_mdm.seeds import key
-
-Scores = list[tuple[dict[str, float | None], int]]  # values by metric, and number of motions, of each replication
 
 
 def evaluate(request: EvaluationRequest) -> None:
@@ -44,7 +42,7 @@ def evaluate(request: EvaluationRequest) -> None:
         result = make_result(request, plan)
         parts = (plan.protocol, plan.clips, plan.extractor, plan.representation)
         evaluation = Evaluation(*parts, request.seed, plan.batch_size, training=plan.data.clips("train"))
-        measured = evaluation.run(plan.source, force=request.force)
+        measured = evaluation.run(plan.source, force=request.force, resamples=request.resamples)
         if is_first():
             reasons = measured.invalid_because + result.invalid_because
             result = result.model_copy(update=dict(measured) | {"invalid_because": reasons})
@@ -64,33 +62,51 @@ class Evaluation:
     batch_size: int = 64  # of the extractor
     training: Clips | None = None  # the training split, for metrics that look for copies of its motions
 
-    def run(self, source: Source | None, *, ground_truth: bool = True, force: bool = False) -> Measured:
+    def run(
+        self, source: Source | None, *, ground_truth: bool = True, force: bool = False, resamples: int = 0
+    ) -> Measured:
         """Evaluates real motions of all replications, and then the motions of the source, if there is one.
 
         Of several processes, each generates and extracts a share of the batches. The first one computes the metrics;
-        all return the result. Without `force`, raises `UserError` before anything is generated if real motions do not
-        have the expected values; they are not measured without `ground_truth`.
+        all return the result. Raises `UserError` before anything is generated if real motions do not have the expected
+        values, unless `force`.
+
+        Args:
+            source: source of the motions; None = only real motions are measured.
+            ground_truth: whether real motions are measured, too.
+            force: whether to generate even if real motions do not have the expected values.
+            resamples: number of sets drawn from the motions of the first replication, for intervals over motions.
         """
-        seeds = [key("draws", self.seed, replication) for replication in range(self.protocol.replications)]
-        measured = Measured(ground_truth=None, values=None, not_computed={}, invalid_because=[], seeds=seeds)
-        real_sets = self._measure_real(measured, source, ground_truth)
-        measured.invalid_because = shared(self._unexpected(measured.ground_truth or {}))
-        if measured.invalid_because and source is not None:
-            measured.forced = force
-            if not is_first() and not force:
-                raise SystemExit(1)  # the first process prints the reason
-            if not force:
-                raise UserError(
-                    f"nothing was generated, because {'; '.join(measured.invalid_because)}. Check the data and the "
-                    "extractor, or give force=true: the result is then marked as not valid"
-                )
+        real_sets, real = self._measure_real(source, ground_truth)
+        unexpected = shared(self._unexpected(real.values))
+        if unexpected and source is not None and not force:
+            self._refuse(unexpected)
+
+        generated, several = Outcome(), Outcome()
         if source is not None:
-            self._measure(measured, source, real_sets)
+            generated = self._measure(source, real_sets, resamples)
             if self.several:
-                self._measure_multimodality(measured, source, self.several)
-        if self.evaluator.skip_features:
-            measured.not_computed["extractor"] = "extractor=none: metrics that need features were not computed"
-        return shared(measured)
+                several = self._measure_multimodality(source, self.several)
+        return shared(
+            Measured(
+                ground_truth=real.values if ground_truth else None,
+                values=None if source is None else generated.values | several.values,
+                not_computed=real.reasons | generated.reasons | several.reasons | self._skipped,
+                invalid_because=unexpected,
+                forced=bool(unexpected) and source is not None and force,
+                warnings=[*self._conditions(), *generated.warnings],
+                cost=None if source is None else mean_cost(generated.costs),
+                seeds=[key("draws", self.seed, replication) for replication in range(self.protocol.replications)],
+            )
+        )
+
+    def _refuse(self, unexpected: Sequence[str]) -> None:
+        if not is_first():
+            raise SystemExit(1)  # the first process prints the reason
+        raise UserError(
+            f"nothing was generated, because {'; '.join(unexpected)}. Check the data and the extractor, or give "
+            "force=true: the result is then marked as not valid"
+        )
 
     @cached_property
     def evaluator(self) -> Evaluator:
@@ -112,17 +128,26 @@ class Evaluation:
         several = self.protocol.multimodality
         return several and replace(self.evaluator, metrics=several.metrics)
 
-    def _score(
-        self, evaluator: Evaluator, measured: Measured, motions: Rows, paired: Rows, real: Rows, replication: int
-    ) -> tuple[dict[str, float | None], int]:
-        """Returns the values of motions, and their number; adds the reasons for missing values to `measured`."""
-        values, reasons = evaluator.score(motions, paired, real, key("draws", self.seed, replication))
-        measured.not_computed |= reasons
-        return values, len(motions["keys"])
+    @property
+    def _skipped(self) -> dict[str, str]:
+        skipped = {"extractor": "extractor=none: metrics that need features were not computed"}
+        return skipped if self.evaluator.skip_features else {}
 
-    def _measure_real(self, measured: Measured, source: Source | None, ground_truth: bool) -> list[tuple[Rows, Rows]]:
-        """Measures real motions; returns for each replication those that motions of the source are compared with."""
-        scores: Scores = []
+    def _score(self, evaluator: Evaluator, motions: Rows, paired: Rows, real: Rows, replication: int) -> Scores:
+        values, reasons = evaluator.score(motions, paired, real, self._seed(replication))
+        real_counts = dict.fromkeys(filter(evaluator.compares_sets, values), len(real["keys"]))
+        units = {name: evaluator.unit_of(name) for name in values}
+        return Scores(values, reasons, len(motions["keys"]), real_counts, units)
+
+    def _seed(self, replication: int) -> int:
+        return key("draws", self.seed, replication)
+
+    def _measure_real(self, source: Source | None, ground_truth: bool) -> tuple[list[tuple[Rows, Rows]], Outcome]:
+        """Measures real motions; also returns for each replication those that the source's motions are compared with.
+
+        The first of each pair are the real motions of the same clips, the second are for comparisons of sets.
+        """
+        scores = []
         real_sets = []
         for replication in range(self.protocol.replications):
             again = self.protocol.rows(self.clips, self.seed, replication, purpose="real")
@@ -133,15 +158,13 @@ class Evaluation:
             real = _without_joints(real)
             paired = self._paired(self.protocol.rows(self.clips, self.seed, replication))
             if ground_truth:
-                scores.append(self._score(self.evaluator, measured, paired, paired, real, replication))
+                scores.append(self._score(self.evaluator, paired, paired, real, replication))
             if source is not None:
                 for checked in filter(None, (self.evaluator, self.several)):  # before motions are generated
                     checked.check(paired)
                 # All replications are kept in memory; joints, the largest part, only if metrics compare them.
                 real_sets.append((paired if self.evaluator.reads("real_joints") else _without_joints(paired), real))
-        if ground_truth:
-            measured.ground_truth = averages(scores)
-        return real_sets
+        return real_sets, Outcome(scores)
 
     def _paired(self, rows: Sequence[DrawnClip]) -> Rows:
         motions = self._motions(rows, real_motions(self.clips, rows))
@@ -151,23 +174,47 @@ class Evaluation:
 
     def _unexpected(self, values: Mapping[str, Value | None]) -> list[str]:
         """Returns a line for each value of real motions of the test split that differs from the expected one."""
-        # Without test clips (HumanAct12), the training clips are the test split, so they are checked.
-        info = self.clips.store.info
-        if self.protocol.quick or (self.clips.clips[0].split != "test" and info["clips"]["test"]):
+        if not values or self.protocol.resized_samples:
             return []
         lines = []
-        for name in (info["dataset"], *([self.extractor.sha256] if self.extractor else [])):
-            for metric, (expected, tolerance) in self.protocol.expected.get(name, {}).items():
-                value = values.get(metric)
-                mean = value.mean if value else None
-                if mean is not None and not abs(mean - expected) <= tolerance:
-                    lines.append(f"real motions have {metric} {mean:.4g}, expected {expected:g} +- {tolerance:g}")
+        for metric, (expected, tolerance) in self._expected().items():
+            value = values.get(metric)
+            mean = value.mean if value else None
+            if mean is None:
+                if not self.evaluator.skip_features:
+                    lines.append(f"{metric} of real motions, expected {expected:g}, could not be computed")
+            elif not abs(mean - expected) <= tolerance:
+                lines.append(f"real motions have {metric} {mean:.4g}, expected {expected:g} +- {tolerance:g}")
         return lines
 
-    def _measure(self, measured: Measured, source: Source, real_sets: Sequence[tuple[Rows, Rows]]) -> None:
-        """Measures the source's motions of each replication, compared with the real ones; fills in `measured`."""
-        scores: Scores = []
-        costs = []
+    def _expected(self) -> dict[str, list[float]]:
+        """Returns value and tolerance of real motions by metric; {} for other splits than the test split."""
+        # Without test clips (HumanAct12), the training clips are the test split, so they are checked.
+        info = self.clips.store.info
+        if self.clips.clips[0].split != "test" and info["clips"]["test"]:
+            return {}
+        names = [info["dataset"], *([self.extractor.sha256] if self.extractor else [])]
+        return {metric: bounds for name in names for metric, bounds in self.protocol.expected.get(name, {}).items()}
+
+    def _conditions(self) -> list[str]:
+        """Returns what restricts the meaning of the values: repeated clips, and bounds that were not checked."""
+        lines = []
+        clips = len(self.protocol.selected(self.clips))
+        drawn = {"motions": self.protocol.samples, "real motions for comparisons of sets": self.protocol.real_samples}
+        for purpose, count in drawn.items():
+            if count is not None and count > clips:
+                lines.append(f"{count} {purpose} of {clips} clips: clips are repeated, which changes distances of sets")
+        if self.protocol.resized_samples and self._expected():
+            lines.append(
+                "the expected values of real motions were not checked: they hold for the number of motions of the "
+                "protocol alone"
+            )
+        return lines
+
+    def _measure(self, source: Source, real_sets: Sequence[tuple[Rows, Rows]], resamples: int) -> Outcome:
+        """Measures the source's motions of each replication, compared with the real ones."""
+        scores, costs, warnings = [], [], []
+        resampled: Mapping[str, list[float | None]] = {}
         for replication, (paired, real) in enumerate(real_sets):
             rows = self.protocol.rows(self.clips, self.seed, replication)
             samples = source(f"rep_{replication}", rows, replication)
@@ -176,17 +223,22 @@ class Evaluation:
                 ids = {row.id for row in samples.rows}
                 paired = _select(paired, [i for i, row in enumerate(rows) if row.id in ids])
             generated = self.evaluator.extract(self._generated(samples))
-            scores.append(self._score(self.evaluator, measured, generated, paired, real, replication))
+            scores.append(self._score(self.evaluator, generated, paired, real, replication))
             if not replication:
-                measured.warnings = self._warnings(generated, real)
-        measured.values, measured.cost = averages(scores), mean_cost(costs)
+                warnings = self._warnings(generated, real)
+                resampled = self.evaluator.resample(generated, paired, real, self._seed(0), resamples)
+        counts = [replication.count for replication in scores]
+        if len(set(counts)) > 1:
+            numbers = ", ".join(map(str, counts))
+            warnings.append(f"replications of {numbers} motions: values that depend on this number are mixed")
+        return Outcome(scores, resampled, warnings, costs)
 
-    def _measure_multimodality(self, measured: Measured, source: Source, evaluator: Evaluator) -> None:
+    def _measure_multimodality(self, source: Source, evaluator: Evaluator) -> Outcome:
         """Computes the metrics that need several motions per prompt."""
         several = self.protocol.multimodality
         assert several is not None
         generates = isinstance(source, Generator) and not self.protocol.quick
-        scores: Scores = []
+        scores = []
         nothing = evaluator.extract(self._motions([], []))
         for replication in range(several.replications):
             motions = paired = nothing
@@ -195,11 +247,11 @@ class Evaluation:
                 motions = evaluator.extract(self._generated(source(f"multimodality_{replication}", rows, replication)))
                 real = self._paired(rows[:: several.samples])
                 paired = _select(real, [i // several.samples for i in range(len(rows))])
-            scores.append(self._score(evaluator, measured, motions, paired, nothing, replication))
-        if not generates:
-            why = "not computed in a quick evaluation" if self.protocol.quick else "there is one sample per clip"
-            measured.not_computed["multimodality"] = f"{why}: it needs several samples per prompt"
-        measured.values = (measured.values or {}) | averages(scores)
+            scores.append(self._score(evaluator, motions, paired, nothing, replication))
+        if generates:
+            return Outcome(scores)
+        reason = "not computed in a quick evaluation" if self.protocol.quick else "there is one sample per clip"
+        return Outcome(scores, not_computed={"multimodality": f"{reason}: it needs several samples per prompt"})
 
     def _generated(self, samples: Samples) -> Motions:
         """Returns the motions to measure; smooths each over time, without padding, as FLAME's code does."""
@@ -209,7 +261,7 @@ class Evaluation:
         return self._motions(samples.rows, features, samples.captions)
 
     def _warnings(self, generated: Rows, real: Rows) -> list[str]:
-        lines = []
+        lines: list[str] = []
         count, others = len(generated["keys"]), len(real["keys"])
         for name, config in self.protocol.metrics.items():
             if "generated" in generated and config["_target_"].endswith(FrechetMotionDistance.__name__):

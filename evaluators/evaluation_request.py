@@ -13,6 +13,8 @@ from flame_mdm.errors import UserError
 from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.sampling.motion_request import EditRequest
 
+MIN_RESAMPLES = 100
+
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationKeys:
@@ -27,6 +29,7 @@ class EvaluationKeys:
     seed: int = option(0, "seed of the noise and of the drawn motions")
     replications: int | None = option(None, "replications and samples: override the protocol; the result says so")
     samples: int | None = option(None, "number of motions")
+    resamples: int = option(0, "sets of motions drawn with replacement, for 95 % intervals over motions, such as 200")
     multimodality: bool = option(True, "false = skip metrics that need several samples per prompt; the result says so")
     quick: bool = option(False, "two replications of 64 motions, to check that everything works; the result says so")
     force: bool = option(False, "generate even if real motions miss the expected values; the result says so")
@@ -74,3 +77,5 @@ class EvaluationRequest(EvaluationKeys):
             raise UserError(f"{what[0]} needs a protocol. Add protocol=NAME, such as protocol=text_to_motion")
         if what == ["from_samples"] and (self.quick or self.samples or self.replications):
             raise UserError("from_samples evaluates all motions of the files. Remove quick, samples and replications")
+        if self.resamples and self.resamples < MIN_RESAMPLES:
+            raise UserError(f"resamples={self.resamples}: give 0, or {MIN_RESAMPLES} or more for a 95 % interval")

@@ -3,25 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
-from torchmetrics import Metric
 
 from evaluators.collectives import dealt, is_first
 from evaluators.extractors import Extractor
 from evaluators.metrics import make_metrics, missing_input, required_inputs, update_metrics
 from evaluators.metrics.memorization import TrainingMotions, poses
-from evaluators.metrics.samples import TwoSets
+from evaluators.metrics.samples import SampleMetric, TwoSets
 from flame_mdm.batch import length_mask
 from flame_mdm.config import Config
 from flame_mdm.errors import UserError
+from flame_mdm.progress import ProgressBar
 from flame_mdm.representations import Representation
 from flame_mdm.sampling.editing import kept_parts
 from flame_mdm.sampling.motion_request import EditRequest
@@ -145,6 +145,36 @@ class Evaluator:
         """
         if not is_first():
             return {}, {}
+        metrics, _ = self._updated(generated, paired, real, seed)
+        return _values({name: metric.compute for name, metric in metrics.items()}, metrics)
+
+    def resample(
+        self, generated: Rows, paired: Rows, real: Rows, seed: int, resamples: int
+    ) -> dict[str, list[float | None]]:
+        """Computes all metrics of `resamples` sets of motions drawn with replacement, for a bootstrap; see `score`.
+
+        Both sets of comparisons of sets are drawn. The draws are functions of `seed` and the numbers of motions alone,
+        so that those of two models are of the same clips. Returns (resamples,) values by name, like `score`.
+        """
+        count, others = len(generated["keys"]), len(real["keys"])
+        if not is_first() or not count or not resamples:
+            return {}
+        metrics, usable = self._updated(generated, paired, real, seed)
+        generator = np.random.default_rng(key("bootstrap", seed))
+        drawn: list[dict[str, float | None]] = []
+        for _ in ProgressBar(range(resamples), desc="bootstrap", unit=" sets"):
+            own, other = (torch.from_numpy(generator.integers(n, size=n)) for n in (count, others))
+            values = {
+                name: partial(metric.drawn_value, own, other) if name in usable else metric.compute
+                for name, metric in metrics.items()
+            }
+            drawn.append(_values(values, metrics)[0])
+        return {name: [values[name] for values in drawn] for name in drawn[0]}
+
+    def _updated(
+        self, generated: Rows, paired: Rows, real: Rows, seed: int
+    ) -> tuple[dict[str, SampleMetric], dict[str, SampleMetric]]:
+        """Returns all metrics with the motions, and those of them that can be computed."""
         metrics = make_metrics(self.metrics, seed=key("metric", seed) % 2**32)
         for metric in metrics.values():
             metric.distributed_available_fn = bool  # returns False: no synchronization, this process has all motions
@@ -159,17 +189,31 @@ class Evaluator:
             update_metrics(others, **_chunk(generated, paired, part))
         if "generated" in real:
             update_metrics(sets, real=real["generated"], real_keys=real["keys"])
-        return _values(metrics)
+        return metrics, usable
+
+    @cached_property
+    def declared(self) -> dict[str, SampleMetric]:
+        """The metrics by name, for what they declare."""
+        return make_metrics(self.metrics)
+
+    def unit_of(self, name: str) -> str:
+        """Returns the unit of a value, `metric` or `metric/part`."""
+        metric, _, part = name.partition("/")
+        return self.declared[metric].unit_of(part)
+
+    def compares_sets(self, name: str) -> bool:
+        """Returns whether a value compares the set of motions with a set of real ones."""
+        return isinstance(self.declared[name.partition("/")[0]], TwoSets)
 
     def reads(self, name: str) -> bool:
         """Returns whether a metric requires an input."""
-        return any(name in required_inputs(metric) for metric in make_metrics(self.metrics).values())
+        return any(name in required_inputs(metric) for metric in self.declared.values())
 
-    def check(self, motions: Rows, metrics: Mapping[str, Metric] | None = None) -> dict[str, Metric]:
+    def check(self, motions: Rows, metrics: Mapping[str, SampleMetric] | None = None) -> dict[str, SampleMetric]:
         """Returns the metrics that can be computed, without `skip_features` all; `UserError` if an input is missing."""
         available = {*motions, "mask", "real_mask", *(PAIRED[name] for name in PAIRED if name in motions)}
         usable = {}
-        for name, metric in (make_metrics(self.metrics) if metrics is None else metrics).items():
+        for name, metric in (self.declared if metrics is None else metrics).items():
             needed = ["generated", "keys"] if isinstance(metric, TwoSets) else required_inputs(metric)
             missing = [row for row in needed if row not in available]
             if not missing:
@@ -195,17 +239,18 @@ def _chunk(generated: Rows, paired: Rows, part: slice) -> Rows:
     return rows
 
 
-def _values(metrics: Mapping[str, Metric]) -> tuple[dict[str, float | None], dict[str, str]]:
-    """Returns the values of metrics that have been updated, and the reasons for missing ones."""
+def _values(
+    computations: Mapping[str, Callable[[], Any]], metrics: Mapping[str, SampleMetric]
+) -> tuple[dict[str, float | None], dict[str, str]]:
+    """Returns the values of metrics, and the reasons for missing ones."""
     values: dict[str, float | None] = {}
     reasons: dict[str, str] = {}
     for name, metric in metrics.items():
         try:
-            result = metric.compute()
+            result = computations[name]()
         except UserError as error:
             reasons[name] = str(error)
-            metric.reset()
-            result = metric.compute()
+            result = metric.nothing
         for part, value in result.items() if isinstance(result, dict) else [("", result)]:
             if value is not None and not math.isfinite(value):
                 reasons[name] = f"{type(metric).__name__}: the value is {value}: too few or degenerate samples"

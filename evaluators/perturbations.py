@@ -4,29 +4,31 @@ Each function of joints (F, J, 3) in meters, y up, returns as many frames unless
 from a generator alone, so that the grades of a perturbation share theirs.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from functools import partial
 
 import numpy as np
 import torch
 
+from evaluators.encoding import Joints, encode
 from evaluators.protocol import DrawnClip
+from evaluators.scene import NEAR, RANDOM, Scene, Text
 from evaluators.sources import real_motions
 from flame_mdm.config import EXPERIMENTS, instantiate
-from flame_mdm.data.datamodule import MotionDataModule
-from flame_mdm.data.store import Entry
 from flame_mdm.formats.resampling import resample
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.skeleton import SKELETONS
 from flame_mdm.safe_io import read_yaml
 from flame_mdm.seeds import key
 
-Joints = np.ndarray
 Draws = np.random.Generator
 GROUND = np.array([1.0, 0.0, 1.0])
 WOBBLE = 1.0  # frequency of the wobble, in Hz
 BLEND = 0.4  # seconds over which the poses of another motion are blended in
+SHARES = (5, 10, 20, 50, 100)  # grades of replaced motions, in percent
 
 
 def jitter(joints: Joints, millimeters: float, draws: Draws) -> Joints:
@@ -110,253 +112,260 @@ def continue_with(joints: Joints, other: Joints, fps: float) -> Joints:
     return np.concatenate([joints[:half], rest + fading * (joints[half - 1] - rest[0])])
 
 
-def encode(representation: HumanML, motions: Sequence[Joints]) -> list[np.ndarray]:
-    """Encodes motions as features (F, D) float32, with as many rows as frames, and at their own height.
+BASE, STORED, REAL = "decoded and encoded", "as stored", "reference"
+"""Sets of motions of every audit: those that all others are compared with, the features as stored, and a second draw of
+real motions, with which sets are compared."""
 
-    The encoder needs one more frame, and puts the lowest joint on the floor, which would hide floating and sinking.
-    """
-    longer = [torch.from_numpy(np.concatenate([x, 2 * x[-1:] - x[-2:-1]])) for x in motions]
-    encoded = []
-    for joints, features in zip(motions, representation.encode_many(longer), strict=True):
-        height, positions = representation.slices["root_height"], representation.slices["positions"]
-        rise = float(joints[0, 0, 1]) * representation.units_per_metre - features[0, height]
-        features[:, height] += rise
-        features[:, positions.start + 1 : positions.stop : 3] += rise
-        encoded.append(features.numpy())
-    return encoded
+Inputs = dict[str, np.ndarray]
+"""Metric inputs of N motions by name: features (N, E), and what the metrics read from the motions."""
+
+Motions = Callable[[], list[np.ndarray]]
+"""Computes a set of N motions, as features (F, D)."""
 
 
 @dataclass(frozen=True)
 class Perturbation:
-    """A perturbation of a set of motions, and its grades.
-
-    `change` computes joints from joints, grade, generator and frames per second; None = `Scene` replaces features,
-    captions or the set.
-    """
+    """A perturbation of a set of motions, and its grades."""
 
     name: str
     group: str  # joints, meaning, set or plumbing
     about: str
-    unit: str = ""  # of the grades; "% of motions", "% of captions" and "% of actions" say how many are replaced
+    unit: str = ""  # of the grades
     grades: Sequence[float] = (1,)  # from weak to strong
-    change: Callable[[Joints, float, Draws, float], Joints] | None = None
+
+    def offered(self, scene: Scene, captioned: bool) -> Sequence[Perturbation]:
+        """Returns the perturbation with the grades that the motions allow, or several by kind; [] if none is."""
+        return [self]
+
+    def motions(self, scene: Scene) -> dict[str, Motions]:
+        """Returns the sets of motions that `apply` takes from, by name."""
+        return {}
+
+    def apply(
+        self, scene: Scene, grade: float, sets: Mapping[str, Inputs], texts: Sequence[Text]
+    ) -> tuple[Inputs, Sequence[Text]]:
+        """Returns the motions and texts at a grade; pair i belongs to real motion i, with texts[i]."""
+        raise NotImplementedError
+
+    def order(self, scene: Scene) -> np.ndarray:
+        """Returns the motions (N,) in the order in which they are perturbed, the same at all grades."""
+        return scene.draws("order", self.name).permutation(len(scene))
 
 
-_P = Perturbation
-_CM, _PERCENT, _SHARES, _FEW = (1, 2, 5, 10), (1, 2, 5, 10, 20), (5, 10, 20, 50, 100), (1, 2, 5, 10, 20, 50, 100)
-PERTURBATIONS = [
-    _P("jitter", "joints", "noise on all joints, std", "mm", (1, 2, 5, 10, 20), lambda x, g, r, _: jitter(x, g, r)),
-    _P("wobble", "joints", "joints sway at 1 Hz, amplitude", "mm", (5, 10, 20, 50), wobble),
-    _P("skating", "joints", "root speed", "x", (1.05, 1.1, 1.25, 1.5, 2), lambda x, g, *_: skate(x, g)),
-    _P("floating", "joints", "above the floor", "cm", _CM, lambda x, g, *_: lift(x, g)),
-    _P("sinking", "joints", "below the floor", "cm", _CM, lambda x, g, *_: lift(x, -g)),
-    _P("longer bones", "joints", "all bones longer", "%", _PERCENT, lambda x, g, *_: resize(x, g)),
-    _P("shorter bones", "joints", "all bones shorter", "%", _PERCENT, lambda x, g, *_: resize(x, -g)),
-    _P("pop", "joints", "one frame displaced", "cm", _PERCENT, lambda x, g, r, _: pop(x, g, r)),
-    _P("last-frame pop", "joints", "last frame displaced", "cm", _PERCENT, lambda x, g, r, _: pop(x, g, r, last=True)),
-    _P("arms inside", "joints", "wrists moved into the trunk", "cm", (10, 20, 30), lambda x, g, *_: draw_in(x, g)),
-    _P("mirrored", "meaning", "left and right exchanged, captions kept", "% of motions", _SHARES),
-    _P("reversed", "meaning", "played backward", "% of motions", _SHARES),
-    _P("slower", "meaning", "played at this speed", "x", (0.9, 0.75, 0.5), lambda x, g, _, fps: play(x, g, fps)),
-    _P("faster", "meaning", "played at this speed", "x", (1.1, 1.25, 1.5, 2), lambda x, g, _, fps: play(x, g, fps)),
-    _P("frozen", "meaning", "held up to the end", "% of time", (10, 25, 50, 75, 100), lambda x, g, *_: freeze(x, g)),
-    _P("other half", "meaning", "second half of another motion", "% of motions", _SHARES),
-    _P("wrong captions", "meaning", "captions of random other motions", "% of captions", _FEW),
-    _P("near misses", "meaning", "captions wrong in one attribute", "% of captions", _FEW),
-    _P("missing actions", "set", "actions that never appear; others repeat", "% of actions", (10, 25, 50, 75)),
-    _P("memorized", "set", "training motions with the same captions", "% of motions", _SHARES),
-    _P("fewer", "set", "only so many motions", "motions", (256, 128, 64)),
-    _P("as stored", "plumbing", "features neither decoded nor encoded"),
-    _P("half precision", "plumbing", "features rounded to float16"),
-    _P("frame rate", "plumbing", "resampled and back", "fps", (30, 15, 10), lambda x, g, _, f: through_rate(x, g, f)),
-    _P("cropped", "plumbing", "end removed", "% of time", (10, 25, 50), lambda x, g, *_: crop(x, g)),
-]
-"""All perturbations, apart from those that depend on the data: near misses by attribute, other representations."""
+@dataclass(frozen=True)
+class ChangedJoints(Perturbation):
+    """Changes the joints of all motions; the draws of a motion are the same at all grades.
 
-
-ACTION = ("action", "content")  # names of the attribute that says what is done; clips without it have no near misses
-UNSAID = "normal"  # value that captions do not mention: such captions are less exact, but not wrong
-
-_Stated = frozenset[tuple[str, str | int | float]]
-
-
-def near_misses(clips: Sequence[Entry]) -> list[dict[str, list[str]]]:
-    """Returns the near misses of each clip among the captions of the others, sorted, by the attribute that differs.
-
-    A caption of another clip is a near miss if both clips show the same action, and of the attributes that both have
-    (side, style, count, ...), exactly one differs: "walks backward" is a near miss of a slow walk forward.
+    `change` takes joints, the grade, and those of `draws` and `fps` that `takes` names; `sign` multiplies the grade.
     """
-    stated = [_stated(clip) for clip in clips]
-    captions: dict[_Stated, set[str]] = {}
-    for own, clip in zip(stated, clips, strict=True):
-        captions.setdefault(own, set()).update(clip.captions)
-    contradicting = {own: _contradicting(own, captions) for own in captions}
-    return [contradicting[own] for own in stated]
+
+    change: Callable[..., Joints] = lambda joints, grade: joints
+    takes: Sequence[str] = ()
+    sign: int = 1
+
+    def motions(self, scene: Scene) -> dict[str, Motions]:
+        return {self._set(grade): partial(self._motions, scene, grade) for grade in self.grades}
+
+    def _set(self, grade: float) -> str:
+        return f"{self.name} {grade:g}"
+
+    def _motions(self, scene: Scene, grade: float) -> list[np.ndarray]:
+        changed = []
+        for row, joints in zip(scene.rows, scene.joints, strict=True):
+            options = {"draws": scene.draws(self.name, row.id), "fps": scene.fps}
+            changed.append(self.change(joints, self.sign * grade, **{name: options[name] for name in self.takes}))
+        return encode(scene.representation, changed)
+
+    def apply(
+        self, scene: Scene, grade: float, sets: Mapping[str, Inputs], texts: Sequence[Text]
+    ) -> tuple[Inputs, Sequence[Text]]:
+        return sets[self._set(grade)], texts
 
 
-def _stated(clip: Entry) -> _Stated:
-    """Returns the attributes of a clip; in its action, they are slots: "wave-left-hand" is "wave-{side}-hand"."""
-    stated = {name: value for name, value in clip.attributes.items() if isinstance(value, str | int | float)}
-    action = next((str(stated.pop(name)) for name in ACTION if name in stated), "")
-    names = {str(value): f"{{{name}}}" for name, value in stated.items()}
-    if action:
-        stated["action"] = "-".join(names.get(word, word.removesuffix("s")) for word in action.split("-"))
-    return frozenset(stated.items())
+@dataclass(frozen=True)
+class ChangedSet(Perturbation):
+    """Replaces all motions; `make` computes the new ones from the scene."""
+
+    make: Callable[[Scene], list[np.ndarray]] = lambda scene: scene.features
+
+    def motions(self, scene: Scene) -> dict[str, Motions]:
+        return {self.name: partial(self.make, scene)}
+
+    def apply(
+        self, scene: Scene, grade: float, sets: Mapping[str, Inputs], texts: Sequence[Text]
+    ) -> tuple[Inputs, Sequence[Text]]:
+        return sets[self.name], texts
 
 
-def _contradicting(own: _Stated, captions: dict[_Stated, set[str]]) -> dict[str, list[str]]:
-    mine = dict(own)
-    wrong: dict[str, set[str]] = {}
-    for attributes, texts in captions.items():
-        other = dict(attributes)
-        if "action" not in mine or mine["action"] != other.get("action"):
-            continue
-        differing = [name for name in mine.keys() & other.keys() if mine[name] != other[name]]
-        if len(differing) == 1 and other[differing[0]] != UNSAID:
-            wrong.setdefault(differing[0], set()).update(texts - captions[own])
-    return {name: sorted(texts) for name, texts in sorted(wrong.items()) if texts}
+@dataclass(frozen=True)
+class ReplacedShare(ChangedSet):
+    """Replaces a share of the motions, in percent."""
+
+    unit: str = "% of motions"
+    grades: Sequence[float] = SHARES
+
+    def apply(
+        self, scene: Scene, grade: float, sets: Mapping[str, Inputs], texts: Sequence[Text]
+    ) -> tuple[Inputs, Sequence[Text]]:
+        count = round(len(scene) * grade / 100)
+        replaced = np.isin(np.arange(len(scene)), self.order(scene)[:count])
+        base, other = sets[BASE], sets[self.name]
+        shaped = {name: replaced.reshape(-1, *[1] * (x.ndim - 1)) for name, x in base.items()}
+        return {name: np.where(shaped[name], other[name], x) for name, x in base.items()}, texts
 
 
-BASE, REAL = "decoded and encoded", "reference"
-"""Sets of motions that all others are compared with: those of grade 0, and the real ones of set metrics."""
+@dataclass(frozen=True)
+class ReplacedCaptions(Perturbation):
+    """Replaces a share of the captions by wrong ones of the kind `name` in `Scene.wrong`, in percent."""
 
-Inputs = dict[str, np.ndarray]
-"""Metric inputs of N motions: "features" (N, E), "seen" (N,) attributes as JSON, and totals (N, 2) by metric."""
+    unit: str = "% of captions"
+    grades: Sequence[float] = (1, 2, 5, 10, 20, 50, 100)
 
+    def offered(self, scene: Scene, captioned: bool) -> Sequence[Perturbation]:
+        offered = []
+        for kind in scene.wrong if captioned else ():
+            if kind.partition(":")[0] == self.name:
+                most = 100 * sum(text is not None for text in scene.wrong[kind]) / len(scene)
+                grades = [*(grade for grade in self.grades if grade < most), round(most, 1)]
+                offered.append(replace(self, name=kind, grades=grades))
+        return offered
 
-class Text(NamedTuple):
-    """A caption, its tagged words, and the attributes that it requests."""
-
-    caption: str
-    tokens: Sequence[str] | None
-    requested: Mapping[str, Any]
-
-
-@dataclass
-class Scene:
-    """Real motions of a split, and how to perturb them."""
-
-    data: MotionDataModule
-    rows: list[DrawnClip]
-    features: list[np.ndarray]
-    representation: HumanML
-    seed: int
-
-    def __post_init__(self) -> None:
-        self.joints = [self.representation.decode(torch.from_numpy(x)).double().numpy() for x in self.features]
-        self.wrong = self._wrong()
-
-    def draws(self, *parts: str | int) -> np.random.Generator:
-        return np.random.default_rng(key("audit", self.seed, *parts))
-
-    def motions(self) -> dict[str, Callable[[], list[np.ndarray]]]:
-        """Returns how to make each set of N motions, as features, by the name of the perturbation and the grade."""
-        fps, mirror = self.representation.fps, self.representation.skeleton.mirror
-        order = self.draws("other half").permutation(len(self.rows))
-        other = dict(zip(order.tolist(), np.roll(order, 1).tolist(), strict=True))
-
-        def changed(change: Callable[[int, Joints], Joints]) -> Callable[[], list[np.ndarray]]:
-            return lambda: encode(self.representation, [change(i, x) for i, x in enumerate(self.joints)])
-
-        def graded(perturbation: Perturbation, grade: float) -> Callable[[int, Joints], Joints]:
-            change = perturbation.change
-            assert change is not None
-            # The draws are the same at all grades.
-            return lambda i, x: change(x, grade, self.draws(perturbation.name, self.rows[i].id), fps)
-
-        sets = {
-            BASE: changed(lambda _, x: x),
-            "as stored": lambda: self.features,
-            "half precision": lambda: [x.astype(np.float16).astype(np.float32) for x in sets[BASE]()],
-            "mirrored": changed(lambda _, x: mirror(torch.from_numpy(x)).numpy()),
-            "reversed": changed(lambda _, x: x[::-1].copy()),
-            "other half": changed(lambda i, x: continue_with(x, self.joints[other[i]], fps)),
-            "memorized": self._memorized,
-        }
-        sets |= {f"{p.name} {g:g}": changed(graded(p, g)) for p in PERTURBATIONS if p.change for g in p.grades}
-        for through in self._representations():
-            sets[f"through {through.name}"] = changed(
-                lambda _, x, r=through: r.decode(torch.from_numpy(encode(r, [x])[0])).numpy()
-            )
-        return sets
-
-    def _memorized(self) -> list[np.ndarray]:
-        """Returns for each motion a training motion with the same captions or the same action, or the motion itself."""
-        training, copies = self.data.clips("train"), []
-        for row in self.rows:
-            same = [clip for clip in training.clips if clip.captions == row.clip.captions]
-            same = same or [clip for clip in training.clips if clip.action == row.clip.action] or [row.clip]
-            draws = self.draws("memorized", row.id)
-            clip = same[int(draws.integers(len(same)))]
-            copies.append(DrawnClip(row.id, clip, training.crop(clip.length, draws), None, row.id))
-        return real_motions(training, copies)
-
-    def _representations(self) -> list[HumanML]:
-        files = sorted((EXPERIMENTS / "representation").glob("humanml*.yaml"))
-        others: list[HumanML] = [instantiate(read_yaml(path)) for path in files]
-        own = self.representation
-        return [r for r in others if r.skeleton == own.skeleton and r.fps == own.fps and r.name != own.name]
-
-    def _wrong(self) -> dict[str, list[Text | None]]:
-        """Returns a wrong text for each motion, by the name of the perturbation; None if there is none."""
-        texts = {caption: text_of(row, caption) for row in self.rows for caption in row.clip.captions}
-        contradicting = near_misses([row.clip for row in self.rows])
-        names = sorted({name for misses in contradicting for name in misses})
-        wrong: dict[str, list[Text | None]] = {}
-        for kind in ("wrong captions", "near misses", *(f"near misses: {name}" for name in names if len(names) > 1)):
-            wrong[kind] = []
-            for row, misses in zip(self.rows, contradicting, strict=True):
-                draws, options = self.draws(kind, row.id), misses.get(kind.partition(": ")[2], [])
-                if kind == "near misses" and misses:
-                    options = misses[sorted(misses)[draws.integers(len(misses))]]
-                elif kind == "wrong captions":
-                    options = [caption for caption in texts if caption not in row.clip.captions]
-                wrong[kind].append(texts[options[draws.integers(len(options))]] if options else None)
-        return {kind: chosen for kind, chosen in wrong.items() if any(chosen)}
-
-    def perturbations(self, captioned: bool) -> list[Perturbation]:
-        listed = []
-        for perturbation in PERTURBATIONS:
-            if perturbation.unit == "% of captions":
-                names = [name for name in self.wrong if captioned and name.partition(":")[0] == perturbation.name]
-                for kind in names:
-                    most = 100 * sum(text is not None for text in self.wrong[kind]) / len(self.rows)
-                    grades = [*(grade for grade in perturbation.grades if grade < most), round(most, 1)]
-                    listed.append(replace(perturbation, name=kind, grades=grades))
-            elif perturbation.unit == "motions":
-                grades = [grade for grade in perturbation.grades if grade < len(self.rows)]
-                listed.append(replace(perturbation, grades=grades))
-            elif perturbation.unit != "% of actions" or len({row.clip.action for row in self.rows}) > 1:
-                listed.append(perturbation)
-        about = "encoded and decoded by another representation"
-        listed += [Perturbation(f"through {other.name}", "plumbing", about) for other in self._representations()]
-        return [perturbation for perturbation in listed if perturbation.grades]
-
-    def condition(
-        self, perturbation: Perturbation, grade: float, inputs: Mapping[str, Inputs], texts: Sequence[Text]
-    ) -> tuple[Inputs, list[Text]]:
-        """Returns the motions and texts of a perturbation at a grade; pair i belongs to real motion i."""
-        base, texts, count = inputs[BASE], list(texts), len(self.rows)
-        order, share = self.draws("order", perturbation.name).permutation(count), round(count * grade / 100)
-        if perturbation.unit == "% of captions":
-            for i in [i for i in order if self.wrong[perturbation.name][i]][:share]:
-                texts[i] = self.wrong[perturbation.name][i] or texts[i]
-        elif perturbation.unit == "% of motions":
-            chosen = np.isin(np.arange(count), order[:share])
-            shaped = {name: chosen.reshape(-1, *[1] * (x.ndim - 1)) for name, x in base.items()}
-            base = {name: np.where(shaped[name], inputs[perturbation.name][name], x) for name, x in base.items()}
-        elif perturbation.unit == "% of actions":
-            actions = sorted({row.clip.action or 0 for row in self.rows}, key=lambda a: key("missing", self.seed, a))
-            gone = actions[: max(1, round(len(actions) * grade / 100))]
-            kept = [i for i in order if (self.rows[i].clip.action or 0) not in gone]
-            picked = np.array([i if i in kept else kept[i % len(kept)] for i in range(count)])
-            return {name: x[picked] for name, x in base.items()}, [texts[i] for i in picked] if texts else []
-        elif perturbation.unit == "motions":
-            return {name: x[: int(grade)] for name, x in base.items()}, texts[: int(grade)]
-        else:
-            base = inputs[f"{perturbation.name} {grade:g}" if perturbation.change else perturbation.name]
-        return base, texts
+    def apply(
+        self, scene: Scene, grade: float, sets: Mapping[str, Inputs], texts: Sequence[Text]
+    ) -> tuple[Inputs, Sequence[Text]]:
+        wrong, replaced = scene.wrong[self.name], list(texts)
+        for i in [i for i in self.order(scene) if wrong[i]][: round(len(scene) * grade / 100)]:
+            replaced[i] = wrong[i] or texts[i]
+        return sets[BASE], replaced
 
 
-def text_of(row: DrawnClip, caption: str) -> Text:
-    return Text(caption, row.tokens(caption), row.requested)
+@dataclass(frozen=True)
+class DroppedActions(Perturbation):
+    """Drops a share of the actions, in percent; other motions repeat in their place, with their texts."""
+
+    unit: str = "% of actions"
+
+    def offered(self, scene: Scene, captioned: bool) -> Sequence[Perturbation]:
+        return [self] if len({row.clip.action for row in scene.rows}) > 1 else []
+
+    def apply(
+        self, scene: Scene, grade: float, sets: Mapping[str, Inputs], texts: Sequence[Text]
+    ) -> tuple[Inputs, Sequence[Text]]:
+        actions = sorted(set(scene.actions), key=lambda action: key("missing", scene.seed, action))
+        gone = set(actions[: max(1, round(len(actions) * grade / 100))])
+        kept = [i for i in self.order(scene) if scene.actions[i] not in gone]
+        left = set(kept)
+        picked = np.array([i if i in left else kept[i % len(kept)] for i in range(len(scene))])
+        return {name: x[picked] for name, x in sets[BASE].items()}, [texts[i] for i in picked] if texts else []
+
+
+@dataclass(frozen=True)
+class FewerMotions(Perturbation):
+    """Keeps only the first motions, as many as the grade."""
+
+    unit: str = "motions"
+
+    def offered(self, scene: Scene, captioned: bool) -> Sequence[Perturbation]:
+        grades = [grade for grade in self.grades if grade < len(scene)]
+        return [replace(self, grades=grades)] if grades else []
+
+    def apply(
+        self, scene: Scene, grade: float, sets: Mapping[str, Inputs], texts: Sequence[Text]
+    ) -> tuple[Inputs, Sequence[Text]]:
+        return {name: x[: int(grade)] for name, x in sets[BASE].items()}, texts[: int(grade)]
+
+
+def base_motions(scene: Scene) -> list[np.ndarray]:
+    """Returns the real motions, decoded and encoded like perturbed ones."""
+    return encode(scene.representation, scene.joints)
+
+
+def _half_precision(scene: Scene) -> list[np.ndarray]:
+    return [x.astype(np.float16).astype(np.float32) for x in base_motions(scene)]
+
+
+def _mirrored(scene: Scene) -> list[np.ndarray]:
+    mirror = scene.representation.skeleton.mirror
+    return encode(scene.representation, [mirror(torch.from_numpy(x)).numpy() for x in scene.joints])
+
+
+def _reversed(scene: Scene) -> list[np.ndarray]:
+    return encode(scene.representation, [x[::-1].copy() for x in scene.joints])
+
+
+def _other_half(scene: Scene) -> list[np.ndarray]:
+    order = scene.draws("other half").permutation(len(scene))
+    other = dict(zip(order.tolist(), np.roll(order, 1).tolist(), strict=True))
+    joined = [continue_with(x, scene.joints[other[i]], scene.fps) for i, x in enumerate(scene.joints)]
+    return encode(scene.representation, joined)
+
+
+def _memorized(scene: Scene) -> list[np.ndarray]:
+    """Returns for each motion a training motion with the same captions or the same action, or the motion itself."""
+    training, copies = scene.data.clips("train"), []
+    for row in scene.rows:
+        same = [clip for clip in training.clips if clip.captions == row.clip.captions]
+        same = same or [clip for clip in training.clips if clip.action == row.clip.action] or [row.clip]
+        draws = scene.draws("memorized", row.id)
+        clip = same[int(draws.integers(len(same)))]
+        copies.append(DrawnClip(row.id, clip, training.crop(clip.length, draws), None, row.id))
+    return real_motions(training, copies)
+
+
+def _through(other: HumanML, scene: Scene) -> list[np.ndarray]:
+    decoded = [other.decode(torch.from_numpy(encode(other, [x])[0])).numpy() for x in scene.joints]
+    return encode(scene.representation, decoded)
+
+
+def through_others(representation: HumanML) -> list[Perturbation]:
+    """Returns a perturbation for each other representation of the same skeleton and frame rate."""
+    files = sorted((EXPERIMENTS / "representation").glob("humanml*.yaml"))
+    others: list[HumanML] = [instantiate(read_yaml(path)) for path in files]
+    about, skeleton, fps = "encoded and decoded by another representation", representation.skeleton, representation.fps
+    return [
+        ChangedSet(f"through {other.name}", "plumbing", about, make=partial(_through, other))
+        for other in others
+        if other.skeleton == skeleton and other.fps == fps and other.name != representation.name
+    ]
+
+
+def perturbations_of(scene: Scene, captioned: bool) -> list[Perturbation]:
+    """Returns the perturbations that motions and their captions allow; near misses also by attribute."""
+    listed = [*PERTURBATIONS, *through_others(scene.representation)]
+    return [offered for perturbation in listed for offered in perturbation.offered(scene, captioned)]
+
+
+# fmt: off
+PERTURBATIONS: list[Perturbation] = [
+    ChangedJoints("jitter", "joints", "noise on all joints, std", "mm", (1, 2, 5, 10, 20), jitter, ["draws"]),
+    ChangedJoints(
+        "wobble", "joints", "joints sway at 1 Hz, amplitude", "mm", (5, 10, 20, 50), wobble, ["draws", "fps"]
+    ),
+    ChangedJoints("skating", "joints", "root speed", "x", (1.05, 1.1, 1.25, 1.5, 2), skate),
+    ChangedJoints("floating", "joints", "above the floor", "cm", (1, 2, 5, 10), lift),
+    ChangedJoints("sinking", "joints", "below the floor", "cm", (1, 2, 5, 10), lift, sign=-1),
+    ChangedJoints("longer bones", "joints", "all bones longer", "%", (1, 2, 5, 10, 20), resize),
+    ChangedJoints("shorter bones", "joints", "all bones shorter", "%", (1, 2, 5, 10, 20), resize, sign=-1),
+    ChangedJoints("pop", "joints", "one frame displaced", "cm", (1, 2, 5, 10, 20), pop, ["draws"]),
+    ChangedJoints(
+        "last-frame pop", "joints", "last frame displaced", "cm", (1, 2, 5, 10, 20), partial(pop, last=True), ["draws"]
+    ),
+    ChangedJoints("arms inside", "joints", "wrists moved into the trunk", "cm", (10, 20, 30), draw_in),
+    ReplacedShare("mirrored", "meaning", "left and right exchanged, captions kept", make=_mirrored),
+    ReplacedShare("reversed", "meaning", "played backward", make=_reversed),
+    ChangedJoints("slower", "meaning", "played at this speed", "x", (0.9, 0.75, 0.5), play, ["fps"]),
+    ChangedJoints("faster", "meaning", "played at this speed", "x", (1.1, 1.25, 1.5, 2), play, ["fps"]),
+    ChangedJoints("frozen", "meaning", "held up to the end", "% of time", (10, 25, 50, 75, 100), freeze),
+    ReplacedShare("other half", "meaning", "second half of another motion", make=_other_half),
+    ReplacedCaptions(RANDOM, "meaning", "captions of random other motions"),
+    ReplacedCaptions(NEAR, "meaning", "captions wrong in one attribute"),
+    DroppedActions("missing actions", "set", "actions that never appear; others repeat", grades=(10, 25, 50, 75)),
+    ReplacedShare("memorized", "set", "training motions with the same captions", make=_memorized),
+    FewerMotions("fewer", "set", "only so many motions", grades=(256, 128, 64)),
+    ChangedSet(STORED, "plumbing", "features neither decoded nor encoded"),
+    ChangedSet("half precision", "plumbing", "features rounded to float16", make=_half_precision),
+    ChangedJoints("frame rate", "plumbing", "resampled and back", "fps", (30, 15, 10), through_rate, ["fps"]),
+    ChangedJoints("cropped", "plumbing", "end removed", "% of time", (10, 25, 50), crop),
+]
+# fmt: on
+"""All perturbations, apart from those that depend on the data: near misses by attribute, other representations."""

@@ -66,7 +66,9 @@ class Plan:
             path = Path("runs/baselines") / data.store.info["dataset"] / protocol.title / f"{request.baseline}{split}"
         else:
             self.source = SampleFolder(Path(str(request.from_samples)), self.representation)
-            protocol = protocol.model_copy(update={"replications": len(self.source.files), "samples": None})
+            sizes = {"replications": len(self.source.files), "samples": None}
+            resized = protocol.resized_samples or protocol.samples is not None
+            protocol = protocol.model_copy(update=sizes | {"resized_samples": resized})
             path = Path(str(request.from_samples)) / protocol.title
         self.protocol = protocol
         suffix = f"-{self.extractor.sha256[:8]}" if self.extractor else ""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -14,6 +15,7 @@ from pydantic import ConfigDict, Field
 from evaluators.extractors import Extractor
 from evaluators.metrics import make_metrics
 from evaluators.metrics.attributes import ATTRIBUTES
+from evaluators.metrics.samples import SampleMetric
 from flame_mdm.config import EXPERIMENTS, Config, check, instantiate, plain
 from flame_mdm.data.datamodule import Clips
 from flame_mdm.data.store import Entry
@@ -90,6 +92,7 @@ class Protocol(ClosedSchema):
     # If they differ, nothing is generated.
     expected: dict[str, dict[str, Annotated[list[Number], Field(min_length=2, max_length=2)]]] = Field({})
     quick: bool = False  # whether the evaluation is a quick one, set by `resized`
+    resized_samples: bool = False  # whether the number of motions is not that of the file, set by `resized`
     sha256: str = ""  # hash of the content of the file, set by `load_protocol`
 
     def resized(
@@ -119,7 +122,8 @@ class Protocol(ClosedSchema):
             several = several.model_copy(update={"replications": min(changed["replications"], several.replications)})
         if several and not multimodality:
             several, changed["multimodality"] = None, False
-        return self.model_copy(update={**changed, "quick": quick, "multimodality": several}), changed
+        sizes = {"quick": quick, "multimodality": several, "resized_samples": "samples" in changed}
+        return self.model_copy(update=changed | sizes), changed
 
     def open_extractor(self, path: str | None, representation: Representation, dataset: str) -> Extractor | None:
         """Opens an extractor at `path`, or that of the protocol; None if it is not needed, or `path` is "none".
@@ -252,8 +256,21 @@ def load_protocol(name: str, representation: Representation) -> Protocol:
         raise UserError(f"protocol {name}: {error}") from error
     check(config)
     several = protocol.multimodality
-    make_metrics(protocol.metrics | (several.metrics if several else {}))  # raises if one cannot be created
+    make_metrics(several.metrics if several else {})  # raises if one cannot be created
+    values = _value_names(make_metrics(protocol.metrics))
+    for bounds in protocol.expected.values():
+        for metric in bounds:
+            if metric not in values:
+                raise UserError(
+                    f"protocol {name}: expected: no value is called {metric}.{did_you_mean(metric, values)}"
+                )
     return protocol
+
+
+def _value_names(metrics: Mapping[str, SampleMetric]) -> list[str]:
+    """Returns the names of all values of metrics: `metric` or `metric/part`."""
+    parts = [(name, part) for name, metric in metrics.items() for part in metric.names or [""]]
+    return [f"{name}/{part}" if part else name for name, part in parts]
 
 
 def digest(values: Any) -> str:

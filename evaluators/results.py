@@ -1,6 +1,7 @@
 """Results of evaluations: averages over replications, provenance, and what is printed."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -17,24 +18,66 @@ from flame_mdm.safe_io import sha256
 from flame_mdm.training.provenance import environment
 
 
-def mean_ci(values: Sequence[float]) -> tuple[float, float]:
+@dataclass(frozen=True)
+class Scores:
+    """Values of all metrics in one replication."""
+
+    values: Mapping[str, float | None]  # by name, `metric` or `metric/part`; None if not computable
+    reasons: Mapping[str, str]  # why a value is missing, by metric
+    count: int  # motions
+    real_counts: Mapping[str, int]  # real motions that sets are compared with, by the names of such values
+    units: Mapping[str, str]  # by name
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a part of an evaluation measured: real motions, generated ones, or several per prompt."""
+
+    scores: Sequence[Scores] = ()  # by replication
+    resampled: Mapping[str, list[float | None]] = field(default_factory=dict)  # by name, see `Value`
+    warnings: Sequence[str] = ()
+    costs: Sequence[Cost] = ()
+    not_computed: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def values(self) -> dict[str, Value | None]:
+        """Means over replications, None if one has no value."""
+        table: dict[str, Value | None] = {}
+        counts = [scores.count for scores in self.scores]
+        for name in self.scores[0].values if self.scores else ():
+            values = [scores.values[name] for scores in self.scores]
+            numbers = [value for value in values if value is not None]
+            mean, ci = mean_ci(numbers) if len(numbers) == len(values) else (None, None)
+            table[name] = Value(
+                mean=mean,
+                ci=ci,
+                replications=len(values),
+                n=counts[0] if len(set(counts)) == 1 else None,
+                per_replication=values,
+                n_per_replication=counts,
+                n_real=self.scores[0].real_counts.get(name),
+                unit=self.scores[0].units.get(name, ""),
+                resampled=self.resampled.get(name, []),
+            )
+        return table
+
+    @property
+    def reasons(self) -> dict[str, str]:
+        """Why values are missing, by metric."""
+        reasons: dict[str, str] = {}
+        for scores in self.scores:
+            reasons |= scores.reasons
+        return reasons | dict(self.not_computed)
+
+
+def mean_ci(values: Sequence[float]) -> tuple[float, float | None]:
     """Returns the mean of R replications, at least one, and the half width of its 95 % confidence interval.
 
     The half width is 1.96 std / sqrt(R), with R in the denominator of the variance, as in the code of Guo et al. 2022,
-    MDM and MFM. ACTOR's tables show 1.96 times the variance instead.
+    MDM and MFM. ACTOR's tables show 1.96 times the variance instead. A single replication has no interval.
     """
-    return float(np.mean(values)), float(1.96 * np.std(values) / len(values) ** 0.5)
-
-
-def averages(scores: Sequence[tuple[Mapping[str, float | None], int]]) -> dict[str, Value | None]:
-    """Returns means over replications, None if one has no value."""
-    table: dict[str, Value | None] = {}
-    for name in scores[0][0] if scores else ():
-        values = [replication[name] for replication, _ in scores]
-        numbers = [value for value in values if value is not None]
-        mean, ci = mean_ci(numbers) if len(numbers) == len(values) else (None, None)
-        table[name] = Value(mean=mean, ci=ci, replications=len(values), n=scores[0][1], per_replication=values)
-    return table
+    half = float(1.96 * np.std(values) / len(values) ** 0.5) if len(values) > 1 else None
+    return float(np.mean(values)), half
 
 
 def mean_cost(costs: Sequence[Cost]) -> Cost:
@@ -49,31 +92,29 @@ def make_result(request: EvaluationRequest, plan: Plan) -> Result:
     device, crop, short = plan.representation.mean.device, plan.data.crop, plan.clips.too_short
     reason = f"{request.split} clips shorter than {crop.min_frames} frames"
     excluded = info["excluded"] | ({reason: short} if short else {})
-    card = card_of(info["dataset"], extractor.sha256 if extractor else None)
+    data = Data(
+        dataset=info["dataset"],
+        representation=info["representation"],
+        fingerprint=info["fingerprint"],
+        frames=[crop.min_frames, crop.longest()],
+        excluded=excluded,
+    )
+    card = card_of(data, extractor.sha256 if extractor else None)
     return Result(
         quick=request.quick,
         protocol=ProtocolVersion(name=protocol.name, version=protocol.version, sha256=protocol.sha256),
         changed=plan.changed,
         split=request.split,
         published_split=info["published_split"],
-        data=Data(
-            dataset=info["dataset"],
-            representation=info["representation"],
-            fingerprint=info["fingerprint"],
-            frames=[crop.min_frames, crop.longest()],
-            excluded=excluded,
-        ),
+        data=data,
         seed=request.seed,
         extractor=extractor
-        and ExtractorRecord(
-            sha256=extractor.sha256,
-            path=str(request.extractor or (protocol.extractor or {})["path"]),
-            data=extractor.fingerprint,
-        ),
+        and ExtractorRecord(sha256=extractor.sha256, path=_extractor_path(request, plan), data=extractor.fingerprint),
         checkpoint=_checkpoint(plan),
         samples_sha256=plan.source.sha256 if isinstance(plan.source, SampleFolder) else None,
         baseline=request.baseline,
-        audit=card.as_posix() if card else None,
+        audit=card.path.as_posix() if card else None,
+        audit_motions=card.motions if card else None,
         skeleton=plan.skeleton,
         device=torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
         precision=f"float32, matmul {torch.get_float32_matmul_precision()}",
@@ -83,6 +124,11 @@ def make_result(request: EvaluationRequest, plan: Plan) -> Result:
         not_computed={},
         invalid_because=_overlaps(request, plan),
     )
+
+
+def _extractor_path(request: EvaluationRequest, plan: Plan) -> str:
+    """Returns what was given as the extractor, or the path that the protocol names."""
+    return request.extractor or str((plan.protocol.extractor or {}).get("path", ""))
 
 
 def _checkpoint(plan: Plan) -> Checkpoint | None:
@@ -120,14 +166,20 @@ def _overlaps(request: EvaluationRequest, plan: Plan) -> list[str]:
 
 
 def show(result: Result, path: Path) -> None:
-    protocol, data = result.protocol, result.data
+    protocol, data, values = result.protocol, result.data, result.values or {}
     mark = " QUICK RUN, NOT FOR PUBLICATION" if result.quick else ""
     say(f"{protocol.name} version {protocol.version}, {data.dataset} {result.split}{mark}")
-    say(f"{'':32}{'real motions':>24}{result.baseline or 'generated':>24}")
-    for name, value in (result.values or {}).items():
+    usual = result.counts
+    if usual:
+        say(f"replications x motions: {usual}" + _intervals(values))
+    if result.changed:
+        say("differs from the protocol: " + ", ".join(f"{name}={value}" for name, value in result.changed.items()))
+    say(f"{'':40}{'real motions':>24}{result.baseline or 'generated':>24}")
+    for name, value in values.items():
         real = (result.ground_truth or {}).get(name)
         if any(shown is not None and shown.mean is not None for shown in (real, value)):
-            say(f"{name:32}{_cell(real):>24}{_cell(value):>24}")
+            unit = next((f" ({shown.unit})" for shown in (value, real) if shown and shown.unit), "")
+            say(f"{name + unit:40}{_cell(real, usual):>24}{_cell(value, usual):>24}")
     for reason, count in data.excluded.items():
         say(f"excluded from the data set: {count} {reason}")
     for name, reason in result.not_computed.items():
@@ -138,10 +190,25 @@ def show(result: Result, path: Path) -> None:
         say(f"warning: {reason}")
     for reason in result.invalid_because:
         say(f"NOT VALID: {reason}")
-    if result.audit is None:
+    if result.audit is not None:
+        say(f"audit of this evaluator, of {result.audit_motions} motions: {result.audit}")
+    else:
         say(f"not audited: no one has checked what this evaluator sees. To do so: make audit DATA={data.dataset}")
     say(f"written: {path}")
 
 
-def _cell(value: Value | None) -> str:
-    return "-" if value is None or value.mean is None else f"{value.mean:.4g} +- {value.ci:.2g}"
+def _intervals(values: Mapping[str, Value | None]) -> str:
+    """Returns what the intervals are about, as the end of a line; "" if there are none."""
+    shown = [value for value in values.values() if value and value.half is not None]
+    if not shown:
+        return ""
+    return "; +-: 95 % interval over " + ("motions" if shown[0].resampled and shown[0].ci is None else "replications")
+
+
+def _cell(value: Value | None, usual: str) -> str:
+    """Formats a value with its interval, if there is one, and with its own numbers of motions if they are unusual."""
+    if value is None or value.mean is None:
+        return "-"
+    half = f" +- {value.half:.2g}" if value.half is not None else ""
+    own = f" ({value.counts})" if value.n is not None and value.counts != usual else ""
+    return f"{value.mean:.4g}{half}{own}"

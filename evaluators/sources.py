@@ -177,20 +177,11 @@ class SampleFolder:
     """
 
     def __init__(self, folder: Path, representation: Representation):
-        self.representation = representation
-        files = [path for path in folder.glob("*.npz") if not path.name.startswith((".", "multimodality_"))]
-        self.files = sorted(files, key=lambda path: (len(path.name), path.name))
-        if not self.files:
-            raise UserError(f"from_samples={folder}: no .npz file in this folder")
-        for path in self.files:
-            regular_file(path)
+        self.representation, self.files = representation, sample_files(folder)
 
     @property
     def sha256(self) -> str:
-        digest = hashlib.sha256()
-        for path in self.files:
-            digest.update(path.read_bytes())
-        return digest.hexdigest()
+        return sha256_of_samples(self.files)
 
     def __call__(self, name: str, rows: list[DrawnClip], replication: int) -> Samples:
         """Returns the motions of one file that belong to the rows; `UserError` if it names other clips."""
@@ -278,6 +269,24 @@ class Baseline:
             longer = [x[:1].expand(len(x) + 1, -1, -1) for x in joints]  # encoders may need one more frame
             held = [x[: len(y)] for x, y in zip(representation.encode_many(longer), motions, strict=True)]
         return [x.numpy().copy() for x in held]
+
+
+def sample_files(folder: Path) -> list[Path]:
+    """Returns the files of a `SampleFolder`, one per replication; raises `UserError` if there are none."""
+    files = [path for path in folder.glob("*.npz") if not path.name.startswith((".", "multimodality_"))]
+    if not files:
+        raise UserError(f"from_samples={folder}: no .npz file in this folder")
+    for path in files:
+        regular_file(path)
+    return sorted(files, key=lambda path: (len(path.name), path.name))
+
+
+def sha256_of_samples(files: Sequence[Path]) -> str:
+    """Returns the hash of the content of all files, in this order."""
+    digest = hashlib.sha256()
+    for path in files:
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
 def read_samples(path: Path) -> dict[str, np.ndarray]:

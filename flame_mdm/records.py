@@ -1,5 +1,9 @@
 """Records of evaluations and audits: the schemas of their files, which evaluators write and reporting reads."""
 
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,13 +13,49 @@ from flame_mdm.schemas import ClosedSchema, Int, Number, Plain, Schema, read_jso
 
 
 class Value(Schema):
-    """A metric over replications: mean, half-width of its 95 % interval, number of motions; None if not computable."""
+    """A metric over replications, with the number of motions that it was computed from."""
 
-    mean: Number | None
-    ci: Number | None
+    mean: Number | None  # None if it cannot be computed
+    ci: Number | None  # half width of its 95 % interval over replications; None for a single one
     replications: Int | None
-    n: Int | None
-    per_replication: list[Number | None] = Field([])
+    n: Int | None  # motions per replication; None if replications have different numbers
+    per_replication: list[Number | None] = Field(default_factory=list)
+    n_per_replication: list[Int] = Field(default_factory=list)
+    n_real: Int | None = None  # real motions that a set of motions is compared with; None = no comparison of sets
+    unit: str = ""
+    resampled: list[Number | None] = Field(
+        default_factory=list
+    )  # values of the motions of the first replication, drawn again and again
+
+    @property
+    def half(self) -> float | None:
+        """Half width of the 95 % interval: over replications or, of a single one, over motions; None if not known."""
+        if (self.replications or 0) > 1:
+            return self.ci
+        drawn = [value for value in self.resampled if value is not None]
+        if self.mean is None or not drawn or len(drawn) < len(self.resampled):
+            return None
+        low, high = percentiles(drawn, self.mean)
+        return (high - low) / 2
+
+    @property
+    def counts(self) -> str:
+        """Numbers of motions as text: "3 x 64", or "64 + 5" of replications with different numbers."""
+        if len(set(self.n_per_replication)) > 1:
+            return " + ".join(map(str, self.n_per_replication))
+        return f"{self.replications} x {self.n}"
+
+
+def percentiles(drawn: Sequence[float], value: float) -> tuple[float, float]:
+    """Returns the 95 % interval of a value from its bootstrap, shifted so that it is centered at the value.
+
+    Efron and Tibshirani 1993, section 13.3. The shift is for values such as Fréchet distances, which are larger for
+    sets with repetitions (section 10.6): the interval is that of the value for the same number of motions.
+    """
+    import numpy as np
+
+    low, high = np.percentile(drawn, (2.5, 97.5)) - np.mean(drawn) + value
+    return float(low), float(high)
 
 
 class ProtocolVersion(Schema):
@@ -92,9 +132,9 @@ class Measured(Schema):
     not_computed: dict[str, str]  # reasons by metric
     invalid_because: list[str]  # [] if the values are valid
     forced: bool = False  # whether motions were generated although real motions do not have the expected values
-    warnings: list[str] = Field([])
+    warnings: list[str] = Field(default_factory=list)
     cost: Cost | None = None
-    seeds: list[Int] = Field([])  # of metrics, by replication
+    seeds: list[Int] = Field(default_factory=list)  # of metrics, by replication
 
 
 class Result(Measured):
@@ -112,10 +152,30 @@ class Result(Measured):
     samples_sha256: str | None = None  # of motion files from another system
     baseline: str | None = None
     audit: str | None = None  # path of the audit card of the extractor; None = not audited
+    audit_motions: Int | None = None  # number of motions that the card is about
     skeleton: UsedSkeleton | None = None  # None if the data has joint positions
     device: str
     precision: str = ""
     environment: dict[str, Any] = Field({})
+
+    @property
+    def counts(self) -> str:
+        """Numbers of replications and motions of most values, as text; "" without values."""
+        counts = Counter(value.counts for value in (self.values or {}).values() if value and value.n is not None)
+        return counts.most_common(1)[0][0] if counts else ""
+
+    @property
+    def origin(self) -> str:
+        """Hash of what the values were computed from: motions or checkpoint, extractor, data and protocol."""
+        parts = [
+            self.checkpoint.sha256 if self.checkpoint else self.samples_sha256 or self.baseline,
+            self.extractor.sha256 if self.extractor else None,
+            self.data.fingerprint,
+            self.protocol.sha256,
+            self.split,
+            self.seed,
+        ]
+        return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 
     @property
     def stand_in_skeleton(self) -> bool:
@@ -141,6 +201,16 @@ class AuditedPerturbation(ClosedSchema):
     grades: Annotated[list[AuditedGrade], Field(min_length=1)]
 
 
+class AuditedMetric(ClosedSchema):
+    """What a metric declares about one of its values."""
+
+    unit: str = ""
+    sees_meaning: bool = True  # whether it may see that a motion shows something other than requested
+    sums_up: bool = True  # whether the value sums up the other values of the metric
+    exact: bool = False  # whether it reads attributes from the joints, without a network
+    depends_on_count: bool = False  # whether it is biased by the number of motions
+
+
 class AuditedExtractor(Schema):
     """The extractor of an audit, by its recipe or file."""
 
@@ -161,6 +231,7 @@ class AuditCard(ClosedSchema):
     resamples: Int
     packages: dict[str, str]
     metrics: dict[str, bool | None]  # whether higher values are better; None = values near those of real motions
+    facts: dict[str, AuditedMetric] = Field({})  # by metric; earlier versions wrote none
     real: dict[str, Annotated[list[Number | None], Field(min_length=2, max_length=2)]]  # and half widths of intervals
     perturbations: Annotated[list[AuditedPerturbation], Field(min_length=1)]
     not_computed: dict[str, str]

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,13 +16,16 @@ from evaluators.audit import _inputs, _Measure
 from evaluators.evaluator import Evaluator, Motions
 from evaluators.extractors import Extractor
 from evaluators.metrics.alignment import MotionsForText, TextsForMotion
-from evaluators.perturbations import BASE, PERTURBATIONS, REAL, Text
+from evaluators.metrics.samples import SampleMetric
+from evaluators.perturbations import BASE, PERTURBATIONS, REAL
 from evaluators.protocol import load_protocol
+from evaluators.scene import Text
 from flame_mdm.__main__ import main
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.records import AuditCard, AuditedPerturbation
-from flame_mdm.reporting.audit_cards import PHYSICS, Seen, card_name, findings, read_card, seen, write_card
+from flame_mdm.reporting.audit_cards import CitedCard, Seen, card_name, card_of, findings, read_card, seen, write_card
 from flame_mdm.representations.humanml import HumanML
+from flame_mdm.safe_io import write_json
 from flame_mdm.schemas import check_shape
 from flame_mdm.seeds import key
 
@@ -137,16 +141,65 @@ def test_a_grade_is_seen_from_where_all_stronger_ones_differ_and_findings_are_se
     assert findings(card) == ["No metric sees: still.", "jitter rates better than real motions: noise."]
 
 
-def test_pages_escape(card, tmp_path):
-    page, text = write_card(card, tmp_path)
-    assert (page.name, page.read_text().count("<polyline")) == ("x-abababababab.html", 2)
+def test_pages_escape_and_show_one_card_or_two(card, tmp_path):
+    page, text = write_card([card], tmp_path)
+    assert page.name.startswith("x-abababababab-40-")
+    assert page.read_text().count("<polyline") == 2
     assert "| noise (mm) | 2 → 5 | 1 → – |" in text.read_text()
+    fewer = {"extractor": None, "metrics": {"jitter": False}, "perturbations": card.perturbations[:1]}
+    page, text = write_card([card, card.model_copy(update=fewer)], tmp_path)
+    assert "-and-x-none-40-" in page.name
+    assert "| noise (mm) | 2 → 5 / not computed | 1 → – / 1 → – |" in text.read_text()
+    assert page.read_text().count("<polyline") == 3
     content = card.model_dump_json()
     for own in ('"jitter"', '"mm"', '"noise <b>"', '"motion_clip/x"', '"test"', '"torch"', '"x"', '"f"'):
         content = content.replace(own, json.dumps("<img src=x onerror=alert(1)>"))
-    for path in write_card(check_shape(json.loads(content), AuditCard), tmp_path):
+    for path in write_card([check_shape(json.loads(content), AuditCard)], tmp_path, "escaped"):
         assert "<img" not in path.read_text()
         assert path.read_text().count("&lt;img src=x onerror=alert(1)&gt;") > 10
+
+
+def test_the_strongest_card_that_fits_is_cited_and_a_weaker_one_overwrites_nothing(card, tmp_path, monkeypatch):
+    monkeypatch.setenv("FLAME_MDM_AUDITS", str(tmp_path))
+    assert card_of(card.data, "ab" * 32) is None
+    crop = card.data.model_copy(update={"frames": [24, 40]})
+    for changes in ({}, {"motions": 8}, {"motions": 900, "data": crop}, {"motions": 41, "seed": 1}):
+        changed = card.model_copy(update=changes)
+        write_json(tmp_path / f"{card_name(changed)}.json", changed.model_dump())
+    assert len(list(tmp_path.iterdir())) == 4, "every card is kept"
+    cited = card_of(card.data, "ab" * 32)
+    assert cited is not None
+    assert (cited.motions, str(cited).endswith("(41 motions)"), cited.path.parent) == (41, True, tmp_path)
+    other = card_of(crop, "ab" * 32)
+    assert other is not None
+    assert other.motions == 900
+    assert card_of(card.data, None) is None
+
+
+class Halves(SampleMetric):
+    """A metric that no other module knows."""
+
+    higher_is_better = True
+    unit = "halves"
+    states = ("generated",)
+
+    def per_sample(self, rows):
+        values = rows["generated"][:, 0] / 2
+        return {"": torch.stack([values, torch.ones_like(values)], 1)}
+
+
+def test_an_audit_asks_metrics_that_it_does_not_know(scene):
+    _, sets, texts, _, _ = scene
+    evaluator = Evaluator(Linear(), {"halves": {"_target_": f"{__name__}.Halves"}}, HumanML())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("evaluators.audit.make_metrics", lambda _: {"halves": Halves()})
+        measure = _Measure(evaluator, sets, texts, np.random.default_rng(0), 20)
+    values = measure(sets[BASE], texts)["halves"]
+    expected = measure.weights @ sets[BASE]["features"][:, 0] / measure.weights.sum(1) / 2
+    np.testing.assert_allclose(values, expected)
+    assert measure.direction_of("halves") is True
+    assert measure.facts_of("halves")["unit"] == "halves"
+    assert measure.judges == {}
 
 
 @pytest.mark.slow
@@ -163,7 +216,7 @@ def test_an_audit_resumes_and_gives_the_same_card(tmp_path, monkeypatch, capsys)
     words = ["audit", "data=synthetic", "data.source.clips=400", f"data_root={tmp_path}", "resamples=100"]
     words += ["extractor=none", f"out={tmp_path / 'out'}"]
     assert main(words) == 0
-    path = tmp_path / "out" / "synthetic-none.json"
+    (path,) = (tmp_path / "out").glob("synthetic-none-*.json")
     card, first = read_card(path), len(passes)
     assert card.motions == clips == passes[0]
     assert [perturbation.name for perturbation in card.perturbations][:2] == ["jitter", "mirrored"]
@@ -189,10 +242,16 @@ CARDS = sorted((ROOT / "docs" / "benchmarks" / "audit").glob("*.json"))
 
 @pytest.mark.parametrize("path", CARDS, ids=lambda path: path.stem)
 def test_committed_cards_are_listed_complete_and_small(path, tmp_path):
-    assert json.loads((ROOT / "flame_mdm" / "reporting" / "audited.json").read_text()) == [p.stem for p in CARDS]
+    listed = json.loads((ROOT / "flame_mdm" / "reporting" / "audited.json").read_text())
+    assert [card["name"] for card in listed] == [p.stem for p in CARDS]
     card = read_card(path)
-    assert path.stem == card_name(card)
-    for written in write_card(card, tmp_path):
+    sha256 = card.extractor.sha256 if card.extractor else None
+    facts = {"extractor": sha256 and sha256[:12], "motions": card.motions, "split": card.split}
+    assert next(x for x in listed if x["name"] == path.stem).items() >= facts.items()
+    assert card_of(card.data, sha256) == CitedCard(
+        Path("docs/benchmarks/audit") / f"{path.stem}.html", card.motions, card.split, card.data
+    )
+    for written in write_card([card], tmp_path, path.stem):
         kept = path.with_suffix(written.suffix)
         assert kept.read_bytes() == written.read_bytes(), f"flame-mdm audit cards={path} out={path.parent}"
         assert kept.stat().st_size <= 300_000
@@ -202,4 +261,4 @@ def test_committed_cards_are_listed_complete_and_small(path, tmp_path):
         responses = {metric: seen(card, by_name[name], metric) for metric in card.metrics}
         noticed = {metric for metric, response in responses.items() if response and response.grade is not None}
         assert "fid" not in noticed
-        assert bool(noticed) == any(not metric.startswith(PHYSICS) for metric in card.metrics)
+        assert bool(noticed) == any(fact.sees_meaning for fact in card.facts.values())

@@ -25,6 +25,7 @@ from flame_mdm.__main__ import main
 from flame_mdm.batch import Condition, MotionBatch
 from flame_mdm.checkpoints import hub, model_files
 from flame_mdm.checkpoints.loading import load
+from flame_mdm.checkpoints.locating import find
 from flame_mdm.checkpoints.released import Options, _options, import_flame, import_mdm
 from flame_mdm.errors import UserError
 from flame_mdm.generator import MotionGenerator
@@ -417,3 +418,9 @@ def test_a_model_is_sampled_without_importing_lightning_and_the_compiler():
     program = "import sys, flame_mdm; flame_mdm.generate(flame_mdm.load('quickstart'), 'a person walks', seconds=1)"
     slow = "{'lightning', 'torchmetrics', 'transformers', 'torch._dynamo', 'scipy.stats'}"
     subprocess.run([sys.executable, "-c", f"{program}; assert not {slow} & {{*sys.modules}}"], check=True)
+
+
+def test_a_folder_of_runs_names_the_runs_below_it(tmp_path):
+    (tmp_path / "x" / "default" / "checkpoints").mkdir(parents=True)
+    with pytest.raises(UserError, match=r"x: no run, but there are runs below it\. Give one: .*x/default$"):
+        find(tmp_path / "x")

@@ -16,6 +16,7 @@ import pytest
 import torch
 from support.runs import TINY
 
+from evaluators.callback import Evaluate
 from evaluators.evaluation import Evaluation
 from evaluators.evaluation_request import EvaluationRequest
 from evaluators.evaluator import Evaluator, Motions, Rows
@@ -37,7 +38,9 @@ from flame_mdm.records import Measured, read_result
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.rot6d import Rot6D
 from flame_mdm.representations.skeleton import find_joints
+from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.sampling.motion_request import EditRequest
+from flame_mdm.seeds import key
 
 pytestmark = pytest.mark.slow
 
@@ -231,6 +234,73 @@ def test_other_metrics_need_no_new_motions(runs, full, tmp_path, monkeypatch):
         assert value.mean == (full[0].values[name].mean if name.startswith(of_joints) else None), name
 
 
+def again(rows: Rows, indices: np.ndarray) -> Rows:
+    """The motions with these numbers, as if they were different ones."""
+    taken = {
+        name: values[indices] if isinstance(values, torch.Tensor) else [values[i] for i in indices]
+        for name, values in rows.items()
+    }
+    return taken | {"keys": torch.arange(len(indices))}
+
+
+def test_a_bootstrap_measures_each_motion_as_often_as_it_is_drawn(runs):
+    evaluation = runs.evaluation(features=True)
+    metrics = {name: metric for name, metric in evaluation.protocol.metrics.items() if name != "mid"}  # ill-conditioned
+    evaluator = Evaluator(evaluation.extractor, metrics, evaluation.representation)
+    rows = [evaluation.protocol.rows(evaluation.clips, 0, replication) for replication in range(2)]
+    first, second = (evaluation._paired(drawn) for drawn in rows)
+    drawn = evaluator.resample(first, first, second, 3, 2)
+    generator = np.random.default_rng(key("bootstrap", 3))
+    count = len(first["keys"])
+    for number in range(2):
+        own, others = (generator.integers(count, size=count) for _ in range(2))
+        values, _ = evaluator.score(again(first, own), again(first, own), again(second, others), 3)
+        assert values.keys() == drawn.keys()
+        for name, value in values.items():
+            assert drawn[name][number] == (None if value is None else pytest.approx(value, rel=1e-5)), name
+    assert drawn["fid"][0] != drawn["fid"][1]
+
+
+def test_a_single_replication_has_no_interval_but_the_one_over_motions(runs, tmp_path, capsys):
+    words = ["baseline=noisy", "extractor=none", "replications=1", "resamples=100"]
+    result = runs.of_others(tmp_path / "result.json", *words)
+    jitter = result.values["jitter"]
+    assert (jitter.ci, jitter.replications, len(jitter.resampled), jitter.unit) == (None, 1, 100, "m/s^3")
+    assert 0 < jitter.half < jitter.mean
+    assert result.ground_truth["jitter"].half is None
+    out = capsys.readouterr().out
+    count = len(runs.data().test)
+    for words in (f"1 x {count}; +-: 95 % interval over motions", "jitter (m/s^3)", "replications=1", "synthetic test"):
+        assert words in out
+    assert "+- 0" not in out
+
+
+def test_each_number_carries_its_own_number_of_motions(runs, full, tmp_path):
+    folder, out = tmp_path / "samples", tmp_path / "result.json"
+    folder.mkdir()
+    for number, path in enumerate(sorted(motions(full[1]).glob("rep_*.npz"))):
+        content = read_samples(path)
+        kept = len(content["ids"]) - 30 * number
+        frames = int(content["lengths"][:kept].sum())
+        parts = {"ids": content["ids"][:kept], "lengths": content["lengths"][:kept]}
+        np.savez(folder / path.name, **parts, features=content["features"][:frames])
+    result = runs.of_others(out, f"from_samples={folder}")
+    count = len(runs.data().test)
+    fid = result.values["fid"]
+    assert (fid.n, fid.n_per_replication, fid.n_real) == (None, [count, count - 30], count)
+    assert fid.counts == result.counts == f"{count} + {count - 30}"
+    assert result.ground_truth["fid"].n == count
+    assert any(f"replications of {count}, {count - 30} motions" in line for line in result.warnings)
+
+
+def test_more_motions_than_clips_are_said_to_repeat_clips(runs):
+    evaluation = runs.evaluation(samples=500)
+    assert evaluation._conditions() == [
+        f"500 motions of {len(evaluation.clips)} clips: clips are repeated, which changes distances of sets"
+    ]
+    assert runs.evaluation(samples=5)._conditions() == []
+
+
 def shares(runs: Runs, samples: int, folder: Path | None) -> Any:
     evaluation = runs.evaluation(features=True, samples=samples, multimodality=True)
     assert evaluation.protocol.multimodality is not None
@@ -344,6 +414,18 @@ def test_variants_replace_options_of_their_file(tmp_path):
     assert protocol_config(str(tmp_path / "mine_upper_body.yaml"))["edit"] == {"joints": "upper_body"}
 
 
+def test_other_sampling_options_have_other_folders_of_motions(runs):
+    folders = []
+    base: dict[str, Any] = {"sampler": "ddim", "num_inference_steps": 3, "eta": 0.0, "spacing": "linspace"}
+    for changes in ({}, {"eta": 0.5}, {"spacing": "stride"}, {"num_inference_steps": 4}, {"guidance_scale": 2.0}):
+        options = SamplerOptions(**base | changes)
+        request = EvaluationRequest(ckpt=str(runs.model), extractor="none", options=options)
+        source = Plan(request, "cpu").source
+        assert isinstance(source, Generator)
+        folders.append(source.folder)
+    assert len(set(folders)) == len(folders)
+
+
 def test_captions_crops_and_second_draws_are_functions_of_seed_replication_and_id(runs):
     data = runs.data()
     protocol = load_protocol("synthetic", data.representation)
@@ -372,6 +454,13 @@ def test_unexpected_values_of_real_motions_stop_before_anything_is_generated(run
     assert (right.forced, right.invalid_because) == (False, [])
     with pytest.raises(UserError, match=r"real motions have attributes/all .*, expected 0\.5 \+- 0\.05.*force=true"):
         evaluation.run(unused)
+    resized = runs.evaluation(samples=8)
+    resized = changed(resized, expected={"synthetic": {"attributes/all": [0.5, 0.05]}})
+    measured = resized.run(Baseline("real", evaluation.clips, "text", 0))
+    assert measured.invalid_because == [], "bounds hold for the number of motions of the protocol"
+    assert "the expected values of real motions were not checked" in measured.warnings[0]
+    uncomputed = changed(runs.evaluation(features=True), expected={"synthetic": {"diversity": [4.0, 0.5]}})
+    assert uncomputed.run(None).invalid_because == ["diversity of real motions, expected 4, could not be computed"]
     others = replace(evaluation, clips=runs.data().clips("val"))
     assert others.run(None).invalid_because == [], "nothing is expected of other splits"
     others.clips.store.info["clips"]["test"] = 0  # HumanAct12 is tested on its training clips
@@ -388,6 +477,7 @@ def own(folder: Path, old: str, new: str) -> str:
 
 def test_what_does_not_fit_is_refused(runs, tmp_path):
     for message, keys in (
+        ("resamples=20: give 0, or 100 or more", {"resamples": 20}),
         ("needs a feature extractor", {"extractor": None, "protocol": "text_to_motion"}),
         ("holds a motion generator, not a motion-CLIP", {"extractor": str(runs.model)}),
         ("Did you mean synthetic", {"protocol": "synthetical"}),
@@ -406,6 +496,7 @@ def test_what_does_not_fit_is_refused(runs, tmp_path):
         ("  prompts: 20", "  promts: 20", "Did you mean prompts"),
         ("condition: text", "condition: music", "condition"),
         ("replications: 5", "replications: many", "not a whole number"),
+        ("replications: 5", "replications: 5\nexpected: {x: {fidd: [0, 1]}}", "called fidd. Did you mean fid"),
     ):
         with pytest.raises(UserError, match=message):
             load_protocol(own(tmp_path, old, new), HumanML())
@@ -512,6 +603,13 @@ def test_shuffled_motions_are_all_there_and_belong_to_what_others_ask_for(runs):
         Baseline("shufled", clips, "text", 0)
     with pytest.raises(UserError, match="without text or labels cannot be shuffled"):
         Baseline("shuffled", clips, "none", 0)
+
+
+@pytest.mark.parametrize("extractor", ["none", None, "motion_clip_synthetic", "clip", "clip/checkpoints/last.ckpt"])
+def test_an_evaluation_in_training_takes_the_extractors_that_evaluate_takes(runs, extractor):
+    source = str(runs.clip.parents[2] / extractor) if (extractor or "").startswith("clip") else extractor
+    callback = Evaluate("synthetic", source, every_n_steps=1)
+    assert callback.path == source
 
 
 def test_a_missing_extractor_of_the_selection_stops_before_training(runs, tmp_path, capsys, monkeypatch):

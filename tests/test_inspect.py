@@ -8,6 +8,7 @@ import torch
 from support.motions import Page, posed, synthetic
 
 from evaluators import perturbations as p
+from evaluators.encoding import encode
 from flame_mdm.__main__ import main
 from flame_mdm.formats.faults import LIMITS, find_faults
 from flame_mdm.formats.motion import Motion
@@ -194,11 +195,11 @@ def test_encoding_keeps_frames_heights_and_features():
     motion = torch.from_numpy(synthetic("jump").joints).double()
     features = representation.encode(motion)
     joints = representation.decode(features).double().numpy()
-    (again,) = p.encode(representation, [joints])
+    (again,) = encode(representation, [joints])
     assert again.shape == features.shape
     # The smoothed heading depends on the last frame, which is continued.
     np.testing.assert_allclose(again[:-1], features[:-1].numpy(), atol=1e-2)
     for meters in (-0.05, 0.05):  # lifted motions keep their height
-        (encoded,) = p.encode(representation, [p.lift(joints, 100 * meters)])
+        (encoded,) = encode(representation, [p.lift(joints, 100 * meters)])
         offset = representation.decode(torch.from_numpy(encoded)).numpy() - joints
         np.testing.assert_allclose(offset, np.broadcast_to([0, meters, 0], joints.shape), atol=1e-4)

@@ -1,5 +1,6 @@
 """Metrics: against the authors' code and against closed forms."""
 
+import itertools
 import math
 from typing import Any
 
@@ -22,6 +23,7 @@ from evaluators.metrics.retrieval import TMR_TOP, whole_set_retrieval
 from evaluators.results import mean_ci
 from flame_mdm.batch import length_mask
 from flame_mdm.errors import UserError
+from flame_mdm.records import Value, percentiles
 from flame_mdm.representations.skeleton import KIT21, SMPL22
 
 FIXTURE = golden("metrics")
@@ -463,3 +465,41 @@ def test_physics_of_simple_motions():
         values = measured(joints)
         assert values["above"] == pytest.approx(above, rel=1e-6)
         assert values["below"] == pytest.approx(below, rel=1e-6)
+
+
+def test_a_bootstrap_of_a_mean_is_the_interval_in_closed_form():
+    generator = np.random.default_rng(0)
+    x = generator.normal(3, 2, 200)
+    drawn = x[generator.integers(200, size=(4000, 200))].mean(1)
+    half = 1.96 * x.std() / 200**0.5
+    low, high = percentiles(drawn.tolist(), x.mean())
+    np.testing.assert_allclose([low, high], [x.mean() - half, x.mean() + half], atol=0.05 * half)
+
+
+def test_a_bootstrap_of_a_distance_is_at_its_value():
+    generator, draws = torch.Generator().manual_seed(0), np.random.default_rng(0)
+    real, noise = torch.randn(2, 150, 8, generator=generator, dtype=torch.float64)
+    value = frechet_distance(noise, real).item()
+    drawn = [frechet_distance(noise[draws.integers(150, size=150)], real).item() for _ in range(300)]
+    low, high = percentiles(drawn, value)
+    assert low < value < high, "sets with repetitions are farther away, which is not the value's error"
+
+
+def test_an_interval_is_over_replications_or_over_motions_and_a_single_value_has_none():
+    assert mean_ci([3.0]) == (3.0, None)
+    single: dict[str, Any] = {"mean": 3.0, "replications": 1, "n": 64}
+    assert Value(ci=0.0, **single).half is None, "as earlier versions wrote it"
+    assert Value(ci=None, **single).half is None
+    drawn: list[float | None] = [2.0 + k / 100 for k in range(201)]
+    assert Value(ci=None, **single, resampled=drawn).half == pytest.approx(0.95)
+    assert Value(mean=3.0, ci=0.5, replications=2, n=64, resampled=drawn).half == 0.5
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_multimodality_draws_no_motion_twice_on_the_same_side(seed: int):
+    # Both sides are all 5 motions in some order, so that the value is the mean distance of one of 120 pairings.
+    features = torch.tensor([0.0, 1.0, 4.3, 13.7, 41.9], dtype=torch.float64)
+    pairings = [(features - features[list(order)]).abs().mean() for order in itertools.permutations(range(5))]
+    metric = diversity.TextMultimodality(samples=5, pairs=5, seed=seed)
+    value = computed(metric, generated=features[:, None], groups=torch.zeros(5, dtype=torch.long), keys=keys(5))
+    assert min(abs(value - float(pairing)) for pairing in pairings) < 1e-9

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from evaluators.perturbations import near_misses
+from evaluators.near_misses import near_misses
 from flame_mdm.data.bandai import captions as bandai_captions
 from flame_mdm.data.bandai import side_of
 from flame_mdm.data.store import Entry

@@ -69,6 +69,11 @@ def test_the_history_holds_what_a_step_does_and_costs(evaluated):
     name = "val/synthetic/foot_skating"
     assert curves[name].keys() == curves[f"{name}/ci"].keys() == {3, 7}
     assert all(width > 0 for width in curves[f"{name}/ci"].values())
+    jitter = "val/synthetic/jitter (m/s^3)"
+    assert curves[jitter].keys() == curves[f"{jitter}/real"].keys() == {3, 7}
+    assert len({*curves[f"{jitter}/real"].values()}) == 1, "real motions do not change"
+    assert 0 < curves[f"{jitter}/real"][3] < curves[jitter][3]
+    assert "val/synthetic/jitter" not in curves, "checkpoints alone are selected by the name without a unit"
 
 
 def test_tensorboard_shows_the_table_the_configuration_and_the_data(evaluated):
@@ -77,7 +82,7 @@ def test_tensorboard_shows_the_table_the_configuration_and_the_data(evaluated):
     names = events.Tags()["tensors"]
     values = [events.Tensors(name)[-1].tensor_proto.string_val[0].decode() for name in names]
     text = {name.removesuffix("/text_summary"): value for name, value in zip(names, values, strict=True)}
-    evaluation = "| metric | mean | ci | replications | n |", "| foot_skating |"
+    evaluation = "| metric | mean | ci | replications | n | unit | real motions |", "| foot_skating |", "| m/s^3 |"
     assert all(words in text["evaluation/synthetic"] for words in evaluation)
     assert "num_train_timesteps: 10" in text["config"]
     assert "fingerprint: " in text["provenance"]

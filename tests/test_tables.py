@@ -5,12 +5,14 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from support.pages import result
 
 import evaluators.evaluation
 from evaluators.evaluation_request import EvaluationRequest
+from evaluators.sources import SampleFolder
 from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.model_files import FORMAT, FORMAT_KEY, weights_sha256
 from flame_mdm.commands.tables import outdated, shows_multimodality
@@ -19,6 +21,7 @@ from flame_mdm.reporting.tables import build as builder
 from flame_mdm.reporting.tables.build import build
 from flame_mdm.reporting.tables.format import Cell, Line, Table, ranks, rendered
 from flame_mdm.reporting.tables.specs import Evaluation, evaluations, load_spec, spec_names
+from flame_mdm.representations.humanml import HumanML
 from flame_mdm.safe_io import write_json
 
 SPEC = """
@@ -509,6 +512,66 @@ def test_a_result_is_outdated_when_checkpoint_or_extractor_are_others_now(folder
             assert outdated(path, request) == stand_in
     (folder / "mdm.ckpt").write_bytes(b"trained again")
     assert outdated(path, request)
+
+
+def test_a_result_is_outdated_when_the_motion_files_are_others_now(tmp_path):
+    (tmp_path / "theirs").mkdir()
+    for number in range(2):
+        np.savez(tmp_path / "theirs" / f"{number}.npz", ids=["a"])
+    request = Evaluation("theirs", {"from_samples": str(tmp_path / "theirs"), "protocol": "synthetic"})
+    sha256 = SampleFolder(tmp_path / "theirs", HumanML()).sha256
+    path = put(request, tmp_path, measured(0, 0, 0, checkpoint=None, samples_sha256=sha256))
+    assert not outdated(path, request)
+    np.savez(tmp_path / "theirs" / "1.npz", ids=["b"])
+    assert outdated(path, request)
+
+
+SEVERAL = """
+title: several
+parts:
+  all:
+    protocol: synthetic
+    extractor: none
+    columns: {{FID: {{value: fid}}{more}}}
+    rows:
+      - {{label: MDM, ckpt: {folder}/mdm.ckpt}}
+"""
+
+
+def test_multimodality_is_computed_if_a_column_shows_it(folder, monkeypatch):
+    requests = []
+
+    def evaluate(request: EvaluationRequest) -> None:
+        requests.append(request.multimodality)
+        content = measured(0, 0, 0, changed={} if request.multimodality else {"multimodality": False})
+        content["checkpoint"]["sha256"] = hashlib.sha256(Path(str(request.ckpt)).read_bytes()).hexdigest()
+        content["extractor"] = None
+        content["values"] |= {"multimodality": entry(1.0)} if request.multimodality else {}
+        write_json(str(request.out), content)
+
+    monkeypatch.setattr(evaluators.evaluation, "evaluate", evaluate)
+    spec, more = folder / "several.yaml", ", Multimodality: {value: multimodality}"
+    words = ["tables", f"table={spec}", f"results={folder / 'several'}", f"out={folder / 'out'}"]
+    for text, expected in (("", [False]), (more, [False, True]), (more, [False, True]), ("", [False, True])):
+        spec.write_text(SEVERAL.format(folder=folder, more=text))
+        assert main(words) == 0
+        assert requests == expected
+    page = (folder / "out" / "several.md").read_text()
+    assert "differs from the protocol" not in page
+
+
+def test_a_footnote_states_the_numbers_of_generated_and_of_real_motions(folder):
+    content = measured(0.1, 0.5, 9)
+    content["values"]["fid"] |= {"n": 64, "n_per_replication": [64] * 5, "n_real": 378}
+    content["ground_truth"]["fid"]["n"] = 378
+    put(request_of(folder, "MDM"), folder, content)
+    notes = dict(made(folder).parts[0].notes)
+    assert any(
+        "N = 64, 5 replications (real motions: N = 378), compared with sets of 378 real motions" in text
+        for text in notes.values()
+    )
+    origins = {line.facts["computed from"] for line in rows(folder).values() if line.facts}
+    assert {len(origin) for origin in origins} == {16}
 
 
 def test_figure_4_of_mdm_shows_the_ratings_of_a_user_study_beside_the_reported_ones(tmp_path, monkeypatch):

@@ -10,8 +10,9 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
+from evaluators.encoding import encode
 from evaluators.extractors.motion_clip import MotionCLIPTask, info_nce
-from evaluators.perturbations import encode, near_misses
+from evaluators.near_misses import near_misses
 from flame_mdm.batch import MotionBatch
 from flame_mdm.config import Config
 from flame_mdm.errors import UserError

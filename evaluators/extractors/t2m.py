@@ -132,7 +132,7 @@ class T2MEvaluator(nn.Module):
         self.used = used_features or len(mean) - CONTACTS
         self.movement_encoder = _MovementEncoder(self.used, movement_hidden, movement_latent)
         self.text_encoder = _TextEncoder(text_hidden, embedding)
-        self.motion_encoder = _Recurrent(movement_latent, motion_hidden, embedding)
+        self.motion_encoder = _MotionEncoder(movement_latent, motion_hidden, embedding)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
         """Returns embeddings (B, E) of motions (B, F, D) of 4 to `max_frames` frames, with mask (B, F)."""
@@ -182,11 +182,18 @@ class _Recurrent(nn.Module):
         )
         self.hidden = nn.Parameter(torch.randn(2, 1, hidden))
 
-    def forward(self, x: Tensor, lengths: Tensor) -> Tensor:
+    def encode(self, x: Tensor, lengths: Tensor) -> Tensor:
         """(B, N, in_features) of which the first `lengths` (B,) are real -> (B, embedding)."""
         packed = pack_padded_sequence(self.input_emb(x), lengths.cpu(), batch_first=True, enforce_sorted=False)
         _, last = self.gru(packed, self.hidden.expand(-1, len(x), -1).contiguous())
         return self.output_net(torch.cat([last[0], last[1]], -1))
+
+
+class _MotionEncoder(_Recurrent):
+    """Encodes the features of a motion's movements."""
+
+    def forward(self, x: Tensor, lengths: Tensor) -> Tensor:
+        return self.encode(x, lengths)
 
 
 class _TextEncoder(_Recurrent):
@@ -200,7 +207,7 @@ class _TextEncoder(_Recurrent):
 
     def forward(self, vectors: Tensor, parts: Tensor, lengths: Tensor) -> Tensor:
         """(B, N, 300) and (B, N, 15), of which the first `lengths` (B,) are real -> (B, embedding)."""
-        return super().forward(vectors + self.pos_emb(parts), lengths)
+        return self.encode(vectors + self.pos_emb(parts), lengths)
 
 
 def _read_numbers(path: Path) -> np.ndarray:

@@ -42,10 +42,12 @@ from flame_mdm.errors import UserError
 if TYPE_CHECKING:
     from torchmetrics import Metric
 
+    from evaluators.metrics.samples import SampleMetric
 
-def make_metrics(configs: Mapping[str, Config], **options: Any) -> dict[str, Metric]:
+
+def make_metrics(configs: Mapping[str, Config], **options: Any) -> dict[str, SampleMetric]:
     """Creates metrics from mappings with a `_target_`, by name; `options` are passed to those that take them."""
-    metrics = {}
+    metrics: dict[str, SampleMetric] = {}
     for name, config in configs.items():
         legal = parameters(config["_target_"]) if "_target_" in config else ()
         metrics[name] = instantiate(config, **{option: value for option, value in options.items() if option in legal})

@@ -3,11 +3,19 @@
 import numpy as np
 import torch
 import torch.nn.functional as F
+from scipy.stats import hypergeom
 from torch import Tensor
 
-from evaluators.metrics.samples import SampleMetric
+from evaluators.metrics.diversity import distances
+from evaluators.metrics.samples import Rows, SampleMetric
+from flame_mdm.errors import UserError
 
 TOP = (1, 2, 3)  # k of R-precision
+
+
+def equally_weighted(values: Tensor) -> Tensor:
+    """Returns values (N,) with weights of 1, (N, 2)."""
+    return torch.stack([values, torch.ones(len(values), dtype=values.dtype)], 1)
 
 
 def retrieval_ranks(queries: Tensor, candidates: Tensor, pools: Tensor, own: Tensor) -> Tensor:
@@ -30,6 +38,8 @@ class RPrecision(SampleMetric):
     """R-precision: the fraction of queries with fewer than k candidates before the correct one in a pool of `pool`."""
 
     higher_is_better = True
+    summary = "top3"
+    audited = ("top1", "top3")
     states = ("generated", "text", "text_keys")
     names = tuple(f"top{k}" for k in TOP)
 
@@ -44,6 +54,21 @@ class RPrecision(SampleMetric):
     def ranks(self, generated: Tensor, text: Tensor, text_keys: Tensor) -> Tensor:
         """Returns the rank (N,) of the correct candidate for each query, 0 = first."""
         raise NotImplementedError
+
+    def in_random_pools(self, distance: Tensor, own: Tensor) -> dict[str, Tensor]:
+        """Returns how probable it is that the correct candidate is among the k nearest of a random pool, by query.
+
+        Args:
+            distance: (N, M) from queries to candidates.
+            own: (N,) index of the correct candidate of each query.
+        """
+        others = distance.shape[1] - 1
+        if others + 1 < self.pool:
+            raise UserError(f"{others + 1} candidates are fewer than a pool of {self.pool}")
+        at = distance.gather(1, own[:, None])
+        closer = (distance < at).sum(1) + ((distance == at).sum(1) - 1) // 2
+        probable = {f"top{k}": hypergeom.cdf(k - 1, others, closer.numpy(), self.pool - 1) for k in TOP}
+        return {name: equally_weighted(torch.from_numpy(values)) for name, values in probable.items()}
 
 
 class TextsForMotion(RPrecision):
@@ -66,6 +91,11 @@ class TextsForMotion(RPrecision):
         rows = np.arange(len(own))
         pools[rows, others], pools[rows, position] = pools[rows, position], own
         return retrieval_ranks(generated, text[first], torch.from_numpy(pools), torch.from_numpy(position))
+
+    def per_sample(self, rows: Rows) -> dict[str, Tensor]:
+        keys = rows["text_keys"].numpy()
+        _, first, own = np.unique(keys, return_index=True, return_inverse=True)
+        return self.in_random_pools(distances(rows["generated"], rows["text"][first]), torch.from_numpy(own))
 
 
 class MotionsForText(RPrecision):
@@ -92,6 +122,12 @@ class MotionsForText(RPrecision):
         order, pools, position = own_pools(len(generated), self.pool, self.seed)
         return retrieval_ranks(text[order], generated, pools, position)
 
+    def per_sample(self, rows: Rows) -> dict[str, Tensor]:
+        generated, text = rows["generated"], rows["text"]
+        if self.normalize:
+            generated, text = F.normalize(generated, dim=-1), F.normalize(text, dim=-1)
+        return self.in_random_pools(distances(text, generated), torch.arange(len(generated)))
+
 
 def own_pools(count: int, pool: int, seed: int) -> tuple[Tensor, Tensor, Tensor]:
     """Returns samples in random order (N,), the pool of each (N, P) for `MotionsForText`, and its place there (N,)."""
@@ -115,9 +151,15 @@ class MultimodalDistance(SampleMetric):
         self.normalize = normalize
 
     def value(self, generated: Tensor, text: Tensor) -> float:
+        return self._distances(generated, text).mean().item()
+
+    def _distances(self, generated: Tensor, text: Tensor) -> Tensor:
         if self.normalize:
             generated, text = F.normalize(generated, dim=-1), F.normalize(text, dim=-1)
-        return torch.linalg.vector_norm(generated - text, dim=-1).mean().item()
+        return torch.linalg.vector_norm(generated - text, dim=-1)
+
+    def per_sample(self, rows: Rows) -> dict[str, Tensor]:
+        return {"": equally_weighted(self._distances(rows["generated"], rows["text"]))}
 
 
 class MotionCLIPScore(SampleMetric):
@@ -128,6 +170,10 @@ class MotionCLIPScore(SampleMetric):
 
     def value(self, generated: Tensor, text: Tensor) -> float:
         return F.cosine_similarity(generated, text).mean().item()
+
+    def per_sample(self, rows: Rows) -> dict[str, Tensor]:
+        cosines = F.normalize(rows["generated"], dim=-1) * F.normalize(rows["text"], dim=-1)
+        return {"": equally_weighted(cosines.sum(1))}
 
 
 def pointwise_mutual_information(
@@ -163,6 +209,7 @@ class MutualInformationDivergence(SampleMetric):
     """
 
     higher_is_better = True
+    unit = "nats"
     states = ("generated", "text", "real")
 
     def __init__(self, eps: float = 5e-4):
@@ -172,3 +219,10 @@ class MutualInformationDivergence(SampleMetric):
     def value(self, generated: Tensor, text: Tensor, real: Tensor) -> float:
         self.need(len(text), real.shape[1] + text.shape[1] + 1, "samples, one more than features of motion and text")
         return pointwise_mutual_information(real, text, generated, text, self.eps).mean().item()
+
+    def per_sample(self, rows: Rows) -> dict[str, Tensor]:
+        real, real_text = rows["paired"], rows["paired_text"]
+        if len(real) <= real.shape[1] + real_text.shape[1]:
+            raise UserError(f"{len(real)} motions are too few for its covariances")
+        terms = pointwise_mutual_information(real, real_text, rows["generated"], rows["text"], self.eps)
+        return {"": equally_weighted(terms)}

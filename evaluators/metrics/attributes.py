@@ -4,14 +4,16 @@ They read what a person would see in a clip of a few seconds that shows one acti
 is stated next to its rule. The joints are the 22 of SMPL.
 """
 
+import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import torch
 from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
-from evaluators.metrics.samples import MotionMean, Timed
+from evaluators.metrics.samples import MotionMean, Rows, Timed
 
 PELVIS, NECK, HEAD = 0, 12, 15
 HIPS, ANKLES, TOES, COLLARS = (1, 2), (7, 8), (10, 11), (13, 14)
@@ -230,7 +232,24 @@ class AttributeAccuracy(Timed, MotionMean):
     """Fraction of motions that show the requested value, by attribute; see `right_attributes`."""
 
     higher_is_better = True
+    summary = exact = "all"
     names = (*ATTRIBUTES, "action_and_side", "all")
+
+    def readings(self, motions: Rows) -> dict[str, np.ndarray]:
+        """Returns the attributes of each motion as JSON: `seen` (N,)."""
+        seen = [json.dumps(read_attributes(joints.numpy(), self.fps)) for joints in motions["joints"]]
+        return {"seen": np.array(seen)}
+
+    def per_sample(self, rows: Rows) -> dict[str, Tensor]:
+        """Returns whether each motion shows the requested value, by attribute, and whether it was requested."""
+        pairs = zip(rows["seen"], rows["requested"], strict=True)
+        shown = [right_attributes(json.loads(str(seen)), requested) for seen, requested in pairs]
+        weighted: dict[str, Tensor] = {}
+        for name in self.names:
+            if any(name in right for right in shown):
+                values = [[right.get(name, False), name in right] for right in shown]
+                weighted[name] = torch.tensor(values, dtype=torch.float64)
+        return weighted
 
     def update(self, joints: Tensor, mask: Tensor, requested: Sequence[Mapping[str, Any]], keys: Tensor) -> None:
         rows = []
@@ -263,6 +282,7 @@ class SideAccuracy(Timed, MotionMean):
     """
 
     higher_is_better = True
+    summary = "hand_or_path"
     names = ("hand", "path", "hand_or_path")
 
     def update(self, joints: Tensor, mask: Tensor, sides: Sequence[tuple[str, str]], keys: Tensor) -> None:

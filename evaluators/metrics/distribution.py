@@ -1,10 +1,12 @@
 """Distances between the feature distributions of generated and real motions: FID, KID, precision and recall."""
 
+from collections.abc import Mapping
+
 import numpy as np
 import torch
 from torch import Tensor
 
-from evaluators.metrics.samples import TwoSets
+from evaluators.metrics.samples import Rows, TwoSets
 
 NEIGHBORS = 3  # of a sample of `PrecisionRecall`, as in MoDi and MDM
 
@@ -36,6 +38,15 @@ class FrechetMotionDistance(TwoSets):
         self.need(len(real), 2, "real motions")
         return max(frechet_distance(generated, real).item(), 0.0)  # rounding may give a value slightly below 0
 
+    def weighted(self, rows: Rows, weights: np.ndarray) -> dict[str, np.ndarray]:
+        """Computes the distance of sets in which each motion is repeated as often as it was drawn."""
+        generated, real = rows["generated"], rows["real"]
+        values = []
+        for times in map(torch.from_numpy, weights):
+            drawn = generated.repeat_interleave(times[: len(generated)], 0)
+            values.append(frechet_distance(drawn, real.repeat_interleave(times, 0)).item())
+        return {"": np.array(values)}
+
 
 def polynomial_mmd2(a: Tensor, b: Tensor) -> Tensor:
     """Computes the unbiased squared MMD of a (n, E) and b (n, E) with the kernel (x . y / E + 1)^3.
@@ -56,6 +67,8 @@ class KernelMotionDistance(TwoSets):
     """
 
     higher_is_better = False
+    directions: Mapping[str, bool | None] = {"std": None}
+    summary = "mean"
     names = ("mean", "std")
 
     def __init__(self, subsets: int = 100, subset_size: int = 1000, replace: bool = False, seed: int = 0):
@@ -95,6 +108,7 @@ class PrecisionRecall(TwoSets):
     """
 
     higher_is_better = True
+    summary = None
     names = ("precision", "recall")
 
     def value(self, generated: Tensor, real: Tensor) -> dict[str, float | None]:

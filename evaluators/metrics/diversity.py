@@ -4,12 +4,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from evaluators.metrics.samples import SampleMetric
+from evaluators.metrics.samples import Rows, SampleMetric
 
 
 def pair_distance(a: Tensor, b: Tensor) -> float:
     """Returns the mean Euclidean distance of features a (..., E) and b (..., E)."""
     return torch.linalg.vector_norm(a - b, dim=-1).mean().item()
+
+
+def distances(a: Tensor, b: Tensor) -> Tensor:
+    """Returns the Euclidean distances (N, M) of features a (N, E) and b (M, E), each computed from its difference."""
+    return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
 
 
 def _random_pairs(count: int, pairs: int, replace: bool, seed: int) -> tuple[Tensor, Tensor]:
@@ -36,6 +41,13 @@ class Diversity(SampleMetric):
         self.need(len(features), 2 if self.replace else self.pairs, f"motions for {self.pairs} pairs")
         first, second = _random_pairs(len(features), self.pairs, self.replace, self.seed)
         return pair_distance(features[first], features[second])
+
+    def weighted(self, rows: Rows, weights: np.ndarray) -> dict[str, np.ndarray]:
+        """Computes the mean distance over all pairs that may be drawn."""
+        features = rows["generated"]
+        times = weights[:, : len(features)]
+        between = distances(features, features).numpy()
+        return {"": ((times @ between) * times).sum(1) / times.sum(1) ** 2}
 
 
 class TextMultimodality(SampleMetric):
@@ -112,6 +124,7 @@ class JointVariance(SampleMetric):
     """
 
     higher_is_better = None
+    unit = "m^2"
     states = ("groups",)
     motions: list[Tensor]
 

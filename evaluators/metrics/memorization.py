@@ -1,6 +1,6 @@
 """Memorization: distance of generated motions from the training motions, compared to that of held-out real motions."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -73,6 +73,9 @@ class NearestTraining(SampleMetric):
 
     states = ("nearest", "real_nearest")
     names = ("joints", "features", "copies")
+    units: Mapping[str, str] = {"joints": "m"}
+    directions: Mapping[str, bool | None] = {"copies": False}
+    summary = "copies"
 
     def value(self, nearest: Tensor, real: Tensor) -> dict[str, float | None]:
         """Returns medians `joints` (meters) and `features`, and `copies` in [0, 1]."""

@@ -5,14 +5,14 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from evaluators.metrics.samples import MotionMean, Timed
+from evaluators.metrics.samples import JointMean, Timed
 from flame_mdm.formats.faults import LIMITS, LOW
 
 TOLERANCE = 0.005  # distance from the floor, in meters, that counts as 0
 STANDING = 0.03  # speed in meters per second below which a motion counts as static
 
 
-class FootSkating(Timed, MotionMean):
+class FootSkating(Timed, JointMean):
     """Foot skating ratio: fraction of frame transitions in which a foot that touches the floor slides.
 
     A toe joint touches the floor if it is below 5 cm in two adjacent frames, and slides if it moves more than 2.5 cm
@@ -35,13 +35,14 @@ class FootSkating(Timed, MotionMean):
         return (low[1:] & low[:-1] & fast).any(1)
 
 
-class Penetration(MotionMean):
+class Penetration(JointMean):
     """Mean depth over frames of the lowest joint below the floor, y = 0, in meters; depths up to 5 mm count as 0.
 
     Yuan et al. 2023 (PhysDiff) measure the lowest vertex of a mesh instead.
     """
 
     higher_is_better = False
+    unit = "m"
     side = -1  # of the floor
 
     def measure(self, motion: Tensor) -> Tensor:
@@ -55,19 +56,20 @@ class Floating(Penetration):
     side = 1
 
 
-class Jitter(Timed, MotionMean):
+class Jitter(Timed, JointMean):
     """Mean jerk of the joints, the third difference of their positions, in m/s^3, as in Yi et al. 2022 (PIP).
 
     It grows with the frame rate: compare only values for equal frame rates.
     """
 
     higher_is_better = False
+    unit = "m/s^3"
 
     def measure(self, motion: Tensor) -> Tensor:
         return motion.double().diff(n=3, dim=0).norm(dim=-1).mean(1) * self.fps**3
 
 
-class StaticShare(Timed, MotionMean):
+class StaticShare(Timed, JointMean):
     """Fraction of motions that hardly move: less than 3 cm/s on average over joints and frames.
 
     Real data sets have static motions, too, of standing people: compare with their value.

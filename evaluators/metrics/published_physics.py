@@ -6,11 +6,12 @@ Values of different benchmarks are not comparable with one another, nor with tho
 import math
 from collections.abc import Mapping, Sequence
 
+import numpy as np
 import torch
 from scipy.signal import find_peaks
 from torch import Tensor
 
-from evaluators.metrics.samples import MotionMean, SampleMetric, Timed
+from evaluators.metrics.samples import JointMean, MotionMean, Rows, SampleMetric, Timed
 
 FEET = (7, 10, 8, 11)  # left ankle or heel, left toe, right ankle or heel and right toe of the 22 SMPL joints
 JERK_OF_REAL_MOTIONS: dict[float, float] = {20: 0.033031363, 30: 0.016383045}
@@ -18,11 +19,11 @@ JERK_OF_REAL_MOTIONS: dict[float, float] = {20: 0.033031363, 30: 0.016383045}
 Values = dict[str, Tensor | float]
 
 
-class PublishedPhysics(Timed, MotionMean):
+class PublishedPhysics(Timed, JointMean):
     """Means over motions of values by name; `measured` is the fraction of motions that have all of them."""
 
     higher_is_better = False
-    DIRECTIONS: Mapping[str, bool | None] = {}  # values for which higher is better (True), or neither (None)
+    summary = None
     required_fps: float | None = None  # the only frame rate at which the values are defined; None = any
 
     def __init__(self, fps: float, feet: Sequence[int] = FEET):
@@ -30,9 +31,17 @@ class PublishedPhysics(Timed, MotionMean):
         self.feet = list(feet)
 
     def value(self, sums: Tensor, counts: Tensor) -> dict[str, float | None]:
-        if self.required_fps and self.fps != self.required_fps:
+        if not self.defined:
             raise self.error(f"defined at {self.required_fps:g} frames per second, but the motions have {self.fps:g}")
-        return super().value(sums, counts) | {"measured": (counts > 0).all(1).double().mean().item()}
+        return self.means(sums, counts) | {"measured": (counts > 0).all(1).double().mean().item()}
+
+    @property
+    def defined(self) -> bool:
+        """Whether the values are defined at the frame rate of the motions."""
+        return self.required_fps in (None, self.fps)
+
+    def readings(self, motions: Rows) -> dict[str, np.ndarray]:
+        return super().readings(motions) if self.defined else {}
 
 
 class MBenchQuality(PublishedPhysics):
@@ -50,7 +59,9 @@ class MBenchQuality(PublishedPhysics):
 
     parts = ("jitter_degree", "dynamic_degree", "ground_penetration", "foot_sliding", "foot_floating")
     names = (*parts, "measured")
-    DIRECTIONS: Mapping[str, bool | None] = {"dynamic_degree": None}
+    unit = "m/frame"
+    units: Mapping[str, str] = {"ground_penetration": "m", "foot_floating": "", "measured": ""}
+    directions: Mapping[str, bool | None] = {"dynamic_degree": None}
     required_fps = 20
 
     def __init__(self, fps: float, toes: Sequence[int] = (10, 11)):
@@ -128,12 +139,17 @@ class KimodoQuality(PublishedPhysics):
 
     parts = ("skate_from_height", "skate_ratio", "low", "skate_from_contacts", "skate_max", "contact_consistency")
     names = (*parts, "measured")
-    DIRECTIONS: Mapping[str, bool | None] = {"low": None, "contact_consistency": True}
+    unit = "m/s"
+    units: Mapping[str, str] = {"skate_ratio": "", "low": "", "contact_consistency": "", "measured": ""}
+    directions: Mapping[str, bool | None] = {"low": None, "contact_consistency": True}
 
     def update(self, joints: Tensor, mask: Tensor, keys: Tensor, contacts: Tensor | None = None) -> None:
         motions = self.real_frames(joints, mask)
         labels = [None] * len(motions) if contacts is None else contacts[mask].split(mask.sum(1).tolist())
         self.add(keys, [self.measure(*pair) for pair in zip(motions, labels, strict=True)])
+
+    def extras(self, motions: Rows, i: int) -> dict[str, Tensor]:
+        return {"contacts": motions["contacts"][i][None]} if "contacts" in motions else {}
 
     def measure(self, motion: Tensor, contacts: Tensor | None = None) -> Values:
         """Computes the values of a motion (F, J, 3) with contacts (F, 4) bool of its feet, as far as it has them."""
@@ -167,6 +183,10 @@ class KimodoConstraints(MotionMean):
     """
 
     higher_is_better = False
+    unit = "m"
+    units: Mapping[str, str] = {"root2d_acc": ""}
+    directions: Mapping[str, bool | None] = {"root2d_acc": True}
+    summary = None
     parts = ("root2d_err", "root2d_acc", "fullbody_keyframe", "end_effector")
     names = (*parts, "root2d_err_p95")
 
@@ -181,7 +201,7 @@ class KimodoConstraints(MotionMean):
 
     def value(self, sums: Tensor, counts: Tensor) -> dict[str, float | None]:
         roots = sums[counts[:, 0] > 0, 0]
-        return super().value(sums, counts) | {"root2d_err_p95": roots.quantile(0.95).item() if len(roots) else None}
+        return self.means(sums, counts) | {"root2d_err_p95": roots.quantile(0.95).item() if len(roots) else None}
 
 
 def constraint_errors(root: Tensor, full: Tensor, parts: Tensor) -> dict[str, Tensor]:
@@ -230,6 +250,10 @@ class TransitionJerk(SampleMetric):
     """
 
     higher_is_better = False
+    unit = "m/frame^3"
+    units: Mapping[str, str] = {"windows": ""}
+    directions: Mapping[str, bool | None] = {"windows": None}
+    summary = None
     states = ("total", "windows")
     names = ("peak", "area", "windows")
 

@@ -47,6 +47,7 @@ class PositionErrors(MotionMean):
     """
 
     higher_is_better = False
+    summary = None
     states = ("sums", "counts", "groups")
     parts = tuple(f"{error}_{part}" for error in ("ape", "ave") for part in PARTS)
 
@@ -81,12 +82,12 @@ class PositionErrors(MotionMean):
         self.add(keys, errors, groups=keys if groups is None or self.samples == 1 else groups)
 
     def value(self, sums: Tensor, counts: Tensor, groups: Tensor) -> dict[str, float | None]:
-        texts = self.by_group(groups, self.samples)
+        texts = self.by_group(groups, self.samples) if self.samples > 1 else torch.arange(len(groups))[:, None]
         root, values = (sums[:, 0] / counts[:, 0])[texts], []
         for descending in self.ranked.values():
             first = root.argsort(dim=1, descending=descending, stable=True)[:, :1]
             chosen = texts.gather(1, first)[:, 0]
-            values += super().value(sums[chosen], counts[chosen]).values()
+            values += self.means(sums[chosen], counts[chosen]).values()
         return dict(zip(self.names, values, strict=True))
 
     def positions(self, joints: Tensor) -> dict[str, Tensor]:
@@ -107,6 +108,7 @@ class TemosPositionErrors(PositionErrors):
     `upsampling=8`.
     """
 
+    unit = "1,000 KIT units"
     units_per_meter = 640.0  # KIT units per meter of `joints`, as in the KIT representations
 
     def positions(self, joints: Tensor) -> dict[str, Tensor]:
@@ -132,6 +134,7 @@ class FlamePositionErrors(PositionErrors):
     def __init__(self, parents: Sequence[int], samples: int = 1):
         super().__init__(samples)
         self.parents = tuple(parents)
+        self.units = {name: "m^2" if "ave_" in name else "m" for name in self.names}
 
     def positions(self, joints: Tensor) -> dict[str, Tensor]:
         return flame_parts(joints, joints[:, 0], self.parents)
@@ -148,20 +151,23 @@ class EditErrors(MotionMean):
     """Distances of the joints from those of real motions, of the part that an edit kept or generated."""
 
     higher_is_better = False
+    unit = "m"
+    summary = None
 
-    def update(
+    def compare(
         self,
         joints: Tensor,
         mask: Tensor,
         real_joints: Tensor,
         real_mask: Tensor,
         keys: Tensor,
-        kept: Tensor | None = None,
+        kept: Tensor | None,
     ) -> None:
+        """Adds the errors of pairs of motions (B, F, J, 3) with masks (B, F), up to the end of the shorter one."""
         motions = zip(self.real_frames(joints, mask), self.real_frames(real_joints, real_mask), strict=True)
         errors = []
         for row, (motion, real) in enumerate(motions):
-            length = min(len(motion), len(real))  # motions are compared up to the end of the shorter one
+            length = min(len(motion), len(real))
             distance = (motion[:length].double() - real[:length].double()).norm(dim=-1)
             old = torch.zeros_like(distance, dtype=torch.bool) if kept is None else kept[row][mask[row]][:length]
             errors.append(self.errors_of(distance, old))
@@ -181,6 +187,17 @@ class DisplacementErrors(EditErrors):
     """
 
     names = ("ade", "fde")
+
+    def update(
+        self,
+        joints: Tensor,
+        mask: Tensor,
+        real_joints: Tensor,
+        real_mask: Tensor,
+        keys: Tensor,
+        kept: Tensor | None = None,
+    ) -> None:
+        self.compare(joints, mask, real_joints, real_mask, keys, kept)
 
     def errors_of(self, distance: Tensor, kept: Tensor) -> dict[str, Tensor]:
         new = ~kept
@@ -202,7 +219,7 @@ class KeptDrift(EditErrors):
     def update(
         self, joints: Tensor, mask: Tensor, real_joints: Tensor, real_mask: Tensor, keys: Tensor, kept: Tensor
     ) -> None:
-        super().update(joints, mask, real_joints, real_mask, keys, kept)
+        self.compare(joints, mask, real_joints, real_mask, keys, kept)
 
     def errors_of(self, distance: Tensor, kept: Tensor) -> dict[str, Tensor]:
         return {"mean": distance[kept].mean(), "largest": distance[kept].max()} if kept.any() else {}

@@ -3,7 +3,7 @@
 import functools
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -95,6 +95,8 @@ class MultiPositiveRPrecision(CaptionMetric):
     """
 
     names = (*(f"{kind}top{k}" for kind in ("", "single_", "chance_") for k in TOP), "proper", "positives")
+    summary = "top3"
+    directions: Mapping[str, bool | None] = {"positives": None} | {f"chance_top{k}": None for k in TOP}
 
     def __init__(self, encoder: Config | None = None, pool: int = 32, seed: int = 0, normalize: bool = False):
         super().__init__(encoder, seed)
@@ -155,6 +157,8 @@ class TMRRetrieval(CaptionMetric):
         for way in ("t2m", "m2t")
         for value in (*(f"top{k}" for k in TMR_TOP), "median")
     )
+    summary = None
+    directions: Mapping[str, bool | None] = {name: False for name in names if name.endswith("median")}
 
     def __init__(self, encoder: Config | None = None, seed: int = 0, ids: str | None = None):
         super().__init__(encoder, seed)

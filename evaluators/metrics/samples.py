@@ -1,8 +1,11 @@
 """Base classes of metrics, which compute their values from all samples, sorted by key."""
 
-from collections.abc import Sequence
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torchmetrics import Metric
@@ -13,6 +16,9 @@ from flame_mdm.errors import UserError
 Value = float | dict[str, float | None] | None
 """What `compute` returns: a number, or numbers by name; None without samples."""
 
+Rows = Mapping[str, Any]
+"""Inputs of N motions by the names in `evaluators.metrics`, such as tensors whose first dimension is N."""
+
 
 class SampleMetric(Metric):
     """Base class of all metrics: keeps one row per sample and computes its value from all rows, sorted by key.
@@ -20,15 +26,34 @@ class SampleMetric(Metric):
     The value therefore does not depend on the batches, their order or the number of processes, of which some may have
     no samples. `value` is the formula. Several metrics take `seed`, that of their random draws.
 
+    A class also declares what readers of its values need to know: unit, direction, and what it can see.
+
     Attributes:
         states: names of the kept rows, in the order of the arguments of `value`. Each row also has a key. Unless
             `update` is overridden, they are its inputs.
         names: names of the values; empty if there is only one.
+        unit: unit of the values; "" = a number without a unit.
+        units: units of single values by name, if they differ from `unit`.
+        directions: of single values by name, if they differ from `higher_is_better`: whether higher is better; None =
+            neither.
+        summary: name of the value that sums up the others; None = there is none.
+        audited: names of the values that audits show; None = all.
+        sees_meaning: whether the metric may see that a motion shows something other than requested.
+        exact: name of the value that reads the requested attributes without a network; None = there is none.
+        depends_on_count: whether the value is biased by the number of motions.
     """
 
     full_state_update = False
     states: tuple[str, ...]
     names: Sequence[str] = ()
+    unit: str = ""
+    units: Mapping[str, str] = {}
+    directions: Mapping[str, bool | None] = {}
+    summary: str | None = ""
+    audited: Sequence[str] | None = None
+    sees_meaning = True
+    exact: str | None = None
+    depends_on_count = False
 
     def __init__(self):
         super().__init__()
@@ -39,7 +64,15 @@ class SampleMetric(Metric):
     def update_called(self) -> bool:
         return True  # a metric without samples returns None, without a warning
 
-    def update(self, **rows: Any) -> None:
+    def unit_of(self, name: str) -> str:
+        """Returns the unit of the value with a name; "" is the name of the only value."""
+        return self.units.get(name, self.unit)
+
+    def direction_of(self, name: str) -> bool | None:
+        """Returns whether higher values with a name are better; None = neither, or closer to real motions is."""
+        return self.directions.get(name, self.higher_is_better)
+
+    def update(self, *_: Any, **rows: Any) -> None:
         """Adds equally many rows by the names of their states, which include the keys; `ValueError` otherwise."""
         if len({len(values) for values in rows.values()}) > 1:
             sizes = ", ".join(f"{len(values)} {name}" for name, values in rows.items())
@@ -55,9 +88,49 @@ class SampleMetric(Metric):
     def nothing(self) -> Value:
         return dict.fromkeys(self.names) if self.names else None
 
-    def value(self, *rows: Tensor) -> Value:
+    def value(self, *rows: Any, **_: Any) -> Value:
         """Computes the value from all rows, in the order of their keys."""
         raise NotImplementedError
+
+    def drawn_value(self, drawn: Tensor, real_drawn: Tensor) -> Value:
+        """Computes the value of samples drawn with replacement, for a bootstrap.
+
+        Args:
+            drawn: (N,) indices of the samples, in the order in which they were added.
+            real_drawn: (M,) indices of the real motions, if the metric compares two sets.
+        """
+        return self.value(*self._taken(drawn, *self.states))
+
+    def _taken(self, drawn: Tensor, *names: str) -> list[Tensor]:
+        rows = [dim_zero_cat(getattr(self, name))[drawn] for name in names]
+        return [values.double() if values.is_floating_point() else values for values in rows]
+
+    def readings(self, motions: Rows) -> dict[str, np.ndarray]:
+        """Returns what the metric reads from motions without their conditions, by name, as arrays of N rows.
+
+        Metrics of features read nothing else.
+        """
+        return {}
+
+    def per_sample(self, rows: Rows) -> dict[str, Tensor]:
+        """Returns the value and the weight (N, 2) of each sample, by the names of the values; {} if there are none.
+
+        The metric is the weighted mean, and, if it draws pools at random, the mean over all draws. `rows` has the
+        inputs of the metric and its `readings`. Raises `UserError` if there are too few samples.
+        """
+        return {}
+
+    def weighted(self, rows: Rows, weights: np.ndarray) -> dict[str, np.ndarray]:
+        """Computes the values (R,) of R resamples of N samples, by name; {} if the metric cannot be resampled.
+
+        `weights` (R, N) says how often each sample was drawn; see `per_sample` for the rest.
+        """
+        values = {}
+        for name, pairs in self.per_sample(rows).items():
+            pair, times = np.asarray(pairs), weights[:, : len(pairs)]
+            with np.errstate(invalid="ignore"):
+                values[name] = times @ pair[:, 0] / (times @ pair[:, 1])
+        return values
 
     def rows(self, keys: str, *names: str) -> list[Tensor]:
         """Returns finite rows in the order of their keys, floats as float64; [] if there are none."""
@@ -134,15 +207,11 @@ class MotionMean(SampleMetric):
     states = ("sums", "counts")
     parts: Sequence[str] = ()  # names of the values of a motion, if `names` has more
 
-    def update(self, joints: Tensor, mask: Tensor, keys: Tensor) -> None:
-        self.add(keys, [self.measure(motion) for motion in self.real_frames(joints, mask)])
-
-    def measure(self, motion: Tensor) -> Any:
-        """Computes the values of a motion (F, J, 3), by name if the metric has `names`; NaN or missing = undefined."""
-        raise NotImplementedError
-
     def add(self, keys: Tensor, motions: Sequence[Any], **more: Tensor) -> None:
-        """Adds motions, given as the results of `measure`; undefined values do not count."""
+        """Adds motions, given as their values, by name if the metric has `names`; NaN or missing = undefined.
+
+        Undefined values do not count. A value may be a tensor of several, such as one per frame.
+        """
         names, rows = self.parts or self.names, []
         for motion in motions:
             values = [motion.get(name, torch.nan) for name in names] if names else [motion]
@@ -151,19 +220,55 @@ class MotionMean(SampleMetric):
             rows.append([[float(x.sum()) for x in defined], [len(x) for x in defined]])
         if rows:
             sums, counts = torch.tensor(rows, dtype=torch.float64).unbind(1)
-            super().update(keys=keys, sums=sums, counts=counts, **more)
+            SampleMetric.update(self, keys=keys, sums=sums, counts=counts, **more)
 
-    def value(self, sums: Tensor, counts: Tensor) -> Any:
+    def value(self, *rows: Any, **_: Any) -> Value:
+        return self.means(*rows)
+
+    def means(self, sums: Tensor, counts: Tensor) -> Any:
         """Returns the mean of all values, by name if the metric has `names`; None for what has no value."""
         totals = zip(sums.sum(0).tolist(), counts.sum(0).tolist(), strict=True)
         means = [total / count if count else None for total, count in totals]
         return dict(zip(self.parts or self.names, means, strict=True)) if self.names else means[0]
+
+    def per_sample(self, rows: Rows) -> dict[str, Tensor]:
+        names = self.parts or self.names or [""]
+        return {name: torch.as_tensor(rows[name]) for name in names if name in rows}
+
+
+class JointMean(MotionMean):
+    """A mean of values that are measured on the joints of one motion at a time."""
+
+    sees_meaning = False
+
+    def update(self, joints: Tensor, mask: Tensor, keys: Tensor) -> None:
+        """Adds motions with joints (B, F, J, 3) in meters, y up, mask (B, F) and keys (B,)."""
+        self.add(keys, [self.measure(motion) for motion in self.real_frames(joints, mask)])
+
+    def measure(self, motion: Tensor) -> Any:
+        """Computes the values of a motion (F, J, 3), by name if the metric has `names`; NaN or missing = undefined."""
+        raise NotImplementedError
+
+    def readings(self, motions: Rows) -> dict[str, np.ndarray]:
+        """Returns the sum and the number (N, 2) of the values of each motion, by name."""
+        self.reset()
+        for i, joints in enumerate(motions["joints"]):
+            mask = torch.ones(1, len(joints), dtype=torch.bool)
+            self.update(joints[None], mask, motions["keys"][i : i + 1], **self.extras(motions, i))
+        pairs = torch.stack([torch.cat(getattr(self, state)) for state in ("sums", "counts")], 1).numpy()
+        names = self.parts or self.names or [""]
+        return {name: pairs[..., k] for k, name in enumerate(names) if pairs[:, 1, k].any()}
+
+    def extras(self, motions: Rows, i: int) -> dict[str, Any]:
+        """Returns further inputs of `update` for the motion with number i."""
+        return {}
 
 
 class TwoSets(SampleMetric):
     """A metric that compares the set of features of generated motions with that of real motions."""
 
     states = ("generated",)
+    depends_on_count = True
 
     def __init__(self):
         super().__init__()
@@ -186,3 +291,6 @@ class TwoSets(SampleMetric):
     def compute(self) -> Any:
         generated, real = self.rows("keys", "generated"), self.rows("real_keys", "real")
         return self.value(*generated, *real) if generated and real else self.nothing
+
+    def drawn_value(self, drawn: Tensor, real_drawn: Tensor) -> Value:
+        return self.value(*self._taken(drawn, "generated"), *self._taken(real_drawn, "real"))

@@ -53,6 +53,8 @@ def _find_in_folder(folder: Path, which: Which) -> Path:
             raise FileNotFoundError(f"{file}: no such checkpoint. The run has {names}")
         return file
     if len(weights) != 1:
+        if runs := [run for run in sorted(folder.iterdir()) if (run / "checkpoints").is_dir()]:
+            raise UserError(f"{folder}: no run, but there are runs below it. Give one: {', '.join(map(str, runs))}")
         names = ", ".join(file.name for file in weights) or "no .safetensors file"
         raise UserError(f"{folder}: this folder holds {names}. Name the file of the model, or a run directory")
     regular_file(weights[0])

@@ -14,11 +14,12 @@ from flame_mdm.safe_io import write_json
 @dataclass(frozen=True, kw_only=True)
 class AuditSettings(DataSettings):
     """usage: flame-mdm audit data=NAME extractor=FILE|none [key=value ...]
-           flame-mdm audit cards=CARD.json
+           flame-mdm audit cards="A.json B.json"
 
     Perturbs the real motions of a data set at graded strengths, measures them like generated ones, and writes a card:
     what each metric sees, from which strength, and what it cannot see. extractor=none audits the metrics of joint
-    positions. If interrupted, the same command continues where it stopped. cards= renders cards again.
+    positions. If interrupted, the same command continues where it stopped. cards= renders a card again, or two cards
+    side by side.
     """
 
     OBJECTS: ClassVar = ("data", "extractor")
@@ -29,7 +30,7 @@ class AuditSettings(DataSettings):
     split: Literal["train", "val", "test"] = option("test", "train, val or test")
     samples: int | None = option(None, "number of motions; default: all of the split")
     resamples: int = option(100, "bootstrap resamples of motions, for the intervals")
-    cards: list[str] | None = option(None, "cards (.json) to render again")
+    cards: list[str] | None = option(None, "one card (.json) to render again, or two, side by side")
     batch_size: int = option(64, "motions at once")
     device: str | None = option(None, "default: cpu", device_name)
     data_root: str = option("", "folder of the prepared data sets; default: FLAME_MDM_DATA, or data")
@@ -39,8 +40,11 @@ class AuditSettings(DataSettings):
 def main(settings: AuditSettings) -> None:
     out = Path(settings.out)
     if settings.cards is not None:
-        for card in settings.cards:
-            say(*write_card(read_card(Path(card)), out))
+        if len(settings.cards) > 2:
+            raise UserError(f"cards={' '.join(settings.cards)}: {len(settings.cards)} cards. Give one or two")
+        paths = [Path(card) for card in settings.cards]
+        name = "-and-".join(path.stem for path in paths)
+        say(*write_card([read_card(path) for path in paths], out, name))
         return
     if settings.data is None or settings.extractor is None:
         raise UserError("give a data set and an extractor: data=NAME extractor=FILE, or extractor=none")
@@ -53,4 +57,4 @@ def main(settings: AuditSettings) -> None:
     request = EvaluationRequest.of(vars(settings) | settings.nodes | {"baseline": "real", "protocol": protocol})
     card = measure(request, out / "cache", settings.resamples)
     write_json(out / f"{card_name(card)}.json", card.model_dump(), indent=None)
-    say(*write_card(card, out))
+    say(*write_card([card], out))

@@ -119,17 +119,21 @@ def shows_multimodality(evaluation: Evaluation, values: Set[str]) -> bool:
 def outdated(path: Path, evaluation: Evaluation, values: Set[str] = frozenset()) -> bool:
     """Returns whether a result must be measured again.
 
-    That is the case if its checkpoint or extractor has changed, if SMPL's model file is now available, or if it lacks
-    metrics that need several motions per prompt.
+    That is the case if its checkpoint, extractor or motion files have changed, if SMPL's model file is now available, or
+    if it lacks metrics that need several motions per prompt.
 
     Args:
         path: the result.
         evaluation: the evaluation that a table needs.
         values: the values that tables show of the result.
     """
+    from evaluators.sources import sample_files, sha256_of_samples
     from flame_mdm.checkpoints.model_files import weights_sha256
 
     result = read_result(path)
+    samples = evaluation.keys.get("from_samples")
+    if samples and result.samples_sha256 != sha256_of_samples(sample_files(Path(samples))):
+        return True
     was_skipped = "multimodality" in result.changed and "multimodality" not in evaluation.keys
     if was_skipped and shows_multimodality(evaluation, values):
         return True

@@ -1,19 +1,25 @@
-"""Cards of evaluator audits: one page per extractor and data set."""
+"""Cards of evaluator audits: one page per extractor and data set, or two cards side by side."""
 
+from __future__ import annotations
+
+import hashlib
 import itertools
+import json
 import os
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from flame_mdm.errors import markdown_text
-from flame_mdm.records import AuditCard, AuditedPerturbation
+from flame_mdm.records import AuditCard, AuditedMetric, AuditedPerturbation, Data
 from flame_mdm.reporting.page import interval, number, page, render
 from flame_mdm.safe_io import write_text
-from flame_mdm.schemas import read_json
+from flame_mdm.schemas import ClosedSchema, Int, read_json
 
 COMMITTED = "docs/benchmarks/audit"  # folder of the cards that audited.json lists
-PHYSICS = ("foot_skating", "penetration", "floating", "jitter", "static_share")  # do not see the meaning of a motion
+SETS = {"fewer": "{:g} real motions", "as stored": "features as stored"}
+"""Perturbations of the set that show the bias of a metric, and what they measure at their strongest grade."""
 ROUNDING = 1e-6  # relative differences below this are not seen
 WIDE, HIGH = 132, 48
 LEGEND = (
@@ -54,53 +60,127 @@ def seen(card: AuditCard, perturbation: AuditedPerturbation, metric: str) -> See
 
 
 def card_name(card: AuditCard) -> str:
-    return _name(card.data.dataset, card.extractor.sha256 if card.extractor else None)
+    """Returns the name of a card's files: data set, extractor, number of motions, and a hash of what was audited.
 
-
-def _name(dataset: str, sha256: str | None) -> str:
-    return f"{dataset}-{sha256[:12] if sha256 else 'none'}"
-
-
-def card_of(dataset: str, sha256: str | None) -> Path | None:
-    """Returns the card of an extractor on a data set, or of metrics of joints; None if it was not audited.
-
-    It is in the folder that FLAME_MDM_AUDITS names, by default runs/audit, or one of those named in audited.json.
+    An audit of other motions, or of another crop, has another name, so that it does not overwrite a stronger one.
     """
-    name = _name(dataset, sha256)
-    path = Path(os.environ.get("FLAME_MDM_AUDITS", "runs/audit")) / f"{name}.html"
-    if path.exists():
-        return path
-    committed: list[str] = read_json(Path(__file__).with_name("audited.json"), list[str])
-    return Path(COMMITTED) / f"{name}.html" if name in committed else None
+    extractor = card.extractor.sha256[:12] if card.extractor else "none"
+    facts = card.model_dump(include={"protocol", "data", "split", "seed", "motions", "resamples"})
+    digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
+    return f"{card.data.dataset}-{extractor}-{card.motions}-{digest[:8]}"
+
+
+class ListedCard(ClosedSchema):
+    """A card in this repository, as audited.json lists it."""
+
+    name: str
+    extractor: str | None  # first 12 characters of its sha256
+    motions: Int
+    split: str
+    data: Data
+
+    def cited(self, folder: Path) -> CitedCard:
+        return CitedCard(folder / f"{self.name}.html", self.motions, self.split, self.data)
+
+
+@dataclass(frozen=True)
+class CitedCard:
+    """The page of a card, and the motions that it is about."""
+
+    path: Path
+    motions: int
+    split: str
+    data: Data
+
+    def strength(self, data: Data) -> tuple[bool, bool, bool, int]:
+        """Returns how well the card fits evaluated data: the same limits of length, the test split, the same data, N.
+
+        Cards are compared in this order.
+        """
+        same_frames = self.data.frames == data.frames
+        return same_frames, self.split == "test", self.data.fingerprint == data.fingerprint, self.motions
+
+    def __str__(self) -> str:
+        return f"{self.path.as_posix()} ({self.motions} motions)"
+
+
+def card_of(data: Data, sha256: str | None) -> CitedCard | None:
+    """Returns the strongest card of an extractor that fits evaluated data; None if it was not audited.
+
+    Without an extractor, it is a card of the metrics of joints. Cards are in the folder that FLAME_MDM_AUDITS names, by
+    default runs/audit, and in the repository; audited.json lists the latter.
+    """
+    extractor = sha256[:12] if sha256 else None
+    listed = read_json(Path(__file__).with_name("audited.json"), list[ListedCard])
+    fitting = [card.cited(Path(COMMITTED)) for card in listed if card.extractor == extractor]
+    folder = Path(os.environ.get("FLAME_MDM_AUDITS", "runs/audit"))
+    for path in sorted(folder.glob(f"{data.dataset}-{extractor or 'none'}*.json")):
+        card = read_card(path)
+        if (card.extractor.sha256[:12] if card.extractor else None) == extractor:
+            fitting.append(CitedCard(path.with_suffix(".html"), card.motions, card.split, card.data))
+    fitting = [card for card in fitting if card.data.dataset == data.dataset]
+    return max(fitting, key=lambda card: card.strength(data), default=None)
 
 
 def read_card(path: Path) -> AuditCard:
     return read_json(path, AuditCard, "run `flame-mdm audit` again")
 
 
-def write_card(card: AuditCard, out: Path) -> list[Path]:
-    """Writes a card as a web page and as Markdown; returns the paths."""
-    metrics = sorted(card.metrics, key=lambda name: name.startswith("attributes"))
-    evaluator = f"{card.extractor.name} ({card.extractor.sha256[:12]})" if card.extractor else "metrics of joints"
-    rows = []
-    for perturbation in card.perturbations:
-        cells = [_cell(card, perturbation, metric) for metric in metrics]
-        curves = [(metric, curve) for metric in metrics if (curve := _curve(card, perturbation, metric))]
-        rows.append({"about": perturbation, "cells": cells, "curves": curves})
+def write_card(cards: Sequence[AuditCard], out: Path, name: str = "") -> list[Path]:
+    """Writes one card, or two side by side, as a web page and as Markdown; returns the paths.
+
+    `name` is the name of the files; default: the names of the cards.
+    """
+    metrics = list(dict.fromkeys(metric for card in cards for metric in card.metrics))
+    metrics.sort(key=lambda metric: any(_facts_of(card, metric).exact for card in cards))
     values = {
-        "title": f"Audit of {evaluator} on {card.data.dataset}",
+        "title": " and ".join(f"Audit of {_evaluator(card)} on {card.data.dataset}" for card in cards),
+        "cards": [_section(card) for card in cards],
+        "metrics": metrics,
+        "rows": _rows(cards, metrics),
+        "legend": LEGEND,
+    }
+    name = name or "-and-".join(map(card_name, cards))
+    paths = [out / f"{name}{suffix}" for suffix in (".html", ".md")]
+    write_text(paths[0], page(str(values["title"]), render("audit.html", **values, wide=WIDE, high=HIGH)))
+    write_text(paths[1], str(render("audit.md", **values, metric_text=_metric_text)))
+    return paths
+
+
+def _evaluator(card: AuditCard) -> str:
+    return f"{card.extractor.name} ({card.extractor.sha256[:12]})" if card.extractor else "metrics of joints"
+
+
+def _section(card: AuditCard) -> dict[str, object]:
+    """Returns what pages say about a single card."""
+    return {
+        "name": _evaluator(card),
         "facts": _facts(card),
         "findings": findings(card),
         "truth": [(name, number(x["auc"]), number(x["correlation"])) for name, x in card.truth.items()],
         "real": [(name, interval(*pair)) for name, pair in card.real.items()],
-        "metrics": metrics,
-        "rows": rows,
-        "legend": LEGEND,
     }
-    paths = [out / f"{card_name(card)}{suffix}" for suffix in (".html", ".md")]
-    write_text(paths[0], page(values["title"], render("audit.html", **values, wide=WIDE, high=HIGH)))
-    write_text(paths[1], str(render("audit.md", **values, metric_text=_metric_text)))
-    return paths
+
+
+def _rows(cards: Sequence[AuditCard], metrics: Sequence[str]) -> list[dict[str, object]]:
+    """Returns the perturbations of all cards, each with one cell per metric and card, and its curves by metric."""
+    by_name = [{perturbation.name: perturbation for perturbation in card.perturbations} for card in cards]
+    rows = []
+    for name in dict.fromkeys(name for names in by_name for name in names):
+        pairs = [(card, perturbations.get(name)) for card, perturbations in zip(cards, by_name, strict=True)]
+        curves = []
+        for metric in metrics:
+            drawn = [_curve(card, perturbation, metric) for card, perturbation in pairs]
+            if any(drawn):
+                curves.append((metric, drawn))
+        rows.append(
+            {
+                "about": next(perturbation for _, perturbation in pairs if perturbation),
+                "cells": [[_cell(card, perturbation, metric) for card, perturbation in pairs] for metric in metrics],
+                "curves": curves,
+            }
+        )
+    return rows
 
 
 def _facts(card: AuditCard) -> list[list[str]]:
@@ -129,25 +209,35 @@ def findings(card: AuditCard) -> list[str]:
     lines += [f"Only {metric} sees: {', '.join(names)}." for metric, names in single.items() if names]
     for metric in card.metrics:
         unseen = [n for n in wrong if (n, metric) not in noticed and n not in blind]
-        unseen = [n for n in unseen if group[n] == "joints" or metric not in PHYSICS]
-        if unseen and metric.partition("/")[2] in ("", "all", "top3"):
+        unseen = [n for n in unseen if group[n] == "joints" or _facts_of(card, metric).sees_meaning]
+        if unseen and _facts_of(card, metric).sums_up:
             lines.append(f"{metric} does not see: {', '.join(unseen)}.")
     for metric in card.metrics:
         liked = [n for n in wrong if (response := table[n, metric]) and response.rewarded]
         if liked:
             lines.append(f"{metric} rates better than real motions: {', '.join(liked)}.")
+    biased = [metric for metric in card.metrics if _facts_of(card, metric).depends_on_count]
     for perturbation in card.perturbations:
-        if perturbation.name in ("fewer", "as stored") and "fid" in card.real:
-            grade, (real, _) = perturbation.grades[-1], card.real["fid"]
-            what = f"of {grade.grade:g} real motions" if perturbation.name == "fewer" else "of features as stored"
-            lines.append(
-                f"fid {what} is {number(grade.values['fid'][0])}; of all of them, decoded and encoded, {number(real)}."
-            )
+        of_motions = SETS.get(perturbation.name)
+        if of_motions is not None:
+            grade = perturbation.grades[-1]
+            lines += [
+                f"{metric} of {of_motions.format(grade.grade)} is {number(grade.values[metric][0])}; of all of them, "
+                f"decoded and encoded, {number(card.real[metric][0])}."
+                for metric in biased
+            ]
     return lines
 
 
-def _cell(card: AuditCard, perturbation: AuditedPerturbation, metric: str) -> tuple[str, str]:
-    response = seen(card, perturbation, metric)
+def _facts_of(card: AuditCard, metric: str) -> AuditedMetric:
+    return card.facts.get(metric, AuditedMetric())
+
+
+def _cell(card: AuditCard, perturbation: AuditedPerturbation | None, metric: str) -> tuple[str, str]:
+    """Returns the text of a cell of the summary, and its class."""
+    response = seen(card, perturbation, metric) if perturbation and metric in card.metrics else None
+    if perturbation is None or metric not in card.metrics:
+        return "not computed", "faint"
     if response is None:
         return _not_computed(card, perturbation, metric), "faint"
     if response.grade is None:
@@ -168,8 +258,10 @@ def _not_computed(card: AuditCard, perturbation: AuditedPerturbation, metric: st
     return f"not computed at {', '.join(f'{grade:g}' for grade in grades)}"
 
 
-def _curve(card: AuditCard, perturbation: AuditedPerturbation, metric: str) -> dict[str, str] | None:
+def _curve(card: AuditCard, perturbation: AuditedPerturbation | None, metric: str) -> dict[str, str] | None:
     """Returns a response curve over real motions and all grades; None if the metric never changes."""
+    if perturbation is None or metric not in card.metrics:
+        return None
     pairs = [card.real[metric], *(grade.values[metric][:2] for grade in perturbation.grades)]
     points = [(i, value, half) for i, (value, half) in enumerate(pairs) if value is not None and half is not None]
     real = card.real[metric][0]

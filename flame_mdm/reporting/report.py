@@ -81,6 +81,9 @@ def _player(run: Run, body: Mesh | None) -> str:
 
 def _chart(run: Run, name: str, families: list[str]) -> Markup:
     lines: dict[str, Curve] = {family: run.curves[f"{family}/{name}"] for family in families}
+    for family in families:
+        if real := run.curves.get(f"{family}/{name}/real"):
+            lines["real motions"] = real
     return chart(name, lines, {family: run.curves.get(f"{family}/{name}/ci", {}) for family in families})
 
 
@@ -90,7 +93,7 @@ def charted(curves: Collection[str]) -> dict[str, dict[str, list[str]]]:
     groups: dict[str, dict[str, list[str]]] = {"Losses": {}, "Validation": {}, samples: {}, "Training curves": {}}
     for name in curves:
         family, _, rest = name.partition("/")
-        if rest.endswith("/ci") or rest in ("", "epochs"):  # "": a name without a family; runs write none
+        if rest.endswith(("/ci", "/real")) or rest in ("", "epochs"):  # "": a name without a family; runs write none
             continue
         heading = {"samples": samples, "val": "Validation"}.get(family, "Training curves")
         if f"train/{rest}" in curves and rest not in COST:
@@ -101,8 +104,14 @@ def charted(curves: Collection[str]) -> dict[str, dict[str, list[str]]]:
 
 def _evaluation(result: Result) -> tuple[object, ...]:
     values, real = result.values or {}, result.ground_truth or {}
-    rows = [[name, printed(real.get(name)), printed(values.get(name))] for name in sorted(values | real)]
-    audit = f"audit of the evaluator: {result.audit}" if result.audit else "evaluator not audited"
+    rows = [
+        [labeled(name, values.get(name) or real.get(name)), printed(real.get(name)), printed(values.get(name))]
+        for name in sorted(values | real)
+    ]
+    audit = "evaluator not audited"
+    if result.audit:
+        audit = f"audit of the evaluator: {result.audit}"
+        audit += f", of {result.audit_motions} motions" if result.audit_motions else ""
     return evaluation_title(result), f"{sampling(result)}; {audit}", marks(result), result.not_computed, rows
 
 
@@ -112,16 +121,23 @@ def evaluation_title(result: Result) -> str:
     return f"{protocol.name} version {protocol.version}, {data.dataset} {result.split}{measured}"
 
 
+def labeled(name: str, value: Value | None) -> str:
+    """Returns the name of a metric with its unit, if it has one."""
+    return f"{name} ({value.unit})" if value and value.unit else name
+
+
 def sampling(result: Result) -> str:
     checkpoint = result.checkpoint
-    if checkpoint is None:
-        return "motions from other systems"
-    words = [
-        f"{Path(checkpoint.path).name} ({checkpoint.sha256[:8]})",
-        f"{checkpoint.sampler}, {checkpoint.num_inference_steps} steps",
-        f"guidance {checkpoint.guidance_scale:g}",
-        f"seed {result.seed}",
-    ]
+    words = [f"baseline {result.baseline}" if result.baseline else "motions from other systems"]
+    if checkpoint is not None:
+        words = [
+            f"{Path(checkpoint.path).name} ({checkpoint.sha256[:8]})",
+            f"{checkpoint.sampler}, {checkpoint.num_inference_steps} steps",
+            f"guidance {checkpoint.guidance_scale:g}",
+            f"seed {result.seed}",
+        ]
+    if result.counts:
+        words.append(f"replications x motions: {result.counts}")
     if result.cost and result.cost.seconds_per_sample is not None:
         words.append(f"{result.cost.seconds_per_sample:.3g} seconds per motion on {result.device}")
         if result.cost.batch_size:
@@ -138,7 +154,7 @@ def marks(result: Result) -> list[str]:
 
 
 def printed(value: Value | None) -> str:
-    return interval(value.mean, value.ci) if value else "–"
+    return interval(value.mean, value.half) if value else "–"
 
 
 def _provenance(facts: Provenance) -> list[list[str]]:

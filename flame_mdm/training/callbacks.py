@@ -19,8 +19,11 @@ from torch.nn.utils import get_total_norm
 from torch.optim import Optimizer
 from torchmetrics import Metric
 
+from flame_mdm.checkpoints.locating import SHIPPED
+from flame_mdm.checkpoints.model_files import read_model_file
 from flame_mdm.conditions.action import ActionLabels
 from flame_mdm.conditions.vocabulary import plainest
+from flame_mdm.config import Config
 from flame_mdm.data.datamodule import Clips, MotionDataModule
 from flame_mdm.errors import UserError, say
 from flame_mdm.formats.motion import Motion
@@ -178,7 +181,17 @@ class Report(Callback):
                 "none": "unconditioned=true",
             }[pl_module.generator.conditioned_on]
             say(f"next: {shlex.join(['flame-mdm', 'sample', str(self.folder), example])}")
-            say(f"      {shlex.join(['flame-mdm', 'evaluate', str(self.folder), 'extractor=none', 'quick=true'])}")
+            extractor = f"extractor={_extractor_in_package(pl_module.config, pl_module.facts) or 'none'}"
+            say(f"      {shlex.join(['flame-mdm', 'evaluate', str(self.folder), extractor, 'quick=true'])}")
+
+
+def _extractor_in_package(config: Config, facts: Mapping[str, Any]) -> str:
+    """Returns the name of the extractor in the package that measures the motions of a model; "" if there is none."""
+    name = f"motion_clip_{facts.get('dataset')}"
+    if name not in SHIPPED or "captions" not in facts:
+        return ""
+    trained = read_model_file(SHIPPED[name])["config"]
+    return name if trained["representation"] == config.get("representation") else ""
 
 
 def explain_metrics(values: Values, real: Values, metrics: Mapping[str, Metric]) -> list[str]:

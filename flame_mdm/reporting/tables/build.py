@@ -163,8 +163,7 @@ def _conditions(result: Result, timed: bool, shows_multimodality: bool) -> dict[
         shows_multimodality: whether the table shows multimodality; if not, whether it was measured does not matter.
     """
     protocol, data, extractor, cost = result.protocol, result.data, result.extractor, result.cost
-    card = card_of(data.dataset, extractor.sha256 if extractor else None)
-    first = next((v for v in (result.values or {}).values() if v and v.n), None)  # later ones may have fewer motions
+    card = card_of(data, extractor.sha256 if extractor else None)
     shown = {k: v for k, v in result.changed.items() if k != "multimodality" or shows_multimodality}
     changed = ", ".join(f"{k} = {v}" for k, v in shown.items())
     smpl = result.skeleton and result.skeleton.smpl_sha256
@@ -175,11 +174,11 @@ def _conditions(result: Result, timed: bool, shows_multimodality: bool) -> dict[
         "protocol": f"protocol {protocol.name} version {protocol.version}",
         "data": f"{result.split} split of {data.dataset} (fingerprint {data.fingerprint})",
         "limits": "{} to {} frames".format(*data.frames) if data.frames else "",
-        "metrics": f"N = {first.n}, {first.replications} replications" if first else "",
+        "metrics": _numbers(result),
         "time": f"timed in batches of {cost.batch_size or 0:g} on {result.device}" if timed and cost else "",
         "seed": f"seed {result.seed}",
         "extractor": f"extractor sha256 {extractor.sha256[:12]}" if extractor else "no extractor",
-        "audit": f"audit {card.as_posix()}" if card else "not audited",
+        "audit": f"audit {card}" if card else "not audited",
         "exclusions": _left_out(data.excluded),
         "skeleton": skeleton,
         "changes": f"differs from the protocol: {changed}" if changed else "",
@@ -188,6 +187,23 @@ def _conditions(result: Result, timed: bool, shows_multimodality: bool) -> dict[
         "warnings": "; ".join(result.warnings),
         "quick run": "QUICK RUN, NOT FOR PUBLICATION" if result.quick else "",
     }
+
+
+def _numbers(result: Result) -> str:
+    """Describes the numbers of motions and replications of most values, and of those of real motions."""
+    values = [value for value in (result.values or {}).values() if value and value.replications]
+    if not values:
+        return ""
+    first = values[0]  # later ones may have fewer motions
+    count = first.n if first.n is not None else " + ".join(map(str, first.n_per_replication))
+    text = f"N = {count}, {first.replications} replications"
+    real = next((value.n for value in (result.ground_truth or {}).values() if value and value.n), None)
+    if real is not None and real != first.n:
+        text += f" (real motions: N = {real})"
+    sets = next((value.n_real for value in values if value.n_real is not None), None)
+    if sets is not None and sets != first.n:
+        text += f", compared with sets of {sets} real motions"
+    return text
 
 
 def _left_out(excluded: Mapping[str, int]) -> str:
@@ -236,6 +252,7 @@ def _line(
         "training hours": fact("training_hours"),
         "device of training": fact("training_device"),
         "peak memory of training, GiB": fact("training_memory_gib"),
+        "computed from": first.origin[:16],
         "result": " ".join(dict.fromkeys(file for r, file in zip(results, files, strict=True) if r is not None)),
         "not valid because": "; ".join(reasons),
     }
@@ -247,8 +264,8 @@ def _counts(results: Sequence[Result | None], values: Sequence[str]) -> str:
     counts = {}
     for result, name in zip(results, values, strict=True):
         entry = (result.values or {}).get(name) if result else None
-        if entry and entry.n:
-            counts[name] = f"{entry.replications} x {entry.n}"
+        if entry and entry.replications:
+            counts[name] = entry.counts
     most = Counter(counts.values()).most_common(1)[0][0] if counts else ""
     return most + "".join(f"; {name} {count}" for name, count in counts.items() if count != most)
 
@@ -279,7 +296,7 @@ def _entry(values: Mapping[str, Value | None] | None, name: str) -> Cell | None:
     entry = (values or {}).get(name)
     if entry is None or entry.mean is None:
         return None
-    return Cell("", entry.mean, entry.ci if (entry.replications or 0) > 1 else None)
+    return Cell("", entry.mean, entry.half)
 
 
 def _print_cells(lines: Sequence[Line], columns: int) -> None:

@@ -1,0 +1,27 @@
+"""Encoding of changed joint positions as features, at their own height."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from flame_mdm.representations.humanml import HumanML
+
+Joints = np.ndarray
+"""Joint positions (F, J, 3) in meters, y up."""
+
+
+def encode(representation: HumanML, motions: Sequence[Joints]) -> list[np.ndarray]:
+    """Encodes motions as features (F, D) float32, with as many rows as frames, and at their own height.
+
+    The encoder needs one more frame, and puts the lowest joint on the floor, which would hide floating and sinking.
+    """
+    longer = [torch.from_numpy(np.concatenate([x, 2 * x[-1:] - x[-2:-1]])) for x in motions]
+    encoded = []
+    for joints, features in zip(motions, representation.encode_many(longer), strict=True):
+        height, positions = representation.slices["root_height"], representation.slices["positions"]
+        rise = float(joints[0, 0, 1]) * representation.units_per_metre - features[0, height]
+        features[:, height] += rise
+        features[:, positions.start + 1 : positions.stop : 3] += rise
+        encoded.append(features.numpy())
+    return encoded

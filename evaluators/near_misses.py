@@ -1,0 +1,47 @@
+"""Near misses: captions of a data set that are wrong for a clip in exactly one attribute."""
+
+from collections.abc import Sequence
+
+from flame_mdm.data.store import Entry
+
+ACTION = ("action", "content")  # names of the attribute that says what is done; clips without it have no near misses
+UNSAID = "normal"  # value that captions do not mention: such captions are less exact, but not wrong
+
+_Stated = frozenset[tuple[str, str | int | float]]
+
+
+def near_misses(clips: Sequence[Entry]) -> list[dict[str, list[str]]]:
+    """Returns the near misses of each clip among the captions of the others, sorted, by the attribute that differs.
+
+    A caption of another clip is a near miss if both clips show the same action, and of the attributes that both have
+    (side, style, count, ...), exactly one differs: "walks backward" is a near miss of a slow walk forward.
+    """
+    stated = [_stated(clip) for clip in clips]
+    captions: dict[_Stated, set[str]] = {}
+    for own, clip in zip(stated, clips, strict=True):
+        captions.setdefault(own, set()).update(clip.captions)
+    contradicting = {own: _contradicting(own, captions) for own in captions}
+    return [contradicting[own] for own in stated]
+
+
+def _stated(clip: Entry) -> _Stated:
+    """Returns the attributes of a clip; in its action, they are slots: "wave-left-hand" is "wave-{side}-hand"."""
+    stated = {name: value for name, value in clip.attributes.items() if isinstance(value, str | int | float)}
+    action = next((str(stated.pop(name)) for name in ACTION if name in stated), "")
+    names = {str(value): f"{{{name}}}" for name, value in stated.items()}
+    if action:
+        stated["action"] = "-".join(names.get(word, word.removesuffix("s")) for word in action.split("-"))
+    return frozenset(stated.items())
+
+
+def _contradicting(own: _Stated, captions: dict[_Stated, set[str]]) -> dict[str, list[str]]:
+    mine = dict(own)
+    wrong: dict[str, set[str]] = {}
+    for attributes, texts in captions.items():
+        other = dict(attributes)
+        if "action" not in mine or mine["action"] != other.get("action"):
+            continue
+        differing = [name for name in mine.keys() & other.keys() if mine[name] != other[name]]
+        if len(differing) == 1 and other[differing[0]] != UNSAID:
+            wrong.setdefault(differing[0], set()).update(texts - captions[own])
+    return {name: sorted(texts) for name, texts in sorted(wrong.items()) if texts}

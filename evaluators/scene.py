@@ -1,0 +1,88 @@
+"""The real motions that an audit perturbs, their captions, and wrong captions for them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from evaluators.near_misses import near_misses
+from evaluators.protocol import DrawnClip
+from flame_mdm.data.datamodule import MotionDataModule
+from flame_mdm.representations.humanml import HumanML
+from flame_mdm.seeds import key
+
+RANDOM, NEAR = "wrong captions", "near misses"
+"""Kinds of wrong captions: those of random other motions, and those that are wrong in one attribute."""
+
+
+class Text(NamedTuple):
+    """A caption, its tagged words, and the attributes that it requests."""
+
+    caption: str
+    tokens: Sequence[str] | None
+    requested: Mapping[str, Any]
+
+
+def text_of(row: DrawnClip, caption: str) -> Text:
+    return Text(caption, row.tokens(caption), row.requested)
+
+
+@dataclass
+class Scene:
+    """Real motions of a split: the clips, their features (F, D) each, and the seed of all draws."""
+
+    data: MotionDataModule
+    rows: list[DrawnClip]
+    features: list[np.ndarray]
+    representation: HumanML
+    seed: int
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    @property
+    def fps(self) -> float:
+        return self.representation.fps
+
+    @cached_property
+    def joints(self) -> list[np.ndarray]:
+        """Joint positions (F, J, 3) of each motion in meters, y up, float64."""
+        return [self.representation.decode(torch.from_numpy(x)).double().numpy() for x in self.features]
+
+    @property
+    def actions(self) -> list[int]:
+        """Action label of each motion; 0 if the data has none."""
+        return [row.clip.action or 0 for row in self.rows]
+
+    def draws(self, *parts: str | int) -> np.random.Generator:
+        """Returns a generator that is a function of the seed and the parts."""
+        return np.random.default_rng(key("audit", self.seed, *parts))
+
+    @cached_property
+    def wrong(self) -> dict[str, list[Text | None]]:
+        """A wrong text for each motion, by kind; None if there is none.
+
+        The kinds are `RANDOM`, `NEAR`, and, if near misses differ in several attributes, "near misses: ATTRIBUTE".
+        """
+        texts = {caption: text_of(row, caption) for row in self.rows for caption in row.clip.captions}
+        contradicting = near_misses([row.clip for row in self.rows])
+        attributes = sorted({name for misses in contradicting for name in misses})
+        kinds = [RANDOM, NEAR]
+        if len(attributes) > 1:
+            kinds += [f"{NEAR}: {name}" for name in attributes]
+
+        wrong: dict[str, list[Text | None]] = {}
+        for kind in kinds:
+            wrong[kind] = []
+            for row, misses in zip(self.rows, contradicting, strict=True):
+                draws = self.draws(kind, row.id)
+                options = misses.get(kind.partition(": ")[2], [])
+                if kind == NEAR and misses:
+                    options = misses[sorted(misses)[draws.integers(len(misses))]]
+                elif kind == RANDOM:
+                    options = [caption for caption in texts if caption not in row.clip.captions]
+                wrong[kind].append(texts[options[draws.integers(len(options))]] if options else None)
+        return {kind: chosen for kind, chosen in wrong.items() if any(chosen)}

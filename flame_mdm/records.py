@@ -161,7 +161,7 @@ class Result(Measured):
     @property
     def counts(self) -> str:
         """Numbers of replications and motions of most values, as text; "" without values."""
-        counts = Counter(value.counts for value in (self.values or {}).values() if value and value.n is not None)
+        counts = Counter(value.counts for value in (self.values or {}).values() if value and value.replications and value.n != 0)
         return counts.most_common(1)[0][0] if counts else ""
 
     @property

@@ -119,8 +119,8 @@ def shows_multimodality(evaluation: Evaluation, values: Set[str]) -> bool:
 def outdated(path: Path, evaluation: Evaluation, values: Set[str] = frozenset()) -> bool:
     """Returns whether a result must be measured again.
 
-    That is the case if its checkpoint, extractor or motion files have changed, if SMPL's model file is now available, or
-    if it lacks metrics that need several motions per prompt.
+    That is the case if its checkpoint, extractor or motion files have changed, if SMPL's model file is available now,
+    or if it lacks metrics that need several motions per prompt.
 
     Args:
         path: the result.

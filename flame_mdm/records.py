@@ -161,7 +161,8 @@ class Result(Measured):
     @property
     def counts(self) -> str:
         """Numbers of replications and motions of most values, as text; "" without values."""
-        counts = Counter(value.counts for value in (self.values or {}).values() if value and value.replications and value.n != 0)
+        values = [value for value in (self.values or {}).values() if value and value.replications]
+        counts = Counter(value.counts for value in values if value.n != 0)
         return counts.most_common(1)[0][0] if counts else ""
 
     @property

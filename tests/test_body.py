@@ -1,18 +1,21 @@
 """Bodies: a sound mesh, bound to clips and skinned."""
 
+import sys
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from support.fixtures import script
+import torch
 from support.motions import degrees, frames_array, posed, sway
 
 from flame_mdm.errors import UserError
 from flame_mdm.formats.body import fit_body
 from flame_mdm.formats.motion import Motion
+from flame_mdm.formats.people import HEADS, load_body
 from flame_mdm.representations.skeleton import JOINT, KIT21, SMPL22
 from flame_mdm.visualize import player_page, render
-from flame_mdm.visualize.body import ANCHORS, load_body, mannequin, sides
+from flame_mdm.visualize.body import ANCHORS, mannequin, sides
 
 
 def test_the_mesh_is_one_closed_symmetric_surface_in_its_stored_pose():
@@ -128,14 +131,64 @@ def test_bodies_in_files_are_drawn_and_damaged_ones_named(tmp_path):
             load_body(str(tmp_path / f"{name}.npz"))
 
 
-@pytest.mark.tools
-def test_anny_is_fitted_like_the_mannequin(tmp_path):
-    pytest.importorskip("anny", reason="anny is not installed: pip install flame-mdm[body]")
-    tool = script("tools/human.py")
-    np.savez(tmp_path / "old.npz", **tool.bake(tool.shape_of(["age=0.9", "gender=1"])))
-    body = load_body(str(tmp_path / "old.npz"))
-    assert len(body.points) == 1229
+SIDES = (("L", "left"), ("R", "right"))
+
+
+class StandIn:
+    """Anny's interface with the mannequin's mesh; counts the bodies that are built."""
+
+    built = 0
+
+    def __init__(self, **options: str) -> None:
+        assert options == {"rig": "anny", "topology": "notoes_collapse10pc", "skinning_method": "lbs"}
+        StandIn.built += 1
+        joints = {name: mannequin().joints[JOINT[name]] for name in SMPL22.joints}
+        bones = [(bone, joint) for joint, bone in HEADS.items() if joint != "head"]
+        bones += [("clavicle", "collar"), ("shoulder01", "collar")]
+        heads = {f"{bone}.{letter}": joints[f"{side}_{joint}"] for bone, joint in bones for letter, side in SIDES}
+        heads |= {"head": joints["head"], "neck01": joints["neck"] - [0, 0.02, 0]}
+        spine = np.linspace(joints["pelvis"], heads["neck01"], 6)
+        heads |= {f"spine0{5 - k}": spine[k] for k in range(5)}
+        self.bone_labels, self.heads = list(heads), np.stack(list(heads.values()))
+        distances = np.linalg.norm(mannequin().points[:, None] - self.heads, axis=-1)
+        self.vertex_bone_indices = torch.from_numpy(distances.argmin(1)[:, None])
+        self.vertex_bone_weights = torch.ones(len(distances), 1)
+        self.faces = torch.from_numpy(mannequin().triangles)
+
+    def __call__(self, phenotype_kwargs: dict[str, float]) -> dict[str, torch.Tensor]:
+        size = 0.9 + 0.2 * phenotype_kwargs["height"]
+        axes = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
+        return {
+            key: torch.from_numpy(size * (points + np.array([0, 1, 0])) @ axes.T)[None]
+            for key, points in (("rest_vertices", mannequin().points), ("rest_bone_heads", self.heads))
+        }
+
+
+def test_anny_is_made_once_and_fitted_like_the_mannequin(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setitem(sys.modules, "anny", SimpleNamespace(Anny=StandIn))
+    body = load_body("anny height=0.9 gender=1")
+    (file,) = (tmp_path / "flame-mdm").iterdir()
+    load_body("anny gender=1 height=0.9")
+    assert StandIn.built == 1
+    assert load_body(str(file)).points.shape == body.points.shape == mannequin().points.shape
     motion = posed(left_knee=(60, 0, 0), left_hip=(-30, 0, 0))
     drawn = fit_body(motion, body)
     np.testing.assert_allclose(drawn.starts[0, :22] - [0, drawn.lift, 0], motion.joints[0], atol=1e-6)
-    assert drawn.skinned(0)[0][:, 1].min() == pytest.approx(0, abs=0.004)
+    for name in ("a.glb", "a.gif"):
+        motion.save(tmp_path / name, body=body)
+        motion.save(tmp_path / f"mannequin_{name}")
+        assert (tmp_path / name).read_bytes() != (tmp_path / f"mannequin_{name}").read_bytes()
+
+
+def test_shapes_that_anny_cannot_have_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setitem(sys.modules, "anny", None)
+    for name, message in (
+        ("anny age=old", "age=old is not one of gender, age, height, weight with a number from 0 to 1"),
+        ("anny age=1.1", r"age=1\.1 is not one of"),
+        ("anny", r'body=anny needs the package anny\. Run pip install "flame-mdm\[body\]"'),
+    ):
+        with pytest.raises(UserError, match=message):
+            load_body(name)
+    assert not list(tmp_path.iterdir())

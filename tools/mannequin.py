@@ -11,11 +11,11 @@ from collections.abc import Callable, Sequence
 
 import fast_simplification
 import numpy as np
-from human import hairline, packed, smooth, with_helpers
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 from skimage import measure
 
+from flame_mdm.formats.people import hairline, packed, smooth, with_helpers
 from flame_mdm.formats.posture import orthonormal
 from flame_mdm.representations.skeleton import JOINT, SMPL22
 from flame_mdm.representations.smpl import ADULT

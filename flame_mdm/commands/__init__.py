@@ -65,8 +65,8 @@ def model_source(key: str, source: str) -> None:
 
 
 def body_name(key: str, body: str) -> None:
-    if body != "mannequin" and not Path(body).is_file():
-        raise UserError(f"{key}={body}: no such file. Use mannequin, or a file of tools/human.py")
+    if body.split()[:1] not in (["mannequin"], ["anny"]) and not Path(body).is_file():
+        raise UserError(f'{key}={body}: no such file. Use mannequin, a file, or Anny: {key}="anny age=0.9"')
 
 
 def device_name(key: str, device: str) -> None:
@@ -122,7 +122,9 @@ class FileSettings:
 class BodySettings:
     """The body in pictures, pages and files."""
 
-    body: str = option("mannequin", "or the file of another body: docs/formats.md", body_name)
+    body: str = option(
+        "mannequin", 'or a file, or Anny with a shape, such as "anny gender=1 age=0.9": docs/formats.md', body_name
+    )
 
 
 @dataclass(frozen=True)
@@ -182,8 +184,8 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
         import torch
 
         from flame_mdm.checkpoints.loading import load
+        from flame_mdm.formats.people import load_body
         from flame_mdm.sampling.output import refuse_no_condition
-        from flame_mdm.visualize.body import load_body
 
         adapters = self.adapters()
         device = self.device or ("cuda" if torch.cuda.is_available() else "cpu")

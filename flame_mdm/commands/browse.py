@@ -35,8 +35,8 @@ def main(settings: BrowseSettings) -> None:
     node = settings.data_node(settings.source)
 
     from flame_mdm.data.store import Store
+    from flame_mdm.formats.people import load_body
     from flame_mdm.reporting.browse import choose, find, write_clips, write_page
-    from flame_mdm.visualize.body import load_body
 
     body = load_body(settings.body)
     representation = instantiate(settings.nodes["representation"])

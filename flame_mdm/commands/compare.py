@@ -84,7 +84,7 @@ def _count(files: Sequence[Path], out: str) -> None:
 
 def _compare(folders: Sequence[Path], settings: CompareSettings) -> None:
     compared = find(folders)
-    from flame_mdm.visualize.body import load_body
+    from flame_mdm.formats.people import load_body
 
     body = load_body(settings.body)
     shown = _motions(compared, settings)

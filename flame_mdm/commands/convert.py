@@ -80,9 +80,9 @@ def _targets(settings: ConvertSettings, folder: Path, out: Path) -> dict[Path, P
 
 def _convert(settings: ConvertSettings, path: Path, out: Path, character: Character | None) -> None:
     from flame_mdm.formats.layouts import head_height, leg_length
+    from flame_mdm.formats.people import load_body
     from flame_mdm.formats.readers import read
     from flame_mdm.representations.skeleton import SMPL22
-    from flame_mdm.visualize.body import load_body
 
     body = load_body(settings.body)
     motion = read(path, settings.fps, settings.unit, settings.up)

@@ -54,8 +54,8 @@ class InspectSettings(BodySettings, FileSettings, DataSettings):
 
 def main(settings: InspectSettings) -> None:
     from flame_mdm.formats.faults import LIMITS, find_faults
+    from flame_mdm.formats.people import load_body
     from flame_mdm.visualize import write_player
-    from flame_mdm.visualize.body import load_body
 
     body = load_body(settings.body)
     failures: list[str] = []

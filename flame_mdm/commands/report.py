@@ -26,7 +26,7 @@ class ReportSettings(BodySettings):
 def main(settings: ReportSettings) -> None:
     for folder in settings.runs:
         check_run(Path(folder))
-    from flame_mdm.visualize.body import load_body
+    from flame_mdm.formats.people import load_body
 
     body = load_body(settings.body)
     for folder in settings.runs:

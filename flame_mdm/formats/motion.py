@@ -104,7 +104,7 @@ class Motion(PosedFigure):
                 default: SMPL's.
             character: a `.glb` file with a skin, or what `characters.read` returned, to be written with this motion
                 as a `.glb`, `.fbx` or USD file.
-            body: the body in `.glb`, `.fbx`, USD, `.gif` and `.mp4` files, from `visualize.body.load_body`; default:
+            body: the body in `.glb`, `.fbx`, USD, `.gif` and `.mp4` files, from `formats.people.load_body`; default:
                 the mannequin.
             root_motion: the joint on the floor of `rig` follows the hips in a `.glb`, `.fbx` or USD file; otherwise
                 it stays in place. For `rig="unreal"` and `rig="soma"`.

@@ -78,7 +78,7 @@ def radii(skeleton: Skeleton) -> list[float]:
 
 
 class Mesh:
-    """A closed mesh in its stored pose, an A-pose with the pelvis at 0; tools/mannequin.py and tools/human.py write it.
+    """A closed mesh in its stored pose, an A-pose with the pelvis at 0; as `tools/mannequin.py` writes it.
 
     Attributes:
         points: (V, 3) in meters; `normals` (V, 3), `colors` (V, 3) from 0 to 255.
@@ -117,7 +117,7 @@ def mannequin() -> Mesh:
     return Mesh(MANNEQUIN)
 
 
-def load_body(name: str) -> Mesh:
+def read_body(name: str) -> Mesh:
     """Returns the mannequin, or the body in a file; raises `UserError` if the file is damaged."""
     with naming(name, KeyError, ValueError, IndexError, what="not a body: "):
         return mannequin() if name == "mannequin" else Mesh(Path(name))

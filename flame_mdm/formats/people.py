@@ -1,24 +1,33 @@
-"""Makes a body for `body=FILE` with Anny, a model of people of all ages and shapes (pip install "flame-mdm[body]"):
-
-    python tools/human.py OUT.npz [gender=0.5] [age=0.67] [height=0.45] [weight=0.4]
+"""Bodies by name: the mannequin, the body in a file, and people of all shapes made by Anny (`body="anny age=0.9"`).
 
 Brégier et al., "Human Mesh Modeling for Anny Body", 2026, https://arxiv.org/abs/2511.03589: (c) 2025 NAVER Corp.,
 Apache-2.0; its shapes and weights are those of MakeHuman and MPFB2, CC0. Topologies of SMPL and SMPL-X, which Anny
 downloads and which are not free for commercial use, are never built.
 """
 
-import sys
+import os
 from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 
-from flame_mdm.errors import UserError, say
+from flame_mdm.errors import UserError
 from flame_mdm.formats.posture import orthonormal, shortest_turns
 from flame_mdm.representations.skeleton import JOINT, SMPL22
 from flame_mdm.representations.smpl import ADULT
 from flame_mdm.safe_io import atomic_write
-from flame_mdm.visualize.body import HAIR, HELPERS, SHIRT, SHOES, SKIN, TROUSERS, largest_weights, mannequin
+from flame_mdm.visualize.body import (
+    HAIR,
+    HELPERS,
+    SHIRT,
+    SHOES,
+    SKIN,
+    TROUSERS,
+    Mesh,
+    largest_weights,
+    mannequin,
+    read_body,
+)
 
 SHAPE = {"gender": 0.5, "age": 2 / 3, "height": 0.45, "weight": 0.4}
 """Anny's numbers and their defaults, 0 to 1: male to female, baby to old (2/3: a young adult), small to tall, light to
@@ -48,6 +57,29 @@ CLOTHES = {"neck": SKIN, "head": SKIN, "wrist": SKIN, "ankle": SHOES, "foot": SH
 )
 
 
+def load_body(name: str) -> Mesh:
+    """Returns a body: "mannequin", a file, or "anny" and numbers of its shape, such as "anny gender=1 age=0.9".
+
+    Anny takes about 90 seconds for the first body; each body is kept in the user's cache. Raises `UserError` if the
+    file is damaged, a number is unknown, or Anny is not installed.
+    """
+    kind, *words = name.split() or [""]
+    if kind != "anny":
+        return read_body(name)
+    shape = shape_of(words)
+    path = _cache() / f"anny1-{'-'.join(f'{key}{value:.3g}' for key, value in shape.items())}.npz"
+    if not path.exists():
+        figure = bake(shape)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_write(path) as temporary, temporary.open("wb") as file:
+            np.savez_compressed(file, allow_pickle=False, **figure)
+    return read_body(str(path))
+
+
+def _cache() -> Path:
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "flame-mdm"
+
+
 def shape_of(words: list[str]) -> dict[str, float]:
     """Returns the numbers of a shape from words such as age=0.9."""
     shape = dict(SHAPE)
@@ -58,7 +90,7 @@ def shape_of(words: list[str]) -> dict[str, float]:
         except ValueError:
             shape[key] = np.nan
         if not 0 <= shape[key] <= 1:
-            raise UserError(f"{word} is not one of {', '.join(SHAPE)} with a number from 0 to 1")
+            raise UserError(f"body=anny: {word} is not one of {', '.join(SHAPE)} with a number from 0 to 1")
     return shape
 
 
@@ -67,7 +99,7 @@ def bake(shape: dict[str, float]) -> dict[str, np.ndarray]:
     try:
         package = import_module("anny")
     except ImportError:
-        raise UserError('this needs the package anny. Run pip install "flame-mdm[body]"') from None
+        raise UserError('body=anny needs the package anny. Run pip install "flame-mdm[body]"') from None
     model = package.Anny(rig="anny", topology="notoes_collapse10pc", skinning_method="lbs")
     output = model(phenotype_kwargs={**shape, "muscle": 0.5, "proportions": 0.5})
     axes = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # Anny's z is up, and it faces -y
@@ -201,15 +233,3 @@ def packed(
         "joints": joints,
         "turns": turns,
     }
-
-
-if __name__ == "__main__":
-    try:
-        out = Path(sys.argv[1])
-        figure = bake(shape_of(sys.argv[2:]))
-        with atomic_write(out) as temporary, temporary.open("wb") as file:
-            np.savez_compressed(file, allow_pickle=False, **figure)
-        say(f"written: {out}")
-    except UserError as error:
-        say(f"error: {error}", error=True)
-        sys.exit(1)

@@ -27,6 +27,8 @@ from flame_mdm.representations import Representation
 from flame_mdm.safe_io import write_json
 from flame_mdm.seeds import key
 
+SKIPPED = {"extractor": "extractor=none: metrics that need features were not computed"}
+
 
 def evaluate(request: EvaluationRequest) -> None:
     """Evaluates a checkpoint, motion files or a baseline, and writes the result file; see `Plan`.
@@ -80,32 +82,28 @@ class Evaluation:
         real_sets, real = self._measure_real(source, ground_truth)
         unexpected = shared(self._unexpected(real.values))
         if unexpected and source is not None and not force:
-            self._refuse(unexpected)
+            _refuse(unexpected)
 
         generated, several = Outcome(), Outcome()
         if source is not None:
             generated = self._measure(source, real_sets, resamples)
             if self.several:
                 several = self._measure_multimodality(source, self.several)
+        skipped = SKIPPED if self.evaluator.skip_features else {}
         return shared(
             Measured(
                 ground_truth=real.values if ground_truth else None,
                 values=None if source is None else generated.values | several.values,
-                not_computed=real.reasons | generated.reasons | several.reasons | self._skipped,
+                not_computed=real.reasons
+                | generated.reasons
+                | several.reasons
+                | (SKIPPED if self.evaluator.skip_features else {}),
                 invalid_because=unexpected,
                 forced=bool(unexpected) and source is not None and force,
                 warnings=[*self._conditions(), *generated.warnings],
                 cost=None if source is None else mean_cost(generated.costs),
                 seeds=[key("draws", self.seed, replication) for replication in range(self.protocol.replications)],
             )
-        )
-
-    def _refuse(self, unexpected: Sequence[str]) -> None:
-        if not is_first():
-            raise SystemExit(1)  # the first process prints the reason
-        raise UserError(
-            f"nothing was generated, because {'; '.join(unexpected)}. Check the data and the extractor, or give "
-            "force=true: the result is then marked as not valid"
         )
 
     @cached_property
@@ -128,19 +126,11 @@ class Evaluation:
         several = self.protocol.multimodality
         return several and replace(self.evaluator, metrics=several.metrics)
 
-    @property
-    def _skipped(self) -> dict[str, str]:
-        skipped = {"extractor": "extractor=none: metrics that need features were not computed"}
-        return skipped if self.evaluator.skip_features else {}
-
     def _score(self, evaluator: Evaluator, motions: Rows, paired: Rows, real: Rows, replication: int) -> Scores:
-        values, reasons = evaluator.score(motions, paired, real, self._seed(replication))
+        values, reasons = evaluator.score(motions, paired, real, key("draws", self.seed, replication))
         real_counts = dict.fromkeys(filter(evaluator.compares_sets, values), len(real["keys"]))
         units = {name: evaluator.unit_of(name) for name in values}
         return Scores(values, reasons, len(motions["keys"]), real_counts, units)
-
-    def _seed(self, replication: int) -> int:
-        return key("draws", self.seed, replication)
 
     def _measure_real(self, source: Source | None, ground_truth: bool) -> tuple[list[tuple[Rows, Rows]], Outcome]:
         """Measures real motions; also returns for each replication those that the source's motions are compared with.
@@ -226,7 +216,7 @@ class Evaluation:
             scores.append(self._score(self.evaluator, generated, paired, real, replication))
             if not replication:
                 warnings = self._warnings(generated, real)
-                resampled = self.evaluator.resample(generated, paired, real, self._seed(0), resamples)
+                resampled = self.evaluator.resample(generated, paired, real, key("draws", self.seed, 0), resamples)
         counts = [replication.count for replication in scores]
         if len(set(counts)) > 1:
             numbers = ", ".join(map(str, counts))
@@ -304,3 +294,12 @@ def _without_joints(rows: Rows) -> Rows:
 
 def _select(rows: Rows, indices: list[int]) -> Rows:
     return {n: v[indices] if isinstance(v, Tensor) else [v[i] for i in indices] for n, v in rows.items()}
+
+
+def _refuse(unexpected: Sequence[str]) -> None:
+    if not is_first():
+        raise SystemExit(1)  # the first process prints the reason
+    raise UserError(
+        f"nothing was generated, because {'; '.join(unexpected)}. Check the data and the extractor, or give "
+        "force=true: the result is then marked as not valid"
+    )

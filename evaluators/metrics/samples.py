@@ -20,18 +20,10 @@ Rows = Mapping[str, Any]
 """Inputs of N motions by the names in `evaluators.metrics`, such as tensors whose first dimension is N."""
 
 
-class SampleMetric(Metric):
-    """Base class of all metrics: keeps one row per sample and computes its value from all rows, sorted by key.
-
-    The value therefore does not depend on the batches, their order or the number of processes, of which some may have
-    no samples. `value` is the formula. Several metrics take `seed`, that of their random draws.
-
-    A class also declares what readers of its values need to know: unit, direction, and what it can see.
+class Declared:
+    """What a metric declares about its values, and its values for single samples and for resamples of them.
 
     Attributes:
-        states: names of the kept rows, in the order of the arguments of `value`. Each row also has a key. Unless
-            `update` is overridden, they are its inputs.
-        names: names of the values; empty if there is only one.
         unit: unit of the values; "" = a number without a unit.
         units: units of single values by name, if they differ from `unit`.
         directions: of single values by name, if they differ from `higher_is_better`: whether higher is better; None =
@@ -43,9 +35,7 @@ class SampleMetric(Metric):
         depends_on_count: whether the value is biased by the number of motions.
     """
 
-    full_state_update = False
-    states: tuple[str, ...]
-    names: Sequence[str] = ()
+    higher_is_better: bool | None
     unit: str = ""
     units: Mapping[str, str] = {}
     directions: Mapping[str, bool | None] = {}
@@ -55,6 +45,60 @@ class SampleMetric(Metric):
     exact: str | None = None
     depends_on_count = False
 
+    def unit_of(self, name: str) -> str:
+        """Returns the unit of the value with a name; "" is the name of the only value."""
+        return self.units.get(name, self.unit)
+
+    def direction_of(self, name: str) -> bool | None:
+        """Returns whether higher values with a name are better; None = neither, or closer to real motions is."""
+        return self.directions.get(name, self.higher_is_better)
+
+    def readings(self, motions: Rows) -> dict[str, np.ndarray]:
+        """Returns what the metric reads from motions without their conditions, by name, as arrays of N rows.
+
+        Metrics of features read nothing else.
+        """
+        return {}
+
+    def per_sample(self, rows: Rows) -> dict[str, Tensor]:
+        """Returns the value and the weight (N, 2) of each sample, by the names of the values; {} if there are none.
+
+        The metric is the weighted mean, and, if it draws pools at random, the mean over all draws. `rows` has the
+        inputs of the metric and its `readings`. Raises `UserError` if there are too few samples.
+        """
+        return {}
+
+    def weighted(self, rows: Rows, weights: np.ndarray) -> dict[str, np.ndarray]:
+        """Computes the values (R,) of R resamples of N samples, by name; {} if the metric cannot be resampled.
+
+        `weights` (R, N) says how often each sample was drawn; see `per_sample` for the rest.
+        """
+        values = {}
+        for name, pairs in self.per_sample(rows).items():
+            pair, times = np.asarray(pairs), weights[:, : len(pairs)]
+            with np.errstate(invalid="ignore"):
+                values[name] = times @ pair[:, 0] / (times @ pair[:, 1])
+        return values
+
+
+class SampleMetric(Declared, Metric):
+    """Base class of all metrics: keeps one row per sample and computes its value from all rows, sorted by key.
+
+    The value therefore does not depend on the batches, their order or the number of processes, of which some may have
+    no samples. `value` is the formula. Several metrics take `seed`, that of their random draws.
+
+    A class also declares what readers of its values need to know, see `Declared`.
+
+    Attributes:
+        states: names of the kept rows, in the order of the arguments of `value`. Each row also has a key. Unless
+            `update` is overridden, they are its inputs.
+        names: names of the values; empty if there is only one.
+    """
+
+    full_state_update = False
+    states: tuple[str, ...]
+    names: Sequence[str] = ()
+
     def __init__(self):
         super().__init__()
         for name in ("keys", *self.states):
@@ -63,14 +107,6 @@ class SampleMetric(Metric):
     @property
     def update_called(self) -> bool:
         return True  # a metric without samples returns None, without a warning
-
-    def unit_of(self, name: str) -> str:
-        """Returns the unit of the value with a name; "" is the name of the only value."""
-        return self.units.get(name, self.unit)
-
-    def direction_of(self, name: str) -> bool | None:
-        """Returns whether higher values with a name are better; None = neither, or closer to real motions is."""
-        return self.directions.get(name, self.higher_is_better)
 
     def update(self, *_: Any, **rows: Any) -> None:
         """Adds equally many rows by the names of their states, which include the keys; `ValueError` otherwise."""
@@ -104,33 +140,6 @@ class SampleMetric(Metric):
     def _taken(self, drawn: Tensor, *names: str) -> list[Tensor]:
         rows = [dim_zero_cat(getattr(self, name))[drawn] for name in names]
         return [values.double() if values.is_floating_point() else values for values in rows]
-
-    def readings(self, motions: Rows) -> dict[str, np.ndarray]:
-        """Returns what the metric reads from motions without their conditions, by name, as arrays of N rows.
-
-        Metrics of features read nothing else.
-        """
-        return {}
-
-    def per_sample(self, rows: Rows) -> dict[str, Tensor]:
-        """Returns the value and the weight (N, 2) of each sample, by the names of the values; {} if there are none.
-
-        The metric is the weighted mean, and, if it draws pools at random, the mean over all draws. `rows` has the
-        inputs of the metric and its `readings`. Raises `UserError` if there are too few samples.
-        """
-        return {}
-
-    def weighted(self, rows: Rows, weights: np.ndarray) -> dict[str, np.ndarray]:
-        """Computes the values (R,) of R resamples of N samples, by name; {} if the metric cannot be resampled.
-
-        `weights` (R, N) says how often each sample was drawn; see `per_sample` for the rest.
-        """
-        values = {}
-        for name, pairs in self.per_sample(rows).items():
-            pair, times = np.asarray(pairs), weights[:, : len(pairs)]
-            with np.errstate(invalid="ignore"):
-                values[name] = times @ pair[:, 0] / (times @ pair[:, 1])
-        return values
 
     def rows(self, keys: str, *names: str) -> list[Tensor]:
         """Returns finite rows in the order of their keys, floats as float64; [] if there are none."""

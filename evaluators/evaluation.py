@@ -94,10 +94,7 @@ class Evaluation:
             Measured(
                 ground_truth=real.values if ground_truth else None,
                 values=None if source is None else generated.values | several.values,
-                not_computed=real.reasons
-                | generated.reasons
-                | several.reasons
-                | (SKIPPED if self.evaluator.skip_features else {}),
+                not_computed=real.reasons | generated.reasons | several.reasons | skipped,
                 invalid_because=unexpected,
                 forced=bool(unexpected) and source is not None and force,
                 warnings=[*self._conditions(), *generated.warnings],

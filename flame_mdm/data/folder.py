@@ -19,9 +19,11 @@ from flame_mdm.data.parallel import in_order
 from flame_mdm.errors import UserError, first_line, printable
 from flame_mdm.formats import ENDINGS, motions_in
 from flame_mdm.formats.checks import LYING
+from flame_mdm.formats.conversion import raw_motion
 from flame_mdm.formats.readers import read_recording
 from flame_mdm.representations import rotation
 from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.representations.smpl import SMPL
 from flame_mdm.safe_io import naming, read_text
 
 SHORTEST = 3  # frames that representations need at least
@@ -48,8 +50,8 @@ class Folder(MotionSource):
 
     Args:
         path: the folder; motions may be in subfolders.
-        motion: "joints" for representations of joint positions; "smpl" for those of SMPL's rotations, which only
-            AMASS files contain.
+        motion: "joints" for representations of joint positions; "smpl" for those of SMPL's rotations, which
+            AMASS files contain; they are fitted to the joints of other files.
         mirror: yield a mirrored copy after each clip of the training split; joints only.
         exclude: motions to leave out, by their path in the folder without extension.
     """
@@ -251,15 +253,19 @@ def _read(kind: str, fps: float, path: Path) -> _Attempt:
             raise UserError(f"{path}: {doubts.jump}")
         if len(joints) < SHORTEST:
             raise UserError(f"{path}: {len(joints)} frames at {fps:g} per second, but a motion has at least {SHORTEST}")
+        notes = [note for note in recording.motion.notes if note not in doubts.lines]
         if kind == "joints":
             motion = joints
         elif recording.smpl is None:
-            raise UserError(f"{path}: contains no SMPL rotations; use AMASS .npz files, or set motion=joints")
+            fitted = raw_motion(recording.motion, SMPL(fps))
+            motion = fitted.values.numpy().astype(np.float32)
+            if fitted.note:
+                centimeters = math.ceil(100 * fitted.error)
+                notes.append(f"rotations were fitted to joints, with a mean error of at most {centimeters} cm")
         else:
             translation, turns = recording.smpl
             angles = rotation.quaternion_to_axis_angle(turns).flatten(1)
             motion = torch.cat([translation, angles], 1).numpy().astype(np.float32)
     except (ValueError, OSError) as error:
         return _Attempt(first_line(error))
-    notes = [note for note in recording.motion.notes if note not in doubts.lines]
     return _Attempt("", motion, recording.layout, doubts.upright, notes)

@@ -32,10 +32,12 @@ class RawMotion:
     Attributes:
         values: joints (F, J, 3) in meters, y up, or rotations of SMPL (F, 75) as in `representations.smpl.read_pose`.
         note: a line for the user if rotations were fitted to joints, with the error; "" otherwise.
+        error: mean distance in meters of the joints of the fitted body from the joints of the motion.
     """
 
     values: Tensor
     note: str = ""
+    error: float = 0.0
 
 
 def raw_motion(motion: Motion, representation: Representation) -> RawMotion:
@@ -75,10 +77,10 @@ def _rotations(motion: Motion, fps: float, axes: Tensor) -> RawMotion:
             f"the model needs rotations of SMPL's joints, which {motion.skeleton.name} does not determine. Give a "
             "motion of SMPL's 22 joints"
         )
-    note = ""
+    note, error = "", 0.0
     if motion.poses is None:
         moved = Motion(resample(motion.joints.astype(float), motion.fps, fps, cubic=True), fps, motion.skeleton)
-        poses, note = _adult(moved)
+        poses, note, error = _adult(moved)
     else:
         poses = _resampled(motion.poses, motion.fps, fps)
     rotations = poses.rotations.clone()
@@ -86,11 +88,11 @@ def _rotations(motion: Motion, fps: float, axes: Tensor) -> RawMotion:
     vectors = rotation.matrix_to_axis_angle(rotations).flatten(1)
     hands = vectors.new_zeros(len(vectors), 6)
     translation = poses.root @ axes - vectors.new_tensor(ADULT[0])
-    return RawMotion(torch.cat([translation, vectors, hands], 1), note)
+    return RawMotion(torch.cat([translation, vectors, hands], 1), note, error)
 
 
-def _adult(motion: Motion) -> tuple[Poses, str]:
-    """Returns the motion on the body of an adult, and a line with the distance of its joints from the motion's."""
+def _adult(motion: Motion) -> tuple[Poses, str, float]:
+    """Returns the motion on the body of an adult, a line about the distance of its joints, and the mean in meters."""
     solved = motion.posed()
     adult = solved.offsets.new_tensor(ADULT[: len(SMPL22)])
     scale = float(adult[list(LEGS)].norm(dim=1).sum() / solved.offsets[list(LEGS)].norm(dim=1).sum())
@@ -98,7 +100,7 @@ def _adult(motion: Motion) -> tuple[Poses, str]:
     joints = forward_kinematics(SMPL22, poses.rotations, adult, poses.root).numpy()
     apart = 100 * np.linalg.norm(joints - scale * motion.joints[:, : len(SMPL22)], axis=-1)
     note = "rotations were fitted to joints, on the body of an adult"
-    return poses, f"{note}: mean error {apart.mean():.1f} cm, max {apart.max():.1f} cm"
+    return poses, f"{note}: mean error {apart.mean():.1f} cm, max {apart.max():.1f} cm", float(apart.mean()) / 100
 
 
 def _resampled(poses: Poses, rate: float, fps: float) -> Poses:

@@ -138,6 +138,13 @@ def test_without_a_score_the_fewest_faulty_frames_decide():
     assert best([worse, better], lambda motions: [2.0, 1.0]) is worse
 
 
+def test_a_faultless_candidate_is_kept_even_if_a_faulty_one_has_a_higher_score():
+    faulty, faultless = synthetic(), synthetic()
+    faulty.joints[5, 3, 0] += 5
+    assert not find_faults(faultless)
+    assert best([faulty, faultless], lambda motions: [float(motion is faulty) for motion in motions]) is faultless
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -323,7 +323,8 @@ def of_baseline(runs: Runs) -> tuple[Any, int]:
 
 
 def stopped(runs: Runs) -> str:
-    evaluation = changed(runs.evaluation(samples=4), expected={"synthetic": {"attributes/all": [0.1, 0.05]}})
+    bounds = {"synthetic": {"attributes/all": [0.1, 0.05]}}
+    evaluation = changed(runs.evaluation(samples=4), expected=bounds, resized_samples=False)
     with pytest.raises((UserError, SystemExit)) as error:
         evaluation.run(runs.generator(evaluation))
     return error.type.__name__

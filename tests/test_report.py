@@ -192,7 +192,7 @@ def test_training_ends_with_what_its_numbers_mean(evaluated, printed, tmp_path):
     assert float(batch) > 0
     command = re.findall(r"^next: flame-mdm (sample .*)$", out, re.MULTILINE)[0]
     assert main([*shlex.split(command), f"out={tmp_path / 'samples'}", "samples=1"]) == 0
-    assert f"flame-mdm evaluate {evaluated} extractor=none quick=true" in out
+    assert f"flame-mdm evaluate {evaluated} extractor=motion_clip_synthetic quick=true" in out
 
 
 def points(svg: str) -> list[tuple[float, float]]:

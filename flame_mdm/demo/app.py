@@ -91,7 +91,8 @@ def web_app(studio: Studio, hosts: Collection[str] = ()) -> Guard:
         finally:
             waiting -= 1
         words = "-".join(re.findall(r"[a-z0-9]+", request.text.lower()))[:60]
-        name = f"{words or 'motion'}-{int(number) + 1}{extension}"
+        rig = f"-{options['rig']}" if options.get("rig") else ""  # the name of one of the rigs, as a file was written
+        name = f"{words or 'motion'}-{int(number) + 1}{rig}{extension}"
         headers = {"Content-Disposition": f'attachment; filename="{name}"'}
         return Response(content, media_type="application/octet-stream", headers=headers)
 

@@ -135,7 +135,7 @@ class Guard:
             raise HTTPException(HTTPStatus.MISDIRECTED_REQUEST, line)
         origin = headers.get("origin", f"http://{host}")
         # a proxy may have replaced the host, but not the origin
-        same = urlsplit(origin).netloc.lower() == host.lower() or _host_name(origin) in self.hosts
+        same = _network_location(origin) == host.lower() or _host_name(origin) in self.hosts
         if not same or (path != "/" and headers.get("sec-fetch-site", "none") not in ("same-origin", "none")):
             raise HTTPException(HTTPStatus.FORBIDDEN, "this request comes from a page of another site")
 
@@ -167,6 +167,14 @@ async def _body(request: Request) -> bytes:
     except TimeoutError as error:
         raise HTTPException(HTTPStatus.REQUEST_TIMEOUT, "the request took too long to arrive") from error
     return bytes(body)
+
+
+def _network_location(address: str) -> str:
+    """Returns host and port of an address, lowercased; "" for one that is not valid, such as http://[."""
+    try:
+        return urlsplit(address).netloc.lower()
+    except ValueError:
+        return ""
 
 
 def _host_name(address: str) -> str:

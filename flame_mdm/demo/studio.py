@@ -113,7 +113,10 @@ class Studio:
         motion = _numbered(_cleaned(model, motions) if cleanup else motions, number)
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder, f"motion{extension}")
-            motion.save(path, rig=rig)
+            try:
+                motion.save(path, rig=rig)
+            except UserError as error:  # a visitor must not see where files are written
+                raise UserError(str(error).replace(str(path), path.name)) from error
             return path.read_bytes()
 
 

@@ -19,7 +19,7 @@ import flame_mdm
 from evaluators.metrics.attributes import read_attributes
 from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.locating import find
-from flame_mdm.conditions.vocabulary import check_known
+from flame_mdm.conditions.vocabulary import advice, check_known
 from flame_mdm.errors import UserError
 from flame_mdm.formats.readers import read
 from flame_mdm.safe_io import read_yaml, sha256
@@ -181,3 +181,11 @@ def test_the_shipped_file_is_documented_and_its_name_comes_after_paths(here, cap
     (here / "quickstart").mkdir()
     (here / "quickstart" / "mine.safetensors").touch()
     assert find("quickstart").name == "mine.safetensors"
+
+
+@pytest.mark.parametrize("word", ["kickz\\1", "kickz\\n", ""])
+def test_any_word_of_a_model_may_be_suggested(word):
+    facts = {"vocabulary": [word, "", "walks"], "captions": []}
+    (line,) = advice("a person kickzx", facts)
+    suggestion = f" Did you mean 'a person {word}'?" if word else ""
+    assert line == f"never seen in training: kickzx.{suggestion}"

@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 import zipfile
+from collections import OrderedDict
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,8 @@ from evaluators.protocol import load_protocol
 from flame_mdm.checkpoints.hub import card, export
 from flame_mdm.checkpoints.loading import load
 from flame_mdm.checkpoints.model_files import KEY, content_sha256, read_checkpoint, read_model_file
+from flame_mdm.checkpoints.released_weights import read_released
+from flame_mdm.checkpoints.torch_files import read_torch
 from flame_mdm.config import compose, instantiate, plain
 from flame_mdm.errors import UserError
 
@@ -314,3 +317,60 @@ def test_little_memory_is_one_line(trained, tmp_path):
     line, threads = [sys.executable, "-c", program], {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     ended = subprocess.run(line, capture_output=True, text=True, cwd=tmp_path, check=False, env=os.environ | threads)
     assert (ended.returncode, one_line(ended.stderr)) == (1, True), ended.stderr
+
+
+def with_keys(keys: list[Any], path: Path, *, legacy: bool = False) -> Path:
+    """A file of `torch.save` with a dictionary of any keys; `torch.load` is not used to make or check it."""
+    torch.save({"facts": dict.fromkeys(keys)}, path, _use_new_zipfile_serialization=not legacy)
+    return path
+
+
+MODULUS = 2**61 - 1  # whole numbers that differ by a multiple of it have the same hash
+SAME_HASH: dict[str, list[Any]] = {
+    "whole numbers": [number * MODULUS for number in range(50)],
+    "negative": [-number * MODULUS for number in range(1, 50)],
+    "tuples": [(number, 1) for number in range(50)],
+    "fractions": [2.0 ** (61 * number) for number in range(17)],
+}
+
+
+@pytest.mark.parametrize("kind", SAME_HASH)
+@pytest.mark.parametrize("legacy", [False, True])
+def test_keys_that_may_share_a_hash_are_refused_before_a_dictionary_is_made(kind, legacy, bad, monkeypatch):
+    path = with_keys(SAME_HASH[kind], bad / "keys.ckpt", legacy=legacy)
+    monkeypatch.setattr(torch, "load", lambda *_, **__: pytest.fail("PyTorch read the file"))
+    refuses(path, "not text or a small whole number")
+    with pytest.raises(UserError, match=r"keys\.ckpt: damaged.*small whole number"):
+        read_released(path)
+
+
+class Made:
+    """Pickled as a call of a container's class."""
+
+    def __init__(self, kind: type, *arguments: Any):
+        self.call = kind, arguments
+
+    def __reduce__(self) -> tuple[type, tuple[Any, ...]]:
+        return self.call
+
+
+@pytest.mark.parametrize("kind", [OrderedDict, set, bytearray])
+def test_containers_are_made_of_checked_keys_only(kind, bad):
+    keys = SAME_HASH["whole numbers"]
+    arguments = {OrderedDict: [(key, 0) for key in keys], set: keys, bytearray: 10**12}
+    torch.save({"facts": Made(kind, arguments[kind])}, bad / "made.ckpt")
+    refuses(bad / "made.ckpt", "made.ckpt: damaged")
+
+
+def test_ten_thousand_states_of_an_optimizer_are_read(bad):
+    weights = {number: {"step": torch.tensor(1.0), "exp_avg": torch.zeros(2)} for number in range(10_000)}
+    content = {"state_dict": OrderedDict(weight=torch.zeros(2)), "optimizer": {"state": weights}, "seed": 2**63}
+    for legacy in (False, True):
+        torch.save(content, bad / "large.ckpt", _use_new_zipfile_serialization=not legacy)
+        assert len(read_torch(bad / "large.ckpt")["optimizer"]["state"]) == 10_000
+
+
+def test_files_of_torch_with_many_members_are_refused(bad, monkeypatch):
+    path = with_keys(["a"], bad / "many.ckpt")
+    monkeypatch.setattr("flame_mdm.safe_io.MAX_MEMBERS", 2)
+    refuses(path, "more than 2 files")

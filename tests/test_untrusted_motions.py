@@ -37,10 +37,11 @@ from flame_mdm.data.humanact12 import HumanAct12
 from flame_mdm.data.parallel import in_order
 from flame_mdm.data.store import Store
 from flame_mdm.errors import UserError
+from flame_mdm.formats import asf, resampling
 from flame_mdm.formats import bvh as bvh_files
-from flame_mdm.formats import resampling
+from flame_mdm.formats.bvh import Lines
 from flame_mdm.formats.readers import read
-from flame_mdm.safe_io import MEBIBYTE, sha256
+from flame_mdm.safe_io import MEBIBYTE, read_npz, sha256
 
 pytestmark = pytest.mark.slow
 
@@ -233,6 +234,7 @@ def archive_cases() -> Iterator[tuple[bytes, str]]:
     yield zipped({TAKE: whole}, zipfile.ZIP_LZMA), "another method than deflate"
     yield zipped({TAKE: whole})[:-30], "damaged archive"
     yield b"PK\3\4", "damaged archive"
+    yield zipped({"-" + TAKE: whole}).replace(b"-" + TAKE.encode(), b"\0" + TAKE.encode()), "a file without a name"
     yield b"", "neither a folder nor"
     yield bytes(10240), "no file dataset-1"
 
@@ -252,6 +254,101 @@ def test_archives_are_refused_and_many_members_take_little_memory(tmp_path: Path
         assert tracemalloc.get_traced_memory()[1] < 4 * MEBIBYTE
     finally:
         tracemalloc.stop()
+
+
+def test_archives_of_too_many_members_are_refused_before_they_are_listed(tmp_path: Path, monkeypatch):
+    names = [f"{number}.txt" for number in range(1000)]
+    cases = {"a.zip": zipped(dict.fromkeys(names, b"")), "a.tar": member("x") * 1000 + bytes(1024)}
+    cases["a.npz"] = npz(**{f"a{number}": np.zeros(0) for number in range(1000)})
+    made = []
+
+    class Counted(zipfile.ZipInfo):
+        def __init__(self, *words: Any):
+            made.append(words)
+            super().__init__(*words)
+
+    monkeypatch.setattr(zipfile, "ZipInfo", Counted)
+    for name, content in cases.items():
+        (tmp_path / name).write_bytes(content)
+    listed = {
+        "a.zip": lambda: list(archives.members(tmp_path / "a.zip", lambda name: False)),
+        "a.tar": lambda: list(archives.members(tmp_path / "a.tar", lambda name: False)),
+        "a.npz": lambda: read_npz(tmp_path / "a.npz"),
+    }
+    for read_archive in listed.values():
+        read_archive()  # a thousand are allowed
+    monkeypatch.setattr("flame_mdm.safe_io.MAX_MEMBERS", 999)
+    for read_archive in listed.values():
+        refuses("more than 999 files", read_archive)
+    made.clear()
+    monkeypatch.setattr("flame_mdm.safe_io.DIRECTORY_LIMIT", 1000)
+    for name in ("a.zip", "a.npz"):
+        refuses("more than 999 files", listed[name])
+    assert made == []
+
+
+def wide_bvh(joints: int, frames: int) -> bytes:
+    """A motion of joints without channels below a root with one channel: two bytes per frame."""
+    below = "JOINT j\n{\nOFFSET 0 1 0\nCHANNELS 0\nEnd Site\n{\nOFFSET 0 1 0\n}\n}\n" * (joints // 2)
+    head = f"HIERARCHY\nROOT r\n{{\nOFFSET 0 0 0\nCHANNELS 1 Yposition\n{below}}}\n"
+    return f"{head}MOTION\nFrames: {frames}\nFrame Time: 0.05\n".encode() + b"0\n" * frames
+
+
+def wide_amc(folder: Path, bones: int, frames: int) -> Path:
+    """A motion of bones without degrees of freedom, each the child of the root."""
+    data = "".join(f"begin\nname b{n}\ndirection 0 1 0\nlength 1\naxis 0 0 0 XYZ\nend\n" for n in range(bones))
+    tree = "".join(f"root b{n}\n" for n in range(bones))
+    (folder / "1.asf").write_text(f":root\norder TY\naxis XYZ\n:bonedata\n{data}:hierarchy\nbegin\n{tree}end\n")
+    path = folder / "1_1.amc"
+    path.write_text("".join(f"{frame}\nroot 0\n" for frame in range(1, frames + 1)))
+    return path
+
+
+def test_frames_times_joints_are_bounded_before_memory_is_taken(tmp_path: Path, folder: Callable):
+    path = tmp_path / "wide.bvh"
+    path.write_bytes(wide_bvh(4000, 10_000))
+    assert path.stat().st_size < 200_000
+    with bounded(20, 200 * MEBIBYTE), pytest.raises(UserError, match="a file of this size may have at most 249 frames"):
+        bvh_files.read(path)
+    amc = wide_amc(tmp_path, 2000, 4000)
+    with bounded(20, 200 * MEBIBYTE), pytest.raises(UserError, match=r"1_1\.amc: 4,001 frames of 4,001 joints"):
+        asf.read(amc, 120)
+
+
+def test_long_motions_of_many_moving_joints_are_read(tmp_path: Path):
+    """A minute of 300 joints: 2 million positions are more than a small file may have, but its numbers are there."""
+    body = "".join(f"JOINT j{n}\n{{\nOFFSET 0 1 0\nCHANNELS 3 Zrotation Xrotation Yrotation\n" for n in range(300))
+    text = f"HIERARCHY\nROOT r\n{{\nOFFSET 0 0 0\nCHANNELS 3 Xposition Yposition Zposition\n{body}{'}' * 301}\n"
+    text = text.replace("}", "}\n") + "MOTION\nFrames: 7200\nFrame Time: 0.00833333\n"
+    path = tmp_path / "long.bvh"
+    path.write_text(text + (" ".join(["0.5"] * 903) + "\n") * 7200)
+    read_back = bvh_files.read(path)
+    assert read_back.frames.shape == (7200, 903)
+    assert len(read_back.joints) * len(read_back.frames) > resampling.FEW_POSITIONS
+
+
+def test_skeletons_of_asf_files_take_linear_time(tmp_path: Path, monkeypatch):
+    """Each bone compares its name with a constant number of others."""
+    compared = 0
+
+    class Name(str):
+        def __eq__(self, other: object) -> bool:
+            nonlocal compared
+            compared += 1
+            return str.__eq__(self, other)
+
+        __hash__ = str.__hash__
+
+    split = Lines.__iter__
+    monkeypatch.setattr(Lines, "__iter__", lambda lines: ([*map(Name, words)] for words in split(lines)))
+    counts = []
+    for bones in (100, 200):
+        compared = 0
+        asf.read(wide_amc(tmp_path, bones, 3), 120)
+        counts.append(compared)
+    assert counts[1] < 2.5 * counts[0]
+    with pytest.raises(UserError, match="more than 4096 bones"):
+        asf.read(wide_amc(tmp_path, 5000, 3), 120)
 
 
 @pytest.mark.parametrize(("case", "says"), [("killed", "a worker process was killed"), ("bomb", "frame time")])

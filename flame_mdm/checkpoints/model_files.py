@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING, Annotated, Any, NotRequired, Required
 from pydantic import Field
 from typing_extensions import TypedDict
 
+from flame_mdm.checkpoints.torch_files import read_torch
 from flame_mdm.config import moved, plain, renamed
 from flame_mdm.errors import UserError
-from flame_mdm.safe_io import atomic_write, parse_json, read_torch
+from flame_mdm.safe_io import atomic_write, parse_json
 from flame_mdm.schemas import Number, check_shape
 
 if TYPE_CHECKING:

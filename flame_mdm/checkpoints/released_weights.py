@@ -8,8 +8,9 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor, nn
 
+from flame_mdm.checkpoints.torch_files import check_keys, check_torch
 from flame_mdm.errors import UserError
-from flame_mdm.safe_io import check_torch, read_yaml
+from flame_mdm.safe_io import read_yaml
 
 Network = TypeVar("Network", bound=nn.Module)
 
@@ -25,6 +26,8 @@ def read_released(path: Path, *, run_code: bool = False, advice: str = "Save onl
     """
     try:
         check_torch(path)
+        if not run_code:
+            check_keys(path)
         content = torch.load(path, map_location="cpu", weights_only=not run_code)
     except (FileNotFoundError, UserError):
         raise

@@ -103,10 +103,11 @@ def _suggested(text: str, facts: Mapping[str, Any]) -> str:
     """Returns " Did you mean '...'?": the text with similar known words, or the nearest training caption, if any."""
     fixed = text.lower()
     for word in (unknown := unknown_words(text, facts)):
-        similar = [other for other in facts["vocabulary"] if other[0] == word[0]]
+        similar = [other for other in facts["vocabulary"] if other[:1] == word[0]]
         if not (near := difflib.get_close_matches(word, similar, 1, 0.75)):
             break
-        fixed = re.sub(rf"\b{word}\b", near[0], fixed)
+        # a function, because the words of a model may contain backslashes
+        fixed = re.sub(rf"\b{word}\b", lambda _, known=near[0]: known, fixed)
     else:
         if unknown:
             return f" Did you mean '{fixed}'?"

@@ -13,7 +13,16 @@ from typing import IO, Any
 from weakref import finalize
 
 from flame_mdm.errors import UserError, show_as
-from flame_mdm.safe_io import MEBIBYTE, ZIP_ERRORS, check_expansion, check_member, naming, regular_file
+from flame_mdm.safe_io import (
+    MEBIBYTE,
+    ZIP_ERRORS,
+    check_expansion,
+    check_member,
+    check_members,
+    naming,
+    opened_zip,
+    regular_file,
+)
 
 MEMBER_LIMIT = 512 * MEBIBYTE
 """Maximum size of one unpacked member in bytes. Motions, captions and arrays are far smaller."""
@@ -27,7 +36,8 @@ _DAMAGE = (*ZIP_ERRORS, tarfile.TarError, lzma.LZMAError, OSError, ValueError)
 def members(path: Path, is_wanted: Callable[[str], bool]) -> Iterator[tuple[str, bytes]]:
     """Yields names and contents of the wanted files in a zip or tar archive.
 
-    Raises `UserError` if it is damaged, expands disproportionately, or one of them is a link, sparse or encrypted.
+    Raises `UserError` if it is damaged, expands disproportionately or has too many members, or if one of the wanted
+    files is a link, sparse or encrypted.
     """
     size = regular_file(path)
     with path.open("rb") as file:
@@ -66,10 +76,12 @@ def as_folder(path: Path, owner: object, is_wanted: Callable[[str], bool]) -> Pa
 
 
 def _zip_members(file: IO[bytes], size: int, is_wanted: Callable[[str], bool]) -> Iterator[tuple[str, bytes]]:
-    with zipfile.ZipFile(file) as archive:
+    with opened_zip(file) as archive:
         check_expansion(sum(info.file_size for info in archive.infolist()), size)
         for info in archive.infolist():
             name = info.filename
+            if not name:  # `zipfile` cuts names at a null character
+                raise UserError("a file without a name")
             if not info.is_dir() and "__MACOSX" not in name and is_wanted(name):  # macOS keeps attributes there
                 check_member(info)
                 _check_size(name, info.file_size)
@@ -81,8 +93,11 @@ def _tar_members(path: Path, stream: Any, is_wanted: Callable[[str], bool]) -> I
         archive: Any = tarfile.open(mode="r|", fileobj=stream, bufsize=MEBIBYTE // 4, tarinfo=_Member)  # noqa: SIM115
     except tarfile.ReadError as error:
         raise UserError(f"{path}: neither a folder nor a zip or tar archive: {error}") from error
+    count = 0
     with archive:
         while (member := archive.next()) is not None:
+            count += 1
+            check_members(count)
             if not member.isdir() and is_wanted(member.name):
                 if not member.isreg() or member.issparse():
                     raise UserError(f"{member.name}: a link or another special file, not a regular file")

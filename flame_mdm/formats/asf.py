@@ -16,8 +16,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flame_mdm.errors import UserError
-from flame_mdm.formats.bvh import CHANNELS, Bvh, Lines, read_lines
-from flame_mdm.formats.resampling import check_frames, frame_rate
+from flame_mdm.formats.bvh import CHANNELS, MAX_JOINTS, Bvh, Lines, read_lines
+from flame_mdm.formats.resampling import check_tree, frame_rate
+from flame_mdm.safe_io import naming
 
 MOVES = ("TX", "TY", "TZ")
 TURNS = ("RX", "RY", "RZ")
@@ -42,8 +43,10 @@ def read(path: Path, fps: float | None) -> Bvh:
     bones, parents = read_skeleton(skeleton_of(path))
     if fps is None:
         raise UserError(f"{path}: AMC files contain no frame rate: give fps=120, or `fps: 120` in skeleton.yaml")
-    angles = _angles(lines, bones)
     names = tuple(bones)
+    inner = set(parents.values())
+    parents |= {f"{name}.end": name for name in names if name not in inner}
+    angles = _angles(lines, bones, 1 + len(parents))
     columns, channels = [], []
     for name, bone in bones.items():
         values = dict(zip(bone.freedoms, angles[name].T, strict=True))
@@ -56,10 +59,10 @@ def read(path: Path, fps: float | None) -> Bvh:
                 warnings.simplefilter("ignore")  # in gimbal lock, any third angle is as good
                 columns.append((bone.axes * turned * bone.axes.inv()).as_euler("ZYX", degrees=True))
         channels.append(_POSITIONS * (name == "root") + _ROTATIONS * bool(turns))
-    parents |= {f"{name}.end": name for name in names if name not in parents.values()}
+    numbers = {name: number for number, name in enumerate(names)}
     return Bvh(
         joints=("root", *parents),
-        parents=(-1, *(names.index(parent) for parent in parents.values())),
+        parents=(-1, *(numbers[parent] for parent in parents.values())),
         offsets=np.stack([np.zeros(3), *(bones[parent].vector for parent in parents.values())]),
         channels=(*channels, *[()] * (1 + len(parents) - len(names))),
         frames=np.concatenate(columns, 1),
@@ -100,11 +103,14 @@ def read_skeleton(path: Path) -> tuple[dict[str, Bone], dict[str, str]]:
             fields = {}
         elif section == ":bonedata" and word == "end":
             read[fields.get("name", [""])[0]] = _bone(lines, fields)
+            if len(read) > MAX_JOINTS:
+                lines.fail(f"more than {MAX_JOINTS} bones")
         elif section == ":bonedata":
             fields[word] = words[1:]
         elif section == ":hierarchy" and word not in ("begin", "end"):
             for child in words[1:]:
-                if child not in read or words[0] not in {"root", *parents} or child in {"root", *parents}:
+                has_parent = words[0] == "root" or words[0] in parents
+                if child not in read or not has_parent or child == "root" or child in parents:
                     lines.fail(f"bone {child[:40]} is unknown, has two parents, or precedes its parent")
                 parents[child] = words[0]
     if not parents:
@@ -131,8 +137,11 @@ def _order(lines: Lines, words: list[str]) -> str:
     return order
 
 
-def _angles(lines: Lines, bones: dict[str, Bone]) -> dict[str, np.ndarray]:
-    """Returns the values (F, N) of the N degrees of freedom of each bone; angles in degrees."""
+def _angles(lines: Lines, bones: dict[str, Bone], joints: int) -> dict[str, np.ndarray]:
+    """Returns the values (F, N) of the N degrees of freedom of each bone; angles in degrees.
+
+    Raises `UserError` for too many frames of this number of `joints`.
+    """
     rows: dict[str, list[list[float]]] = {name: [] for name, bone in bones.items() if bone.freedoms}
     frames = 0
     for words in chain(lines, [["0"]]):
@@ -150,5 +159,7 @@ def _angles(lines: Lines, bones: dict[str, Bone]) -> dict[str, np.ndarray]:
             rows[words[0]].append(lines.numbers(words[1:], len(bones[words[0]].freedoms)))
     if frames < 2:
         lines.fail("not an AMC file (no frames)")
-    check_frames(frames)
-    return {name: np.array(rows.get(name, [[]] * (frames - 1)), float) for name in bones}
+    with naming(lines.name):
+        check_tree(frames, joints, lines.size)
+    nothing = np.zeros((frames - 1, 0))
+    return {name: np.array(rows[name], float) if name in rows else nothing for name in bones}

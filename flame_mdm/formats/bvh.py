@@ -20,8 +20,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flame_mdm.errors import UserError
-from flame_mdm.formats.resampling import RATES, frame_pairs, interpolate
-from flame_mdm.safe_io import TEXT_LIMIT, regular_file, write_text
+from flame_mdm.formats.resampling import MAX_FRAMES, RATES, check_tree, frame_pairs, interpolate
+from flame_mdm.safe_io import TEXT_LIMIT, naming, regular_file, write_text
 
 CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "XYZ")
 MAX_JOINTS = 4096  # maximum number of joints and end sites of a file
@@ -154,7 +154,10 @@ def read(path: str | Path) -> Bvh:
     whole, last_digit = max(round(1 / time), 1), 10.0 ** int(Decimal(seconds).as_tuple().exponent)
     fps = float(whole) if abs(1 / whole - time) < min(last_digit, 0.01 * time) else 1 / time
     width = sum(len(node.channels) for node in nodes)
-    frames = [source.numbers(words, width) for words in source]
+    rows = (np.array(source.numbers(words, width)) for words in source)
+    frames = list(itertools.islice(rows, MAX_FRAMES + 1))
+    with naming(source.name):
+        check_tree(len(frames), len(nodes), source.size)
     if len(frames) != count or not frames:
         source.fail(f"the file contains {len(frames)} frames, but says {count}")
     return Bvh(
@@ -185,7 +188,7 @@ class Lines:
     """Lines of a text file as words, without blank lines and comments (#); tracks the line number for errors."""
 
     def __init__(self, data: bytes, name: str):
-        self.name, self.line, self.row = name, 1, list[str]()
+        self.name, self.size, self.line, self.row = name, len(data), 1, list[str]()
         try:
             lines = data.decode("utf-8-sig").splitlines()
         except UnicodeDecodeError as error:

@@ -9,6 +9,11 @@ from flame_mdm.errors import UserError
 
 RATES = (0.1, 1000.0)  # lowest and highest frame rate of a motion file, in frames per second
 MAX_FRAMES = 500_000  # maximum number of frames of a motion: 70 minutes at 120 frames per second
+MAX_POSITIONS = 25_000_000  # maximum frames times joints of a tree: an hour of 57 joints at 120 frames per second
+FEW_POSITIONS = 1_000_000  # frames times joints that a file of any size may have: 300 MB while it is read
+BYTES_PER_POSITION = 4
+"""Smallest number of bytes of a larger file per frame and joint. A joint with three numbers of one digit takes 6 bytes
+in each frame, but end sites take none."""
 MAX_RESAMPLED = 1_000_000  # maximum number of joint positions after upsampling: 38 minutes of 22 joints at 20 fps
 
 
@@ -26,6 +31,20 @@ def check_frames(frames: int) -> None:
     """Raises `UserError` if a motion has more than `MAX_FRAMES` frames."""
     if frames > MAX_FRAMES:
         raise UserError(f"{frames:,} frames, but a motion may have at most {MAX_FRAMES:,}: cut it")
+
+
+def check_tree(frames: int, joints: int, size: int) -> None:
+    """Raises `UserError` if a file of `size` bytes has too many frames for its number of joints.
+
+    Each joint takes memory in each frame, even if the file has no numbers for it.
+    """
+    check_frames(frames)
+    most = min(MAX_POSITIONS, max(FEW_POSITIONS, size // BYTES_PER_POSITION))
+    if frames * joints > most:
+        raise UserError(
+            f"{frames:,} frames of {joints:,} joints, but a file of this size may have at most {most // joints:,} "
+            "frames: cut it, or remove joints that do not move"
+        )
 
 
 def frame_pairs(

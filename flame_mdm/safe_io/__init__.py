@@ -21,7 +21,7 @@ import zlib
 from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any, cast
 
 from flame_mdm.errors import UserError, first_line, say
 from flame_mdm.safe_io.paths import check_within, open_in_place, remove_abandoned, temporary_beside
@@ -45,6 +45,9 @@ POINTER_LIMIT = 1024  # size in bytes below which such files are
 
 ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError)
 """Errors that `zipfile` raises for damaged, encrypted and unusually compressed archives."""
+DIRECTORY_LIMIT = 16 * MEBIBYTE
+"""Maximum size of the directory of a zip archive in bytes. Each of its entries becomes a Python object."""
+MAX_MEMBERS = 200_000  # maximum number of members of an archive; the largest known, HumanML3D, has 90,000
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # numbers of errors of a full disk
 
 
@@ -301,7 +304,7 @@ def read_npz(
     """Returns the arrays of an .npz file, or seekable open file, by name; refuses objects and excessive sizes."""
     from numpy.lib import format as npy
 
-    with _opened(source) as (file, size), zipfile.ZipFile(file) as archive:
+    with _opened(source) as (file, size), opened_zip(file) as archive:
         members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
         members = {n: m for n, m in members.items() if n not in skip and (only is None or n in only)}
         check_expansion(sum(member.file_size for member in members.values()), size)
@@ -357,34 +360,45 @@ def _check_array(file: IO[bytes], size: int, name: str) -> int:
     return count
 
 
+@contextmanager
+def opened_zip(file: IO[bytes]) -> Iterator[zipfile.ZipFile]:
+    """Opens a zip archive for reading; raises `UserError` if it has more than `MAX_MEMBERS` members.
+
+    `zipfile` reads the directory of the archive at once, and makes an object for each entry, whatever the archive says
+    about their number. Therefore the directory is limited in bytes, too.
+    """
+    directory = _DirectoryReader(file)
+    with zipfile.ZipFile(cast(IO[bytes], directory)) as archive:
+        directory.limit = None
+        check_members(len(archive.infolist()))
+        yield archive
+
+
+def check_members(count: int) -> None:
+    """Raises `UserError` if an archive has too many members."""
+    if count > MAX_MEMBERS:
+        raise UserError(f"more than {MAX_MEMBERS:,} files in one archive. Unpack it, and name the folder")
+
+
+class _DirectoryReader:
+    """A file from which only a limited number of bytes is read at once, until `limit` is None."""
+
+    def __init__(self, file: IO[bytes]):
+        self.file, self.limit = file, DIRECTORY_LIMIT
+        self.seek, self.tell, self.seekable = file.seek, file.tell, file.seekable
+
+    limit: int | None
+
+    def read(self, size: int = -1) -> bytes:
+        if self.limit is not None and size > self.limit:
+            check_members(size)  # an entry has more than one byte
+        return self.file.read(size)
+
+
 def check_member(member: zipfile.ZipInfo) -> None:
     """Refuses members of a zip archive other than deflated ones, of which alone `zipfile` limits the unpacked bytes."""
     if member.flag_bits & 1 or member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise UserError(f"{member.filename}: encrypted, or compressed with another method than deflate")
-
-
-def read_torch(path: Path) -> Any:
-    """Returns the plain values and tensors in a file written by `torch.save`; code in the file is never executed."""
-    import torch
-
-    check_torch(path)
-    with naming(path, Exception, what="damaged, or not a file of plain values and tensors: "):
-        return torch.load(path, map_location="cpu", weights_only=True)
-
-
-def check_torch(path: Path) -> None:
-    """Checks sizes and checksums of an archive of `torch.save`, which `torch.load` does not check."""
-    size = regular_file(path)
-    with path.open("rb") as file:
-        if file.read(4) != b"PK\3\4":  # formats of old versions, which are not archives
-            return
-    damage = naming(path, *ZIP_ERRORS, OSError, ValueError, what="damaged, or not a file of torch.save: ")
-    with damage, zipfile.ZipFile(path) as archive:
-        members = archive.infolist()
-        if any(member.compress_type for member in members) or sum(m.file_size for m in members) > size:
-            raise UserError("damaged: its parts are compressed or overlap, and torch.save compresses none")
-        if (spoiled := archive.testzip()) is not None:
-            raise UserError(f"damaged: the checksum of {spoiled} is wrong")
 
 
 def check_expansion(expanded: int, packed: int) -> None:

@@ -10,6 +10,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 import urllib.error
 import urllib.request
@@ -136,6 +137,26 @@ def test_a_request_stops_within_a_step_and_the_next_one_runs(studio, monkeypatch
         studio.motions(request.model_copy(update={"seed": 1}))
 
 
+def test_refusals_of_files_name_no_temporary_folder(studio):
+    request = DemoRequest(text="a person walks", **FAST)
+    studio.motions(request)
+    for extension in (".npz", ".mp4"):
+        with pytest.raises(UserError) as error:
+            studio.file(request, 0, extension, "unreal")
+        assert str(error.value).startswith(f"motion{extension}")
+        assert tempfile.gettempdir() not in str(error.value)
+
+
+def test_an_invalid_origin_is_refused():
+    guard = pytest.importorskip("flame_mdm.demo.guard", reason="gradio is not installed")
+    headers = pytest.importorskip("starlette.datastructures").Headers
+    checked = guard.Guard(None, (), {})
+    checked._check_sender(headers({"host": "localhost", "origin": "http://localhost"}), "/")
+    for origin in ("http://[", "http://[::1", "[", "null"):
+        with pytest.raises(guard.HTTPException, match="another site"):
+            checked._check_sender(headers({"host": "localhost", "origin": origin}), "/")
+
+
 def test_a_wrong_port_and_a_missing_package_are_one_line(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "gradio", None)
     assert error_of(capsys, "demo", "port=99999").startswith("error: port=99999: give a number from 0 to 65535")
@@ -158,6 +179,8 @@ studio.motions(EDITED)
 with TestClient(app, "http://localhost") as client, studio._working:
     requests = EDITED, EDITED.model_copy(update={"seed": 6})
     files = [client.get(f"/motion.npz?{request.query()}") for request in requests]
+    rigs = [client.get(f"/motion.bvh?{EDITED.query()}{rig}") for rig in ("", "&rig=unreal", "&rig=unity")]
+    names = [answer.headers["content-disposition"] for answer in rigs]
     for number in range(demo.SESSIONS + 20):
         body = json.loads(body_of(halt, session=f"s{number}"))
         answer = client.post("/gradio_api/run/predict", json=body)
@@ -167,7 +190,8 @@ groups = [group.original_router for group in gradio.routes if hasattr(group, "or
 api = [route.path for group in groups for route in group.routes]
 routes = sorted({*own, *(path if path.startswith("/gradio_api") else f"/gradio_api{path}" for path in api)})
 sessions = [len(gradio.state_holder.session_data), demo.SESSIONS]
-print(json.dumps({"routes": routes, "sessions": sessions, "files": [file.status_code for file in files]}), flush=True)
+statuses = [file.status_code for file in files]
+print(json.dumps({"routes": routes, "sessions": sessions, "files": statuses, "names": names}), flush=True)
 """
 NORMAL = "from flame_mdm.__main__ import main; sys.exit(main(['demo', 'port=0', 'hosts=demo.example']))"
 
@@ -313,6 +337,11 @@ def test_bodies_are_counted_as_they_arrive(server):
 def test_files_come_from_memory_while_the_model_works_and_old_sessions_are_forgotten(normal):
     assert normal.inside["files"] == [200, 400]
     assert normal.inside["sessions"][0] == normal.inside["sessions"][1]
+
+
+def test_downloads_are_named_after_their_rig(normal):
+    names = [f'attachment; filename="a-person-walks-1{rig}.bvh"' for rig in ("", "-unreal", "-unity")]
+    assert normal.inside["names"] == names
 
 
 @pytest.mark.slow

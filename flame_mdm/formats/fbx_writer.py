@@ -55,6 +55,8 @@ class _Writer:
         poses: dict[int, np.ndarray] = {}
         for skin in clip.skins:
             poses |= self._mesh(skin, bones, materials)
+        if poses and clip.root >= 0:
+            poses[bones[clip.root]][2, 3] -= PER_METER * ROOT_BACK  # three.js takes its place from the bind pose
         if poses:
             self._bind_pose(poses)
         self._animation(bones, duration)

@@ -11,11 +11,13 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from support.fixtures import ROOT, blender
 from support.glb import odd_character, write_names
 from support.motions import synthetic
 
+from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError
 from flame_mdm.formats import fbx_scene, glb, glb_animation, vrma
 from flame_mdm.formats.animated import AnimatedNodes
@@ -35,7 +37,7 @@ PACKAGES = {
 MILLIMETER = 1e-3
 FRAMES = [0, 7, 20, 41]
 RIGS = [None, *presets()]
-ACTIONS = ["walk", "kick", "wave", "jump", "punch", "raise", "bow", "sit", "crawl", "run"]
+MOTIONS = 10  # synthetic motions at each of two frame rates
 
 
 @pytest.fixture(scope="session")
@@ -85,11 +87,10 @@ def bones(motion: AnimatedNodes, meshes: tuple[str, ...] = ("person",)) -> list[
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("rig", RIGS)
 def test_autodesk_and_three_read_what_was_written(rig: str | None, node_modules: Path, tmp_path: Path):
-    """Ten motions on each rig, and ten with another length and rate, in Autodesk's SDK, three.js and our reader."""
-    for number, action in enumerate(ACTIONS):
-        for fps in (20.0, 30.0):
-            motion = synthetic(action)
-            motion.fps = fps
+    """Ten motions on each rig at each of two frame rates, in Autodesk's SDK, three.js and our reader."""
+    for fps in (20.0, 30.0):
+        for number, clip in enumerate(Synthetic(clips=MOTIONS).clips(fps)):
+            motion = Motion(np.asarray(clip.motion), fps, text=clip.captions[0])
             path = tmp_path / f"{number}_{fps:g}.fbx"
             motion.save(path, rig=rig)
             ours = fbx_scene.read(path)
@@ -123,10 +124,11 @@ def test_the_surface_in_autodesk_is_that_of_pictures(node_modules: Path, tmp_pat
     motion.save(tmp_path / "kick.glb", rig="mixamo")
     surfaces = []
     for path, frame in ((tmp_path / "kick.glb", 20), (autodesk(node_modules, tmp_path / "kick.fbx"), 30)):
-        surfaces.append(np.sort(skinned(path, frame).round(6), axis=0))
-    # both exporters order vertices differently, so sorted coordinates are compared
-    low, high = (np.quantile(surface, np.linspace(0, 1, 101), axis=0) for surface in surfaces)
-    assert np.abs(low - high).max() < 2 * MILLIMETER
+        surfaces.append(skinned(path, frame))
+    # the SDK's file has a vertex once per material that meets there, in another order
+    for first, second in (surfaces, surfaces[::-1]):
+        nearest, _ = cKDTree(first).query(second)
+        assert nearest.max() < 0.02 * MILLIMETER
 
 
 def skinned(path: Path, frame: int) -> np.ndarray:
@@ -300,7 +302,7 @@ def test_a_vrm_animation_has_the_positions_of_the_motion_and_the_rest_pose_of_vr
 @pytest.mark.slow
 def test_three_vrm_animation_reads_the_motion(node_modules: Path, tmp_path: Path):
     """Its normalized tracks, applied to the rest pose by forward kinematics, give our joints."""
-    for action in ("walk", "sit", "kick"):
+    for action in ("walk", "jump", "kick"):
         path = tmp_path / f"{action}.vrma"
         synthetic(action).save(path)
         issues = node("gltf_validate.mjs", node_modules, path)

@@ -116,6 +116,7 @@ class FileSettings:
     fps: float | None = option(None, "frames per second; overrides the value in the file; required for .npy, .amc")
     unit: float | None = option(None, "meters per length unit of the file; default 0.01 for most .bvh, 1 for .npy")
     up: str | None = option(None, "axis of the file that points up: y, z or -y; default that of skeleton.yaml, or y")
+    animation: str | None = option(None, "name or number of an animation in an .fbx or .glb file; default: the first")
 
 
 @dataclass(frozen=True, kw_only=True)

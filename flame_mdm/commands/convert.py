@@ -25,17 +25,21 @@ class ConvertSettings(BodySettings, FileSettings):
 
     Converts a motion file, or all motion files in a folder and the folders below it. The nearest skeleton.yaml in its
     folder or above applies (docs/own-data.md).
-    Inputs: .npz of `make sample` and of AMASS, .bvh, .amc with its .asf, .json, and .npy with joint positions.
-    Outputs: .bvh and .glb for Blender and game engines, .npz in the layout of AMASS, and .json and .npy with joint
-    positions; .mp4 and .gif to look at. Units, axes and joint names: docs/formats.md
+    Inputs: .npz of `make sample` and of AMASS, .bvh, animations in .fbx, .glb, .vrm and .vrma, .amc with its .asf,
+    .json, and .npy with joint positions.
+    Outputs: .fbx, .glb, .bvh, .usda, .usdc and .usdz for Blender and game engines, .vrma for VRM avatars, .npz in the
+    layout of AMASS, and .json and .npy with joint positions; .mp4 and .gif to look at.
+    Which file a program reads: docs/engines.md. Units, axes and joint names: docs/formats.md
     """
 
     OBJECTS: ClassVar = ("motion", "out")
     motion: str = required("a file, or a folder of files; .npy holds joint positions (frames, joints, 3)")
-    out: str = required(".bvh, .glb, .npz (layout of AMASS), .json or .npy; .mp4 or .gif to look at")
+    out: str = required(".fbx, .glb, .bvh, .usdz, .vrma, .npz (AMASS), .json or .npy; .mp4 or .gif to look at")
     format: str | None = option(None, "if MOTION is a folder: ending of the files that are written to the folder OUT")
     rest_pose: bool = option(False, "true = .bvh begins with a frame of the rest pose, arms out")
     rig: str | None = option(None, "skeleton: mixamo, unreal, unity, rigify, lafan1, soma, cmu or 100style")
+    root_motion: bool = option(False, "true = the root of rig=unreal or soma follows the hips on the floor")
+    resample: float | None = option(None, "frames per second of OUT; default: those of MOTION")
     character: str | None = option(None, "your own .glb file with a skin to move: docs/characters.md", existing)
 
 
@@ -82,16 +86,19 @@ def _convert(settings: ConvertSettings, path: Path, out: Path, character: Charac
     from flame_mdm.formats.layouts import head_height, leg_length
     from flame_mdm.formats.people import load_body
     from flame_mdm.formats.readers import read
+    from flame_mdm.formats.resampling import frame_rate
     from flame_mdm.representations.skeleton import SMPL22
 
     body = load_body(settings.body)
-    motion = read(path, settings.fps, settings.unit, settings.up)
+    motion = read(path, settings.fps, settings.unit, settings.up, animation=settings.animation)
     if out.exists() and out.samefile(path):
         raise UserError(f"{out}: the same file as the input, which stays as it is. Choose another name for the output")
+    if settings.resample is not None:
+        motion = motion.resampled(frame_rate(settings.resample, "resample"))
     if out.suffix.lower() == ".npz":
         motion.poses = motion.posed()  # other programs expect AMASS's keys
     try:
-        say(motion.save(out, settings.rest_pose, settings.rig, character, body))
+        say(motion.save(out, settings.rest_pose, settings.rig, character, body, settings.root_motion))
     except UserError as error:  # of the motion, if not of the output
         if str(out) in str(error):
             raise

@@ -44,6 +44,7 @@ def main(settings: EditSettings) -> None:
         fps=settings.fps,
         unit=settings.unit,
         up=settings.up,
+        animation=settings.animation,
         cut=settings.cut,
         data_root=settings.data_root,
     )

@@ -92,13 +92,17 @@ def _read(settings: InspectSettings, failures: list[str]) -> tuple[str, int, Ite
 
     path = Path(settings.motion)
     if not path.is_dir():
-        return path.resolve().stem, 1, iter([read(path, settings.fps, settings.unit, settings.up)])
+        return (
+            path.resolve().stem,
+            1,
+            iter([read(path, settings.fps, settings.unit, settings.up, animation=settings.animation)]),
+        )
     files = motion_files(path)
 
     def motions() -> Iterator[Motion]:
         for file in files:
             try:
-                motion = read(file, settings.fps, settings.unit, settings.up)
+                motion = read(file, settings.fps, settings.unit, settings.up, animation=settings.animation)
             except (UserError, OSError) as error:
                 failures.append(first_line(error))
                 continue

@@ -1,15 +1,17 @@
 """Own data: a folder of motions (BVH, AMASS or joint files) with captions, described in `docs/own-data.md`."""
 
+import contextlib
 import csv
 import io
 import math
 import os
+import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -17,7 +19,7 @@ import torch
 from flame_mdm.data import SPLITS, Clip, MotionSource, Split, hashed_split, mirrored, name_hash, some
 from flame_mdm.data.parallel import in_order
 from flame_mdm.errors import UserError, first_line, printable
-from flame_mdm.formats import ENDINGS, motions_in
+from flame_mdm.formats import ENDINGS, SCENES, motions_in, scenes
 from flame_mdm.formats.checks import LYING
 from flame_mdm.formats.conversion import raw_motion
 from flame_mdm.formats.readers import read_recording
@@ -30,6 +32,13 @@ SHORTEST = 3  # frames that representations need at least
 SPLITTABLE = 10  # number of motions from which on each split has at least one
 TABLE = "captions.csv"
 COLUMNS = ("id", "text", "action", "split", "source")
+
+
+class MotionFile(NamedTuple):
+    """A file, and which of its animations is meant; None = the only one."""
+
+    path: Path
+    animation: str | None = None
 
 
 @dataclass
@@ -141,16 +150,18 @@ class Folder(MotionSource):
                 raise UserError(f"{where}; set the axis `up` in skeleton.yaml")
 
     @cached_property
-    def files(self) -> dict[str, Path]:
-        """Path in the folder without extension -> file, sorted."""
-        files: dict[str, Path] = {}
+    def files(self) -> dict[str, MotionFile]:
+        """Path in the folder without extension -> file, sorted; with several animations, each has `PATH/ANIMATION`."""
+        files: dict[str, MotionFile] = {}
         for path in motions_in(self.path):
             name = path.relative_to(self.path).with_suffix("").as_posix()
             if (shown := printable(name)) != name:
                 raise UserError(f"{shown}: its name contains control characters or is not UTF-8. Rename it")
-            if name in files:
-                raise UserError(f"{path}: has the same name as {files[name].name}; each motion needs its own name")
-            files[name] = path
+            for label, file in _animations(name, path):
+                if label in files:
+                    other = files[label].path.name
+                    raise UserError(f"{path}: has the same name as {other}; each motion needs its own name")
+                files[label] = file
         if not files:
             reason = "no motions in this folder" if self.path.is_dir() else "no such folder"
             raise FileNotFoundError(f"{self.path}: {reason}. Give a folder of {', '.join(ENDINGS)} files")
@@ -168,8 +179,8 @@ class Folder(MotionSource):
         notes = {name: Note() for name in self.files}
         if os.path.lexists(self.path / TABLE):
             self._read_table(self.path / TABLE, notes)
-        for name, path in self.files.items():
-            texts = path.with_suffix(".txt")
+        for name, file in self.files.items():
+            texts = file.path.with_suffix(".txt")
             if os.path.lexists(texts):
                 lines = read_text(texts).splitlines()
                 notes[name].texts += [text for line in lines if (text := line.partition("#")[0].strip())]
@@ -217,6 +228,20 @@ class Folder(MotionSource):
         return {name: note.split or splits[sources[name]] for name, note in self.notes.items()}
 
 
+def _animations(name: str, path: Path) -> Iterator[tuple[str, MotionFile]]:
+    """Yields the motions of a file and their names; several animations of one file get their own names."""
+    animations: list[str] = []
+    if path.suffix.lower() in SCENES:
+        with contextlib.suppress(UserError):  # the reader names what is wrong with this file later
+            animations = scenes.animations(path)
+    if len(animations) <= 1:
+        yield name, MotionFile(path)
+        return
+    for number, animation in enumerate(animations, 1):
+        label = re.sub(r"[^\w .-]", "_", animation)
+        yield f"{name}/{label}", MotionFile(path, str(number))
+
+
 def _add(notes: dict[str, Note], cells: dict[str, str]) -> None:
     """Adds the cells of a row of the table to the note of its motion."""
     name, split = cells["id"], cells.get("split")
@@ -244,10 +269,11 @@ class _Attempt:
     notes: Sequence[str] = ()
 
 
-def _read(kind: str, fps: float, path: Path) -> _Attempt:
+def _read(kind: str, fps: float, file: MotionFile) -> _Attempt:
     """Reads joints or, if `kind` is "smpl", a raw motion of SMPL's rotations, at `fps` frames per second."""
+    path = file.path
     try:
-        recording = read_recording(path, fps, as_smpl=True)
+        recording = read_recording(path, fps, as_smpl=True, animation=file.animation)
         joints, doubts = recording.motion.joints, recording.doubts
         if doubts.jump:
             raise UserError(f"{path}: {doubts.jump}")

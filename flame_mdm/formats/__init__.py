@@ -5,16 +5,15 @@ from pathlib import Path
 
 from flame_mdm.errors import UserError
 
-ENDINGS = (".npz", ".bvh", ".amc", ".json", ".npy")  # of motion files that are read
+SCENES = (".fbx", ".glb", ".vrm", ".vrma")  # files with a scene of nodes, and animations of them
+ENDINGS = (".npz", ".bvh", *SCENES, ".amc", ".json", ".npy")  # of motion files that are read
 TREES = (".bvh", ".amc")  # of those that contain a tree of joints and their rotations
 USD = (".usda", ".usdc", ".usdz")  # Universal Scene Description
 RIGGED = (".bvh", ".glb", ".fbx", *USD)  # of files that can have the skeleton of another program
 WRITTEN = (*RIGGED, ".vrma", ".npz", ".json", ".npy", ".gif", ".mp4")  # of the files that `Motion.save` writes
 
 ADVICE = {
-    ".fbx": "Open it in Blender and export BVH (File > Export > Motion Capture)",
-    ".glb": "Open it in Blender and export BVH (File > Export > Motion Capture)",
-    ".gltf": "Open it in Blender and export BVH (File > Export > Motion Capture)",
+    ".gltf": "Save it as .glb, which is one file, for example with Blender (File > Export > glTF 2.0)",
     ".blend": "Open it in Blender and export BVH (File > Export > Motion Capture)",
     ".c3d": "It contains markers, not joints: fit a skeleton with your motion capture program and export BVH",
     ".trc": "It contains markers, not joints: fit a skeleton with your motion capture program and export BVH",

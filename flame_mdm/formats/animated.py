@@ -28,6 +28,7 @@ class AnimatedNodes:
         fps: frames per second.
         animation: the name of the animation.
         humanoid: joint of SMPL -> index of a node, if the file says which nodes are a human body; else empty.
+        unit: meters per unit of length, as the file declares it.
     """
 
     names: tuple[str, ...]
@@ -36,6 +37,7 @@ class AnimatedNodes:
     fps: float
     animation: str
     humanoid: dict[str, int]
+    unit: float = 1.0
 
 
 def choose(animations: Sequence[tuple[str, Item]], requested: str | int | None) -> tuple[str, Item]:

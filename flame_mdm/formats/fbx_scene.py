@@ -274,7 +274,8 @@ class _Scene:
             positions = worlds[..., :3, 3] @ self._axes().T * self._unit()
         if not (np.abs(positions) <= LARGEST).all():
             raise ValueError("numbers are not finite, or too large")
-        return AnimatedNodes(tuple(model.name for model in models), parents, positions, fps, name, {})
+        names = tuple(model.name for model in models)
+        return AnimatedNodes(names, parents, positions, fps, name, {}, self._unit())
 
     def _setting(self, name: str, default: float) -> float:
         value = self.settings.get(name, (default,))

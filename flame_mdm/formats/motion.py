@@ -174,6 +174,7 @@ class Motion(PosedFigure):
             poses=poses,
             cleanup=self.cleanup,
             parts=parts,
+            notes=self.notes,
         )
 
     def show(self) -> Any:

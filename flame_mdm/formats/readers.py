@@ -15,13 +15,14 @@ import torch
 from torch import Tensor
 
 from flame_mdm.errors import UserError
-from flame_mdm.formats import ENDINGS, TREES, checks, unread
+from flame_mdm.formats import ENDINGS, SCENES, TREES, checks, scenes, unread
 from flame_mdm.formats.arrays import check_numbers, is_real, read_arrays, smpl_motion
 from flame_mdm.formats.bvh import Bvh, forward_kinematics
 from flame_mdm.formats.layouts import (
     UP,
     Layout,
     array_layout,
+    find_layout,
     find_skeleton,
     layout_name,
     read_tree,
@@ -94,8 +95,12 @@ def read(
     unit: float | None = None,
     up: str | None = None,
     resample_to: float | None = None,
+    animation: str | None = None,
 ) -> Motion:
-    """Reads a motion: `.npz` of this project, of AMASS or with joints and fps, `.bvh`, `.amc`, `.json`, or `.npy`.
+    """Reads a motion file.
+
+    Files are `.npz` of this project, of AMASS or with joints and fps, `.bvh`, animations in `.fbx`, `.glb`, `.vrm` and
+    `.vrma`, `.amc`, `.json`, or `.npy`.
 
     Args:
         path: the file. The nearest `skeleton.yaml` in its folder or above describes it, except files written by this
@@ -105,11 +110,12 @@ def read(
         up: the axis of the file that points up: y, z or -y.
         resample_to: target frame rate, None = that of the file. Rotations are interpolated on the sphere, joints and
             translations with cubic splines.
+        animation: name or number, from 1, of an animation in an FBX or GLB file; None = the first one.
 
     Returns the motion; its `notes` say what was left out or looks wrong. Raises `FileNotFoundError`, or `UserError` if
     the file is damaged, of another kind, without rate, not of a person's size, or if a key has no effect on it.
     """
-    return read_recording(path, resample_to, fps=fps, unit=unit, up=up).motion
+    return read_recording(path, resample_to, fps=fps, unit=unit, up=up, animation=animation).motion
 
 
 def read_recording(
@@ -119,6 +125,7 @@ def read_recording(
     fps: float | None = None,
     unit: float | None = None,
     up: str | None = None,
+    animation: str | None = None,
     as_smpl: bool = False,
     standard: Standard | None = None,
 ) -> Recording:
@@ -134,7 +141,11 @@ def read_recording(
     said = {key: value for key, value in (("unit", unit), ("up", up)) if value is not None}
     rate = None if fps is None else frame_rate(fps)
     fields = find_skeleton(path, up) | said
+    if animation is not None and path.suffix.lower() not in SCENES:
+        raise UserError(f"{path}: animation={animation} has no effect, {path.suffix} files have one. Drop animation=")
     with naming(path, ValueError):
+        if path.suffix.lower() in SCENES:
+            return _of_scene(path, animation, rate, resample_to, fields)
         if path.suffix.lower() in TREES:
             return _of_tree(path, rate, resample_to, fields, standard)
         data = read_arrays(path)
@@ -193,6 +204,33 @@ def _of_tree(
         joints = layout.apply(forward_kinematics(tree.parents, *local)[0], names)
     motion = Motion(joints, fps, id=path.stem, notes=(*notes, *doubts.lines))
     return Recording(motion, label, doubts, tree=tree)
+
+
+def _of_scene(
+    path: Path,
+    animation: str | None,
+    rate: float | None,
+    resample_to: float | None,
+    fields: Mapping[str, Any],
+) -> Recording:
+    """Returns the recording of an animation of nodes, whose positions are in meters, y up, unless `fields` differ."""
+    _refuse(fields, ["joints"], "FBX and GLB files contain the names of their joints")
+    scene = scenes.read(path, animation)
+    rate = scene.fps if rate is None else rate
+    names = scenes.joint_names(scene)
+    layout = find_layout(names, fields)
+    if "map" not in fields and "unit" not in fields:
+        layout = layout.model_copy(update={"unit": scene.unit})
+    joints = layout.apply(scene.positions / scene.unit, names)
+
+    notes = []
+    if start := checks.rest_frames(joints, rate):
+        notes.append(_rest_note(start))
+        joints = joints[start:]
+    checks.check_body(joints, layout.unit, layout.children)
+    doubts = _doubts(joints, rate, layout.up, np.array(UP[layout.up], float))
+    motion = Motion(joints, rate, text="", id=path.stem, notes=(*notes, *doubts.lines))
+    return Recording(_resampled(motion, resample_to), _label(path, layout, rate), doubts)
 
 
 def _of_joints(

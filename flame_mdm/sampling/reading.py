@@ -27,6 +27,7 @@ def read_motion(
     fps: float | None = None,
     unit: float | None = None,
     up: str | None = None,
+    animation: str | None = None,
     cut: Sequence[float] | None = None,
     data_root: str | Path = "data",
 ) -> Motion:
@@ -34,13 +35,13 @@ def read_motion(
 
     Features of the same representation and frame rate are kept. Other motions are converted as in
     `flame_mdm.formats.conversion` and made canonical; `notes` of the result tell what was fitted, with the error.
-    `fps`, `unit` and `up` (y, z or -y) describe the file, as in `flame_mdm.formats.readers.read`; `cut` is begin and
-    end of the part to use, in seconds. Raises `FileNotFoundError` or `UserError` if the motion does not exist or is
-    damaged, `cut` is outside of it, or it cannot be encoded.
+    `fps`, `unit`, `up` (y, z or -y) and `animation` describe the file, as in `flame_mdm.formats.readers.read`; `cut`
+    is begin and end of the part to use, in seconds. Raises `FileNotFoundError` or `UserError` if the motion does not
+    exist or is damaged, `cut` is outside of it, or it cannot be encoded.
     """
     name = str(source)
     if Path(source).suffix.lower() in ENDINGS:
-        motion = read(source, fps, unit, up, representation.fps)
+        motion = read(source, fps, unit, up, representation.fps, animation)
         motion = with_features(representation, replace(motion, id=name))
     elif ":" in name:
         dataset, _, clip_id = name.partition(":")

@@ -1,0 +1,92 @@
+"""FBX and GLB animations as motions: in commands, in data sets, and what is refused."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.fixtures import SHARED, needs_third_party
+from support.motions import synthetic
+
+from flame_mdm.data.folder import Folder
+from flame_mdm.errors import UserError
+from flame_mdm.formats import glb_animation
+from flame_mdm.formats.readers import read
+from flame_mdm.representations.skeleton import SMPL22
+
+FILES = SHARED / "data" / "files"
+MILLIMETER = 1e-3
+
+
+CASES = [(ending, rig) for ending in (".fbx", ".glb") for rig in (None, "mixamo", "unreal", "unity", "lafan1", "soma")]
+
+
+@pytest.mark.parametrize(("ending", "rig"), [*CASES, (".vrma", None)])
+def test_a_motion_comes_back_from_each_kind_of_file_and_rig(ending: str, rig: str | None, tmp_path: Path):
+    motion = synthetic("kick")
+    motion.save(tmp_path / f"kick{ending}", rig=rig)
+    again = read(tmp_path / f"kick{ending}")
+    assert again.fps == motion.fps
+    # up to the thickness of the soles, and bones of constant length
+    lift = (again.joints - motion.joints)[..., 1].mean()
+    again.joints[..., 1] -= lift
+    assert 0 < lift < 0.04
+    assert np.abs(again.joints - motion.posed().joints().numpy()).max() < 0.1 * MILLIMETER
+
+
+@needs_third_party
+@pytest.mark.parametrize("name", ["mixamo_prerotation.fbx", "mixamo_not_tpose.fbx", "mixamo_not_tpose.glb"])
+def test_joints_of_other_writers_are_those_of_the_file(name: str):
+    motion = read(FILES / name)
+    with np.load(FILES / "mixamo_not_tpose_expected.npz") as expected:
+        names = [str(joint).removeprefix("mixamorig:") for joint in expected["names"]]
+        walk = expected["walk"][: len(motion.joints)]
+    for joint, bone in (("left_knee", "LeftLeg"), ("head", "Head"), ("right_wrist", "RightHand"), ("spine2", "Spine1")):
+        ours = motion.joints[:, SMPL22.joints.index(joint)]
+        assert np.abs(ours - walk[:, names.index(bone)]).max() < 0.01 * MILLIMETER
+
+
+@needs_third_party
+def test_a_key_acts_on_scenes_or_is_refused(tmp_path: Path):
+    file = FILES / "mixamo_prerotation.fbx"
+    plain = read(file)
+    assert read(file, fps=60).fps == 60
+    resampled = read(file, resample_to=20)
+    assert (resampled.fps, len(resampled.joints)) == (20, 21)
+    # the file is in centimeters: meters per unit replace what it declares
+    np.testing.assert_allclose(read(file, unit=0.009).joints, 0.9 * plain.joints, atol=1e-6)
+    with pytest.raises(UserError, match="m long"):
+        read(file, unit=1)
+    lying = read(file, up="z")
+    assert any("lying" in note for note in lying.notes)
+    synthetic("kick").save(tmp_path / "kick.npz")
+    with pytest.raises(UserError, match=r"animation=Walk has no effect, \.npz files have one"):
+        read(tmp_path / "kick.npz", animation="Walk")
+
+
+@needs_third_party
+def test_all_animations_of_a_folder_become_clips(tmp_path: Path):
+    shutil.copy(FILES / "mixamo_not_tpose.glb", tmp_path / "hero.glb")
+    shutil.copy(FILES / "mixamo_prerotation.fbx", tmp_path / "walk.fbx")
+    (tmp_path / "captions.csv").write_text(
+        "id,text\nhero/Walk,a person walks\nhero/Wave,a person waves\nhero/Turn,a person turns\nwalk,a person walks\n"
+    )
+    clips = {clip.id: clip for clip in Folder(str(tmp_path), workers=1).clips(30)}
+    assert sorted(clips) == ["hero_Turn", "hero_Walk", "hero_Wave", "walk"]
+    assert clips["hero_Wave"].captions == ["a person waves"]
+    # the second animation, not the first one
+    wave = read(tmp_path / "hero.glb", animation="Wave").joints
+    np.testing.assert_allclose(clips["hero_Wave"].motion, wave, atol=1e-5)
+
+
+def test_a_scene_without_animation_or_with_a_strange_skeleton_is_refused(tmp_path: Path):
+    motion = synthetic("kick")
+    motion.save(tmp_path / "kick.glb", rig="mixamo")
+    content = (tmp_path / "kick.glb").read_bytes()
+    (tmp_path / "still.glb").write_bytes(content.replace(b'"animations"', b'"animationz"'))
+    with pytest.raises(UserError, match=r"still\.glb: contains no animation"):
+        read(tmp_path / "still.glb")
+    (tmp_path / "bird.glb").write_bytes(content.replace(b"mixamorig:LeftArm", b"mixamorig:LeftWng"))
+    with pytest.raises(UserError, match="unknown skeleton"):
+        read(tmp_path / "bird.glb")
+    assert len(glb_animation.animations(tmp_path / "bird.glb")) == 1

@@ -186,9 +186,11 @@ def _of_tree(
         tree, own = standard(tree)
         fields = own or fields
     layout, names = tree_layout(tree, fields)
-    if standard is None and rate is None and (known := known_rate(path.stem, layout_name(layout), tree.fps)):
-        notes.append(f"CMU recorded it at {known:g} frames per second, not {tree.fps:g} as the file says: read at that")
-        tree = replace(tree, fps=known)
+    if standard is None and rate is None and (recorded := known_rate(path.stem, layout_name(layout), tree.fps)):
+        notes.append(
+            f"CMU recorded it at {recorded:g} frames per second, not {tree.fps:g} as the file says: read at that"
+        )
+        tree = replace(tree, fps=recorded)
 
     joints = layout.apply(tree.positions(), names)
     if start := checks.rest_frames(joints, tree.fps):

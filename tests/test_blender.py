@@ -62,7 +62,7 @@ def test_blender_shows_the_motions_of_the_package(package: Path, tmp_path: Path)
             motion.joints = motion.joints[::2]
         assert np.abs(np.array(joints)[:, order] - motion.joints).max() < 1e-3
     wave.save(tmp_path / "python.glb", character=hero)
-    file, character = Glb(tmp_path / "python.glb"), characters.read(hero)
+    file, character = Glb(tmp_path / "python.glb"), characters.read_skinned(hero)
     names, joints = third
     for number in character.map.values():
         expected = file.worlds()[:, character.file.nodes[number], :3, 3]

@@ -3,6 +3,7 @@
 import itertools
 import json
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from support.motions import largest_step, synthetic
 
 from flame_mdm.__main__ import main
 from flame_mdm.errors import UserError
-from flame_mdm.formats import characters
+from flame_mdm.formats import bvh, characters
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.posture import world_rotations
 from flame_mdm.formats.readers import read
@@ -59,7 +60,7 @@ def test_a_known_skeleton_brings_the_joints_back_also_as_a_character_and_does_no
             np.testing.assert_allclose(file.skinned(worlds[frame]), moved, rtol=0, atol=1e-5, err_msg=name)
         if name in ("lafan1", "unreal", "mixamo"):  # as a character, up to the height of the soles
             kick.save(tmp_path / "out.glb", character=tmp_path / "a.glb")
-            at = joints_of(Glb(tmp_path / "out.glb"), characters.read(tmp_path / "a.glb"))
+            at = joints_of(Glb(tmp_path / "out.glb"), characters.read_skinned(tmp_path / "a.glb"))
             for joint in (f"{side}_{part}" for side in SIDES for part in ("hip", "knee", "ankle", "foot", "wrist")):
                 off = np.linalg.norm((at[joint] - kick.joints[:, JOINT[joint]])[:, [0, 2]], axis=1)
                 assert np.median(off) < 0.012, (name, joint)
@@ -113,7 +114,7 @@ def test_a_character_with_odd_names_scale_and_rest_pose(kick: Motion, tmp_path: 
     write_names(tmp_path / "hero.yaml")
     assert ", 22 of 2" in kick.save(tmp_path / "out.glb", character=hero)
     file = Glb(tmp_path / "out.glb")
-    at = joints_of(file, characters.read(hero))
+    at = joints_of(file, characters.read_skinned(hero))
     assert limbs_off(at, kick.joints, "shoulder", "elbow") < 0.1
     assert limbs_off(at, kick.joints, "hip", "knee") < 6  # the legs reach for the floor
     standing = kick.joints[:, [JOINT["left_foot"], JOINT["right_foot"]], 1].min(1) < 0.005
@@ -126,6 +127,72 @@ def test_a_character_with_odd_names_scale_and_rest_pose(kick: Motion, tmp_path: 
         assert np.median((at[f"{side}_foot"] - at[f"{side}_ankle"])[standing, 2]) > 0  # it faces +z, as the motion does
     world = characters.moved(characters.read(hero), kick)[0]
     assert largest_step(world) < largest_step(world_rotations(kick.posed().rotations.numpy())) + 10  # no limb flips
+
+
+def own_bvh(path: Path, kick: Motion, changes: str) -> bvh.Bvh:
+    """Writes a skeleton with Unreal's names as a user's own file, and returns it."""
+    kick.save(path, rig="unreal", rest_pose=True)
+    file = bvh.read(path)
+    if changes == "z up":  # its rest pose is the pose of the offsets
+        turn = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
+        file = replace(file, offsets=file.offsets @ turn.T, frames=np.zeros_like(file.frames[:1]))
+    elif changes == "root alone moves":
+        hips = file.joints.index("pelvis")
+        columns = file.columns()[hips]
+        moving = [columns.start + number for number, name in enumerate(file.channels[hips]) if "position" in name]
+        offsets = file.offsets.copy()
+        offsets[hips] = file.frames[0, moving]
+        channels = list(file.channels)
+        channels[hips] = tuple(name for name in file.channels[hips] if "rotation" in name)
+        frames = np.delete(file.frames, moving, axis=1)
+        file = replace(file, offsets=offsets, channels=tuple(channels), frames=frames)
+    bvh.write(file, path)
+    return bvh.read(path)
+
+
+@pytest.mark.parametrize("changes", ["first frame", "z up", "root alone moves"])
+def test_a_bvh_character_keeps_its_skeleton(kick: Motion, tmp_path: Path, changes: str):
+    hero, out = tmp_path / "hero.bvh", tmp_path / "out.bvh"
+    before = own_bvh(hero, kick, changes)
+    assert "22 of 23 joints follow the motion, 1 keep their angle" in kick.save(out, character=hero)
+
+    file, character = bvh.read(out), characters.read(hero)
+    assert (file.joints, file.parents, file.channels) == (before.joints, before.parents, before.channels)
+    assert (len(file.frames), file.fps) == (len(kick.joints), kick.fps)
+    np.testing.assert_array_equal(file.offsets, before.offsets)
+
+    positions = file.positions() @ character.rig.frame.T / 100
+    at = {joint: positions[:, number] for joint, number in character.map.items()}
+    assert limbs_off(at, kick.joints, "shoulder", "elbow") < 0.1
+    assert limbs_off(at, kick.joints, *LIMBS) < 1
+    lowest = np.minimum(at["left_foot"][:, 1], at["right_foot"][:, 1])
+    np.testing.assert_allclose(np.median(lowest), np.median(kick.joints[..., 1].min(1)), atol=0.01)
+    walked = at["pelvis"][-1] - at["pelvis"][0]
+    np.testing.assert_allclose(walked, kick.joints[-1, 0] - kick.joints[0, 0], atol=0.01)
+
+
+def test_a_bvh_character_whose_body_cannot_turn_or_move_is_refused(kick: Motion, tmp_path: Path):
+    hero = tmp_path / "hero.bvh"
+    own_bvh(hero, kick, "first frame")
+    with pytest.raises(UserError, match=r"out\.glb: this character is a \.bvh file without meshes"):
+        kick.save(tmp_path / "out.glb", character=hero)
+    text = hero.read_text()
+    lines = text.splitlines()
+    elbow = next(number for number, line in enumerate(lines) if "lowerarm_l" in line) + 3
+    numbers = lines.copy()
+    numbers[elbow] = numbers[elbow].replace("3 Zrotation", "2").replace("3 Xrotation", "2").replace("3 Yrotation", "2")
+    rows = next(number for number, line in enumerate(lines) if line.startswith("Frame Time")) + 1
+    numbers[rows:] = [row.rsplit(" ", 1)[0] for row in lines[rows:]]
+    fixed = [line.replace("6 Xposition Yposition Zposition", "3") for line in lines[:rows]]
+    fixed += [" ".join(row.split()[3:6] + row.split()[9:]) for row in lines[rows:]]
+    for changed_lines, message in (
+        (numbers, r"lowerarm_l \(left_elbow\) has 2 rotation channels"),
+        (fixed, "pelvis and the joints above it have no position channels"),
+    ):
+        hero.write_text("\n".join(changed_lines) + "\n")
+        with pytest.raises(UserError, match=message):
+            kick.save(tmp_path / "out.bvh", character=hero)
+        assert not (tmp_path / "out.bvh").exists()
 
 
 def test_names_of_joints_are_read_from_a_file(kick: Motion, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -215,6 +282,8 @@ def test_a_folder_is_converted(kick: Motion, tmp_path: Path, capsys: pytest.Capt
     kick.save(tmp_path / "hero.glb")
     assert main(["convert", folder, str(tmp_path / "on"), f"character={tmp_path / 'hero.glb'}"]) == 0
     assert (tmp_path / "on" / "below" / "b.glb").exists()
+    assert main(["convert", folder, str(tmp_path / "tree"), f"character={out / 'a.bvh'}"]) == 0
+    assert (tmp_path / "tree" / "below" / "b.bvh").exists()
     assert main(["convert", str(tmp_path / "double"), str(out), "format=bvh"]) == 1
     assert "another motion has the same name" in capsys.readouterr().err
 

@@ -13,7 +13,7 @@ from flame_mdm.formats import motion_files
 from flame_mdm.progress import ProgressBar
 
 if TYPE_CHECKING:
-    from flame_mdm.formats.characters import Character
+    from flame_mdm.formats.characters import BvhCharacter, Character
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +40,7 @@ class ConvertSettings(BodySettings, FileSettings):
     rig: str | None = option(None, "skeleton: mixamo, unreal, unity, rigify, lafan1, soma, cmu or 100style")
     root_motion: bool = option(False, "true = the root of rig=unreal or soma follows the hips on the floor")
     resample: float | None = option(None, "frames per second of OUT; default: those of MOTION")
-    character: str | None = option(None, "your own .glb file with a skin to move: docs/characters.md", existing)
+    character: str | None = option(None, "your own .glb with a skin, or .bvh, to move: docs/characters.md", existing)
 
 
 def main(settings: ConvertSettings) -> None:
@@ -82,7 +82,7 @@ def _targets(settings: ConvertSettings, folder: Path, out: Path) -> dict[Path, P
     return targets
 
 
-def _convert(settings: ConvertSettings, path: Path, out: Path, character: Character | None) -> None:
+def _convert(settings: ConvertSettings, path: Path, out: Path, character: Character | BvhCharacter | None) -> None:
     from flame_mdm.formats.layouts import head_height, leg_length
     from flame_mdm.formats.people import load_body
     from flame_mdm.formats.readers import read

@@ -1,4 +1,4 @@
-"""Motions on a user's own character: the skeleton of the skin of a .glb file.
+"""Motions on a user's own character: the skeleton of the skin of a .glb file, or of a .bvh file.
 
 It may have other proportions, units, axes, names and another rest pose than SMPL's body. Bones of arms and legs take
 the directions of the motion's. Trunk, head, hands and feet are turned as in the motion, starting from the rest pose,
@@ -8,19 +8,21 @@ toes reach the scaled positions of the motion's toes, at the height above the fl
 
 import copy
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from flame_mdm.errors import UserError, did_you_mean
-from flame_mdm.formats import glb
+from flame_mdm.formats import bvh, glb
 from flame_mdm.formats.body import PosedFigure, fit_body, local_rotations
 from flame_mdm.formats.layouts import LAYOUTS, opposite
 from flame_mdm.formats.names import spelled
 from flame_mdm.formats.posture import world_rotations
+from flame_mdm.formats.retarget import continuous_euler
 from flame_mdm.formats.rig import RestPose, Rig, follow, matched, recognized, rest_pose
 from flame_mdm.representations.skeleton import JOINT, SMPL22
 from flame_mdm.safe_io import read_yaml
@@ -28,17 +30,83 @@ from flame_mdm.safe_io import read_yaml
 
 @dataclass(frozen=True, eq=False)
 class Character(RestPose):
-    """A character and its file."""
+    """A character with a skin and its .glb file."""
 
     file: glb.Glb
 
 
-def read(path: str | Path) -> Character:
+@dataclass(frozen=True, eq=False)
+class BvhCharacter(RestPose):
+    """A character without meshes and its .bvh file."""
+
+    file: bvh.Bvh
+
+
+def read(path: str | Path) -> Character | BvhCharacter:
     """Reads a character. Names of joints are those of a known skeleton, or are in a `.yaml` file of the same name.
 
-    Raises `UserError` if the file is damaged, or has no skin, known joints (`UnknownJoints`) or usable rest pose.
+    Raises `UserError` if the file is damaged, or has no skin (.glb), no known joints (`UnknownJoints`) or no usable
+    rest pose.
     """
     path = Path(path)
+    return _read_bvh(path) if path.suffix.lower() == ".bvh" else read_skinned(path)
+
+
+def _read_bvh(path: Path) -> BvhCharacter:
+    """Reads the skeleton of a BVH file; its rest pose is the one without rotations, or else the first frame."""
+    file = bvh.read(path)
+    joints = identify(path, {number: file.joints[number] for number, names in enumerate(file.channels) if names})
+    for joint, number in joints.items():
+        if len(turning := _order(file.channels[number])) < 3:
+            name = f"{file.joints[number]} ({joint})"
+            raise UserError(f"{path}: {name} has {len(turning)} rotation channels. Give it three")
+    if not any(_moves(names) for names in _above(file, joints["pelvis"]).values()):
+        name = file.joints[joints["pelvis"]]
+        raise UserError(f"{path}: {name} and the joints above it have no position channels. Give them to the root")
+
+    still = np.tile(np.eye(3), (1, len(file.joints), 1, 1))
+    first = replace(file, frames=file.frames[:1])
+    poses = ((still, file.offsets[None]), (first.rotations(), first.translations()))
+    problem: UserError | None = None
+    for rotations, translations in poses:
+        (positions,), (turned,) = bvh.forward_kinematics(file.parents, rotations, translations)
+        up = _vertical(positions, joints)
+        try:
+            pose = rest_pose(path, file.joints, file.parents, positions, turned, joints, positions, up)
+            return BvhCharacter(pose.rig, pose.map, pose.floor, file)
+        except UserError as error:  # many files are upright in their first frame alone
+            problem = problem or error
+    raise problem or AssertionError
+
+
+def _order(channels: Sequence[str]) -> str:
+    """Returns the axes of the rotation channels of a joint, such as ZXY."""
+    return "".join(name[0] for name in channels if name.endswith("rotation"))
+
+
+def _moves(channels: Sequence[str]) -> bool:
+    return sum(name.endswith("position") for name in channels) == 3
+
+
+def _above(file: bvh.Bvh, joint: int) -> dict[int, Sequence[str]]:
+    """Returns the channels of a joint and of the joints above it, by number, from the joint to the root."""
+    channels: dict[int, Sequence[str]] = {}
+    while joint >= 0:
+        channels[joint] = file.channels[joint]
+        joint = file.parents[joint]
+    return channels
+
+
+def _vertical(positions: np.ndarray, joints: Mapping[str, int]) -> tuple[int, int, int]:
+    """Returns the direction, along y or z, in which the trunk of a pose (J, 3) points."""
+    shoulders = positions[[joints["left_shoulder"], joints["right_shoulder"]]].mean(0)
+    hips = positions[[joints["left_hip"], joints["right_hip"]]].mean(0)
+    axes = ((0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
+    return max(axes, key=lambda axis: float((shoulders - hips) @ np.array(axis)))
+
+
+def read_skinned(path: Path) -> Character:
+    """Reads a character in a .glb file; raises the errors of `read`."""
     file = glb.read(path)
     skeletons: list[set[int]] = []
     for skin in file.skins:
@@ -89,7 +157,7 @@ def _rest(file: glb.Glb, pelvis: int) -> tuple[np.ndarray, np.ndarray]:
     return worlds, points if len(points) else worlds[:, :3, 3]
 
 
-def moved(character: Character, motion: PosedFigure) -> tuple[np.ndarray, np.ndarray, Rig]:
+def moved(character: RestPose, motion: PosedFigure) -> tuple[np.ndarray, np.ndarray, Rig]:
     """Moves a character as in a motion; see `follow`."""
     body = fit_body(motion)
     joints, world = motion.joints[:, : len(SMPL22)], world_rotations(local_rotations(body)) @ body.neutral
@@ -176,5 +244,34 @@ def write(path: Path, character: Character, motion: PosedFigure, name: str) -> s
     # programs show the first animation
     document["animations"] = [binary.animation(name, motion.fps, curves), *document.get("animations", [])]
     binary.save(path, document)
+    return _following(rig, len(rig.joints))
+
+
+def write_bvh(path: Path, character: BvhCharacter, motion: PosedFigure) -> str:
+    """Writes the character's file with a motion in place of its own, and returns a line that describes it."""
+    if path.suffix.lower() != ".bvh":
+        raise UserError(f"{path}: this character is a .bvh file without meshes, so name a .bvh file for the result")
+    file, (world, positions, rig) = character.file, moved(character, motion)
+    local, offsets, hips = rig.local(world), rig.offsets(), rig.hips
+    # the joint that carries the body: the hips, or a root above them
+    mover = next(joint for joint, names in _above(file, hips).items() if _moves(names))
+    carried = rig.within(rig.positions[mover] + positions[:, hips] - rig.positions[hips], mover)
+
+    frames = np.zeros((len(world), file.frames.shape[1]))
+    for joint, (names, columns) in enumerate(zip(file.channels, file.columns(), strict=True)):
+        position = carried if joint == mover else np.tile(offsets[joint], (len(world), 1))
+        values = {f"{axis}position": position[:, number] for number, axis in enumerate("XYZ")}
+        if len(order := _order(names)) == 3:
+            angles = continuous_euler(torch.from_numpy(local[:, [joint]]), (order,))[:, 0].numpy()
+            values |= {f"{axis}rotation": np.degrees(angles[:, number]) for number, axis in enumerate(order)}
+        for number, name in enumerate(names):
+            if name in values:
+                frames[:, columns.start + number] = np.round(values[name], 6)
+    bvh.write(replace(file, frames=frames, fps=motion.fps), path)
+    return _following(rig, sum(map(bool, file.channels)))
+
+
+def _following(rig: Rig, joints: int) -> str:
+    """Describes how many of the `joints` of a character follow the motion."""
     follow = sum(source >= 0 for source in rig.sources)
-    return f"{follow} of {len(rig.joints)} joints follow the motion, {len(rig.joints) - follow} keep their angle"
+    return f"{follow} of {joints} joints follow the motion, {joints - follow} keep their angle"

@@ -22,7 +22,7 @@ from flame_mdm.errors import UserError, shortened
 from flame_mdm.formats import RIGGED, USD, WRITTEN, bvh, characters, fbx_writer, glb_writer, usd, vrma
 from flame_mdm.formats.body import PosedFigure
 from flame_mdm.formats.character_meshes import character_clip
-from flame_mdm.formats.characters import Character
+from flame_mdm.formats.characters import BvhCharacter, Character
 from flame_mdm.formats.poses import Poses
 from flame_mdm.formats.resampling import frame_pairs, frame_rate, resample
 from flame_mdm.formats.retarget import continuous_euler, preset, retarget
@@ -90,7 +90,7 @@ class Motion(PosedFigure):
         path: str | Path,
         rest_pose: bool = False,
         rig: str | None = None,
-        character: str | Path | Character | None = None,
+        character: str | Path | Character | BvhCharacter | None = None,
         body: Mesh | None = None,
         root_motion: bool = False,
         **facts: Any,
@@ -102,8 +102,8 @@ class Motion(PosedFigure):
             rest_pose: begin a `.bvh` file with a frame of the rest pose, arms out, which some programs expect.
             rig: the skeleton of a `.bvh`, `.glb`, `.fbx` or USD file, one of `flame_mdm.formats.retarget.presets`;
                 default: SMPL's.
-            character: a `.glb` file with a skin, or what `characters.read` returned, to be written with this motion
-                as a `.glb`, `.fbx` or USD file.
+            character: your own character, or what `characters.read` returned: a `.glb` file with a skin, to be written
+                with this motion as a `.glb`, `.fbx` or USD file, or a `.bvh` file, to be written as a `.bvh` file.
             body: the body in `.glb`, `.fbx`, USD, `.gif` and `.mp4` files, from `formats.people.load_body`; default:
                 the mannequin.
             root_motion: the joint on the floor of `rig` follows the hips in a `.glb`, `.fbx` or USD file; otherwise
@@ -124,7 +124,8 @@ class Motion(PosedFigure):
         if root_motion and (ending == ".bvh" or not on_a_rig or rig is None):
             raise UserError(f"{path}: root_motion is only for .glb, .fbx and USD files with rig=unreal or rig=soma")
         if character is not None:
-            character = character if isinstance(character, Character) else characters.read(character)
+            if not isinstance(character, Character | BvhCharacter):
+                character = characters.read(character)
             what = _write_character(self, path, character)
         elif ending == ".bvh":
             what = _write_bvh(self, path, rest_pose, rig)
@@ -273,10 +274,12 @@ def _write_rigged(motion: Motion, path: Path, rig: str | None, body: Mesh | None
     return f"{unit}, y up; {_error(motion, poses)}" + (reason and f"; without a body: {reason}")
 
 
-def _write_character(motion: Motion, path: Path, character: Character) -> str:
-    """Writes a .glb file, which keeps all that the file of the character contains, or an .fbx or USD file."""
+def _write_character(motion: Motion, path: Path, character: Character | BvhCharacter) -> str:
+    """Writes a .glb or .bvh file, which keeps the skeleton of the character's file, or an .fbx or USD file."""
     name = motion.text or motion.id or "motion"
     ending = path.suffix.lower()
+    if isinstance(character, BvhCharacter):
+        return characters.write_bvh(path, character, motion)
     if ending not in (".fbx", *USD):
         return characters.write(path, character, motion, name)
     clip = character_clip(character, motion, name)

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
 
+import pytest
 from support.fixtures import ROOT
 
 FILES = sorted([*(ROOT / "flame_mdm").rglob("*.py"), *(ROOT / "evaluators").rglob("*.py")])
@@ -201,6 +202,144 @@ ON_DEMAND = ["torch.load(path, map_location='cpu', weights_only=not run_code)"]
 def test_no_untrusted_file_or_word_is_executed():
     unsafe = {name: calls for name, text in sources().items() if (calls := unsafe_calls(text))}
     assert all(part(name) == "checkpoints" and calls == ON_DEMAND for name, calls in unsafe.items()), unsafe
+
+
+WRITERS = {"np.save", "np.savez", "np.savez_compressed", "torch.save", "onnx.save", "json.dump", "pickle.dump"}
+WRITERS |= {"os.open", "os.replace", "os.rename", "os.link", "os.symlink", "os.truncate", "os.mkfifo"}
+WRITERS |= {f"shutil.{name}" for name in ("copy", "copy2", "copyfile", "copytree", "move", "make_archive")}
+WRITING_METHODS = {"save", "save_file", "write_text", "write_bytes", "rename", "symlink_to", "hardlink_to", "touch"}
+OPENERS = {"open": 1, "io.open": 1, "gzip.open": 1, "tarfile.open": 1, "zipfile.ZipFile": 1, "ZipFile": 1}
+"""Functions that open a file, and the position of the mode; of a method `open`, the mode is the first argument."""
+TEMPORARIES = {"atomic_write", "atomic_folder", "temporary_beside", "_temporary", "TemporaryDirectory", "mkdtemp"}
+TEMPORARIES |= {"BytesIO", "token_hex"}
+"""Functions whose result names a file of this process alone; the runner, which stands alone, draws its own name."""
+
+
+def writing_calls(text: str) -> list[str]:
+    """Calls that write to a file, as "function: call", unless they name a temporary file or a value made of one."""
+    calls = []
+    tree = ast.parse(text)
+    for scope in (tree, *(node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef))):
+        writers = [node for node in within(scope) if isinstance(node, ast.Call) and is_writer(node)]
+        temporary = temporary_names(scope) if writers else set()
+        function = getattr(scope, "name", "module")
+        calls += [f"{function}: {ast.unparse(node.func)}" for node in writers if not names_in(node) & temporary]
+    return sorted(set(calls))
+
+
+def within(scope: ast.AST) -> list[ast.AST]:
+    """Nodes of a module or function, apart from those of the functions in it."""
+    nodes: list[ast.AST] = []
+    for node in ast.iter_child_nodes(scope):
+        if not isinstance(node, ast.FunctionDef):
+            nodes += [node, *within(node)]
+    return nodes
+
+
+def names_in(node: ast.AST) -> set[str]:
+    return {name.id for name in ast.walk(node) if isinstance(name, ast.Name)}
+
+
+def temporary_names(scope: ast.AST) -> set[str]:
+    """Names that a function binds to a temporary path or to something made of one."""
+    bindings = []
+    for node in within(scope):
+        if isinstance(node, ast.withitem) and node.optional_vars:
+            bindings.append((node.optional_vars, node.context_expr))
+        elif isinstance(node, ast.Assign):
+            bindings += [(target, node.value) for target in node.targets]
+    links = [(names_in(target), names_in(value)) for target, value in bindings]
+    temporary = {name for target, value in bindings if called_names(value) & TEMPORARIES for name in names_in(target)}
+    while new := {name for target, used in links if used & temporary for name in target} - temporary:
+        temporary |= new
+    return temporary
+
+
+def called_names(node: ast.AST) -> set[str]:
+    """Last names of the functions that an expression calls."""
+    return {ast.unparse(call.func).split(".")[-1] for call in ast.walk(node) if isinstance(call, ast.Call)}
+
+
+def is_writer(call: ast.Call) -> bool:
+    called, method = ast.unparse(call.func), isinstance(call.func, ast.Attribute) and call.func.attr
+    if called in OPENERS or method == "open":
+        modes = [keyword.value for keyword in call.keywords if keyword.arg == "mode"]
+        modes += call.args[OPENERS.get(called, 0) :][:1]
+        texts = [str(mode.value) for mode in modes if isinstance(mode, ast.Constant)]
+        return called == "os.open" or any(re.fullmatch("[rbt]*[wax+][wax+bt]*([:|].*)?", text) for text in texts)
+    one = len(call.args) == 1 and not call.keywords  # a text's `replace` takes two arguments
+    return called in WRITERS or method in WRITING_METHODS or (method == "replace" and one)
+
+
+PUBLIC = "a method that writes under a temporary name itself"
+INSIDE = "in the temporary folder that the caller has opened"
+MAY_WRITE = {
+    "flame_mdm.checkpoints.onnx_export": {"_shrink: onnx.save": INSIDE, "write_graph: program.save": INSIDE},
+    "flame_mdm.commands.convert": {"_convert: motion.save": PUBLIC},
+    "flame_mdm.data.store": {
+        "_pack: (folder / 'features.npy').open": INSIDE,
+        "_pack: zipfile.ZipFile": INSIDE,
+        "_write: (folder / 'clips.jsonl').write_text": INSIDE,
+        "_write: (folder / 'store.json').write_text": INSIDE,
+        "_write: np.savez": INSIDE,
+    },
+    "flame_mdm.errors": {"drop: os.open": "the null device, for output that nobody reads"},
+    "flame_mdm.formats.characters": {"write: binary.save": PUBLIC},
+    "flame_mdm.formats.glb_writer": {"write: binary.save": PUBLIC},
+    "flame_mdm.formats.vrma": {"write: binary.save": PUBLIC},
+    "flame_mdm.training.checkpointing": {
+        "save_checkpoint: path.replace": "the last checkpoint becomes the previous one"
+    },
+}
+"""Calls outside `safe_io` that write to a file without naming a temporary one, and why they may."""
+
+
+def test_files_are_written_under_a_temporary_name():
+    texts = {name: text for name, text in sources().items() if part(name) != "safe_io"}
+    assert {name: calls for name, text in texts.items() if (calls := writing_calls(text))} == {
+        name: sorted(calls) for name, calls in MAY_WRITE.items()
+    }
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        *(
+            "open(path, 'w')",
+            "open(path, mode='ab')",
+            "path.open('xb')",
+            "path.open('r+')",
+            "zipfile.ZipFile(path, 'w')",
+        ),
+        *(
+            "tarfile.open(path, 'w:gz')",
+            "path.write_text('')",
+            "path.write_bytes(b'')",
+            "image.save(path)",
+            "np.save(path, x)",
+        ),
+        *(
+            "np.savez(path, x=x)",
+            "np.savez_compressed(path, x=x)",
+            "torch.save(x, path)",
+            "json.dump(x, open(path, 'w'))",
+        ),
+        *("shutil.copy(x, path)", "os.replace(x, path)", "x.replace(path)", "x.rename(path)", "path.symlink_to(x)"),
+        "os.open(path, os.O_WRONLY)",
+    ],
+)
+def test_a_call_that_writes_in_place_is_seen_and_one_to_a_temporary_file_is_not(call):
+    assert writing_calls(f"def f(path, x):\n    {call}")
+    assert writing_calls(f"def f(path, x):\n    with atomic_write(path) as temporary:\n        {call}")
+    made = f"with atomic_folder(out) as made:\n        path = x = made / 'part'\n        {call}"
+    assert not writing_calls(f"def f(out):\n    {made}")
+
+
+@pytest.mark.parametrize(
+    "call", ["open(path)", "path.open('rb')", "text.replace('a', 'b')", "zipfile.ZipFile(path)", "Cache.open(path, a)"]
+)
+def test_a_call_that_reads_is_not_taken_for_one_that_writes(call):
+    assert not writing_calls(f"def f(path, text):\n    {call}")
 
 
 FILLERS = {"found", "each", "given", "known", "wanted", "place", "places", "told", "asked"}

@@ -7,26 +7,39 @@ import zipfile
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 from typing import Any
+from weakref import finalize
 
 import numpy as np
 import pytest
 import torch
+from support.fixtures import ROOT
 from support.pages import a_run
 from support.refusals import one_line_error
 from support.stores import OwnClips, clip
 
+from evaluators.audit import _inputs as audited_inputs
+from evaluators.sources import _write as write_motions_of_evaluation
 from flame_mdm.__main__ import main
-from flame_mdm.checkpoints import hub
+from flame_mdm.checkpoints import adapters, hub, onnx_export, runner
+from flame_mdm.checkpoints.model_files import write_model_file
 from flame_mdm.conditions.text import EncodedCaptions, PretrainedText
+from flame_mdm.config import command_line, sweeps
 from flame_mdm.data import archives
-from flame_mdm.data.store import write_store
+from flame_mdm.data.store import Store, write_store
+from flame_mdm.data.synthetic import Synthetic
+from flame_mdm.data.verify import report as verify_data
 from flame_mdm.errors import UserError, say
 from flame_mdm.formats.motion import Motion
+from flame_mdm.reporting.browse import write_page
+from flame_mdm.reporting.report import write_report
+from flame_mdm.reporting.tables.format import Table
+from flame_mdm.reporting.tables.format import write as write_table
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.skeleton import KIT21, SMPL22
-from flame_mdm.safe_io import atomic_folder, atomic_write, locked, paths, write_json
+from flame_mdm.safe_io import atomic_folder, atomic_write, locked, naming, paths, write_json
 from flame_mdm.sampling.output import write_motions
 from flame_mdm.training.checkpointing import AtomicCheckpoints
 from flame_mdm.training.guards import only_run
@@ -81,6 +94,104 @@ def any_file(out: Path) -> None:
         np.savez(temporary, a=np.zeros(1))
 
 
+def tables(out: Path) -> None:
+    write_table(Table("mdm", "Table 1", []), out)
+
+
+def audit(out: Path) -> None:
+    succeed(["audit", f"cards={CARD}", f"out={out}"])
+
+
+def audit_cache(out: Path) -> None:
+    evaluator: Any = SimpleNamespace(
+        extract=lambda _: {"generated": torch.zeros(1, 2)}, metrics={}, protocol=SimpleNamespace(metrics={})
+    )
+    audited_inputs(evaluator, out / "real.npz", ["a"], lambda: [torch.zeros(2, 3)])
+
+
+def evaluated_motions(out: Path) -> None:
+    row: Any = SimpleNamespace(id="a", text="walks")
+    cost: Any = SimpleNamespace(model_dump=lambda: {"seconds": 1.0})
+    write_motions_of_evaluation(out / "0.npz", [row], [np.zeros((2, 3), np.float32)], cost, "text")
+
+
+def ratings(out: Path) -> None:
+    answer = {"prompt": "p", "a": "ours", "b": "real", "choice": "a"}
+    with TemporaryDirectory() as folder:
+        answers = Path(folder, "x.json")
+        write_json(answers, {"format": 1, "study": "s", "rater": "ann", "ratings": [answer]})
+        succeed(["compare", f"ratings={answers}", f"out={out}/ratings.json"])
+
+
+def compare(out: Path) -> None:
+    with TemporaryDirectory() as folder:
+        runs = [str(a_run(Path(folder, name))) for name in "ab"]
+        succeed(["compare", *runs, f"out={out}/compare.html"])
+
+
+def report(out: Path) -> None:
+    with TemporaryDirectory() as folder:
+        a_run(Path(folder, "run")).joinpath("config.yaml").rename(out / "config.yaml")
+    write_report(out)
+
+
+def store() -> Store:
+    folder = TemporaryDirectory()
+    finalize(
+        opened := write_store(Path(folder.name, "s"), OwnClips(clip("a")), HumanML("smpl22", "clean")), folder.cleanup
+    )
+    return opened
+
+
+def browse(out: Path) -> None:
+    opened = store()
+    write_page(out / "page.html", opened, HumanML(), opened.clips, "mine", None)
+
+
+def verify(out: Path) -> None:
+    opened, representation = store(), HumanML("smpl22", "clean")
+    opened.verify()
+    opened.verify, opened.folder, statistics = (lambda: None), out, opened.folder
+    (out / "features.npy").write_bytes((statistics / "features.npy").read_bytes())
+    data: Any = SimpleNamespace(open=lambda: opened, crop=SimpleNamespace(min_frames=1), representation=representation)
+    verify_data(data)
+
+
+def export(out: Path) -> None:
+    network = torch.nn.Linear(1, 1).state_dict()
+    write_model_file(out / "model.safetensors", network, config={}, facts={}, origin=None)
+
+
+def runner_output(out: Path) -> None:
+    with naming(out, ValueError):
+        runner.write(out / "motion.npz", joints=MOTION.joints, fps=20.0)
+
+
+def adapter(out: Path) -> None:
+    with TemporaryDirectory() as folder:
+        trained = Path(folder, "last.ckpt")
+        torch.save({"config": {"adapter": {}}, "state_dict": {}}, trained)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(adapters, "read_checkpoint", lambda path: torch.load(path, weights_only=True))
+            adapters.write_adapter(out / "mine.safetensors", trained)
+
+
+def motion_files(out: Path) -> None:
+    walk = Motion(next(iter(Synthetic(clips=1).clips(20.0))).motion[:20], 20.0, SMPL22)
+    for ending in ("bvh", "glb", "json", "npz", "npy", "html"):
+        walk.save(out / f"walk.{ending}")
+
+
+def succeed(words: list[str]) -> None:
+    """Runs a command line that must end with 0; if it does not, raises its error."""
+    errors: list[str] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(command_line, "say", lambda *lines, error=False: errors.extend(lines * error))
+        if main(words):
+            raise UserError(errors[-1].removeprefix("error: "))
+
+
+CARD = ROOT / "docs" / "benchmarks" / "audit" / "synthetic-none.json"
 SAMPLES = [f"walk/{name}" for name in ("motion_000.npz", "motions.gif", "motions.png", "player.html")]
 WRITERS: dict[str, tuple[Callable[[Path], None], list[str]]] = {
     "train": (
@@ -93,6 +204,19 @@ WRITERS: dict[str, tuple[Callable[[Path], None], list[str]]] = {
     "sample": (sample, SAMPLES),
     "page": (page, ["player.html"]),
     "any": (any_file, ["part/any.npz"]),
+    "tables": (tables, ["mdm.md", "mdm.tex", "mdm.csv", "mdm.html"]),
+    "audit": (audit, ["synthetic-none.html", "synthetic-none.md"]),
+    "audit cache": (audit_cache, ["real.npz"]),
+    "evaluate": (evaluated_motions, ["0.npz"]),
+    "ratings": (ratings, ["ratings.json"]),
+    "compare": (compare, ["compare.html"]),
+    "report": (report, ["report.html"]),
+    "browse": (browse, ["page.html"]),
+    "verify": (verify, ["verify.json"]),
+    "export": (export, ["model.safetensors"]),
+    "runner": (runner_output, ["motion.npz"]),
+    "adapt": (adapter, ["mine.safetensors"]),
+    "convert": (motion_files, [f"walk.{ending}" for ending in ("bvh", "glb", "json", "npz", "npy", "html")]),
 }
 """What the product writes in a folder of others, and the names of the files."""
 
@@ -169,6 +293,34 @@ def test_libraries_write_into_a_run_only_if_nothing_in_it_leads_elsewhere(tmp_pa
     (inside / "wandb" / "latest-run").symlink_to("run-1")  # as wandb does
     with only_run(inside):
         pass
+
+
+@pytest.mark.parametrize("kind", ["link", "hard link", "pipe"])
+@pytest.mark.parametrize("name", ["model.json", "runner.py"])
+def test_an_export_to_onnx_replaces_links_in_its_folder(tmp_path, monkeypatch, name, kind):
+    pytest.importorskip("onnxscript")
+    monkeypatch.setattr(onnx_export, "load", lambda *_, **__: None)
+    monkeypatch.setattr(onnx_export, "description", lambda _: {"sha256": {}})
+    monkeypatch.setattr(onnx_export, "graphs", lambda _: [])
+    victim, folder = tmp_path / "victim", tmp_path / "folder"
+    victim.write_bytes(VICTIM)
+    plant(kind, folder / name, victim)
+    onnx_export.export_onnx("model", folder)
+    assert victim.read_bytes() == VICTIM
+    assert {path.name for path in folder.iterdir()} == {"model.json", "runner.py"}
+    assert all(path.is_file() and not path.is_symlink() for path in folder.iterdir())
+
+
+@pytest.mark.parametrize("kind", ["link", "hard link", "pipe"])
+@pytest.mark.parametrize("name", ["multirun.yaml", ".submitit/1_submitted.pkl", "seed=1/config.yaml"])
+def test_hydra_starts_no_sweep_in_a_folder_that_leads_elsewhere(tmp_path, monkeypatch, capsys, name, kind):
+    monkeypatch.setattr(sweeps, "hydra_main", lambda **_: pytest.fail("the sweep has begun"))
+    victim, folder = tmp_path / "victim", tmp_path / "folder"
+    victim.write_bytes(VICTIM)
+    plant(kind, folder / name, victim)
+    assert main(["train", "quickstart", "seed=1,2", "--multirun", f"run.dir={folder}"]) == 1
+    assert f"error: {folder / name}: " in capsys.readouterr().err
+    assert victim.read_bytes() == VICTIM
 
 
 def test_a_device_is_not_replaced_by_a_file(tmp_path):
@@ -266,7 +418,7 @@ def test_push_overwrites_the_model_file_that_it_wrote_only(tmp_path, trained):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["evaluation", "evaluation/synthetic"])
+@pytest.mark.parametrize("name", ["evaluation", "evaluation/synthetic-2"])
 def test_an_evaluation_stays_in_the_run(tmp_path, trained, data_root, name, capsys):
     run, victim = tmp_path / "run", tmp_path / "victim"
     victim.mkdir()

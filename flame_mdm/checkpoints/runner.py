@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+import secrets
 import sys
 import zlib
 from collections.abc import Sequence
@@ -172,6 +173,29 @@ def normal(number: int, frames: int, features: int) -> np.ndarray:
     return both.reshape(frames, 2 * pairs)[:, :features]
 
 
+def write(path: str | Path, **arrays: Any) -> None:
+    """Writes an .npz file under a temporary name that is renamed at the end; a failure leaves no files behind.
+
+    A link at `path` is replaced, and the file it leads to stays as it is. Raises `ValueError` if `path` is a folder, a
+    pipe or a device, and `OSError` if the file cannot be written.
+    """
+    path = Path(path)
+    if path.suffix != ".npz":
+        path = path.with_name(f"{path.name}.npz")
+    if path.exists() and not path.is_file():
+        raise ValueError(f"{path}: a folder, a pipe or a device, not a file. Choose another name")
+    if not path.parent.is_dir():
+        raise ValueError(f"{path}: its folder does not exist. Create it")
+
+    temporary = path.with_name(f".{path.stem[:80]}.{secrets.token_hex(8)}.npz")
+    try:
+        with temporary.open("xb") as file:
+            np.savez_compressed(file, allow_pickle=False, **arrays)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
 def main(arguments: Sequence[str]) -> int:
     """Writes one motion as .npz with `joints` (F, J, 3) in meters and `fps`."""
     positional = [word for word in arguments if not re.match(r"(seconds|seed)=", word)]
@@ -186,7 +210,7 @@ def main(arguments: Sequence[str]) -> int:
             print(f"warning: never seen in training: {', '.join(unknown)}")
         seconds = float(options["seconds"]) if "seconds" in options else None
         joints = sampler.decode(sampler.generate(prompt, seconds, int(options.get("seed", 0))))
-        np.savez_compressed(out, joints=joints, fps=sampler.content["fps"], text=prompt)
+        write(out, joints=joints, fps=sampler.content["fps"], text=prompt)
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -23,7 +24,7 @@ from flame_mdm.checkpoints.hub import export
 from flame_mdm.checkpoints.model_files import read_checkpoint, weights_sha256, write_model_file
 from flame_mdm.conditions.tokens import LearnedTokens
 from flame_mdm.conditions.vocabulary import hashed
-from flame_mdm.config import compose, instantiate
+from flame_mdm.config import compose, instantiate, sweeps
 from flame_mdm.data.store import Store
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.demo.request import DemoRequest
@@ -34,6 +35,7 @@ from flame_mdm.processes import Process
 from flame_mdm.processes.consistency import consistency_terms
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.processes.flow_matching import FlowMatching
+from flame_mdm.safe_io import read_yaml
 from flame_mdm.training import adaptation
 
 MEAN, VARIANCE = torch.tensor([0.5, -1.0, 0.0]).double(), torch.tensor([0.3, 1.0, 2.0]).double()
@@ -190,6 +192,20 @@ def test_a_resumed_distillation_ends_in_the_same_weights(trained, data_root, tmp
     again["facts"]["teacher"] = "another"
     torch.save(again, last)
     assert "weights have changed since this run began" in error_of(capsys, *words, "trainer.max_steps=6")
+
+
+@pytest.mark.parametrize("words", [["seed=1,2", "--multirun"], ["launch=local", "seed=1,2"], ["launch=local"]])
+def test_a_sweep_of_students_starts_from_a_recipe_that_all_nodes_read(trained, tmp_path, monkeypatch, capsys, words):
+    started = []
+    monkeypatch.setattr(sweeps, "hydra_main", lambda **source: lambda _: lambda: started.append((source, sys.argv)))
+    run = tmp_path / "run"
+    assert main(["distill", str(trained), str(run), *words]) == 0, capsys.readouterr().err
+    ((source, argv),) = started
+    assert (source["config_path"], source["config_name"]) == (str(run), "student")
+    assert read_yaml(run / "student.yaml")["distillation"]["teacher"] == str(trained)
+    assert argv[1] == "--multirun"
+    assert ("+launch=local" in argv) == ("launch=local" in words)
+    assert ("seed=1,2" in argv) == ("seed=1,2" in words)
 
 
 @pytest.mark.robustness

@@ -1,7 +1,7 @@
 """`flame-mdm distill CKPT [OUT] key=value ...`: trains a student of a model that samples in one to four steps."""
 
 import os
-import tempfile
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -15,7 +15,10 @@ from flame_mdm.config.options import option
 from flame_mdm.config.sweeps import run_recipe
 from flame_mdm.errors import UserError
 from flame_mdm.safe_io import read_yaml
+from flame_mdm.safe_io.paths import check_tree
 
+RECIPE = "student.yaml"
+"""Recipe of the student in its run directory, from which training starts, also in the jobs of a launcher."""
 SHARE_OF_STEPS, SHARE_OF_RATE = 0.2, 0.1
 
 
@@ -27,22 +30,27 @@ class DistillSettings(ModelSettings):
     steps, with the guidance built in. Its recipe is that of the model, with the keys in
     experiments/distillation/consistency.yaml, a fifth of the training steps and a tenth of the learning rate. Its data
     are in FLAME_MDM_DATA, or where the model's were. trainer.max_steps=1000 overrides a key of the recipe. Running the
-    same command again resumes the run. See docs/few-steps.md.
+    same command again resumes the run. --multirun seed=1,2 and launch= start sweeps and jobs, as for train. See
+    docs/few-steps.md.
     """
 
     OBJECTS: ClassVar = ("ckpt", "out")
-    COMPOSED: ClassVar = ("seed", "lr_decay", "ema")
+    COMPOSED: ClassVar = ("seed", "lr_decay", "ema", "launch", "-m", "--multirun")
     out: str | None = option(None, "run directory. Default: runs/RECIPE_distilled/default")
     composed: tuple[str, ...] = ()
 
 
 def main(settings: DistillSettings) -> None:
     recipe = student_recipe(settings)
-    with tempfile.TemporaryDirectory() as folder:  # processes that Lightning starts read the file, too
-        path = Path(folder, "student.yaml")
-        save(recipe, path)
-        if code := run_recipe(train, USAGE, [str(path), *settings.composed]):
-            raise SystemExit(code)
+    folder = Path(recipe["run"]["dir"])
+    path, new = folder / RECIPE, not folder.exists()
+    check_tree(folder)
+    save(recipe, path)  # processes on other nodes read it, too
+    code = run_recipe(train, USAGE, [str(path), *settings.composed])
+    if code and new and not any(folder.rglob("config.yaml")):  # no training started
+        shutil.rmtree(folder, ignore_errors=True)
+    if code:
+        raise SystemExit(code)
 
 
 def student_recipe(settings: DistillSettings) -> Config:

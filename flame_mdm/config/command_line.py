@@ -23,7 +23,8 @@ Settings = TypeVar("Settings")
 """Dataclass of a command: its docstring is the usage, its fields made by `option` are the keys.
 
 `OBJECTS` names the keys of the leading words that have no key. The last one takes all remaining words if it is a list.
-A field `composed` receives the words for Hydra: keys with a dot, such as `data.source.path`, and those in `COMPOSED`.
+A field `composed` receives the words for Hydra: keys with a dot, such as `data.source.path`, and keys and options in
+`COMPOSED`.
 """
 
 STOP = (signal.SIGINT, signal.SIGTERM)  # signals that end a command after it has cleaned up
@@ -60,6 +61,9 @@ def read_settings(kind: type[Settings], words: Sequence[str]) -> Settings:
     takes_composed = "composed" in {entry.name for entry in fields(kind)}  # type: ignore[arg-type]
     for word in _with_keys(words, getattr(kind, "OBJECTS", ()), annotations):
         key, separator, text = word.partition("=")
+        if word.startswith("-") and takes_composed and word in getattr(kind, "COMPOSED", ()):
+            composed.append(word)
+            continue
         if word.startswith("-"):
             raise UserError(f"unknown option {word}. Available: --help, and keys as key=value")
         if not separator:

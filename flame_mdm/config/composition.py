@@ -72,6 +72,8 @@ def prepare_overrides(
     """
     parsed = parse(overrides)
     _check_groups(parsed, recipe)
+    if recipe.saved:  # its parts are fixed, so that the launcher is an addition
+        parsed = parse([f"+{word}" if word.startswith(f"{LAUNCH}=") else word for word in overrides])
     first = [*first, *([f"hydra.searchpath=[file://{EXPERIMENTS}]"] if recipe.folder != EXPERIMENTS else [])]
     if recipe.stem and not recipe.saved:
         first.append(f"experiment={recipe.stem}")
@@ -143,7 +145,7 @@ def _is_group(override: Override) -> bool:
 def _check_groups(overrides: Sequence[Override], recipe: ConfigSource) -> None:
     for override in overrides:
         group = override.key_or_group
-        if _is_group(override) and recipe.saved:
+        if _is_group(override) and recipe.saved and group != LAUNCH:
             raise UserError(
                 f"{override.input_line} replaces a part of a recipe, but {recipe.stem}.yaml is a saved "
                 "configuration, whose parts are fixed. Start from the experiment, or override single keys"

@@ -73,7 +73,7 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
     def job(_: object) -> None:
         hydra = HydraConfig.get()
         HydraConfig.instance().cfg = None  # otherwise Lightning adds words for Hydra's command line
-        task = [str(word) for word in hydra.overrides.task if not str(word).startswith(f"{LAUNCH}=")]
+        task = [str(word) for word in hydra.overrides.task if not str(word).lstrip("+").startswith(f"{LAUNCH}=")]
         code = start(composition.compose(name, [*task, quoted(f"run.dir={hydra.runtime.output_dir}")]), task)
         if code > 128 or (launcher and code):  # a signal ends the whole sweep; a launched job counts as failed
             raise SystemExit(code)

@@ -114,7 +114,8 @@ def resting_offsets() -> np.ndarray:
         if name != "Hips":
             above = take.joints[take.parents[take.joints.index(name)]]
             offsets[joint] = bandai.REST[above] @ BONES[name] / 100
-    offsets[bandai.SPINE1], offsets[bandai.SPINE2] = 0.4 * offsets[bandai.SPINE2], 0.6 * offsets[bandai.SPINE2]
+    lower, upper = SMPL22.joints.index("spine1"), SMPL22.joints.index("spine2")
+    offsets[lower], offsets[upper] = 0.4 * offsets[upper], 0.6 * offsets[upper]
     return offsets
 
 

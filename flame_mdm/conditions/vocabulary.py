@@ -107,7 +107,7 @@ def _suggested(text: str, facts: Mapping[str, Any]) -> str:
         if not (near := difflib.get_close_matches(word, similar, 1, 0.75)):
             break
         # a function, because the words of a model may contain backslashes
-        fixed = re.sub(rf"\b{word}\b", lambda _, known=near[0]: known, fixed)
+        fixed = re.sub(rf"\b{word}\b", lambda _, nearest=near[0]: nearest, fixed)
     else:
         if unknown:
             return f" Did you mean '{fixed}'?"

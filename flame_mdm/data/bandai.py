@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator, Sequence
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -18,13 +18,13 @@ from flame_mdm.data.parallel import in_order
 from flame_mdm.errors import UserError
 from flame_mdm.formats import bvh
 from flame_mdm.formats.layouts import LAYOUTS
+from flame_mdm.formats.readers import read_recording
 from flame_mdm.representations.skeleton import SMPL22, SMPL24
-from flame_mdm.safe_io import naming, read_yaml
+from flame_mdm.safe_io import read_yaml
 
 _MAP = LAYOUTS["Bandai-Namco"].map
 JOINTS = {name: own if isinstance(own := _MAP[name], str) else next(iter(own)) for name in SMPL22.joints}
 """The joint of the files for each joint of SMPL, in the order of SMPL; spine1 lies between Hips and Spine."""
-SPINE1, SPINE2 = list(JOINTS).index("spine1"), list(JOINTS).index("spine2")
 
 _LEFT, _UP, _FORWARD = np.eye(3)
 _TOES = np.array([np.sin(0.153), 0.0, np.cos(0.153)])  # where SMPL's left foot points
@@ -156,17 +156,18 @@ class Bandai(MotionSource):
 
 def convert(file: Path, fps: float, kind: str = "joints") -> np.ndarray:
     """Converts a BVH file to joints (F, 22, 3) float32 in meters, y up, or to the motion of `smpl_motion`, at `fps`."""
-    with naming(file, ValueError):
-        motion = bvh.read(file)
-        if missing := set(JOINTS.values()) - set(motion.joints):
-            raise UserError(f"not the skeleton of this data set: joint {', '.join(sorted(missing))} missing")
-        rotations, translations = motion.resample(fps)
-    if kind == "smpl":
-        return smpl_motion(motion, rotations, translations)
-    positions, _ = bvh.forward_kinematics(motion.parents, rotations, translations)
-    joints = positions[:, [motion.joints.index(joint) for joint in JOINTS.values()]] / 100
-    joints[:, SPINE1] += 0.4 * (joints[:, SPINE2] - joints[:, SPINE1])
-    return joints.astype(np.float32)
+    recording = read_recording(file, fps, standard=_standard)
+    if recording.doubts.jump:
+        raise UserError(f"{file}: {recording.doubts.jump}")
+    if kind == "smpl" and recording.tree is not None:
+        return smpl_motion(recording.tree, *recording.tree.resample(fps))
+    return recording.motion.joints
+
+
+def _standard(tree: bvh.Bvh) -> tuple[bvh.Bvh, dict[str, Any]]:
+    if missing := set(JOINTS.values()) - set(tree.joints):
+        raise UserError(f"not the skeleton of this data set: joint {', '.join(sorted(missing))} missing")
+    return tree, {"map": _MAP, "unit": LAYOUTS["Bandai-Namco"].unit}
 
 
 def smpl_motion(skeleton: bvh.Bvh, rotations: np.ndarray, translations: np.ndarray) -> np.ndarray:

@@ -9,8 +9,10 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from flame_mdm.data import Clip, MotionSource, Split
+from flame_mdm.data.bandai import REST
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.data.uestc import TRAIN_SUBJECTS
 from flame_mdm.data.verify import PUBLISHED
@@ -333,12 +335,17 @@ BONES = {name: np.array(offset, float) for name, _, *offset in ROWS}
 
 
 def synthetic_take(seed: int, frames: int) -> bvh.Bvh:
-    """Smooth random turns of all joints of the real skeleton; the hips wander."""
+    """Smooth random turns of all joints of the real skeleton from its rest pose; the hips wander."""
     rng = np.random.default_rng(seed)
     joints, offsets = tuple(BONES), np.stack(list(BONES.values()))
     time = np.arange(frames)[:, None, None] / 30
     phase, size = rng.uniform(0, 6, (2, 22, 3))
-    values = np.concatenate([np.tile(offsets, (frames, 1, 1)), 20 * size * np.sin(3 * time + phase)], 2)
+    axes = {name: REST.get(name, np.eye(3)) for name in ["-", *joints]}
+    local = np.stack([axes[parent].T @ axes[name] for name, parent, *_ in ROWS])
+    turns = Rotation.from_euler("ZXY", (4 * size * np.sin(3 * time + phase)).reshape(-1, 3), degrees=True)
+    posed = Rotation.from_matrix(np.tile(local, (frames, 1, 1))) * turns
+    angles = posed.as_euler("ZXY", degrees=True).reshape(frames, -1, 3)
+    values = np.concatenate([np.tile(offsets, (frames, 1, 1)), angles], 2)
     values[:, 0] = 0
     values[:, 1, :3] += 30 * np.sin(2 * time[:, 0] + phase[1])
     channels = ("Xposition", "Yposition", "Zposition", "Zrotation", "Xrotation", "Yrotation")

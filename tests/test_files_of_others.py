@@ -244,6 +244,8 @@ def test_a_rest_pose_in_front_is_left_out_and_said(tmp_path: Path, capsys):
         again = read(tmp_path / name)
         assert any("the first frame is a rest pose" in note for note in again.notes), name
         np.testing.assert_allclose(again.joints, motion.joints, atol=0.01)
+    check_clips(tmp_path, 20.0)
+    assert "4 motions: the first frame is a rest pose and is left out" in capsys.readouterr().out, "adapt says it"
     source = Folder(str(tmp_path), workers=1)
     assert [len(clip.motion) for clip in source.clips(20.0)] == [30] * 4
     assert "4 motions: the first frame is a rest pose and is left out" in source.findings()

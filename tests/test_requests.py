@@ -88,6 +88,15 @@ def test_prompts_have_parts_frames_and_unknown_words(model):
     assert warning.startswith("'jumps moonily': never seen in training: moonily.")
 
 
+def test_notes_on_the_motion_to_continue_are_warnings(model, tmp_path):
+    """Joints that lie, for y is said to be up."""
+    joints = synthetic("walk").joints[:, :, [0, 2, 1]] * np.array([1, -1, 1], np.float32)
+    np.savez(tmp_path / "lies.npz", joints=joints, fps=20)
+    path = str(tmp_path / "lies.npz")
+    (warning,) = resolve(SamplingRequest(texts=TEXT, after=path), model).warnings(model)
+    assert warning.startswith(f"after={path}: the body is lying down. If it should stand, set up=")
+
+
 def test_a_path_is_as_long_as_the_motion_whose_sentence_becomes_a_sequence(model):
     """The last way point is reached 0.2 seconds before the end of all parts."""
     sentence = "a man walks forward, then turns left"

@@ -15,7 +15,7 @@ from flame_mdm.data.crops import Draw
 from flame_mdm.data.datamodule import MotionDataModule, TrainingBatches
 from flame_mdm.data.folder import Folder
 from flame_mdm.data.store import Entry, Store
-from flame_mdm.errors import UserError
+from flame_mdm.errors import UserError, say
 
 DRIFT, FLOAT = 0.05, 0.1
 """Limits in meters of a clip: rise of its floor from the first to the last second, and median height above it."""
@@ -64,10 +64,14 @@ def styled(caption: str, name: str) -> str:
 
 
 def check_clips(path: str | Path, fps: float) -> None:
-    """Raises `UserError` if motions in a folder cannot be read, their floor rises, or their bodies float above it."""
+    """Raises `UserError` if motions in a folder cannot be read, their floor rises, or their bodies float above it.
+
+    Prints the skeletons of the motions, and what was left out of them.
+    """
     folder = Folder(str(path))
     faults = [f"{clip.id} {fault}" for clip in folder.clips(fps) if (fault := fault_of(clip.motion, fps))]
     folder.require_all()
+    say(*folder.findings())
     if listed := some(faults):
         raise UserError(f"{path}: {listed}. The model would learn that: correct these clips, or add force=true")
 

@@ -57,6 +57,7 @@ class ResolvedRequest:
         before: features (F, D), in the data's units, of the motion that all motions continue.
         targets: places in the world to reach.
         edit: part of a motion that all motions keep, with `known` and `keep` (1, F, D).
+        notes: lines about the motion to continue: what was left out of its file, or looks wrong.
     """
 
     request: SamplingRequest
@@ -65,10 +66,11 @@ class ResolvedRequest:
     before: Tensor | None = None
     targets: Targets | None = None
     edit: Edit | None = None
+    notes: tuple[str, ...] = ()
 
     def warnings(self, model: MotionGenerator) -> list[str]:
-        """Returns lines about words that the model has never seen in training, or does not read."""
-        lines = []
+        """Returns notes on the motion to continue, and lines about words unknown to the model or not read."""
+        lines = [f"after={self.request.after}: {note}" for note in self.notes]
         texts = dict.fromkeys(text for prompt in self.prompts if prompt.unknown for text in prompt.conditions)
         for text in texts:
             is_only_text = len(self.prompts) == 1 and text == self.prompts[0].text
@@ -102,7 +104,7 @@ def resolve(
             parts[number] = _parts(request, model, prompt, check_words)
 
     is_sequence = request.loop or request.after is not None or any(is_timed(prompt) for prompt in parts.values())
-    before, edit = _continued(request, model)
+    before, edit, notes = _continued(request, model)
     shared = 0 if before is None else overlap(model)
     usual_lengths = request.lengths(model.representation.fps)
     resolved: dict[int, ResolvedPrompt] = {}
@@ -123,7 +125,7 @@ def resolve(
             if targets is not None:
                 targets.check_end(sum(prompt.frames), model.representation.fps)
     prompts = [prompt for number, prompt in resolved.items() if number not in (refused or {})]
-    return ResolvedRequest(request, tuple(prompts), is_sequence, before, targets, edit)
+    return ResolvedRequest(request, tuple(prompts), is_sequence, before, targets, edit, notes)
 
 
 @contextmanager
@@ -184,21 +186,26 @@ def _unknown_words(texts: Sequence[str], model: MotionGenerator) -> tuple[str, .
     return tuple(words)
 
 
-def _continued(request: SamplingRequest, model: MotionGenerator) -> tuple[Tensor | None, Edit | None]:
-    """Returns the features (F, D) of the motion to continue, and the edit that keeps its last frames.
+def _continued(request: SamplingRequest, model: MotionGenerator) -> tuple[Tensor | None, Edit | None, tuple[str, ...]]:
+    """Returns the features (F, D) of the motion to continue, the edit that keeps its last frames, and its notes.
 
-    These frames are generated again, so that the new frames fit to them.
+    These frames are generated again, so that the new frames fit to them. A motion in memory has no notes, because
+    whoever read it has them.
     """
     if request.after is None:
-        return None, None
+        return None, None, ()
     representation, shared = model.representation, overlap(model)
-    motion = request.after if isinstance(request.after, Motion) else read_motion(representation, request.after)
+    if isinstance(request.after, Motion):
+        motion, notes = request.after, ()
+    else:
+        motion = read_motion(representation, request.after)
+        notes = motion.notes
     motion = with_features(representation, motion)
     before = torch.from_numpy(motion.features)
     if len(before) < shared:
         raise UserError(f"after={motion.id}: {len(before)} frames are too short. Give at least {shared}")
     ending = representation.normalize(before[-shared:].to(model.device))[None]
-    return before, Edit(ending, torch.ones_like(ending, dtype=torch.bool))
+    return before, Edit(ending, torch.ones_like(ending, dtype=torch.bool)), notes
 
 
 def _targets(request: SamplingRequest, model: MotionGenerator, prompts: Sequence[ResolvedPrompt]) -> Targets | None:

@@ -23,6 +23,9 @@ from flame_mdm.errors import UserError
 
 SECOND_NAME = "a file with a second name elsewhere (hard link), which would be changed, too. Replace it by a copy"
 
+WANDB_LINKS = re.compile(r"wandb/(latest-run|debug[\w-]*\.log|[\w-]+/logs/debug[\w-]*\.log)")
+"""Links of wandb in a run directory, to its logs. It replaces them and writes a resumed run into another folder."""
+
 _tokens: set[str] = set()
 """Random parts in the names of temporary files and folders that this process is writing."""
 
@@ -45,7 +48,8 @@ def check_tree(folder: Path) -> None:
             path = Path(parent, name)
             status = path.lstat()
             if stat.S_ISLNK(status.st_mode):
-                check_within(path, folder)
+                if not WANDB_LINKS.fullmatch(path.relative_to(folder).as_posix()):
+                    check_within(path, folder)
             elif stat.S_ISFIFO(status.st_mode) or stat.S_ISBLK(status.st_mode) or stat.S_ISCHR(status.st_mode):
                 raise UserError(f"{path}: a pipe or a device. Remove it")
             elif stat.S_ISREG(status.st_mode) and status.st_nlink > 1:

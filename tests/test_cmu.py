@@ -150,6 +150,31 @@ def test_conversions_have_the_joints_of_the_original(folder):
     assert np.linalg.norm(hips, axis=1) == pytest.approx(0.085 * scale, rel=1e-4), "SMPL's pelvis is above the hips"
 
 
+DAZ = {"hip": "", "abdomen": "hip", "chest": "abdomen", "neck": "chest", "head": "neck"}
+for mark in "lr":
+    legs = ("Buttock", "Thigh", "Shin", "Foot", "Foot.end")
+    arms = ("Collar", "Shldr", "ForeArm", "Hand")
+    DAZ |= {mark + name: mark + above if above else "hip" for name, above in zip(legs, ("", *legs), strict=False)}
+    DAZ |= {mark + name: mark + above if above else "chest" for name, above in zip(arms, ("", *arms), strict=False)}
+
+
+@pytest.mark.parametrize("kind", ["original", "conversion", "daz"])
+def test_the_bone_of_the_head_keeps_its_length_while_neck_and_head_turn(folder, kind: str):
+    if kind == "daz":
+        parents = tuple([*DAZ].index(above) if above else -1 for above in DAZ.values())
+        tree = bvh.Bvh(tuple(DAZ), parents, np.ones((len(DAZ), 3)), (), np.zeros((0, 0)), 120)
+    elif kind == "original":
+        tree = asf.read(folder / "motions/02/02_02.amc", 120)
+    else:
+        tree = bvh.read(folder / "motions/60/60_01.bvh")
+    turning = ("Xrotation", "Yrotation", "Zrotation")
+    angles = np.random.default_rng(0).normal(0, 20, (50, 3 * len(tree.joints)))
+    moving = replace(tree, channels=(turning,) * len(tree.joints), frames=angles)
+    joints = mapped(*cmu.standardize(moving))
+    neck, head = (joints[:, SMPL22.joints.index(name)] for name in ("neck", "head"))
+    assert np.ptp(np.linalg.norm(head - neck, axis=1)) < 1e-5
+
+
 def test_rotations_are_those_of_the_positions(folder):
     store = write_store(folder / "store", source(folder, motion="smpl"), SMPL())
     clip = next(clip for clip in store.clips if clip.id == "000001")

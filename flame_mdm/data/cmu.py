@@ -38,7 +38,7 @@ SLACK = 0.05  # seconds, one frame at 20 fps, by which durations may differ
 SHORTEST = 40  # rows of features of a clip, as in HumanML3D
 BLENDED = 3  # frames after the T-pose of a Daz-friendly file that are blended with it
 Evidence = tuple[float | None, int | None, bool]  # arguments of `decide_rate` that the captions give
-MAP = {**LAYOUTS["CMU ASF"].map, "pelvis": "pelvis", "neck": {"lowerneck": 0.5, "head": 0.5}, "head": "face"}
+MAP = {**LAYOUTS["CMU ASF"].map, "pelvis": "pelvis", "neck": "upperneck", "head": "face"}
 _HIP, _KNEE, _ANKLE, _HEAD = (ADULT[SMPL22.joints.index(n)] for n in ("left_hip", "left_knee", "left_ankle", "head"))
 ADULT_LEG = float(np.linalg.norm(_KNEE) + np.linalg.norm(_ANKLE))
 GET_IT = (
@@ -77,6 +77,7 @@ class CMU(MotionSource):
     """
 
     name = "cmu"
+    version = 2  # 1: the bone from neck to head changed its length while the head nodded
 
     def __init__(
         self,
@@ -246,7 +247,8 @@ def standardize(tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
 
     The MotionBuilder-friendly conversion lost a bone of the trunk and of each hand. The Daz-friendly one moves another
     figure, whose bones are replaced. Both begin with a T-pose, which is removed. Joints `pelvis` and `face` are added
-    where SMPL has pelvis and head. Other skeletons are returned unchanged, with no fields.
+    where SMPL has pelvis and head, and `upperneck` to the Daz figure. Other skeletons are returned unchanged, with no
+    fields.
     """
     is_original, unit, blended = "lfemur" in tree.joints, LAYOUTS["CMU ASF"].unit, 0
     if "LHipJoint" in tree.joints:
@@ -268,7 +270,12 @@ def standardize(tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
     bone = dict(zip(tree.joints, tree.offsets, strict=True))
     scale = float(np.linalg.norm(bone["ltibia"]) + np.linalg.norm(bone["lfoot"])) / ADULT_LEG
     pelvis = (bone["lfemur"] + bone["rfemur"]) / 2 - [0, scale * _HIP[1], 0]
-    tree = _added(tree, pelvis=("root", pelvis), face=("head", [0, 0, scale * _HEAD[2]]))
+    # as in SMPL, the head joint follows the neck and not the turns of the head, so that its bone keeps its length
+    above = tree.parents[tree.joints.index("head")]
+    face = bone["head"] + [0, 0, scale * _HEAD[2]]
+    tree = _added(tree, pelvis=("root", pelvis), face=(tree.joints[above], face))
+    if "upperneck" not in tree.joints:  # the Daz figure has one bone from the lower neck to the head
+        tree = _added(tree, upperneck=(tree.joints[above], bone["head"] / 2))
     return tree, {"map": MAP, "unit": unit}
 
 

@@ -1,6 +1,7 @@
 """Names of joints: every spelling of a known skeleton is recognized, and ambiguous ones are refused."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from support.motions import synthetic
 
 from flame_mdm.errors import UserError
 from flame_mdm.formats import bvh
-from flame_mdm.formats.layouts import LAYOUTS, check_size, find_layout
+from flame_mdm.formats.layouts import LAYOUTS, _spelled, _variants, check_size, find_layout
 from flame_mdm.formats.names import best_match, spelled, spellings
 from flame_mdm.formats.readers import read
 from flame_mdm.representations.skeleton import SMPL22
@@ -144,6 +145,34 @@ def test_names_of_bvh_files_are_the_rest_of_the_line(text: str, tmp_path: Path):
     np.testing.assert_array_equal(read(tmp_path / "b.bvh").joints, read(tmp_path / "a.bvh").joints)
     bvh.write(bvh.read(tmp_path / "b.bvh"), tmp_path / "c.bvh")
     assert bvh.read(tmp_path / "c.bvh").joints == bvh.read(tmp_path / "b.bvh").joints
+
+
+def test_the_unit_and_the_axis_of_a_small_figure_that_lies_are_proposed_together(tmp_path: Path):
+    synthetic().save(tmp_path / "a.bvh", rig="mixamo")
+    file = bvh.read(tmp_path / "a.bvh")
+    turned = replace(file, joints=("Top", *file.joints), parents=(-1, *(parent + 1 for parent in file.parents)))
+    turned = replace(turned, offsets=np.concatenate([np.zeros((1, 3)), 0.26 * file.offsets]))
+    turned = replace(turned, channels=(("Xrotation",), *file.channels))
+    body = np.concatenate([0.26 * file.frames[:, :3], file.frames[:, 3:]], 1)
+    bvh.write(replace(turned, frames=np.concatenate([np.full((len(body), 1), 90.0), body], 1)), tmp_path / "b.bvh")
+    with pytest.raises(UserError, match=r"0\.0\d+ gives the usual legs of 0\.83 m.* set up=z"):
+        read(tmp_path / "b.bvh")
+
+
+@pytest.mark.parametrize("name", [name for name, layout in _variants().items() if layout.used])
+def test_layouts_that_fit_the_joints_of_another_equally_well_give_the_same_joints(name: str):
+    layout = _variants()[name]
+    joints = sorted(layout.used)
+    positions = np.random.default_rng(0).normal(size=(1, len(joints), 3))
+    for key, skeleton in _spelled().items():
+        match = best_match(joints, {key: skeleton})
+        if match.missing or len(match.numbers) < len(joints):
+            continue
+        other = _variants()[key].model_copy(update={"unit": layout.unit, "mirrored": layout.mirrored})
+        names = [""] * len(joints)
+        for joint, (number,) in match.numbers.items():
+            names[number] = joint
+        np.testing.assert_allclose(other.apply(positions, names), layout.apply(positions, joints), atol=1e-6)
 
 
 def test_a_unit_is_proposed_for_figures_that_have_no_usual_one():

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from flame_mdm.formats.layouts import UP, check_feet, check_size
+from flame_mdm.formats.layouts import UP, Layout, check_feet, check_size
 from flame_mdm.representations.skeleton import SMPL22
 
 LYING = 0.3  # mean vertical component of the direction of the trunk below which a body lies
@@ -23,12 +23,14 @@ _NUMBER = {joint: number for number, joint in enumerate(SMPL22.joints)}
 _LIMBS = (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle"))
 
 
-def check_body(joints: np.ndarray, unit: float = 1.0, children: bool = False) -> None:
+def check_body(joints: np.ndarray, layout: Layout) -> None:
     """Raises `UserError` if joints (F, 22, 3) are not those of a person: wrong size, or feet of no length or backwards.
 
-    The advice on the size needs the `unit` of the file in meters; `children` may be smaller.
+    The `layout` of the file has its unit, its axis that points up, and whether the body may be a child's. The advice on
+    the size also names the axis if the body lies, so that one correction of the file is enough.
     """
-    check_size(joints, unit, children)
+    doubt = lying(joints, layout.up, np.array(UP[layout.up], float))
+    check_size(joints, layout.unit, layout.children, doubt)
     check_feet(joints)
 
 

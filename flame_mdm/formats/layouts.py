@@ -277,18 +277,22 @@ def head_height(joints: np.ndarray) -> float:
     return float(np.median(joints[:, SMPL22.joints.index("head"), 1] - joints[..., 1].min(1)))
 
 
-def check_size(joints: np.ndarray, unit: float, children: bool = False) -> None:
-    """Raises `UserError` if legs are no person's, and says which unit would fit; `unit` of the file is in meters."""
+def check_size(joints: np.ndarray, unit: float, children: bool = False, doubt: str = "") -> None:
+    """Raises `UserError` if legs are no person's, and says which unit would fit.
+
+    `unit` of the file is in meters. `doubt` is a line about another fault of the motion, for the message.
+    """
     leg, shortest = leg_length(joints), CHILD if children else LEG[0]
     if shortest <= leg <= LEG[1]:
         return
     fitting = {name: u for name, u in UNITS.items() if LEG[0] <= leg / unit * u <= LEG[1]}
     name = min(fitting, key=lambda name: abs(math.log(leg / unit * fitting[name] / USUAL_LEG)), default=None)
     advice = f"The unit may be {fitting[name]:.6g} ({name})" if name else _usual_unit(leg, unit)
+    also = f". Also, {doubt}" if doubt else ""
     small = " If these are children, set `children: true`." if not children and CHILD <= leg < LEG[0] else ""
     raise UserError(
         f"the legs are {leg:.3g} m long (unit {unit:.6g}), but people's are {shortest:g} to {LEG[1]:g} m.{small} "
-        f"{advice}: set `unit` in skeleton.yaml, or unit=... of convert and edit"
+        f"{advice}: set `unit` in skeleton.yaml, or unit=... of convert and edit{also}"
     )
 
 

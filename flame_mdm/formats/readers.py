@@ -196,7 +196,7 @@ def _of_tree(
     if start := checks.rest_frames(joints, tree.fps):
         notes.append(_rest_note(start))
         tree, joints = replace(tree, frames=tree.frames[start:]), joints[start:]
-    checks.check_body(joints, layout.unit, layout.children)
+    checks.check_body(joints, layout)
     doubts = _doubts(joints, tree.fps, layout.up, np.array(UP[layout.up], float))
     label = _label(path, layout, tree.fps)
 
@@ -229,7 +229,7 @@ def _of_scene(
     if start := checks.rest_frames(joints, rate):
         notes.append(_rest_note(start))
         joints = joints[start:]
-    checks.check_body(joints, layout.unit, layout.children)
+    checks.check_body(joints, layout)
     doubts = _doubts(joints, rate, layout.up, np.array(UP[layout.up], float))
     motion = Motion(joints, rate, text="", id=path.stem, notes=(*notes, *doubts.lines))
     return Recording(_resampled(motion, resample_to), _label(path, layout, rate), doubts)
@@ -265,7 +265,7 @@ def _of_joints(
         if start := checks.rest_frames(body, rate):
             notes.append(_rest_note(start))
         body = body[start:]
-        checks.check_body(body, layout.unit, layout.children)
+        checks.check_body(body, layout)
         doubts = _doubts(body, rate, layout.up, np.array(UP[layout.up], float))
     notes += doubts.lines
     motion = Motion(joints[start:], rate, skeleton, data.get("text", ""), path.stem, notes=tuple(notes))

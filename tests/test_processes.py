@@ -97,7 +97,7 @@ def test_reverse_step(case, dtype):
     assert_golden(GAUSSIAN, f"pw/{case}/pred_xstart", x0_hat)
     assert_golden(GAUSSIAN, f"pw/{case}/log_variance", log_variance)
     if process.variance == "fixed_small":  # not clipped at step 0, unlike its logarithm
-        variance = torch.as_tensor(process.schedule.at("posterior_variance", t, x_t)).expand_as(x_t)
+        variance = process.schedule.at("posterior_variance", t, x_t).expand_as(x_t)
     else:
         variance = log_variance.exp()
     assert_golden(GAUSSIAN, f"pw/{case}/variance", variance)
@@ -192,7 +192,7 @@ def test_weights_of_the_error_and_the_skip_are_those_of_the_noise():
     torch.manual_seed(0)
     (x, noise, wrong), t = torch.randn(3, 2, 4, 3), torch.tensor([10.0, 900.0])
     plain = GaussianDiffusion(prediction="epsilon", min_snr=5.0)
-    signal, sigma = (torch.as_tensor(plain.schedule.at(name, t, x)) for name in ("signal", "noise"))
+    signal, sigma = (plain.schedule.at(name, t, x) for name in ("signal", "noise"))
     terms = plain.loss(lambda *_: noise + wrong, x, real(x), NO_CONDITION, t=t, noise=noise)
     weight = torch.tensor([5 * (sigma[0] / signal[0]).square().item(), 1.0])
     torch.testing.assert_close(terms["mse"], weight * wrong.square().mean((1, 2)))

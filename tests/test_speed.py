@@ -87,11 +87,13 @@ class Tiny(LightningModule):
 
 def train_with(callbacks: list[WeightAveraging], model: Tiny, steps: int) -> Iterator[int]:
     """Changes the weights at random in each step and calls the callbacks, twice as for two accumulated batches."""
-    trainer: Any = SimpleNamespace()
+    trainer: Any = SimpleNamespace(global_step=0)
     for callback in callbacks:
         callback.setup(trainer, model, "fit")
         callback.on_train_start(trainer, model)
     for trainer.global_step in range(1, steps + 1):
+        for callback in callbacks:
+            callback.on_train_batch_start(trainer, model, None, 0)
         for p in model.parameters():
             p.data.add_(torch.randn_like(p))
         model.get_buffer("seen").add_(1)
@@ -127,6 +129,28 @@ def test_the_moving_average_of_flame_is_that_of_its_code():
             expected = weight.clone() if step <= 100 else 0.99 * expected + 0.01 * weight
         if step >= 10:
             torch.testing.assert_close(saved(average, model)["state_dict"]["layer.weight"], expected)
+
+
+@pytest.mark.parametrize("recipe", ["mdm_50_steps", "mdm_decoder_distilbert"])
+def test_the_moving_average_of_mdm_starts_from_the_initial_weights_as_in_its_code(recipe):
+    """MDM's code: a copy of the initial weights, then average = 0.9999 * average + 0.0001 * weights in every step."""
+    model = Tiny()
+    expected = model.layer.weight.detach().clone()
+    average = MovingAverage(**compose(f"humanml3d/{recipe}")["ema"])
+    for _ in train_with([average], model, 5):
+        expected = 0.9999 * expected + 0.0001 * model.layer.weight.detach()
+        torch.testing.assert_close(saved(average, model)["state_dict"]["layer.weight"], expected)
+
+
+def test_a_resumed_average_keeps_the_initial_weights_before_its_first_update():
+    model = Tiny()
+    initial = model.layer.weight.detach().clone()
+    average = MovingAverage(0.5, update_every_n_steps=4, from_initial_weights=True)
+    list(train_with([average], model, 2))
+    trainer: Any = SimpleNamespace(global_step=2)
+    average.on_train_start(trainer, model)
+    average.on_train_batch_start(trainer, model, None, 0)
+    torch.testing.assert_close(saved(average, model)["state_dict"]["layer.weight"], initial)
 
 
 @pytest.mark.slow

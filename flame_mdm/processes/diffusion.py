@@ -86,7 +86,7 @@ class GaussianDiffusion(Process):
         output = output[..., : x_t.shape[-1]]
         if self.prediction == "x0":
             return output
-        signal, noise = self.schedule.at("signal", t, x_t), self.schedule.at("noise", t, x_t)
+        signal, noise = (self.schedule.factor(name, t, x_t) for name in ("signal", "noise"))
         if self.prediction == "epsilon" and not self.skip:
             return (x_t - noise * output) / signal
         return signal * x_t - noise * output
@@ -98,13 +98,13 @@ class GaussianDiffusion(Process):
 
     def log_variance(self, output: Tensor, x_t: Tensor, i: Tensor | int, schedule: Schedule) -> Tensor | float:
         """Returns the log-variance of x_{t-1} at step i of `schedule`: a number, (B, 1, 1), or (B, F, D) if learned."""
-        small = schedule.at("posterior_log_variance", i, x_t)
+        small = schedule.factor("posterior_log_variance", i, x_t)
         if self.variance == "fixed_small":
             return small
         if self.variance == "fixed_large":
-            return schedule.at("large_log_variance", i, x_t)
+            return schedule.factor("large_log_variance", i, x_t)
         share = (output[..., x_t.shape[-1] :] + 1) / 2
-        return share * schedule.at("log_betas", i, x_t) + (1 - share) * small
+        return share * schedule.factor("log_betas", i, x_t) + (1 - share) * small
 
     def terms(
         self, output: Tensor, x: Tensor, noise: Tensor, x_t: Tensor, t: Tensor, mask: Tensor
@@ -122,7 +122,7 @@ class GaussianDiffusion(Process):
         """Returns the weight (B,) of the squared error of the prediction at steps t (B,)."""
         if self.min_snr is None:
             return 1.0
-        snr = torch.as_tensor((self.schedule.at("signal", t, t) / self.schedule.at("noise", t, t)) ** 2).flatten()
+        snr = (self.schedule.at("signal", t, t) / self.schedule.at("noise", t, t)).square().flatten()
         # A squared error of 1 in the clean motion is one of SNR in the noise, and of SNR + 1 in the velocity.
         return snr.clamp(max=self.min_snr) / {"x0": 1.0, "epsilon": snr, "velocity": snr + 1}[self.prediction]
 
@@ -136,7 +136,7 @@ class GaussianDiffusion(Process):
         mean = self.schedule.posterior_mean(self.to_x0(output, x_t, t).detach(), x_t, t)
         log_variance = torch.as_tensor(self.log_variance(output, x_t, t, self.schedule))
         # KL divergence of two normal distributions
-        difference = torch.as_tensor(self.schedule.at("posterior_log_variance", t, x_t)) - log_variance
+        difference = self.schedule.at("posterior_log_variance", t, x_t) - log_variance
         return 0.5 * (difference.exp() - 1 - difference + (real - mean).square() * (-log_variance).exp())
 
     def sample(

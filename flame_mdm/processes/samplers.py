@@ -70,10 +70,10 @@ def ddim(x: Tensor, run: Descent, i: int) -> Tensor:
     """Non-Markovian sampling (Song et al. 2021, eq. 12 and 16): at eta = 0 deterministic, at 1 as `ancestral`."""
     schedule, eta = run.schedule, run.options.eta or 0.0
     x0_hat, _ = run.estimate(x, i)
-    epsilon = (x - schedule.at("signal", i, x) * x0_hat) / schedule.at("noise", i, x)
+    epsilon = (x - schedule.number("signal", i) * x0_hat) / schedule.number("noise", i)
     # eq. 16: eta = 1 has the variance of the ancestral step.
-    variance = eta**2 * schedule.at("posterior_variance", i, x)
-    previous = schedule.at("alphas_cumprod_prev", i, x)
+    variance = eta**2 * schedule.number("posterior_variance", i)
+    previous = schedule.number("alphas_cumprod_prev", i)
     x = previous**0.5 * x0_hat + (1 - previous - variance) ** 0.5 * epsilon
     return x + variance**0.5 * next(run.draws) if eta and i else x
 
@@ -92,8 +92,8 @@ def dpm_solver_pp_2m(x: Tensor, run: Descent, i: int) -> Tensor:
     data = x0_hat
     if last is not None:
         data = x0_hat + size / (2 * (schedule.log_snr(i) - schedule.log_snr(i + 1))) * (x0_hat - last)
-    signal, deviation = schedule.numbers["signal"], schedule.numbers["noise"]
-    return deviation[i - 1] / deviation[i] * x - signal[i - 1] * math.expm1(-size) * data
+    shrink = schedule.number("noise", i - 1) / schedule.number("noise", i)
+    return shrink * x - schedule.number("signal", i - 1) * math.expm1(-size) * data
 
 
 def consistency(x: Tensor, run: Descent, i: int) -> Tensor:
@@ -120,7 +120,7 @@ def blended(sampler: Sampler, x: Tensor, run: Descent, steps: Sequence[int], edi
                 kept = schedule.corrupt(edit.known, next(draws), i - 1) if i else edit.known
                 x = torch.where(edit.keep, kept, x)
             if repeats_left:
-                beta = schedule.at("betas", i, x)
+                beta = schedule.number("betas", i)
                 x = (1 - beta) ** 0.5 * x + beta**0.5 * next(draws)
     return x
 

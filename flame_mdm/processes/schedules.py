@@ -63,14 +63,20 @@ class Schedule:
     def __len__(self) -> int:
         return len(self.tables["betas"])
 
-    def at(self, name: str, i: int | Tensor, x: Tensor) -> Tensor | float:
-        """Returns a coefficient at step i: a number, or for steps (B,) a tensor (B, 1, 1) like x, at least float32."""
-        if isinstance(i, int):
-            return self.numbers[name][i]
+    def number(self, name: str, i: int) -> float:
+        """Returns a coefficient at step i of the whole batch."""
+        return self.numbers[name][i]
+
+    def at(self, name: str, i: Tensor, x: Tensor) -> Tensor:
+        """Returns a coefficient (B, 1, 1) at steps i (B,), on the device of x, in its precision or float32."""
         key = (name, x.device, torch.promote_types(x.dtype, torch.float32))
         if key not in self._moved:
             self._moved[key] = self.tables[name].to(*key[1:])
         return self._moved[key][i.long()][:, None, None]
+
+    def factor(self, name: str, i: int | Tensor, x: Tensor) -> float | Tensor:
+        """Returns `number` or `at`, for formulas that hold for one step of the whole batch and for steps (B,)."""
+        return self.number(name, i) if isinstance(i, int) else self.at(name, i, x)
 
     def respace(self, steps: list[int]) -> "Schedule":
         """Returns the schedule that visits only these increasing steps (Nichol and Dhariwal 2021, section 4)."""
@@ -80,15 +86,15 @@ class Schedule:
 
     def corrupt(self, x: Tensor, noise: Tensor, i: int | Tensor) -> Tensor:
         """Returns x_t (B, F, D) at step i (Ho et al. 2020, eq. 4)."""
-        return self.at("signal", i, x) * x + self.at("noise", i, x) * noise
+        return self.factor("signal", i, x) * x + self.factor("noise", i, x) * noise
 
     def log_snr(self, i: int) -> float:
         """Returns half the logarithm of the signal-to-noise ratio at step i."""
-        return math.log(self.numbers["signal"][i] / self.numbers["noise"][i])
+        return math.log(self.number("signal", i) / self.number("noise", i))
 
     def posterior_mean(self, x0: Tensor, x_t: Tensor, i: int | Tensor) -> Tensor:
         """Returns the mean (B, F, D) of x_{t-1} given x_0 and x_t (Ho et al. 2020, eq. 7)."""
-        return self.at("posterior_x0", i, x_t) * x0 + self.at("posterior_x_t", i, x_t) * x_t
+        return self.factor("posterior_x0", i, x_t) * x0 + self.factor("posterior_x_t", i, x_t) * x_t
 
 
 def build_schedule(name: str, num_train_timesteps: int) -> Schedule:

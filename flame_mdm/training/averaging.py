@@ -20,14 +20,23 @@ class MovingAverage(WeightAveraging):
         decay: average = decay * average + (1 - decay) * weights, from 0 to 1.
         update_every_n_steps: updates are at the multiples of this number of steps.
         update_starting_at_step: up to this step, updates copy the weights instead of averaging them; so does the first.
+        from_initial_weights: the average starts from the weights before the first step, as in MDM's code, so that the
+            first update is an average, too.
     """
 
-    def __init__(self, decay: float, update_every_n_steps: int = 1, update_starting_at_step: int = 0):
+    def __init__(
+        self,
+        decay: float,
+        update_every_n_steps: int = 1,
+        update_starting_at_step: int = 0,
+        from_initial_weights: bool = False,
+    ):
         if not 0 <= decay <= 1:
             raise UserError(f"ema.decay={decay}: must be from 0 to 1")
         super().__init__(use_buffers=False)
         self.average = get_ema_multi_avg_fn(decay)
         self.update_every_n_steps, self.update_starting_at_step = update_every_n_steps, update_starting_at_step
+        self.from_initial_weights = from_initial_weights
         self.averages: list[Tensor] = []
         self.weights: list[Tensor] = []
         self.begun = False
@@ -42,7 +51,14 @@ class MovingAverage(WeightAveraging):
         self.weights = [p.detach() for p in pl_module.parameters()]
         for copy, module in zip(self.averaged().modules(), pl_module.modules(), strict=True):
             copy._buffers = module._buffers  # shared, so that both always have the current ones
-        self.begun = int(self._average_model.n_averaged) > 0  # type: ignore[union-attr]
+        updates = int(self._average_model.n_averaged)  # type: ignore[union-attr]
+        self.begun = updates > 0 or (self.from_initial_weights and trainer.global_step > 0)
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        """Copies the initial weights before the first step: by now, pretraining or a teacher has set them."""
+        if self.from_initial_weights and not self.begun:
+            self._copy_weights()
+            self.begun = True
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         step = trainer.global_step
@@ -51,7 +67,10 @@ class MovingAverage(WeightAveraging):
         if self.begun and step > self.update_starting_at_step:
             self.average(self.averages, self.weights, None)
         else:
-            for average, weight in zip(self.averages, self.weights, strict=True):
-                average.copy_(weight)
+            self._copy_weights()
         self._average_model.n_averaged += 1  # type: ignore[union-attr]
         self._latest_update_step, self.begun = step, True
+
+    def _copy_weights(self) -> None:
+        for average, weight in zip(self.averages, self.weights, strict=True):
+            average.copy_(weight)

@@ -26,7 +26,8 @@ from flame_mdm.batch import Condition, MotionBatch
 from flame_mdm.checkpoints import hub, model_files
 from flame_mdm.checkpoints.loading import load
 from flame_mdm.checkpoints.locating import find
-from flame_mdm.checkpoints.released import Options, _options, import_flame, import_mdm
+from flame_mdm.checkpoints.released import import_flame, import_mdm
+from flame_mdm.checkpoints.released_options import Options, check_hyperparameters, read_options
 from flame_mdm.errors import UserError
 from flame_mdm.generator import MotionGenerator
 from flame_mdm.sampling.generation import generate
@@ -203,6 +204,53 @@ def test_every_weight_of_the_released_sizes_has_its_target_and_text_encoders_are
         assert sum(x.numel() for x in released.state.values()) + action == manifest[name]["n_params"], name
 
 
+MDM_ARGUMENTS = {
+    **{"arch": "trans_enc", "batch_size": 64, "cond_mask_prob": 0.1, "cuda": True, "data_dir": "", "device": 0},
+    **{"dataset": "humanml", "diffusion_steps": 1000, "emb_trans_dec": False, "eval_batch_size": 32, "seed": 10},
+    **{"eval_during_training": False, "eval_num_samples": 1000, "eval_rep_times": 3, "eval_split": "test"},
+    **{"lambda_fc": 0.0, "lambda_rcxyz": 0.0, "lambda_vel": 0.0, "latent_dim": 512, "layers": 8, "lr": 0.0001},
+    **{"log_interval": 1000, "lr_anneal_steps": 0, "noise_schedule": "cosine", "num_frames": 0, "use_ema": True},
+    **{"num_steps": 600000, "overwrite": False, "resume_checkpoint": "", "save_dir": "save/x", "weight_decay": 0.0},
+    **{"save_interval": 50000, "sigma_small": True, "train_platform_type": "NoPlatform", "unconstrained": False},
+    **{"text_encoder_type": "clip", "mask_frames": True, "pos_embed_max_len": 5000, "context_len": 0, "pred_len": 0},
+    **{"lambda_target_loc": 0.0, "multi_target_cond": False, "multi_encoder_type": "single", "target_enc_layers": 1},
+    **{"emb_policy": "add", "avg_model_beta": 0.9999, "adam_beta2": 0.999, "gen_during_training": False},
+    **{"gen_num_samples": 3, "gen_num_repetitions": 2, "gen_guidance_param": 2.5, "autoregressive": False},
+    **{"autoregressive_include_prefix": False, "autoregressive_init": "data", "target_joint_names": "DIMP_FINAL"},
+    **{"external_mode": False},
+}
+"""Names and defaults of the options of MDM's training, without the prefix and the targets of DiP."""
+MFM_OPTIONS = """
+model: {arch: trans_enc, emb_trans_dec: false, layers: 8, latent_dim: 512, ff_size: 1024, num_heads: 4,
+  cond_mask_prob: 0.1, lambda_rcxyz: 0.0, lambda_vel: 0.0, lambda_fc: 0.0, unconstrained: false, text_emebed: clip}
+training: {save_dir: x, overwrite: true, train_platform_type: x, resume_checkpoint: "", num_steps: 600000,
+  num_frames: 60, lr: 1e-4, weight_decay: 0.0, lr_anneal_steps: 0, log_interval: 1000, save_interval: 10000,
+  eval_batch_size: 32, eval_split: test, eval_during_training: true, eval_rep_times: 3, eval_num_samples: 1000}
+num_frames: null
+jointstype: null
+num_seeds: 2
+dataset: humanact12
+num_workers: 4
+dynamic: flow
+noise_schedule: cosine
+diffusion_steps_sample: 1000
+use_ddim: false
+sigma_small: true
+ode_kwargs: {method: euler, atol: 1e-5, rtol: 1e-5, step_size: 0.01, edit_till: 1.0, return_x_est: false,
+  return_x_est_num: null}
+motion_length: 6.0
+wandb: {project: motionfm}
+"""
+"""Names and defaults of the options of MFM's configuration."""
+FLAME_HYPERPARAMETERS = {
+    **{"diffusion_steps": 1000, "beta_schedule": "squaredcos_cap_v2", "schedule_sampler": "uniform", "lr": 0.0001},
+    **{"text_replace_prob": 0.25, "weight_decay": 0.0, "ema_start": 100, "ema_update": 10, "ema_decay": 0.99},
+    **{"sampling_strategy": "ddpm", "epoch_sample_every": 50, "sample_fps": 20, "sampling_length": 200},
+    **{"sampling_texts": ["walking"], "guidance_scale": 8.0},
+}
+"""Names and defaults of the hyperparameters of FLAME's Lightning module."""
+
+
 def small_state(features: int = 3) -> dict[str, torch.Tensor]:
     """A state dict with the authors' names."""
     state = {"input_process.poseEmbedding.weight": torch.ones(8, features)}
@@ -231,15 +279,38 @@ def test_every_weight_is_used_or_the_import_fails() -> None:
 
 
 @pytest.mark.parametrize(
-    "option", [{"context_len": 20}, {"pred_len": 40}, {"emb_policy": "concat"}, {"multi_target_cond": True}]
+    ("kind", "options", "message"),
+    [
+        ("mdm", {"context_len": 20}, "context_len=20: changes the model in a way that is not imported"),
+        ("mdm", {"pred_len": 40}, "pred_len=40: changes the model"),
+        ("mdm", {"emb_policy": "concat"}, "emb_policy=concat: changes the model"),
+        ("mdm", {"multi_target_cond": True}, "multi_target_cond=True: changes the model"),
+        ("mdm", {"rope_base": 100}, "rope_base=100: an unknown option, which may change the network"),
+        ("mfm", {"model": {"skip_connections": True}}, "skip_connections=True: an unknown option"),
+        ("mfm", {"ode_kwargs": {"order": 3}}, "ode_kwargs.order=3: an unknown option"),
+        ("mfm", {"ode_kwargs": {"atol": "1e-3"}}, "ode_kwargs.atol=1e-3: changes the model"),
+    ],
 )
-def test_options_of_a_network_with_prefix_or_targets_are_refused(tmp_path, option):
-    (name, value), path = *option.items(), tmp_path / "args.json"
-    path.write_text(json.dumps({"arch": "trans_dec", **option}))
-    with pytest.raises(UserError, match=f"{name}={value}: a model with a prefix of clean frames or targets"):
-        _options(path, {})
-    path.write_text(json.dumps({"context_len": 0, "pred_len": 0, "emb_policy": "add", "multi_target_cond": False}))
-    assert _options(path, {}) == Options()
+def test_options_that_change_a_released_model_are_refused(refused, tmp_path, kind, options, message):
+    words = released_file(tmp_path, small_state(150), {"dataset": "uestc", **options})
+    refused("import", kind, *words, says=f"args.json: {message}")
+
+
+@pytest.mark.parametrize("kind", ["flame", "mclip"])
+@pytest.mark.parametrize("name", ["predict_length", "diffusion_steps"])
+def test_hyperparameters_that_change_a_released_model_are_refused(refused, tmp_path, kind, name):
+    state = {"state_dict": {"net.x": torch.zeros(1)}, "hyper_parameters": {"lr": 1e-4, name: 50}}
+    words = released_file(tmp_path, state, {})
+    refused("import", kind, words[0], words[2], says=f"model.pt: hyper_parameters.{name}=50: ")
+
+
+def test_options_of_the_authors_codes_are_known(tmp_path):
+    path = tmp_path / "args.json"
+    path.write_text(json.dumps(MDM_ARGUMENTS))
+    assert read_options(path, {}) == Options(mask_frames=True)
+    path.write_text(MFM_OPTIONS)
+    assert read_options(path, {}) == Options(dataset="humanact12", num_frames=60)
+    check_hyperparameters({"hyper_parameters": FLAME_HYPERPARAMETERS}, "flame")
 
 
 def test_options_of_mdm(tmp_path):
@@ -289,17 +360,22 @@ def test_averaged_weights_are_taken_and_models_that_attend_to_padding_are_sample
 
 def test_imports_that_cannot_be_are_one_line(refused, bad):
     statistics_folder(bad, 150)
-    for kind, change, message in (
-        ("mdm", {"stats": True}, "model.pt: features of uestc are not normalized. Leave out stats=FOLDER"),
-        ("mdm", {"dataset": "humanml"}, "150 features, but not the 263 of humanml-legacy-smpl22"),
-        ("mdm", {"dataset": "amass"}, "args.json: dataset is \"amass\", not 'humanml', 'kit', 'humanact12' or 'uestc'"),
-        ("mdm", {"arch": "trans_dec"}, "unknown keys seqTransEncoder"),
-        ("mfm", {"dynamic": "diffusion"}, "dynamic is \"diffusion\", not 'flow'"),
-        ("mfm", {"text_emebed": "t5-large"}, "text_emebed is \"t5-large\", not 'clip'"),
-        ("flame", {}, "flame takes no file of options"),
+    for kind, change, more, message in (
+        ("mdm", {}, [f"stats={bad}"], "model.pt: features of uestc are not normalized. Leave out stats=FOLDER"),
+        ("mdm", {"dataset": "humanml"}, [], "150 features, but not the 263 of humanml-legacy-smpl22"),
+        (
+            "mdm",
+            {"dataset": "amass"},
+            [],
+            "args.json: dataset is \"amass\", not 'humanml', 'kit', 'humanact12' or 'uestc'",
+        ),
+        ("mdm", {"arch": "trans_dec"}, [], "unknown keys seqTransEncoder"),
+        ("mfm", {"dynamic": "diffusion"}, [], "dynamic is \"diffusion\", not 'flow'"),
+        ("mfm", {"text_emebed": "t5-large"}, [], "text_emebed is \"t5-large\", not 'clip'"),
+        ("flame", {}, [], "flame takes no file of options"),
     ):
         words = released_file(bad, small_state(150), {"dataset": "uestc"} | change)
-        refused("import", kind, *words, *([f"stats={bad}"] if "stats" in change else []), says=message)
+        refused("import", kind, *words, *more, says=message)
     state = {f"net.{key}": value for key, value in weights(golden("flame_text2motion")).items()}
     torch.save({"state_dict": state}, bad / "a.ckpt")
     refused("import", "flame", str(bad / "a.ckpt"), f"out={bad}", says="lm.pooler.dense.weight is missing")

@@ -5,26 +5,24 @@ Each learned weight is used exactly once, or the import fails. Frozen text encod
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import torch
 from hydra.utils import get_class
-from pydantic import BeforeValidator, Field
 from torch import Tensor
 
 from flame_mdm.checkpoints import released_weights as theirs
-from flame_mdm.checkpoints.model_files import MOST_FRAMES, check_weights, without_own_paths, write_model_file
+from flame_mdm.checkpoints.model_files import check_weights, without_own_paths, write_model_file
+from flame_mdm.checkpoints.released_options import Options, check_hyperparameters, read_options
 from flame_mdm.config import EXPERIMENTS, Config, compose, instantiate, plain
 from flame_mdm.data.humanact12 import HumanAct12
 from flame_mdm.denoisers import Denoiser
 from flame_mdm.denoisers.flame import FLAME
 from flame_mdm.denoisers.gru import MDMGRU
 from flame_mdm.denoisers.mdm import MDMDecoder, MDMEncoder
-from flame_mdm.errors import UserError, first_line, shortened
+from flame_mdm.errors import UserError, first_line
 from flame_mdm.generator import MotionGenerator
 from flame_mdm.safe_io import read_npy, read_yaml, sha256
-from flame_mdm.sampler_options import MAX_STEPS
-from flame_mdm.schemas import Number, Schema, check_shape
 from flame_mdm.task import Task
 
 NETWORKS = {
@@ -37,42 +35,6 @@ NORMALIZED = ("humanml3d", "kit")
 PADDED_FRAMES, ACTION_FRAMES = 196, 60
 ENCODERS = {"clip": "clip", "bert": "distilbert"}
 POOLER, ACTIONS = "lm.pooler.dense.", "embed_action.action_embedding"
-
-
-NEUTRAL = {"context_len": 0, "pred_len": 0, "emb_policy": "add", "multi_target_cond": False, "lambda_target_loc": 0}
-"""Options that change the network or its input in a way that ours does not have, and their value without effect."""
-
-
-class Solver(Schema):
-    """MFM's `ode_kwargs`."""
-
-    method: str = "euler"
-    # JSON is read as YAML 1.1, in which 2e-2 is a text
-    step_size: Annotated[
-        float, BeforeValidator(lambda x: float(x) if isinstance(x, str) else x), Field(ge=1 / MAX_STEPS, le=1)
-    ] = 0.01
-
-
-class Options(Schema):
-    """The options of a released model that the import reads, with the authors' defaults."""
-
-    arch: Literal["trans_enc", "trans_dec", "gru"] = "trans_enc"
-    dataset: Literal["humanml", "kit", "humanact12", "uestc"] = "humanml"
-    dynamic: Literal["flow"] = "flow"
-    text_emebed: Literal["clip"] = "clip"  # spelled like this by the authors
-    text_encoder_type: Literal["clip", "bert"] = "clip"
-    emb_trans_dec: bool = False
-    mask_frames: bool = False
-    sigma_small: bool = True
-    noise_schedule: str = "cosine"
-    cond_mask_prob: Annotated[float, Field(ge=0, le=1)] = 0.1
-    diffusion_steps: Annotated[int, Field(ge=1, le=MAX_STEPS)] = 1000
-    lambda_fc: Number = 0.0
-    lambda_rcxyz: Number = 0.0
-    lambda_vel: Number = 0.0
-    num_frames: Annotated[int, Field(ge=0, le=MOST_FRAMES)] = 0
-    num_heads: Annotated[int, Field(ge=1, le=MAX_STEPS)] = 4
-    ode_kwargs: Solver = Solver()
 
 
 class Released(NamedTuple):
@@ -215,12 +177,14 @@ def import_released(
     if (args is None) != (kind in ("flame", "mclip")):
         needs = "takes no" if args else "needs a"
         raise UserError(f"{kind} {needs} file of options: MDM's args.json, or MFM's .hydra/config.yaml")
-    options = _options(args, {} if num_heads is None else {"num_heads": num_heads})
+    options = read_options(args, {} if num_heads is None else {"num_heads": num_heads})
     advice = "Add run_code=true if you trust the authors of the file"
     checkpoint = theirs.read_released(file, run_code=run_code, advice=advice)
     try:
         state = theirs.released_state(checkpoint, ema=averaged and kind != "mclip")
         check_weights(state, file)
+        if args is None:
+            check_hyperparameters(checkpoint, kind)
         if kind == "mclip":
             sizes = [] if num_heads is None else [f"task.network.num_heads={num_heads}"]
             config = compose("motion_clip/humanml3d_smpl", sizes)
@@ -245,23 +209,6 @@ def import_released(
     made = f"released by the authors of {kind.upper()}"
     origin = {"made": made, "file": file.name, "sha256": sha256(file), "averaged": averaged}
     return write_model_file(out, model.state_dict(), config=model.config, facts=model.facts, origin=origin)
-
-
-def _options(path: str | Path | None, changes: dict[str, Any]) -> Options:
-    options = {} if path is None else read_yaml(path)  # JSON is YAML
-    if not isinstance(options, dict):
-        raise UserError(f"{path}: not a mapping of options")
-    # In a composed configuration of MFM, options of network and training are one level down.
-    groups = [value for name, value in options.items() if name in ("model", "training") and isinstance(value, dict)]
-    flat = {k: v for part in (*groups, options) for k, v in part.items() if isinstance(k, str) and v is not None}
-    for name, neutral in NEUTRAL.items():
-        if flat.get(name, neutral) != neutral:
-            what = "a model with a prefix of clean frames or targets, such as DiP, which is not imported"
-            raise UserError(f"{path}: {name}={shortened(str(flat[name]), 40)}: {what}. Import a model without it")
-    try:
-        return check_shape(flat | changes, Options)
-    except ValueError as error:
-        raise UserError(f"{path}: {error}") from error
 
 
 def _model(

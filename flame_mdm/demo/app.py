@@ -20,9 +20,9 @@ from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 
 from flame_mdm.demo.guard import Guard
-from flame_mdm.demo.page import build_page
 from flame_mdm.demo.request import parse_query
 from flame_mdm.demo.studio import Studio
+from flame_mdm.demo.studio_page import build_page
 from flame_mdm.errors import UserError, first_line, one_line, say
 
 SESSIONS = 64  # open pages that gradio remembers; it keeps half a megabyte for each, and the page needs none of it

@@ -1,3 +1,4 @@
+# pyright: standard
 """Adaptation of a trained model to a few clips of the user; `docs/own-motion.md` is the guide."""
 
 import re
@@ -110,13 +111,17 @@ def adapt(
     check(config)
     train(config)
     path, last = out / f"{name}.safetensors", out / "checkpoints" / "last.ckpt"
-    if rank_zero_only.rank == 0:
+
+    @rank_zero_only
+    def write_results() -> None:
         export(last, path) if full else write_adapter(path, last)
         data = instantiate(config["data"], representation=model.representation)
         adapted = load_task(path if full else file, GeneratorTask, adapter=() if full else path)
         body = _comparison(name, data, task, adapted)
         write_text(out / "adaptation.html", page(f"Adaptation: {name}", body))
         say(f"written: {path}", f"before and after: {out / 'adaptation.html'} (open in any browser)")
+
+    write_results()
     if torch.distributed.is_initialized():  # the launcher ends all processes when the first one exits
         torch.distributed.barrier()
     return path

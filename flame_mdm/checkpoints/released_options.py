@@ -1,0 +1,95 @@
+# pyright: standard
+"""Options of released models. Every option is read, known to have no effect on the model, or refused."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field
+
+from flame_mdm.checkpoints.model_files import MOST_FRAMES
+from flame_mdm.checkpoints.released_weights import NAMES
+from flame_mdm.config import Config
+from flame_mdm.errors import UserError, shortened
+from flame_mdm.safe_io import read_yaml
+from flame_mdm.sampler_options import MAX_STEPS
+from flame_mdm.schemas import Number, Schema, check_shape
+
+# JSON is read as YAML 1.1, in which 2e-2 is a text
+YamlNumber = Annotated[float, BeforeValidator(lambda x: float(x) if isinstance(x, str) else x)]
+
+
+class Solver(Schema):
+    """MFM's `ode_kwargs`."""
+
+    method: str = "euler"
+    step_size: Annotated[YamlNumber, Field(ge=1 / MAX_STEPS, le=1)] = 0.01
+
+
+class Options(Schema):
+    """The options of a released model that the import reads, with the authors' defaults."""
+
+    arch: Literal["trans_enc", "trans_dec", "gru"] = "trans_enc"
+    dataset: Literal["humanml", "kit", "humanact12", "uestc"] = "humanml"
+    dynamic: Literal["flow"] = "flow"
+    text_emebed: Literal["clip"] = "clip"  # spelled like this by the authors
+    text_encoder_type: Literal["clip", "bert"] = "clip"
+    emb_trans_dec: bool = False
+    mask_frames: bool = False
+    sigma_small: bool = True
+    noise_schedule: str = "cosine"
+    cond_mask_prob: Annotated[float, Field(ge=0, le=1)] = 0.1
+    diffusion_steps: Annotated[int, Field(ge=1, le=MAX_STEPS)] = 1000
+    lambda_fc: Number = 0.0
+    lambda_rcxyz: Number = 0.0
+    lambda_vel: Number = 0.0
+    num_frames: Annotated[int, Field(ge=0, le=MOST_FRAMES)] = 0
+    num_heads: Annotated[int, Field(ge=1, le=MAX_STEPS)] = 4
+    ode_kwargs: Solver = Solver()
+
+
+def read_options(path: str | Path | None, changes: dict[str, Any]) -> Options:
+    """Returns the options in a file of MDM or MFM, with `changes`; raises `UserError` naming the first invalid one."""
+    options = {} if path is None else read_yaml(path)  # JSON is YAML
+    if not isinstance(options, dict):
+        raise UserError(f"{path}: not a mapping of options")
+    # In a composed configuration of MFM, options of network and training are one level down.
+    groups = [name for name in ("model", "training") if isinstance(options.get(name), dict)]
+    top = {name: value for name, value in options.items() if name not in groups}
+    flat = {k: v for part in (*(options[name] for name in groups), top) for k, v in part.items() if v is not None}
+    solver = flat.get("ode_kwargs")
+    try:
+        _check_known(flat, Options.model_fields, NAMES["options"]["mdm"])
+        if isinstance(solver, dict):
+            _check_known(solver, Solver.model_fields, NAMES["options"]["solver"], "ode_kwargs.")
+        return check_shape(flat | changes, Options)
+    except ValueError as error:
+        raise UserError(f"{path}: {error}") from error
+
+
+def check_hyperparameters(checkpoint: Mapping[str, Any], kind: str) -> None:
+    """Raises `ValueError` for a hyperparameter of a checkpoint of FLAME's code that the import does not know."""
+    options = checkpoint.get("hyper_parameters")
+    if isinstance(options, Mapping):
+        _check_known(options, (), NAMES["options"][kind], "hyper_parameters.")
+
+
+def _check_known(options: Mapping[Any, Any], read: Any, table: Config, prefix: str = "") -> None:
+    """Raises `ValueError` for an option that is not read and not in the table, or has an effect that ours lacks."""
+    for name, value in options.items():
+        shown = f"{prefix}{shortened(str(name), 40)}={shortened(str(value), 40)}"
+        if name in table["neutral"]:
+            neutral = table["neutral"][name]
+            if value is not None and not _equal(value, neutral):
+                what = f"changes the model in a way that is not imported; known is {neutral}"
+                raise ValueError(f"{shown}: {what}. Import a model without it")
+        elif value is not None and name not in read and name not in table["unused"]:
+            raise ValueError(f"{shown}: an unknown option, which may change the network. Import a model without it")
+
+
+def _equal(value: Any, neutral: Any) -> bool:
+    """Returns whether two values are equal; numbers may be texts, as 1e-5 in YAML 1.1."""
+    try:
+        return value == neutral or (isinstance(neutral, float) and float(value) == neutral)
+    except (TypeError, ValueError):
+        return False

@@ -5,6 +5,7 @@ import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,8 @@ from safetensors.torch import load_file, save_file
 from support.analytic import NO_CONDITION, CountedDenoise, drawn, real, sample
 from support.refusals import error_of
 from support.runs import RUN, TINY, TWO, finish, inputs_of, reference, spawn
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn.utils import parameters_to_vector
 
 import flame_mdm
 from flame_mdm.__main__ import main
@@ -36,7 +38,7 @@ from flame_mdm.processes.consistency import consistency_terms
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.processes.flow_matching import FlowMatching
 from flame_mdm.safe_io import read_yaml
-from flame_mdm.training import adaptation
+from flame_mdm.training import adaptation, distillation
 
 MEAN, VARIANCE = torch.tensor([0.5, -1.0, 0.0]).double(), torch.tensor([0.3, 1.0, 2.0]).double()
 """Of the data: independent normal features."""
@@ -138,6 +140,25 @@ def test_a_student_starts_as_its_teacher_and_keeps_its_hash_data_and_text_encode
         after = content["state_dict"][name]
         assert torch.equal(value, after) == (not name.startswith("denoiser")), name
         torch.testing.assert_close(after, value, atol=0.05, rtol=0)
+
+
+def test_the_target_of_a_student_has_its_averaged_weights(trained, data_root, tmp_path, monkeypatch):
+    students, targets = [], []
+
+    def recorded(process: Process, student: nn.Module, follower: nn.Module, *rest: Any, **options: Any) -> Any:
+        if torch.is_grad_enabled():  # not in validation
+            students.append(parameters_to_vector(student.parameters()).detach())
+            targets.append(parameters_to_vector(follower.parameters()).detach())
+        return consistency_terms(process, student, follower, *rest, **options)
+
+    monkeypatch.setattr(distillation, "consistency_terms", recorded)
+    words = [*SHORT, f"data.root={data_root}", "ema.decay=0.5"]
+    assert main(["distill", str(trained), str(tmp_path / "run"), *words]) == 0
+    initial, first, second, third = students
+    assert not torch.equal(second, third)
+    average = (first + second) / 2
+    for target, expected in zip(targets, (initial, first, average, (average + third) / 2), strict=True):
+        torch.testing.assert_close(target, expected)
 
 
 def test_a_student_is_sampled_edited_led_chained_and_exported_without_its_teacher(trained, student, tmp_path):

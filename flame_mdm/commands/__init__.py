@@ -182,6 +182,7 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
 
     def load(self, request: SamplingRequest) -> LoadedModel:
         """Loads the model and the body; raises `UserError` with examples if the request names no condition."""
+        file = find(self.ckpt, self.which)  # before PyTorch is imported
         import torch
 
         from flame_mdm.checkpoints.loading import load
@@ -190,7 +191,6 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
 
         adapters = self.adapters()
         device = self.device or ("cuda" if torch.cuda.is_available() else "cpu")
-        file = find(self.ckpt, self.which)
         model = load(file, device, **adapters)
         if request.kind == "none" and not self.unconditioned:
             refuse_no_condition(model)

@@ -85,11 +85,11 @@ def main(settings: SampleSettings) -> None:
 
 def _sample(settings: SampleSettings, request: SamplingRequest, prompts: PromptFile | None) -> None:
     """Samples and writes the motions of a request; prompts of a file that the model cannot sample are refused."""
+    loaded = settings.load(request)  # finds the file before PyTorch is imported
     from flame_mdm.sampling.generation import sample
     from flame_mdm.sampling.output import SAMPLES, summary, write_motions
     from flame_mdm.sampling.resolution import resolve
 
-    loaded = settings.load(request)
     model = loaded.model
     refused: dict[int, UserError] | None = None if prompts is None else {}
     resolved = resolve(request, model, refused)

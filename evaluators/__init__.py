@@ -1,1 +1,2 @@
+# pyright: standard
 """Evaluation: protocols, the evaluator, metrics and feature extractors."""

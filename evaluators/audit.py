@@ -1,3 +1,4 @@
+# pyright: standard
 """Evaluator audit: real motions, perturbed at graded strengths, are measured like generated ones."""
 
 from __future__ import annotations

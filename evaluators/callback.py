@@ -1,3 +1,4 @@
+# pyright: standard
 """Evaluation during training."""
 
 from pathlib import Path

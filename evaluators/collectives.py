@@ -1,3 +1,4 @@
+# pyright: standard
 """Work shared by the processes of an evaluation. Without a process group, there is one process."""
 
 import os

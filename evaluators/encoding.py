@@ -1,3 +1,4 @@
+# pyright: standard
 """Encoding of changed joint positions as features, at their own height."""
 
 from collections.abc import Sequence

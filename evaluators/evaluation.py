@@ -1,3 +1,4 @@
+# pyright: standard
 """Evaluations: real motions are measured first, then motions are generated and measured, and the result is written."""
 
 from collections.abc import Mapping, Sequence

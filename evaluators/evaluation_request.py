@@ -1,3 +1,4 @@
+# pyright: standard
 """The keys of an evaluation. Nothing here imports torch, so that wrong keys are reported at once."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# pyright: standard
 """The evaluator: one feature pass over motions, many metrics."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# pyright: standard
 """Near misses: captions of a data set that are wrong for a clip in exactly one attribute."""
 
 from collections.abc import Sequence

@@ -1,3 +1,4 @@
+# pyright: standard
 """Graded perturbations of real motions, to audit evaluators with: what a metric should see, or should ignore.
 
 Each function of joints (F, J, 3) in meters, y up, returns as many frames unless it says otherwise. Random draws come

@@ -1,3 +1,4 @@
+# pyright: standard
 """From the request of an evaluation to its parts: model, data, protocol, extractor, source and file names."""
 
 import os

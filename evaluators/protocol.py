@@ -1,3 +1,4 @@
+# pyright: standard
 """Evaluation protocols: which motions are generated, how often, and which metrics are computed."""
 
 from __future__ import annotations

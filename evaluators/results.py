@@ -1,3 +1,4 @@
+# pyright: standard
 """Results of evaluations: averages over replications, provenance, and what is printed."""
 
 from collections.abc import Mapping, Sequence

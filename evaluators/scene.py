@@ -1,3 +1,4 @@
+# pyright: standard
 """The real motions that an audit perturbs, their captions, and wrong captions for them."""
 
 from collections.abc import Mapping, Sequence

@@ -1,3 +1,4 @@
+# pyright: standard
 """Sources of the motions to evaluate: a model, files of another system, or sanity-check baselines."""
 
 import hashlib

@@ -242,6 +242,16 @@ def test_own_classes_outside_the_repository_need_no_registration(tmp_path, monke
         check({"_target_": "my_parts.Mine", "widht": 3})
 
 
+def test_classes_of_a_generic_base_take_its_arguments(tmp_path, monkeypatch):
+    code = "from typing import Generic, TypeVar\n\nT = TypeVar('T')\n\n\n"
+    code += "class Base(Generic[T]):\n    def __init__(self, width: int): ...\n\n\nclass OfTexts(Base[str]): ...\n"
+    (tmp_path / "generic_parts.py").write_text(code)
+    monkeypatch.syspath_prepend(tmp_path)
+    check({"_target_": "generic_parts.OfTexts", "width": 3})
+    with pytest.raises(UserError, match="Did you mean width"):
+        check({"_target_": "generic_parts.OfTexts", "widht": 3})
+
+
 @dataclass(frozen=True, kw_only=True)
 class Example:
     """usage: example FILE [NAME ...]"""

@@ -1,13 +1,15 @@
+# pyright: standard
 """Feature extractors for evaluation: a common interface to trained and released networks."""
 
 import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Generic, TypeVar
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 
 from evaluators.extractors.action_gru import ActionGRU
 from evaluators.extractors.classifier import ClassifierTask
@@ -16,7 +18,7 @@ from evaluators.extractors.motion_clip import MotionCLIPTask
 from evaluators.extractors.stgcn import UESTC, Unconstrained
 from evaluators.extractors.t2m import T2MEvaluator, WordVectors, load_t2m, read_statistics
 from evaluators.extractors.t2m_training import T2MTask
-from evaluators.extractors.training import ExtractorTask
+from evaluators.extractors.training import ExtractorTask, Network
 from flame_mdm.checkpoints.loading import find, load_task
 from flame_mdm.checkpoints.model_files import weights_sha256
 from flame_mdm.checkpoints.released_weights import load_strictly, read_weights
@@ -55,11 +57,14 @@ class Extractor(ABC):
         return None
 
 
-class OwnExtractor(Extractor):
+TrainedTask = TypeVar("TrainedTask", bound=ExtractorTask)
+
+
+class OwnExtractor(Extractor, Generic[TrainedTask]):
     """A network trained with `make train`, loaded from its checkpoint; raises `UserError` if it holds another one."""
 
-    task: ExtractorTask
-    trained: type[ExtractorTask]
+    task: TrainedTask
+    trained: type[TrainedTask]
     recipes: str  # folder of the recipes that train it
 
     def __init__(self, path: str, device: str | torch.device = "cpu"):
@@ -86,11 +91,10 @@ class OwnExtractor(Extractor):
         return {"features": self.task(features, mask)}
 
 
-class MotionCLIPExtractor(OwnExtractor):
+class MotionCLIPExtractor(OwnExtractor[MotionCLIPTask]):
     """A motion-CLIP trained with `make train EXP=motion_clip/...`."""
 
     trained, recipes = MotionCLIPTask, "motion_clip"
-    task: MotionCLIPTask
 
     def __init__(self, path: str, device: str | torch.device = "cpu"):
         super().__init__(path, device)
@@ -120,11 +124,10 @@ class MotionCLIPExtractor(OwnExtractor):
         return scores
 
 
-class OwnT2MExtractor(OwnExtractor):
+class OwnT2MExtractor(OwnExtractor[T2MTask]):
     """An evaluator of Guo et al. 2022 trained with `make train EXP=t2m/...`."""
 
     trained, recipes = T2MTask, "t2m"
-    task: T2MTask
 
     def reads(self, other: Representation) -> bool:
         """Returns whether the network reads motions in a representation, also if it sees only their common part."""
@@ -136,11 +139,10 @@ class OwnT2MExtractor(OwnExtractor):
         return self.task.text(list(map(words, captions)) if self.task.learns_words else _tagged(self.path, tokens))
 
 
-class OwnClassifierExtractor(OwnExtractor):
+class OwnClassifierExtractor(OwnExtractor[ClassifierTask]):
     """An action classifier trained with `make train EXP=classifier/...`."""
 
     trained, recipes = ClassifierTask, "classifier"
-    task: ClassifierTask
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
         return {"features": self.task(joints, mask), "logits": self.task.network.logits(joints, mask)}
@@ -153,11 +155,11 @@ def _tagged(path: Path, tokens: Sequence[Sequence[str] | None]) -> list[Sequence
     return tagged
 
 
-class ReleasedExtractor(Extractor):
+class ReleasedExtractor(Extractor, Generic[Network]):
     """A network with the weights that its authors released, from a folder of `FILES`, or from one file."""
 
     FILES: tuple[str, ...] = ()
-    network: nn.Module
+    network: Network
     made_for: tuple[str, str]  # names of the representation and the data set that it was trained on
     used = 0  # number of features that it reads, from the first
 
@@ -182,7 +184,7 @@ class ReleasedExtractor(Extractor):
         return {"features": self.network(features, mask)}
 
 
-class T2MExtractor(ReleasedExtractor):
+class T2MExtractor(ReleasedExtractor[T2MEvaluator]):
     """The evaluator of Guo et al. 2022, or MARDM's first evaluator, as released, from a folder with five files.
 
     They are finest.tar (from text_mot_match/model), mean.npy and std.npy (t2m_... in MDM, kit_... for KIT, eval_... in
@@ -190,7 +192,6 @@ class T2MExtractor(ReleasedExtractor):
     """
 
     FILES = ("finest.tar", "mean.npy", "std.npy", "our_vab_data.npy", "our_vab_idx.pkl")
-    network: T2MEvaluator
 
     def __init__(self, path: str, device: str | torch.device = "cpu", *, full_length: bool = False):
         super().__init__(path)
@@ -204,7 +205,7 @@ class T2MExtractor(ReleasedExtractor):
         return self.network.text(self.words(_tagged(self.path, tokens), full_length=self.full_length))
 
 
-class MARDMClipExtractor(ReleasedExtractor):
+class MARDMClipExtractor(ReleasedExtractor[MARDMClip]):
     """The second evaluator of MARDM as released, for its CLIP-score: `MotionCLIPScore` of its features.
 
     The files are finest.tar (from text_mot_match_clip/model), mean.npy and std.npy (eval_mean and eval_std).
@@ -212,7 +213,6 @@ class MARDMClipExtractor(ReleasedExtractor):
 
     FILES = ("finest.tar", "mean.npy", "std.npy")
     made_for = ("humanml-legacy-smpl22", "humanml3d")
-    network: MARDMClip
 
     def __init__(self, path: str, device: str | torch.device = "cpu"):
         super().__init__(path)
@@ -233,14 +233,12 @@ action_recognition_model_humanact12.tar (humanact12_gru.tar in MDM), humanact12_
 despite its name) and uestc_rot6d_stgcn.tar."""
 
 
-class ClassifierExtractor(ReleasedExtractor):
+class ClassifierExtractor(ReleasedExtractor[ActionGRU | UESTC | Unconstrained]):
     """A released action classifier, one of `CLASSIFIERS`, which reads rotations or joints of 24 SMPL joints.
 
     `random_start` is a legacy option of Guo et al. 2020 and all later work: the initial state of the humanact12 GRU is
     drawn from a normal distribution, separately for features and scores; here, as a function of the motion.
     """
-
-    network: ActionGRU | UESTC | Unconstrained
 
     def __init__(self, kind: str, path: str, device: str | torch.device = "cpu", *, random_start: bool = False):
         super().__init__(path)
@@ -266,7 +264,6 @@ class UnconstrainedExtractor(ClassifierExtractor):
     """The classifier of unconstrained HumanAct12 with its reference motions, from a folder of two files."""
 
     FILES = ("humanact12_gru_modi_struct.pth.tar", "humanact12_unconstrained_modi_struct.npy")
-    network: Unconstrained
 
     def __init__(self, path: str, device: str | torch.device = "cpu"):
         super().__init__("humanact12_unconstrained", path, device)
@@ -274,6 +271,7 @@ class UnconstrainedExtractor(ClassifierExtractor):
 
     def reference(self) -> Tensor:
         """(N, 256) features of the reference motions."""
+        assert isinstance(self.network, Unconstrained)
         mask = torch.ones(self.real.shape[:2], dtype=torch.bool, device=self.real.device)
         pairs = zip(self.real.split(64), mask.split(64), strict=True)
         return torch.cat([self.network.published(*pair) for pair in pairs]).float().cpu()

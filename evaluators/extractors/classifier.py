@@ -1,3 +1,4 @@
+# pyright: standard
 """Training of action classifiers, whose features measure action-to-motion on data sets without a released one."""
 
 from collections.abc import Sequence
@@ -21,11 +22,10 @@ from flame_mdm.errors import UserError
 from flame_mdm.representations import Representation
 
 
-class ClassifierTask(ExtractorTask):
+class ClassifierTask(ExtractorTask[ActionGRU | JointSTGCN]):
     """Trains an action classifier of joint positions, in any representation (`make train EXP=classifier/...`)."""
 
     noun = "an action classifier"
-    network: ActionGRU | JointSTGCN
 
     @classmethod
     def parts(cls, config: Config, representation: Representation, actions: Sequence[str]) -> dict[str, Any]:

@@ -1,3 +1,4 @@
+# pyright: standard
 """The CLIP-score evaluator of MARDM (Meng et al. 2025, "Rethinking Diffusion for Text-Driven Human Motion Generation").
 
 MARDM's other evaluator is `evaluators.extractors.t2m` for 67 features.

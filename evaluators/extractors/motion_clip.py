@@ -1,3 +1,4 @@
+# pyright: standard
 """Motion-CLIP (Kim et al. 2023, "FLAME", table 8): a joint embedding of motions and texts, trained contrastively."""
 
 import math
@@ -140,11 +141,10 @@ class PooledLoss(SampleMetric):
         return torch.cat(losses).mean().item()
 
 
-class MotionCLIPTask(ExtractorTask):
+class MotionCLIPTask(ExtractorTask[MotionCLIP]):
     """Trains motion-CLIP (`make train EXP=motion_clip/...`); the text encoder is frozen in FLAME."""
 
     noun = "a motion-CLIP"
-    network: MotionCLIP
 
     @classmethod
     def parts(cls, config: Config, representation: Representation, actions: Sequence[str]) -> dict[str, Any]:

@@ -1,3 +1,4 @@
+# pyright: standard
 """Motion-CLIP calibrated by hard cases: near-miss captions, and copies of motions with noise of known strength."""
 
 import json

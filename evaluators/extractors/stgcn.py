@@ -1,3 +1,4 @@
+# pyright: standard
 """Action classifiers with graph convolutions over skeleton and time (Yan et al. 2018, "ST-GCN")."""
 
 from collections.abc import Sequence

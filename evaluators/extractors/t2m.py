@@ -1,3 +1,4 @@
+# pyright: standard
 """The evaluator of HumanML3D and KIT-ML (Guo et al. 2022, "Generating Diverse and Natural 3D Human Motions from Text").
 
 The authors' code returns embeddings in the order of descending length, ours in the order of the input.

@@ -1,3 +1,4 @@
+# pyright: standard
 """Training of Guo et al.'s evaluator (`evaluators.extractors.t2m`), if the released one cannot be used."""
 
 from collections.abc import Sequence
@@ -86,7 +87,7 @@ class MatchingLoss(SampleMetric):
         return matching_loss(motion, text, self.margin).item() if len(motion) > 1 else None
 
 
-class T2MTask(ExtractorTask):
+class T2MTask(ExtractorTask[T2MEvaluator]):
     """Trains the evaluator (`make train EXP=t2m/...`).
 
     Until step `movement_steps`, the movement encoder is trained with a decoder to reconstruct motions. It is then
@@ -100,7 +101,6 @@ class T2MTask(ExtractorTask):
     """
 
     noun = "a trained evaluator of Guo et al."
-    network: T2MEvaluator
 
     def __init__(
         self,

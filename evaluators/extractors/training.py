@@ -1,7 +1,8 @@
+# pyright: standard
 """Base class of the tasks that train feature extractors."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Self
+from typing import Any, Generic, Self, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -17,15 +18,17 @@ from flame_mdm.representations import Representation
 from flame_mdm.seeds import key
 from flame_mdm.task import Task
 
+Network = TypeVar("Network", bound=nn.Module)
 
-class ExtractorTask(Task):
+
+class ExtractorTask(Task, Generic[Network]):
     """Task that trains a network whose features evaluate motions, independent of the parts of the evaluated model."""
 
-    network: nn.Module
+    network: Network
 
     def __init__(
         self,
-        network: nn.Module,
+        network: Network,
         condition: ConditionEncoder,
         representation: Representation,
         *,

@@ -1,3 +1,4 @@
+# pyright: standard
 """Metrics of generated motions: torchmetrics classes whose inputs have common names.
 
 Every `update` takes some of these inputs by name, of B generated and R real motions.

@@ -1,3 +1,4 @@
+# pyright: standard
 """Action recognition accuracy of generated motions."""
 
 from torch import Tensor

@@ -1,3 +1,4 @@
+# pyright: standard
 """Alignment of generated motions with their texts: R-precision, distances and MID."""
 
 import numpy as np

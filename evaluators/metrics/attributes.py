@@ -1,3 +1,4 @@
+# pyright: standard
 """Attributes of a motion, read from its joints by geometric rules: action, side, count, direction, speed, amount.
 
 They read what a person would see in a clip of a few seconds that shows one action of the synthetic set; each threshold

@@ -1,3 +1,4 @@
+# pyright: standard
 """Distances between the feature distributions of generated and real motions: FID, KID, precision and recall."""
 
 from collections.abc import Mapping

@@ -1,3 +1,4 @@
+# pyright: standard
 """Diversity and multimodality: how much generated motions differ from one another."""
 
 import numpy as np

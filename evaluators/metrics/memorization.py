@@ -1,3 +1,4 @@
+# pyright: standard
 """Memorization: distance of generated motions from the training motions, compared to that of held-out real motions."""
 
 from collections.abc import Mapping, Sequence

@@ -1,3 +1,4 @@
+# pyright: standard
 """Physical plausibility: foot skating, floor contact, jitter and static motions."""
 
 from collections.abc import Sequence

@@ -1,3 +1,4 @@
+# pyright: standard
 """Physics metrics of published benchmarks, each with its own units, thresholds and frame rate; the floor is y = 0.
 
 Values of different benchmarks are not comparable with one another, nor with those of `evaluators.metrics.physics`.

@@ -1,3 +1,4 @@
+# pyright: standard
 """Errors of generated motions against the real motion of the same text, or the motion that was edited."""
 
 from collections.abc import Mapping, Sequence

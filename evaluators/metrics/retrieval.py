@@ -1,3 +1,4 @@
+# pyright: standard
 """Retrieval with several correct answers: equal and similar captions, and the protocols of TMR."""
 
 import functools

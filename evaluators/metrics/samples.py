@@ -1,3 +1,4 @@
+# pyright: standard
 """Base classes of metrics, which compute their values from all samples, sorted by key."""
 
 from __future__ import annotations

@@ -292,7 +292,9 @@ def _arguments(module: str, node: ast.AST) -> dict[str, str]:
 
 
 def _inherited(module: str, node: ast.ClassDef) -> dict[str, str]:
-    parents = [definition(module, ast.unparse(base).rpartition(".")[2]) for base in node.bases]
+    # `Base[Kind]`, a generic class for one kind of values, has the arguments of `Base`.
+    bases = [base.value if isinstance(base, ast.Subscript) else base for base in node.bases]
+    parents = [definition(module, _name(base)) for base in bases]
     names: dict[str, str] = {}
     for parent in parents:
         names |= _arguments(*parent) if parent and parent[1] is not node else {}

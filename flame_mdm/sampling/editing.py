@@ -1,3 +1,4 @@
+# pyright: standard
 """Motion editing without additional training: part of a motion is kept, the rest is resampled."""
 
 from collections.abc import Sequence

@@ -1,3 +1,4 @@
+# pyright: standard
 """Motion sampling, with text, action or no condition."""
 
 from collections import Counter

@@ -1,3 +1,4 @@
+# pyright: standard
 """Keywords of `flame_mdm.generate` and `flame_mdm.edit`, with their types.
 
 They are the fields of `SamplingRequest`, `EditRequest` and `SamplerOptions`, where defaults and help texts are.

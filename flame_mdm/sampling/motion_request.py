@@ -1,3 +1,4 @@
+# pyright: standard
 """Requests for motions and edits. Their checks do not import torch, so that wrong input is refused at once."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# pyright: standard
 """Output of the commands that sample: folders, files, and the lines that tell what was written."""
 
 import hashlib

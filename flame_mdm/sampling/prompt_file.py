@@ -1,3 +1,4 @@
+# pyright: standard
 """Files of prompts. Nothing here imports torch, so that wrong files are refused at once."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# pyright: standard
 """Motions from files and prepared data sets, with the features of a model."""
 
 import math

@@ -1,3 +1,4 @@
+# pyright: standard
 """Resolution of requests: what a request means for one model, found out once, before anything is sampled."""
 
 from collections.abc import Iterator, Sequence

@@ -1,3 +1,4 @@
+# pyright: standard
 """Lengths of motions, and the windows that cover sequences of actions."""
 
 from collections.abc import Sequence

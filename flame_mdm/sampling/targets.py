@@ -1,3 +1,4 @@
+# pyright: standard
 """Targets in the world: way points of the root, joint positions, and whole poses at given times."""
 
 import math
@@ -27,26 +28,31 @@ Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)] | None  # meters; None = f
 OnFloor = Annotated[Sequence[Coordinate], Field(min_length=2, max_length=2)]  # x and z
 
 
-class WayPoint(ClosedSchema):
-    """A place of the root over the floor."""
+class Timed(ClosedSchema):
+    """What a motion should meet at a time."""
 
     time: Annotated[float, Field(ge=0, le=1e4)]  # seconds
+
+
+class WayPoint(Timed):
+    """A place of the root over the floor."""
+
     position: OnFloor
 
 
-class JointTarget(WayPoint):
+class JointTarget(Timed):
     """A place of a joint."""
 
-    joint: str
     position: Annotated[Sequence[Coordinate], Field(min_length=3, max_length=3)]
+    joint: str
 
 
-class PoseTarget(WayPoint):
+class PoseTarget(Timed):
     """A frame of a motion, at a place or anywhere; `heading` is in degrees."""
 
+    position: OnFloor | None = None
     file: str
     frame: Annotated[int, Field(ge=0)] = 0
-    position: OnFloor | None = None
     heading: Annotated[float, Field(ge=-1e4, le=1e4)] | None = None
 
 

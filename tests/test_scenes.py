@@ -1,5 +1,6 @@
 """FBX and GLB animations as motions: in commands, in data sets, and what is refused."""
 
+import os
 import shutil
 from pathlib import Path
 
@@ -7,10 +8,12 @@ import numpy as np
 import pytest
 from support.fixtures import SHARED, needs_third_party
 from support.motions import synthetic
+from support.refusals import bounded
 
 from flame_mdm.data.folder import Folder
 from flame_mdm.errors import UserError
 from flame_mdm.formats import glb_animation
+from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.readers import read
 from flame_mdm.representations.skeleton import SMPL22
 
@@ -90,3 +93,49 @@ def test_a_scene_without_animation_or_with_a_strange_skeleton_is_refused(tmp_pat
     with pytest.raises(UserError, match="unknown skeleton"):
         read(tmp_path / "bird.glb")
     assert len(glb_animation.animations(tmp_path / "bird.glb")) == 1
+
+
+def mutated(content: bytes, number: int) -> bytes:
+    """Content with some bytes changed, removed, repeated or swapped, as decided by a number."""
+    draw = np.random.default_rng(number)
+    changed = bytearray(content)
+    for _ in range(int(draw.integers(1, 6))):
+        begin = int(draw.integers(len(changed)))
+        end = min(len(changed), begin + int(draw.integers(1, 64)))
+        kind = int(draw.integers(5))
+        if kind == 0:
+            changed[begin] = int(draw.integers(256))
+        elif kind == 1:
+            del changed[begin:end]
+        elif kind == 2:
+            changed[begin:begin] = changed[begin:end]
+        elif kind == 3:
+            changed[begin:end] = draw.bytes(end - begin)
+        else:
+            changed[begin:end] = b"\xff" * (end - begin)
+    return bytes(changed)
+
+
+def outcome(path: Path) -> tuple[str, np.ndarray]:
+    """The error of a file, or "", and its joints."""
+    try:
+        return "", read(path).joints
+    except UserError as error:
+        return str(error), np.zeros(0)
+
+
+@pytest.mark.parametrize("ending", [".fbx", ".glb", ".vrma"])
+def test_mutated_files_give_one_line_or_a_motion(ending: str, tmp_path: Path):
+    """Ten mutations of each kind of file; with FLAME_MDM_FUZZ=all, 150."""
+    motion = synthetic("kick")
+    motion = Motion(motion.joints[:12], motion.fps)
+    motion.save(tmp_path / f"kick{ending}")
+    content = (tmp_path / f"kick{ending}").read_bytes()
+    path = tmp_path / f"mutated{ending}"
+    for number in range(150 if os.environ.get("FLAME_MDM_FUZZ") == "all" else 10):
+        path.write_bytes(mutated(content, number))
+        with bounded():
+            message, joints = outcome(path)
+        assert np.isfinite(joints).all(), number
+        assert not message or str(path) in message, number
+        assert "\n" not in message, number

@@ -246,7 +246,8 @@ def _binds(parts: _Document, skin: _Skin, data: bytes) -> np.ndarray:
     if view.buffer or view.byteStride not in (0, 64) or not fits:
         raise ValueError("inverse bind matrices are not floats, or not one per joint")
     values = np.frombuffer(data, "<f4", 16 * len(skin.joints), view.byteOffset + accessor.byteOffset)
-    binds = values.reshape(-1, 4, 4).mT.astype(float)
+    with np.errstate(all="ignore"):  # checked below
+        binds = values.reshape(-1, 4, 4).mT.astype(float)
     if not ((np.abs(binds) <= LARGEST).all() and (np.abs(np.linalg.det(binds)) > 1e-30).all()):
         raise ValueError("inverse bind matrices are not finite, or have no inverse")
     return binds

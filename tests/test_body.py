@@ -10,6 +10,7 @@ import torch
 from support.motions import degrees, frames_array, posed, sway
 
 from flame_mdm.errors import UserError
+from flame_mdm.formats import body as body_module
 from flame_mdm.formats.body import fit_body
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.people import HEADS, load_body
@@ -110,6 +111,27 @@ def test_a_motion_that_no_body_fits_says_why():
         assert motion.try_fit()[0] is None
         assert frames_array(motion, 64).shape == (len(motion.joints), 64, 64, 3)  # its skeleton
         assert render._lines(motion, None, 200, 200) == [*render._lines(motion, drawn, 200, 200), "(no body fits)"]
+
+
+@pytest.mark.parametrize("matrix", [np.ones((3, 3)), np.zeros((3, 3)), -np.eye(3), np.full((3, 3), np.nan)])
+def test_matrices_that_are_no_rotations_are_the_reason_for_a_skeleton_in_pictures_and_pages(matrix: np.ndarray):
+    motion = posed(3)
+    assert motion.poses is not None
+    motion.poses.rotations[1, JOINT["left_knee"]] = torch.from_numpy(matrix)
+    body, reason = motion.try_fit()
+    assert body is None
+    assert reason == "the matrix of left_knee in frame 1 is not a rotation, so a body cannot be drawn"
+    assert reason in player_page([motion])
+    assert frames_array(motion, 64).shape == (3, 64, 64, 3)
+
+
+def test_errors_that_are_not_the_motions_are_not_taken_for_a_reason(monkeypatch):
+    def faulty(*_: Any) -> None:
+        raise ValueError("a mistake")
+
+    monkeypatch.setattr(body_module, "proportions", faulty)
+    with pytest.raises(ValueError, match="a mistake"):
+        posed().try_fit()
 
 
 def test_bodies_in_files_are_drawn_and_damaged_ones_named(tmp_path):

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from support.analytic import euler_to_matrix
 from support.fixtures import golden, golden_case, tensors
 from torch import Tensor
+from torch.nn import functional
 
 from flame_mdm.representations import rotation
 
@@ -121,6 +122,72 @@ def test_opposite_directions_and_small_angles_have_finite_and_right_gradients():
         assert gradient.isfinite().all()
         if angle < 3:
             assert gradient[0, 0].item() == pytest.approx(1)
+
+
+def gram_schmidt(rot6d: Tensor) -> Tensor:
+    first, second = functional.normalize(rot6d[..., :3], dim=-1), rot6d[..., 3:]
+    second = functional.normalize(second - (first * second).sum(-1, keepdim=True) * first, dim=-1)
+    return torch.stack([first, second, torch.linalg.cross(first, second)], -2)
+
+
+def degenerate_pairs() -> Tensor:
+    """Pairs of vectors (N, 6) that define no rotation: parallel, opposite, 0, tiny, or all but parallel."""
+    generator = torch.Generator().manual_seed(0)
+    vector, other = torch.randn(2, 50, 3, generator=generator)
+    signs = vector.sign()
+    pairs = [(vector, factor * vector) for factor in (1, -1, 3.3, -0.01)]
+    pairs += [(signs, signs), (signs, -signs), (0 * vector, vector), (vector, 0 * vector), (0 * vector, 0 * vector)]
+    pairs += [(1e-13 * vector, other), (vector, 1e-13 * other), (1e-30 * vector, 1e-30 * other)]
+    pairs += [(vector, vector + tilt * other) for tilt in (1e-7, 1e-6, 1e-5)]
+    return torch.cat([torch.cat(pair, -1) for pair in pairs])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("convention", ["rows", "columns"])
+def test_vectors_that_define_no_rotation_are_completed(convention: rotation.SixD, dtype: torch.dtype):
+    rot6d = degenerate_pairs().to(dtype).requires_grad_()
+    matrix = rotation.rot6d_to_matrix(rot6d, convention)
+    atol = 3 * torch.finfo(dtype).eps ** 0.5
+    same(matrix @ matrix.mT, torch.eye(3, dtype=dtype).expand_as(matrix), atol)
+    same(torch.linalg.det(matrix), torch.ones(len(matrix), dtype=dtype), atol)
+    same(matrix, rotation.rot6d_to_matrix(rot6d, convention), 0)
+    (gradient,) = torch.autograd.grad(matrix.square().sum() + matrix.sum(), rot6d)
+    assert gradient.isfinite().all()
+    # vectors that have a direction keep it
+    first = matrix[:, 0] if convention == "rows" else matrix[..., 0]
+    has_direction = rot6d[:, :3].norm(dim=-1) > 1e-6
+    same(first[has_direction], functional.normalize(rot6d[has_direction, :3], dim=-1), atol)
+    same(rotation.rot6d_to_matrix(torch.zeros(6, dtype=dtype), convention), torch.eye(3, dtype=dtype), 0)
+    assert rotation.rot6d_to_matrix(torch.full((6,), torch.nan, dtype=dtype), convention).isnan().all()
+
+
+def test_vectors_beside_degenerate_ones_keep_every_bit_of_value_and_gradient():
+    generator = torch.Generator().manual_seed(1)
+    ordinary = torch.randn(len(degenerate_pairs()), 6, generator=generator)
+    weights = torch.randn(len(ordinary), 3, 3, generator=generator)
+    for others in (ordinary, degenerate_pairs()):
+        rot6d = torch.stack([ordinary, others], 1).requires_grad_()
+        matrix = rotation.rot6d_to_matrix(rot6d, "rows")[:, 0]
+        alone = ordinary.clone().requires_grad_()
+        expected = gram_schmidt(alone)
+        assert torch.equal(matrix, expected)
+        (gradient,) = torch.autograd.grad((weights * matrix).sum(), rot6d)
+        (expected_gradient,) = torch.autograd.grad((weights * expected).sum(), alone)
+        assert torch.equal(gradient[:, 0], expected_gradient)
+
+
+def test_exported_graphs_and_vmap_complete_vectors_too():
+    class Decoder(torch.nn.Module):
+        def forward(self, rot6d: Tensor) -> Tensor:
+            return rotation.rot6d_to_matrix(rot6d, "rows")
+
+    pairs = degenerate_pairs()
+    ordinary = torch.randn(pairs.shape, generator=torch.Generator().manual_seed(2))
+    graph = torch.export.export(Decoder(), (ordinary,)).module()
+    for rot6d in (ordinary, pairs):
+        expected = rotation.rot6d_to_matrix(rot6d, "rows")
+        same(graph(rot6d), expected, 0)
+        same(torch.func.vmap(Decoder())(rot6d), expected, 0)
 
 
 def test_slerp_takes_the_shorter_way():

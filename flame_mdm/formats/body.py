@@ -19,6 +19,7 @@ TRUNK = {"pelvis": 0.0, "spine1": 0.35, "spine2": 0.75, "spine3": 1.0}
 WIDER = (0.8, 1.25)  # limits of the width of hips and shoulders relative to that of the limbs
 LONGER = (0.4, 2.5)  # limits of the length of a limb relative to the mesh's
 TALLER = (0.6, 1.6)  # limits of the length of other parts relative to that of the limbs
+ORTHONORMAL = 0.1  # largest error of the products of two rows of a rotation matrix
 LIMBS = tuple(JOINT[f"{side}_{name}"] for side in ("left", "right") for name in ("knee", "ankle", "elbow", "wrist"))
 
 
@@ -53,7 +54,8 @@ def fit_body(motion: PosedFigure, body: Mesh | None = None) -> FittedBody:
     """Fits a body (None = the mannequin) to a clip and computes the rotations of its bones.
 
     The body's joints are the motion's, but higher by the thickness of the sole. Rotations that are solved for are
-    completed. Raises `UserError` if the skeleton is not SMPL's, or a limb is much longer or shorter than people's.
+    completed. Raises `UserError` if the skeleton is not SMPL's, a limb is much longer or shorter than people's, or a
+    matrix is not a rotation.
     """
     poses, body = motion.posed(), body or mannequin()
     joints = motion.joints[:, : len(SMPL22)].astype(float)
@@ -63,6 +65,7 @@ def fit_body(motion: PosedFigure, body: Mesh | None = None) -> FittedBody:
     neutral = np.tile(np.eye(3), (len(SMPL22), 1, 1))
     if motion.poses is None:
         neutral, world, offsets = complete(joints, offsets, world)
+    _check_rotations(world)
     lift = wide * body.sole
     for toe in (JOINT["left_foot"], JOINT["right_foot"]):
         _, high, long = body.rest[toe]
@@ -120,6 +123,19 @@ def proportions(body: Mesh, offsets: np.ndarray) -> tuple[np.ndarray, float]:
             long = np.clip(ratio[children[0]], *np.multiply(TALLER, wide))
             fit[joint] += (long - wide) * np.outer(along, along)
     return fit, wide
+
+
+def _check_rotations(world: np.ndarray) -> None:
+    """Raises `UserError` if one of the matrices (F, 22, 3, 3) is not finite, or far from a rotation."""
+    products = world @ world.mT
+    near = (np.abs(products - np.eye(3)) < ORTHONORMAL).all((2, 3))
+    mirrored = (np.cross(world[..., 0, :], world[..., 1, :]) * world[..., 2, :]).sum(-1) < 0
+    unsound = np.argwhere(~near | mirrored)
+    if len(unsound):
+        frame, joint = unsound[0]
+        raise UserError(
+            f"the matrix of {SMPL22.joints[joint]} in frame {frame} is not a rotation, so a body cannot be drawn"
+        )
 
 
 def _with_helpers(world: np.ndarray, offsets: np.ndarray) -> np.ndarray:

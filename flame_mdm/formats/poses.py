@@ -115,6 +115,7 @@ def _fit(offsets: Tensor, bones: Tensor) -> Tensor:
     """Returns quaternions (F, 4) that best align K offsets (K, 3) with K bones (F, K, 3), by repeated squaring.
 
     They are dominant eigenvectors (Horn 1987, "Closed-form solution of absolute orientation using unit quaternions").
+    Bones without length give the identity.
     """
     (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in (offsets.mT @ bones).unbind(-2))
     elements = [
@@ -124,7 +125,8 @@ def _fit(offsets: Tensor, bones: Tensor) -> Tensor:
         *(b - d, g + c, f + h, i - a - e),
     ]
     power = torch.stack(elements, -1).unflatten(-1, (4, 4))
-    power = power / torch.linalg.vector_norm(power, dim=(1, 2), keepdim=True) + torch.eye(4, dtype=bones.dtype)
+    size = torch.linalg.vector_norm(power, dim=(1, 2), keepdim=True)
+    power = power / size.clamp_min(torch.finfo(bones.dtype).tiny) + torch.eye(4, dtype=bones.dtype)
     for _ in range(SQUARINGS):
         power = power @ power
         power = power / power.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None]

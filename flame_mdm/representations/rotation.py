@@ -79,12 +79,49 @@ def matrix_to_rot6d(matrix: Tensor, convention: SixD) -> Tensor:
 
 
 def rot6d_to_matrix(rot6d: Tensor, convention: SixD) -> Tensor:
-    """(..., 6), orthonormal or not -> (..., 3, 3) by Gram-Schmidt (Zhou et al. 2019, eq. 15)."""
-    first = F.normalize(rot6d[..., :3], dim=-1)
-    second = rot6d[..., 3:]
-    second = F.normalize(second - (first * second).sum(-1, keepdim=True) * first, dim=-1)
+    """(..., 6), orthonormal or not -> (..., 3, 3) by Gram-Schmidt (Zhou et al. 2019, eq. 15).
+
+    Every finite pair of vectors gives a rotation. If one has no direction, it is replaced by the basis vector that is
+    least along the other one; so is the second vector if both are parallel. Two zeros give the identity.
+    """
+    degenerate = _degenerate(rot6d, *_orthogonal(rot6d))
+    # not a branch: neither exported graphs nor torch.func.vmap, which guidance uses, can have one
+    first, across = _orthogonal(torch.where(degenerate, _completed(rot6d), rot6d))
+    second = F.normalize(across, dim=-1)
     rows = torch.stack([first, second, torch.linalg.cross(first, second)], -2)
     return rows if convention == "rows" else rows.mT
+
+
+def _orthogonal(rot6d: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns the first of two vectors (..., 6), normalized, and the part of the second one across it."""
+    first, second = F.normalize(rot6d[..., :3], dim=-1), rot6d[..., 3:]
+    return first, second - (first * second).sum(-1, keepdim=True) * first
+
+
+def _degenerate(rot6d: Tensor, first: Tensor, across: Tensor) -> Tensor:
+    """Returns (..., 1) bool: whether two vectors (..., 6), of which `_orthogonal` is known, define no rotation.
+
+    Of parallel vectors, rounding alone determines `across`. NaN is not degenerate, so it stays NaN.
+    """
+    length = torch.linalg.vector_norm(rot6d[..., 3:], dim=-1, keepdim=True)
+    parallel = torch.linalg.vector_norm(across, dim=-1, keepdim=True) <= torch.finfo(rot6d.dtype).eps ** 0.5 * length
+    return parallel | _shorter(first) | _shorter(F.normalize(across, dim=-1))
+
+
+def _shorter(normalized: Tensor) -> Tensor:
+    """Returns (..., 1) bool: whether normalized vectors (..., 3) are shorter than 1, as those of 0 are."""
+    return torch.linalg.vector_norm(normalized, dim=-1, keepdim=True) < 1 - torch.finfo(normalized.dtype).eps ** 0.5
+
+
+def _completed(rot6d: Tensor) -> Tensor:
+    """Returns pairs of vectors (..., 6) in which one vector of each pair, or both, is replaced by a basis vector."""
+    first, second = F.normalize(rot6d[..., :3], dim=-1), F.normalize(rot6d[..., 3:], dim=-1)
+    basis = torch.eye(3, dtype=rot6d.dtype, device=rot6d.device)
+    replaced = _shorter(first)
+    kept = replaced & ~_shorter(second)
+    first = torch.where(replaced, basis[second.abs().argmin(-1)], first)
+    second = torch.where(kept, second, basis[first.abs().argmin(-1)])
+    return torch.cat([first, second], -1)
 
 
 def matrix_to_euler(matrix: Tensor, order: str) -> Tensor:

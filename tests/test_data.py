@@ -82,11 +82,13 @@ def test_the_same_input_gives_the_same_fingerprint(store, tmp_path, monkeypatch)
     monkeypatch.setattr("time.time", lambda: float(next(clock)))
     again = write_store(tmp_path / "again", Synthetic(clips=40, seed=1), HumanML())
     assert store.fingerprint == again.fingerprint != other.fingerprint
-    print_of = partial(_fingerprint, store.folder, store.info["representation"], store.info["fps"], std=store.std)
+    info = store.info
+    print_of = partial(_fingerprint, store.folder, info["representation"], info["fps"], std=store.std, version=1)
     zero = np.zeros_like(store.mean)
     assert print_of(mean=store.mean) == print_of(mean=store.mean - 1e-9) == store.fingerprint, "nor does rounding"
     assert print_of(mean=zero + 4e-23) == print_of(mean=zero - 3e-22)
     assert print_of(mean=store.mean + 0.01) != store.fingerprint
+    assert print_of(mean=store.mean, version=2) != store.fingerprint
 
 
 @pytest.mark.parametrize(

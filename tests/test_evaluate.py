@@ -281,7 +281,7 @@ def test_each_number_carries_its_own_number_of_motions(runs, full, tmp_path):
         content = read_samples(path)
         kept = len(content["ids"]) - 30 * number
         frames = int(content["lengths"][:kept].sum())
-        parts = {"ids": content["ids"][:kept], "lengths": content["lengths"][:kept]}
+        parts: dict[str, Any] = {"ids": content["ids"][:kept], "lengths": content["lengths"][:kept]}
         np.savez(folder / path.name, **parts, features=content["features"][:frames])
     result = runs.of_others(out, f"from_samples={folder}")
     count = len(runs.data().test)
@@ -417,7 +417,14 @@ def test_variants_replace_options_of_their_file(tmp_path):
 def test_other_sampling_options_have_other_folders_of_motions(runs):
     folders = []
     base: dict[str, Any] = {"sampler": "ddim", "num_inference_steps": 3, "eta": 0.0, "spacing": "linspace"}
-    for changes in ({}, {"eta": 0.5}, {"spacing": "stride"}, {"num_inference_steps": 4}, {"guidance_scale": 2.0}):
+    changed: list[dict[str, Any]] = [
+        {},
+        {"eta": 0.5},
+        {"spacing": "stride"},
+        {"num_inference_steps": 4},
+        {"guidance_scale": 2.0},
+    ]
+    for changes in changed:
         options = SamplerOptions(**base | changes)
         request = EvaluationRequest(ckpt=str(runs.model), extractor="none", options=options)
         source = Plan(request, "cpu").source

@@ -38,8 +38,8 @@ TURNED = {"z": [[1, 0, 0], [0, 0, -1], [0, 1, 0]], "-y": [[1, 0, 0], [0, -1, 0],
 def walk(frames: int = 40) -> Motion:
     """A body whose arms hang, which turns a little and swings its legs."""
     swing = np.sin(np.arange(frames) / 6)[:, None] * [20.0, 0, 0]
-    legs = {"left_hip": swing, "right_hip": -swing}
-    arms = {"left_shoulder": [0, 0, -70.0], "right_shoulder": [0, 0, 70.0]}
+    legs: dict[str, Any] = {"left_hip": swing, "right_hip": -swing}
+    arms: dict[str, Any] = {"left_shoulder": [0, 0, -70.0], "right_shoulder": [0, 0, 70.0]}
     return posed(frames, heading=np.sin(np.arange(frames) / 9), **legs, **arms)
 
 
@@ -76,7 +76,8 @@ def test_arrays_that_are_not_needed_are_never_opened(tmp_path: Path):
     np.savez(tmp_path / "a_stageii.npz", **parts, markers_latent_vids=np.array({"a": 1}, dtype=object))
     np.testing.assert_array_equal(read(tmp_path / "a_stageii.npz").joints, read(tmp_path / "plain.npz").joints)
     np.testing.assert_allclose(read(tmp_path / "plain.npz").joints, walk().joints, atol=1e-5)
-    np.savez(tmp_path / "b.npz", **(parts | {"poses": np.array([{}])}))
+    parts["poses"] = np.array([{}])
+    np.savez(tmp_path / "b.npz", **parts)
     with pytest.raises(UserError, match="an array of Python objects"):
         read(tmp_path / "b.npz")
 
@@ -100,7 +101,8 @@ def test_shapes_are_read_by_their_layout_and_rates_of_one_element_are_rates(tmp_
     assert read(path).fps == 60
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        np.savez(path, **{name: np.asarray(values, np.float16) for name, values in amass(walk()).items()})
+        halves: dict[str, Any] = {name: np.asarray(values, np.float16) for name, values in amass(walk()).items()}
+        np.savez(path, **halves)
         np.testing.assert_allclose(read(path).joints, expected, atol=0.02)
 
 
@@ -145,7 +147,7 @@ def outcome(path: Path, **keys: Any) -> tuple[str, Motion | None]:
 @pytest.mark.parametrize(("key", "kind"), product(KEYS, KINDS))
 def test_a_key_acts_or_is_refused(key: str, kind: str, tmp_path: Path):
     path = write_kind(kind, tmp_path)
-    rate = {"fps": 20} if kind == "npy" else {}
+    rate: dict[str, Any] = {"fps": 20} if kind == "npy" else {}
     before = read(path, **rate)
     skeleton = {key: KEYS[key]}
     if key == "map" and kind != "bvh" and kind != "amass":
@@ -236,7 +238,9 @@ def test_a_rest_pose_in_front_is_left_out_and_said(tmp_path: Path, capsys):
     write_bvh(tmp_path / "a.bvh", motion, first=rest)
     np.savez(tmp_path / "b.npz", joints=np.concatenate([rest[None], motion.joints]), fps=20)
     parts = amass(motion)
-    still = {name: np.concatenate([parts[name][:1] * (name == "trans"), parts[name]]) for name in ("poses", "trans")}
+    still: dict[str, Any] = {
+        name: np.concatenate([parts[name][:1] * (name == "trans"), parts[name]]) for name in ("poses", "trans")
+    }
     still["poses"][0, 0] = np.pi / 2
     np.savez(tmp_path / "c.npz", **(parts | still))
     motion.save(tmp_path / "d.bvh", rest_pose=True, rig="lafan1")

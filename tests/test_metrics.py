@@ -102,8 +102,9 @@ def test_action_metrics_equal_the_authors(case: str):
 
 @one
 def test_intervals_accuracy_unconstrained_diversity_precision_recall_and_retrieval_equal_the_authors(stem: str):
-    np.testing.assert_allclose(mean_ci(array("ci/values").tolist()), array("ci/mean_ci"), rtol=1e-12)
-    columns = [mean_ci(column.tolist()) for column in array("ci/values3").T]
+    interval: Any = mean_ci(array("ci/values").tolist())
+    np.testing.assert_allclose(interval, array("ci/mean_ci"), rtol=1e-12)
+    columns: Any = [mean_ci(column.tolist()) for column in array("ci/values3").T]
     np.testing.assert_allclose(np.transpose(columns), array("ci/mean_ci3"), rtol=1e-12)
     labels = tensor("a2m/logit_labels")
     value = computed(accuracy.ActionAccuracy(), logits=tensor("a2m/logits"), labels=labels, keys=keys(len(labels)))

@@ -11,7 +11,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from support.fixtures import ROOT, blender
 from support.glb import odd_character, write_names
@@ -127,7 +127,7 @@ def test_the_surface_in_autodesk_is_that_of_pictures(node_modules: Path, tmp_pat
         surfaces.append(skinned(path, frame))
     # the SDK's file has a vertex once per material that meets there, in another order
     for first, second in (surfaces, surfaces[::-1]):
-        nearest, _ = cKDTree(first).query(second)
+        nearest, _ = KDTree(first).query(second)
         assert nearest.max() < 0.02 * MILLIMETER
 
 

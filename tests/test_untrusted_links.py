@@ -106,7 +106,7 @@ def audit_cache(out: Path) -> None:
     evaluator: Any = SimpleNamespace(
         extract=lambda _: {"generated": torch.zeros(1, 2)}, metrics={}, protocol=SimpleNamespace(metrics={})
     )
-    audited_inputs(evaluator, out / "real.npz", ["a"], lambda: [torch.zeros(2, 3)])
+    audited_inputs(evaluator, out / "real.npz", ["a"], lambda: [np.zeros((2, 3))])
 
 
 def evaluated_motions(out: Path) -> None:

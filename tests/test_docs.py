@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+import os
 import pkgutil
 import re
 import shlex
@@ -122,6 +123,8 @@ def resolved_once(monkeypatch):
 
 @pytest.mark.slow
 def test_links_names_paths_and_commands_exist(tmp_path, monkeypatch, resolved_once):
+    # launch=slurm is refused on a machine without the commands of SLURM
+    monkeypatch.setenv("PATH", f"{ROOT / 'tests/support/slurm'}{os.pathsep}{os.environ['PATH']}")
     wrong, commands = {}, {}
     for number, page in enumerate(PAGES):
         text, name = page.read_text(), str(page.relative_to(ROOT)).removeprefix("docs/")

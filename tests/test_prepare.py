@@ -140,7 +140,7 @@ WHERE = {
     **{"bandai": "github.com/BandaiNamcoResearchInc", "cmu": "clone https://github.com/una-dinosauria/cmu-mocap"},
     **dict.fromkeys(("humanact12", "uestc"), "github.com/Mathux/ACTOR"),
     **dict.fromkeys(("humanml3d", "humanml3d_smpl", "kit"), "github.com/EricGuo5513/HumanML3D"),
-    "folder": "give a folder of .npz, .bvh, .fbx, .glb, .vrm, .vrma, .amc, .json, .npy files",
+    "folder": "Give a folder of .npz, .bvh, .fbx, .glb, .vrm, .vrma, .amc, .json, .npy files",
 }
 
 

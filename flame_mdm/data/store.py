@@ -154,6 +154,7 @@ def write_store(folder: Path, source: MotionSource, representation: Representati
     lock = folder.with_name(folder.name + ".lock")
     waiting = f"{folder}: another process is preparing it; waiting"
     with locked(lock, lambda _: say(waiting), "prepare in one process at a time"):
+        remove_abandoned(folder.parent, folder, is_locked=True)  # also of a process that is just ending
         remove_abandoned(folder.parent)
         if before or not (folder / "store.json").exists():
             replaced = _replaceable(folder)

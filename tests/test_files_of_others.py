@@ -16,58 +16,20 @@ import pytest
 from support.fixtures import SHARED
 from support.glb import changed
 from support.motions import posed, synthetic
+from support.others import POINTER, TURNED, amass, swapped, walk, write_bvh
 
 from flame_mdm.__main__ import main
 from flame_mdm.data.adaptation import check_clips
 from flame_mdm.data.folder import Folder
 from flame_mdm.data.store import Store
 from flame_mdm.errors import UserError
-from flame_mdm.formats import bvh, glb
+from flame_mdm.formats import glb
 from flame_mdm.formats.layouts import head_height
-from flame_mdm.formats.motion import AMASS_AXES, Motion, amass_parameters
-from flame_mdm.formats.readers import PELVIS, read, read_recording
+from flame_mdm.formats.motion import Motion
+from flame_mdm.formats.readers import read, read_recording
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.sampling.reading import read_motion
-
-POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n"
-TURNED = {"z": [[1, 0, 0], [0, 0, -1], [0, 1, 0]], "-y": [[1, 0, 0], [0, -1, 0], [0, 0, -1]], "y": np.eye(3)}
-"""Axis that points up -> rows of the rotation of joints with y up to these axes."""
-
-
-def walk(frames: int = 40) -> Motion:
-    """A body whose arms hang, which turns a little and swings its legs."""
-    swing = np.sin(np.arange(frames) / 6)[:, None] * [20.0, 0, 0]
-    legs: dict[str, Any] = {"left_hip": swing, "right_hip": -swing}
-    arms: dict[str, Any] = {"left_shoulder": [0, 0, -70.0], "right_shoulder": [0, 0, 70.0]}
-    return posed(frames, heading=np.sin(np.arange(frames) / 9), **legs, **arms)
-
-
-def amass(motion: Motion, up: str = "z", numbers: int = 156) -> dict[str, Any]:
-    """The motion as SMPL's rotations in axes of which `up` points up, with the pelvis of SMPL's template."""
-    poses = motion.posed()
-    turn = np.array(TURNED[up]) @ AMASS_AXES.numpy() if up != "z" else np.eye(3)
-    vectors, pelvis = amass_parameters(poses)
-    root = np.array(TURNED[up], float) @ poses.rotations[:, 0].numpy() if up != "z" else None
-    if root is not None:
-        from scipy.spatial.transform import Rotation
-
-        vectors[:, :3], pelvis = Rotation.from_matrix(root).as_rotvec(), pelvis @ turn.T
-    padded = np.pad(vectors, ((0, 0), (0, numbers - 66)))
-    return {"poses": padded, "trans": pelvis - np.array(PELVIS), "mocap_framerate": motion.fps}
-
-
-def write_bvh(path: Path, motion: Motion, turn: Any = None, first: Any = None) -> None:
-    """A BVH file with position channels; `first` (22, 3) is a frame in front."""
-    joints = motion.joints.astype(float)
-    if first is not None:
-        joints = np.concatenate([np.asarray(first, float)[None], joints])
-    local = 100 * joints @ np.array(TURNED[turn or "y"], float).T
-    local[:, 1:] -= local[:, :1]
-    frames = np.concatenate([local, np.zeros_like(local)], 2).reshape(len(local), -1)
-    channels = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "XYZ")
-    tree = bvh.Bvh(SMPL22.joints, (-1, *[0] * 21), np.zeros((22, 3)), (channels,) * 22, frames, motion.fps)
-    bvh.write(tree, path)
 
 
 def test_arrays_that_are_not_needed_are_never_opened(tmp_path: Path):
@@ -199,12 +161,6 @@ def test_up_of_commands_and_of_json_files_acts(tmp_path: Path):
         read(tmp_path / "ours.npz", up="z")
 
 
-SWAPPED = [
-    SMPL22.joints.index(name.replace("left", "x").replace("right", "left").replace("x", "right"))
-    for name in SMPL22.joints
-]
-
-
 def test_every_entrance_checks_sides_size_and_orientation(tmp_path: Path, capsys):
     folder = tmp_path / "in"
     folder.mkdir()
@@ -223,8 +179,8 @@ def test_every_entrance_checks_sides_size_and_orientation(tmp_path: Path, capsys
         except UserError as error:
             return str(error)
 
-    swapped, small = replace(walk(), joints=walk().joints[:, SWAPPED]), replace(walk(), joints=0.4 * walk().joints)
-    for motion, words in ((swapped, "the toes point backwards"), (small, "people's are")):
+    mirrored, small = replace(walk(), joints=swapped(walk())), replace(walk(), joints=0.4 * walk().joints)
+    for motion, words in ((mirrored, "the toes point backwards"), (small, "people's are")):
         write_bvh(path, motion)
         for name, enter in entrances.items():
             assert words in said(enter), name

@@ -29,6 +29,9 @@ UP = {
 LEG, USUAL_LEG = (0.6, 1.2), 0.83  # shortest, longest and usual leg of an adult, in meters: hip to knee to ankle
 CHILD = 0.25  # shortest leg of a child in meters, at about one year
 FOOT = 0.02  # shortest foot in meters, ankle to toes
+UNEQUAL = 1.5  # ratio of the left and right bones of limbs above which joints are not in the assumed order
+CHANGING = 0.25  # standard deviation of the bones of limbs over their mean length, above which the same holds
+LIMBS = (("hip", "knee"), ("knee", "ankle"), ("shoulder", "elbow"), ("elbow", "wrist"))
 SIDES = ("left_", "right_")  # prefixes of SMPL's joints
 UNITS = {  # in meters
     **{"meters": 1.0, "centimeters": 0.01, "millimeters": 0.001, "inches": 0.0254, "feet": 0.3048},
@@ -320,6 +323,34 @@ def check_feet(joints: np.ndarray) -> None:
         raise UserError("the toes point backwards. Exchange left and right in skeleton.yaml, or set `mirrored: true`")
 
 
+def check_order(joints: np.ndarray, count: int, skeleton: str) -> None:
+    """Raises `UserError` if an array of joints was taken for another skeleton, because of their number alone.
+
+    Args:
+        joints: (F, 22, 3) of SMPL, mapped from the array as if its joints were those of the skeleton.
+        count: number of joints of the array.
+        skeleton: name of the skeleton.
+
+    The bones of a person's limbs are equally long on both sides and keep their length. In another order of joints, or
+    on another skeleton, the same pairs of joints are not bones.
+    """
+    lengths = np.stack([_lengths(joints, side + start, side + end) for side in SIDES for start, end in LIMBS], 1)
+    usual = np.maximum(lengths.mean(0), 1e-9)
+    unequal = np.abs(np.log(usual[:4] / usual[4:])).mean() > math.log(UNEQUAL)
+    changing = (lengths.std(0) / usual).mean() > CHANGING
+    if unequal or changing:
+        fault = "left and right limbs are not equally long" if unequal else "the limbs change their length"
+        raise UserError(
+            f"{count} joints, not those of {skeleton} in their order: {fault}. Write the names of all joints and a map "
+            "into skeleton.yaml"
+        )
+
+
 def _bone(joints: np.ndarray, start: str, end: str) -> float:
-    first, last = (joints[:, SMPL22.joints.index(name)] for name in (start, end))
-    return float(np.linalg.norm(first - last, axis=1).mean())
+    return float(_lengths(joints, start, end).mean())
+
+
+def _lengths(joints: np.ndarray, start: str, end: str) -> np.ndarray:
+    """Returns the distances (F,) of two joints of SMPL."""
+    first, last = (joints[:, SMPL22.joints.index(name)].astype(float) for name in (start, end))
+    return np.linalg.norm(first - last, axis=1)

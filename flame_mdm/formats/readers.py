@@ -22,6 +22,7 @@ from flame_mdm.formats.layouts import (
     UP,
     Layout,
     array_layout,
+    check_order,
     find_layout,
     find_skeleton,
     layout_name,
@@ -249,19 +250,22 @@ def _of_joints(
     stated = {key: data[key] for key in ("up", "unit") if key in data}
     fields = _checked(fields | stated | said)
     names = tuple(data.get("names", ()))
+    is_counted = not names and not {"joints", "map"} & fields.keys()  # the skeleton follows from the number of joints
     if names and not {"joints", "map"} & fields.keys() and all(names != s.joints for s in SKELETONS.values()):
         fields["joints"] = list(names)
 
     if as_smpl or {"joints", "map"} & fields.keys() or joints.shape[1:2] not in [(len(s),) for s in SKELETONS.values()]:
         layout, names = array_layout(joints, fields)
-        joints, skeleton = layout.apply(joints.astype(float), names), SMPL22
+        joints, skeleton, assumed = layout.apply(joints.astype(float), names), SMPL22, layout_name(layout)
     else:
-        layout, skeleton = Layout(**fields), _skeleton(joints)
+        layout, skeleton, assumed = Layout(**fields), _skeleton(joints), "SMPL"
         joints = layout.turn(joints.astype(float)).astype(np.float32)
 
     notes, doubts, start = [], Doubts(), 0
     if skeleton.joints[: len(SMPL22)] == SMPL22.joints:
         body = joints[:, : len(SMPL22)]
+        if is_counted:
+            check_order(body, data["joints"].shape[1], assumed)
         if start := checks.rest_frames(body, rate):
             notes.append(_rest_note(start))
         body = body[start:]

@@ -150,7 +150,7 @@ def test_refusals_of_files_name_no_temporary_folder(studio):
 def test_an_invalid_origin_is_refused():
     guard = pytest.importorskip("flame_mdm.demo.guard", reason="gradio is not installed")
     headers = pytest.importorskip("starlette.datastructures").Headers
-    checked = guard.Guard(None, (), {})
+    checked = guard.Guard(None, (), {}, bool)
     checked._check_sender(headers({"host": "localhost", "origin": "http://localhost"}), "/")
     for origin in ("http://[", "http://[::1", "[", "null"):
         with pytest.raises(guard.HTTPException, match="another site"):
@@ -203,12 +203,16 @@ class Server(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def normal() -> Iterator[Server]:
-    """A demo, which ends by a signal while a page is open."""
+def normal(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """A demo, which ends by a signal while a page is open; no request of the tests below makes it print a traceback."""
     pytest.importorskip("gradio", reason="gradio is not installed")
+    errors = tmp_path_factory.mktemp("demo") / "errors"
     words = [sys.executable, "-c", f"import sys; {INSIDE}{NORMAL}"]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests")])}
-    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, cwd=ROOT, env=environment) as running:
+    with (
+        errors.open("w") as file,
+        subprocess.Popen(words, stdout=subprocess.PIPE, stderr=file, text=True, cwd=ROOT, env=environment) as running,
+    ):
         assert running.stdout is not None
         inside = json.loads(running.stdout.readline())
         address = running.stdout.readline().split()[0]
@@ -219,6 +223,7 @@ def normal() -> Iterator[Server]:
                 assert running.wait(20) in (143, -signal.SIGTERM)
         finally:
             running.kill()
+    assert "Traceback" not in (printed := errors.read_text()), printed[-3000:]
 
 
 @pytest.fixture
@@ -318,6 +323,36 @@ def test_requests_of_other_sites_and_for_other_names_are_refused(server):
         assert get(server, Origin=origin)[0] == 403
     assert get(motion, Sec_Fetch_Site="cross-site")[0] == get(motion, Sec_Fetch_Site="same-site")[0] == 403
     assert get(server, Sec_Fetch_Site="cross-site", Origin=server)[0] == 200  # a link to the page
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        "gradio_api/queue/data?session_hash=x%00",
+        "gradio_api/queue/data?session_hash=nobody",
+        "gradio_api/queue/data?session_hash=a&session_hash=b",
+        "gradio_api/queue/data",
+        "assets/" + "a" * 300,
+        "static/" + "%C3%A9" * 90,
+        "assets/" + "/".join(["a"] * 3000),
+        "motion.npz?" + "&".join(f"a{number}=1" for number in range(60)),
+        "gradio_api/heartbeat/%C3%A9",
+    ],
+    ids=lambda address: address[:40],
+)
+def test_an_address_that_the_page_does_not_use_gets_one_line(server, address):
+    status, body = get(f"{server}/{address}")
+    assert status in (400, 404)
+    assert body.decode() in (
+        "this page has nothing at that address",
+        "this page has no such session. Reload it",
+        "the link has 60 options. Give at most 50",
+    )
+
+
+def test_a_link_with_too_many_options_is_refused_on_the_page(server):
+    notes = generated(server, "&".join(f"a{number}=1" for number in range(51)))[1]
+    assert "the link has 51 options. Give at most 50" in notes
 
 
 def test_bodies_are_counted_as_they_arrive(server):

@@ -6,8 +6,8 @@ import re
 import socket
 import tempfile
 from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 os.environ |= {"GRADIO_ANALYTICS_ENABLED": "False", "HF_HUB_DISABLE_TELEMETRY": "1"}  # read when gradio is imported
 
@@ -19,14 +19,14 @@ from gradio import themes
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 
+from flame_mdm.demo.connections import ConnectionLimits, server_settings
 from flame_mdm.demo.guard import Guard
-from flame_mdm.demo.request import parse_query
+from flame_mdm.demo.request import parse_query, query_pairs
 from flame_mdm.demo.studio import Studio
 from flame_mdm.demo.studio_page import build_page
 from flame_mdm.errors import UserError, first_line, one_line, say
 
 SESSIONS = 64  # open pages that gradio remembers; it keeps half a megabyte for each, and the page needs none of it
-CONNECTIONS = 256  # maximum number of open connections; further ones get status 503
 WRITERS, WAITING_FILES = 2, 32  # motion files that are written at the same time, and those that wait for it
 FONT, MONO = ("system-ui", "sans-serif"), ("ui-monospace", "monospace")
 
@@ -51,8 +51,13 @@ def serve(
             os.environ["GRADIO_TEMP_DIR"] = folder
             app = web_app(studio, {host, *hosts})
             say(f"http://{f'[{host}]' if ':' in host else host}:{listening.getsockname()[1]}  (Ctrl+C stops the demo)")
-            limits: dict[str, Any] = {"limit_concurrency": CONNECTIONS, "timeout_graceful_shutdown": 3}
-            Server(uvicorn.Config(app, log_level="warning", ws="none", **limits)).run([listening])
+            Server(server_settings(app, connection_limits(hosts))).run([listening])
+
+
+def connection_limits(hosts: Collection[str]) -> ConnectionLimits:
+    """Returns the limits of connections. All visitors have one address behind a web server, whose names are `hosts`."""
+    limits = ConnectionLimits()
+    return replace(limits, per_address=limits.total) if hosts else limits
 
 
 class Server(uvicorn.Server):
@@ -71,13 +76,13 @@ def web_app(studio: Studio, hosts: Collection[str] = ()) -> Guard:
     @app.get("/motion{extension}")
     async def motion_file(extension: str, web: Request) -> Response:
         nonlocal waiting
-        pairs = web.query_params.multi_items()
-        options = {key: value for key, value in pairs if key in ("motion", "rig")}
-        number = options.get("motion", "0")
         if waiting >= WAITING_FILES:
             return PlainTextResponse("too many files are being written. Try again in a minute", 503)
         waiting += 1
         try:
+            pairs = query_pairs(web.url.query)
+            options = {key: value for key, value in pairs if key in ("motion", "rig")}
+            number = options.get("motion", "0")
             if not number.isdecimal() or len(number) > 3:
                 raise UserError(f"motion={one_line(number[:20])}: not a number of a motion")
             request = parse_query([pair for pair in pairs if pair[0] not in options])
@@ -119,4 +124,5 @@ def web_app(studio: Studio, hosts: Collection[str] = ()) -> Guard:
         "halt": (direct, lambda data: data == []),
         "switch": (direct, lambda data: len(data) == 1 and data[0] in studio.files),
     }
-    return Guard(app, hosts, {number: calls[fn.name] for number, fn in blocks.fns.items() if fn.name in calls})
+    numbers = {number: calls[fn.name] for number, fn in blocks.fns.items() if fn.name in calls}
+    return Guard(app, hosts, numbers, lambda session: session in blocks._queue.pending_messages_per_session)

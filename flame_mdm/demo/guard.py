@@ -9,7 +9,7 @@ from typing import Annotated
 from urllib.parse import urlsplit
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
-from starlette.datastructures import Headers
+from starlette.datastructures import Headers, QueryParams
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import PlainTextResponse
@@ -17,11 +17,14 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 MAX_BODY = 64 * 1024  # maximum number of bytes of a request's body, counted as they arrive
 BODY_TIME = 10.0  # maximum number of seconds in which a body arrives
+MAX_PATH = 200  # maximum number of characters of an address's path; names of files have at most 255
 READ = re.compile(
     r"/|/theme\.css|/favicon\.ico|/manifest\.json|/(assets|static)(/[\w-]+(\.[\w-]+)*)+|/motion\.\w{3}"
-    r"|/gradio_api/(queue/data|heartbeat/\w{1,40})"
+    r"|/gradio_api/(queue/data|heartbeat/\w{1,40})",
+    re.ASCII,
 )
 """Paths that the page reads with GET."""
+STREAM = "/gradio_api/queue/data"
 HEADERS = {
     "Content-Security-Policy": "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; "
     "style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self'; "
@@ -77,13 +80,19 @@ class Guard:
 
     `hosts` are names of this server, besides localhost and addresses in numbers: another name is one that somebody else
     pointed at this computer (DNS rebinding). `calls` are the functions of the page that may be called: number -> path,
-    and whether arguments are accepted.
+    and whether arguments are accepted. `is_open` says whether a session has called a function, so that its results can
+    be read.
     """
 
     def __init__(
-        self, app: ASGIApp, hosts: Collection[str], calls: Mapping[int, tuple[str, Callable[[list[str]], bool]]]
+        self,
+        app: ASGIApp,
+        hosts: Collection[str],
+        calls: Mapping[int, tuple[str, Callable[[list[str]], bool]]],
+        is_open: Callable[[str], bool],
     ):
         self.app = app
+        self.is_open = is_open
         self.hosts = {host.lower() for host in hosts if not _is_address(host)} - {"localhost"}
         self.calls = calls
         self.closing = asyncio.Event()
@@ -106,7 +115,7 @@ class Guard:
             if scope["method"] == "POST" and headers.get("content-type") != "application/json":
                 raise HTTPException(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "this is not a request of this page")
             body = await _body(Request(scope, receive))
-            self._check_content(scope["method"], scope["path"], body)
+            self._check_content(scope, body)
         except HTTPException as refusal:
             answer = PlainTextResponse(refusal.detail, refusal.status_code, {"Connection": "close"})
             return await answer(scope, receive, send_headers)
@@ -139,8 +148,11 @@ class Guard:
         if not same or (path != "/" and headers.get("sec-fetch-site", "none") not in ("same-origin", "none")):
             raise HTTPException(HTTPStatus.FORBIDDEN, "this request comes from a page of another site")
 
-    def _check_content(self, method: str, path: str, body: bytes) -> None:
-        if method in ("GET", "HEAD") and READ.fullmatch(path) and not body:
+    def _check_content(self, scope: Scope, body: bytes) -> None:
+        method, path = scope["method"], scope["path"]
+        if method in ("GET", "HEAD") and len(path) <= MAX_PATH and READ.fullmatch(path) and not body:
+            if path == STREAM:
+                self._check_session(QueryParams(scope["query_string"]))
             return
         if method != "POST" or path not in POSTS:
             raise HTTPException(HTTPStatus.NOT_FOUND, "this page has nothing at that address")
@@ -152,6 +164,11 @@ class Guard:
             address, accepts = self.calls.get(content.fn_index, ("", bool))
             if address != path or not accepts(content.data):
                 raise HTTPException(HTTPStatus.BAD_REQUEST, "this is not a request of this page")
+
+    def _check_session(self, query: QueryParams) -> None:
+        sessions = query.getlist("session_hash")
+        if len(sessions) != 1 or not self.is_open(sessions[0]):
+            raise HTTPException(HTTPStatus.NOT_FOUND, "this page has no such session. Reload it")
 
 
 async def _body(request: Request) -> bytes:

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Iterable
 from typing import Annotated, Any, Literal
-from urllib.parse import urlencode
+from urllib.parse import parse_qsl, urlencode
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, StringConstraints, ValidationError
 
@@ -12,6 +12,7 @@ from flame_mdm.sampling.motion_request import path_targets, read_parts, read_pat
 
 MAX_TEXT, MAX_SECONDS, MAX_SAMPLES, MAX_STEPS, MAX_EDITS = 300, 30, 4, 1000, 8  # limits of a request
 MAX_SEED = 2**31 - 1
+MAX_FIELDS = 50  # of a query string
 MAX_WAY_POINTS, FAR = 16, 20.0  # a path: way points, and meters along x and z
 PLUS = " + "  # between the names of a model and of its adapter
 PLAIN = r"^[^\x00-\x1f\x7f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]*$"
@@ -112,6 +113,15 @@ class DemoRequest(BaseModel):
             call = "generate(model" if source is None else f"edit(model, motions[{source}]"
             lines.append(f"motions = flame_mdm.{call}, {', '.join(f'{k}={v!r}' for k, v in keywords.items())})")
         return "\n".join([*lines, 'motions[0].save("motion.bvh")  # or .glb, .npz, .mp4'])
+
+
+def query_pairs(query: str) -> list[tuple[str, str]]:
+    """Returns the keys and values of a query string; raises `UserError` if it has more than `MAX_FIELDS`."""
+    try:
+        return parse_qsl(query, keep_blank_values=True, max_num_fields=MAX_FIELDS)
+    except ValueError:
+        fields = query.count("&") + 1
+        raise UserError(f"the link has {fields} options. Give at most {MAX_FIELDS}") from None
 
 
 def parse_query(pairs: Iterable[tuple[str, str]]) -> DemoRequest:

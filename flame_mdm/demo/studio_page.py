@@ -9,12 +9,11 @@ from html import escape
 from threading import Event
 from types import SimpleNamespace
 from typing import Any
-from urllib.parse import parse_qsl
 
 import gradio as gr
 
 from flame_mdm.data.synthetic import example, prompts
-from flame_mdm.demo.request import MAX_TEXT, DemoRequest, parse_query
+from flame_mdm.demo.request import MAX_TEXT, DemoRequest, parse_query, query_pairs
 from flame_mdm.demo.studio import FORMATS, Studio
 from flame_mdm.errors import UserError, first_line, markdown_text, one_line
 from flame_mdm.formats.motion import Motion
@@ -48,7 +47,7 @@ def build_page(studio: Studio) -> gr.Blocks:
     def show(query: str, web: gr.Request, progress: gr.Progress = gr.Progress()) -> dict[Any, Any]:  # noqa: B008
         stop = stops[str(web.session_hash)] = Event()
         try:
-            request = studio.understood(parse_query(parse_qsl(query, max_num_fields=50)))
+            request = studio.understood(parse_query(query_pairs(query)))
             model = studio.model(request.model)
             runs = 1 + len(request.edits) + STEERING_STEPS * bool(request.path)
             steps = request.num_inference_steps or model.sampler_options.num_inference_steps

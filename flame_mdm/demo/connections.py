@@ -1,0 +1,134 @@
+"""Connections of the demo's server: deadlines, and limits of their number in total and per address."""
+
+import asyncio
+from dataclasses import dataclass
+from functools import partial
+from ipaddress import IPv4Address, IPv6Address, IPv6Network, ip_address
+from typing import Any
+
+import uvicorn
+from starlette.types import ASGIApp
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConnectionLimits:
+    """Limits of the connections of a server.
+
+    A connection is *waiting* until the headers of a request are complete, and again after the answer. When a limit of
+    their number is reached, the connection that has waited longest is closed in favor of a new one. If none is waiting,
+    the request of the new connection gets status 503.
+
+    Attributes:
+        total: maximum number of open connections.
+        per_address: maximum number of open connections of one address, or of one IPv6 network of 64 bits.
+        header_seconds: maximum waiting time of a connection, however many bytes of the headers arrive.
+        idle_seconds: maximum waiting time after an answer, if nothing arrives.
+        stall_seconds: maximum number of seconds in which a client reads nothing of an answer.
+    """
+
+    total: int = 256
+    per_address: int = 32
+    header_seconds: float = 10.0
+    idle_seconds: int = 5
+    stall_seconds: float = 30.0
+
+
+def server_settings(app: ASGIApp, limits: ConnectionLimits) -> uvicorn.Config:
+    """Returns the settings of a server of `app` within `limits`."""
+    options: dict[str, Any] = {
+        "http": partial(Connection, limits=limits),
+        "ws": "none",
+        "timeout_keep_alive": limits.idle_seconds,
+        "timeout_graceful_shutdown": 3,
+        "log_level": "warning",
+    }
+    return uvicorn.Config(app, **options)
+
+
+class Connection(H11Protocol):
+    """A connection within `ConnectionLimits`."""
+
+    def __init__(self, *arguments: Any, limits: ConnectionLimits, **keywords: Any):
+        super().__init__(*arguments, **keywords)
+        self.limits = limits
+        self.network: IPv4Address | IPv6Network | None = None
+        self.deadline: asyncio.TimerHandle | None = None  # None while a request is being answered
+        self.stall: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        self.network = _network(self.client[0]) if self.client else None
+        self._watch()
+
+        others = [connection for connection in self.connections if isinstance(connection, Connection)]
+        self._make_room([other for other in others if other.network == self.network], self.limits.per_address)
+        self._make_room(others, self.limits.total)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._stop_timers()
+        super().connection_lost(exc)
+
+    def handle_events(self) -> None:
+        super().handle_events()
+        self._watch()
+
+    def on_response_complete(self) -> None:
+        super().on_response_complete()
+        self._watch()
+
+    def pause_writing(self) -> None:
+        super().pause_writing()
+        # The client does not read: closing would wait for it, too.
+        self.stall = self.loop.call_later(self.limits.stall_seconds, self.transport.abort)
+
+    def resume_writing(self) -> None:
+        super().resume_writing()
+        if self.stall is not None:
+            self.stall.cancel()
+            self.stall = None
+
+    def close(self) -> None:
+        """Closes the connection; it no longer counts."""
+        self._stop_timers()
+        self.connections.discard(self)
+        self.transport.close()
+
+    def _watch(self) -> None:
+        """Starts the deadline when the connection begins to wait, and stops it when it has a request."""
+        if self.transport.is_closing():
+            return
+
+        waiting = self.cycle is None or self.cycle.response_complete
+        if waiting and self.deadline is None:
+            self.deadline = self.loop.call_later(self.limits.header_seconds, self.close)
+        elif not waiting and self.deadline is not None:
+            self.deadline.cancel()
+            self.deadline = None
+
+    def _make_room(self, group: "list[Connection]", limit: int) -> None:
+        """Closes the connections of a group that have waited longest, as many as exceed the limit."""
+        excess = len(group) - limit
+        if excess <= 0:
+            return
+
+        deadlines = [(other.deadline.when(), other) for other in group if other.deadline and other is not self]
+        closed = sorted(deadlines, key=lambda pair: pair[0])[:excess]
+        for _, other in closed:
+            other.close()
+        if len(closed) < excess:
+            self.limit_concurrency = 0  # uvicorn answers the request with 503
+
+    def _stop_timers(self) -> None:
+        for timer in (self.deadline, self.stall):
+            if timer is not None:
+                timer.cancel()
+        self.deadline = self.stall = None
+
+
+def _network(address: str) -> IPv4Address | IPv6Network:
+    """Returns an address, or the network of 64 bits of an IPv6 address: one subscriber has all of its addresses."""
+    parsed = ip_address(address.partition("%")[0])
+    if isinstance(parsed, IPv6Address):
+        return parsed.ipv4_mapped or IPv6Network((parsed, 64), strict=False)
+    return parsed

@@ -249,8 +249,10 @@ def test_quality_has_intervals_over_seeds_and_of_the_differences_of_equal_seeds(
         quality.measure(settings)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", run.SECTIONS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=() if name == "averaging" else pytest.mark.robustness) for name in run.SECTIONS],
+)
 def test_every_benchmark_runs_at_a_toy_size(name, tmp_path, monkeypatch):
     monkeypatch.setattr(run, "PAGE", tmp_path / "speed.md")
     measured = run.run(name, Settings(quick=True))

@@ -41,6 +41,7 @@ class Clip:
     window: tuple[int, int] | None = None
     # (F', J, 3) joints in meters at the frame rate of the recording, for protocols that compare at it
     reference: np.ndarray | None = None
+    license: str = ""  # of this motion, an identifier such as "MIT"; empty if the data set has one license for all
 
 
 class MotionSource(ABC):
@@ -53,6 +54,9 @@ class MotionSource(ABC):
     read them. They are saved in the store, and commands compare them with the recipe's."""
     actions: tuple[str, ...] = ()  # names of the action labels, in the order of their numbers
     verbs: tuple[str, ...] = ()  # all forms of the verbs in the captions, at which sentences are split, or none
+    license: str = (
+        ""  # of all motions, a key of `licenses.yaml` such as "MIT"; empty if unknown or if clips have theirs
+    )
     captions_may_be_shared: bool = False  # whether the license allows checkpoints to contain captions
     published_split: bool = False
     """Whether the split is the one used in papers although it tests on clips seen in training or leaves no validation
@@ -93,6 +97,10 @@ class MotionSource(ABC):
     def changed(self, store: Path) -> list[str]:
         """Returns a line if files were added or changed after they were prepared as the file `store`."""
         return []
+
+    def licenses(self) -> set[str]:
+        """Returns the licenses of all motions, without reading motions; "" stands for an unknown license."""
+        return {self.license}
 
     @abstractmethod
     def count(self) -> int:

@@ -105,6 +105,7 @@ class Bandai(MotionSource):
     """
 
     name = "bandai"
+    license = "CC-BY-NC-4.0"
     captions_may_be_shared = True
     actions = tuple(dict.fromkeys([*CONTENTS_1, *TAKES_2]))
 

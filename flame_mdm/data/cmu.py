@@ -77,6 +77,7 @@ class CMU(MotionSource):
     """
 
     name = "cmu"
+    license = "CMU"
     version = 2  # 1: the bone from neck to head changed its length while the head nodded
 
     def __init__(

@@ -8,7 +8,7 @@ import os
 import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -31,7 +31,8 @@ from flame_mdm.safe_io import naming, read_text
 SHORTEST = 3  # frames that representations need at least
 SPLITTABLE = 10  # number of motions from which on each split has at least one
 TABLE = "captions.csv"
-COLUMNS = ("id", "text", "action", "split", "source")
+COLUMNS = ("id", "text", "action", "split", "source", "license")
+MOST_COPIES = 16  # of a clip in a balanced set; more would only be learned by heart
 
 
 class MotionFile(NamedTuple):
@@ -49,6 +50,7 @@ class Note:
     action: str | None = None
     split: Split | None = None
     source: str | None = None
+    license: str | None = None
 
 
 class Folder(MotionSource):
@@ -63,6 +65,9 @@ class Folder(MotionSource):
             AMASS files contain; they are fitted to the joints of other files.
         mirror: yield a mirrored copy after each clip of the training split; joints only.
         exclude: motions to leave out, by their path in the folder without extension.
+        balance: training clips of an action that has fewer than this many, mirrored copies included, are repeated
+            until there are about as many, each at most 16 times; 0 repeats none.
+        license: of the motions whose row in the table has none, a key of `licenses.yaml`; empty = unknown.
     """
 
     name = "folder"
@@ -75,19 +80,48 @@ class Folder(MotionSource):
         motion: Literal["joints", "smpl"] = "joints",
         mirror: bool = False,
         exclude: Sequence[str] = (),
+        balance: int = 0,
+        license: str = "",
         workers: int = 0,
     ):
+        if balance < 0:
+            raise UserError(f"data.source.balance={balance}: give the number of clips per action, or 0")
         if mirror and motion == "smpl":
             raise UserError("data.source.mirror=true: needs data.source.motion=joints")
         self.path, self.motion, self.mirror, self.exclude = Path(path), motion, mirror, tuple(exclude)
-        self.workers = workers
+        self.workers, self.balance, self.license = workers, balance, license
         self.options = {"motion": motion, "mirror": mirror, "exclude": list(exclude)}
+        if balance:
+            self.options["balance"] = balance
+        if license:
+            self.options["license"] = license
         self._uprights: defaultdict[str, list[float]] = defaultdict(list)  # of the motions read so far, by layout
         self._notes: Counter[str] = Counter()  # lines about the motions read so far
 
     def count(self) -> int:
-        splits = Counter(self.splits.values())
-        return sum(splits.values()) + (splits["train"] if self.mirror else 0)
+        return sum(self.copies(name) * (2 if self._is_mirrored(name) else 1) for name in self.files)
+
+    def licenses(self) -> set[str]:
+        return {note.license or self.license for note in self.notes.values()}
+
+    @cached_property
+    def sizes(self) -> Counter[str | None]:
+        """Number of training clips by action, mirrored copies included."""
+        sizes = Counter[str | None]()
+        for name, note in self.notes.items():
+            if self.splits[name] == "train":
+                sizes[note.action] += 2 if self.mirror else 1
+        return sizes
+
+    def copies(self, name: str) -> int:
+        """Returns how often a motion occurs in the set."""
+        if not self.balance or self.splits[name] != "train":
+            return 1
+        repeated = round(self.balance / self.sizes[self.notes[name].action])
+        return min(max(1, repeated), MOST_COPIES)
+
+    def _is_mirrored(self, name: str) -> bool:
+        return self.mirror and self.splits[name] == "train"
 
     def clips(self, fps: float) -> Iterator[Clip]:
         """Yields the clips of all motions that can be read; `failures` lists the others."""
@@ -95,10 +129,19 @@ class Folder(MotionSource):
         for name, motion in self._motions(fps):
             note, split = self.notes[name], self.splits[name]
             action = None if note.action is None else self.actions.index(note.action)
-            clip = Clip(name.replace("/", "_"), motion, note.texts, split, note.source or name, action)
-            yield clip
-            if self.mirror and split == "train":
-                yield mirrored(clip, SMPL22.mirror(torch.from_numpy(motion)).numpy(), self.actions)
+            clip = Clip(
+                id=name.replace("/", "_"),
+                motion=motion,
+                captions=note.texts,
+                split=split,
+                source=note.source or name,
+                action=action,
+                license=note.license or self.license,
+            )
+            yield from _repeated(clip, self.copies(name))
+            if self._is_mirrored(name):
+                image = mirrored(clip, SMPL22.mirror(torch.from_numpy(motion)).numpy(), self.actions)
+                yield from _repeated(image, self.copies(name))
         if len(self.failures) == len(self.files):
             self.require_all()
         self.leave_out("motions that cannot be read", len(self.failures))
@@ -228,6 +271,13 @@ class Folder(MotionSource):
         return {name: note.split or splits[sources[name]] for name, note in self.notes.items()}
 
 
+def _repeated(clip: Clip, copies: int) -> Iterator[Clip]:
+    """Yields a clip and its further copies, which share its frames in the store."""
+    yield clip
+    for number in range(2, copies + 1):
+        yield replace(clip, id=f"{clip.id}~{number}")
+
+
 def _animations(name: str, path: Path) -> Iterator[tuple[str, MotionFile]]:
     """Yields the motions of a file and their names; several animations of one file get their own names."""
     animations: list[str] = []
@@ -251,7 +301,7 @@ def _add(notes: dict[str, Note], cells: dict[str, str]) -> None:
         raise UserError(f"unknown split {split!r}; use {', '.join(SPLITS)}")
     note = notes[name]
     note.texts += [text] if (text := cells.get("text")) else []
-    for key in ("action", "split", "source"):
+    for key in ("action", "split", "source", "license"):
         if value := cells.get(key):
             if getattr(note, key) not in (None, value):
                 raise UserError(f"{name} has two values of {key}: {getattr(note, key)} and {value}")

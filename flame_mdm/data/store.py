@@ -65,6 +65,7 @@ class Entry:
     captions: list[str]
     action: Count | None
     attributes: dict[str, Any] = field(default_factory=dict)
+    license: str = ""
 
 
 class Contents(Schema):
@@ -191,8 +192,8 @@ def _write(folder: Path, source: MotionSource, representation: Representation, t
     if not splits["train"]:
         advice = " Add a `split` column to captions.csv" if source.named_by_recipe else ""
         raise UserError(f"{source.name}: no clip is in the training split.{advice}")
-    index = (json.dumps(asdict(entry), ensure_ascii=False, sort_keys=True) + "\n" for entry in entries)
-    (folder / "clips.jsonl").write_text("".join(index), encoding="utf-8")
+    index = "".join(f"{_line(entry)}\n" for entry in entries)
+    (folder / "clips.jsonl").write_text(index, encoding="utf-8")
     mean, std = source.statistics() or training_statistics(folder, entries, frames, representation)
     mean, std = mean[: representation.features], std[: representation.features]
     np.savez(folder / "statistics.npz", mean=mean, std=std)
@@ -214,6 +215,14 @@ def _write(folder: Path, source: MotionSource, representation: Representation, t
         "sha256": {path.name: sha256(path) for path in sorted(folder.iterdir())},
     }
     (folder / "store.json").write_text(json.dumps(info, indent=2) + "\n")
+
+
+def _line(entry: Entry) -> str:
+    """Returns the line of a clip. A clip without a license has no such key, as in all stores before there was one."""
+    values = asdict(entry)
+    if not entry.license:
+        del values["license"]
+    return json.dumps(values, ensure_ascii=False, sort_keys=True)
 
 
 def _pack(
@@ -243,8 +252,17 @@ def _pack(
             if clip.id in entries:
                 raise UserError(f"{name}: two clips have the same id, {clip.id}")
             start, attributes = begin + first, dict(clip.attributes)
-            entry = Entry(clip.id, start, length, clip.split, clip.source, clip.captions, clip.action, attributes)
-            entries[clip.id] = entry
+            entries[clip.id] = Entry(
+                id=clip.id,
+                start=start,
+                length=length,
+                split=clip.split,
+                source=clip.source,
+                captions=clip.captions,
+                action=clip.action,
+                attributes=attributes,
+                license=clip.license,
+            )
             if clip.reference is not None:
                 references = references or stack.enter_context(zipfile.ZipFile(folder / "references.npz", "w"))
                 with references.open(f"{clip.id}.npy", "w", force_zip64=True) as file:

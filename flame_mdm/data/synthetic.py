@@ -173,6 +173,7 @@ class Synthetic(MotionSource):
     """
 
     name = "synthetic"
+    license = "MIT"
     captions_may_be_shared = True
     actions = tuple(ACTIONS)
     verbs = tuple(sorted({form for forms in content()["verbs"].values() for form in forms}))

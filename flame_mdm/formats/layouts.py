@@ -307,6 +307,9 @@ def _usual_unit(leg: float, unit: float) -> str:
     return f"The file has no usual unit; {usual:.3g} gives the usual legs of {USUAL_LEG:g} m"
 
 
+BACKWARDS = 0.25  # share of the frames in which the toes of both feet point backwards, above which sides are exchanged
+
+
 def check_feet(joints: np.ndarray) -> None:
     """Raises `UserError` if a foot of SMPL's joints (F, 22, 3) has no length, or the toes point backwards."""
     at = {name: joints[:, number] for number, name in enumerate(SMPL22.joints)}
@@ -314,12 +317,15 @@ def check_feet(joints: np.ndarray) -> None:
         if _bone(joints, f"{side}_ankle", f"{side}_foot") < FOOT:
             advice = "to the toes, or to the end site of the ankle, such as LeftAnkle.end"
             raise UserError(f"the {side} foot has no length. Map {side}_foot in skeleton.yaml {advice}")
-    # The toes of a foot in the air may point backwards, as while running: of each frame, the lower foot counts.
+    # The toes of a foot in the air may point backwards, as while running: of each frame, the lower foot counts. So do
+    # the toes of one foot of a person who kneels: both feet point backwards in a part of the frames.
     across, trunk = at["left_hip"] - at["right_hip"], at["neck"] - at["pelvis"]
     depths = [((at[f"{side}_hip"] - at[f"{side}_ankle"]) * trunk).sum(1) for side in ("left", "right")]
     left, right = (at[f"{side}_foot"] - at[f"{side}_ankle"] for side in ("left", "right"))
-    toes = np.where((depths[0] > depths[1])[:, None], left, right)
-    if np.median((np.cross(across, trunk) * toes).sum(1)) < 0:
+    ahead = np.cross(across, trunk)
+    forward = np.stack([(ahead * foot).sum(1) for foot in (left, right)])
+    lower = np.where(depths[0] > depths[1], *forward)
+    if np.median(lower) < 0 and np.mean(forward.max(0) < 0) > BACKWARDS:
         raise UserError("the toes point backwards. Exchange left and right in skeleton.yaml, or set `mirrored: true`")
 
 

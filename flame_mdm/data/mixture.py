@@ -1,0 +1,91 @@
+"""Several data sets as one: every clip keeps the license of the data set that it comes from."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Literal
+
+from flame_mdm.data import Clip, MotionSource
+from flame_mdm.errors import UserError
+from flame_mdm.safe_io import read_yaml
+
+Use = Literal["any", "research"]
+
+
+@cache
+def known_licenses() -> dict[str, dict[str, str]]:
+    """Returns the content of `licenses.yaml`: by the name of a license, the `use` that it allows and its `terms`."""
+    return read_yaml(Path(__file__).with_name("licenses.yaml"))
+
+
+class Mixture(MotionSource):
+    """Clips of several data sets, one after the other.
+
+    Args:
+        parts: the data sets, by a name of your choice.
+        use: what the trained model is for. "any" refuses data sets of which a motion has an unknown license, or one
+            that allows research only; "research" takes all.
+    """
+
+    name = "mixture"
+    named_by_recipe = True
+
+    def __init__(self, parts: Mapping[str, MotionSource], use: Use = "any"):
+        if not parts:
+            raise UserError("data.source.parts: give at least one data set")
+        if use not in ("any", "research"):
+            raise UserError(f"data.source.use={use!s:.40}: give any or research")
+        self.parts, self.use = dict(parts), use
+        self.captions_may_be_shared = all(part.captions_may_be_shared for part in parts.values())
+        self.verbs = tuple(sorted({verb for part in parts.values() for verb in part.verbs}))
+        self.options = {"use": use, "parts": {name: dict(part.options) for name, part in self.parts.items()}}
+
+    def count(self) -> int:
+        self.check_licenses()
+        return sum(part.count() for part in self.parts.values())
+
+    def licenses(self) -> set[str]:
+        return {license for part in self.parts.values() for license in part.licenses()}
+
+    def check_licenses(self) -> None:
+        """Raises `UserError` if a license forbids the use that the recipe states."""
+        if self.use == "research":
+            return
+        for name, part in self.parts.items():
+            for license in sorted(part.licenses()):
+                if known_licenses().get(license, {}).get("use") == "any":
+                    continue
+                label = f"license {license}" if license else "an unknown license"
+                raise UserError(
+                    f"data.source.parts.{name}: has motions of {label}, but data.source.use=any. Leave them out, or "
+                    "set data.source.use=research for a model that is for research only"
+                )
+
+    def clips(self, fps: float) -> Iterator[Clip]:
+        """Yields the clips of each part; their actions are those of all parts together."""
+        self.check_licenses()
+        names: dict[str, int] = {}
+        for part in self.parts.values():
+            for clip in part.clips(fps):
+                action = None
+                if clip.action is not None:
+                    # A folder knows its actions only when it yields the first clip.
+                    action = names.setdefault(part.actions[clip.action], len(names))
+                yield replace(clip, action=action, license=clip.license or part.license)
+            self.excluded.update(part.excluded)
+        self.actions = tuple(names)
+        self.failures = [line for part in self.parts.values() for line in part.failures]
+
+    def findings(self) -> list[str]:
+        return [f"{name}: {line}" for name, part in self.parts.items() for line in part.findings()]
+
+    def failure_lines(self) -> list[str]:
+        return [line for part in self.parts.values() for line in part.failure_lines()]
+
+    def changed(self, store: Path) -> list[str]:
+        return [line for part in self.parts.values() for line in part.changed(store)]
+
+    def check(self, fps: float) -> list[str]:
+        self.check_licenses()
+        return [line for part in self.parts.values() for line in part.check(fps)]

@@ -1,0 +1,91 @@
+"""Several data sets as one, with the licenses of their motions; balanced folders."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flame_mdm.data.folder import MOST_COPIES, Folder
+from flame_mdm.data.mixture import Mixture
+from flame_mdm.data.store import write_store
+from flame_mdm.data.synthetic import Synthetic
+from flame_mdm.errors import UserError
+from flame_mdm.representations.humanml import HumanML
+
+WALK = next(c for c in Synthetic(clips=30).clips(20.0) if c.attributes["action"] == "walk").motion
+CAPTIONS = """id,text,action,split,license
+one,a person walks,walk,train,MIT
+two,someone strolls,walk,train,CC0
+three,a person walks,walk,test,MIT
+four,she dances with her left arm up,dance,train,CMU
+"""
+
+
+@pytest.fixture
+def people(tmp_path: Path) -> Path:
+    """A folder of four motions, two of which are training clips of a walk and one of a dance."""
+    folder = tmp_path / "people"
+    folder.mkdir()
+    for name in ("one", "two", "three", "four"):
+        np.savez(folder / f"{name}.npz", joints=WALK, fps=20)
+    (folder / "captions.csv").write_text(CAPTIONS)
+    return folder
+
+
+def mixture(people: Path, **options) -> Mixture:
+    return Mixture({"synthetic": Synthetic(clips=5), "people": Folder(str(people), mirror=True)}, **options)
+
+
+def test_a_store_of_a_mixture_has_all_clips_with_their_licenses(people: Path, tmp_path: Path):
+    source = mixture(people)
+    store = write_store(tmp_path / "store", source, HumanML())
+    assert len(store.clips) == source.count() == 5 + 4 + 3
+
+    licenses = {clip.id: clip.license for clip in store.clips}
+    assert licenses["synthetic_0_000000"] == "MIT"
+    assert licenses["two"] == "CC0"
+    assert licenses["Mfour"] == "CMU"
+
+    actions = store.info["actions"]
+    assert {actions[clip.action] for clip in store.clips if clip.id in ("one", "four")} == {"walk", "dance"}
+    assert len(set(actions)) == len(actions)
+
+
+def test_stores_without_licenses_are_written_as_before(tmp_path: Path):
+    store = write_store(tmp_path / "store", Synthetic(clips=3), HumanML())
+    lines = (store.folder / "clips.jsonl").read_text().splitlines()
+    assert all("license" not in json.loads(line) for line in lines)
+
+
+@pytest.mark.parametrize(("license", "words"), [("CC-BY-NC-4.0", "license CC-BY-NC-4.0"), ("", "an unknown license")])
+def test_a_license_that_forbids_the_use_is_refused_before_motions_are_read(people: Path, license: str, words: str):
+    (people / "captions.csv").write_text(CAPTIONS.replace("CC0", license))
+    with pytest.raises(UserError, match=f"parts.people: has motions of {words}"):
+        mixture(people).count()
+    assert mixture(people, use="research").count() == 12
+
+
+def test_few_clips_of_an_action_are_repeated(people: Path):
+    source = Folder(str(people), mirror=True, balance=8)
+    clips = list(source.clips(20.0))
+    assert len(clips) == source.count()
+    actions = [source.actions[clip.action] for clip in clips if clip.split == "train" and clip.action is not None]
+    assert (actions.count("walk"), actions.count("dance")) == (8, 8)
+    assert len({clip.id for clip in clips}) == len(clips)
+    assert sum(clip.split == "test" for clip in clips) == 1
+
+
+def test_copies_share_their_frames_and_are_limited(people: Path, tmp_path: Path):
+    source = Folder(str(people), balance=1000)
+    store = write_store(tmp_path / "store", source, HumanML())
+    copies = [clip for clip in store.clips if clip.id.startswith("four")]
+    assert len(copies) == MOST_COPIES
+    assert len({clip.start for clip in copies}) == 1
+
+
+def test_a_recipe_of_a_mixture_is_checked_at_the_command_line():
+    with pytest.raises(UserError, match="give any or research"):
+        Mixture({"synthetic": Synthetic(clips=1)}, use="sale")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(UserError, match="at least one data set"):
+        Mixture({})

@@ -1,27 +1,30 @@
 """The synthetic data set: procedural motions with captions and exact attributes; needs no download.
 
 `docs/synthetic.md` describes the grammar of the captions and the limits of the data set. To add an action, write its
-motion in `synthetic_motions`, a line in `ACTIONS`, and its captions in `synthetic.yaml`.
+motion in `synthetic_motions`, a line in `MORE` of `synthetic_actions`, and its captions in `synthetic_more.yaml`.
 """
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 
 from flame_mdm.data import Clip, MotionSource, hashed_split
 from flame_mdm.data.parallel import in_order
-from flame_mdm.data.synthetic_motions import gestures, locomotion
+from flame_mdm.data.synthetic_actions import ACTIONS, BASES, CORE, CYCLES, GESTURES, MORE, drawn_from, move
 from flame_mdm.data.synthetic_motions.body import Attributes, Body
 from flame_mdm.errors import UserError
 from flame_mdm.safe_io import read_yaml
 
 MIN_SECONDS, MAX_SECONDS = 2.0, 3.0  # durations of clips
 CAPTIONS = 8  # captions per clip
+SIMULTANEOUS, CYCLIC = 0.08, 0.04  # shares of clips of all actions that show two at once, or a part of a cycle
+MARGIN = 1.0  # seconds before and after a part of a cycle, in which the body starts and stops
 PARTIAL = 0.25  # share of the training clips whose captions leave out attributes; those of val and test state all
+ALWAYS = ("action", "while")  # attributes that each caption states
 UNSAID = {"speed": "normal", "amount": "quarter"}  # values that a caption need not state
 CHOICE = re.compile(r"\[([^\[\]]*)\]")
 SLOT = re.compile(r"\{(\w+)(?:\.(\w+))?\}")
@@ -30,10 +33,21 @@ VERB = re.compile(r"((?:\w+ly )?)<([^>]*)>")  # with an adverb before it: "is sl
 
 @cache
 def content() -> dict[str, Any]:
-    """Returns the content of `synthetic.yaml`; the captions by single keys, the forms of verbs by their infinitive."""
+    """Returns the grammars of the two groups of actions as one.
+
+    Captions are by single keys, the forms of verbs by their infinitive; `core_verbs` are the infinitives of the core.
+    """
     grammar = read_yaml(Path(__file__).with_name("synthetic.yaml"))
+    more = read_yaml(Path(__file__).with_name("synthetic_more.yaml"))
     grammar["captions"] = {key: value for keys, value in grammar["captions"].items() for key in keys.split(", ")}
-    grammar["verbs"] = {line.split()[0]: line.split() for line in grammar["verbs"]}
+    for name in ("captions", "phrases", "stated", "widths"):
+        if both := grammar[name].keys() & more[name].keys():
+            raise ValueError(f"synthetic_more.yaml: {name}: {sorted(both)} are in synthetic.yaml, too")
+        grammar[name] |= more[name]
+
+    grammar |= {name: more[name] for name in ("simultaneous", "mains", "gestures")}
+    grammar["core_verbs"] = {line.split()[0] for line in grammar["verbs"]}
+    grammar["verbs"] = {line.split()[0]: line.split() for line in (*grammar["verbs"], *more["verbs"])}
     grammar["subjects"] = [group for group in grammar["subjects"] for _ in range(group["share"])]
     return grammar
 
@@ -45,7 +59,7 @@ def draw_captions(
 
     If `incomplete`, they leave out some attributes, all of them the same ones, if the grammar has such captions.
     """
-    everything = {name for name, value in attributes.items() if name != "action" and UNSAID.get(name) != value}
+    everything = {name for name, value in attributes.items() if name not in ALWAYS and UNSAID.get(name) != value}
     captions: list[str] = []
     stated = everything
     for _ in range(30 if incomplete else 0):  # the first caption that leaves something out decides what is left out
@@ -59,13 +73,13 @@ def draw_captions(
             captions.append(caption)
     if stated == everything:
         return captions, dict(attributes)
-    return captions, {name: value for name, value in attributes.items() if name == "action" or name in stated}
+    return captions, {name: value for name, value in attributes.items() if name in stated or name in ALWAYS}
 
 
 def _sentence(rng: np.random.Generator, attributes: Attributes) -> tuple[str, set[str]]:
     """Returns a sentence and the names of the attributes that it states."""
     grammar = content()
-    template = _one(rng, _entry(grammar["captions"], attributes))
+    template = _template(rng, attributes)
     subject = _one(rng, grammar["subjects"])
     who = "" if template.startswith("=") else _one(rng, subject["who"])
     text = template.lstrip("= ") if template.startswith("=") or "{who}" in template else f"{{who}} {template}"
@@ -86,12 +100,27 @@ def _sentence(rng: np.random.Generator, attributes: Attributes) -> tuple[str, se
     return " ".join(text.split()), {name for name in said if UNSAID.get(name) != attributes[name]}
 
 
+def _template(rng: np.random.Generator, attributes: Attributes) -> str:
+    """Returns a template of the captions, of two actions at once with those of each in its place."""
+    grammar = content()
+    if "while" not in attributes:
+        return _one(rng, _entry(grammar["captions"], attributes))
+    parts = {"main": _one(rng, _entry(grammar["mains"], attributes))}
+    parts["gesture"] = _one(rng, grammar["gestures"][attributes["while"]])
+    template = _one(rng, grammar["simultaneous"])
+    for name, part in parts.items():
+        template = template.replace(f"{{{name}}}", part).replace(f"{{{name}.ing}}", part.replace("<", "<-"))
+    return template
+
+
 def _conjugated(rng: np.random.Generator, text: str, tenses: Sequence[tuple[str, int]]) -> str:
     """Returns the text with its verbs in one of the tenses."""
     auxiliary, column = _one(rng, tenses)
 
     def form(verb: re.Match[str]) -> str:
         nonlocal auxiliary
+        if verb[2].startswith("-"):
+            return verb[1] + content()["verbs"][_one(rng, verb[2][1:].split("/"))][2]
         before, auxiliary = auxiliary, ""
         return before + verb[1] + content()["verbs"][_one(rng, verb[2].split("/"))][column]
 
@@ -109,80 +138,51 @@ def _one(rng: np.random.Generator, choices: Any) -> Any:
     return choices[int(rng.integers(len(choices)))]
 
 
-class Action(NamedTuple):
-    """An action and the attributes that its clips have besides its name."""
-
-    # moves a body at times (F,) in seconds, for the attributes
-    motion: Callable[[Body, np.random.Generator, np.ndarray, Attributes], None]
-    share: int = 1  # how often the action occurs, relative to the others
-    # attribute -> values, equally often, or with their probabilities; drawn in this order, `speed` for forward only
-    values: Mapping[str, Sequence[str | int] | Mapping[str, float]] = {}
-    seconds: float = 0.0  # minimum duration
-
-    def draw(self, rng: np.random.Generator, name: str) -> Attributes:
-        """Draws the attributes of a clip."""
-        drawn: Attributes = {"action": name}
-        for attribute, values in self.values.items():
-            if attribute != "speed" or drawn["direction"] == "forward":
-                shares = list(values.values()) if isinstance(values, Mapping) else None
-                drawn[attribute] = rng.choice(list(values), p=shares).item()
-        return drawn
-
-
-SIDE, ANY_SIDE = {"side": ("left", "right")}, {"side": ("left", "right", "both")}
-ONCE_OR_TWICE, UP_TO_THREE = {"count": (1, 2)}, {"count": (1, 2, 3)}
-FORWARD = {"direction": ("forward",)}
-WAYS = {"forward": 0.3, **dict.fromkeys(("backward", "left", "right", "clockwise", "counterclockwise"), 0.14)}
-ACTIONS = {
-    "walk": Action(locomotion.walk, 6, {"direction": WAYS, "speed": ("slow", "normal", "fast")}),
-    "run": Action(locomotion.run, 1, FORWARD),
-    "turn": Action(locomotion.turn, 3, {"direction": ("left", "right"), "amount": ("quarter", "half")}),
-    "jump": Action(gestures.jump, 2, UP_TO_THREE),
-    "wave": Action(gestures.wave, 2, ANY_SIDE),
-    "raise": Action(gestures.raise_arms, 2, ANY_SIDE),
-    "kick": Action(gestures.kick, 2, SIDE | ONCE_OR_TWICE),
-    "punch": Action(gestures.punch, 2, SIDE | UP_TO_THREE),
-    "squat": Action(gestures.squat, 1, ONCE_OR_TWICE),
-    "bow": Action(gestures.bow),
-    "stand": Action(gestures.stand),
-    "sit": Action(gestures.sit),
-    "rise": Action(gestures.rise),
-    "dance": Action(locomotion.dance),
-    "leap": Action(gestures.leap),
-    "pick": Action(gestures.pick, 2, SIDE),
-    "throw": Action(gestures.throw, 2, SIDE),
-    "crawl": Action(locomotion.crawl, 1, FORWARD),
-    "lie": Action(gestures.lie, seconds=2.6),
-    "clap": Action(gestures.clap, 2, UP_TO_THREE),
-    "salute": Action(gestures.salute, 2, SIDE),
-    "nod": Action(gestures.nod, 2, UP_TO_THREE),
-}
-
-
 def _joints(rng: np.random.Generator, t: np.ndarray, attributes: Attributes) -> np.ndarray:
     """Returns the joints (F, 22, 3) of a motion with these attributes at times (F,) in seconds."""
-    body = Body(rng, t, _entry(content()["widths"], attributes))
-    ACTIONS[str(attributes["action"])].motion(body, rng, t, attributes)
-    return body.joints().astype(np.float32)
+    margin = round(MARGIN / (t[1] - t[0])) if attributes.get("ends") == "cycle" else 0
+    times = np.arange(len(t) + 2 * margin) * (t[1] - t[0]) if margin else t
+    body = Body(rng, times, _entry(content()["widths"], attributes))
+    move(body, rng, times, attributes)
+    joints = body.joints()[margin : margin + len(t)]
+
+    name = str(attributes["action"])
+    if ACTIONS[name].reverse:
+        joints = joints[::-1]
+    if name in MORE or attributes.keys() & {"while", "ends"}:
+        joints = joints - joints[0, 0] * np.array([1, 0, 1])
+    return joints.astype(np.float32)
 
 
 class Synthetic(MotionSource):
     """Clips of the 22 SMPL joints, y up, that start at the origin facing +z; each shows one action.
 
-    Clip number n is a function of the seed and n.
+    Clip number n is a function of the seed, n, and the group of actions.
+
+    Args:
+        clips: number of clips.
+        seed: seed of the clips; from 0 on.
+        workers: processes that generate clips; 0 = one per core.
+        actions: "core", 22 actions, or "all", which adds 52 actions, clips of two actions at once, and parts of cycles.
     """
 
     name = "synthetic"
     license = "MIT"
     captions_may_be_shared = True
-    actions = tuple(ACTIONS)
-    verbs = tuple(sorted({form for forms in content()["verbs"].values() for form in forms}))
+    actions = tuple(CORE)
+    verbs = tuple(sorted({form for name in content()["core_verbs"] for form in content()["verbs"][name]}))
 
-    def __init__(self, clips: int = 5000, seed: int = 0, workers: int = 0):
+    def __init__(self, clips: int = 5000, seed: int = 0, workers: int = 0, actions: Literal["core", "all"] = "core"):
         if clips < 1 or seed < 0:
             raise UserError(f"synthetic: clips={clips}, seed={seed}: give at least one clip and a seed from 0 on")
-        self.size, self.seed, self.workers = clips, seed, workers
+        if actions not in ("core", "all"):
+            raise UserError(f'synthetic: actions={actions!r}: choose "core" or "all"')
+        self.size, self.seed, self.workers, self.everything = clips, seed, workers, actions == "all"
         self.options = {"clips": clips, "seed": seed}
+        if self.everything:
+            self.options["actions"] = actions
+            self.actions = tuple(ACTIONS)
+            self.verbs = tuple(sorted({form for forms in content()["verbs"].values() for form in forms}))
 
     def count(self) -> int:
         return self.size
@@ -193,12 +193,11 @@ class Synthetic(MotionSource):
     def clip(self, index: int, fps: float) -> Clip:
         """Returns clip number `index` with `round(seconds * fps) + 1` frames."""
         rng = np.random.default_rng((self.seed, index))
-        shares = np.array([action.share for action in ACTIONS.values()], float)
-        action = str(rng.choice(list(ACTIONS), p=shares / shares.sum()))
-        attributes = ACTIONS[action].draw(rng, action)
+        attributes = self.attributes(rng)
+        action = str(attributes["action"])
         repeating = 0.35 + 0.8 * int(attributes.get("count", 0))
         seconds = rng.uniform(max(MIN_SECONDS, repeating, ACTIONS[action].seconds), MAX_SECONDS)
-        name = f"synthetic_{self.seed}_{index:06d}"
+        name = f"synthetic_{'all_' if self.everything else ''}{self.seed}_{index:06d}"
         split = hashed_split(name, val=5, test=10)
         words = np.random.default_rng((self.seed, index, 1))  # so that motions do not depend on the grammar
         incomplete = split == "train" and words.random() < PARTIAL
@@ -212,6 +211,22 @@ class Synthetic(MotionSource):
             action=self.actions.index(action),
             attributes=stated,
         )
+
+    def attributes(self, rng: np.random.Generator) -> Attributes:
+        """Draws the attributes of a clip."""
+        kind = rng.random() if self.everything else 1.0
+        if kind < SIMULTANEOUS:
+            base, gesture = drawn_from(rng, BASES), drawn_from(rng, GESTURES)
+            added = GESTURES[gesture].draw(rng, gesture)
+            added["while"] = added.pop("action")
+            return BASES[base].draw(rng, base) | added
+        if kind < SIMULTANEOUS + CYCLIC:
+            cycle = drawn_from(rng, CYCLES)
+            drawn = CYCLES[cycle].draw(rng, cycle)
+            return {"action": cycle, "ends": "cycle"} | drawn
+        actions = ACTIONS if self.everything else CORE
+        action = drawn_from(rng, actions)
+        return actions[action].draw(rng, action)
 
 
 def prompts() -> list[tuple[str, Attributes]]:

@@ -63,6 +63,7 @@ class Body:
         self.head = self._drift(rng, 0.08, 3) * np.array([[0.5], [1], [1]])
         self.arms = self._drift(rng, 0.05, 2, 4)  # forward, sideways, turned outward, elbow
         self.arms += np.array([rng.normal(0.03, 0.05), rng.uniform(0.14, 0.24), -0.4, rng.uniform(0.2, 0.4)])[:, None]
+        self.shoulders = np.zeros((2, len(t)))  # the girdle raised, beyond its rise with the arm
         self.reaches: list[tuple[int, np.ndarray, np.ndarray, str]] = []
 
         self.ankles = np.zeros((2, len(t), 3))
@@ -140,7 +141,7 @@ class Body:
         for side, sign in enumerate(SIGN):
             forward, sideways, outward, elbow = self.arms[side]
             arm = rotation(2, sign * sideways) @ rotation(0, -forward) @ rotation(1, sign * outward)
-            lift = 0.2 * (1 + (arm @ down)[:, 1])  # the shoulder girdle rises with the arm
+            lift = 0.2 * (1 + (arm @ down)[:, 1]) + self.shoulders[side]  # the shoulder girdle rises with the arm
             collar = bone @ rotation(2, sign * lift)
             out[:, 13 + side] = out[:, 9] + bone @ np.array([sign * COLLAR[0], *COLLAR[1:]])
             out[:, 16 + side] = out[:, 13 + side] + collar @ np.array([sign * SHOULDER[0], *SHOULDER[1:]])
@@ -170,6 +171,37 @@ def bent(
     across = toward - (toward * line).sum(-1, keepdims=True) * line
     across /= np.linalg.norm(across, axis=-1, keepdims=True)
     return start + along * line + np.sqrt(upper**2 - along**2) * across, start + length * line
+
+
+def beat(t: np.ndarray, frequency: float, phase: float = 0.0) -> np.ndarray:
+    """Returns a sine wave of a frequency in hertz; `phase` in turns."""
+    return np.sin(2 * np.pi * (frequency * t + phase))
+
+
+def step(
+    body: Body, side: int, start: float, end: float, by: Sequence[float], lift: float = 0.09, heel: float = 0.3
+) -> None:
+    """Moves a foot by (x, y, z) in meters between two times; the heel, at the angle `heel`, leaves the floor first.
+
+    A foot that lands higher than it stood rises before it moves ahead.
+    """
+    s = np.clip((body.t - start) / (end - start), 0, 1)
+    across, up = ease(s, 0.25 if by[1] else 0.08, 0.96), ease(s, 0.02, 0.7)
+    foot = body.ankles[side]
+    foot += np.stack([across * by[0], up * by[1] + lift * np.sin(np.pi * s) ** 1.5, across * by[2]], 1)
+    body.foot_pitch[side] += heel * pulse(body.t, start - 0.15, start + 0.03, start + 0.03, end - 0.03)
+
+
+def follow_feet(body: Body) -> None:
+    """Carries the pelvis along with the point between the feet, on the ground."""
+    middle = body.ankles.mean(0)[:, [0, 2]]
+    body.position[:, [0, 2]] += middle - middle[0]
+
+
+def flight(t: np.ndarray, start: float, seconds: float) -> np.ndarray:
+    """Returns the height (F,) in meters of a body that leaves the ground at `start` and lands `seconds` later."""
+    s = np.clip((t - start) / seconds, 0, 1)
+    return 9.81 / 8 * seconds**2 * 4 * s * (1 - s)
 
 
 def events(rng: np.random.Generator, t: np.ndarray, count: int, slowest: float) -> list[tuple[float, float]]:

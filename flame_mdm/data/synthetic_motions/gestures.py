@@ -213,7 +213,7 @@ def pick(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
     body.reach(side, pulse(t, start + 0.1, low, rise, rise + 0.6 * (end - rise)), spot)
 
 
-def _seat(body: Body, seated: np.ndarray, bent: np.ndarray) -> None:
+def seat(body: Body, seated: np.ndarray, bent: np.ndarray) -> None:
     """Seats a body by the share `seated` (F,) on a chair behind its feet; `bent` (F,) is how far the trunk leans."""
     body.position[:, 1] += seated * (CHAIR - body.position[:, 1])
     body.position[:, 2] -= 0.36 * seated
@@ -230,13 +230,13 @@ def _seat(body: Body, seated: np.ndarray, bent: np.ndarray) -> None:
 def sit(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
     start, seconds = rng.uniform(0.1, 0.25), rng.uniform(1.25, 1.5)
     end = start + seconds
-    _seat(body, ease(t, start, end), pulse(t, start, start + 0.5 * seconds, start + 0.6 * seconds, end + 0.25))
+    seat(body, ease(t, start, end), pulse(t, start, start + 0.5 * seconds, start + 0.6 * seconds, end + 0.25))
 
 
 def rise(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
     start, seconds = rng.uniform(0.35, 0.5), rng.uniform(1.25, 1.45)
     end = start + seconds
-    _seat(body, 1 - ease(t, start + 0.1, end), pulse(t, start - 0.3, start + 0.4 * seconds, start + 0.5 * seconds, end))
+    seat(body, 1 - ease(t, start + 0.1, end), pulse(t, start - 0.3, start + 0.4 * seconds, start + 0.5 * seconds, end))
     for path in (body.position, *body.ankles):
         path[:, 2] += 0.36
     body.reaches = [(side, weight, goal + np.array([0, 0, 0.36]), frame) for side, weight, goal, frame in body.reaches]

@@ -26,7 +26,7 @@ class Gait:
     behind: float = 0.0  # how much farther back the feet come down than they stand
 
 
-def _walk_along(body: Body, rng: np.random.Generator, gait: Gait, speed: float, path: Path, first: int) -> np.ndarray:
+def walk_along(body: Body, rng: np.random.Generator, gait: Gait, speed: float, path: Path, first: int) -> np.ndarray:
     """Moves the pelvis at `speed`, in m/s, along a path, and places the feet on either side of it, `first` first.
 
     Returns (F,) how far the right foot is in front of the left one, in meters, relative to the heading of the pelvis.
@@ -89,7 +89,7 @@ def _walk_along(body: Body, rng: np.random.Generator, gait: Gait, speed: float, 
     return (apart.T * forward).sum(0)
 
 
-def _straight(x: float, z: float) -> Path:
+def straight(x: float, z: float) -> Path:
     return lambda share, length: (x * share * length, z * share * length, 0 * share)
 
 
@@ -98,12 +98,12 @@ def walk(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
     sign = 1 if direction in ("left", "counterclockwise") else -1
     if direction in ("left", "right"):
         speed, first = rng.uniform(0.45, 0.6), LEFT if sign > 0 else RIGHT
-        _walk_along(body, rng, Gait(0.46, 0.82, 0.15, 0.25, 0.05, 0.16), speed, _straight(sign, 0), first)
+        walk_along(body, rng, Gait(0.46, 0.82, 0.15, 0.25, 0.05, 0.16), speed, straight(sign, 0), first)
         return
     if direction == "backward":
         speed = rng.uniform(0.6, 0.9)
         gait = Gait(0.54, 0.78, 0.12, -0.2, -0.4, rng.uniform(0.08, 0.1))
-        apart = _walk_along(body, rng, gait, speed, _straight(0, -1), RIGHT)
+        apart = walk_along(body, rng, gait, speed, straight(0, -1), RIGHT)
     elif direction == "forward":
         low, high = {"slow": (0.5, 0.7), "normal": (1.0, 1.25), "fast": (1.55, 1.8)}[str(requested["speed"])]
         speed = rng.uniform(low, high)
@@ -111,7 +111,7 @@ def walk(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
         lift, sink = rng.uniform(0.1, 0.13), 0.02 + 0.01 * speed
         gait = Gait(step, 0.82, lift, 0.25 + 0.4 * speed, 0.15 + 0.12 * speed, 0.085, sink)
         body.spine[0] += 0.03 * speed
-        apart = _walk_along(body, rng, gait, speed, _straight(0, 1), RIGHT)
+        apart = walk_along(body, rng, gait, speed, straight(0, 1), RIGHT)
     else:
         arc = sign * rng.uniform(np.radians(180), np.radians(220))
         body.spine[2] += 0.06 * sign
@@ -122,22 +122,22 @@ def walk(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
             return radius * (1 - np.cos(angle)), radius * np.sin(angle), angle
 
         gait = Gait(0.5, 0.82, 0.11, 0.6, 0.25, 0.085)
-        apart = _walk_along(body, rng, gait, rng.uniform(1.0, 1.2), circle, LEFT if sign > 0 else RIGHT)
-    _swing_arms(body, apart, rng.uniform(0.5, 0.75))
+        apart = walk_along(body, rng, gait, rng.uniform(1.0, 1.2), circle, LEFT if sign > 0 else RIGHT)
+    swing_arms(body, apart, rng.uniform(0.5, 0.75))
 
 
 def run(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
     gait = Gait(rng.uniform(0.34, 0.38), 1.3, rng.uniform(0.2, 0.26), 1.1, 0.15, 0.07, 0.06, 0.035, behind=0.12)
-    apart = _walk_along(body, rng, gait, rng.uniform(2.4, 3.0), _straight(0, 1), RIGHT)
+    apart = walk_along(body, rng, gait, rng.uniform(2.4, 3.0), straight(0, 1), RIGHT)
     speed = np.gradient(body.position[:, 2], t)
     body.pelvis[0] += 0.025 * speed + 0.015 * np.gradient(speed, t)  # leans forward to speed up, and back to stop
     body.spine[0] += 0.05 * speed
     for side in (0, 1):
         body.move_arm(side, np.clip(speed / 1.5, 0, 1), (-0.1, 0.3, -0.15, rng.uniform(1.4, 1.7)))
-    _swing_arms(body, apart, rng.uniform(0.7, 0.9))
+    swing_arms(body, apart, rng.uniform(0.7, 0.9))
 
 
-def _swing_arms(body: Body, apart: np.ndarray, size: float) -> None:
+def swing_arms(body: Body, apart: np.ndarray, size: float) -> None:
     """Swings the arms opposite to the legs, and the shoulders opposite to the hips."""
     body.pelvis[1] += 0.15 * apart
     body.spine[1] -= 0.3 * apart
@@ -151,7 +151,7 @@ def turn(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
     low, high = (160, 195) if requested["amount"] == "half" else (75, 110)
     angle = sign * np.radians(rng.uniform(low, high))
     gait = Gait(0.36, 0.82, 0.09, 0.3, 0.0, 0.1)
-    _walk_along(body, rng, gait, 1.0, lambda s, _: (0 * s, 0 * s, angle * s), LEFT if sign > 0 else RIGHT)
+    walk_along(body, rng, gait, 1.0, lambda s, _: (0 * s, 0 * s, angle * s), LEFT if sign > 0 else RIGHT)
     ahead = np.gradient(body.heading, t)
     body.head[1] += 0.2 * ahead  # the head looks in the direction of the turn
     body.spine[1] += 0.08 * ahead
@@ -186,7 +186,7 @@ def crawl(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attrib
     body.foot_yaw *= 0.3
     body.ankles[..., 2] = -0.58 - FOOT[2]  # the toes point backward
     gait = Gait(rng.uniform(0.5, 0.58), 0.82, 0.13, 0.0, 0.0, rng.uniform(0.09, 0.11), sink=0.0)
-    _walk_along(body, rng, gait, rng.uniform(0.45, 0.6), _straight(0, 1), RIGHT)
+    walk_along(body, rng, gait, rng.uniform(0.45, 0.6), straight(0, 1), RIGHT)
     apart, ahead = SIGN * rng.uniform(0.17, 0.2), rng.uniform(1.12, 1.18)
     for side in (0, 1):
         foot = body.ankles[1 - side]

@@ -191,6 +191,14 @@ def test_the_runner_samples_the_motions_of_the_package_without_pytorch_and_refus
         assert error.count("\n") == 1
 
 
+def test_a_model_beyond_the_limits_of_the_runner_is_not_exported() -> None:
+    model = tiny("mdm_encoder_small", "learned")
+    assert onnx.description(model)["max_frames"] == 20
+    model.facts |= {"max_frames": 20_000}
+    with pytest.raises(UserError, match="max_frames: not within the limits of an exported model"):
+        onnx.description(model)
+
+
 def test_models_with_a_language_model_and_unknown_formats_are_refused(refused: Any, tmp_path: Path) -> None:
     refused("export", "quickstart", str(tmp_path / "x"), "format=tflite", says="format=tflite: ")
     model = tiny("mdm_encoder_small", "learned")
@@ -294,3 +302,10 @@ def test_a_damaged_page_says_so_in_one_line(
     with browser(tmp_path / "profile") as tab:
         tab.open(url)
         assert says in tab.wait(DONE, 60)
+
+
+@of_page
+def test_the_length_in_a_link_is_checked(served: tuple[Path, str], tmp_path: Path) -> None:
+    with browser(tmp_path / "profile") as tab:
+        tab.open(f"{served[1]}#seconds=1e9")
+        assert tab.wait(DONE, 60) == "seconds=1000000000: give 0.1 to 3 seconds"

@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 
 import flame_mdm
 from flame_mdm.checkpoints.onnx_export import export_onnx
+from flame_mdm.checkpoints.runner import SCHEMA
 from flame_mdm.errors import UserError, say
 from flame_mdm.formats.body import fit_body
 from flame_mdm.formats.motion import END_SITES, Motion
@@ -47,6 +48,7 @@ def build(model: str, out: Path) -> None:
     (out / "runner.py").unlink()
     for path in SOURCE.iterdir():
         shutil.copy(path, out)
+    write_text(out / "schema.js", f"export const SCHEMA = {json.dumps(SCHEMA)};\n")
     fetch_runtime(out / "ort")
     loaded = flame_mdm.load(model)
     example = flame_mdm.generate(loaded, loaded.facts["captions"][0])[0]

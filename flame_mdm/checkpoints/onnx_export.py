@@ -1,5 +1,6 @@
 """Export to ONNX: graphs for onnxruntime, with the sampling loop, the skeleton and the vocabulary as JSON."""
 
+import json
 import logging
 import shutil
 import warnings
@@ -15,7 +16,7 @@ from torch.nn import functional
 
 from flame_mdm.batch import Condition, Edit, MotionBatch, length_mask
 from flame_mdm.checkpoints.loading import load
-from flame_mdm.checkpoints.runner import FORMAT, MIN_WORDS, digest
+from flame_mdm.checkpoints.runner import FORMAT, MIN_WORDS, SCHEMA, digest, faults
 from flame_mdm.conditions.tokens import LearnedTokens
 from flame_mdm.conditions.vocabulary import FUNCTION_WORDS
 from flame_mdm.denoisers.gru import MDMGRU
@@ -61,12 +62,16 @@ def export_onnx(source: str | Path, out: str | Path, *, half: bool = False, **ad
 
 
 def description(model: MotionGenerator) -> dict[str, Any]:
-    """Returns the content of `model.json`, without the hashes of the graphs; errors as for `sampling_plan`."""
+    """Returns the content of `model.json`, without the hashes of the graphs.
+
+    Raises:
+        UserError: If a value is not within the limits of the runner, or the sampler cannot be exported.
+    """
     representation, skeleton, facts = model.representation, model.representation.skeleton, model.facts
     encoder, denoiser = model.condition, model.denoiser
     padded = isinstance(denoiser, FIXED_LENGTH) or not denoiser.mask_padding
     words = {"buckets": encoder.buckets, "max_words": encoder.max_words} if isinstance(encoder, LearnedTokens) else {}
-    return {
+    content = {
         **{"format": FORMAT, "experiment": model.config["experiment"], "reads": model.conditioned_on, **words},
         **{key: list(facts.get(key, ())) for key in ("actions", "vocabulary", "captions")},
         "function_words": sorted(FUNCTION_WORDS),
@@ -75,8 +80,11 @@ def description(model: MotionGenerator) -> dict[str, Any]:
         "skeleton": {"joints": skeleton.joints, "parents": skeleton.parents, "feet": skeleton.feet},
         "clip_x0": bool(getattr(model.process, "clip_x0", False)),
         "steps": sampling_plan(model.process, model.sampler_options),
-        "sha256": {},
     }
+    wrong = [name for name in faults(json.loads(json.dumps(content)), SCHEMA) if name not in ("sha256", "digest")]
+    if wrong:
+        raise UserError(f"{wrong[0]}: not within the limits of an exported model, which docs/export.md lists")
+    return content | {"sha256": {}}
 
 
 class Probe:

@@ -13,7 +13,7 @@ import re
 import secrets
 import sys
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,35 +23,185 @@ FORMAT = 1
 MIN_WORDS = 3  # least number of tokens of a graph, with padding
 WORD = re.compile(r"[^\W_]+")
 MASK = (1 << 64) - 1
+GRAPHS = ("denoiser.onnx", "joints.onnx", "poses.onnx")  # the last one only for SMPL's joints
+MAX_DESCRIPTION = 64 * 2**20  # bytes of model.json
+MAX_GRAPH = 2**31  # bytes of an ONNX file, whose format has no larger ones
+EXTERNAL_DATA = re.compile(rb"(?:\x08|\x88\x80*\x00)location")
+"""Key that names the file of external data, after its length, which protobuf may write with more bytes than needed."""
+
+
+def _object(required: Sequence[str], **properties: dict[str, Any]) -> dict[str, Any]:
+    return {"type": "object", "properties": properties, "required": list(required)}
+
+
+def _array(items: dict[str, Any], most: int, least: int = 0) -> dict[str, Any]:
+    return {"type": "array", "items": items, "minItems": least, "maxItems": most}
+
+
+def _number(least: float, most: float, kind: str = "integer") -> dict[str, Any]:
+    return {"type": kind, "minimum": least, "maximum": most}
+
+
+TEXTS = _array({"type": "string"}, 1_000_000)
+PRINTABLE = {"type": "string", "pattern": r"[^\x00-\x1f\x7f-\x9f]{1,1000}"}
+HASH = {"type": "string", "pattern": "[0-9a-f]{64}"}
+# fmt: off
+REQUIRED = (
+    "format", "reads", "actions", "vocabulary", "captions", "function_words", "features", "fps", "max_frames",
+    "padded_frames", "skeleton", "clip_x0", "steps", "sha256", "digest",
+)
+# fmt: on
+SCHEMA = _object(
+    REQUIRED,
+    format=_number(FORMAT, FORMAT),
+    experiment=PRINTABLE,
+    reads={"type": "string", "pattern": "none|action|text"},
+    buckets=_number(1, 10_000_000),
+    max_words=_number(1, 1000),
+    actions=_array(PRINTABLE, 100_000),
+    vocabulary=TEXTS,
+    captions=TEXTS,
+    function_words=TEXTS,
+    features=_number(1, 2000),
+    fps=_number(1, 1000, "number"),
+    max_frames=_number(2, 10_000),
+    padded_frames=_number(0, 10_000),
+    skeleton=_object(
+        ["joints", "parents", "feet"],
+        joints=_array({"type": "string"}, 1000, 1),
+        parents=_array(_number(-1, 999), 1000, 1),
+        feet={"type": "array", "maxItems": 1000},
+    ),
+    clip_x0={"type": "boolean"},
+    steps=_array(_array(_number(-1e9, 1e9, "number"), 7, 7), 10_000, 1),
+    sha256=_object(GRAPHS[:2], **dict.fromkeys(GRAPHS, HASH)),
+    digest=HASH,
+)
+"""JSON schema of `model.json`, within the part of the language that `faults` reads. The web page has the same."""
+TYPES: dict[str, type | tuple[type, ...]] = {
+    "object": dict,
+    "array": list,
+    "string": str,
+    "boolean": bool,
+    "integer": int,
+    "number": (int, float),
+}
+
+
+def faults(value: Any, schema: Mapping[str, Any], name: str = "") -> list[str]:
+    """Returns the dotted names of values that a JSON schema refuses; items have the name of their list.
+
+    The schema has types, bounds of numbers and of numbers of items, patterns of whole texts, and required keys. Objects
+    may have keys that are not in the schema.
+    """
+    kind = schema["type"]
+    if not _has_type(value, kind):
+        return [name]
+
+    if kind in ("integer", "number"):
+        return [] if schema["minimum"] <= value <= schema["maximum"] else [name]
+
+    if kind == "string":
+        return [] if re.fullmatch(schema.get("pattern", r"(?s:.*)"), value) else [name]
+
+    if kind == "array":
+        if not schema.get("minItems", 0) <= len(value) <= schema["maxItems"]:
+            return [name]
+        items = schema.get("items")
+        return [name] if items and any(faults(item, items) for item in value) else []
+
+    wrong = []
+    for key, part in schema.get("properties", {}).items():
+        full = f"{name}.{key}".lstrip(".")
+        if key in value:
+            wrong += faults(value[key], part, full)
+        elif key in schema["required"]:
+            wrong.append(full)
+    return wrong
+
+
+def _has_type(value: Any, kind: str) -> bool:
+    if isinstance(value, bool):  # Python's bool is an int
+        return kind == "boolean"
+    return isinstance(value, TYPES[kind])
+
+
+def check(content: Any) -> None:
+    """Raises `ValueError` if the content of `model.json` is damaged, changed, or not within the limits of `SCHEMA`."""
+    if not isinstance(content, dict):
+        raise ValueError("model.json is damaged")
+    if content.get("format") != FORMAT:
+        raise ValueError(f"model.json is not of format {FORMAT}")
+    if content.get("digest") != digest(content):
+        raise ValueError("model.json has changed since it was exported")
+
+    wrong = faults(content, SCHEMA)
+    if not wrong and content["reads"] == "text":
+        wrong += [name for name in ("buckets", "max_words") if name not in content]
+    if not wrong and content["padded_frames"] not in (0, content["max_frames"]):
+        wrong.append("padded_frames")
+    if wrong:
+        raise ValueError(f"model.json is damaged: {', '.join(wrong)}")
+
+
+def read_file(path: Path, most: int) -> bytes:
+    """Returns the content of a regular file of up to `most` bytes; raises `ValueError` or `OSError`."""
+    if path.exists() and not path.is_file():
+        raise ValueError(f"{path.name} is a folder, a pipe or a device")
+    with path.open("rb") as file:
+        content = file.read(most + 1)
+    if len(content) > most:
+        raise ValueError(f"{path.name} has more than {most} bytes")
+    return content
+
+
+def first_line(error: Exception) -> str:
+    lines = str(error).strip().splitlines()
+    return lines[0] if lines else type(error).__name__
 
 
 class Sampler:
     """A model in a folder: `content` of `model.json`, and sessions of onnxruntime; `poses` is None except for SMPL."""
 
     def __init__(self, folder: str | Path, threads: int = 1):
-        """Opens a folder; raises `ValueError` if a file is missing, damaged or of another version."""
+        """Opens a folder; raises `ValueError` if a file is missing, damaged, too large or of another version."""
+        self.folder = Path(folder)
+        try:
+            self.content = self._description()
+            sessions = {name: self._session(name, threads) for name in GRAPHS if name in self.content["sha256"]}
+        except (OSError, ValueError) as error:
+            reason = first_line(error)
+            raise ValueError(f"{self.folder}: not an exported model ({reason}). Export the model again") from error
+        self.denoiser, self.joints = sessions["denoiser.onnx"], sessions["joints.onnx"]
+        self.poses = sessions.get("poses.onnx")
+
+    def _description(self) -> dict[str, Any]:
+        text = read_file(self.folder / "model.json", MAX_DESCRIPTION)
+        try:
+            content = json.loads(text.decode("utf-8"))
+        except (ValueError, RecursionError) as error:
+            raise ValueError("model.json is damaged: not JSON") from error
+        check(content)
+        return content
+
+    def _session(self, name: str, threads: int) -> Any:
+        """Returns a session of a graph. Its weights are in the file: a graph may not name other files to read."""
         import onnxruntime
 
-        self.folder = Path(folder)
+        graph = read_file(self.folder / name, MAX_GRAPH)
+        if hashlib.sha256(graph).hexdigest() != self.content["sha256"][name]:
+            raise ValueError(f"{name} has changed since it was exported")
+        if EXTERNAL_DATA.search(graph):
+            raise ValueError(f"{name} reads data from other files")
+
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads
+        options.log_severity_level = 4  # errors are raised
+        options.add_session_config_entry("session.load_model_format", "ONNX")
         try:
-            self.content = json.loads((self.folder / "model.json").read_text(encoding="utf-8"))
-            if self.content["format"] != FORMAT:
-                raise ValueError(f"model.json is not of format {FORMAT}")
-            if self.content["digest"] != digest(self.content):
-                raise ValueError("model.json has changed since it was exported")
-            sessions = {}
-            for name, expected in self.content["sha256"].items():
-                graph = (self.folder / name).read_bytes()
-                if hashlib.sha256(graph).hexdigest() != expected:
-                    raise ValueError(f"{name} has changed since it was exported")
-                sessions[name] = onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
-            self.denoiser, self.joints = sessions["denoiser.onnx"], sessions["joints.onnx"]
-            self.poses = sessions.get("poses.onnx")
+            return onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
         except Exception as error:  # onnxruntime raises its own kinds
-            reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-            raise ValueError(f"{self.folder}: not an exported model ({reason}). Export the model again") from error
+            raise ValueError(f"{name} is damaged: {first_line(error)}") from error
 
     def unknown(self, text: str) -> list[str]:
         """Returns the content words of a text that the model does not know; raises `ValueError` if it knows none."""
@@ -70,7 +220,10 @@ class Sampler:
         """
         content = self.content
         longest, fps = content["max_frames"], content["fps"]
-        frames = min(round(3 * fps), longest) if seconds is None else round(seconds * fps)
+        if seconds is None:
+            frames = min(round(3 * fps), longest)
+        else:
+            frames = round(min(seconds * fps, longest + 1)) if seconds > 0 else 0
         if not 2 <= frames <= longest:
             raise ValueError(f"seconds={seconds}: give {2 / fps:g} to {longest / fps:g} seconds")
         padded = max(frames, content["padded_frames"])
@@ -79,7 +232,8 @@ class Sampler:
         x, draw = normal(number, padded, content["features"]), 1
         before = np.zeros_like(x)
         for t, of_x, of_output, keep, clean, last, noise in content["steps"]:
-            output = self.denoiser.run(None, {"x_t": x[None], "t": np.array([t], np.float32), **inputs})[0][0]
+            values = {"x_t": x[None], "t": np.array([t], np.float32), **inputs}
+            output = self._run("denoiser", values, [(1, *x.shape)])[0][0]
             x0_hat = np.float32(of_x) * x + np.float32(of_output) * output
             if content["clip_x0"]:
                 x0_hat = x0_hat.clip(-1, 1)
@@ -93,7 +247,8 @@ class Sampler:
 
     def decode(self, x: np.ndarray) -> np.ndarray:
         """Returns joints (F, J, 3) in meters, y up, of normalized features (F, D)."""
-        return self.joints.run(None, {"x": x[None]})[0][0]
+        shape = (1, len(x), len(self.content["skeleton"]["joints"]), 3)
+        return self._run("joints", {"x": x[None]}, [shape])[0][0]
 
     def rotations(self, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns offsets (22, 3) from the parents in the rest pose (arms out), and local quaternions (F, 22, 4).
@@ -102,8 +257,19 @@ class Sampler:
         """
         if self.poses is None:
             raise ValueError("rotations are computed only for SMPL's 22 joints")
-        offsets, quaternions = self.poses.run(None, {"joints": joints})
+        offsets, quaternions = self._run("poses", {"joints": joints}, [(22, 3), (len(joints), 22, 4)])
         return offsets, quaternions
+
+    def _run(self, name: str, inputs: dict[str, np.ndarray], shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray]:
+        """Returns the outputs of a graph; raises `ValueError` if it cannot run, or has outputs of other shapes."""
+        session = getattr(self, name)
+        try:
+            outputs = session.run(None, inputs)
+        except Exception as error:  # onnxruntime raises its own kinds
+            raise ValueError(f"{name}.onnx cannot run: {first_line(error)}. Export the model again") from error
+        if [np.shape(output) for output in outputs] != list(shapes):
+            raise ValueError(f"{name}.onnx does not fit model.json. Export the model again")
+        return outputs
 
     def _condition(self, prompt: str) -> dict[str, np.ndarray]:
         content = self.content
@@ -196,6 +362,15 @@ def write(path: str | Path, **arrays: Any) -> None:
         temporary.unlink(missing_ok=True)
 
 
+def _number_of(options: Mapping[str, str], key: str, kind: type[Any]) -> Any:
+    if key not in options:
+        return None
+    try:
+        return kind(options[key])
+    except ValueError as error:
+        raise ValueError(f"{key}={options[key][:40]}: give a {'whole ' if kind is int else ''}number") from error
+
+
 def main(arguments: Sequence[str]) -> int:
     """Writes one motion as .npz with `joints` (F, J, 3) in meters and `fps`."""
     positional = [word for word in arguments if not re.match(r"(seconds|seed)=", word)]
@@ -205,11 +380,12 @@ def main(arguments: Sequence[str]) -> int:
         return 2
     folder, prompt, out = positional
     try:
+        seconds = _number_of(options, "seconds", float)
+        seed = _number_of(options, "seed", int)
         sampler = Sampler(folder)
         if unknown := sampler.unknown(prompt):
             print(f"warning: never seen in training: {', '.join(unknown)}")
-        seconds = float(options["seconds"]) if "seconds" in options else None
-        joints = sampler.decode(sampler.generate(prompt, seconds, int(options.get("seed", 0))))
+        joints = sampler.decode(sampler.generate(prompt, seconds, seed or 0))
         write(out, joints=joints, fps=sampler.content["fps"], text=prompt)
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)

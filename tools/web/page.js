@@ -30,14 +30,14 @@ function advise(text) { // unknown words and the nearest captions; returns wheth
 }
 
 async function generate() {
-  const [text, seconds, seed] = [element("text").value.trim(), Number(element("seconds").value), element("seed").value.trim()];
-  if (!/^-?\d+$/.test(seed)) return say(`seed ${seed}: give a whole number`, "error");
+  const [text, seconds, seed] = [element("text").value.trim(), element("seconds").valueAsNumber, element("seed").value.trim()];
+  if (!/^-?\d{1,18}$/.test(seed)) return say(`seed=${seed}: give a whole number`, "error");
   element("generate").disabled = true;
   try {
     if (!advise(text)) return;
-    const { fps } = sampler.content, frames = Math.round(seconds * fps), begin = performance.now();
-    const x = await sampler.generate(text, frames, BigInt(seed).toString(), (share) => { element("progress").value = share; });
-    const joints = await sampler.decode(x);
+    const begin = performance.now();
+    const x = await sampler.generate(text, seconds, BigInt(seed).toString(), (share) => { element("progress").value = share; });
+    const joints = await sampler.decode(x), frames = x.length / sampler.content.features;
     const milliseconds = performance.now() - begin;
     motion = { text, seed, frames, joints, milliseconds, ...(await sampler.rotations(joints)) };
     const data = JSON.stringify([shown(figure, motion)]).replaceAll("<", "\\u003c");

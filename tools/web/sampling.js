@@ -1,11 +1,12 @@
 // Samples motions with onnxruntime-web: flame_mdm/checkpoints/runner.py in JavaScript. The same text, length and seed give the same motion.
 import * as ort from "./ort/ort.wasm.min.mjs";
+import { check, frameCount } from "./check.js";
 
 ort.env.wasm.wasmPaths = new URL("./ort/", import.meta.url).href;
 ort.env.wasm.numThreads = 1; // threads need headers that a static server does not send
 ort.env.logLevel = "error";
 
-const FORMAT = 1, MIN_WORDS = 3, fround = Math.fround, TURN = fround(2 * Math.PI), SCALE = 2 ** -24;
+const MIN_WORDS = 3, fround = Math.fround, TURN = fround(2 * Math.PI), SCALE = 2 ** -24;
 
 export const words = (text) => text.toLowerCase().match(/[\p{L}\p{N}]+/gu) ?? [];
 const digest = async (bytes) => new Uint8Array(await crypto.subtle.digest("SHA-256", bytes));
@@ -70,15 +71,6 @@ export function normal(key, draw, frames, features) { // key: 64 bits; standard 
 }
 
 // ---- the model ----
-function check(content) {
-  const numbers = { features: 1, fps: 1, max_frames: 2, padded_frames: 0, buckets: 1, max_words: 1 }, graphs = ["denoiser.onnx", "joints.onnx", "poses.onnx"];
-  const wrong = Object.keys(numbers).filter((name) => !(content?.[name] >= numbers[name]));
-  wrong.push(...["steps", "vocabulary", "captions", "function_words"].filter((name) => !Array.isArray(content?.[name])));
-  if (!wrong.length && !content.steps.every((row) => row.length === 7 && row.every(Number.isFinite))) wrong.push("steps");
-  if (content?.format !== FORMAT || content.reads !== "text" || !graphs.every((name) => content.sha256?.[name])) wrong.push("format");
-  if (wrong.length) throw new Error(`model.json is damaged: ${wrong.join(", ")}`);
-}
-
 async function download(name) {
   const answer = await fetch(name);
   if (!answer.ok) throw new Error(`${name}: ${answer.status} ${answer.statusText}`);
@@ -106,7 +98,8 @@ export class Sampler {
     try { return await ort.InferenceSession.create(bytes); } catch { throw new Error(`${name} is damaged`); }
   }
 
-  async generate(text, frames, seed, progress = () => {}) { // normalized features (frames * D)
+  async generate(text, seconds, seed, progress = () => {}) { // normalized features (frames * D)
+    const frames = frameCount(seconds, this.content);
     const { features, steps, clip_x0: clip, padded_frames: least, buckets, max_words: most } = this.content;
     const bytes = await digest(new TextEncoder().encode(["noise", seed, 0, `${text}#0`].join("\x1f")));
     const key = bytes.slice(0, 8).reduce((sum, byte) => sum << 8n | BigInt(byte), 0n) >> 1n;

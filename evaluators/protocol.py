@@ -15,7 +15,7 @@ from pydantic import ConfigDict, Field
 
 from evaluators.extractors import Extractor
 from evaluators.metrics import make_metrics
-from evaluators.metrics.attributes import ATTRIBUTES
+from evaluators.metrics.attributes import ATTRIBUTES, UNREAD
 from evaluators.metrics.samples import SampleMetric
 from flame_mdm.config import EXPERIMENTS, Config, check, instantiate, plain
 from flame_mdm.data.datamodule import Clips
@@ -49,8 +49,8 @@ class DrawnClip:
 
     @property
     def requested(self) -> dict[str, Any]:
-        """Those of the attributes of the clip that can be read from motions."""
-        return {name: value for name, value in self.clip.attributes.items() if name in ATTRIBUTES}
+        """The attributes of the clip that rules know; clips with one of `UNREAD` are not scored."""
+        return {name: value for name, value in self.clip.attributes.items() if name in (*ATTRIBUTES, *UNREAD)}
 
     def tokens(self, caption: str) -> list[str] | None:
         """Returns the "word/PART" tokens of a caption of the clip, if the data has them."""

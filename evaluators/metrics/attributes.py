@@ -14,14 +14,31 @@ import torch
 from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
+from evaluators.metrics.checks import (
+    ANKLES,
+    CHECKED,
+    COLLARS,
+    ELBOWS,
+    HEAD,
+    NECK,
+    PELVIS,
+    SHOULDERS,
+    SIDES,
+    TOES,
+    WRISTS,
+    View,
+    check,
+    count_rises,
+    heading_of,
+    tilt_of,
+)
 from evaluators.metrics.samples import MotionMean, Rows, Timed
+from flame_mdm.data.synthetic_actions import MORE
 
-PELVIS, NECK, HEAD = 0, 12, 15
-HIPS, ANKLES, TOES, COLLARS = (1, 2), (7, 8), (10, 11), (13, 14)
-SHOULDERS, ELBOWS, WRISTS = (16, 17), (18, 19), (20, 21)
-SIDES = ("left", "right")
 BONES = [(1, 4), (2, 5), (4, 7), (5, 8), (16, 18), (17, 19), (18, 20), (19, 21)]  # thighs, shins, arms
 ATTRIBUTES = ("action", "side", "count", "direction", "speed", "amount")
+UNREAD = ("while", "ends")  # attributes of synthetic clips that no rule reads; such clips are not scored
+UNDECIDED = MORE.keys() - CHECKED.keys()  # actions without a rule, which are not scored either
 
 
 def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
@@ -37,7 +54,7 @@ def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
     if not _is_a_body(joints, smooth):
         return {}
     floor = np.percentile(smooth[:, TOES, 1], 10)
-    forward, left, turned = _heading(smooth)
+    forward, left, turned = heading_of(smooth)
 
     # Standing, the neck is 25 cm above the pelvis and the pelvis 50 cm above the toes, half of the time.
     pelvis = smooth[:, PELVIS, 1]
@@ -45,7 +62,7 @@ def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
     lowered = _lowered(smooth, floor, forward, fps)
     if lowered or not stands:
         return lowered
-    jumps = _count((smooth[:, TOES, 1] - floor).min(1), 0.07, 0.035)
+    jumps = count_rises((smooth[:, TOES, 1] - floor).min(1), 0.07, 0.035)
     # A leap goes more than 45 cm with both feet side by side, a dance sways at least three times by more than 3.5 cm to
     # one side and the other, and a hand that picks something up comes within 42 cm of the floor.
     stride = ((smooth[:, TOES[0]] - smooth[:, TOES[1]])[:, [0, 2]] * forward).sum(-1)
@@ -57,7 +74,7 @@ def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
         return {"action": "jump", "count": jumps}
     sway = (smooth[:, PELVIS][:, [0, 2]] * left.mean(0)).sum(-1)
     sway -= gaussian_filter1d(sway, 0.5 * fps, mode="nearest")
-    if _count(sway, 0.035, -0.035) + _count(-sway, 0.035, -0.035) >= 3:
+    if count_rises(sway, 0.035, -0.035) + count_rises(-sway, 0.035, -0.035) >= 3:
         return {"action": "dance"}
     if kicked := _kick(smooth, floor, forward):
         return kicked
@@ -65,9 +82,9 @@ def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
     side = int(hands.min(0).argmin())
     if hands[:, side].min() < 0.42 and np.ptp(hands[:, side]) > 0.3:
         return {"action": "pick", "side": SIDES[side]}
-    if squats := _count(np.percentile(pelvis, 95) - pelvis, 0.18, 0.1):
+    if squats := count_rises(np.percentile(pelvis, 95) - pelvis, 0.18, 0.1):
         return {"action": "squat", "count": squats}
-    if _tilt(smooth).max() > 28:
+    if tilt_of(smooth).max() > 28:
         return {"action": "bow"}
     if abs(turned) > 45:
         amount = "half" if abs(turned) > 135 else "quarter"
@@ -77,13 +94,17 @@ def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
     return {"action": "nod", "count": nods} if nods else gesture
 
 
-def _heading(smooth: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Returns the directions (F, 2) forward and left on the ground, and the turn to the left in degrees."""
-    across = (smooth[:, HIPS[0]] - smooth[:, HIPS[1]] + smooth[:, SHOULDERS[0]] - smooth[:, SHOULDERS[1]])[:, [0, 2]]
-    left = across / np.linalg.norm(across, axis=-1, keepdims=True)
-    forward = np.stack([-left[:, 1], left[:, 0]], -1)
-    yaw = np.unwrap(np.arctan2(forward[:, 0], forward[:, 1]))
-    return forward, left, float(np.degrees(yaw[-3:].mean() - yaw[:3].mean()))
+def read_all(joints: np.ndarray, fps: float) -> dict[str, Any]:
+    """Returns `read_attributes` of one clip (F, 22, 3) and, as "checks", what each check of `CHECKED` reads."""
+    seen: dict[str, Any] = dict(read_attributes(joints, fps))
+    joints = np.asarray(joints, np.float64)
+    if len(joints) < fps or not np.isfinite(joints).all():
+        return seen
+    smooth = gaussian_filter1d(joints, 0.05 * fps, axis=0, mode="nearest")
+    if not _is_a_body(joints, smooth):
+        return seen
+    view = View.of(smooth, fps)
+    return seen | {"checks": {name: shown for name in CHECKED if (shown := check(name, view))}}
 
 
 def _is_a_body(joints: np.ndarray, smooth: np.ndarray) -> bool:
@@ -95,19 +116,13 @@ def _is_a_body(joints: np.ndarray, smooth: np.ndarray) -> bool:
     return bool(steady and calm and length.min() > 0.15 and length.max() < 0.6)
 
 
-def _tilt(smooth: np.ndarray) -> np.ndarray:
-    """Returns the angle (F,) between the trunk and the vertical in degrees."""
-    trunk = smooth[:, NECK] - smooth[:, PELVIS]
-    return np.degrees(np.arctan2(np.linalg.norm(trunk[:, [0, 2]], axis=-1), trunk[:, 1]))
-
-
 def _lowered(smooth: np.ndarray, floor: float, forward: np.ndarray, fps: float) -> dict[str, str | int]:
     """Reads crawling, lying down, sitting down and standing up from the height of the pelvis and the tilt of the trunk.
 
     A standing pelvis is higher than 78 cm, a seated one at 35 to 72 cm, a lying one below 35 cm. The trunk of who lies
     or crawls is tilted by more than 55 degrees.
     """
-    pelvis, tilt = smooth[:, PELVIS, 1] - floor, _tilt(smooth)
+    pelvis, tilt = smooth[:, PELVIS, 1] - floor, tilt_of(smooth)
     first, last = (slice(0, max(1, round(0.1 * fps))), slice(-max(1, round(0.1 * fps)), None))
     ends = [pelvis[part].mean() for part in (first, last)]
     moved = ((smooth[-1] - smooth[0])[PELVIS, [0, 2]] * forward.mean(0)).sum()
@@ -118,17 +133,6 @@ def _lowered(smooth: np.ndarray, floor: float, forward: np.ndarray, fps: float) 
     if max(tilt[first].mean(), tilt[last].mean()) < 35 and 0.35 < min(ends) < 0.72 and max(ends) > 0.78:
         return {"action": "sit" if ends[1] < ends[0] else "rise"}
     return {}
-
-
-def _count(signal: np.ndarray, high: float, low: float) -> int:
-    """Counts how often a signal rises above `high` after having been below `low`."""
-    count, armed = 0, False
-    for value in signal:
-        if armed and value > high:
-            count, armed = count + 1, False
-        elif value < low:
-            armed = True
-    return count
 
 
 def _locomotion(
@@ -162,7 +166,7 @@ def _kick(smooth: np.ndarray, floor: float, forward: np.ndarray) -> dict[str, st
     high = smooth[:, ANKLES, 1] - floor - 0.06
     reach = np.where(high > 0.25, ahead, 0).max(0)
     side = int(reach.argmax())
-    kicks = _count(np.where(high[:, side] > 0.15, ahead[:, side], 0), 0.35, 0.2)
+    kicks = count_rises(np.where(high[:, side] > 0.15, ahead[:, side], 0), 0.35, 0.2)
     return {"action": "kick", "side": SIDES[side], "count": kicks} if kicks and reach[side] > 0.35 else {}
 
 
@@ -203,10 +207,10 @@ def _arms(smooth: np.ndarray, forward: np.ndarray, fps: float) -> dict[str, str 
 
     reach = np.linalg.norm(arm[..., [0, 2]], axis=-1) / length
     side = int(reach.max(0).argmax())
-    if punches := _count(reach[:, side], 0.8, 0.6):
+    if punches := count_rises(reach[:, side], 0.8, 0.6):
         return {"action": "punch", "side": SIDES[side], "count": punches}
     apart = np.linalg.norm(smooth[:, WRISTS[0]] - smooth[:, WRISTS[1]], axis=-1)
-    if claps := _count(-apart, -0.175, -0.28):
+    if claps := count_rises(-apart, -0.175, -0.28):
         return {"action": "clap", "count": claps}
     moved = np.ptp(smooth[:, [*WRISTS, *ANKLES, HEAD]], axis=0)
     return {"action": "stand"} if np.linalg.norm(moved, axis=-1).max() < 0.35 else {}
@@ -217,14 +221,26 @@ def _nods(smooth: np.ndarray, forward: np.ndarray) -> int:
     base = smooth[:, [NECK, *COLLARS, *SHOULDERS]].mean(1)
     head = smooth[:, HEAD] - base - (smooth[:, NECK] - base).mean(0)
     nod = np.degrees(np.arctan2((head[:, [0, 2]] * forward).sum(-1), head[:, 1]))
-    return _count(nod - np.percentile(nod, 30), 32, 22)
+    return count_rises(nod - np.percentile(nod, 30), 32, 22)
 
 
 def right_attributes(seen: Mapping[str, Any], requested: Mapping[str, Any]) -> dict[str, bool]:
     """Returns for each requested attribute whether it was read from the motion, and for combinations of them.
 
-    `action_and_side`: both are right, or the action if no side was requested; `all`: every requested attribute is.
+    Actions of `CHECKED` are read by their own check; {} for actions that have no rule.
+
+    Args:
+        seen: what `read_all` or `read_attributes` returns.
+        requested: the attributes of the request.
+
+    Returns:
+        Whether the attributes are right, by name. `action_and_side`: both are, or the action if no side was requested;
+        `all`: every requested attribute is.
     """
+    if requested["action"] in UNDECIDED or requested.keys() & set(UNREAD):
+        return {}
+    if requested["action"] in CHECKED:
+        seen = seen.get("checks", {}).get(requested["action"], {})
     right = {name: seen.get(name) == value for name, value in requested.items()}
     return right | {"action_and_side": right["action"] and right.get("side", True), "all": all(right.values())}
 
@@ -237,8 +253,8 @@ class AttributeAccuracy(Timed, MotionMean):
     names = (*ATTRIBUTES, "action_and_side", "all")
 
     def readings(self, motions: Rows) -> dict[str, np.ndarray]:
-        """Returns the attributes of each motion as JSON: `seen` (N,)."""
-        seen = [json.dumps(read_attributes(joints.numpy(), self.fps)) for joints in motions["joints"]]
+        """Returns the attributes of each motion of `read_all` as JSON: `seen` (N,)."""
+        seen = [json.dumps(read_all(joints.numpy(), self.fps)) for joints in motions["joints"]]
         return {"seen": np.array(seen)}
 
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
@@ -255,7 +271,7 @@ class AttributeAccuracy(Timed, MotionMean):
     def update(self, joints: Tensor, mask: Tensor, requested: Sequence[Mapping[str, Any]], keys: Tensor) -> None:
         rows = []
         for motion, real, attributes in zip(joints.detach().cpu(), mask.cpu(), requested, strict=True):
-            rows.append(right_attributes(read_attributes(motion[real].numpy(), self.fps), attributes))
+            rows.append(right_attributes(read_all(motion[real].numpy(), self.fps), attributes))
         self.add(keys, rows)
 
 
@@ -267,7 +283,7 @@ def read_side(joints: np.ndarray, content: str, fps: float) -> str:
     """
     smooth = gaussian_filter1d(np.asarray(joints, np.float64), 0.05 * fps, axis=0, mode="nearest")
     if content.startswith("walk"):
-        _, left, turned = _heading(smooth)
+        _, left, turned = heading_of(smooth)
         travel = (np.diff(smooth[:, PELVIS][:, [0, 2]], axis=0) * left[1:]).sum()
         toward = turned if content.startswith("walk-turn") else travel
     else:

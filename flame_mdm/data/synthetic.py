@@ -237,6 +237,8 @@ def prompts() -> list[tuple[str, Attributes]]:
 def example(attributes: Attributes, fps: float = 20.0) -> np.ndarray:
     """Returns the joints (F, 22, 3) of a motion of three seconds with at least these attributes, such as a prompt's."""
     name = str(attributes["action"])
-    draws = (ACTIONS[name].draw(np.random.default_rng(seed), name) for seed in range(1000))
-    drawn = next(drawn for drawn in draws if attributes.items() <= drawn.items())
+    drawn = attributes
+    if not attributes.keys() & {"while", "ends"}:
+        draws = (ACTIONS[name].draw(np.random.default_rng(seed), name) for seed in range(1000))
+        drawn = next(drawn for drawn in draws if attributes.items() <= drawn.items())
     return _joints(np.random.default_rng(0), np.arange(0, 3, 1 / fps), drawn)

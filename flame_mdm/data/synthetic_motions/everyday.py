@@ -48,7 +48,8 @@ def point(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attrib
     start = rng.uniform(0.1, 0.3)
     out = pulse(t, start, start + rng.uniform(0.45, 0.6), t[-1] - 0.55, t[-1])
     aside = rng.uniform(-0.1, 0.35)
-    body.move_arm(side, out, (rng.uniform(1.4, 1.6), aside, -0.4, 0.06))
+    bent = body.pelvis[0] + body.spine[0]  # of a trunk that leans: the arm points ahead, not at the floor
+    body.move_arm(side, out, (rng.uniform(1.4, 1.6) + bent, aside, -0.4, 0.06))
     body.spine[1] -= 0.2 * SIGN[side] * out
     body.head[1] += (0.2 + 0.5 * aside) * SIGN[side] * out
 
@@ -58,7 +59,7 @@ def beckon(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attri
     (side,) = SIDES[str(requested["side"])]
     out = hold(rng, t)
     pull = beat(t, rng.uniform(1.1, 1.4), rng.random())
-    body.move_arm(side, out, (0.9 + 0.12 * pull, 0.15, 0.1, 1.25 + 0.75 * pull))
+    body.move_arm(side, out, (0.9 + 0.12 * pull, 0.15, 0.35, 1.25 + 0.75 * pull))
     body.spine[0] += 0.04 * out * pull
 
 

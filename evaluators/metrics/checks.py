@@ -195,6 +195,14 @@ def _dodge(view: View) -> Shown:
     return {"direction": "backward"} if ahead < 0 else {}
 
 
+def _strafe(view: View) -> Shown:
+    """Reads a way of more than 33 cm to a side, more than twice as far as ahead or back."""
+    aside, ahead = view.path()[-3:].mean(0)
+    if abs(aside) < max(0.33, 2 * abs(ahead)):
+        return {}
+    return {"direction": "left" if aside > 0 else "right"}
+
+
 def _limp(view: View) -> Shown:
     """Reads the leg on which the pelvis sinks while the other foot is in the air, during a walk.
 
@@ -227,6 +235,7 @@ CHECKED: dict[str, Callable[[View], Shown]] = {
     "lean": _lean,
     "spin": _spin,
     "dodge": _dodge,
+    "strafe": _strafe,
 }
 
 

@@ -163,7 +163,7 @@ class Synthetic(MotionSource):
         clips: number of clips.
         seed: seed of the clips; from 0 on.
         workers: processes that generate clips; 0 = one per core.
-        actions: "core", 22 actions, or "all", which adds 52 actions, clips of two actions at once, and parts of cycles.
+        actions: "core", 22 actions, or "all", which adds 54 actions, clips of two actions at once, and parts of cycles.
     """
 
     name = "synthetic"

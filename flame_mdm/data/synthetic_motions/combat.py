@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from flame_mdm.data.synthetic_motions.body import SIDES, SIGN, Attributes, Body, ease, follow_feet, pulse, step
+from flame_mdm.data.synthetic_motions.body import SIDES, SIGN, Attributes, Body, beat, ease, follow_feet, pulse, step
 from flame_mdm.data.synthetic_motions.gestures import lie
 
 
@@ -11,6 +11,19 @@ def guard(body: Body, weight: np.ndarray) -> None:
     body.position[:, 1] -= 0.05 * weight
     for side in (0, 1):
         body.move_arm(side, weight, (0.6, 0.3, -0.35, 2.1))
+
+
+def stance(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+    """Waits with raised fists and one foot ahead, bouncing on bent knees."""
+    sign, bounce = rng.choice(SIGN), beat(t, rng.uniform(1.2, 1.7), rng.random())
+    guard(body, np.ones_like(t))
+    body.ankles[..., 2] += 0.13 * sign * SIGN[:, None]
+    body.position[:, 1] -= 0.05 - 0.012 * bounce
+    body.position[:, 2] += 0.02 * beat(t, rng.uniform(0.4, 0.7), rng.random())
+    body.pelvis[1] -= 0.25 * sign
+    body.spine[0] += 0.12 + 0.02 * bounce
+    body.head[1] += 0.25 * sign
+    body.arms[:, 3] += 0.1 * bounce
 
 
 def dodge(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:

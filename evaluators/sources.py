@@ -75,6 +75,8 @@ class Generator:
     progress: bool = True
 
     def __post_init__(self) -> None:
+        if self.model.denoiser.context_frames:
+            raise UserError("this model continues clean frames, and no protocol gives them yet. Evaluate another model")
         total, shown = self.protocol.count(self.clips) // world_size(), self.progress and is_first()
         self.bar = ProgressBar(total=total, desc="generating", unit=" motions", disable=not shown)
 

@@ -59,40 +59,60 @@ class Condition:
         tokens: (B, S, C), one vector per word piece; (B, 0, C) if the encoder has none.
         token_mask: (B, S) bool, True = real token. In a null, None means: keep the mask of the replaced sample.
         null: the condition that means "no condition", with batch size 1; None if there is none.
+        prefix: (B, P, D), normalized features of the P clean frames before the motion; None if there are none.
+        target: (B, 8, 4), where the motion should end: `flame_mdm.conditions.target`; None = anywhere.
+        target_mask: (B,) bool, False = this sample's target is left out; None = all samples have theirs.
     """
 
     pooled: Tensor
     tokens: Tensor
     token_mask: Tensor | None
     null: Condition | None = None
+    prefix: Tensor | None = None
+    target: Tensor | None = None
+    target_mask: Tensor | None = None
 
     def drop(self, drop: Tensor) -> Condition:
-        """Returns conditions in which samples with `drop` (B,) bool True are replaced by the null condition."""
+        """Returns conditions in which samples with `drop` (B,) bool True are replaced by the null condition.
+
+        The null replaces text or action alone: prefix and target stay.
+        """
         if self.null is None:
             raise ValueError("this condition has no null to drop to")
         null = self.null
         pooled = torch.where(drop[:, None], null.pooled.to(self.pooled), self.pooled)
         if self.token_mask is None:
-            return Condition(pooled, self.tokens, None, null)
+            return replace(self, pooled=pooled)
         if null.token_mask is None:
             tokens = torch.where(drop[:, None, None], null.tokens.to(self.tokens), self.tokens)
-            return Condition(pooled, tokens, self.token_mask, null)
+            return replace(self, pooled=pooled, tokens=tokens)
         size = max(self.tokens.shape[1], null.tokens.shape[1])
         tokens = torch.where(drop[:, None, None], pad_to(null.tokens.to(self.tokens), size), pad_to(self.tokens, size))
         replaced = drop[:, None]
         token_mask = (replaced & pad_to(null.token_mask, size)) | (~replaced & pad_to(self.token_mask, size))
-        return Condition(pooled, tokens, token_mask, null)
+        return replace(self, pooled=pooled, tokens=tokens, token_mask=token_mask)
 
     def with_null(self) -> Condition:
         """Returns the batch followed by its null conditions (2B), for classifier-free guidance in one forward pass."""
         batch = self.pooled.shape[0]
-        twice = Condition(
-            torch.cat([self.pooled, self.pooled]),
-            torch.cat([self.tokens, self.tokens]),
-            None if self.token_mask is None else torch.cat([self.token_mask, self.token_mask]),
-            self.null,
-        )
+        twice = self.select(torch.arange(2 * batch, device=self.pooled.device) % batch)
         return twice.drop(torch.arange(2 * batch, device=self.pooled.device) >= batch)
+
+    def select(self, rows: Tensor) -> Condition:
+        """Returns the conditions of samples `rows` (N,) int64."""
+
+        def selected(x: Tensor | None) -> Tensor | None:
+            return None if x is None else x[rows]
+
+        return Condition(
+            self.pooled[rows],
+            self.tokens[rows],
+            selected(self.token_mask),
+            self.null,
+            selected(self.prefix),
+            selected(self.target),
+            selected(self.target_mask),
+        )
 
 
 class Guide(Protocol):
@@ -163,9 +183,14 @@ def length_mask(lengths: Tensor, frames: int | None = None) -> Tensor:
     return torch.arange(frames, device=lengths.device) < lengths[:, None]
 
 
+def ceil_div(count: int, size: int) -> int:
+    """Returns the number of groups of `size` that hold `count` things."""
+    return -(-count // size)
+
+
 def padded_length(length: int, multiple: int, most: int) -> int:
     """Returns `length` rounded up to a multiple, but at most `most`."""
-    return min(-(-length // multiple) * multiple, max(most, length))
+    return min(ceil_div(length, multiple) * multiple, max(most, length))
 
 
 def sent(x: Tensor, device: torch.device) -> Tensor:

@@ -8,7 +8,7 @@ from typing import Any, Literal, Self
 import torch
 from torch import Tensor, nn
 
-from flame_mdm.batch import Condition, Denoise, Edit, MotionBatch, pad_to
+from flame_mdm.batch import Condition, Denoise, Edit, MotionBatch, ceil_div, pad_to
 from flame_mdm.conditions import ConditionEncoder
 from flame_mdm.config import Config, instantiate, parameters
 from flame_mdm.denoisers import Denoiser
@@ -150,6 +150,7 @@ class MotionGenerator(Model, nn.Module):
         replication: int = 0,
         edit: Edit | None = None,
         windows: Windows | None = None,
+        prefix: Tensor | None = None,
         unconditioned: bool = False,
         shared_noise: bool = False,
         trajectory: list[Tensor] | None = None,
@@ -160,7 +161,9 @@ class MotionGenerator(Model, nn.Module):
         (seed, replication, id), so the motion is the same in any batch; with `shared_noise`, of (seed, replication).
         `unconditioned` samples a conditional model with its null condition. The normalized clean estimate (B, F, D) of
         each denoiser call is appended to `trajectory`. With `windows`, motions may be longer than those in training,
-        and the conditions are those of the windows. Returns (B, F, D) normalized, 0 past the end of each motion.
+        and the conditions are those of the windows. A model with `context_frames` continues `prefix` (B, C, D), frames
+        of normalized features, block by block, without an edit. Returns (B, F, D) normalized, 0 past the end of each
+        motion.
         """
         self.check_request(options, unconditioned)
         options = self.sampler_options if options is None else options.over(self.sampler_options)
@@ -168,11 +171,19 @@ class MotionGenerator(Model, nn.Module):
         if was_training:  # setting the mode of all modules takes as long as a small network
             self.eval()
 
-        cond = self._encode(batch if windows is None else windows.batch, unconditioned)
-        denoise: Denoise = self.denoiser
-        scale = options.guidance_scale
-        if scale is not None and cond.null is not None and self.condition.features and not unconditioned:
-            denoise = classifier_free_guidance(self.denoiser, scale, self.representation.features)
+        cond = self.encode(batch if windows is None else windows.batch, unconditioned)
+        ids = ["shared"] * len(batch) if shared_noise else batch.ids
+        if self.denoiser.context_frames:
+            if edit is not None or windows is not None or trajectory is not None:
+                raise UserError("this model continues motions block by block: omit edits, windows and trajectory")
+            blocks = Blocks(self, ids, prefix, options, seed=seed, replication=replication, unconditioned=unconditioned)
+            count = ceil_div(batch.mask.shape[1], self.block_frames)
+            x = torch.cat([blocks.sample(cond) for _ in range(count)], 1)[:, : batch.mask.shape[1]]
+            if was_training:
+                self.train()
+            return x * batch.mask[..., None]
+
+        denoise = self.guided(cond, options, unconditioned)
         if windows is not None:
             denoise = blended(denoise, windows)
 
@@ -184,7 +195,6 @@ class MotionGenerator(Model, nn.Module):
                 padded = mask.shape[1]
                 edit = replace(edit, known=pad_to(edit.known, padded), keep=~pad_to(~edit.keep, padded))
 
-        ids = ["shared"] * len(batch) if shared_noise else batch.ids
         features = self.representation.features
         noise = seeded_noise(ids, mask.shape[1], features, seed=seed, replication=replication, like=batch.x)
         x = self.process.sample(denoise, noise, mask, cond, options, edit=edit, trajectory=trajectory)
@@ -192,13 +202,95 @@ class MotionGenerator(Model, nn.Module):
             self.train()
         return x[:, :frames]
 
-    def _encode(self, batch: MotionBatch, unconditioned: bool) -> Condition:
+    def encode(self, batch: MotionBatch, unconditioned: bool = False) -> Condition:
         """Returns the condition of a batch, or the null condition if a conditional model samples without one."""
         if not (unconditioned and self.condition.features):
             return self.condition(batch)
         nothing = torch.zeros(len(batch), dtype=torch.long, device=batch.x.device)
         empty = replace(batch, text=[""] * len(batch), action=nothing)
         return self.condition(empty).drop(nothing == 0)
+
+    def guided(self, cond: Condition, options: SamplerOptions, unconditioned: bool) -> Denoise:
+        """Returns the denoiser with the guidance of the options, if there is a condition to guide by."""
+        scale = options.guidance_scale
+        if scale is None or cond.null is None or not self.condition.features or unconditioned:
+            return self.denoiser
+        return classifier_free_guidance(self.denoiser, scale, self.representation.features)
+
+    @property
+    def block_frames(self) -> int:
+        """Number of frames that a model with `context_frames` predicts at once."""
+        return self.facts["max_frames"] - self.denoiser.context_frames
+
+    def split_prefix(self, batch: MotionBatch) -> tuple[Tensor | None, MotionBatch]:
+        """Splits motions into the clean frames (B, C, D) that the denoiser reads, if it reads any, and the rest."""
+        context = self.denoiser.context_frames
+        if not context:
+            return None, batch
+        return batch.x[:, :context], replace(batch, x=batch.x[:, context:], mask=batch.mask[:, context:])
+
+
+class Blocks:
+    """Motions that grow by blocks, each of which continues the last frames before it (Tevet et al. 2025, "CLoSD").
+
+    The noise of a block is a function of (seed, replication, id, number of the block): later conditions change later
+    blocks alone.
+
+    Args:
+        model: a model whose denoiser has `context_frames` C.
+        ids: B names of the motions, which seed their noise.
+        prefix: (B, C, D) normalized features of the frames before the first block.
+        options: all options of the sampler.
+        seed, replication: of the noise.
+        unconditioned: whether conditions are null conditions already.
+
+    Raises `UserError` if the prefix is missing or has another shape.
+    """
+
+    def __init__(
+        self,
+        model: MotionGenerator,
+        ids: Sequence[str],
+        prefix: Tensor | None,
+        options: SamplerOptions,
+        *,
+        seed: int = 0,
+        replication: int = 0,
+        unconditioned: bool = False,
+    ):
+        expected = (len(ids), model.denoiser.context_frames, model.representation.features)
+        if prefix is None or tuple(prefix.shape) != expected:
+            shape = None if prefix is None else tuple(prefix.shape)
+            raise UserError(f"prefix of shape {shape}: this model continues frames of shape {expected}. Give these")
+        self.model, self.ids, self.prefix, self.options = model, list(ids), prefix, options
+        self.seed, self.replication, self.unconditioned = seed, replication, unconditioned
+        self.number = 0  # of the next block
+
+    @torch.no_grad()
+    def sample(self, cond: Condition, kept: Tensor | None = None, edit: Edit | None = None) -> Tensor:
+        """Samples the next block (B, P, D), normalized.
+
+        Args:
+            cond: the conditions of this block.
+            kept: (B,) int64, number of frames of the block that stay; the next block continues these. Default: all.
+            edit: part of the block to keep.
+        """
+        model, prefix = self.model, self.prefix
+        frames, features = model.block_frames, model.representation.features
+        names = [f"{name}\x1f{self.number}" for name in self.ids]
+        noise = seeded_noise(names, frames, features, seed=self.seed, replication=self.replication, like=prefix)
+        mask = torch.ones(len(prefix), frames, dtype=torch.bool, device=prefix.device)
+        cond = replace(cond, prefix=prefix)
+        denoise = model.guided(cond, self.options, self.unconditioned)
+        x = model.process.sample(denoise, noise, mask, cond, self.options, edit=edit)
+
+        self.number += 1
+        context = prefix.shape[1]
+        kept = torch.full((len(x),), frames, device=x.device) if kept is None else kept
+        last = kept[:, None] + torch.arange(context, device=x.device)
+        rows = torch.arange(len(x), device=x.device)[:, None]
+        self.prefix = torch.cat([prefix, x], 1)[rows, last]
+        return x
 
 
 class DistilledGenerator(MotionGenerator):

@@ -2,6 +2,7 @@
 """Lightning modules: what trains a model, while the model itself is `flame_mdm.generator.MotionGenerator`."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -14,6 +15,7 @@ from torchmetrics import MeanMetric
 
 from flame_mdm.batch import Condition, MotionBatch
 from flame_mdm.conditions import ConditionEncoder
+from flame_mdm.conditions.target import TargetConditions
 from flame_mdm.conditions.vocabulary import vocabulary
 from flame_mdm.config import Config, instantiate
 from flame_mdm.data.datamodule import MotionDataModule
@@ -116,6 +118,10 @@ class GeneratorTask(Task):
         guidance_scale, sampler, num_inference_steps: defaults of `generate`; see `SamplerOptions`.
         seed: of all random draws in training, which are functions of (seed, batch number, rank).
         compile: compile the denoiser with torch.compile, when training begins.
+        targets: options of `TargetConditions`, for a denoiser with a target encoder; None = no targets.
+
+    If the denoiser reads `context_frames`, the first frames of a training sample are its clean prefix, and the losses
+    are those of the frames after them.
     """
 
     noun = MotionGenerator.noun
@@ -133,6 +139,7 @@ class GeneratorTask(Task):
         num_inference_steps: int | list[int],
         seed: int = 0,
         compile: bool = False,
+        targets: dict[str, Any] | None = None,
     ):
         super().__init__(optimizer=optimizer, seed=seed)
         if not 0 <= cond_drop_prob <= 1:
@@ -146,6 +153,9 @@ class GeneratorTask(Task):
         representation = parts.representation
         skeleton = representation.skeleton
         self.losses = MotionLosses(representation.to_joints, skeleton.feet, skeleton.edges, **losses)
+        self.targets = None if targets is None else TargetConditions(skeleton.joints, skeleton.facing, **targets)
+        if (self.targets is None) != (getattr(parts.denoiser, "target", None) is None):
+            raise UserError("task.targets and denoiser.target_encoder: give both, or none of them")
         self.cond_drop_prob, self.compiles = cond_drop_prob, compile
         self.val_losses = torch.nn.ModuleDict()
 
@@ -175,6 +185,11 @@ class GeneratorTask(Task):
         """Also stores the vocabulary of the training captions, and tells it to the text encoder."""
         super().setup(stage)
         data = self.data
+        context = self.generator.denoiser.context_frames
+        shortest = int(data.crop.draw(data.crop.min_frames, lambda count: 0)[1])
+        if context >= shortest:
+            advice = "Increase data.crop.min_frames, or decrease denoiser.context_frames"
+            raise UserError(f"data.crop: a sample of {shortest} frames has none after a prefix of {context}. {advice}")
         if self.generator.conditioned_on == "text":
             captions = (caption for clip in data.train.clips for caption in clip.captions)
             self.add_facts(vocabulary(captions, share=data.source.captions_may_be_shared))
@@ -208,7 +223,10 @@ class GeneratorTask(Task):
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
         """Returns the loss of one batch. Random draws are functions of (seed, batch number, rank)."""
         seed_generator(key("step", self.seed, batch_idx, self.global_rank), self.device)
-        cond = self.generator.condition(batch)
+        targeted = None if self.targets is None else torch.rand(2, len(batch), device=self.device)
+        batch, cond = _conditioned(self.generator, self.targets, batch, None if targeted is None else targeted[0])
+        if self.targets is not None and targeted is not None:
+            cond = replace(cond, target_mask=targeted[1] >= self.targets.drop_prob)
         if cond.null is not None:  # even if the probability is 0, since DDP requires a gradient for every parameter
             cond = cond.drop(self.dropped(batch))
         terms = self.loss_terms(batch, cond)
@@ -230,13 +248,23 @@ class GeneratorTask(Task):
         """
         process = self.generator.process
         t = None if u is None else process.training_times(u)
-        return process.loss(self.generator.denoiser, batch.x, batch.mask, cond, t=t, noise=noise, auxiliary=self.losses)
+
+        def auxiliary(x0_hat: Tensor, x: Tensor, mask: Tensor) -> dict[str, Tensor]:
+            terms = self.losses(x0_hat, x, mask)
+            if self.targets is not None and cond.target is not None:
+                joints = self.generator.representation.to_joints(x0_hat)
+                terms["target"] = self.targets.error(joints, cond.target, batch.lengths)
+            return terms
+
+        return process.loss(self.generator.denoiser, batch.x, batch.mask, cond, t=t, noise=noise, auxiliary=auxiliary)
 
     def losses_of(self, batch: MotionBatch) -> dict[str, Tensor]:
-        """Returns the losses (B,) of clips. Each clip always gets the same time and noise."""
+        """Returns the losses (B,) of clips. Each clip always gets the same time, noise and target."""
         keys = torch.tensor([key("validation", name) for name in batch.ids], device=self.device)
-        u, noise = uniform(keys, (1,))[0][:, 0], normal(keys, *batch.x.shape[1:])
-        return self.loss_terms(batch, self.generator.condition(batch), u, noise)
+        u, v = (draw[:, 0] for draw in uniform(keys, (1,)))
+        batch, cond = _conditioned(self.generator, self.targets, batch, v)
+        noise = normal(keys, *batch.x.shape[1:])
+        return self.loss_terms(batch, cond, u, noise)
 
     def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:
         for name, value in self.losses_of(batch).items():
@@ -250,6 +278,21 @@ class GeneratorTask(Task):
             assert isinstance(metric, MeanMetric)
             self.log(f"val/{name}", metric.compute(), prog_bar=name == "loss")
             metric.reset()
+
+
+def _conditioned(
+    generator: MotionGenerator, targets: TargetConditions | None, batch: MotionBatch, u: Tensor | None
+) -> tuple[MotionBatch, Condition]:
+    """Returns the motions to predict, without the frames of the prefix, and their conditions.
+
+    Uniform numbers u (B,) in (0, 1) decide on what a target requests, if there are targets.
+    """
+    prefix, batch = generator.split_prefix(batch)
+    cond = replace(generator.condition(batch), prefix=prefix)
+    if targets is not None and u is not None:
+        joints = generator.representation.to_joints(batch.x)
+        cond = replace(cond, target=targets.draw(joints, u, batch.lengths))
+    return batch, cond
 
 
 def _name_as_generator(task: GeneratorTask, state: dict[str, Any], prefix: str, *_: object) -> None:

@@ -281,10 +281,14 @@ def test_every_weight_is_used_or_the_import_fails() -> None:
 @pytest.mark.parametrize(
     ("kind", "options", "message"),
     [
-        ("mdm", {"context_len": 20}, "context_len=20: changes the model in a way that is not imported"),
-        ("mdm", {"pred_len": 40}, "pred_len=40: changes the model"),
-        ("mdm", {"emb_policy": "concat"}, "emb_policy=concat: changes the model"),
-        ("mdm", {"multi_target_cond": True}, "multi_target_cond=True: changes the model"),
+        (
+            "mdm",
+            {"context_len": 20, "pred_len": 40},
+            "context_len=20: known for trans_dec with bert, not for trans_enc",
+        ),
+        ("mdm", {"pred_len": 40}, "context_len=0, pred_len=40: both are positive"),
+        ("mdm", {"emb_policy": "concat"}, "emb_policy=concat: known for trans_dec with bert"),
+        ("mdm", {"emb_before_mask": True}, "emb_before_mask=True: changes the model in a way that is not imported"),
         ("mdm", {"rope_base": 100}, "rope_base=100: an unknown option, which may change the network"),
         ("mfm", {"model": {"skip_connections": True}}, "skip_connections=True: an unknown option"),
         ("mfm", {"ode_kwargs": {"order": 3}}, "ode_kwargs.order=3: an unknown option"),
@@ -294,6 +298,45 @@ def test_every_weight_is_used_or_the_import_fails() -> None:
 def test_options_that_change_a_released_model_are_refused(refused, tmp_path, kind, options, message):
     words = released_file(tmp_path, small_state(150), {"dataset": "uestc", **options})
     refused("import", kind, *words, says=f"args.json: {message}")
+
+
+DIP_FILES = {
+    "no target": ({"emb_policy": "ADD"}, "", {"memory": "add"}),
+    "target": (
+        {"emb_policy": "CONCAT", "lambda_target_loc": 1.0, "multi_target_cond": True, "multi_encoder_type": "single"},
+        "state_single/",
+        {"memory": "concat", "target_encoder": "single", "target_layers": 1},
+    ),
+}
+"""Options in args.json of the two released models of DiP, weights besides those of the network, and our options."""
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("kind", [pytest.param(name, id=f"dip-{name}") for name in DIP_FILES])
+@pytest.mark.parametrize("averaged", [True, False])
+def test_released_models_that_continue_frames(tmp_path, kind, averaged):
+    arrays = golden("dip")
+    config, (options, encoder, expected) = meta(arrays)["config"], DIP_FILES[kind]
+    state = weights(arrays) | (weights(arrays, encoder) if encoder else {})
+    raw = {name: value + 1 for name, value in state.items()}
+    names = ("arch", "text_encoder_type", "context_len", "pred_len", "mask_frames", "emb_trans_dec")
+    args = MDM_ARGUMENTS | {name: config[name] for name in names} | options | {"diffusion_steps": config["steps"]}
+    words = released_file(tmp_path, {"model": raw, "model_avg": state}, args)
+    words += [f"stats={statistics_folder(tmp_path, 263)}", f"num_heads={config['num_heads']}"]
+    assert main(["import", "mdm", *words, *([] if averaged else ["averaged=false"])]) == 0
+
+    model = load(tmp_path)
+    denoiser = model.config["denoiser"]
+    assert {name: denoiser[name] for name in expected} == expected
+    assert model.denoiser.context_frames == config["context_len"]
+    assert model.block_frames == config["pred_len"]
+    assert (model.sampler_options.guidance_scale, model.sampler_options.num_inference_steps) == (7.5, config["steps"])
+    assert torch.equal(model.denoiser.input.bias, (state if averaged else raw)["input_process.poseEmbedding.bias"])  # type: ignore[union-attr]
+
+
+def test_a_released_model_whose_options_name_a_missing_encoder_is_refused(refused, tmp_path):
+    words = released_file(tmp_path, small_state(150), {"dataset": "uestc", "lambda_target_loc": 1.0})
+    refused("import", "mdm", *words, says="model.pt: released weights: embed_target_cond is missing")
 
 
 @pytest.mark.parametrize("kind", ["flame", "mclip"])

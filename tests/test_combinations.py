@@ -16,6 +16,8 @@ from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.task import GeneratorTask
 
 TINY = {"latent_dim": 16, "ff_size": 16, "num_layers": 1, "num_heads": 2, "channels": [8, 8], "num_groups": 4}
+CONTEXT = 3
+TINY |= {"context_frames": CONTEXT}
 FLOW = "flow_matching"
 PROCESSES = {
     **{prediction: {"process": "diffusion", "prediction": prediction} for prediction in ("x0", "epsilon", "velocity")},
@@ -63,11 +65,22 @@ def build(denoiser: str, process: str, condition: str = "learned") -> GeneratorT
         config["denoiser"] = config["denoiser"] | {"project_condition": False}
     config["task"] = config["task"] | {"cond_drop_prob": 0.5, "guidance_scale": 2.5, "num_inference_steps": 4}
     config["task"]["sampler"] = samplers(process)[0]
+    if "target_encoder" in config["denoiser"]:
+        config["task"]["targets"] = recipe("task=generation_targets")["task"]["targets"]
     torch.manual_seed(0)
     representation = instantiate(config["representation"])
     representation.mean.normal_()
     representation.std.uniform_(0.5, 1.5)
-    return GeneratorTask.build(config, representation, actions=ACTIONS).double()
+    task = GeneratorTask.build(config, representation, actions=ACTIONS).double()
+    task.add_facts({"max_frames": max(LENGTHS)})
+    return task
+
+
+def generated(task: GeneratorTask, motions: MotionBatch, options: SamplerOptions | None = None) -> Tensor:
+    """Samples motions; those of a denoiser with a context continue the same random frames."""
+    x = torch.randn(CONTEXT, 263, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    prefix = x.expand(len(motions), -1, -1) if task.generator.denoiser.context_frames else None
+    return task.generator.generate(motions, options, prefix=prefix)
 
 
 def samplers(process: str) -> list[str]:
@@ -94,7 +107,7 @@ def test_trains_and_samples(denoiser, process, condition, monkeypatch):
     task, motions = build(denoiser, process, condition), batch()
     if condition == "none" and DENOISERS[denoiser].get("max_tokens"):  # reads tokens in place of the pooled vector
         with pytest.raises(ValueError, match="needs condition tokens, but the condition encoder has none"):
-            task.generator.generate(motions)
+            generated(task, motions)
         return
     logged: dict[str, Tensor] = {}
     monkeypatch.setattr(task, "log_dict", lambda values, **_: logged.update(values))
@@ -112,7 +125,7 @@ def test_trains_and_samples(denoiser, process, condition, monkeypatch):
     assert {"train/loss", "train/mse"} <= logged.keys()
     assert ("train/vlb" in logged) == (process == "learned_range")
     for sampler in samplers(process):
-        x = task.generator.generate(motions, SamplerOptions(sampler=sampler))
+        x = generated(task, motions, SamplerOptions(sampler=sampler))
         assert x.shape == motions.x.shape
         assert x.isfinite().all()
         assert (x[~motions.mask] == 0).all()
@@ -124,9 +137,9 @@ def test_trains_and_samples(denoiser, process, condition, monkeypatch):
 @each_denoiser
 def test_a_motion_does_not_depend_on_padding_or_neighbors(denoiser, process):
     task = build(denoiser, process)
-    together, longer = task.generator.generate(batch()), task.generator.generate(batch(frames=17))
+    together, longer = generated(task, batch()), generated(task, batch(frames=17))
     for row, length in enumerate(LENGTHS):
-        alone = task.generator.generate(batch(slice(row, row + 1)))
+        alone = generated(task, batch(slice(row, row + 1)))
         for other in (longer[row, :length], alone[0, :length]):
             torch.testing.assert_close(other, together[row, :length], rtol=0, atol=1e-8)
 

@@ -1,5 +1,6 @@
 """What every denoiser of `experiments/denoiser` promises."""
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from flame_mdm.safe_io import read_yaml
 
 CONFIGS = sorted((ROOT / "experiments" / "denoiser").glob("*.yaml"))
 TRANSFORMER = {"latent_dim": 16, "ff_size": 24, "num_layers": 2, "num_heads": 2, "dropout": 0.0}
-TINY = {**TRANSFORMER, "channels": [8, 8, 16], "num_groups": 4}
+TINY = {**TRANSFORMER, "channels": [8, 8, 16], "num_groups": 4, "context_frames": 3}
 D, C, LENGTHS = 7, 12, [11, 8, 1]
 
 
@@ -40,7 +41,10 @@ def batch(lengths: list[int] = LENGTHS, frames: int | None = None, tokens: int =
     x_t = torch.cat([x_t, 100 * normal(size, mask.shape[1] - x_t.shape[1], D)], 1)
     token_mask = length_mask(torch.arange(size) % max(tokens, 1) + 1, tokens)
     null = Condition(normal(1, C), normal(1, tokens, C), torch.ones(1, tokens).bool())
-    return x_t, t, mask, Condition(pooled, text, token_mask, null)
+    # Denoisers without a context or a target encoder read neither.
+    normal = partial(torch.randn, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    prefix, target = normal(size, TINY["context_frames"], D), normal(size, 8, 4)
+    return x_t, t, mask, Condition(pooled, text, token_mask, null, prefix, target)
 
 
 def assert_same(actual: torch.Tensor, expected: torch.Tensor) -> None:
@@ -66,7 +70,8 @@ def test_shape_determinism_and_padding(path: Path) -> None:
     for i, length in enumerate(LENGTHS):
         assert_same(y_longer[i, :length], y[i, :length])
         row, tokens = slice(i, i + 1), i % 5 + 1
-        alone = Condition(cond.pooled[row], cond.tokens[row, :tokens], torch.ones(1, tokens, dtype=torch.bool))
+        alone = cond.select(torch.tensor([i]))
+        alone = replace(alone, tokens=alone.tokens[:, :tokens], token_mask=torch.ones(1, tokens, dtype=torch.bool))
         y_alone = denoiser(x_t[row, :length], t[row], mask[row, :length], alone)
         assert_same(y_alone[0], y[i, :length])
 
@@ -78,7 +83,8 @@ def test_dropped_condition_is_the_null_and_time_is_continuous(path: Path) -> Non
     null, size = cond.null, len(x_t)
     assert null is not None
     all_real = torch.ones(size, 5, dtype=torch.bool)
-    everywhere = Condition(null.pooled.expand(size, -1), null.tokens.expand(size, -1, -1), all_real)
+    nothing = {"pooled": null.pooled.expand(size, -1), "tokens": null.tokens.expand(size, -1, -1)}
+    everywhere = replace(cond, **nothing, token_mask=all_real)
     y, y_null = denoiser(x_t, t, mask, cond), denoiser(x_t, t, mask, everywhere)
     mixed = denoiser(x_t, t, mask, cond.drop(torch.tensor([False, True, False])))
     assert_same(mixed[1], y_null[1])
@@ -90,18 +96,23 @@ def test_dropped_condition_is_the_null_and_time_is_continuous(path: Path) -> Non
 
 def test_paper_sizes() -> None:
     sizes = {"mdm_encoder": 17_880_327, "mdm_decoder": 26_293_511, "mdm_decoder_token": 26_293_511}
+    sizes |= {"dip": 26_424_583, "dip_target": 26_704_135}
     sizes |= {"mdm_gru": 4_472_071, "mdm_unet": 23_565_959, "flame": 64_905_766}  # U-Net: 23.47M in the paper
     for name, parameters in sizes.items():
         with torch.device("meta"):
             config = read_yaml(ROOT / "experiments" / "denoiser" / f"{name}.yaml")
-            denoiser = instantiate(config, *((147, 294, 768) if name == "flame" else (263, 263, 512)))
+            widths = {"flame": (147, 294, 768), "dip": (263, 263, 768), "dip_target": (263, 263, 768)}
+            denoiser = instantiate(config, *widths.get(name, (263, 263, 512)))
         assert sum(p.numel() for p in denoiser.parameters()) == parameters, name
 
 
 @each_denoiser
 def test_runs_under_bf16_autocast(path: Path) -> None:
     denoiser, (x_t, t, mask, cond) = tiny(path).float(), batch()
-    inputs = x_t.float(), t, mask, Condition(cond.pooled.float(), cond.tokens.float(), cond.token_mask)
+    assert cond.prefix is not None
+    assert cond.target is not None
+    single = {name: getattr(cond, name).float() for name in ("pooled", "tokens", "prefix", "target")}
+    inputs = x_t.float(), t, mask, replace(cond, **single, null=None)
     exact = denoiser(*inputs)
     with torch.autocast("cpu", dtype=torch.bfloat16):
         error = (denoiser(*inputs).float() - exact)[mask]
@@ -166,6 +177,31 @@ def test_token_positions_do_not_move_the_frames() -> None:
         encoder(*batch(tokens=6))
 
 
+def test_the_prefix_acts_on_every_frame_and_has_no_output() -> None:
+    decoder = MDMDecoder(D, D, C, **TRANSFORMER, token_memory=True, context_frames=3).double().eval()
+    x_t, t, mask, cond = batch()
+    assert cond.prefix is not None
+    y, moved = decoder(x_t, t, mask, cond), decoder(x_t, t, mask, replace(cond, prefix=cond.prefix + 1))
+    assert y.shape == x_t.shape
+    assert ((y - moved).abs().amax(-1)[mask] > 1e-6).all()
+    for prefix, frames in ((None, 0), (cond.prefix[:, 1:], 2)):
+        with pytest.raises(UserError, match=f"a prefix of {frames} frames: this denoiser continues 3 clean frames"):
+            decoder(x_t, t, mask, replace(cond, prefix=prefix))
+
+
+def test_guidance_and_dropping_keep_prefix_and_target() -> None:
+    *_, cond = batch()
+    cond = replace(cond, target_mask=torch.tensor([True, False, True]))
+    assert cond.prefix is not None
+    assert cond.target is not None
+    assert cond.target_mask is not None
+    dropped, twice = cond.drop(torch.ones(3, dtype=torch.bool)), cond.with_null()
+    assert torch.equal(dropped.prefix, cond.prefix)  # type: ignore[arg-type]
+    assert torch.equal(dropped.target, cond.target)  # type: ignore[arg-type]
+    for name in ("prefix", "target", "target_mask"):
+        assert torch.equal(getattr(twice, name), torch.cat([getattr(cond, name)] * 2))
+
+
 def test_bad_options_are_named() -> None:
     decoder = MDMDecoder(D, D, C, **TRANSFORMER, token_memory=True).double()
     unet = {"latent_dim": 16, "channels": [8], "dropout": 0.0}
@@ -175,6 +211,9 @@ def test_bad_options_are_named() -> None:
         (lambda: MDMEncoder(D, D, C, **TRANSFORMER, project_condition=False), "needs latent_dim=12"),
         (lambda: MDMUNet(D, D, C, **unet, num_groups=3), r"num_groups \(3\)"),
         (lambda: decoder(*batch(tokens=0)), "the condition encoder has none"),
+        (lambda: MDMDecoder(D, D, C, **TRANSFORMER, memory="concat"), "Set token_memory=true"),
+        (lambda: MDMDecoder(D, D, C, **TRANSFORMER, context_frames=-1), "context_frames=-1: give the number"),
+        (lambda: MDMDecoder(D, D, C, **TRANSFORMER, target_encoder="single", target_layers=0), "target_layers=0"),
     ):
         with pytest.raises(UserError, match=message):
             build()

@@ -33,6 +33,7 @@ NETWORKS = {
 """Authors' name of each architecture of MDM -> our network, their name of its transformer, and the names in a layer."""
 NORMALIZED = ("humanml3d", "kit")
 PADDED_FRAMES, ACTION_FRAMES = 196, 60
+PREFIX_GUIDANCE = 7.5  # guidance scale of models that continue a prefix, in the authors' evaluation
 ENCODERS = {"clip": "clip", "bert": "distilbert"}
 POOLER, ACTIONS = "lm.pooler.dense.", "embed_action.action_embedding"
 
@@ -85,9 +86,23 @@ def import_mdm(state: Mapping[str, Tensor], args: Options, *, time_token: bool =
     if args.arch == "trans_dec":
         distilbert = args.text_encoder_type == "bert"
         options["token_memory"] = distilbert
+        options |= {"memory": args.emb_policy, "context_frames": args.context_len, **_target_options(ours)}
         if args.emb_trans_dec:  # the code that introduced DistilBERT has a token of the time alone
             options["input_token"] = "time" if time_token or distilbert else "condition"
+    if (args.lambda_target_loc or args.multi_target_cond) and "target_encoder" not in options:
+        raise ValueError("released weights: embed_target_cond is missing, the encoder of targets that the options name")
     return Released(network, (in_features, out_features, cond_features), options, ours, embedding).checked()
+
+
+def _target_options(ours: Mapping[str, Tensor]) -> dict[str, Any]:
+    """Returns the options of the target encoder whose weights, by our names, are in a state dict."""
+    layers = sum(key.startswith("target.network.") and key.endswith(".weight") for key in ours) - 1
+    if layers >= 0:
+        return {"target_encoder": "single", "target_layers": layers}
+    if "target.weights" in ours:
+        return {"target_encoder": "multi"}
+    layers = sum(key.startswith("target.networks.0.") and key.endswith(".weight") for key in ours) - 1
+    return {"target_encoder": "split", "target_layers": layers} if layers >= 0 else {}
 
 
 def import_flame(state: Mapping[str, Tensor], *, num_heads: int = 8) -> Released:
@@ -157,6 +172,11 @@ def _mdm_recipe(kind: str, released: Released, args: Options) -> tuple[Config, d
         process["variance"] = "fixed_small" if args.sigma_small else "fixed_large"
     config["losses"] = {"joints": args.lambda_rcxyz, "velocity": args.lambda_vel, "foot_contact": args.lambda_fc}
     longest = PADDED_FRAMES if dataset in NORMALIZED else args.num_frames or ACTION_FRAMES
+    if args.context_len:
+        longest = args.context_len + args.pred_len
+        config["task"]["guidance_scale"] = PREFIX_GUIDANCE
+    if released.options.get("target_encoder"):
+        config["task"]["targets"] = _option("task", "generation_targets")["targets"]
     return config, {"actions": actions, "dataset": dataset, "fingerprint": None, "max_frames": longest}
 
 

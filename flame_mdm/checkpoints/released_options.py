@@ -18,6 +18,8 @@ from flame_mdm.schemas import Number, Schema, check_shape
 # JSON is read as YAML 1.1, in which 2e-2 is a text
 YamlNumber = Annotated[float, BeforeValidator(lambda x: float(x) if isinstance(x, str) else x)]
 
+LowerCase = BeforeValidator(lambda x: x.lower() if isinstance(x, str) else x)  # the name of an enumeration's value
+
 
 class Solver(Schema):
     """MFM's `ode_kwargs`."""
@@ -36,6 +38,11 @@ class Options(Schema):
     text_encoder_type: Literal["clip", "bert"] = "clip"
     emb_trans_dec: bool = False
     mask_frames: bool = False
+    context_len: Annotated[int, Field(ge=0, le=MOST_FRAMES)] = 0
+    pred_len: Annotated[int, Field(ge=0, le=MOST_FRAMES)] = 0
+    emb_policy: Annotated[Literal["add", "concat"], LowerCase] = "add"
+    lambda_target_loc: Number = 0.0
+    multi_target_cond: bool = False
     sigma_small: bool = True
     noise_schedule: str = "cosine"
     cond_mask_prob: Annotated[float, Field(ge=0, le=1)] = 0.1
@@ -62,9 +69,25 @@ def read_options(path: str | Path | None, changes: dict[str, Any]) -> Options:
         _check_known(flat, Options.model_fields, NAMES["options"]["mdm"])
         if isinstance(solver, dict):
             _check_known(solver, Solver.model_fields, NAMES["options"]["solver"], "ode_kwargs.")
-        return check_shape(flat | changes, Options)
+        checked = check_shape(flat | changes, Options)
+        _check_prefix(checked)
+        return checked
     except ValueError as error:
         raise UserError(f"{path}: {error}") from error
+
+
+def _check_prefix(options: Options) -> None:
+    """Raises `ValueError` if options of a network that continues clean frames (DiP) do not fit its other options."""
+    decoder = options.arch == "trans_dec" and options.text_encoder_type == "bert"
+    for name, value in (("context_len", options.context_len), ("emb_policy", options.emb_policy)):
+        if value not in (0, "add") and not decoder:
+            kind = f"{options.arch} with {options.text_encoder_type}"
+            raise ValueError(
+                f"{name}={value}: known for trans_dec with bert, not for {kind}. Import a model without it"
+            )
+    if bool(options.context_len) != bool(options.pred_len):
+        lengths = f"context_len={options.context_len}, pred_len={options.pred_len}"
+        raise ValueError(f"{lengths}: both are positive in a model that continues frames, or both 0. Correct the file")
 
 
 def check_hyperparameters(checkpoint: Mapping[str, Any], kind: str) -> None:

@@ -21,6 +21,9 @@ class Denoiser(nn.Module, ABC):
     """Whether padding has no influence on real frames. A network that attends to it (False) is sampled at the padded
     length of its training."""
 
+    context_frames: int = 0
+    """Number of clean frames before the motion that the network reads in `Condition.prefix`."""
+
     @abstractmethod
     def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
         """Returns the prediction (B, F, out_features). A pure function, except for dropout in training.
@@ -32,5 +35,6 @@ class Denoiser(nn.Module, ABC):
             cond: the condition, in which dropped samples are already replaced by nulls.
 
         Raises:
-            UserError: If a motion is too long for the network, or condition tokens are missing or too many.
+            UserError: If a motion is too long for the network, condition tokens are missing or too many, or the
+                prefix is not `context_frames` long.
         """

@@ -137,7 +137,10 @@ class TimeAndCondition(nn.Module):
 
     def forward(self, t: Tensor, condition: Tensor) -> Tensor:
         """Embeds times (B,) and condition (B, C) or (B, S, C) as (B, features) or (B, S, features)."""
-        time = self.time(t)
+        return self.add(self.time(t), condition)
+
+    def add(self, time: Tensor, condition: Tensor) -> Tensor:
+        """Adds embedded times (B, features) to the projected condition (B, C) or (B, S, C)."""
         if not self.cond_features:
             return time
         return self.projection(condition) + (time if condition.ndim == 2 else time[:, None])

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from flame_mdm.batch import Condition
 from flame_mdm.denoisers import Denoiser
 from flame_mdm.denoisers.layers import TimeAndCondition, Transformer, sinusoid, with_prefix
+from flame_mdm.denoisers.target_encoders import TARGET_ENCODERS, TargetEncoder
 from flame_mdm.errors import UserError
 
 
@@ -68,13 +69,20 @@ class MDMEncoder(Denoiser):
 
 
 class MDMDecoder(Denoiser):
-    """Transformer decoder over the frames, with time + condition as cross-attention memory.
+    """Transformer decoder over the frames, with time + condition as cross-attention memory; the network of MDM and DiP.
+
+    With `context_frames`, clean frames precede the noisy ones, as in DiP (Tevet et al. 2025, "CLoSD", section 3.1).
+    Nothing but their positions marks them as clean, and their outputs are dropped.
 
     Args:
         input_token: token before the frames: "condition" is time + condition, as in the paper's "+ input token" and the
             released model; "time" is the time alone, as in MDM's code since February 2025.
         token_memory: memory of all condition tokens, with the time added to each, as MDM with DistilBERT.
+        memory: how the time enters the memory of all tokens: "add" to each of them, or "concat" as a token before them.
         mask_padding: False lets frames attend to the padding, as the released models without `mask_frames` do.
+        context_frames: number of clean frames before the motion, in `Condition.prefix`.
+        target_encoder: network that embeds `Condition.target`, which is added to the time; "none" ignores targets.
+        target_layers: number of hidden layers of the target encoders "single" and "split".
     """
 
     def __init__(
@@ -91,32 +99,62 @@ class MDMDecoder(Denoiser):
         project_condition: bool = True,
         input_token: Literal["none", "condition", "time"] = "none",
         token_memory: bool = False,
+        memory: Literal["add", "concat"] = "add",
         mask_padding: bool = True,
+        context_frames: int = 0,
+        target_encoder: Literal["none", "single", "split", "multi"] = "none",
+        target_layers: int = 1,
     ):
         super().__init__()
-        self.input_token, self.mask_padding = input_token, mask_padding
-        self.token_memory = token_memory and cond_features > 0
+        if memory == "concat" and not token_memory:
+            raise UserError("denoiser.memory=concat: a token of the time needs the other tokens. Set token_memory=true")
+        if type(context_frames) is not int or context_frames < 0:
+            raise UserError(f"denoiser.context_frames={context_frames}: give the number of frames, 0 or more")
+        self.input_token, self.mask_padding, self.context_frames = input_token, mask_padding, context_frames
+        self.token_memory, self.memory = token_memory and cond_features > 0, memory
         self.condition = TimeAndCondition(latent_dim, cond_features, project_condition)
+        self.target: TargetEncoder | None = None
+        if target_encoder != "none":
+            self.target = TARGET_ENCODERS[target_encoder](latent_dim, target_layers)
         self.input = nn.Linear(in_features, latent_dim)
         self.dropout = nn.Dropout(dropout)
         self.transformer = Transformer(latent_dim, ff_size, num_layers, num_heads, dropout, cross_attention=True)
         self.output = nn.Linear(latent_dim, out_features)
 
     def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
-        x = self.input(x_t)
+        time = self.condition.time(t)
+        if self.target is not None:
+            time = time + self.target(cond).to(time)
+
+        x = self.input(self._with_context(x_t, cond))
         if self.input_token == "condition":
-            x = torch.cat([self.condition(t, cond.pooled)[:, None], x], 1)
+            x = torch.cat([self.condition.add(time, cond.pooled)[:, None], x], 1)
         elif self.input_token == "time":
-            x = torch.cat([self.condition.time(t)[:, None], x], 1)
-        prefix = x.shape[1] - x_t.shape[1]
+            x = torch.cat([time[:, None], x], 1)
         x = self.dropout(x + sinusoid(torch.arange(x.shape[1], device=x.device), x.shape[-1]).to(x_t.dtype))
-        if self.token_memory:
-            tokens, memory_mask = condition_tokens(cond)
-            memory = self.condition(t, tokens)
-        else:
-            memory, memory_mask = self.condition(t, cond.pooled)[:, None], None
-        x = self.transformer(x, with_prefix(mask, prefix) if self.mask_padding else None, memory, memory_mask)
-        return self.output(x[:, prefix:])
+
+        memory, memory_mask = self._memory(time, cond)
+        before = x.shape[1] - x_t.shape[1]
+        x = self.transformer(x, with_prefix(mask, before) if self.mask_padding else None, memory, memory_mask)
+        return self.output(x[:, before:])
+
+    def _with_context(self, x_t: Tensor, cond: Condition) -> Tensor:
+        """Returns the clean frames of the prefix and the noisy frames after them."""
+        if not self.context_frames:
+            return x_t
+        frames = 0 if cond.prefix is None else cond.prefix.shape[1]
+        if cond.prefix is None or frames != self.context_frames:
+            raise UserError(f"a prefix of {frames} frames: this denoiser continues {self.context_frames} clean frames")
+        return torch.cat([cond.prefix.to(x_t), x_t], 1)
+
+    def _memory(self, time: Tensor, cond: Condition) -> tuple[Tensor, Tensor | None]:
+        """Returns the memory (B, S, C) of embedded times (B, C) and the condition, and its mask (B, S), None = all."""
+        if not self.token_memory:
+            return self.condition.add(time, cond.pooled)[:, None], None
+        tokens, mask = condition_tokens(cond)
+        if self.memory == "add":
+            return self.condition.add(time, tokens), mask
+        return torch.cat([time[:, None], self.condition.projection(tokens)], 1), with_prefix(mask, 1)
 
 
 def condition_tokens(cond: Condition) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,109 @@
+"""Target conditions: where joints should be at the end of a motion (Tevet et al. 2025, "CLoSD", section 3.1).
+
+A target (B, 8, 4) has a slot for each name in `SLOTS`: x, y, z, and 1 = requested or 0 = free; free slots are 0.
+Positions are in meters, in the frame of reference of the predicted frames: the root of the first one is at x = z = 0
+and faces +z; y is the height above the floor. "traj" is the pelvis on the floor, y = 0. The x of "heading" is the
+direction that hips and shoulders face, in radians: 0 = +z, positive to +x.
+"""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from flame_mdm.errors import UserError, did_you_mean
+
+JOINTS = ("pelvis", "left_foot", "right_foot", "left_wrist", "right_wrist", "head")
+SLOTS = (*JOINTS, "traj", "heading")
+HEADING = SLOTS.index("heading")
+COORDINATES = torch.tensor([[1.0, 1.0, 1.0]] * len(JOINTS) + [[1.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
+"""Coordinates (8, 3) of the slots that are lengths; x of the heading is an angle."""
+
+EPSILON = 1e-8  # added to the numbers of requested values, as in the authors' code, so that none of them costs nothing
+
+
+class TargetConditions:
+    """Targets of motions in training, and the error of predicted motions.
+
+    Args:
+        joints: names of the joints of the skeleton, in the order of its positions.
+        facing: numbers of right hip, left hip, right shoulder and left shoulder.
+        choices: sets of slots; each training motion draws one of them, with equal probability. An empty set is the
+            target that requests nothing, which is not the same as none.
+        drop_prob: probability that a training motion has no target.
+        weight: weight of the error in the loss.
+        heading_modulo_pi: the error of the heading is taken modulo pi, as in MDM's code, so that facing backwards costs
+            nothing.
+
+    Raises `UserError` if the skeleton lacks a joint, or a choice is unknown.
+    """
+
+    def __init__(
+        self,
+        joints: Sequence[str],
+        facing: Sequence[int],
+        *,
+        choices: Sequence[Sequence[str]],
+        drop_prob: float = 0.1,
+        weight: float = 1.0,
+        heading_modulo_pi: bool = False,
+    ):
+        if lacking := [name for name in JOINTS if name not in joints]:
+            raise UserError(f"task.targets: the skeleton has no {', '.join(lacking)}. Choose another data set, or null")
+        unknown = [name for choice in choices for name in choice if name not in SLOTS]
+        if unknown or not choices:
+            advice = did_you_mean(unknown[0], SLOTS) if unknown else ""
+            raise UserError(f"task.targets.choices={list(choices)}:{advice} Give sets of {', '.join(SLOTS)}")
+        if not 0 <= drop_prob <= 1:
+            raise UserError(f"task.targets.drop_prob={drop_prob}: give a probability from 0 to 1")
+        self.columns = [joints.index(name) for name in JOINTS]
+        self.facing = list(facing)
+        self.choices = torch.tensor([[slot in choice for slot in SLOTS] for choice in choices])
+        self.drop_prob, self.weight, self.heading_modulo_pi = drop_prob, weight, heading_modulo_pi
+
+    def locations(self, joints: Tensor, lengths: Tensor | None = None) -> Tensor:
+        """Returns the values (B, 8, 3) of all slots at the last of `lengths` (B,) frames of motions (B, F, J, 3)."""
+        last = (
+            joints[:, -1] if lengths is None else joints[torch.arange(len(joints), device=joints.device), lengths - 1]
+        )
+        pelvis = last[:, :1] * last.new_tensor([1.0, 0.0, 1.0])
+        angle = heading(last[:, self.facing])
+        turned = torch.stack([angle, torch.zeros_like(angle), torch.zeros_like(angle)], -1)
+        return torch.cat([last[:, self.columns], pelvis, turned[:, None]], 1)
+
+    def draw(self, joints: Tensor, u: Tensor, lengths: Tensor | None = None) -> Tensor:
+        """Returns targets (B, 8, 4) of real motions (B, F, J, 3); uniform numbers u (B,) in [0, 1) decide which."""
+        drawn = (u * len(self.choices)).long()
+        return requested(self.locations(joints, lengths), self.choices.to(joints.device)[drawn])
+
+    def error(self, joints: Tensor, target: Tensor, lengths: Tensor | None = None) -> Tensor:
+        """Returns the weighted error (B,) of predicted motions (B, F, J, 3); 0 for targets that request nothing.
+
+        That is the mean squared error of the requested coordinates in square meters, and the squared error of the
+        heading in square radians.
+        """
+        predicted, values, valid = self.locations(joints, lengths), target[..., :3], target[..., 3:]
+        counted = valid * COORDINATES.to(target)
+        squares = ((predicted - values).square() * counted).sum((1, 2)) / (counted.sum((1, 2)) + EPSILON)
+        difference = predicted[:, HEADING, 0] - values[:, HEADING, 0]
+        if self.heading_modulo_pi:
+            turn = torch.remainder(difference + math.pi / 2, math.pi) - math.pi / 2
+        else:
+            turn = torch.remainder(difference + math.pi, 2 * math.pi) - math.pi
+        counted = valid[:, HEADING, 0]
+        return self.weight * (squares + turn.square() * counted / (counted + EPSILON))
+
+
+def heading(joints: Tensor) -> Tensor:
+    """Returns the direction (B,) that right hip, left hip, right shoulder and left shoulder (B, 4, 3) face."""
+    right_hip, left_hip, right_shoulder, left_shoulder = joints.unbind(1)
+    right = right_hip - left_hip + right_shoulder - left_shoulder
+    # forward = y cross right
+    return torch.atan2(right[:, 2], -right[:, 0])
+
+
+def requested(locations: Tensor, slots: Tensor) -> Tensor:
+    """Returns the target (B, 8, 4) that requests `slots` (B, 8) bool of values (B, 8, 3)."""
+    valid = slots[..., None].to(locations)
+    return torch.cat([locations * valid, valid], -1)

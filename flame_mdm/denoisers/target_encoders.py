@@ -1,0 +1,90 @@
+"""Encoders of target conditions: where joints should be at the end of a motion (Tevet et al. 2025, "CLoSD").
+
+A target (B, 8, 4) has a slot per joint; each slot is x, y, z and 1 = requested or 0 = free.
+"""
+
+from abc import ABC, abstractmethod
+
+import torch
+from torch import Tensor, nn
+
+from flame_mdm.batch import Condition
+from flame_mdm.errors import UserError
+
+SLOTS = 8
+
+
+class TargetEncoder(nn.Module, ABC):
+    """Embeds the target of a condition as (B, features); without a target, the embedding is 0.
+
+    A target without requested joints is not the same: its embedding has the biases of the network.
+    """
+
+    @abstractmethod
+    def embed(self, target: Tensor) -> Tensor:
+        """Embeds targets (B, 8, 4) as (B, features)."""
+
+    def forward(self, cond: Condition) -> Tensor:
+        """Embeds the target of a condition; samples whose target is left out get 0."""
+        if cond.target is None:
+            return cond.pooled.new_zeros(len(cond.pooled), 1)
+        embedding = self.embed(cond.target)
+        return embedding if cond.target_mask is None else embedding * cond.target_mask[:, None]
+
+
+class SingleTarget(TargetEncoder):
+    """One network for the values of all slots."""
+
+    def __init__(self, features: int, layers: int):
+        super().__init__()
+        self.network = perceptron(4 * SLOTS, features, layers)
+
+    def embed(self, target: Tensor) -> Tensor:
+        return self.network(target.flatten(1))
+
+
+class SplitTarget(TargetEncoder):
+    """One network per slot; their outputs are concatenated."""
+
+    def __init__(self, features: int, layers: int):
+        super().__init__()
+        if features % SLOTS:
+            raise UserError(f"target_encoder=split needs a latent_dim that is a multiple of {SLOTS}, not {features}")
+        self.networks = nn.ModuleList(perceptron(4, features // SLOTS, layers) for _ in range(SLOTS))
+
+    def embed(self, target: Tensor) -> Tensor:
+        return torch.cat([network(target[:, slot]) for slot, network in enumerate(self.networks)], -1)
+
+
+class MultiTarget(TargetEncoder):
+    """One network per slot; the outputs of requested slots are summed with learned weights.
+
+    The weights are divided by their sum over all slots, as in the authors' code, where the sum may be near 0. `layers`
+    has no effect.
+    """
+
+    def __init__(self, features: int, layers: int):
+        super().__init__()
+        self.networks = nn.ModuleList(perceptron(3, features, 1) for _ in range(SLOTS))
+        self.weights = nn.Parameter(torch.randn(SLOTS))
+
+    def embed(self, target: Tensor) -> Tensor:
+        position, requested = target[..., :3], target[..., 3:]
+        embedded = torch.stack([network(position[:, slot]) for slot, network in enumerate(self.networks)], 1)
+        return ((self.weights / self.weights.sum())[:, None] * requested * embedded).sum(1)
+
+
+TARGET_ENCODERS: dict[str, type[TargetEncoder]] = {
+    "single": SingleTarget,
+    "split": SplitTarget,
+    "multi": MultiTarget,
+}
+"""Target encoders, by the names that the authors give them."""
+
+
+def perceptron(in_features: int, features: int, layers: int) -> nn.Sequential:
+    """Returns a network with `layers` hidden layers of width `features`."""
+    if layers < 1:
+        raise UserError(f"denoiser.target_layers={layers}: give 1 or more")
+    hidden = [layer for _ in range(layers) for layer in (nn.SiLU(), nn.Linear(features, features))]
+    return nn.Sequential(nn.Linear(in_features, features), *hidden)

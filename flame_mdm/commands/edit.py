@@ -33,7 +33,7 @@ def main(settings: EditSettings) -> None:
     request = settings.request()
 
     from flame_mdm.sampling.editing import resolve_edit, sample_edit
-    from flame_mdm.sampling.output import SAMPLES, default_folder, summary, write_motions
+    from flame_mdm.sampling.output import SAMPLES, default_folder, degenerate_notes, summary, write_motions
     from flame_mdm.sampling.reading import read_motion
 
     loaded = settings.load(request)
@@ -53,6 +53,7 @@ def main(settings: EditSettings) -> None:
     say(*(f"warning: {line}" for line in resolved.resolved.warnings(model)))
     stages = [] if settings.trajectory else None
     edits = sample_edit(model, resolved, stages=stages)
+    say(*degenerate_notes(edits))
 
     title = f"edit {Path(original.id).stem} {edits[0].text}"
     general = (settings.motion, settings.cut, settings.adapter, settings.adapter_strength)

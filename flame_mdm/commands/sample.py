@@ -87,7 +87,7 @@ def _sample(settings: SampleSettings, request: SamplingRequest, prompts: PromptF
     """Samples and writes the motions of a request; prompts of a file that the model cannot sample are refused."""
     loaded = settings.load(request)  # finds the file before PyTorch is imported
     from flame_mdm.sampling.generation import sample
-    from flame_mdm.sampling.output import SAMPLES, summary, write_motions
+    from flame_mdm.sampling.output import SAMPLES, degenerate_notes, summary, write_motions
     from flame_mdm.sampling.resolution import resolve
 
     model = loaded.model
@@ -105,6 +105,7 @@ def _sample(settings: SampleSettings, request: SamplingRequest, prompts: PromptF
     score = None if settings.scorer is None else _score(settings.scorer, model)
     stages = [] if settings.trajectory else None
     motions = sample(model, resolved, score=score, stages=stages)
+    say(*degenerate_notes(motions))
     folders = _folders(settings, resolved, model, loaded.sha256, motions)
     facts = {"seed": settings.seed, "checkpoint": loaded.sha256}
     for folder, written in folders.items():

@@ -53,6 +53,7 @@ class Motion(PosedFigure):
         features: (F, D) float32 features in the units of the data; empty if they are not known.
         representation: name of the representation of the features.
         cleanup: whether `flame_mdm.formats.cleanup` changed the joints.
+        degenerate: number of frames in which the features determine no rotation for some joint.
         parts: text, first and last frame (exclusive) of each part of a sequence; () = one part.
         notes: lines for the user about the file that was read, such as frames that were left out.
 
@@ -62,6 +63,7 @@ class Motion(PosedFigure):
     features: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     representation: str = ""
     cleanup: bool = False
+    degenerate: int = 0
     parts: tuple[tuple[str, int, int], ...] = ()
     notes: tuple[str, ...] = ()
 

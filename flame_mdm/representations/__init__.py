@@ -67,6 +67,10 @@ class Representation(nn.Module, ABC):
     def decode(self, features: Tensor) -> Tensor:
         """Decodes features (..., F, D) in the data's units to joints (..., F, J, 3), meters, y up. Differentiable."""
 
+    def rotations6d(self, features: Tensor) -> Tensor:
+        """Returns the rotations (..., F, N, 6) in features (..., F, D) in the data's units; by default N = 0."""
+        return features.new_zeros(*features.shape[:-1], 0, 6)
+
     def statistics(self, features: Tensor | Frames) -> tuple[Tensor, Tensor]:
         """Returns mean and std (D,) for normalization, from all training frames (N, D); 0 and 1 without `slices`."""
         if self.slices:

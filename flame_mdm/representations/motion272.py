@@ -62,6 +62,11 @@ class Motion272(Representation):
         rows = [velocity[:, [0, 2]], rotation.matrix_to_rot6d(turn, "rows"), local.flatten(1), moved.flatten(1)]
         return torch.cat([*rows, rotation.matrix_to_rot6d(turned, "rows").flatten(1)], 1).float()
 
+    def rotations6d(self, features: Tensor) -> Tensor:
+        """Returns (..., F, 23, 6): the turn of the root, then the rotations of the joints."""
+        turn = features[..., None, self.slices["turn"]]
+        return torch.cat([turn, features[..., self.slices["rotations"]].unflatten(-1, (22, 6))], -2)
+
     def decode(self, features: Tensor) -> Tensor:
         """Decodes velocity, turn and positions of features (..., F, 272) to joints (..., F, 22, 3). Differentiable."""
         inverse, ground = self._root(features)
@@ -71,14 +76,14 @@ class Motion272(Representation):
     def poses(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Decodes features (..., F, 272) to the pelvis (..., F, 3) and SMPL's rotations (..., F, 22, 3, 3), y up."""
         inverse, ground = self._root(features)
-        turned = rotation.rot6d_to_matrix(features[..., self.slices["rotations"]].unflatten(-1, (22, 6)), "rows")
+        turned = rotation.rot6d_to_matrix(self.rotations6d(features)[..., 1:, :], "rows")
         height = features[..., self.slices["positions"]][..., 1:2] * features.new_tensor([0.0, 1.0, 0.0])
         root = inverse.mT[..., None, :, :] @ turned[..., :1, :, :]
         return ground + height, torch.cat([root, turned[..., 1:, :, :]], -3)
 
     def _root(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Returns rotations to body coordinates (..., F, 3, 3), and the root's x and z as vectors (..., F, 3)."""
-        inverse = rotation.rot6d_to_matrix(features[..., self.slices["turn"]], "rows")
+        inverse = rotation.rot6d_to_matrix(self.rotations6d(features)[..., 0, :], "rows")
         step = 1
         while step < features.shape[-2]:  # products of all turns so far, in log2(F) steps
             inverse = torch.cat([inverse[..., :step, :, :], inverse[..., step:, :, :] @ inverse[..., :-step, :, :]], -3)

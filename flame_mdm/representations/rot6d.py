@@ -38,11 +38,14 @@ class Rot6D(Representation):
         translation -= features[..., :1, 144:147]
         return moved
 
+    def rotations6d(self, features: Tensor) -> Tensor:
+        return features[..., :144].unflatten(-1, (24, 6))
+
     def decode(self, features: Tensor) -> Tensor:
         """Decodes features (..., F, 150) to joints (..., F, 24, 3), meters, y up (rotated 180 degrees about x)."""
-        rows = features.unflatten(-1, (25, 6))
-        rotations = rotation.rot6d_to_matrix(rows[..., :24, :], "rows")
-        joints = forward_kinematics(self.skeleton, rotations, features.new_tensor(self.offsets), rows[..., 24, :3])
+        rotations = rotation.rot6d_to_matrix(self.rotations6d(features), "rows")
+        translation = features[..., 144:147]
+        joints = forward_kinematics(self.skeleton, rotations, features.new_tensor(self.offsets), translation)
         return joints * joints.new_tensor([1.0, -1.0, -1.0])
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:

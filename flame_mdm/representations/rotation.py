@@ -92,6 +92,14 @@ def rot6d_to_matrix(rot6d: Tensor, convention: SixD) -> Tensor:
     return rows if convention == "rows" else rows.mT
 
 
+def is_degenerate(rot6d: Tensor) -> Tensor:
+    """Returns (...,) bool: whether pairs of vectors (..., 6) define no rotation, so that `rot6d_to_matrix` adds one.
+
+    A vector of such a pair is 0, or both vectors are parallel.
+    """
+    return _degenerate(rot6d, *_orthogonal(rot6d)).squeeze(-1)
+
+
 def _orthogonal(rot6d: Tensor) -> tuple[Tensor, Tensor]:
     """Returns the first of two vectors (..., 6), normalized, and the part of the second one across it."""
     first, second = F.normalize(rot6d[..., :3], dim=-1), rot6d[..., 3:]

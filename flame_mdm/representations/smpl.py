@@ -58,9 +58,12 @@ class SMPL(Representation):
         translation, rotations = read_pose(motion)
         return torch.cat([translation, rotation.matrix_to_rot6d(rotations, "rows").flatten(1)], 1).float()
 
+    def rotations6d(self, features: Tensor) -> Tensor:
+        return features[..., 3:].unflatten(-1, (24, 6))
+
     def decode(self, features: Tensor) -> Tensor:
         """Decodes features (..., F, 147) to joints (..., F, 24, 3), meters, y up as in HumanML3D: (-x, z, y)."""
-        rotations = rotation.rot6d_to_matrix(features[..., 3:].unflatten(-1, (24, 6)), "rows")
+        rotations = rotation.rot6d_to_matrix(self.rotations6d(features), "rows")
         offsets = features.new_tensor(self.offsets)
         joints = forward_kinematics(self.skeleton, rotations, offsets, features[..., :3] + offsets[0])
         return joints[..., [0, 2, 1]] * joints.new_tensor([-1.0, 1.0, 1.0])

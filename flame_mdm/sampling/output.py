@@ -47,6 +47,16 @@ def summary(folder: Path, motions: Sequence[Motion], *, mp4: bool) -> str:
     return f"{count} of {len(motions[0].joints)} frames: {files}"
 
 
+def degenerate_notes(motions: Sequence[Motion]) -> list[str]:
+    """Returns one line about the frames of motions whose features determine no rotations, if there are such frames."""
+    degenerate = sum(motion.degenerate for motion in motions)
+    if not degenerate:
+        return []
+    frames = sum(len(motion.joints) for motion in motions)
+    rest = "which were replaced by arbitrary ones. Train the model longer"
+    return [f"warning: {degenerate} of {frames} frames have degenerate rotations, {rest}"]
+
+
 def write_motions(
     folder: Path,
     motions: Sequence[Motion],

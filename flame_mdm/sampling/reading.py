@@ -17,6 +17,7 @@ from flame_mdm.formats.layouts import check_size
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.readers import ENDINGS, read
 from flame_mdm.representations import Representation
+from flame_mdm.representations.rotation import is_degenerate
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.sampling.motion_request import is_range
 
@@ -100,5 +101,13 @@ def with_features(representation: Representation, motion: Motion) -> Motion:
 def decoded(representation: Representation, features: Tensor, text: str, name: str) -> Motion:
     """Returns the motion of features (F, D)."""
     joints, fps, skeleton = representation.decode(features).cpu().numpy(), representation.fps, representation.skeleton
-    array = features.cpu().numpy()
-    return Motion(joints, fps, skeleton, text, name, features=array, representation=representation.name)
+    return Motion(
+        joints=joints,
+        fps=fps,
+        skeleton=skeleton,
+        text=text,
+        id=name,
+        features=features.cpu().numpy(),
+        representation=representation.name,
+        degenerate=int(is_degenerate(representation.rotations6d(features)).any(-1).sum()),
+    )

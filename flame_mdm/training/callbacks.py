@@ -33,7 +33,7 @@ from flame_mdm.reporting.page import number
 from flame_mdm.reporting.report import write_report
 from flame_mdm.sampling.generation import sample
 from flame_mdm.sampling.motion_request import SamplingRequest
-from flame_mdm.sampling.output import write_motions
+from flame_mdm.sampling.output import degenerate_notes, write_motions
 from flame_mdm.sampling.resolution import resolve
 from flame_mdm.signals import StopRequest
 from flame_mdm.task import GeneratorTask, Task
@@ -269,6 +269,7 @@ class SampleMotions(Callback):
         self.prompts = [(p, {}) if isinstance(p, str) else (p[0], dict(p[1])) for p in prompts or []]
         self.metrics, self.next = metrics or {}, every_n_steps
         self.written: tuple[int, Path, Values] = (-1, self.folder, {})
+        self.notes: list[str] = []
 
     @property
     def texts(self) -> list[str]:
@@ -301,6 +302,7 @@ class SampleMotions(Callback):
         if trainer.is_global_zero:
             real = self._measure_real(trainer.datamodule.train, pl_module) if values else {}  # type: ignore[attr-defined]
             say(*explain_metrics(values, real, self.metrics))
+            say(*self.notes)
             say(f"player: {folder / 'player.html'} (open in any browser), animation: {folder / 'motions.gif'}")
 
     def write(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -323,6 +325,7 @@ class SampleMotions(Callback):
                 log_video(logger, "samples", folder / "motions.gif", step - 1)
                 logger.log_metrics({f"samples/{name}": value for name, value in values.items()}, step - 1)
         self.written = (step, folder, values)
+        self.notes = degenerate_notes(motions)
 
     def _sample(self, model: MotionGenerator, rank: int, world: int) -> list[Motion]:
         """Samples every `world`-th prompt, starting at `rank`; without prompts, all motions on the first process."""

@@ -7,7 +7,7 @@ import math
 import os
 import re
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -99,29 +99,22 @@ class Folder(MotionSource):
         self._notes: Counter[str] = Counter()  # lines about the motions read so far
 
     def count(self) -> int:
-        return sum(self.copies(name) * (2 if self._is_mirrored(name) else 1) for name in self.files)
+        images = sum(self.copies[name] for name in self.files if self.mirror and self.splits[name] == "train")
+        return sum(self.copies.values()) + images
 
     def licenses(self) -> set[str]:
         return {note.license or self.license for note in self.notes.values()}
 
     @cached_property
-    def sizes(self) -> Counter[str | None]:
-        """Number of training clips by action, mirrored copies included."""
-        sizes = Counter[str | None]()
+    def copies(self) -> dict[str, int]:
+        """How often each motion occurs in the set, see `balance`; a mirrored copy occurs as often."""
+        sizes = Counter(note.action for name, note in self.notes.items() if self.splits[name] == "train")
+        copies = dict.fromkeys(self.files, 1)
         for name, note in self.notes.items():
-            if self.splits[name] == "train":
-                sizes[note.action] += 2 if self.mirror else 1
-        return sizes
-
-    def copies(self, name: str) -> int:
-        """Returns how often a motion occurs in the set."""
-        if not self.balance or self.splits[name] != "train":
-            return 1
-        repeated = round(self.balance / self.sizes[self.notes[name].action])
-        return min(max(1, repeated), MOST_COPIES)
-
-    def _is_mirrored(self, name: str) -> bool:
-        return self.mirror and self.splits[name] == "train"
+            if self.balance and self.splits[name] == "train":
+                clips = sizes[note.action] * (2 if self.mirror else 1)
+                copies[name] = min(max(1, round(self.balance / clips)), MOST_COPIES)
+        return copies
 
     def clips(self, fps: float) -> Iterator[Clip]:
         """Yields the clips of all motions that can be read; `failures` lists the others."""
@@ -138,10 +131,10 @@ class Folder(MotionSource):
                 action=action,
                 license=note.license or self.license,
             )
-            yield from _repeated(clip, self.copies(name))
-            if self._is_mirrored(name):
+            yield from _repeated(clip, self.copies[name])
+            if self.mirror and split == "train":
                 image = mirrored(clip, SMPL22.mirror(torch.from_numpy(motion)).numpy(), self.actions)
-                yield from _repeated(image, self.copies(name))
+                yield from _repeated(image, self.copies[name])
         if len(self.failures) == len(self.files):
             self.require_all()
         self.leave_out("motions that cannot be read", len(self.failures))
@@ -221,7 +214,7 @@ class Folder(MotionSource):
         """Captions and labels of each motion, from the table and text files; all motions have a caption, or none."""
         notes = {name: Note() for name in self.files}
         if os.path.lexists(self.path / TABLE):
-            self._read_table(self.path / TABLE, notes)
+            _read_table(self.path / TABLE, notes, self.exclude)
         for name, file in self.files.items():
             texts = file.path.with_suffix(".txt")
             if os.path.lexists(texts):
@@ -235,20 +228,6 @@ class Folder(MotionSource):
                     "each, or leave these out with data.source.exclude"
                 )
         return notes
-
-    def _read_table(self, path: Path, notes: dict[str, Note]) -> None:
-        rows = csv.DictReader(io.StringIO(read_text(path).removeprefix("\ufeff"), newline=""), strict=True)
-        with naming(path, csv.Error, what="damaged: "):
-            names = list(rows.fieldnames or ())
-            if "id" not in names or len(names) > len(set(names) & set(COLUMNS)):
-                raise UserError(f"its columns are {str(names)[:200]}; use {', '.join(COLUMNS)} (only id is required)")
-            for row in rows:
-                with naming(f"{path}, line {rows.line_num}"):
-                    if None in row or None in row.values():
-                        raise UserError("not one cell per column; put texts that contain a comma in quotes")
-                    cells = {name: cell.strip() for name, cell in row.items()}
-                    if cells["id"] not in self.exclude:
-                        _add(notes, cells)
 
     @cached_property
     def splits(self) -> dict[str, Split]:
@@ -290,6 +269,22 @@ def _animations(name: str, path: Path) -> Iterator[tuple[str, MotionFile]]:
     for number, animation in enumerate(animations, 1):
         label = re.sub(r"[^\w .-]", "_", animation)
         yield f"{name}/{label}", MotionFile(path, str(number))
+
+
+def _read_table(path: Path, notes: dict[str, Note], exclude: Collection[str]) -> None:
+    """Adds the rows of a table, but those of excluded motions, to the notes of their motions."""
+    rows = csv.DictReader(io.StringIO(read_text(path).removeprefix("\ufeff"), newline=""), strict=True)
+    with naming(path, csv.Error, what="damaged: "):
+        names = list(rows.fieldnames or ())
+        if "id" not in names or len(names) > len(set(names) & set(COLUMNS)):
+            raise UserError(f"its columns are {str(names)[:200]}; use {', '.join(COLUMNS)} (only id is required)")
+        for row in rows:
+            with naming(f"{path}, line {rows.line_num}"):
+                if None in row or None in row.values():
+                    raise UserError("not one cell per column; put texts that contain a comma in quotes")
+                cells = {name: cell.strip() for name, cell in row.items()}
+                if cells["id"] not in exclude:
+                    _add(notes, cells)
 
 
 def _add(notes: dict[str, Note], cells: dict[str, str]) -> None:

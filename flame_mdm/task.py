@@ -72,6 +72,8 @@ class Task(Model, LightningModule):
                 "max_frames": data.crop.longest(),
             }
         )
+        if licenses := data.store.licenses():
+            self.add_facts({"licenses": licenses})
 
     def _captions(self) -> tuple[list[str], Path]:
         """Returns the captions of the data and the prompts of callbacks, and the folder of their encodings."""

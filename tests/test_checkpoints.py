@@ -521,6 +521,9 @@ def test_push_writes_a_card_and_uploads_these_files_alone(trained, tmp_path, cap
         model["facts"]["dataset"] = dataset
         assert terms in hub.card(model, "me/walker", "")
     assert "non-commercial" in hub.card(model, "me/walker", "")
+    licenses = [{"license": "CC0", "clips": 3, "minutes": 1.5, "actions": ["run", "walk"]}]
+    model["facts"] |= {"dataset": "package", "licenses": licenses}
+    assert "| CC0 | 3 | 1.5 | run, walk | CC0: no conditions. |" in hub.card(model, "me/walker", "")
 
     monkeypatch.setattr(huggingface_hub, "HfApi", lambda: api)
     (folder / "notes.txt").write_text("private")

@@ -52,6 +52,15 @@ def test_a_store_of_a_mixture_has_all_clips_with_their_licenses(people: Path, tm
     assert len(set(actions)) == len(actions)
 
 
+def test_minutes_and_actions_are_counted_by_license(people: Path, tmp_path: Path):
+    source = Folder(str(people), mirror=True, balance=8)
+    licenses = write_store(tmp_path / "store", source, HumanML()).licenses()
+    minutes = round(2 * (len(WALK) - 1) / 20 / 60, 1)
+    assert licenses[0] == {"license": "CC0", "clips": 2, "minutes": minutes, "actions": ["walk"]}
+    assert [row["license"] for row in licenses] == ["CC0", "CMU", "MIT"]
+    assert licenses[2]["clips"] == 3, "a test clip, and a training clip with its mirror image"
+
+
 def test_stores_without_licenses_are_written_as_before(tmp_path: Path):
     store = write_store(tmp_path / "store", Synthetic(clips=3), HumanML())
     lines = (store.folder / "clips.jsonl").read_text().splitlines()

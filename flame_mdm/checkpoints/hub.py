@@ -13,6 +13,7 @@ from flame_mdm.errors import UserError, first_line, markdown_text
 from flame_mdm.safe_io import atomic_folder, read_text, read_yaml, regular_file, sha256, write_text
 
 CARD = Path(__file__).with_name("card.md")
+MOTION_LICENSES = Path(__file__).parent.parent / "data" / "licenses.yaml"
 WRITTEN = {"README.md": "library_name: flame-mdm", "config.yaml": "The recipe of this model."}
 """Files that `push` writes next to the model, and a text in each that identifies it as written by `push`.
 
@@ -101,6 +102,9 @@ def card(model: Mapping[str, Any], repository: str, file_sha256: str) -> str:
         f"sha256 of {FILE}": file_sha256,
         **{f"weights: {name}": value for name, value in model["origin"].items()},
     }
+    terms = read_yaml(MOTION_LICENSES)
+    sources = [motions | terms.get(motions["license"], {}) for motions in facts.get("licenses", ())]
     template = Template(CARD.read_text(encoding="utf-8"), keep_trailing_newline=True)
-    words = licenses.get(facts.get("dataset"), licenses["other"]) | {"repository": repository, "request": request}
-    return template.render(words, rows=rows, markdown=markdown_text)
+    dataset = "mixture" if sources else facts.get("dataset")
+    words = licenses.get(dataset, licenses["other"]) | {"repository": repository, "request": request}
+    return template.render(words, rows=rows, sources=sources, markdown=markdown_text)

@@ -102,6 +102,15 @@ class _Training(TypedDict, total=False):
     precision: str
 
 
+class _Licensed(TypedDict):
+    """The motions under one license."""
+
+    license: str
+    clips: int
+    minutes: Number
+    actions: list[str]
+
+
 class _Facts(TypedDict, total=False):
     actions: Required[list[str]]
     max_frames: Required[Annotated[int, Field(ge=1, le=MOST_FRAMES)]]
@@ -111,6 +120,7 @@ class _Facts(TypedDict, total=False):
     vocabulary: list[str]
     verbs: list[str]
     captions: list[str]
+    licenses: list[_Licensed]
 
 
 class _Metadata(TypedDict):

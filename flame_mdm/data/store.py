@@ -133,6 +133,29 @@ class Store:
         joints = read_npz(self.folder / "references.npz", only=set(ids))
         return [joints[name] for name in ids] if joints.keys() == set(ids) else None
 
+    def licenses(self) -> list[dict[str, Any]]:
+        """Returns license, clips, minutes and actions of the motions under each license, if the data set states them.
+
+        Copies of a clip count once.
+        """
+        frames: dict[str, dict[int, int]] = {}
+        actions: dict[str, set[str]] = {}
+        for clip in self.clips:
+            if clip.license:
+                frames.setdefault(clip.license, {})[clip.start] = clip.length
+                names = actions.setdefault(clip.license, set())
+                if clip.action is not None:
+                    names.add(self.info["actions"][clip.action])
+        return [
+            {
+                "license": license,
+                "clips": len(lengths),
+                "minutes": round(sum(lengths.values()) / self.info["fps"] / 60, 1),
+                "actions": sorted(actions[license]),
+            }
+            for license, lengths in sorted(frames.items())
+        ]
+
     def verify(self) -> None:
         """Checks the hashes of the features and references; opening the store checks the other files only."""
         self._check("features.npy", *{"references.npz"} & self.info["sha256"].keys())

@@ -47,9 +47,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     command = import_module(f"flame_mdm.commands.{'import_released' if name == 'import' else name}").main
     if name == "train":  # Hydra composes its recipe
         return command(rest)
+    settings = get_type_hints(command)["settings"]
+    if getattr(settings, "SWEEPS", False):
+        from flame_mdm.config.jobs import run_jobs
+
+        return run_jobs(command, settings, rest)
     from flame_mdm.config import run  # imports Hydra, for which --help does not wait
 
-    return run(command, get_type_hints(command)["settings"], rest)
+    return run(command, settings, rest)
 
 
 if __name__ == "__main__":

@@ -83,6 +83,14 @@ def test_differences_are_shown_or_not(three, tmp_path, capsys):
     assert all(words in text for words in marks)
 
 
+def test_differences_and_values_have_their_units(three, tmp_path, capsys):
+    put(three[0], values={"jitter": of(1.9, [2.2, 1.5, 2.0]) | {"unit": "m/s^3"}})
+    put(three[1], values={"jitter": of(2.0, [2.0, 2.1, 1.9]) | {"unit": "m/s^3"}})
+    text = page(three[:2], tmp_path / "out.html")
+    assert text.count("<td>jitter (m/s^3)</td>") == 2, "of the values, and of the differences"
+    assert any(line.startswith("jitter (m/s^3) ") for line in capsys.readouterr().out.splitlines())
+
+
 def test_what_is_not_paired_has_no_difference(three, tmp_path, capsys):
     values = {"fid": of(4.5, [4.4, 4.6])}
     put(three[0], values=values)

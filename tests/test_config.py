@@ -5,11 +5,12 @@ import re
 import subprocess
 import sys
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, fields
 from importlib import import_module
-from typing import ClassVar, Literal, get_type_hints
+from pathlib import Path
+from typing import Any, ClassVar, Literal, get_type_hints
 
 import pytest
 import torch
@@ -24,6 +25,7 @@ from flame_mdm.commands.evaluate import EvaluateSettings
 from flame_mdm.commands.inspect import InspectSettings
 from flame_mdm.config import check, compose, compose_data, guarded, instantiate, parameters, recipes, sweeps, trust
 from flame_mdm.config.command_line import make_variables, read_settings, run
+from flame_mdm.config.jobs import run_jobs
 from flame_mdm.config.options import option
 from flame_mdm.config.signatures import check_kind, source_file
 from flame_mdm.data.synthetic import Synthetic
@@ -295,6 +297,60 @@ def test_wrong_words_are_one_line(capsys):
     ):
         assert run(lambda _: pytest.fail("it ran"), Example, words) == 1
         assert message in one_error(capsys)
+
+
+def test_a_sweep_runs_each_combination(capsys):
+    seen: list[Example] = []
+    words = ["file", "rate=1,2", "steps=3,4", "text=a,b", "-m"]
+    assert run_jobs(seen.append, Example, words) == 0
+    jobs = [(job.file, job.rate, job.steps, job.text) for job in seen]
+    assert jobs == [("file", rate, steps, "a,b") for rate in (1, 2) for steps in (3, 4)]
+    assert "job 2 of 4: rate=1 steps=4\n" in capsys.readouterr().out
+
+    def fail(job: Example) -> None:
+        raise UserError(f"failed at {job.rate}")
+
+    assert run_jobs(fail, Example, ["rate=1,2", "-m"]) == 1
+    assert capsys.readouterr().err == "error: failed at 1\nerror: failed at 2\n"
+    assert run_jobs(lambda _: pytest.fail("it ran"), Example, ["rate=1,x", "-m"]) == 1
+    assert "rate=x: must be a finite number" in one_error(capsys)
+    assert run_jobs(seen.append, Example, ["rate=3"]) == 0
+    assert seen[-1].rate == 3
+
+
+def test_evaluations_are_swept_and_launched(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("model.ckpt").touch()
+    evaluated, started = [], []
+    monkeypatch.setattr("evaluators.evaluation.evaluate", evaluated.append)
+    words = ["evaluate", "model.ckpt", "extractor=none", "guidance_scale=1,2.5", "seed=0,1"]
+    assert main([*words, "--multirun"]) == 0, capsys.readouterr().err
+    sampled = [(request.options.guidance_scale, request.seed) for request in evaluated]
+    assert sampled == [(1, 0), (1, 1), (2.5, 0), (2.5, 1)]
+
+    def hydra_main(**source: Any) -> Callable:
+        return lambda job: lambda: started.append((source["config_name"], sys.argv[1:], job))
+
+    monkeypatch.setattr("flame_mdm.config.sweeps.hydra_main", hydra_main)
+    monkeypatch.setattr(sys, "argv", ["flame-mdm"])
+    assert main([*words, "launch=local", "hydra.launcher.timeout_min=5"]) == 0, capsys.readouterr().err
+    ((name, argv, job),) = started
+    assert name is None
+    assert {"--multirun", "+launch=local", "hydra.launcher.timeout_min=5", "+job=0,1,2,3"} <= set(argv)
+    job({"job": 2})
+    assert (evaluated[-1].options.guidance_scale, evaluated[-1].seed) == (2.5, 0)
+
+    for extra, message in (
+        (["launch=slurm"], "launch=slurm: srun is not on this machine"),
+        (["launch=nothing"], "no launch is called 'nothing'"),
+        (["--multirun", "out=a.json"], "out=a.json: 4 jobs would write it. Drop out="),
+        (["--fast", "--multirun"], "unknown option --fast"),
+        ([], "guidance_scale=1,2.5: several values make a sweep, one job for each. Add --multirun"),
+    ):
+        assert main([*words, *extra]) == 1
+        assert message in one_error(capsys)
+    assert len(evaluated) == 5
+    assert len(started) == 1
 
 
 def test_every_command_lists_its_keys_with_defaults_and_help(capsys):

@@ -152,6 +152,17 @@ def test_jobs_of_a_sweep_run_in_processes_and_folders_of_their_own(tiny, tmp_pat
     assert "seed=2 holds a run with another configuration" in logs
 
 
+@pytest.mark.robustness
+def test_evaluations_run_as_jobs_of_a_launcher(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = ["evaluate", "missing.ckpt", "extractor=none", "seed=0,1", "launch=local", "hydra.launcher.timeout_min=5"]
+    code, out, err = finish(spawn(["flame_mdm", *words], PYTHONPATH=str(ROOT)))
+    assert code == 1, out + err
+    assert "waiting for the jobs; their output is in runs/sweeps/.submitit" in out
+    logs = [path.read_text() for path in Path("runs/sweeps/.submitit").rglob("*log.*")]
+    assert sum("error: missing.ckpt: no such file" in log for log in logs) == 2, logs
+
+
 REFUSED = {
     "train quickstart launch=slurmm": "no launch is called 'slurmm'. Did you mean slurm?",
     "train quickstart launch=local trainer.devices=2": "launch=local runs each job in one process",

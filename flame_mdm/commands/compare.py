@@ -105,7 +105,7 @@ def _tested(runs: Mapping[str, Run]) -> list[str]:
     for title, columns in grouped(runs).items():
         for heading, rows in tested(columns):
             cells = [[*HEAD], *rows] if rows else []
-            lines += [title, heading, *("{:34}{:>12}{:>26}  {}".format(*row) for row in cells), ""]
+            lines += [title, heading, *("{:40}{:>12}{:>26}  {}".format(*row) for row in cells), ""]
     return lines
 
 

@@ -15,13 +15,17 @@ class EvaluateSettings(EvaluationKeys, SamplerOptions, DataSettings, ModelSettin
            flame-mdm evaluate from_samples=FOLDER data=NAME protocol=NAME extractor=FILE
            flame-mdm evaluate baseline=shuffled data=NAME protocol=NAME extractor=FILE
            torchrun --nproc-per-node 8 -m flame_mdm evaluate ckpt=FILE ...
+           flame-mdm evaluate ckpt=FILE extractor=FILE guidance_scale=1,2.5,4 --multirun
 
     Evaluates generated and real motions under a protocol, and writes a JSON file with all values and their provenance.
     If interrupted, the same command continues where it stopped. quick=true checks within a minute that everything
     works. Protocols: experiments/evaluation
+    --multirun evaluates once per combination of values, and launch=slurm or launch=local starts a job for each:
+    docs/clusters.md
     """
 
     OBJECTS: ClassVar = ("ckpt", "out")
+    SWEEPS: ClassVar = True
     ckpt: str | None = same_option(ModelSettings, "ckpt", default=None)
     extractor: str | None = same_option(EvaluationKeys, "extractor", model_source)
     device: str | None = same_option(EvaluationKeys, "device", device_name)

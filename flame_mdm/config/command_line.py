@@ -23,11 +23,14 @@ Settings = TypeVar("Settings")
 """Dataclass of a command: its docstring is the usage, its fields made by `option` are the keys.
 
 `OBJECTS` names the keys of the leading words that have no key. The last one takes all remaining words if it is a list.
+`SWEEPS` is True if the command takes --multirun and launch=, as in `flame_mdm.config.jobs`.
 A field `composed` receives the words for Hydra: keys with a dot, such as `data.source.path`, and keys and options in
 `COMPOSED`.
 """
 
 STOP = (signal.SIGINT, signal.SIGTERM)  # signals that end a command after it has cleaned up
+
+TEXT = ("str", "str | None")  # annotations of keys whose values are any text
 
 BUG = 70  # exit code of a bug, as in sysexits.h
 
@@ -42,15 +45,17 @@ def run(command: Callable[[Settings], None], kind: type[Settings], argv: Sequenc
         say(*_help(kind))
         return 0
 
-    def serve() -> None:
-        settings = read_settings(kind, words)
-        for entry in fields(kind):  # type: ignore[arg-type]
-            value, check = getattr(settings, entry.name), entry.metadata.get("check")
-            if check is not None and value is not None:
-                check(entry.name, value)
-        command(settings)
+    return guarded(lambda: command(checked_settings(kind, words)), STOP)
 
-    return guarded(serve, STOP)
+
+def checked_settings(kind: type[Settings], words: Sequence[str]) -> Settings:
+    """Returns settings as `read_settings` does, after the checks that their fields declare."""
+    settings = read_settings(kind, words)
+    for entry in fields(kind):  # type: ignore[arg-type]
+        value, check = getattr(settings, entry.name), entry.metadata.get("check")
+        if check is not None and value is not None:
+            check(entry.name, value)
+    return settings
 
 
 def read_settings(kind: type[Settings], words: Sequence[str]) -> Settings:
@@ -59,7 +64,7 @@ def read_settings(kind: type[Settings], words: Sequence[str]) -> Settings:
     values: dict[str, Any] = {}
     composed: list[str] = []
     takes_composed = "composed" in {entry.name for entry in fields(kind)}  # type: ignore[arg-type]
-    for word in _with_keys(words, getattr(kind, "OBJECTS", ()), annotations):
+    for word in with_keys(kind, words):
         key, separator, text = word.partition("=")
         if word.startswith("-") and takes_composed and word in getattr(kind, "COMPOSED", ()):
             composed.append(word)
@@ -71,7 +76,7 @@ def read_settings(kind: type[Settings], words: Sequence[str]) -> Settings:
         if not key:
             raise UserError(f"'{shortened(word, 60)}' has no key. Write key=value, without spaces around the = sign")
         if key in annotations:
-            values[key] = _value(key, text, annotations[key])
+            values[key] = _value(key, text, annotations[key], getattr(kind, "SWEEPS", False))
         elif takes_composed and ("." in key or key in getattr(kind, "COMPOSED", ())):
             composed.append(word)
         else:
@@ -89,10 +94,10 @@ def _annotations(kind: type[Any]) -> Mapping[str, str]:
     return {entry.name: formatannotation(hints[entry.name]) for entry in fields(kind) if "help" in entry.metadata}
 
 
-def _value(key: str, text: str, annotation: str) -> Any:
+def _value(key: str, text: str, annotation: str, sweeps: bool) -> Any:
     if text == "null" and "None" in annotation:
         return None
-    if annotation in ("str", "str | None"):
+    if annotation in TEXT:
         return text
     if annotation.startswith("list[str]"):
         try:
@@ -103,6 +108,8 @@ def _value(key: str, text: str, annotation: str) -> Any:
             raise UserError(f"{key}={text}: no name given. Give at least one; separate several by spaces")
         return names
     override = parse([f"{key}={text}"])[0]
+    if override.is_sweep_override() and sweeps:
+        raise UserError(f"{key}={text}: several values make a sweep, one job for each. Add --multirun, or give one")
     if override.is_sweep_override():
         raise UserError(f"{key}={text}: several values. Give one, or a list: {key}=[{text}]")
     value = override.value()
@@ -110,8 +117,14 @@ def _value(key: str, text: str, annotation: str) -> Any:
     return value
 
 
-def _with_keys(words: Sequence[str], objects: Sequence[str], annotations: Mapping[str, str]) -> list[str]:
-    """Adds the keys of `objects` to the leading words that have no key."""
+def is_text(kind: type[Any], key: str) -> bool:
+    """Returns whether a key of a command takes any text literally."""
+    return _annotations(kind).get(key) in TEXT
+
+
+def with_keys(kind: type[Any], words: Sequence[str]) -> list[str]:
+    """Adds the keys of the objects of a command to the leading words that have no key."""
+    objects, annotations = getattr(kind, "OBJECTS", ()), _annotations(kind)
     leading = list(takewhile(_is_object, words))
     rest = list(words[len(leading) :])
     if objects and annotations[objects[-1]].startswith("list[str]") and len(leading) >= len(objects):

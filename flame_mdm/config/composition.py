@@ -88,11 +88,12 @@ def prepare_overrides(
 def first_choice(override: Override) -> str:
     """Returns the override; for a sweep, the override with its first value."""
     if override.is_sweep_override():
-        return f"{override.get_key_element()}={_choices(override)[0]}"
+        return f"{override.get_key_element()}={choices(override)[0]}"
     return str(override.input_line)
 
 
-def _choices(override: Override) -> list[str]:
+def choices(override: Override) -> list[str]:
+    """Returns the values of an override as text: one, or those of a sweep."""
     value = override.value()
     if isinstance(value, Glob):
         return value.filter(_options(override.key_or_group)) or [str(value)]
@@ -153,7 +154,7 @@ def _check_groups(overrides: Sequence[Override], recipe: ConfigSource) -> None:
         if not _is_group(override) or override.is_delete():
             continue
         options = _options(group)
-        for option in _choices(override):
+        for option in choices(override):
             if option not in options:
                 raise UserError(
                     f"no {group} is called '{option}'.{did_you_mean(option, options)} Available: {', '.join(options)}"

@@ -5,6 +5,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 from hydra import main as hydra_main
 from hydra.core.global_hydra import GlobalHydra
@@ -18,6 +19,7 @@ from flame_mdm.config.signatures import Config
 from flame_mdm.errors import UserError, say
 from flame_mdm.safe_io.paths import check_tree
 
+SWEEP = ("-m", "--multirun")  # options that make values separated by commas a sweep
 QUIET = ["hydra/job_logging=disabled", "hydra/hydra_logging=disabled", "hydra.output_subdir=null"]
 
 INTERRUPT = STOP[:1]  # signals that end training before the first step; then training handles them itself
@@ -46,7 +48,7 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
         raise UserError(f"the first word must name an experiment, such as quickstart, not '{name}'")
     recipe = composition.find_recipe(name)
     flags = [word for word in words if word.startswith("-")]
-    if unknown := [flag for flag in flags if flag not in ("-m", "--multirun")]:
+    if unknown := [flag for flag in flags if flag not in SWEEP]:
         raise UserError(f"unknown option {unknown[0]}. Available: --help, --multirun, and keys as key=value")
     overrides, base = composition.prepare_overrides(recipe, [word for word in words if word not in flags])
     parsed = composition.parse(overrides)
@@ -84,16 +86,33 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
         "hydra.sweep.subdir=${hydra.job.override_dirname}",
         f"hydra.job.config.override_dirname.exclude_keys=[{','.join(fixed)}]",
     ]
-    if "slurm" in launcher and shutil.which("srun") is None:
-        raise UserError(
-            "launch=slurm: srun is not on this machine. Run the command where SLURM is, or use launch=local"
-        )
+    check_launcher(launcher)
     if launcher:
         say(f"waiting for the jobs; their output is in {config['run']['dir']}/.submitit")
     check_tree(Path(config["run"]["dir"]))  # Hydra and the launchers open files in it in place
-    sys.argv = [sys.argv[0], "--multirun", *output, *overrides, *QUIET]
+    hydra_sweep(job, recipe.folder, recipe.stem, [*output, *overrides])
+
+
+def check_launcher(launchers: Sequence[str]) -> None:
+    """Raises `UserError` if a launcher cannot start jobs on this machine."""
+    if "slurm" in launchers and shutil.which("srun") is None:
+        raise UserError(
+            "launch=slurm: srun is not on this machine. Run the command where SLURM is, or use launch=local"
+        )
+
+
+def hydra_sweep(job: Callable[[Any], None], folder: Path, stem: str | None, words: Sequence[str]) -> None:
+    """Runs the jobs of a sweep with Hydra.
+
+    Args:
+        job: receives the composed configuration of each job.
+        folder: folder of the configuration.
+        stem: name of its file without suffix; None = an empty configuration.
+        words: overrides, some of them with several values.
+    """
+    sys.argv = [sys.argv[0], "--multirun", *words, *QUIET]
     GlobalHydra.instance().clear()
-    hydra_main(version_base="1.3", config_path=str(recipe.folder), config_name=recipe.stem)(job)()
+    hydra_main(version_base="1.3", config_path=str(folder), config_name=stem)(job)()
 
 
 LATE = ("val_check_interval", "log_every_n_steps", "accumulate_grad_batches")

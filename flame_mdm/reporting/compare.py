@@ -17,7 +17,7 @@ from flame_mdm.formats import ENDINGS
 from flame_mdm.records import Result, Value
 from flame_mdm.reporting.page import filled, number, page, render
 from flame_mdm.reporting.plots import Curve, chart
-from flame_mdm.reporting.report import charted, evaluation_title, last, marks, printed, sampling
+from flame_mdm.reporting.report import charted, evaluation_title, labeled, last, marks, printed, sampling
 from flame_mdm.runs import CONFIG, Run, read_run
 
 if TYPE_CHECKING:
@@ -182,9 +182,9 @@ def _difference(name: str, first: Value | None, second: Value | None) -> list[st
         return []
     mean, low, high = paired_difference(one, two)
     if count == 1:
-        return [name, number(mean), "–", "not tested: one replication"]
+        return [labeled(name, first), number(mean), "–", "not tested: one replication"]
     shown = "higher" if low > 0 else "lower" if high < 0 else "no difference shown"
-    return [name, number(mean), f"[{number(low)}, {number(high)}]", shown]
+    return [labeled(name, first), number(mean), f"[{number(low)}, {number(high)}]", shown]
 
 
 def paired_difference(first: ArrayLike, second: ArrayLike) -> tuple[float, float, float]:
@@ -231,10 +231,11 @@ def _evaluations(runs: Mapping[str, Run]) -> list[tuple[str, list[str], list[lis
     for title, columns in grouped(runs).items():
         results = [result for _, result in columns]
         real = results[0].ground_truth or {}
-        rows = [
-            [name, printed(real.get(name)), *(printed((result.values or {}).get(name)) for result in results)]
-            for name in sorted({name for result in results for name in result.values or {}})
-        ]
+        rows = []
+        for name in sorted({name for result in results for name in result.values or {}}):
+            values = [(result.values or {}).get(name) for result in results]
+            label = labeled(name, next(filter(None, values), None))
+            rows.append([label, printed(real.get(name)), *map(printed, values)])
         heads = [f"{label} [{k}]" for k, (label, _) in enumerate(columns, 1)]
         notes = [(sampling(result), marks(result)) for result in results]
         tables.append((title, *filled(["", "real motions", *heads], rows), notes, tested(columns)))

@@ -72,7 +72,9 @@ def _with_objects(path: Path) -> None:
 
 
 def _with_rate_of_one_element(path: Path) -> None:
-    np.savez(path, **(amass(walk()) | {"mocap_framerate": np.array([20.0])}))
+    parts = amass(walk())
+    parts["mocap_framerate"] = np.array([20.0])
+    np.savez(path, **parts)
 
 
 def _halves(path: Path) -> None:
@@ -82,11 +84,14 @@ def _halves(path: Path) -> None:
 
 def _of_a_smaller_body(path: Path) -> None:
     parts = amass(walk())
-    np.savez(path, **(parts | {"trans": parts["trans"] - [0, 0, 0.09]}))
+    parts["trans"] = parts["trans"] - [0, 0, 0.09]
+    np.savez(path, **parts)
 
 
 def _matrices(path: Path) -> None:
-    np.savez(path, **(amass(walk()) | {"poses": np.tile(np.eye(3).ravel(), (40, 24))}))
+    parts = amass(walk())
+    parts["poses"] = np.tile(np.eye(3).ravel(), (40, 24))
+    np.savez(path, **parts)
 
 
 def _thirty_joints(path: Path) -> None:

@@ -208,6 +208,57 @@ def test_bad_recordings_are_listed_and_the_good_ones_prepared(folder, capsys):
     assert Store(folder / "cmu-humanml-legacy-smpl22").info["clips"] == {"train": 2, "val": 0, "test": 5}
 
 
+TABLE = """id,begin,end,text,action,split
+02_01,,,a person walks,walk,train
+02_01,,,somebody goes,walk,train
+02_02,0.5,2.75,"an arm, the left one, swings",swing,test
+02_02,0.5,2.75,the arm moves,swing,test
+60_01,,,a salsa,dance,val
+99_01,,,not there,walk,train
+"""
+
+
+def test_captions_of_ones_own(folder, capsys):
+    """In the folder of the motions or another one, without a clone of HumanML3D."""
+    (folder / "mine").mkdir()
+    (folder / "mine" / "captions.csv").write_text(TABLE)
+    humanml = HumanML("smpl22", "legacy")
+    words = ["data=cmu", f"source={folder / 'motions'}", f"data_root={folder}", "data.source.workers=1"]
+    assert main(["prepare", *words, f"data.source.captions={folder / 'mine'}"]) == 0, capsys.readouterr().err
+    store = Store(folder / "cmu-humanml-legacy-smpl22")
+    clips = {clip.id: clip for clip in store.clips}
+    assert clips.keys() == {"02_01", "02_02@0.5-2.75", "60_01"}
+    assert clips["02_01"].captions == ["a person walks", "somebody goes"]
+    assert (clips["02_02@0.5-2.75"].split, clips["60_01"].split) == ("test", "val")
+    assert [store.info["actions"][clips[name].action] for name in sorted(clips)] == ["walk", "swing", "dance"]
+    assert store.info["excluded"]["parts in captions.csv without their recording"] == 1
+    assert clips["02_01"].split == "train"
+    assert clips["60_01"].length > 100, "60 frames per second, without the T-pose"
+    tree, fields = cmu.standardize(asf.read(folder / "motions/02/02_02.amc", 120))
+    joints = mapped(replace(tree, frames=tree.frames[::6]), fields)[10:55]
+    expected = humanml.encode(torch.from_numpy(joints))
+    np.testing.assert_allclose(store.motion(clips["02_02@0.5-2.75"]), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ("walk,,,a,b,", "captions.csv, line 2: id 'walk' is not the name of a recording, such as 02_01"),
+        ("02_01,3,1,a,b,", "captions.csv, line 2: begin '3', end '1': not a part of a recording, in seconds"),
+        ("02_01,x,1,a,b,", "begin 'x', end '1': not numbers of seconds"),
+        ("02_01,nan,1,a,b,", "begin 'nan', end '1': not numbers of seconds"),
+        ("02_01,,,a,b,tset", "captions.csv, line 2: unknown split 'tset'"),
+        ("02_01,,,,b,\n02_02,,,a,b,", "1 of 2 parts have no text, such as 02_01"),
+        ("02_01,,,a,b,\n02_01,,,a,c,", "captions.csv, line 3: 02_01 has two values of split, source or action"),
+        ("99_01,,,a,b,", "no captions of the recordings in"),
+    ],
+)
+def test_faults_in_captions_of_ones_own_are_named(row: str, message: str, folder):
+    (folder / "motions" / "captions.csv").write_text(f"id,begin,end,text,action,split\n{row}\n")
+    with pytest.raises(UserError, match=re.escape(message)):
+        _ = cmu.CMU(str(folder / "motions")).items
+
+
 def test_wrong_folders_get_one_line(folder):
     for path, captions, message in [
         ("none", "clone", "no recording such as 02_01.bvh or 02_01.amc in it; clone https"),

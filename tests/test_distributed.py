@@ -160,7 +160,7 @@ def test_evaluations_run_as_jobs_of_a_launcher(tmp_path, monkeypatch):
     assert code == 1, out + err
     assert "waiting for the jobs; their output is in runs/sweeps/.submitit" in out
     logs = [path.read_text() for path in Path("runs/sweeps/.submitit").rglob("*log.*")]
-    assert sum("error: missing.ckpt: no such file" in log for log in logs) == 2, logs
+    assert sum("error: missing.ckpt: no such checkpoint" in log for log in logs) == 2, logs
 
 
 REFUSED = {

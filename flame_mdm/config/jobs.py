@@ -38,8 +38,9 @@ def _serve(command: Callable[[Settings], None], kind: type[Settings], words: Seq
     keyed = with_keys(kind, [word for word in words if word not in launcher and word not in SWEEP])
     combinations = list(product(*(_alternatives(kind, word) for word in keyed)))
     jobs = [checked_settings(kind, list(combination)) for combination in combinations]
-    if len(jobs) > 1 and getattr(jobs[0], "out", None) is not None:
-        raise UserError(f"out={jobs[0].out}: {len(jobs)} jobs would write it. Drop out=")
+    out = vars(jobs[0]).get("out")
+    if len(jobs) > 1 and out is not None:
+        raise UserError(f"out={out}: {len(jobs)} jobs would write it. Drop out=")
 
     starts = [partial(guarded, partial(command, job), STOP) for job in jobs]
     if launcher:

@@ -1,4 +1,4 @@
-"""The CMU motion capture database with the sentences of HumanML3D and KIT-ML: text-to-motion without registration.
+"""The CMU motion capture database with the sentences of HumanML3D and KIT-ML, or with captions of one's own.
 
 Motions: http://mocap.cs.cmu.edu, free for all uses, as ASF/AMC or converted to BVH. Captions: Guo et al., CVPR 2022
 (HumanML3D), and Plappert et al., Big Data 2016 (KIT-ML). `docs/cmu.md` says what to download and what differs.
@@ -7,7 +7,7 @@ Motions: http://mocap.cs.cmu.edu, free for all uses, as ASF/AMC or converted to 
 import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, NamedTuple
@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from flame_mdm.data import SPLITS, Clip, MotionSource, Split, archives, hashed_split, required
+from flame_mdm.data.captions import TABLE, drawn_splits, known_split, table_rows
 from flame_mdm.data.humanml3d import FPS, HumanML3D, IndexedClip, read_index
 from flame_mdm.data.parallel import in_order
 from flame_mdm.data.t2m import MAX_LENGTH, Cut, Description, cuts
@@ -37,6 +38,8 @@ RATES = (120.0, 60.0)  # frame rates of the recordings, the usual one first
 SLACK = 0.05  # seconds, one frame at 20 fps, by which durations may differ
 SHORTEST = 40  # rows of features of a clip, as in HumanML3D
 BLENDED = 3  # frames after the T-pose of a Daz-friendly file that are blended with it
+COLUMNS = ("id", "begin", "end", "text", "action", "split", "source")  # of a table of captions of one's own
+UNKNOWN = 1000  # frames of a recording whose length is not known before it is read: more than `SHORTEST`
 Evidence = tuple[float | None, int | None, bool]  # arguments of `decide_rate` that the captions give
 MAP = {**LAYOUTS["CMU ASF"].map, "pelvis": "pelvis", "neck": "upperneck", "head": "face"}
 _HIP, _KNEE, _ANKLE, _HEAD = (ADULT[SMPL22.joints.index(n)] for n in ("left_hip", "left_knee", "left_ankle", "head"))
@@ -49,7 +52,10 @@ GET_IT = (
 
 
 class Item(NamedTuple):
-    """Captions of a clip of HumanML3D, frames `start` to `end` at 20 fps, or of an entire recording."""
+    """Captions of a part of a recording, frames `start` to `end` at 20 fps, or of an entire recording.
+
+    `action` is the label of a part in `captions.csv`, which `is_own` tells from HumanML3D's and KIT-ML's.
+    """
 
     id: str
     split: Split
@@ -58,21 +64,28 @@ class Item(NamedTuple):
     start: int = 0
     end: int | None = None
     mirrored: bool = False
+    action: str | None = None
+    is_own: bool = False
 
     def cuts(self, frames: int) -> list[Cut]:
-        return cuts(self.id, frames, self.descriptions, SHORTEST)
+        """Returns what becomes a clip of the part, which has `frames` rows of features."""
+        if not self.is_own:
+            return cuts(self.id, frames, self.descriptions, SHORTEST)
+        return [Cut(self.id, 0, frames, self.descriptions)] if frames >= SHORTEST else []
 
 
 class CMU(MotionSource):
-    """Clips of HumanML3D, and recordings with captions of KIT-ML, on the 22 joints of SMPL.
+    """Clips of HumanML3D, and recordings with captions of KIT-ML, on the 22 joints of SMPL; or captions of one's own.
 
     HumanML3D's clips keep their names, splits and mirrored copies. Other recordings are in the test (val) split if one
     of its test (val) clips is cut from them, and are split by subject if HumanML3D has no clip of them.
+    If there is a table `captions.csv`, its rows are the only captions. Each part of a recording in it becomes a clip.
 
     Args:
         path: folder with recordings such as 02_01.bvh, or 02_01.amc and 02.asf, in any subfolders; or an archive of it.
-        captions: clone of HumanML3D's repository, or a folder with texts, splits and index; default: `path`.
-            KIT-ML's captions of AMASS, kitml*.json, are used if they are in one of the two folders.
+        captions: clone of HumanML3D's repository, a folder with texts, splits and index, or a folder with
+            `captions.csv`; default: `path`. KIT-ML's captions of AMASS, kitml*.json, are used if they are in one of
+            the two folders.
         motion: "joints", or "smpl" for SMPL's rotations, computed from the joints.
     """
 
@@ -116,8 +129,17 @@ class CMU(MotionSource):
         return good
 
     @cached_property
+    def table(self) -> Path | None:
+        """The table of captions of one's own, None if there is none."""
+        required(self.captions, f"it is the folder of the captions: {GET_IT}")
+        path = self.captions / TABLE
+        return path if path.exists() else None
+
+    @cached_property
     def humanml3d(self) -> tuple[list[IndexedClip], dict[str, list[Description]], Mapping[str, Split]]:
-        """HumanML3D's clips of CMU recordings, captions by name, and splits."""
+        """HumanML3D's clips of CMU recordings, captions by name, and splits; empty with captions of one's own."""
+        if self.table:
+            return [], {}, {}
         required(self.captions, f"it is the folder of the captions: {GET_IT}")
         if files := sorted(self.captions.glob("humanml3d_test_captions*.json")):
             rows, texts = read_index(self.captions / "humanml3d_index_cmu.csv"), _test_captions(files[0])
@@ -132,6 +154,8 @@ class CMU(MotionSource):
     @cached_property
     def kit(self) -> list[tuple[str, str, str, float]]:
         """Id, recording, text and seconds of KIT-ML's captions of CMU recordings; empty if there is no file of them."""
+        if self.table:
+            return []
         files = [file for folder in (self.captions, self.path) for file in sorted(folder.glob("kitml*.json"))]
         if not files:
             return []
@@ -164,6 +188,11 @@ class CMU(MotionSource):
                 by_subject = hashed_split(f"CMU subject {trial.partition('_')[0]}", val=5, test=10)
                 of_clips: list[Split] = [split for split in SPLITS if split in cut_from[trial]] or [by_subject]
                 items[trial].append(Item(id_, of_clips[-1], f"recording {trial}", [Description(text, [])]))
+        if self.table:
+            parts = _parts(self.table)
+            present = {name: part for name, part in parts.items() if part.trial in files}
+            self.leave_out(f"parts in {TABLE} without their recording", len(parts) - len(present))
+            items.update(_own_items(present))
         captioned = {trial: items[trial] for trial in files if items[trial]}
         self.leave_out("recordings without a caption", len(files) - len(captioned))
         if not captioned:
@@ -173,11 +202,14 @@ class CMU(MotionSource):
     def count(self) -> int:
         items = [item for items in self.items.values() for item in items]
         ends = {id_: round(seconds * FPS) for id_, _, _, seconds in self.kit}
-        return sum(len(item.cuts((item.end or ends[item.id]) - item.start - 1)) for item in items)
+        frames = [(item.end or ends.get(item.id, UNKNOWN)) - item.start - 1 for item in items]
+        return sum(len(item.cuts(count)) for item, count in zip(items, frames, strict=True))
 
     def clips(self, fps: float) -> Iterator[Clip]:
         """Yields the clips of all recordings that can be read; `findings` lists the others."""
         self.check_fps(fps, FPS)
+        labels = {item.action for items in self.items.values() for item in items}
+        self.actions = tuple(sorted(label for label in labels if label is not None))
         last = {_recording(row.key): row.end for row in sorted(self.humanml3d[0], key=lambda row: row.end)}
         seconds = {trial: length for _, trial, _, length in self.kit}
         evidence = {trial: (seconds.get(trial), last.get(trial), is_at_60(trial)) for trial in self.items}
@@ -189,12 +221,15 @@ class CMU(MotionSource):
                 continue
             for item, motion in zip(self.items[trial], motions, strict=True):
                 if not (kept := item.cuts(len(motion) - 1)):
-                    self.leave_out(f"motions shorter than {SHORTEST} frames or of {MAX_LENGTH} or more")
+                    longest = "" if item.is_own else f" or of {MAX_LENGTH} or more"
+                    self.leave_out(f"motions shorter than {SHORTEST} frames{longest}")
                 for cut in kept:
-                    if item.end and not item.mirrored:
+                    if item.end and not item.mirrored and not item.is_own:
                         self._counts["clips of HumanML3D"] += cut.id == item.id
                         self._counts["captions of HumanML3D"] += len(cut.descriptions)
-                    yield cut.clip(motion, item.split, item.source, recording=trial)
+                    clip = cut.clip(motion, item.split, item.source, recording=trial)
+                    action = None if item.action is None else self.actions.index(item.action)
+                    yield replace(clip, action=action)
         if len(self._errors) == len(tasks):
             raise UserError(f"{self.path}: no recording can be read; {self._errors[0]}")
 
@@ -203,6 +238,69 @@ class CMU(MotionSource):
 
     def findings(self) -> list[str]:
         return [f"left out: {error}" for error in self._errors]
+
+
+@dataclass
+class _Part:
+    """A part of a recording in a table of captions, frames `start` to `end` at 20 fps."""
+
+    name: str
+    trial: str
+    start: int
+    end: int | None
+    split: Split | None
+    source: str | None
+    action: str | None
+    texts: list[str] = field(default_factory=list)
+
+
+def _parts(table: Path) -> dict[str, _Part]:
+    """Returns the parts of recordings in a table by name; rows of the same part are captions of one clip."""
+    parts: dict[str, _Part] = {}
+    for where, cells in table_rows(table, COLUMNS):
+        with naming(where):
+            part = _part_in_table(cells)
+            before = parts.setdefault(part.name, part)
+            if replace(before, texts=[]) != replace(part, texts=[]):
+                raise UserError(f"{part.name} has two values of split, source or action")
+            before.texts += [text] if (text := cells.get("text")) else []
+    for kind in ("texts", "action"):
+        bare = [name for name, part in parts.items() if not getattr(part, kind)]
+        if 0 < len(bare) < len(parts):
+            raise UserError(
+                f"{table}: {len(bare)} of {len(parts)} parts have no {kind.removesuffix('s')}, such as {bare[0]}; add "
+                "one to each, or leave these out"
+            )
+    return parts
+
+
+def _own_items(parts: Mapping[str, _Part]) -> dict[str, list[Item]]:
+    """Returns recording -> its parts. Their splits are stated, or drawn by their source or else by their subject."""
+    sources = {name: part.source or f"CMU subject {part.trial.partition('_')[0]}" for name, part in parts.items()}
+    splits = drawn_splits(sources, {name: part.split for name, part in parts.items()})
+
+    items: defaultdict[str, list[Item]] = defaultdict(list)
+    for name, part in parts.items():
+        source, descriptions = part.source or f"recording {part.trial}", [Description(text, []) for text in part.texts]
+        item = Item(name, splits[name], source, descriptions, part.start, part.end, action=part.action, is_own=True)
+        items[part.trial].append(item)
+    return items
+
+
+def _part_in_table(cells: Mapping[str, str]) -> _Part:
+    """Returns the part of a recording, without captions, that the cells of a row name."""
+    trial, begin, end = cells["id"], cells.get("begin", ""), cells.get("end", "")
+    if not re.fullmatch(r"\d{2,3}_\d{2,3}", trial):
+        raise UserError(f"id {trial!r} is not the name of a recording, such as 02_01")
+    first, last = 0, None
+    with naming(f"begin {begin!r}, end {end!r}", ValueError, OverflowError, what="not numbers of seconds: "):
+        first = round(float(begin) * FPS) if begin else 0
+        last = round(float(end) * FPS) if end else None
+    if first < 0 or (last is not None and last <= first):
+        raise UserError(f"begin {begin!r}, end {end!r}: not a part of a recording, in seconds")
+    name = f"{trial}@{begin or 0}-{end or 'end'}" if begin or end else trial
+    split = known_split(cells["split"]) if cells.get("split") else None
+    return _Part(name, trial, first, last, split, cells.get("source") or None, cells.get("action") or None)
 
 
 def _is_in(fact: str, trial: str) -> bool:  # or its subject is

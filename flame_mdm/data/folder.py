@@ -1,8 +1,6 @@
 """Own data: a folder of motions (BVH, AMASS or joint files) with captions, described in `docs/own-data.md`."""
 
 import contextlib
-import csv
-import io
 import math
 import os
 import re
@@ -16,7 +14,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 import torch
 
-from flame_mdm.data import SPLITS, Clip, MotionSource, Split, hashed_split, mirrored, name_hash, some
+from flame_mdm.data import SPLITS, Clip, MotionSource, Split, mirrored, some
+from flame_mdm.data.captions import TABLE, drawn_splits, known_split, table_rows
 from flame_mdm.data.parallel import in_order
 from flame_mdm.errors import UserError, first_line, printable
 from flame_mdm.formats import ENDINGS, SCENES, motions_in, scenes
@@ -29,9 +28,6 @@ from flame_mdm.representations.smpl import SMPL
 from flame_mdm.safe_io import naming, read_text
 
 SHORTEST = 3  # frames that representations need at least
-SPLITTABLE = 10  # number of motions from which on each split has at least one
-TABLE = "captions.csv"
-COLUMNS = ("id", "text", "action", "split", "source", "license")
 MOST_COPIES = 16  # of a clip in a balanced set; more would only be learned by heart
 
 
@@ -231,23 +227,9 @@ class Folder(MotionSource):
 
     @cached_property
     def splits(self) -> dict[str, Split]:
-        """Split of each motion: that of the table, else drawn by a hash of the source.
-
-        An empty training split, and in a set of `SPLITTABLE` or more motions any empty split, gets the source with the
-        highest hash from the split with the most sources. All motions of a source stay in one split.
-        """
+        """Split of each motion: that of the table, else drawn as in `drawn_splits`."""
         sources = {name: note.source or name for name, note in self.notes.items()}
-        stated: dict[str, Split] = {sources[name]: note.split for name, note in self.notes.items() if note.split}
-        free = sorted(set(sources.values()) - set(stated))
-        drawn: dict[str, Split] = {source: hashed_split(source, val=5, test=10) for source in free}
-        for split in SPLITS if len(sources) >= SPLITTABLE else SPLITS[:1]:
-            if split not in {*stated.values(), *drawn.values()}:
-                sizes = Counter(drawn.values())
-                most = max(sizes.values(), default=0)
-                if movable := [source for source in drawn if sizes[drawn[source]] == most > (split != "train")]:
-                    drawn[max(movable, key=name_hash)] = split
-        splits: dict[str, Split] = {**stated, **drawn}
-        return {name: note.split or splits[sources[name]] for name, note in self.notes.items()}
+        return drawn_splits(sources, {name: note.split for name, note in self.notes.items()})
 
 
 def _repeated(clip: Clip, copies: int) -> Iterator[Clip]:
@@ -272,19 +254,11 @@ def _animations(name: str, path: Path) -> Iterator[tuple[str, MotionFile]]:
 
 
 def _read_table(path: Path, notes: dict[str, Note], exclude: Collection[str]) -> None:
-    """Adds the rows of a table, but those of excluded motions, to the notes of their motions."""
-    rows = csv.DictReader(io.StringIO(read_text(path).removeprefix("\ufeff"), newline=""), strict=True)
-    with naming(path, csv.Error, what="damaged: "):
-        names = list(rows.fieldnames or ())
-        if "id" not in names or len(names) > len(set(names) & set(COLUMNS)):
-            raise UserError(f"its columns are {str(names)[:200]}; use {', '.join(COLUMNS)} (only id is required)")
-        for row in rows:
-            with naming(f"{path}, line {rows.line_num}"):
-                if None in row or None in row.values():
-                    raise UserError("not one cell per column; put texts that contain a comma in quotes")
-                cells = {name: cell.strip() for name, cell in row.items()}
-                if cells["id"] not in exclude:
-                    _add(notes, cells)
+    """Adds the rows of a table, but those of motions in `exclude`, to the notes of the motions."""
+    for where, cells in table_rows(path):
+        with naming(where):
+            if cells["id"] not in exclude:
+                _add(notes, cells)
 
 
 def _add(notes: dict[str, Note], cells: dict[str, str]) -> None:
@@ -292,8 +266,8 @@ def _add(notes: dict[str, Note], cells: dict[str, str]) -> None:
     name, split = cells["id"], cells.get("split")
     if name not in notes:
         raise UserError(f"no motion {name!r}; ids are paths in the folder without extension")
-    if split and split not in SPLITS:
-        raise UserError(f"unknown split {split!r}; use {', '.join(SPLITS)}")
+    if split:
+        known_split(split)
     note = notes[name]
     note.texts += [text] if (text := cells.get("text")) else []
     for key in ("action", "split", "source", "license"):

@@ -11,7 +11,7 @@ from evaluators.metrics.attributes import UNDECIDED, read_all, right_attributes
 from evaluators.metrics.checks import CHECKED, View, check
 from flame_mdm.conditions.vocabulary import words
 from flame_mdm.data import Clip
-from flame_mdm.data.synthetic import Synthetic, content, example
+from flame_mdm.data.synthetic import Synthetic, content, draw_captions, example
 from flame_mdm.data.synthetic_actions import ACTIONS, BASES, CORE, CYCLES, GESTURES, MORE
 from flame_mdm.data.synthetic_motions.body import Attributes
 from flame_mdm.errors import UserError
@@ -117,17 +117,24 @@ WORDS = {
 }  # fmt: skip
 
 
-def test_captions_state_the_attributes_and_contradict_none(clips: list[Clip]):
-    meaning: dict[str, dict] = {}
-    for clip in clips:
-        assert len(set(clip.captions)) == 8
-        for caption in clip.captions:
-            assert meaning.setdefault(caption, dict(clip.attributes)) == dict(clip.attributes), caption
+def test_captions_state_the_attributes_and_contradict_none():
+    rng, source = np.random.default_rng(0), Synthetic(1, actions="all")
+    requested = [MORE[name].draw(rng, name) for name in MORE for _ in range(6)]
+    requested += [source.attributes(rng) for _ in range(40)]
+    requested = [attributes for number, attributes in enumerate(requested) if attributes not in requested[:number]]
+    meaning: dict[str, Attributes] = {}
+    for attributes in requested:
+        captions, stated = draw_captions(rng, attributes, 14)
+        assert stated == attributes
+        for caption in captions:
+            assert meaning.setdefault(caption, attributes) == attributes, caption
             assert not set(caption) & set("[]{}<>|="), caption
             said = set(words(caption))
-            for name, value in clip.attributes.items():
+            for name, value in attributes.items():
                 if name not in ("action", "while") and value not in ("normal", "quarter"):
                     assert said & set(WORDS[value].split("|")), f"{caption}: {name}={value}"
+            sides = {attributes.get("side"), attributes.get("direction")} & {"left", "right"}
+            assert not sides or not ({"left", "right"} - sides) & said, caption
 
 
 def test_every_action_has_six_captions_and_known_verbs():

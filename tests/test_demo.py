@@ -115,6 +115,8 @@ def test_the_python_lines_and_the_files_give_the_same_motions(studio, tmp_path, 
     with np.load(io.BytesIO(studio.file(EDITED, 1, ".npz"))) as file:
         np.testing.assert_array_equal(file["joints"], ours[1].joints)
     assert all(studio.file(EDITED, 1, ".bvh", rig).startswith(b"HIERARCHY") for rig in presets())
+    for rig in ("unreal", "unity", "mixamo"):
+        assert studio.file(EDITED, 1, ".fbx", rig).startswith(b"Kaydara FBX Binary")
     for wrong, says in (((2, ".bvh"), "there are 2 motions"), ((0, ".exe"), "not a format"), ((0, ".bvh", "no"), "no")):
         with pytest.raises(UserError, match=says):
             studio.file(EDITED, *wrong)
@@ -408,7 +410,8 @@ def test_a_person_uses_the_page(server, tmp_path):
         click(tab, "Generate")
         link = tab.wait("location.search.includes('right') && location.href")
         files = tab.run(f"Object.fromEntries({LINKS}.map(a => [a.text, a.href]))")
-        assert list(files)[:8] == ["Blender", "Unreal", "Unity", "Mixamo", "BVH", "GLB", "NPZ", "MP4"]
+        programs = [f"{name} {kind}" for name in ("Unreal", "Unity", "Mixamo") for kind in ("FBX", "GLB")]
+        assert list(files)[:12] == ["Blender", *programs, "BVH", "FBX", "GLB", "NPZ", "MP4"]
         shown = joints_of(files["NPZ"])
         assert shown.shape == (60, 22, 3)
 

@@ -16,6 +16,7 @@ from flame_mdm.__main__ import main
 from flame_mdm.errors import UserError
 from flame_mdm.formats.faults import find_faults
 from flame_mdm.formats.motion import Motion
+from flame_mdm.formats.readers import read
 from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.sampling import motion_request, resolution
 from flame_mdm.sampling.generation import best
@@ -206,3 +207,37 @@ def test_edit_takes_a_part_of_any_motion(model, tmp_path):
         np.testing.assert_allclose(edited.original.joints[0, :, 1], pose[:, 1] + motion.joints[20, 0, 1], atol=0.02)
     with one_line_error(r"cut=\[3, 9\] is not a range of .*, which lasts 4 seconds"):
         flame_mdm.edit(model, motion, TEXT, cut=[3, 9], **options)
+
+
+def test_a_sample_is_written_as_a_motion_file(tmp_path, monkeypatch, capsys):
+    """One motion by default; further ones have numbers in their names."""
+    monkeypatch.chdir(tmp_path)
+    words = [f"text={TEXT}", "seconds=1.5", "num_inference_steps=2"]
+    assert main(["sample", "quickstart", "walk.fbx", *words, "rig=unreal", "root_motion=true", "resample=30"]) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["walk.fbx"]
+    assert "walk.fbx: 44 frames at 30 per second, centimeters" in capsys.readouterr().out
+    motion = read("walk.fbx")
+    expected = flame_mdm.generate(flame_mdm.load("quickstart"), TEXT, seconds=1.5, num_inference_steps=2)[0]
+    lift = motion.joints[0, 0, 1] - expected.joints[0, 0, 1]
+    assert 0.02 < lift < 0.03
+    assert np.abs(motion.joints[::3] - [0, lift, 0] - expected.joints[::2]).max() < 0.02
+
+    assert main(["sample", "quickstart", "out/walk.vrma", *words, "samples=2"]) == 0
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["walk.vrma", "walk_2.vrma"]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["rig=unreal"], "rig=unreal: a folder gets motions as they are. Name a file, such as out=walk.fbx"),
+        (["walk.glb", "mp4=true"], "mp4=true: walk.glb is a single motion file. Name a folder, or omit out"),
+        (["walk.fbx", "root_motion=true"], "root_motion is only for .glb, .fbx and USD files with rig=unreal"),
+    ],
+)
+def test_keys_that_do_not_fit_the_output_are_refused(words, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    options = [word for word in words if "=" in word]
+    out = [f"out={word}" for word in words if "=" not in word]
+    request = [f"text={TEXT}", "seconds=1", "num_inference_steps=2"]
+    assert message in error_of(capsys, "sample", "quickstart", *request, *options, *out)
+    assert list(tmp_path.iterdir()) == []

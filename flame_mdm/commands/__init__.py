@@ -21,6 +21,8 @@ from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.sampling.motion_request import EditRequest, SamplingRequest
 
 if TYPE_CHECKING:
+    from flame_mdm.formats.characters import BvhCharacter, Character
+    from flame_mdm.formats.motion import Motion
     from flame_mdm.generator import MotionGenerator
     from flame_mdm.visualize.body import Mesh
 
@@ -128,6 +130,32 @@ class BodySettings:
     )
 
 
+@dataclass(frozen=True, kw_only=True)
+class WritingSettings:
+    """Keys of the motion files that are written."""
+
+    rig: str | None = option(None, "skeleton: mixamo, unreal, unity, rigify, lafan1, soma, cmu or 100style")
+    root_motion: bool = option(False, "true = the root of rig=unreal or soma follows the hips on the floor")
+    resample: float | None = option(None, "frames per second of OUT; default: those of the motion")
+    character: str | None = option(None, "your own .glb with a skin, or .bvh, to move: docs/characters.md", existing)
+
+    def read_character(self) -> Character | BvhCharacter | None:
+        """Reads `character`; prints the lines of a file to complete if names of its joints are unknown."""
+        from flame_mdm.formats import characters
+
+        try:
+            return None if self.character is None else characters.read(self.character)
+        except characters.UnknownJoints as error:
+            say(*error.template)
+            raise
+
+    def at_rate(self, motion: Motion) -> Motion:
+        """Returns a motion at the frame rate of `resample`."""
+        from flame_mdm.formats.resampling import frame_rate
+
+        return motion if self.resample is None else motion.resampled(frame_rate(self.resample, "resample"))
+
+
 @dataclass(frozen=True)
 class LoadedModel:
     """A model for sampling, the hash of its file, and the body to draw."""
@@ -144,7 +172,6 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
     text: str | None = same_option(SamplingRequest, "texts")
     action: str | None = same_option(SamplingRequest, "actions")
     unconditioned: bool = option(False, "true = neither text nor action")
-    samples: int = same_option(SamplingRequest, "samples", default=3)
     seed: int = same_option(SamplingRequest, "seed")
     cleanup: bool = same_option(SamplingRequest, "cleanup")
     targets: str | None = same_option(SamplingRequest, "targets", existing)

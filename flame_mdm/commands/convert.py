@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from flame_mdm.commands import BodySettings, FileSettings, existing, finish, motion_file
+from flame_mdm.commands import BodySettings, FileSettings, WritingSettings, finish, motion_file
 from flame_mdm.config.options import option, required
 from flame_mdm.errors import UserError, first_line, say
 from flame_mdm.formats import motion_files
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ConvertSettings(BodySettings, FileSettings):
+class ConvertSettings(BodySettings, WritingSettings, FileSettings):
     """usage: flame-mdm convert MOTION OUT [fps=20] [unit=0.01] [up=z] [rest_pose=true]
            flame-mdm convert MOTION OUT rig=mixamo
            flame-mdm convert MOTION OUT character=hero.glb
@@ -37,10 +37,6 @@ class ConvertSettings(BodySettings, FileSettings):
     out: str = required(".fbx, .glb, .bvh, .usdz, .vrma, .npz (AMASS), .json or .npy; .mp4 or .gif to look at")
     format: str | None = option(None, "if MOTION is a folder: ending of the files that are written to the folder OUT")
     rest_pose: bool = option(False, "true = .bvh begins with a frame of the rest pose, arms out")
-    rig: str | None = option(None, "skeleton: mixamo, unreal, unity, rigify, lafan1, soma, cmu or 100style")
-    root_motion: bool = option(False, "true = the root of rig=unreal or soma follows the hips on the floor")
-    resample: float | None = option(None, "frames per second of OUT; default: those of MOTION")
-    character: str | None = option(None, "your own .glb with a skin, or .bvh, to move: docs/characters.md", existing)
 
 
 def main(settings: ConvertSettings) -> None:
@@ -52,13 +48,7 @@ def main(settings: ConvertSettings) -> None:
     else:
         motion_file("motion", settings.motion)
         targets = {out: path}
-    from flame_mdm.formats import characters
-
-    try:
-        character = None if settings.character is None else characters.read(settings.character)
-    except characters.UnknownJoints as error:
-        say(*error.template)
-        raise
+    character = settings.read_character()
     if not path.is_dir():
         _convert(settings, path, out, character)
         return
@@ -86,15 +76,13 @@ def _convert(settings: ConvertSettings, path: Path, out: Path, character: Charac
     from flame_mdm.formats.layouts import head_height, leg_length
     from flame_mdm.formats.people import load_body
     from flame_mdm.formats.readers import read
-    from flame_mdm.formats.resampling import frame_rate
     from flame_mdm.representations.skeleton import SMPL22
 
     body = load_body(settings.body)
     motion = read(path, settings.fps, settings.unit, settings.up, animation=settings.animation)
     if out.exists() and out.samefile(path):
         raise UserError(f"{out}: the same file as the input, which stays as it is. Choose another name for the output")
-    if settings.resample is not None:
-        motion = motion.resampled(frame_rate(settings.resample, "resample"))
+    motion = settings.at_rate(motion)
     if out.suffix.lower() == ".npz":
         motion.poses = motion.posed()  # other programs expect AMASS's keys
     try:

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import ClassVar
 
 from flame_mdm.commands import FileSettings, OutputSettings, motion_file, usual_data_root
-from flame_mdm.config.options import option, required
+from flame_mdm.config.options import option, required, same_option
 from flame_mdm.errors import say
 from flame_mdm.safe_io.paths import check_within
-from flame_mdm.sampling.motion_request import EditRequest
+from flame_mdm.sampling.motion_request import EditRequest, SamplingRequest
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,7 +23,8 @@ class EditSettings(OutputSettings, EditRequest, FileSettings):
     """
 
     OBJECTS: ClassVar = ("ckpt", "motion", "out")
-    motion: str = required("FILE (.npz, .bvh, .json, .npy) or dataset:id", motion_file)
+    motion: str = required("FILE (.npz, .bvh, .fbx, .glb, .json, .npy) or dataset:id", motion_file)
+    samples: int = same_option(SamplingRequest, "samples", default=3)
     cut: Sequence[float] | None = option(None, "[begin, end] in seconds: use only this part of the motion")
     data_root: str = option(usual_data_root, "folder of the prepared data sets")
     out: str | None = option(None, "folder; default samples/<experiment>/edit-<motion>-<text>-<hash>")

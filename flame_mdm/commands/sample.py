@@ -6,16 +6,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import mean
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
-from flame_mdm.commands import OutputSettings, model_source, motion_file
+from flame_mdm.commands import OutputSettings, WritingSettings, model_source, motion_file
 from flame_mdm.config.options import option, same_option
 from flame_mdm.errors import UserError, say
+from flame_mdm.formats import WRITTEN
 from flame_mdm.safe_io.paths import check_within
 from flame_mdm.sampling.motion_request import SamplingRequest
 from flame_mdm.sampling.prompt_file import PromptFile
 
 if TYPE_CHECKING:
+    from flame_mdm.formats.characters import BvhCharacter, Character
     from flame_mdm.formats.motion import Motion
     from flame_mdm.generator import MotionGenerator
     from flame_mdm.sampling.generation import Score
@@ -27,8 +29,9 @@ GALLERY = 200  # maximum number of motions on the page of a file of prompts, whi
 
 
 @dataclass(frozen=True, kw_only=True)
-class SampleSettings(OutputSettings):
+class SampleSettings(OutputSettings, WritingSettings):
     """usage: flame-mdm sample CKPT text="a person walks in a circle clockwise" [seconds=3] [key=value ...]
+           flame-mdm sample CKPT walk.fbx text="a person walks forward" [rig=unreal] [resample=30]
            flame-mdm sample CKPT text="walks forward @3 | turns around | bows @2.5" [after=walk.npz] [loop=true]
            flame-mdm sample CKPT text="walks forward" path="0,1 0.5,2" | targets=FILE.json
            flame-mdm sample CKPT text="jumps" candidates=8 [scorer=RUN]
@@ -38,6 +41,7 @@ class SampleSettings(OutputSettings):
 
     Writes motions (.npz), a GIF, and a player that opens in any browser. A file of prompts has one per line; each gets
     its own folder, and one page shows all. Prompts that cannot be sampled are named at the end, and the exit code is 1.
+    If OUT is a file, .fbx, .glb, .bvh, .usdz, .vrma, .npz, .json, .npy, .mp4 or .gif, only this file is written.
     """
 
     OBJECTS: ClassVar = ("ckpt", "out")
@@ -51,19 +55,42 @@ class SampleSettings(OutputSettings):
     candidates: int = same_option(SamplingRequest, "candidates")
     scorer: str | None = option(None, "a motion-CLIP that chooses the candidate that fits the text best", model_source)
     shared_noise: bool = same_option(SamplingRequest, "shared_noise")
-    out: str | None = option(None, "folder; default samples/<experiment>/<text>-<hash>")
+    samples: int | None = option(None, "motions per text or action; default 3, or 1 if OUT is a file")
+    out: str | None = option(None, "a folder, default samples/<experiment>/<text>-<hash>; or a motion file")
+
+    @property
+    def file(self) -> Path | None:
+        """The motion file to write; None = a folder."""
+        path = Path(self.out or "")
+        return path if path.suffix.lower() in WRITTEN and not path.is_dir() else None
+
+    def check_output(self) -> None:
+        """Raises `UserError` for keys that do not fit the kind of output."""
+        if self.file is None:
+            for key in ("rig", "root_motion", "resample", "character"):
+                if value := getattr(self, key):
+                    advice = "Name a file, such as out=walk.fbx"
+                    raise UserError(f"{key}={str(value).lower()}: a folder gets motions as they are. {advice}")
+            return
+        for key in ("prompts", "mp4", "trajectory"):
+            if value := getattr(self, key):
+                advice = "Name a folder, or omit out"
+                raise UserError(f"{key}={str(value).lower()}: {self.out} is a single motion file. {advice}")
 
     def conditions(self) -> list[str]:
         return [*super().conditions(), *(["prompts"] if self.prompts is not None else [])]
 
     def request_for(self, prompts: PromptFile | None) -> SamplingRequest:
         """Returns what is requested of the model, for the accepted prompts of a file if there is one."""
+        default = 3 if self.file is None else 1
+        samples = default if self.samples is None else self.samples
         if prompts is None:
-            request = self.request()
+            request = self.request(samples=samples)
         else:
             if self.path is not None:
                 raise UserError(f"path={self.path}: prompts cannot be given with a path. Give text and seconds")
             request = self.request(
+                samples=samples,
                 texts=list(prompts.accepted.values()),
                 seconds=prompts.lengths("seconds", self.seconds),
                 frames=prompts.lengths("frames", self.frames),
@@ -74,6 +101,7 @@ class SampleSettings(OutputSettings):
 
 
 def main(settings: SampleSettings) -> None:
+    settings.check_output()
     prompts = None if settings.prompts is None else PromptFile.read(settings.prompts)
     if prompts is None or prompts.accepted:
         _sample(settings, settings.request_for(prompts), prompts)
@@ -86,6 +114,7 @@ def main(settings: SampleSettings) -> None:
 def _sample(settings: SampleSettings, request: SamplingRequest, prompts: PromptFile | None) -> None:
     """Samples and writes the motions of a request; prompts of a file that the model cannot sample are refused."""
     loaded = settings.load(request)  # finds the file before PyTorch is imported
+    character = settings.read_character()
     from flame_mdm.sampling.generation import sample
     from flame_mdm.sampling.output import SAMPLES, degenerate_notes, summary, write_motions
     from flame_mdm.sampling.resolution import resolve
@@ -106,8 +135,14 @@ def _sample(settings: SampleSettings, request: SamplingRequest, prompts: PromptF
     stages = [] if settings.trajectory else None
     motions = sample(model, resolved, score=score, stages=stages)
     say(*degenerate_notes(motions))
-    folders = _folders(settings, resolved, model, loaded.sha256, motions)
     facts = {"seed": settings.seed, "checkpoint": loaded.sha256}
+    if settings.file is not None:
+        _write_files(settings, settings.file, motions, character, loaded.body, facts)
+        if resolved.targets is not None:
+            say(_distance(resolved.targets, motions))
+        return
+
+    folders = _folders(settings, resolved, model, loaded.sha256, motions)
     for folder, written in folders.items():
         check_within(folder, settings.out or SAMPLES)
         stages_shown = stages if written[0] is motions[0] else None
@@ -118,6 +153,21 @@ def _sample(settings: SampleSettings, request: SamplingRequest, prompts: PromptF
             say(_distance(resolved.targets, written))
     if prompts is not None:
         say(_gallery(prompts, folders, loaded.body))
+
+
+def _write_files(
+    settings: SampleSettings,
+    file: Path,
+    motions: Sequence[Motion],
+    character: Character | BvhCharacter | None,
+    body: Mesh,
+    facts: dict[str, Any],
+) -> None:
+    """Writes the first motion as `file`; further ones have numbers in their names, walk_2.fbx, walk_3.fbx."""
+    for number, motion in enumerate(motions, 1):
+        path = file if number == 1 else file.with_stem(f"{file.stem}_{number}")
+        written = settings.at_rate(motion)
+        say(written.save(path, False, settings.rig, character, body, settings.root_motion, **facts))
 
 
 def _score(source: str, model: MotionGenerator) -> Score:

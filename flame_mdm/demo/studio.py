@@ -22,7 +22,13 @@ from flame_mdm.sampling.resolution import resolve
 
 KEPT = 64  # number of requests whose motions stay in memory; a download or an edit of them needs no model
 TIME_LIMIT = 300.0  # maximum number of seconds of one request on the model
-FORMATS = {".bvh": "BVH", ".glb": "GLB", ".npz": "NPZ", ".mp4": "MP4"}  # files to download, and their names on the page
+FORMATS = {
+    ".bvh": "BVH",
+    ".fbx": "FBX",
+    ".glb": "GLB",
+    ".npz": "NPZ",
+    ".mp4": "MP4",
+}  # files to download, and their names on the page
 
 
 class Studio:

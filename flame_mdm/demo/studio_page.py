@@ -27,9 +27,17 @@ QUEUE = 64  # maximum number of waiting requests; further ones are told to come 
 FORM = ["model", "text", "seconds", "seed", "samples", "guidance_scale", "num_inference_steps", "sampler"]
 FORM += ["cleanup", "split", "path"]
 PARTS = ("left_arm", "right_arm", "left_leg", "right_leg", "upper_body", "lower_body")
-RIGGED = (".bvh", ".glb")
-PROGRAMS = {"Blender": "", "Unreal": "&amp;rig=unreal", "Unity": "&amp;rig=unity", "Mixamo": "&amp;rig=mixamo"}
-"""Programs with a button of their own: the .glb file in their skeleton. Other skeletons are under "More"."""
+RIGGED = (".bvh", ".fbx", ".glb")
+PROGRAMS = {
+    "Blender": ("glb", ""),
+    "Unreal FBX": ("fbx", "&amp;rig=unreal"),
+    "Unreal GLB": ("glb", "&amp;rig=unreal"),
+    "Unity FBX": ("fbx", "&amp;rig=unity"),
+    "Unity GLB": ("glb", "&amp;rig=unity"),
+    "Mixamo FBX": ("fbx", "&amp;rig=mixamo"),
+    "Mixamo GLB": ("glb", "&amp;rig=mixamo"),
+}
+"""Buttons for programs: the ending of the file, and the skeleton in its address. Others are under "More"."""
 EXAMPLES = 12
 EMPTY = '<div class="empty">Describe a motion, then press Generate</div>'
 EDITORS = """<div id="parts"><div class="head"><span>Action</span><span>Seconds</span></div>
@@ -178,7 +186,7 @@ def _result(ui: SimpleNamespace, studio: Studio, request: DemoRequest, motions: 
     for number in range(len(motions)):
         address = f"?{escape(request.query())}&amp;motion={number}"
         files = [(f"motion{extension}{address}", name) for extension, name in FORMATS.items()]
-        programs = [(f"motion.glb{address}{rig}", name) for name, rig in PROGRAMS.items()]
+        programs = [(f"motion.{ending}{address}{rig}", name) for name, (ending, rig) in PROGRAMS.items()]
         rigs = [(f"motion{end}{address}&amp;rig={rig}", f"{rig} {end[1:]}") for rig in presets() for end in RIGGED]
         links += f"<div>{names[number]} For {_links(programs)}</div>"
         links += f"<div>Files {_links(files)}</div>"

@@ -100,21 +100,15 @@ class _Writer:
         A root on the floor is moved back by `ROOT_BACK`, and the hips forward by the same distance.
         """
         clip = self.clip
-        offsets = clip.offsets.copy()
-        moves = {joint: moved.copy() for joint, moved in clip.moves.items()}
-        hips = max(moves)
-        up = np.array([0, clip.lift, 0])
-        if clip.root < 0:
-            offsets[hips] += up
-            moves[hips] += up
-        else:
-            turns = clip.turns[:, clip.root]
+        offsets, moves = clip.on_soles()
+        if clip.root >= 0:
+            hips = max(moves)
             back = clip.rest[clip.root].T @ [0, 0, ROOT_BACK]
             offsets[clip.root] -= clip.rest[clip.root] @ back
-            offsets[hips] += back + clip.rest[clip.root].T @ up
-            moves[hips] += back + (turns.mT @ up[:, None])[..., 0]
+            offsets[hips] += back
+            moves[hips] += back
             if clip.root in moves:
-                moves[clip.root] -= turns @ back
+                moves[clip.root] -= clip.turns[:, clip.root] @ back
         return PER_METER * offsets, {joint: PER_METER * moved for joint, moved in moves.items()}
 
     def _skeleton(self) -> list[int]:

@@ -121,6 +121,20 @@ class RiggedClip:
                 turns[:, joint] = turns[:, parent] @ turns[:, joint]
         return positions, turns
 
+    def on_soles(self) -> tuple[np.ndarray, dict[int, np.ndarray]]:
+        """Returns `offsets` and `moves` with the person on its soles: hips are lifted, a root stays on the floor."""
+        offsets = self.offsets.copy()
+        moves = {joint: moved.copy() for joint, moved in self.moves.items()}
+        hips = max(moves)
+        up = np.array([0, self.lift, 0])
+        if self.root < 0:
+            offsets[hips] += up
+            moves[hips] += up
+        else:
+            offsets[hips] += self.rest[self.root].T @ up
+            moves[hips] += (self.turns[:, self.root].mT @ up[:, None])[..., 0]
+        return offsets, moves
+
 
 def rigged(
     poses: Poses,
@@ -199,13 +213,21 @@ def _skin(body: FittedBody, rig: Rig) -> Skin:
 
     skinned = [rig.sources.index(number) for number in range(len(SMPL22))]
     others = [joint for joint, source in enumerate(rig.sources) if source < 0]
-    binds = np.tile(np.eye(4), (len(rig.joints), 1, 1))
     stored = body.neutral @ mesh.turns[: len(SMPL22)].mT
     moves = -(stored @ (body.joints - floor)[..., None])
+    binds = np.tile(np.eye(4), (len(rig.joints), 1, 1))
     count = len(skinned)
     binds[:count, :3] = rig.neutral[skinned].mT @ np.concatenate([stored, moves], -1)
-    binds[count:, :3, :3] = rig.turns[others].mT
-    binds[count:, :3, 3:] = -(rig.turns[others].mT @ rig.positions[others, :, None])
+
+    # Joints without vertices keep their place in their parents: three.js reads it from the pose of the mesh.
+    worlds = np.tile(np.eye(4), (len(rig.joints), 1, 1))
+    worlds[skinned] = np.linalg.inv(binds[:count])
+    local = np.tile(np.eye(4), (len(rig.joints), 1, 1))
+    local[:, :3, :3], local[:, :3, 3] = rig.rest(), rig.offsets()
+    for joint in others:
+        parent = rig.parents[joint]
+        worlds[joint] = worlds[parent] @ local[joint] if parent >= 0 else local[joint]
+    binds[count:] = np.linalg.inv(worlds[others])
 
     faces = mesh.colors[mesh.triangles].mean(1)
     differences = np.linalg.norm(faces[:, None] - np.array(MATERIALS, float), axis=-1)

@@ -78,9 +78,10 @@ def _skeleton(stage: Any, clip: RiggedClip) -> None:
     skeleton = UsdSkel.Skeleton.Define(stage, "/person/skeleton")
     paths = _paths(clip)
     skeleton.CreateJointsAttr(paths)
+    offsets, moves = clip.on_soles()
     rest = np.tile(np.eye(4), (len(paths), 1, 1))
     rest[:, :3, :3] = clip.rest * clip.scales[:, None, None]
-    rest[:, :3, 3] = clip.offsets
+    rest[:, :3, 3] = offsets
     skeleton.CreateRestTransformsAttr(_matrices(rest))
     bound = rest.copy()
     for joint, parent in enumerate(clip.parents):
@@ -94,10 +95,9 @@ def _skeleton(stage: Any, clip: RiggedClip) -> None:
     animation.CreateJointsAttr(paths)
     animation.CreateScalesAttr(Vt.Vec3hArray([Gf.Vec3h(size, size, size) for size in clip.scales.tolist()]))
     turns = quaternions(clip.turns)
-    moved = np.tile(clip.offsets, (len(clip.turns), 1, 1))
-    for joint, path in clip.moves.items():
+    moved = np.tile(offsets, (len(clip.turns), 1, 1))
+    for joint, path in moves.items():
         moved[:, joint] = path
-    moved[:, 0] += [0, clip.lift, 0]
     rotations, translations = animation.CreateRotationsAttr(), animation.CreateTranslationsAttr()
     for frame in range(len(turns)):
         values = [Gf.Quatf(float(w), float(x), float(y), float(z)) for x, y, z, w in turns[frame]]

@@ -34,12 +34,17 @@ GENERATION = [name for name in recipes() if name.partition("/")[0] not in ("clas
 
 
 @cache
-def blender() -> str:
-    """A Python that has the package bpy; tests skip without one."""
-    python = os.environ.get("FLAME_MDM_BLENDER", sys.executable)
-    if subprocess.run([python, "-c", "import bpy"], capture_output=True, check=False).returncode:
-        pytest.skip("no package bpy: set FLAME_MDM_BLENDER to a Python that has it")
+def python_with(package: str, variable: str) -> str:
+    """A Python that has a package: the one that an environment variable names, or this one; tests skip without it."""
+    python = os.environ.get(variable, sys.executable)
+    if subprocess.run([python, "-c", f"import {package}"], capture_output=True, check=False).returncode:
+        pytest.skip(f"no package {package}: set {variable} to a Python that has it")
     return python
+
+
+def blender() -> str:
+    """A Python that has the package bpy."""
+    return python_with("bpy", "FLAME_MDM_BLENDER")
 
 
 def script(path: str) -> Any:

@@ -56,7 +56,7 @@ def cleanup(joints: np.ndarray, fps: float, skeleton: Skeleton, contacts: np.nda
         toe, shift = motion[:, chain[-1]], np.zeros((len(motion), 3))  # over the ground, fades out between contacts
         still = -np.diff(toe[:, [0, 2]], axis=0)
         shift[:, [0, 2]] = _least_squares(len(toe), (1, 30 * weight, still), (0, 0.03, 0.0), (2, 0.1, 0.0))
-        _bend(motion, chain[1:], shift)
+        bend(motion, chain[1:], shift)
     for side in ("left", "right"):
         _push_out(motion, skeleton, side, fps)
     return motion.astype(np.float32)
@@ -144,10 +144,10 @@ def _push_out(motion: np.ndarray, skeleton: Skeleton, side: str, fps: float) -> 
         away = size * (np.take_along_axis(away, deepest[..., None], 1)[:, 0] + 0.7 * aside)
         away = unit(gaussian_filter1d(away, frames, axis=0, mode="nearest"))
         size = gaussian_filter1d(maximum_filter1d(size, 2 * round(frames) + 1, axis=0), frames / 2, axis=0)
-        _bend(motion, arm, size * away)
+        bend(motion, arm, size * away)
 
 
-def _bend(motion: np.ndarray, leg: Sequence[int], shift: np.ndarray) -> None:
+def bend(motion: np.ndarray, leg: Sequence[int], shift: np.ndarray) -> None:
     """Moves the foot of a leg (hip, knee, ankle, other joints of the foot) by `shift` (F, 3); hands work alike."""
     hip, knee, ankle, *foot = (motion[:, joint].copy() for joint in leg)
     thigh, shin = (np.linalg.norm(bone[0]) for bone in (knee - hip, ankle - knee))

@@ -28,7 +28,10 @@ LINEAR_KEY = 0x4 | 0x100 | 0x2000 | 0x4000  # interpolation and tangents of a ke
 ROOT_BACK = (
     1e-4  # meters by which a root is moved back: Blender keeps a pelvis in place that is at the tail of its root
 )
-AXES = ("d|X", "d|Y", "d|Z")
+AXES = ("X", "Y", "Z")
+HELD_KEY = 0x2  # a value that is held until the next key
+CONTACTS = ("LeftFootContact", "RightFootContact")
+"""Properties of the first bone that say whether a foot is planted, 0 or 1; Unreal imports them as curves."""
 
 
 def write(path: Path, clip: RiggedClip) -> None:
@@ -119,7 +122,10 @@ class _Writer:
             attribute, record = self._object("NodeAttribute", name, "LimbNode")
             record.add("TypeFlags", "Skeleton")
             number, record = self._object("Model", name, "LimbNode")
-            _model(record, self.offsets[joint], before[joint], clip.scales[joint])
+            properties = _model(record, self.offsets[joint], before[joint], clip.scales[joint])
+            if joint == 0 and len(clip.contacts):
+                for label in CONTACTS:
+                    properties.add("P", label, "Number", "", "A+U", 0.0)
             bones.append(number)
             self._connect(attribute, number)
             parent = clip.parents[joint]
@@ -224,24 +230,38 @@ class _Writer:
             self._curves(layer, bone, "Lcl Rotation", "R", times, angles[:, joint])
         for joint, moved in self.moves.items():
             self._curves(layer, bones[joint], "Lcl Translation", "T", times, moved)
+        for foot, name in enumerate(CONTACTS[: clip.contacts.shape[1] if len(clip.contacts) else 0]):
+            planted = clip.contacts[:, foot].astype(float)
+            changes = np.flatnonzero(np.diff(planted, prepend=-1.0))
+            self._curves(layer, bones[0], name, name, times[changes], planted[changes, None], (name,), HELD_KEY)
 
-    def _curves(self, layer: int, bone: int, target: str, label: str, times: np.ndarray, values: np.ndarray) -> None:
-        """Adds the three curves of a property, values (F, 3)."""
+    def _curves(
+        self,
+        layer: int,
+        bone: int,
+        target: str,
+        label: str,
+        times: np.ndarray,
+        values: np.ndarray,
+        axes: Sequence[str] = AXES,
+        interpolation: int = LINEAR_KEY,
+    ) -> None:
+        """Adds a curve for each axis of a property, values (F, axes)."""
         node, record = self._object("AnimationCurveNode", label, "", "AnimCurveNode")
         properties = record.add("Properties70")
         self._connect(node, layer)
         self._connect(node, bone, target)
-        for axis, name in enumerate(AXES):
-            properties.add("P", name, "Number", "", "A", float(values[0, axis]))
+        for axis, name in enumerate(axes):
+            properties.add("P", f"d|{name}", "Number", "", "A", float(values[0, axis]))
             curve, record = self._object("AnimationCurve", "", "", "AnimCurve")
             record.add("Default", float(values[0, axis]))
             record.add("KeyVer", Int(4008))
             record.add("KeyTime", times)
             record.add("KeyValueFloat", values[:, axis].astype("<f4"))
-            record.add("KeyAttrFlags", np.array([LINEAR_KEY], "<i4"))
+            record.add("KeyAttrFlags", np.array([interpolation], "<i4"))
             record.add("KeyAttrDataFloat", np.zeros(4, "<f4"))
             record.add("KeyAttrRefCount", np.array([len(times)], "<i4"))
-            self._connect(curve, node, name)
+            self._connect(curve, node, f"d|{name}")
 
 
 def _degrees(turns: np.ndarray) -> np.ndarray:
@@ -259,7 +279,8 @@ def _vector(properties: Record, name: str, kind: str, flags: str, values: Sequen
     properties.add("P", name, kind, "Vector" if kind == "Vector3D" else "", flags, *map(float, values))
 
 
-def _model(record: Record, offset: np.ndarray, before: np.ndarray, scale: float = 1.0) -> None:
+def _model(record: Record, offset: np.ndarray, before: np.ndarray, scale: float = 1.0) -> Record:
+    """Adds the transform of a model at rest; returns the record of its properties."""
     record.add("Version", Int(232))
     properties = record.add("Properties70")
     properties.add("P", "RotationActive", "bool", "", "", Int(1))
@@ -272,6 +293,7 @@ def _model(record: Record, offset: np.ndarray, before: np.ndarray, scale: float 
     _vector(properties, "Lcl Scaling", "Lcl Scaling", "A", (scale, scale, scale))
     record.add("Shading", True)
     record.add("Culling", "CullingOff")
+    return properties
 
 
 def _geometry(record: Record, skin: Skin) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from flame_mdm.formats.glb import Binary, quaternions
-from flame_mdm.formats.rigged import RiggedClip, Skin
+from flame_mdm.formats.rigged import RiggedClip, Skin, contact_events
 
 VERTICES, INDICES = 34962, 34963  # uses of a buffer view in glTF
 
@@ -28,6 +28,8 @@ def write(path: Path, clip: RiggedClip, text: str) -> None:
         if parent >= 0:
             nodes[parent].setdefault("children", []).append(joint)
     animation = binary.animation(clip.name, clip.fps, curves)
+    if len(clip.contacts):
+        animation["extras"] = {"markers": [event._asdict() for event in contact_events(clip.contacts, clip.fps)]}
     figure: dict[str, Any] = {}
     for skin in clip.skins:
         nodes.append({"name": "figure", "mesh": 0, "skin": 0})

@@ -3,7 +3,8 @@
 Lengths are in meters, y up; the rest pose faces +z. Frames, joints and vertices are counted by F, J and V.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -90,6 +91,7 @@ class RiggedClip:
         skins: the meshes; () if the motion does not fit a person.
         scales: (J,), units of the parent per unit of each joint.
         root: index of the joint on the floor above the hips; -1 if there is none.
+        contacts: (F, 2), whether the left and the right toes are planted; (0, 2) if it is not known.
     """
 
     name: str
@@ -104,6 +106,7 @@ class RiggedClip:
     skins: tuple[Skin, ...]
     scales: np.ndarray
     root: int = -1
+    contacts: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), bool))
 
     def world(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns positions (F, J, 3) and rotations (F, J, 3, 3) of the joints in the world, not lifted.
@@ -121,6 +124,34 @@ class RiggedClip:
                 turns[:, joint] = turns[:, parent] @ turns[:, joint]
         return positions, turns
 
+    def part(self, frames: slice, name: str, contacts: np.ndarray) -> "RiggedClip":
+        """Returns some frames as a clip with a name and the contacts (F, 2) of these frames."""
+        moves = {joint: moved[frames] for joint, moved in self.moves.items()}
+        return replace(self, name=name, turns=self.turns[frames], moves=moves, contacts=contacts)
+
+    def on_path(self, path: np.ndarray, heading: np.ndarray) -> "RiggedClip":
+        """Returns a clip whose body stays in place, moved along a path.
+
+        The root moves, or the hips if there is no root on the floor.
+
+        Args:
+            path: (F, 2), x and z.
+            heading: (F,), rotations about the vertical in radians; positive angles turn to the left.
+        """
+        joint = self.root if self.root >= 0 else max(self.moves)
+        facing = np.tile(np.eye(3), (len(heading), 1, 1))
+        facing[:, 0, 0] = facing[:, 2, 2] = np.cos(heading)
+        facing[:, 0, 2] = np.sin(heading)
+        facing[:, 2, 0] = -np.sin(heading)
+
+        turns, moves = self.turns.copy(), dict(self.moves)
+        turns[:, joint] = facing @ turns[:, joint]
+        before = moves.get(joint, np.tile(self.offsets[joint], (len(heading), 1)))
+        after = (facing @ before[..., None])[..., 0]
+        after[:, [0, 2]] += path
+        moves[joint] = after
+        return replace(self, turns=turns, moves=moves)
+
     def on_soles(self) -> tuple[np.ndarray, dict[int, np.ndarray]]:
         """Returns `offsets` and `moves` with the person on its soles: hips are lifted, a root stays on the floor."""
         offsets = self.offsets.copy()
@@ -134,6 +165,25 @@ class RiggedClip:
             offsets[hips] += self.rest[self.root].T @ up
             moves[hips] += (self.turns[:, self.root].mT @ up[:, None])[..., 0]
         return offsets, moves
+
+
+class ContactEvent(NamedTuple):
+    """A moment in which a foot begins or ends to stand on the floor."""
+
+    time: float  # seconds
+    frame: int
+    foot: str  # left or right
+    event: str  # plant or lift
+
+
+def contact_events(contacts: np.ndarray, fps: float) -> list[ContactEvent]:
+    """Returns when the left and the right foot land and leave the floor, by time, from contacts (F, 2)."""
+    events = []
+    for foot, flags in zip(("left", "right"), contacts.T, strict=True):
+        for frame in np.flatnonzero(np.diff(flags.astype(int))).tolist():
+            event = "plant" if flags[frame + 1] else "lift"
+            events.append(ContactEvent(round((frame + 1) / fps, 4), frame + 1, foot, event))
+    return sorted(events)
 
 
 def rigged(
@@ -205,8 +255,9 @@ def _with_root_motion(turns: np.ndarray, hips: np.ndarray, skeleton: Rig) -> tup
 
 
 def _skin(body: FittedBody, rig: Rig) -> Skin:
-    """Returns the mesh of a body in its stored pose, lifted onto the floor."""
-    mesh, floor = body.mesh, np.array([0, body.points[:, 1].min(), 0])
+    """Returns the mesh of a body in its stored pose, with the hips where they are in the rest pose of the skeleton."""
+    mesh = body.mesh
+    moved = rig.positions[rig.hips] + [0, body.lift, 0] - body.joints[0]
     weights = mesh.weights[:, : len(SMPL22)].copy()  # helper bones join their joints
     np.add.at(weights.T, list(ANCHORS[len(SMPL22) :]), mesh.weights[:, len(SMPL22) :].T)
     bones, shares = largest_weights(weights)
@@ -214,7 +265,7 @@ def _skin(body: FittedBody, rig: Rig) -> Skin:
     skinned = [rig.sources.index(number) for number in range(len(SMPL22))]
     others = [joint for joint, source in enumerate(rig.sources) if source < 0]
     stored = body.neutral @ mesh.turns[: len(SMPL22)].mT
-    moves = -(stored @ (body.joints - floor)[..., None])
+    moves = -(stored @ (body.joints + moved)[..., None])
     binds = np.tile(np.eye(4), (len(rig.joints), 1, 1))
     count = len(skinned)
     binds[:count, :3] = rig.neutral[skinned].mT @ np.concatenate([stored, moves], -1)
@@ -233,7 +284,7 @@ def _skin(body: FittedBody, rig: Rig) -> Skin:
     differences = np.linalg.norm(faces[:, None] - np.array(MATERIALS, float), axis=-1)
     return Skin(
         name="person",
-        points=body.points - floor,
+        points=body.points + moved,
         normals=mesh.normals,
         triangles=mesh.triangles,
         palette=PALETTE,

@@ -1,0 +1,223 @@
+"""Clips for game engines, cut from longer motions: loops, starts, stops and turns whose ends fit together.
+
+A gait is cut at two frames one cycle apart: the start before them, the loop between them, and the stop after them. The
+ends of the clips are then changed to shared poses: the loop's first pose, and the pose in which the person stands.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+
+from flame_mdm.formats.grounding import (
+    GroundedMotion,
+    anchored,
+    planted,
+    planted_loop,
+    repeated,
+    runs,
+    with_lengths,
+)
+
+Kind = Literal["loop", "start", "stop", "turn"]
+CYCLE = (0.5, 1.8)  # shortest and longest cycle of a gait in seconds
+STEADY = 0.85  # share of the full speed from which a gait is steady
+EVEN = 0.2  # seconds over which the speed is averaged, because side steps stop and go
+SLOWEST = 0.2  # m/s; a slower motion is no gait
+ASIDE = 35.0  # degrees by which a gait may go in another direction than requested
+VELOCITY = 0.1  # seconds; weight of velocities beside positions when two poses are compared
+SETTLED = 0.12  # m/s; a body stands if no joint is faster, relative to the root
+MARGIN = 0.15  # seconds of standing that are kept before a start and after a stop
+FADE = 0.5  # seconds in which the first or the last pose of a clip changes into the motion
+OVERSHOOT = (0.6, 1.6)  # smallest and largest turn relative to the requested one
+PART = 0.5  # shortest start and stop in seconds
+STILL = (0.1, 10.0)  # meters and degrees; a loop that moves less from repetition to repetition stays in its place
+TALL = 0.15  # meters per joint; poses of two cycles that differ more do not make a loop
+
+
+@dataclass(frozen=True, eq=False)
+class Clip:
+    """A motion for a game engine.
+
+    Attributes:
+        name: without the name of the set.
+        kind: loop (the last pose is the first one), start, stop or turn.
+        motion: the joints, and the path of the root.
+        text: what the model was asked for.
+    """
+
+    name: str
+    kind: Kind
+    motion: GroundedMotion
+    text: str
+
+
+@dataclass(frozen=True)
+class Cycle:
+    """A cycle of a gait in a motion: its first frame, the same pose one cycle later, and how much the poses differ."""
+
+    first: int
+    last: int
+    difference: float  # mean distance of the joints in meters
+
+
+def direction(degrees: float) -> np.ndarray:
+    """Returns x and z (2,) of a direction; 0 degrees is ahead, 90 degrees is to the left."""
+    return np.array([np.sin(np.radians(degrees)), np.cos(np.radians(degrees))])
+
+
+def progress(motion: GroundedMotion, degrees: float) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the velocities (F,) of the root along a direction relative to its facing, and to the left of it."""
+    cosine, sine = np.cos(motion.heading), np.sin(motion.heading)
+    dx, dz = np.gradient(motion.path, axis=0).T * motion.fps if len(motion) > 1 else np.zeros((2, len(motion)))
+    x, z = cosine * dx - sine * dz, sine * dx + cosine * dz
+    along = direction(degrees)
+    aside = direction(degrees + 90)
+    return x * along[0] + z * along[1], x * aside[0] + z * aside[1]
+
+
+def find_cycle(motion: GroundedMotion, degrees: float) -> Cycle | None:
+    """Returns the cycle of a gait in a direction whose ends differ least; None if there is none.
+
+    Cycles that begin when the left foot lands are preferred, so that the loops of a set begin with the same foot.
+    """
+    along, aside = progress(motion, degrees)
+    even = gaussian_filter1d(along, EVEN * motion.fps, mode="nearest")
+    full = np.percentile(even, 90)
+    if full < SLOWEST:
+        return None
+    begin, end = max(runs(even > STEADY * full), key=lambda run: run[1] - run[0])
+    first, last = moving(motion)
+    part = round(PART * motion.fps)
+    begin, end = max(begin, first + part), min(end, last - part)
+    if (
+        end <= begin
+        or abs(np.degrees(np.arctan2(aside[begin : end + 1].mean(), along[begin : end + 1].mean()))) > ASIDE
+    ):
+        return None
+
+    poses = motion.local
+    speeds = np.gradient(poses, axis=0) * motion.fps
+    landed = [first for first, _ in runs(motion.contacts[:, 0]) if begin <= first <= end]
+    shortest, longest = (round(seconds * motion.fps) for seconds in CYCLE)
+    for starts in (landed, range(begin, end + 1)):
+        cycles = []
+        for first in starts:
+            for last in range(first + shortest, min(first + longest, end) + 1):
+                apart = np.linalg.norm(poses[first] - poses[last], axis=-1).mean()
+                changed = np.linalg.norm(speeds[first] - speeds[last], axis=-1).mean() + abs(even[first] - even[last])
+                cycles.append(Cycle(first, last, float(apart + VELOCITY * changed)))
+        best = min(cycles, key=lambda cycle: cycle.difference, default=None)
+        if best is not None and best.difference < TALL:
+            return best
+    return None
+
+
+def gait(motion: GroundedMotion, cycle: Cycle, degrees: float, stand: np.ndarray) -> list[GroundedMotion]:
+    """Returns start, loop and stop of a gait on a straight path.
+
+    Args:
+        motion: a person who stands, moves in a direction, and stands again.
+        cycle: the cycle that becomes the loop.
+        degrees: the direction, relative to where the person looks.
+        stand: (22, 3), the first pose of the start and the last pose of the stop.
+    """
+    straight = straightened(motion, degrees)
+    loop = closed(straight.cut(cycle.first, cycle.last))
+    along = direction(degrees)
+    distance = float((loop.path[-1] - loop.path[0]) @ along)
+    loop = replace(loop, path=np.linspace(0, distance, len(loop))[:, None] * along)
+    loop = planted_loop(loop)
+
+    begin, end = moving(motion)
+    start = straight.cut(begin, cycle.first)
+    start = anchored(start, loop.local[0], FADE, at_end=True)
+    start = anchored(start, stand, FADE, at_end=False)
+    stop = straight.cut(cycle.last, end)
+    stop = anchored(stop, loop.local[0], FADE, at_end=False)
+    stop = anchored(stop, stand, FADE, at_end=True)
+    start, stop = (planted(clip, fixed_start=True, fixed_end=True) for clip in (start, stop))
+    return [start, loop, stop]
+
+
+def straightened(motion: GroundedMotion, degrees: float) -> GroundedMotion:
+    """Returns the motion with a root that faces +z and moves along a straight line."""
+    along, _ = progress(motion, degrees)
+    distance = np.concatenate([[0], np.cumsum((along[1:] + along[:-1]) / 2) / motion.fps])
+    return replace(motion, path=distance[:, None] * direction(degrees), heading=np.zeros(len(motion)))
+
+
+def closed(motion: GroundedMotion) -> GroundedMotion:
+    """Returns a cycle whose last pose is its first one; the difference is spread evenly over the cycle."""
+    share = np.linspace(-0.5, 0.5, len(motion))[:, None, None]
+    change = motion.local[0] - motion.local[-1]
+    local = with_lengths(motion.local + share * change, motion.local[0])
+    contacts = motion.contacts.copy()
+    contacts[-1] = contacts[0]
+    return replace(motion, local=local, contacts=contacts)
+
+
+def moving(motion: GroundedMotion) -> tuple[int, int]:
+    """Returns the frames between which the body moves, with `MARGIN` around them."""
+    speed = np.linalg.norm(np.gradient(motion.world(), axis=0), axis=-1).max(1) * motion.fps
+    speed = gaussian_filter1d(speed, 0.05 * motion.fps, mode="nearest")
+    fast = np.flatnonzero(speed > SETTLED)
+    if not len(fast):
+        return 0, len(motion) - 1
+    margin = round(MARGIN * motion.fps)
+    return max(0, fast[0] - margin), min(len(motion) - 1, fast[-1] + margin)
+
+
+def turn(motion: GroundedMotion, degrees: float, stand: np.ndarray) -> GroundedMotion | None:
+    """Returns a turn on the spot by an angle; None if the motion turns much less or more, or to the other side.
+
+    `stand` (22, 3) is the first and the last pose.
+    """
+    begin, end = moving(motion)
+    part = motion.cut(begin, end)
+    angle = part.heading[-1] - part.heading[0]
+    ratio = np.degrees(angle) / degrees
+    if not OVERSHOOT[0] <= ratio <= OVERSHOOT[1]:
+        return None
+    part = replace(part, path=np.zeros_like(part.path), heading=part.heading / ratio)
+    part = anchored(part, stand, FADE, at_end=False)
+    part = anchored(part, stand, FADE, at_end=True)
+    return planted(part, fixed_start=True, fixed_end=True)
+
+
+def loop(motion: GroundedMotion) -> GroundedMotion:
+    """Returns the middle of a loop that was generated three times in a row, as a loop of its own.
+
+    The root follows a straight line at a constant speed if it leaves its place, otherwise it stays there.
+    """
+    count = (len(motion) - 1) // 3
+    cycle = closed(motion.cut(count, 2 * count))
+    distance, angle = np.linalg.norm(cycle.path[-1]), np.degrees(abs(cycle.heading[-1]))
+    leaves = distance > STILL[0] or angle > STILL[1]
+    share = np.linspace(0, 1, len(cycle)) if leaves else np.zeros(len(cycle))
+    cycle = replace(cycle, path=share[:, None] * cycle.path[-1], heading=share * cycle.heading[-1])
+    return planted_loop(cycle)
+
+
+def with_neighbors(clips: Sequence[Clip], frames: int) -> tuple[np.ndarray, list[slice]]:
+    """Returns the joints of all clips, seen from the root, in one array, and the frames of each clip in it.
+
+    Each clip has as many `frames` of neighbors before and after it, so that filters over time do not mix the clips: a
+    loop continues with itself, other clips stay in their first and last pose.
+    """
+    parts, slices, position = [], [], 0
+    for clip in clips:
+        local = clip.motion.local
+        if clip.kind == "loop":
+            copies = 1 + 2 * (frames // (len(local) - 1) + 1)
+            several = repeated(clip.motion, copies).local
+            begin = (len(several) - len(local)) // 2
+            part = several[begin - frames : begin + len(local) + frames]
+        else:
+            part = np.concatenate([np.repeat(local[:1], frames, 0), local, np.repeat(local[-1:], frames, 0)])
+        parts.append(part)
+        slices.append(slice(position + frames, position + frames + len(local)))
+        position += len(part)
+    return np.concatenate(parts), slices

@@ -1,0 +1,225 @@
+"""Motions seen from a root on the floor, and feet that stay where they are planted.
+
+Game engines move a character by a root on the floor and play the rest of the motion relative to this root. Cuts of a
+motion are changed in this view, so that the last pose of one clip can be the first pose of the next. Then the path of
+the root is put below them again, and inverse kinematics keeps each foot in place during its contacts.
+
+Arrays hold F frames and the 22 joints of SMPL, in meters, y up. Angles are radians; positive angles turn to the left.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.ndimage import binary_closing, binary_opening, gaussian_filter1d
+
+from flame_mdm.formats.cleanup import bend
+from flame_mdm.representations.skeleton import JOINT, SMPL22
+
+SMOOTHNESS = 0.15  # seconds over which the path of the root is smoothed, so that it does not follow single steps
+LOW = 0.05  # height in meters above its lowest height at which a toe touches the floor
+SLOW = 0.25  # speed in m/s of a toe over the floor below which it is planted
+SHORT = 0.1  # seconds; shorter contacts, and shorter gaps between contacts, are left out
+COPIES = 3  # repetitions of a loop that are planted together; the middle one has neighbors on both sides
+FEET = tuple(tuple(JOINT[f"{side}_{name}"] for name in ("hip", "knee", "ankle", "foot")) for side in ("left", "right"))
+"""Joints of the legs, the left one first."""
+
+
+@dataclass(frozen=True, eq=False)
+class GroundedMotion:
+    """A motion as a path of a root on the floor, and joints relative to this root.
+
+    Attributes:
+        local: (F, 22, 3), joints seen from the root, which faces +z.
+        path: (F, 2), x and z of the root.
+        heading: (F,), direction of the root; 0 faces +z.
+        contacts: (F, 2), whether the left and the right toes are planted.
+        fps: frames per second.
+    """
+
+    local: np.ndarray
+    path: np.ndarray
+    heading: np.ndarray
+    contacts: np.ndarray
+    fps: float
+
+    def __len__(self) -> int:
+        return len(self.local)
+
+    def world(self) -> np.ndarray:
+        """Returns the joints (F, 22, 3) in the world."""
+        joints = turned(self.local, self.heading[:, None])
+        joints[..., [0, 2]] += self.path[:, None]
+        return joints
+
+    def with_world(self, joints: np.ndarray) -> "GroundedMotion":
+        """Returns this motion with other joints (F, 22, 3) in the world, above the same root."""
+        local = joints.copy()
+        local[..., [0, 2]] -= self.path[:, None]
+        return replace(self, local=turned(local, -self.heading[:, None]))
+
+    def cut(self, first: int, last: int) -> "GroundedMotion":
+        """Returns the frames from `first` to `last`, both included; the root begins at the origin and faces +z."""
+        frames = slice(first, last + 1)
+        start, heading = self.path[first], self.heading[first]
+        away = np.zeros((last + 1 - first, 3))
+        away[:, [0, 2]] = self.path[frames] - start
+        path = turned(away, -heading)[:, [0, 2]]
+        return GroundedMotion(
+            self.local[frames].copy(), path, self.heading[frames] - heading, self.contacts[frames].copy(), self.fps
+        )
+
+
+def turned(points: np.ndarray, angles: np.ndarray | float) -> np.ndarray:
+    """Turns points (..., 3) about the vertical by angles (...)."""
+    cosine, sine = np.cos(angles), np.sin(angles)
+    x, y, z = np.moveaxis(points, -1, 0)
+    return np.stack([cosine * x + sine * z, y + 0 * cosine, cosine * z - sine * x], -1)
+
+
+def facing(joints: np.ndarray) -> np.ndarray:
+    """Returns the direction (F,) that hips and shoulders face, without jumps of a full turn."""
+    left = sum(joints[:, JOINT[f"left_{name}"]] - joints[:, JOINT[f"right_{name}"]] for name in ("hip", "shoulder"))
+    return np.unwrap(np.arctan2(-left[:, 2], left[:, 0]))
+
+
+def grounded(joints: np.ndarray, fps: float) -> GroundedMotion:
+    """Puts a root below joints (F, 22, 3); its path and its direction are smooth."""
+    joints = joints.astype(float)
+    frames = SMOOTHNESS * fps
+    path = gaussian_filter1d(joints[:, 0][:, [0, 2]], frames, axis=0, mode="nearest")
+    heading = gaussian_filter1d(facing(joints), frames, mode="nearest")
+    motion = GroundedMotion(joints, path, heading, planted_toes(joints, fps), fps)
+    return motion.with_world(joints)
+
+
+def planted_toes(joints: np.ndarray, fps: float) -> np.ndarray:
+    """Returns whether the left and the right toes are planted, (F, 2), by their height and speed."""
+    toes = joints[:, [leg[-1] for leg in FEET]]
+    steps = np.linalg.norm(np.diff(toes[..., [0, 2]], axis=0), axis=-1) * fps
+    steps = np.concatenate([steps[:1], steps, steps[-1:]])
+    speed = np.minimum(steps[:-1], steps[1:])
+    floor = np.percentile(toes[..., 1].min(1), 10)
+    contacts = (speed < SLOW) & (toes[..., 1] < floor + LOW)
+    span = np.ones((max(2, round(SHORT * fps)), 1))
+    padding = len(span)
+    padded = np.pad(contacts, ((padding, padding), (0, 0)), mode="edge")
+    filtered = binary_opening(binary_closing(padded, span), span)
+    return filtered[padding:-padding]
+
+
+def anchored(motion: GroundedMotion, pose: np.ndarray, seconds: float, *, at_end: bool) -> GroundedMotion:
+    """Returns the motion with another first or last pose; the change fades over some seconds.
+
+    `pose` (22, 3) is seen from the root. Bones keep their lengths.
+    """
+    frames = np.arange(len(motion)) / max(1.0, min(seconds * motion.fps, len(motion) - 1))
+    share = np.clip(1 - (frames[::-1] if at_end else frames), 0, 1)
+    weight = share**2 * (3 - 2 * share)
+    change = pose - motion.local[-1 if at_end else 0]
+    local = motion.local + weight[:, None, None] * change
+    return replace(motion, local=with_lengths(local, pose))
+
+
+def with_lengths(joints: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Returns joints (F, 22, 3) with bones in the same directions, and with the bone lengths of a pose (22, 3)."""
+    out = joints.copy()
+    for parent, joint in SMPL22.edges:
+        bone = joints[:, joint] - joints[:, parent]
+        length = np.linalg.norm(pose[joint] - pose[parent])
+        out[:, joint] = out[:, parent] + bone * length / np.maximum(np.linalg.norm(bone, axis=-1, keepdims=True), 1e-9)
+    return out
+
+
+def runs(flags: np.ndarray) -> list[tuple[int, int]]:
+    """Returns the first and the last frame of each run of flags (F,)."""
+    edges = np.flatnonzero(np.diff(np.r_[0, flags.astype(int), 0]))
+    return [(begin, end - 1) for begin, end in edges.reshape(-1, 2).tolist()]
+
+
+def planted(motion: GroundedMotion, *, fixed_start: bool = False, fixed_end: bool = False) -> GroundedMotion:
+    """Returns the motion with toes that do not move during their contacts.
+
+    With `fixed_start` and `fixed_end`, the first and the last pose do not change: a foot that is planted there stays
+    where this pose has it.
+    """
+    world = motion.world()
+    for leg, flags in zip(FEET, motion.contacts.T, strict=True):
+        shift = _shift(world[:, leg[-1]], flags, fixed_start, fixed_end)
+        bend(world, leg, shift)
+    return motion.with_world(world)
+
+
+def _shift(toe: np.ndarray, flags: np.ndarray, fixed_start: bool, fixed_end: bool) -> np.ndarray:
+    """Returns how far a toe (F, 3) is moved over the floor, (F, 3): smoothly from each contact to the next."""
+    last = len(toe) - 1
+    floor = np.array([1.0, 0.0, 1.0])
+    frames, shifts = [], []
+    if fixed_start and not flags[0]:
+        frames, shifts = [0], [np.zeros(3)]
+    for begin, end in runs(flags):
+        at_start, at_end = fixed_start and begin == 0, fixed_end and end == last
+        place = toe[begin : end + 1].mean(0)
+        if at_start or at_end:
+            place = toe[0] if at_start else toe[last]
+        target = np.tile(place, (end + 1 - begin, 1))
+        if at_start and at_end:  # it cannot stay in place between two given poses
+            target = np.linspace(toe[0], toe[last], len(target))
+        frames += range(begin, end + 1)
+        shifts += list((target - toe[begin : end + 1]) * floor)
+    if fixed_end and not flags[last]:
+        frames.append(last)
+        shifts.append(np.zeros(3))
+    if not frames:
+        return np.zeros_like(toe)
+
+    # between two contacts, the shift changes with zero speed at both ends
+    known = np.array(shifts)
+    after = np.clip(np.searchsorted(frames, np.arange(last + 1)), 0, len(frames) - 1)
+    before = np.maximum(after - 1, 0)
+    at = np.array(frames)
+    span = np.maximum(at[after] - at[before], 1)
+    share = np.clip((np.arange(last + 1) - at[before]) / span, 0, 1)[:, None]
+    share = share**2 * (3 - 2 * share)
+    return (1 - share) * known[before] + share * known[after]
+
+
+def repeated(motion: GroundedMotion, copies: int = COPIES) -> GroundedMotion:
+    """Returns a loop several times in a row; its last frame is the first one of the next repetition."""
+    step = turned(np.r_[motion.path[-1] - motion.path[0], 0][[0, 2, 1]], -motion.heading[0])
+    turn = motion.heading[-1] - motion.heading[0]
+    count = len(motion) - 1
+    paths, headings = [], []
+    place, heading = motion.path[0].copy(), float(motion.heading[0])
+    away = np.zeros((count + 1, 3))
+    away[:, [0, 2]] = motion.path - motion.path[0]
+    for _ in range(copies):
+        paths.append(place + turned(away, heading - motion.heading[0])[:count, [0, 2]])
+        headings.append(motion.heading[:count] + heading - motion.heading[0])
+        place = place + turned(step, heading)[[0, 2]]
+        heading += turn
+    return GroundedMotion(
+        local=np.concatenate([*[motion.local[:count]] * copies, motion.local[-1:]]),
+        path=np.concatenate([*paths, place[None]]),
+        heading=np.concatenate([*headings, [heading]]),
+        contacts=np.concatenate([*[motion.contacts[:count]] * copies, motion.contacts[-1:]]),
+        fps=motion.fps,
+    )
+
+
+def planted_loop(motion: GroundedMotion) -> GroundedMotion:
+    """Returns a loop with planted toes, which is still a loop: the last pose is the first one."""
+    count = len(motion) - 1
+    several = planted(repeated(motion))
+    middle = several.local[count * (COPIES // 2) : count * (COPIES // 2 + 1) + 1].copy()
+    middle[-1] = middle[0]
+    return replace(motion, local=middle)
+
+
+def slide(motion: GroundedMotion) -> float:
+    """Returns the largest distance in meters that a toe moves over the floor during one contact."""
+    toes = motion.world()[:, [leg[-1] for leg in FEET]][..., [0, 2]]
+    distances = [0.0]
+    for foot in range(2):
+        for begin, end in runs(motion.contacts[:, foot]):
+            distances.append(float(np.linalg.norm(toes[begin : end + 1, foot] - toes[begin, foot], axis=-1).max()))
+    return max(distances)

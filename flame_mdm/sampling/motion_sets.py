@@ -1,0 +1,275 @@
+# pyright: standard
+"""Sets of motions for game engines: loops, starts, stops and turns that fit together, from one file that names them."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import torch
+from pydantic import Field
+
+from flame_mdm.errors import UserError
+from flame_mdm.formats import fbx_writer, gaits, glb_writer, usd
+from flame_mdm.formats.body import fit_body
+from flame_mdm.formats.cleanup import cleaned
+from flame_mdm.formats.faults import find_faults
+from flame_mdm.formats.gaits import Clip
+from flame_mdm.formats.grounding import GroundedMotion, grounded, slide, with_lengths
+from flame_mdm.formats.motion import Motion
+from flame_mdm.formats.retarget import preset, presets
+from flame_mdm.formats.rigged import RiggedClip, contact_events, rigged
+from flame_mdm.generator import MotionGenerator
+from flame_mdm.progress import ProgressBar
+from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.safe_io import atomic_folder, read_yaml, write_json
+from flame_mdm.sampling.generation import generate
+from flame_mdm.sampling.keywords import SamplerKeywords
+from flame_mdm.sampling.reading import decoded
+from flame_mdm.schemas import ClosedSchema, check_shape
+from flame_mdm.visualize import contact_sheet, write_player
+from flame_mdm.visualize.body import Mesh
+
+SETS = Path(__file__).parent / "sets"
+IN_PLACE = "_InPlace"  # end of the names of files without a path
+SEPARATION = 1.0  # seconds between two clips while their rotations are solved for
+NAME = r"^[A-Za-z0-9_-]{1,60}$"
+WRITERS: dict[str, Callable[[Path, RiggedClip], None]] = {
+    "fbx": fbx_writer.write,
+    "glb": lambda path, clip: glb_writer.write(path, clip, clip.name),
+    "usda": usd.write,
+    "usdc": usd.write,
+    "usdz": usd.write,
+}
+"""Format -> function that writes a clip."""
+SLIDING = 200.0  # score per meter that a foot slides, relative to the score per meter of difference between poses
+FAULTY = 0.2  # score of a frame with a fault
+
+
+class SetMotion(ClosedSchema):
+    """A motion of a set."""
+
+    text: str
+    kind: Literal["loop", "gait", "turn"]
+    seconds: Annotated[float, Field(gt=0, le=60)] | None = None
+    degrees: Annotated[float, Field(ge=-360, le=360)] = 0.0
+
+
+class MotionSet(ClosedSchema):
+    """Content of a file that describes a set; docs/sampling.md explains the keys."""
+
+    stand: str
+    motions: Annotated[Mapping[Annotated[str, Field(pattern=NAME)], SetMotion], Field(min_length=1, max_length=200)]
+    prefix: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{0,40}$")] = ""
+    format: Literal["fbx", "glb", "usda", "usdc", "usdz"] = "fbx"
+    rig: str | None = "unreal"
+    fps: Annotated[float, Field(ge=10, le=240)] = 30.0
+    candidates: Annotated[int, Field(ge=1, le=100)] = 8
+
+
+def read_set(source: str) -> MotionSet:
+    """Reads a set by its name, such as "locomotion", or from a YAML file; raises `UserError` if it is invalid."""
+    names = sorted(path.stem for path in SETS.glob("*.yaml"))
+    path = Path(source)
+    if source in names:
+        path = SETS / f"{source}.yaml"
+    elif path.suffix not in (".yaml", ".yml"):
+        raise UserError(f"set={source}: no such set. Use {', '.join(names)}, or a .yaml file")
+    try:
+        content = check_shape(read_yaml(path), MotionSet)
+    except UserError:
+        raise
+    except ValueError as error:
+        raise UserError(f"{path}: {error}; see docs/sampling.md") from error
+
+    stand = content.motions.get(content.stand)
+    if stand is None or stand.kind != "loop":
+        raise UserError(f"{path}: stand is {content.stand}, which is no motion with kind: loop. Name such a motion")
+    for name, motion in content.motions.items():
+        if motion.kind == "turn" and not motion.degrees:
+            raise UserError(f"{path}: motions.{name} is a turn without degrees. Give degrees, 90 is to the left")
+    if content.rig is not None and content.rig not in presets():
+        raise UserError(f"{path}: rig is {content.rig}. Use one of {', '.join(presets())}, or null")
+    return content
+
+
+@dataclass(frozen=True, eq=False)
+class MadeSet:
+    """The clips of a set, and why motions were left out, by their names."""
+
+    clips: list[Clip]
+    left_out: dict[str, str]
+
+
+def make_set(model: MotionGenerator, content: MotionSet, seed: int = 0, **options: Any) -> MadeSet:
+    """Generates the motions of a set and cuts them into clips, with a progress bar.
+
+    Of the candidates for each motion, the one whose clips fit best is kept: poses that differ little where the clips
+    are cut, feet that stay in place, few faults. A motion that the model cannot do is left out.
+
+    Args:
+        model: a model of SMPL's 22 joints that samples texts in windows.
+        content: the set.
+        seed: seed of the noise.
+        options: how the motions are sampled, as for `generate`.
+
+    Raises:
+        UserError: If the model has another skeleton or cannot do what is requested, or no person stands.
+    """
+    if model.representation.skeleton.joints != SMPL22.joints:
+        raise UserError(f"set: the model has the skeleton {model.representation.skeleton.name}, not SMPL's 22 joints")
+    others = [name for name in content.motions if name != content.stand]
+    stand = np.zeros((0, 3))
+    clips: list[Clip] = []
+    left_out: dict[str, str] = {}
+    for name in ProgressBar([content.stand, *others], desc="sample", unit="motion"):
+        motion = content.motions[name]
+        takes = _takes(model, motion, content, seed, options)
+        if len(stand):
+            takes = [replace(take, local=with_lengths(take.local, stand)) for take in takes]
+        versions = [version for take in takes if (version := _clips(name, motion, take, stand))]
+        if not versions:
+            left_out[name] = f"none of {content.candidates} motions for '{motion.text}' {_missing(motion)}"
+            continue
+        clips += min(versions, key=lambda version: version[0])[1]
+        if name == content.stand:
+            stand = clips[0].motion.local[0]
+    return MadeSet(clips, left_out)
+
+
+def _takes(
+    model: MotionGenerator, motion: SetMotion, content: MotionSet, seed: int, options: Mapping[str, Any]
+) -> list[GroundedMotion]:
+    """Samples the candidates for a motion; of a loop, each has three repetitions and one frame more."""
+    is_loop, representation = motion.kind == "loop", model.representation
+    sampling: SamplerKeywords = {**options}  # type: ignore[typeddict-item]
+    sampled = generate(
+        model,
+        motion.text,
+        samples=content.candidates,
+        seconds=motion.seconds,
+        seed=seed,
+        loop=is_loop,
+        split=False,
+        **sampling,
+    )
+    takes = []
+    for take in sampled:
+        features = torch.from_numpy(take.features)
+        if is_loop:
+            several = torch.cat([features] * 4)[: 3 * len(features) + 1]
+            take = decoded(representation, several, take.text, take.id)
+            features = several
+        smooth = cleaned(take, representation.contacts(features.numpy())).resampled(content.fps)
+        takes.append(grounded(smooth.joints, content.fps))
+    return takes
+
+
+def _clips(name: str, motion: SetMotion, take: GroundedMotion, stand: np.ndarray) -> tuple[float, list[Clip]] | None:
+    """Returns the clips of a candidate and their score, lower is better; None if it does not show the motion."""
+    score = 0.0
+    if motion.kind == "loop":
+        clips = [Clip(name, "loop", gaits.loop(take), motion.text)]
+    elif motion.kind == "turn":
+        turn = gaits.turn(take, motion.degrees, stand)
+        if turn is None:
+            return None
+        clips = [Clip(name, "turn", turn, motion.text)]
+    else:
+        cycle = gaits.find_cycle(take, motion.degrees)
+        if cycle is None:
+            return None
+        score = 100 * cycle.difference
+        parts = gaits.gait(take, cycle, motion.degrees, stand)
+        kinds = ("start", "loop", "stop")
+        clips = [
+            Clip(f"{name}_{kind.capitalize()}", kind, part, motion.text)
+            for kind, part in zip(kinds, parts, strict=True)
+        ]
+    faulty = sum(fault.end - fault.start for clip in clips for fault in find_faults(motion_of(clip)))
+    return score + SLIDING * max(slide(clip.motion) for clip in clips) + FAULTY * faulty, clips
+
+
+def _missing(motion: SetMotion) -> str:
+    if motion.kind == "gait":
+        return f"goes steadily in the direction of {motion.degrees:g} degrees"
+    return f"turns by {motion.degrees:g} degrees"
+
+
+def motion_of(clip: Clip) -> Motion:
+    """Returns a clip as a motion on its path."""
+    return Motion(clip.motion.world(), clip.motion.fps, SMPL22, clip.name, clip.name)
+
+
+def rig_clips(clips: list[Clip], rig: str | None, body: Mesh | None = None) -> list[RiggedClip]:
+    """Returns clips in place on one skeleton, with one skin; rotations of all clips are solved for together.
+
+    Programs apply all animations of a set to the skeleton of the first file, so the rest pose must be the same.
+    """
+    fps = clips[0].motion.fps
+    joints, frames = gaits.with_neighbors(clips, round(SEPARATION * fps))
+    motion = Motion(joints, fps, SMPL22)
+    poses = motion.posed()
+    whole = rigged(poses, "", fps, preset(rig, poses), fit_body(motion, body))
+    return [whole.part(part, clip.name, clip.motion.contacts) for part, clip in zip(frames, clips, strict=True)]
+
+
+def write_set(folder: Path, made: MadeSet, content: MotionSet, facts: Mapping[str, Any], body: Mesh) -> list[str]:
+    """Writes the files of a set into a folder, all or none; returns their names.
+
+    Each clip is a file with the path of the root and a file in place. `set.json` describes them, `set.png` and
+    `player.html` show them.
+    """
+    in_place = rig_clips(made.clips, content.rig, body)
+    entries = []
+    with atomic_folder(folder) as temporary:
+        pairs = list(zip(made.clips, in_place, strict=True))
+        for clip, still in ProgressBar(pairs, desc="write", unit="clip"):
+            name = f"{content.prefix}{clip.name}"
+            files = {"root_motion": f"{name}.{content.format}", "in_place": f"{name}{IN_PLACE}.{content.format}"}
+            moved = still.on_path(clip.motion.path, clip.motion.heading)
+            for key, variant in (("root_motion", moved), ("in_place", still)):
+                WRITERS[content.format](temporary / files[key], replace(variant, name=Path(files[key]).stem))
+            entries.append(_entry(clip, still, files))
+        shown = [motion_of(clip) for clip in made.clips]
+        contact_sheet(temporary / "set.png", shown, size=144, body=body)
+        write_player(temporary / "player.html", shown, "Set of motions", body=body)
+        listed = {"clips": entries, "left_out": made.left_out}
+        write_json(temporary / "set.json", {"fps": content.fps, "rig": content.rig, **facts, **listed})
+        names = sorted(path.name for path in temporary.iterdir())
+    return names
+
+
+def _entry(clip: Clip, still: RiggedClip, files: Mapping[str, str]) -> dict[str, Any]:
+    """Returns what `set.json` says about a clip; lengths in meters, angles in degrees, times in seconds."""
+    motion = clip.motion
+    seconds = (len(motion) - 1) / motion.fps
+    travel = motion.path[-1] - motion.path[0]
+    steps = np.linalg.norm(np.diff(motion.path, axis=0), axis=1) * motion.fps
+    entry: dict[str, Any] = {
+        "name": clip.name,
+        "kind": clip.kind,
+        "text": clip.text,
+        "files": dict(files),
+        "frames": len(motion),
+        "seconds": round(seconds, 4),
+        "travel": [round(float(value), 4) for value in travel],
+        "turn": round(float(np.degrees(motion.heading[-1] - motion.heading[0])), 2),
+        "speed": [round(float(steps[0]), 3), round(float(steps[-1]), 3)],
+        "slide": round(slide(motion), 4),
+    }
+    if clip.kind == "loop":
+        distance, angle = closure(still)
+        entry["closure"] = {"meters": round(distance, 5), "degrees": round(angle, 3)}
+    entry["planted_at_start"] = dict(zip(("left", "right"), motion.contacts[0].tolist(), strict=True))
+    entry["contacts"] = [event._asdict() for event in contact_events(motion.contacts, motion.fps)]
+    return entry
+
+
+def closure(clip: RiggedClip) -> tuple[float, float]:
+    """Returns how far the last pose of a clip in place is from the first: meters, and degrees of local rotations."""
+    positions, _ = clip.world()
+    distance = float(np.linalg.norm(positions[-1] - positions[0], axis=-1).max())
+    cosines = (np.trace(clip.turns[0].mT @ clip.turns[-1], axis1=-2, axis2=-1) - 1) / 2
+    return distance, float(np.degrees(np.arccos(np.clip(cosines, -1, 1))).max())

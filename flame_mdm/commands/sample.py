@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from statistics import mean
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from flame_mdm.commands import OutputSettings, WritingSettings, model_source, motion_file
 from flame_mdm.config.options import option, same_option
-from flame_mdm.errors import UserError, say
+from flame_mdm.errors import UserError, say, shortened
 from flame_mdm.formats import WRITTEN
 from flame_mdm.safe_io.paths import check_within
+from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.sampling.motion_request import SamplingRequest
 from flame_mdm.sampling.prompt_file import PromptFile
 
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from flame_mdm.formats.motion import Motion
     from flame_mdm.generator import MotionGenerator
     from flame_mdm.sampling.generation import Score
+    from flame_mdm.sampling.motion_sets import MotionSet
     from flame_mdm.sampling.resolution import ResolvedRequest
     from flame_mdm.sampling.targets import Targets
     from flame_mdm.visualize.body import Mesh
@@ -36,11 +38,13 @@ class SampleSettings(OutputSettings, WritingSettings):
            flame-mdm sample CKPT text="walks forward" path="0,1 0.5,2" | targets=FILE.json
            flame-mdm sample CKPT text="jumps" candidates=8 [scorer=RUN]
            flame-mdm sample CKPT prompts=FILE.txt [seconds=[2,3.5,...]] [mp4=true]
+           flame-mdm sample CKPT set=locomotion OUT [rig=unity] [format=glb]
            flame-mdm sample CKPT action=walk
            flame-mdm sample CKPT unconditioned=true
 
     Writes motions (.npz), a GIF, and a player that opens in any browser. A file of prompts has one per line; each gets
     its own folder, and one page shows all. Prompts that cannot be sampled are named at the end, and the exit code is 1.
+    A set is a folder of clips that fit together, for game engines: loops, starts, stops and turns.
     If OUT is a file, .fbx, .glb, .bvh, .usdz, .vrma, .npz, .json, .npy, .mp4 or .gif, only this file is written.
     """
 
@@ -53,6 +57,10 @@ class SampleSettings(OutputSettings, WritingSettings):
     loop: bool = same_option(SamplingRequest, "loop")
     path: str | None = same_option(SamplingRequest, "path")
     candidates: int = same_option(SamplingRequest, "candidates")
+    set: str | None = option(
+        None, "instead of text: locomotion, or a .yaml file: docs/sampling.md#sets-for-game-engines"
+    )
+    format: str | None = option(None, "format of the files of a set: fbx, glb, usda, usdc or usdz")
     scorer: str | None = option(None, "a motion-CLIP that chooses the candidate that fits the text best", model_source)
     shared_noise: bool = same_option(SamplingRequest, "shared_noise")
     samples: int | None = option(None, "motions per text or action; default 3, or 1 if OUT is a file")
@@ -66,6 +74,19 @@ class SampleSettings(OutputSettings, WritingSettings):
 
     def check_output(self) -> None:
         """Raises `UserError` for keys that do not fit the kind of output."""
+        if self.set is not None:
+            of_sets = {"out", "set", "format", "rig", "resample", "seed", "body", "device", "ckpt", "which"}
+            of_sets |= {"adapter", "adapter_strength", *(entry.name for entry in fields(SamplerOptions))}
+            for entry in fields(self):
+                value = getattr(self, entry.name)
+                if entry.name not in of_sets and value != entry.default:
+                    shown = f"{entry.name}={shortened(str(value), 60)}"
+                    raise UserError(f"{shown}: a set says what is sampled, and how it is cut. Omit {entry.name}")
+            if self.file is not None:
+                raise UserError(f"out={self.out}: a set is several files. Name a folder")
+            return
+        if self.format is not None:
+            raise UserError(f"format={self.format} is for sets; the ending of OUT is the format of one file")
         if self.file is None:
             for key in ("rig", "root_motion", "resample", "character"):
                 if value := getattr(self, key):
@@ -76,6 +97,13 @@ class SampleSettings(OutputSettings, WritingSettings):
             if value := getattr(self, key):
                 advice = "Name a folder, or omit out"
                 raise UserError(f"{key}={str(value).lower()}: {self.out} is a single motion file. {advice}")
+
+    def set_content(self, source: str) -> MotionSet:
+        """Returns the description of a set, changed by the keys that say how it is written."""
+        from flame_mdm.sampling.motion_sets import changed, read_set
+
+        keys = {"rig": self.rig, "format": self.format, "fps": self.resample}
+        return changed(read_set(source), **{key: value for key, value in keys.items() if value is not None})
 
     def conditions(self) -> list[str]:
         return [*super().conditions(), *(["prompts"] if self.prompts is not None else [])]
@@ -102,6 +130,9 @@ class SampleSettings(OutputSettings, WritingSettings):
 
 def main(settings: SampleSettings) -> None:
     settings.check_output()
+    if settings.set is not None:
+        _sample_set(settings, settings.set)
+        return
     prompts = None if settings.prompts is None else PromptFile.read(settings.prompts)
     if prompts is None or prompts.accepted:
         _sample(settings, settings.request_for(prompts), prompts)
@@ -153,6 +184,28 @@ def _sample(settings: SampleSettings, request: SamplingRequest, prompts: PromptF
             say(_distance(resolved.targets, written))
     if prompts is not None:
         say(_gallery(prompts, folders, loaded.body))
+
+
+def _sample_set(settings: SampleSettings, source: str) -> None:
+    """Samples and writes a set of clips."""
+    content = settings.set_content(source)
+    request = settings.request(texts=[motion.text for motion in content.motions.values()], samples=1)
+    loaded = settings.load(request)
+    from flame_mdm.sampling.motion_sets import make_set, write_set
+    from flame_mdm.sampling.output import SAMPLES, default_folder
+
+    options = {entry.name: getattr(settings, entry.name) for entry in fields(SamplerOptions)}
+    made = make_set(loaded.model, content, settings.seed, **options)
+    say(*(f"left out: {name}: {reason}" for name, reason in made.left_out.items()))
+    if settings.out is None:
+        general = (content.model_dump(), options, settings.seed, settings.adapter, settings.adapter_strength)
+        folder = default_folder(loaded.model, Path(source).stem, loaded.sha256, *general)
+    else:
+        folder = Path(settings.out)
+    check_within(folder, settings.out or SAMPLES)
+    facts = {"set": Path(source).stem, "seed": settings.seed, "checkpoint": loaded.sha256}
+    write_set(folder, made, content, facts, loaded.body)
+    say(f"{len(made.clips)} clips, each with its path and in place: {folder / 'player.html'}, set.png, set.json")
 
 
 def _write_files(

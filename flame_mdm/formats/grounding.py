@@ -10,15 +10,16 @@ Arrays hold F frames and the 22 joints of SMPL, in meters, y up. Angles are radi
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import binary_closing, binary_opening, gaussian_filter1d
+from scipy.ndimage import binary_closing, binary_opening, gaussian_filter1d, maximum_filter1d
 
-from flame_mdm.formats.cleanup import bend
+from flame_mdm.formats.cleanup import REACH, bend
 from flame_mdm.representations.skeleton import JOINT, SMPL22
 
 SMOOTHNESS = 0.15  # seconds over which the path of the root is smoothed, so that it does not follow single steps
 LOW = 0.05  # height in meters above its lowest height at which a toe touches the floor
 SLOW = 0.25  # speed in m/s of a toe over the floor below which it is planted
 SHORT = 0.1  # seconds; shorter contacts, and shorter gaps between contacts, are left out
+LOWERING = 0.2  # seconds in which the body is lowered for a leg that is too short
 COPIES = 3  # repetitions of a loop that are planted together; the middle one has neighbors on both sides
 FEET = tuple(tuple(JOINT[f"{side}_{name}"] for name in ("hip", "knee", "ankle", "foot")) for side in ("left", "right"))
 """Joints of the legs, the left one first."""
@@ -139,14 +140,39 @@ def runs(flags: np.ndarray) -> list[tuple[int, int]]:
 def planted(motion: GroundedMotion, *, fixed_start: bool = False, fixed_end: bool = False) -> GroundedMotion:
     """Returns the motion with toes that do not move during their contacts.
 
-    With `fixed_start` and `fixed_end`, the first and the last pose do not change: a foot that is planted there stays
-    where this pose has it.
+    The body is lowered where a leg would be too short. With `fixed_start` and `fixed_end`, the first and the last pose
+    do not change: a foot that is planted there stays where this pose has it.
     """
     world = motion.world()
-    for leg, flags in zip(FEET, motion.contacts.T, strict=True):
-        shift = _shift(world[:, leg[-1]], flags, fixed_start, fixed_end)
+    shifts = [
+        _shift(world[:, leg[-1]], flags, fixed_start, fixed_end)
+        for leg, flags in zip(FEET, motion.contacts.T, strict=True)
+    ]
+    lack = np.max([_lack(world, leg, shift) for leg, shift in zip(FEET, shifts, strict=True)], axis=0)
+    if lack.any():
+        width = LOWERING * motion.fps
+        drop = gaussian_filter1d(maximum_filter1d(lack, 2 * round(width) + 1), width / 2, mode="nearest")
+        frames = np.arange(len(motion))
+        if fixed_start:
+            drop *= np.clip(frames / width, 0, 1)
+        if fixed_end:
+            drop *= np.clip(frames[::-1] / width, 0, 1)
+        world[..., 1] -= drop[:, None]
+        for shift in shifts:
+            shift[:, 1] += drop
+    for leg, shift in zip(FEET, shifts, strict=True):
         bend(world, leg, shift)
     return motion.with_world(world)
+
+
+def _lack(world: np.ndarray, leg: tuple[int, ...], shift: np.ndarray) -> np.ndarray:
+    """Returns by how much (F,) the hip of a leg is too high for a foot that is moved by `shift` (F, 3)."""
+    hip, knee, ankle = (world[:, joint] for joint in leg[:3])
+    length = np.linalg.norm(knee - hip, axis=1) + np.linalg.norm(ankle - knee, axis=1)
+    reach = np.maximum(REACH * length, np.linalg.norm(ankle - hip, axis=1))
+    x, height, z = (hip - ankle - shift).T
+    highest = np.sqrt(np.maximum(reach**2 - x**2 - z**2, 0))
+    return np.maximum(height - highest, 0)
 
 
 def _shift(toe: np.ndarray, flags: np.ndarray, fixed_start: bool, fixed_end: bool) -> np.ndarray:

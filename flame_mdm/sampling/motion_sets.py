@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from pydantic import Field
 
-from flame_mdm.errors import UserError
+from flame_mdm.errors import UserError, did_you_mean
 from flame_mdm.formats import fbx_writer, gaits, glb_writer, usd
 from flame_mdm.formats.body import fit_body
 from flame_mdm.formats.cleanup import cleaned
@@ -75,7 +75,8 @@ def read_set(source: str) -> MotionSet:
     if source in names:
         path = SETS / f"{source}.yaml"
     elif path.suffix not in (".yaml", ".yml"):
-        raise UserError(f"set={source}: no such set. Use {', '.join(names)}, or a .yaml file")
+        near = did_you_mean(source, names)
+        raise UserError(f"set={source}: no such set.{near} Use {', '.join(names)}, or a .yaml file")
     try:
         content = check_shape(read_yaml(path), MotionSet)
     except UserError:
@@ -89,9 +90,25 @@ def read_set(source: str) -> MotionSet:
     for name, motion in content.motions.items():
         if motion.kind == "turn" and not motion.degrees:
             raise UserError(f"{path}: motions.{name} is a turn without degrees. Give degrees, 90 is to the left")
-    if content.rig is not None and content.rig not in presets():
-        raise UserError(f"{path}: rig is {content.rig}. Use one of {', '.join(presets())}, or null")
+    _check_rig(content, f"{path}: rig: ")
     return content
+
+
+def changed(content: MotionSet, **values: Any) -> MotionSet:
+    """Returns a set with other values of `rig`, `format` or `fps`; raises `UserError` if one is invalid."""
+    try:
+        content = check_shape(content.model_dump() | values, MotionSet)
+    except ValueError as error:
+        raise UserError(f"set: {error}") from error
+    _check_rig(content, "rig=")
+    return content
+
+
+def _check_rig(content: MotionSet, name: str) -> None:
+    if content.rig is not None and content.rig not in presets():
+        raise UserError(
+            f"{name}{content.rig}: unknown.{did_you_mean(content.rig, presets())} Use {', '.join(presets())}"
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,307 @@
+"""Sets of motions for game engines: clips whose ends fit together, feet that stay in place, files and descriptions."""
+
+import json
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.refusals import error_of
+
+import flame_mdm
+from flame_mdm.__main__ import main
+from flame_mdm.data.synthetic import example
+from flame_mdm.formats import fbx, fbx_scene, glb, glb_animation
+from flame_mdm.formats.gaits import Clip, find_cycle, gait, turn
+from flame_mdm.formats.grounding import GroundedMotion, grounded, planted, repeated, slide
+from flame_mdm.formats.motion import Motion
+from flame_mdm.representations.skeleton import JOINT
+from flame_mdm.sampling import motion_sets
+from flame_mdm.sampling.motion_sets import make_set, read_set, rig_clips, write_set
+from flame_mdm.sampling.reading import with_features
+from flame_mdm.visualize.body import mannequin
+
+CENTIMETER = 0.01
+SMALL = """
+stand: Idle
+fps: 30
+candidates: 1
+prefix: Hero_
+motions:
+  Idle: {kind: loop, text: a person stands, seconds: 2}
+  Walk: {kind: gait, text: a person walks, seconds: 3}
+  Turn: {kind: turn, text: a person turns, degrees: 90}
+  Strafe: {kind: gait, text: a person walks, degrees: 90}
+"""
+
+
+ATTRIBUTES: dict[str, dict[str, str]] = {
+    "a person stands": {"action": "stand"},
+    "a person walks": {"action": "walk", "direction": "forward", "speed": "fast"},
+    "a person waves": {"action": "wave"},
+    "a person turns": {"action": "turn", "direction": "left", "amount": "quarter"},
+}
+
+
+@cache
+def synthetic(text: str) -> Motion:
+    """A synthetic motion of three seconds."""
+    return Motion(example(ATTRIBUTES[text]), 20.0, text=text, id=text)
+
+
+@pytest.fixture(scope="module")
+def walk() -> GroundedMotion:
+    """A person who stands, walks forward, and stands."""
+    return grounded(synthetic("a person walks").joints, 20)
+
+
+@pytest.fixture(scope="module")
+def parts(walk: GroundedMotion) -> list[GroundedMotion]:
+    """Start, loop and stop of the walk; the person stands as in its first frame."""
+    cycle = find_cycle(walk, 0)
+    assert cycle is not None
+    return gait(walk, cycle, 0, walk.local[0])
+
+
+def test_a_motion_on_a_root_is_the_same_motion(walk: GroundedMotion):
+    np.testing.assert_allclose(walk.world(), synthetic("a person walks").joints, atol=1e-6)
+    cut = walk.cut(10, 30)
+    np.testing.assert_allclose(cut.path[0], 0)
+    assert cut.heading[0] == 0
+    np.testing.assert_allclose(cut.local, walk.local[10:31])
+
+
+def test_a_walk_becomes_a_start_a_loop_and_a_stop_that_fit_together(walk: GroundedMotion, parts: list[GroundedMotion]):
+    start, loop, stop = parts
+    np.testing.assert_array_equal(loop.local[-1], loop.local[0])
+    np.testing.assert_allclose(start.local[-1], loop.local[0], atol=1e-5)
+    np.testing.assert_allclose(stop.local[0], loop.local[0], atol=1e-5)
+    np.testing.assert_allclose(start.local[0], walk.local[0], atol=1e-5)
+    np.testing.assert_allclose(stop.local[-1], walk.local[0], atol=1e-5)
+    # a straight path, at a constant speed in the loop
+    for part in parts:
+        assert np.abs(part.path[:, 0]).max() < 1e-9
+        assert np.abs(part.heading).max() == 0
+        assert slide(part) < CENTIMETER
+    steps = np.diff(loop.path[:, 1])
+    np.testing.assert_allclose(steps, steps[0])
+    assert 1.5 < steps[0] * 20 < 2
+
+
+def test_no_joint_jumps_where_clips_meet(parts: list[GroundedMotion]):
+    start, loop, stop = parts
+    steps = np.abs(np.diff(repeated(loop).world(), axis=0)).max()
+    for before, after in ((start, loop), (loop, stop)):
+        move = after.local[1] - after.local[0]
+        assert np.abs(move - (before.local[-1] - before.local[-2])).max() < steps
+
+
+def test_a_gait_in_another_direction_is_not_taken(walk: GroundedMotion):
+    assert find_cycle(walk, 90) is None
+    assert find_cycle(walk, 180) is None
+    assert find_cycle(grounded(synthetic("a person waves").joints, 20), 0) is None
+
+
+def test_a_turn_has_exactly_the_angle_and_begins_and_ends_standing():
+    source = synthetic("a person turns")
+    motion = grounded(source.joints, 20)
+    degrees = float(np.degrees(motion.heading[-1] - motion.heading[0]))
+    wanted = 1.1 * degrees
+    clip = turn(motion, wanted, motion.local[0])
+    assert clip is not None
+    assert np.degrees(clip.heading[-1]) == pytest.approx(wanted)
+    np.testing.assert_allclose(clip.local[0], motion.local[0], atol=1e-9)
+    np.testing.assert_allclose(clip.local[-1], motion.local[0], atol=1e-9)
+    assert slide(clip) < CENTIMETER
+    assert turn(motion, -wanted, motion.local[0]) is None
+    assert turn(motion, 3 * degrees, motion.local[0]) is None
+
+
+def test_planted_feet_stay_where_a_fixed_pose_has_them(walk: GroundedMotion):
+    """A root that moves 5 % farther would let the feet slide."""
+    farther = GroundedMotion(walk.local, 1.05 * walk.path, walk.heading, walk.contacts, walk.fps)
+    assert slide(farther) > 0.5 * CENTIMETER
+    fixed = planted(farther, fixed_start=True, fixed_end=True)
+    assert slide(fixed) < 0.2 * CENTIMETER
+    for frame in (0, -1):
+        np.testing.assert_allclose(fixed.world()[frame], farther.world()[frame], atol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def model() -> flame_mdm.MotionGenerator:
+    return flame_mdm.load("quickstart")
+
+
+@pytest.fixture(scope="module")
+def small(model: flame_mdm.MotionGenerator, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a small set of synthetic motions, so that tests do not depend on what a model has learned."""
+
+    def generate(model: flame_mdm.MotionGenerator, text: str, *, samples: int, **options: Any) -> list[Motion]:
+        return [with_features(model.representation, synthetic(text)) for _ in range(samples)]
+
+    folder = tmp_path_factory.mktemp("small")
+    (folder / "small.yaml").write_text(SMALL)
+    content = read_set(str(folder / "small.yaml"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(motion_sets, "generate", generate)
+        made = make_set(model, content)
+    write_set(folder / "set", made, content, {"seed": 0}, mannequin())
+    return folder / "set"
+
+
+def described(folder: Path) -> dict[str, Any]:
+    """The entries of `set.json` by name."""
+    return {entry["name"]: entry for entry in json.loads((folder / "set.json").read_text())["clips"]}
+
+
+def test_a_set_has_files_with_a_path_and_in_place_and_a_description(small: Path):
+    clips = described(small)
+    assert list(clips) == ["Idle", "Walk_Start", "Walk_Loop", "Walk_Stop", "Turn"]
+    names = [f"Hero_{name}{end}.fbx" for name in clips for end in ("", "_InPlace")]
+    assert sorted(path.name for path in small.iterdir()) == sorted([*names, "player.html", "set.json", "set.png"])
+    content = json.loads((small / "set.json").read_text())
+    assert "goes steadily in the direction of 90 degrees" in content["left_out"]["Strafe"]
+
+    loop = clips["Walk_Loop"]
+    assert loop["closure"]["meters"] < CENTIMETER
+    assert loop["closure"]["degrees"] < 2
+    moving, still = (fbx_scene.read(small / loop["files"][key]) for key in ("root_motion", "in_place"))
+    assert len(still.positions) == len(moving.positions) == loop["frames"]
+    root = moving.names.index("root")
+    travel = moving.positions[-1, root] - moving.positions[0, root]
+    np.testing.assert_allclose(travel, [loop["travel"][0], 0, loop["travel"][1]], atol=1e-4)
+    np.testing.assert_allclose(still.positions[-1], still.positions[0], atol=1e-4)
+    # in place is the same motion without the path
+    bones = [number for number, name in enumerate(still.names) if name != "person"]
+    shift = moving.positions[:, root : root + 1] - still.positions[:, root : root + 1]
+    np.testing.assert_allclose((moving.positions - shift)[:, bones], still.positions[:, bones], atol=1e-4)
+
+
+def test_contacts_are_in_the_description_and_markers_in_the_files(small: Path, tmp_path: Path):
+    start = described(small)["Walk_Start"]
+    objects = fbx.read(small / start["files"]["root_motion"]).first("Objects")
+    assert objects is not None
+    curves = [node for node in objects.all("AnimationCurveNode") if "LeftFootContact" in node.properties[1]]
+    assert len(curves) == 1
+    events = start["contacts"]
+    assert {event["event"] for event in events} == {"plant", "lift"}
+    assert [event["time"] for event in events] == sorted(event["time"] for event in events)
+    assert all(event["time"] == pytest.approx(event["frame"] / 30, abs=1e-4) for event in events)
+    assert start["planted_at_start"] == {"left": True, "right": True}
+
+    motion = grounded(synthetic("a person walks").joints, 20)
+    (clip,) = rig_clips([Clip("walk", "start", motion, "a walk")], "unreal")
+    motion_sets.WRITERS["glb"](tmp_path / "walk.glb", clip)
+    markers = glb.read(tmp_path / "walk.glb").document["animations"][0]["extras"]["markers"]
+    assert {(marker["foot"], marker["event"]) for marker in markers} == {
+        (foot, event) for foot in ("left", "right") for event in ("plant", "lift")
+    }
+
+
+def test_a_rig_without_a_root_moves_its_hips(tmp_path: Path):
+    motion = grounded(synthetic("a person turns").joints, 20)
+    (clip,) = rig_clips([Clip("turn", "turn", motion, "")], "mixamo")
+    across = []
+    for name, variant in (("moving", clip.on_path(motion.path, motion.heading)), ("still", clip)):
+        motion_sets.WRITERS["glb"](tmp_path / f"{name}.glb", variant)
+        read = glb_animation.read(tmp_path / f"{name}.glb")
+        left, right = (read.positions[:, read.names.index(f"mixamorig:{side}UpLeg")] for side in ("Left", "Right"))
+        across.append(left - right)
+        if name == "moving":
+            middle = (left + right)[:, [0, 2]] / 2
+            joints = motion.world()[:, [JOINT["left_hip"], JOINT["right_hip"]]].mean(1)
+            np.testing.assert_allclose(middle, joints[:, [0, 2]], atol=1e-3)
+    angles = [np.degrees(np.unwrap(np.arctan2(-bone[:, 2], bone[:, 0]))) for bone in across]
+    np.testing.assert_allclose(angles[0] - angles[1], np.degrees(motion.heading), atol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"stand: Idle": "stand: Walk"}, "stand is Walk, which is no motion with kind: loop"),
+        ({", degrees: 90}\n  Strafe": "}\n  Strafe"}, "motions.Turn is a turn without degrees"),
+        ({"fps: 30": "fps: 0"}, "fps is 0"),
+        ({"fps: 30": "rate: 30"}, "unknown key: rate"),
+        ({"prefix: Hero_": "prefix: ../up"}, 'prefix is "../up"'),
+        ({"  Turn": "  ../Turn"}, "../Turn"),
+        ({"fps: 30": "rig: unrael"}, "Did you mean unreal"),
+    ],
+)
+def test_an_invalid_description_is_refused_in_one_line(change, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    text = SMALL
+    for before, after in change.items():
+        assert before in text
+        text = text.replace(before, after)
+    (tmp_path / "my.yaml").write_text(text)
+    assert message in error_of(capsys, "sample", "quickstart", "set=my.yaml", "out=set")
+    assert [path.name for path in tmp_path.iterdir()] == ["my.yaml"]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["set=locomotoin"], "no such set. Did you mean locomotion?"),
+        (["set=locomotion", "text=a person walks"], "text=a person walks: a set says what is sampled"),
+        (["set=locomotion", "samples=2"], "samples=2: a set says what is sampled"),
+        (["set=locomotion", "out=walk.fbx"], "out=walk.fbx: a set is several files. Name a folder"),
+        (["set=locomotion", "format=bvh"], 'format is "bvh"'),
+        (["text=a person walks", "format=fbx"], "format=fbx is for sets"),
+    ],
+)
+def test_keys_that_do_not_fit_a_set_are_refused(words: Sequence[str], message: str, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert message in error_of(capsys, "sample", "quickstart", *words)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture(scope="session")
+def locomotion(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the package's set, by the package's model."""
+    folder = tmp_path_factory.mktemp("locomotion") / "set"
+    assert main(["sample", "quickstart", "set=locomotion", f"out={folder}"]) == 0
+    return folder
+
+
+@pytest.mark.slow
+def test_the_locomotion_set_of_the_package_closes_its_loops_and_plants_its_feet(locomotion: Path):
+    clips = described(locomotion)
+    assert json.loads((locomotion / "set.json").read_text())["left_out"] == {}
+    assert len(clips) == 20
+    stand = fbx_scene.read(locomotion / clips["Idle"]["files"]["in_place"])
+    for name, entry in clips.items():
+        moving, still = (fbx_scene.read(locomotion / entry["files"][key]) for key in ("root_motion", "in_place"))
+        bones = [number for number, bone in enumerate(still.names) if bone != "person"]
+        if entry["kind"] == "loop":
+            closes = np.abs(still.positions[-1] - still.positions[0])[bones].max()
+            assert closes < CENTIMETER, name
+            assert entry["closure"]["degrees"] < 2, name
+        if entry["kind"] in ("start", "turn"):
+            assert np.abs(still.positions[0] - stand.positions[0])[bones].max() < CENTIMETER, name
+        if entry["kind"] in ("stop", "turn"):
+            assert np.abs(still.positions[-1] - stand.positions[0])[bones].max() < CENTIMETER, name
+        if entry["kind"] == "turn":
+            requested = int(name.split("_")[1]) * (1 if name.endswith("Left") else -1)
+            assert entry["turn"] == requested, name
+        for foot, bone in (("left", "ball_l"), ("right", "ball_r")):
+            toe = moving.positions[:, moving.names.index(bone)][:, [0, 2]]
+            for first, last in contacts(entry, foot):
+                moved = np.linalg.norm(toe[first : last + 1] - toe[first], axis=1).max()
+                assert moved < CENTIMETER, (name, foot, first)
+
+
+def contacts(entry: dict[str, Any], foot: str) -> list[tuple[int, int]]:
+    """First and last frame of each contact of a foot."""
+    begin = 0 if entry["planted_at_start"][foot] else None
+    spans = []
+    for event in entry["contacts"]:
+        if event["foot"] != foot:
+            continue
+        if event["event"] == "plant":
+            begin = event["frame"]
+        elif begin is not None:
+            spans.append((begin, event["frame"] - 1))
+            begin = None
+    return [*spans, (begin, entry["frames"] - 1)] if begin is not None else spans

@@ -276,6 +276,7 @@ INSIDE = "in the temporary folder that the caller has opened"
 MAY_WRITE = {
     "flame_mdm.checkpoints.onnx_export": {"_shrink: onnx.save": INSIDE, "write_graph: program.save": INSIDE},
     "flame_mdm.commands.convert": {"_convert: motion.save": PUBLIC},
+    "flame_mdm.commands.sample": {"_write_files: written.save": PUBLIC},
     "flame_mdm.data.store": {
         "_pack: (folder / 'features.npy').open": INSIDE,
         "_pack: zipfile.ZipFile": INSIDE,

@@ -12,7 +12,7 @@ from support.refusals import error_of
 
 import flame_mdm
 from flame_mdm.__main__ import main
-from flame_mdm.data.synthetic import example
+from flame_mdm.data.synthetic import Attributes, example
 from flame_mdm.formats import fbx, fbx_scene, glb, glb_animation
 from flame_mdm.formats.gaits import Clip, find_cycle, gait, turn
 from flame_mdm.formats.grounding import GroundedMotion, grounded, planted, repeated, slide
@@ -37,7 +37,7 @@ motions:
 """
 
 
-ATTRIBUTES: dict[str, dict[str, str]] = {
+ATTRIBUTES: dict[str, Attributes] = {
     "a person stands": {"action": "stand"},
     "a person walks": {"action": "walk", "direction": "forward", "speed": "fast"},
     "a person waves": {"action": "wave"},

@@ -79,7 +79,8 @@ def turned(points: np.ndarray, angles: np.ndarray | float) -> np.ndarray:
 
 def facing(joints: np.ndarray) -> np.ndarray:
     """Returns the direction (F,) that hips and shoulders face, without jumps of a full turn."""
-    left = sum(joints[:, JOINT[f"left_{name}"]] - joints[:, JOINT[f"right_{name}"]] for name in ("hip", "shoulder"))
+    right_hip, left_hip, right_shoulder, left_shoulder = (joints[:, joint] for joint in SMPL22.facing)
+    left = left_hip - right_hip + left_shoulder - right_shoulder
     return np.unwrap(np.arctan2(-left[:, 2], left[:, 0]))
 
 
@@ -184,10 +185,10 @@ def _shift(toe: np.ndarray, flags: np.ndarray, fixed_start: bool, fixed_end: boo
         frames, shifts = [0], [np.zeros(3)]
     for begin, end in runs(flags):
         at_start, at_end = fixed_start and begin == 0, fixed_end and end == last
-        place = toe[begin : end + 1].mean(0)
+        footprint = toe[begin : end + 1].mean(0)
         if at_start or at_end:
-            place = toe[0] if at_start else toe[last]
-        target = np.tile(place, (end + 1 - begin, 1))
+            footprint = toe[0] if at_start else toe[last]
+        target = np.tile(footprint, (end + 1 - begin, 1))
         if at_start and at_end:  # it cannot stay in place between two given poses
             target = np.linspace(toe[0], toe[last], len(target))
         frames += range(begin, end + 1)
@@ -199,14 +200,14 @@ def _shift(toe: np.ndarray, flags: np.ndarray, fixed_start: bool, fixed_end: boo
         return np.zeros_like(toe)
 
     # between two contacts, the shift changes with zero speed at both ends
-    known = np.array(shifts)
+    fixed = np.array(shifts)
     after = np.clip(np.searchsorted(frames, np.arange(last + 1)), 0, len(frames) - 1)
     before = np.maximum(after - 1, 0)
     at = np.array(frames)
     span = np.maximum(at[after] - at[before], 1)
     share = np.clip((np.arange(last + 1) - at[before]) / span, 0, 1)[:, None]
     share = share**2 * (3 - 2 * share)
-    return (1 - share) * known[before] + share * known[after]
+    return (1 - share) * fixed[before] + share * fixed[after]
 
 
 def repeated(motion: GroundedMotion, copies: int = COPIES) -> GroundedMotion:
@@ -215,17 +216,17 @@ def repeated(motion: GroundedMotion, copies: int = COPIES) -> GroundedMotion:
     turn = motion.heading[-1] - motion.heading[0]
     count = len(motion) - 1
     paths, headings = [], []
-    place, heading = motion.path[0].copy(), float(motion.heading[0])
+    start, heading = motion.path[0].copy(), float(motion.heading[0])
     away = np.zeros((count + 1, 3))
     away[:, [0, 2]] = motion.path - motion.path[0]
     for _ in range(copies):
-        paths.append(place + turned(away, heading - motion.heading[0])[:count, [0, 2]])
+        paths.append(start + turned(away, heading - motion.heading[0])[:count, [0, 2]])
         headings.append(motion.heading[:count] + heading - motion.heading[0])
-        place = place + turned(step, heading)[[0, 2]]
+        start = start + turned(step, heading)[[0, 2]]
         heading += turn
     return GroundedMotion(
         local=np.concatenate([*[motion.local[:count]] * copies, motion.local[-1:]]),
-        path=np.concatenate([*paths, place[None]]),
+        path=np.concatenate([*paths, start[None]]),
         heading=np.concatenate([*headings, [heading]]),
         contacts=np.concatenate([*[motion.contacts[:count]] * copies, motion.contacts[-1:]]),
         fps=motion.fps,

@@ -1,4 +1,4 @@
-"""Errors that the user can fix, suggestions for misspelled names, and safe output."""
+"""Errors that the user can fix, suggestions for misspelled names, old names, and safe output."""
 
 import difflib
 import html
@@ -6,8 +6,9 @@ import os
 import re
 import sys
 import unicodedata
-from collections.abc import Iterable
-from typing import TextIO
+import warnings
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, TextIO
 
 MAX_LINE = 2_000
 """Maximum length of an error line, whose middle is left out beyond; the framework's own messages are shorter."""
@@ -91,3 +92,22 @@ def drop(stream: TextIO) -> None:
 
 def _escaped(char: str) -> str:
     return char.encode("unicode_escape").decode("ascii")
+
+
+def renamed_names(module: str, names: Mapping[str, str], since: str) -> Callable[[str], Any]:
+    """Returns a `__getattr__` for a module in which names were changed; the old ones work for one minor version.
+
+    Args:
+        module: `__name__` of the module.
+        names: old name -> new name.
+        since: version in which they were renamed.
+    """
+
+    def get(name: str) -> Any:
+        if name not in names:
+            raise AttributeError(f"module {module!r} has no attribute {name!r}")
+        message = f"{module}.{name} is called {names[name]} since version {since}"
+        warnings.warn(message, DeprecationWarning, stacklevel=2)
+        return getattr(sys.modules[module], names[name])
+
+    return get

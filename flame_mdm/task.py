@@ -19,7 +19,7 @@ from flame_mdm.conditions.target import TargetConditions
 from flame_mdm.conditions.vocabulary import vocabulary
 from flame_mdm.config import Config, instantiate
 from flame_mdm.data.datamodule import MotionDataModule
-from flame_mdm.errors import UserError
+from flame_mdm.errors import UserError, renamed_names
 from flame_mdm.generator import Model, MotionGenerator, Parts, sampling_defaults
 from flame_mdm.losses import MotionLosses
 from flame_mdm.representations import Representation
@@ -307,3 +307,6 @@ def _name_as_task(task: GeneratorTask, state: dict[str, Any], prefix: str, *_: o
     """Adds "generator." to the names of the weights that are read."""
     for name in [name for name in state if name.startswith(prefix)]:
         state[f"{prefix}generator.{name.removeprefix(prefix)}"] = state.pop(name)
+
+
+__getattr__ = renamed_names(__name__, {"MotionGeneration": "GeneratorTask"}, since="0.3")

@@ -13,7 +13,7 @@ from flame_mdm.batch import Condition, Denoise, MotionBatch
 from flame_mdm.checkpoints.loading import PARTS, find, load_task
 from flame_mdm.checkpoints.model_files import weights_sha256
 from flame_mdm.config import Config, flatten
-from flame_mdm.errors import UserError
+from flame_mdm.errors import UserError, renamed_names
 from flame_mdm.generator import DistilledGenerator, MotionGenerator
 from flame_mdm.processes.consistency import consistency_terms
 from flame_mdm.processes.guidance import classifier_free_guidance
@@ -140,3 +140,6 @@ def read_teacher(path: Path) -> MotionGenerator:
         what = "predicts noise, whose clean estimate is divided by almost nothing at the noisiest times"
         raise UserError(f"{path}: {what}. Give a model that predicts the clean motion or the velocity (MDM, MFM)")
     return teacher
+
+
+__getattr__ = renamed_names(__name__, {"ConsistencyDistillation": "DistillationTask"}, since="0.3")

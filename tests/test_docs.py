@@ -24,6 +24,7 @@ from support.motions import synthetic
 from flame_mdm.__main__ import COMMANDS
 from flame_mdm.config import composition, guarded, sweeps
 from flame_mdm.config.command_line import make_variables, read_settings
+from flame_mdm.config.jobs import run_jobs
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 OWN = ("mine", "my_", "NAME", "...")
@@ -104,8 +105,14 @@ def is_composed(program: str, command: str, words: Sequence[str]) -> bool:
         if command == "train":
             return main.func(lambda config: None, *main.args[1:], words) == 0
         words = [word for word in words if word != "--help"]
+        settings = get_type_hints(main)["settings"]
+        sweeps_or_launches = any(word == "--multirun" or word.startswith("launch=") for word in words)
+        if sweeps_or_launches and getattr(settings, "SWEEPS", False):
+            # models have to exist
+            words = ["quickstart", *(word for word in words[1:] if not word.startswith("extractor="))]
+            return run_jobs(lambda settings: None, settings, words) == 0
         # files need not exist
-        return not words or guarded(lambda: read_settings(get_type_hints(main)["settings"], words)) == 0
+        return not words or guarded(lambda: read_settings(settings, words)) == 0
 
 
 @pytest.fixture

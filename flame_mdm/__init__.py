@@ -24,9 +24,10 @@ if TYPE_CHECKING:
     from flame_mdm.generator import MotionGenerator as MotionGenerator
     from flame_mdm.sampling.editing import edit
     from flame_mdm.sampling.generation import generate
+    from flame_mdm.sampling.streams import stream
     from flame_mdm.training.adaptation import adapt
 
-__all__ = ["Motion", "adapt", "edit", "generate", "load"]
+__all__ = ["Motion", "adapt", "edit", "generate", "load", "stream"]
 
 _MODULES = {
     "adapt": "training.adaptation",
@@ -35,6 +36,7 @@ _MODULES = {
     "generate": "sampling.generation",
     "Motion": "formats.motion",
     "edit": "sampling.editing",
+    "stream": "sampling.streams",
 }
 
 

@@ -232,7 +232,12 @@ def test_clips_without_a_frame_to_predict_are_refused_before_training(tmp_path, 
     assert "data.crop: a sample of 40 frames has none after a prefix of 40" in one_error(capsys)
 
 
-RUN = ["callbacks.samples=null", "logger=csv", "trainer.val_check_interval=2", "callbacks.checkpoints.every_n_steps=2"]
+RUN = [
+    "callbacks.samples=null",
+    "logger=tensorboard",
+    "trainer.val_check_interval=2",
+    "callbacks.checkpoints.every_n_steps=2",
+]
 
 
 @pytest.mark.slow

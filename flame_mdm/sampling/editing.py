@@ -110,6 +110,8 @@ def resolve_edit(
 ) -> ResolvedEdit:
     """Finds out which features of a motion `request.editing` keeps; see `edit` for the other arguments."""
     representation, editing = model.representation, request.editing or EditRequest()
+    if model.denoiser.context_frames:
+        raise UserError("this model continues frames and cannot edit. Use generate with after=, or another model")
     original = _original(representation, motion, fps, cut)
     length, longest = len(original.features), model.facts["max_frames"]
     if length > longest and not request.is_sequence:

@@ -21,6 +21,7 @@ from flame_mdm.sampling.motion_request import SamplingRequest
 from flame_mdm.sampling.reading import decoded
 from flame_mdm.sampling.resolution import ResolvedPrompt, ResolvedRequest, resolve
 from flame_mdm.sampling.sequences import overlap, windows
+from flame_mdm.sampling.streams import Schedule, Streams, starting_point
 
 BATCH = 32
 STAGES = 10  # number of clean estimates shown of one sampling run, as in figure 5 of MFM
@@ -83,6 +84,9 @@ def sample(
 ) -> list[Motion]:
     """Samples the motions of a resolved request in batches; see `generate` for the arguments and the result."""
     request = resolved.request
+    if model.denoiser.context_frames and (stages is not None or resolved.edit is not None):
+        keyword = "edit" if stages is None else "trajectory"
+        raise UserError(f"{keyword}: this model continues frames block by block, without {keyword}. Omit it")
     if stages is not None and request.candidates > 1:
         raise UserError("trajectory shows the estimates of a single motion: omit candidates or trajectory")
     rows = _rows(resolved)
@@ -144,6 +148,8 @@ def _sample(
     model: MotionGenerator, resolved: ResolvedRequest, rows: Sequence[_Row], trajectory: list[Tensor] | None
 ) -> list[Motion]:
     """Samples a batch of motions."""
+    if model.denoiser.context_frames:
+        return _sample_streams(model, resolved, rows)
     request, device = resolved.request, model.device
     lengths = [row.prompt.frames for row in rows]
     conditions = [row.prompt.conditions for row in rows]
@@ -169,6 +175,36 @@ def _sample(
         trajectory=trajectory,
     )
     return [_decoded(model, resolved, row, features) for row, features in zip(rows, x, strict=True)]
+
+
+def _sample_streams(model: MotionGenerator, resolved: ResolvedRequest, rows: Sequence[_Row]) -> list[Motion]:
+    """Samples motions as the beginnings of streams; with targets one by one, since their guidance is of one motion."""
+    if resolved.targets is not None and len(rows) > 1:
+        return [motion for row in rows for motion in _sample_streams(model, resolved, [row])]
+    request, before = resolved.request, resolved.before
+    prefix, placement = starting_point(model, None)
+    if before is not None:
+        features = before[-model.denoiser.context_frames :].to(model.device)
+        prefix = model.representation.normalize(features)[None]
+
+    # The noise depends on the first part alone, so that later parts change nothing before them.
+    numbers = [row.id.rpartition("#")[2] for row in rows]
+    first = [row.prompt.conditions[0] for row in rows]
+    ids = [f"{condition}#{number}" for condition, number in zip(first, numbers, strict=True)]
+    streams = Streams(
+        model,
+        ["shared"] * len(rows) if request.shared_noise else ids,
+        first,
+        prefix.expand(len(rows), -1, -1),
+        placement,
+        request.options,
+        kind=request.kind,
+        seed=request.seed,
+    )
+    streams.schedules = [Schedule.of_parts(row.prompt.conditions, row.prompt.frames) for row in rows]
+    streams.targets = resolved.targets
+    motions = streams.take([sum(row.prompt.frames) for row in rows])
+    return [_decoded(model, resolved, row, x) for row, x in zip(rows, motions, strict=True)]
 
 
 def _edit(model: MotionGenerator, resolved: ResolvedRequest, x: Tensor) -> Edit | None:

@@ -24,6 +24,7 @@ from flame_mdm.sampling.motion_request import (
 )
 from flame_mdm.sampling.reading import read_motion, with_features
 from flame_mdm.sampling.sequences import overlap, part_frames
+from flame_mdm.sampling.streams import check_streams
 from flame_mdm.sampling.targets import Targets, read_targets
 
 
@@ -143,6 +144,12 @@ def _collected(refused: dict[int, UserError] | None, number: int) -> Iterator[No
 def _check_model(request: SamplingRequest, model: MotionGenerator) -> None:
     """Checks what holds for all prompts: sampler, kind of condition, and windows."""
     model.process.find_sampler(request.options.over(model.sampler_options))
+    if model.denoiser.context_frames:
+        check_streams(model)
+        if request.loop:
+            raise UserError(
+                "loop=true: this model continues frames, and nothing leads back to the first one. Omit loop"
+            )
     if request.kind not in ("none", model.conditioned_on):
         trained, instead = TRAINED_ON[model.conditioned_on]
         raise UserError(f"{request.kind}={shortened(request.prompts[0], 60)}: this model {trained}. Give {instead}")
@@ -190,7 +197,8 @@ def _unknown_words(texts: Sequence[str], model: MotionGenerator) -> tuple[str, .
 def _continued(request: SamplingRequest, model: MotionGenerator) -> tuple[Tensor | None, Edit | None, tuple[str, ...]]:
     """Returns the features (F, D) of the motion to continue, the edit that keeps its last frames, and its notes.
 
-    These frames are generated again, so that the new frames fit to them. A motion in memory has no notes, because
+    These frames are generated again, so that the new frames fit to them. A model that continues frames reads them, and
+    needs no edit. A motion in memory has no notes, because
     whoever read it has them.
     """
     if request.after is None:
@@ -203,8 +211,11 @@ def _continued(request: SamplingRequest, model: MotionGenerator) -> tuple[Tensor
         notes = motion.notes
     motion = with_features(representation, motion)
     before = torch.from_numpy(motion.features)
-    if len(before) < shared:
-        raise UserError(f"after={motion.id}: {len(before)} frames are too short. Give at least {shared}")
+    least = shared or model.denoiser.context_frames
+    if len(before) < least:
+        raise UserError(f"after={motion.id}: {len(before)} frames are too short. Give at least {least}")
+    if not shared:
+        return before, None, notes
     ending = representation.normalize(before[-shared:].to(model.device))[None]
     return before, Edit(ending, torch.ones_like(ending, dtype=torch.bool)), notes
 

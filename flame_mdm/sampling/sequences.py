@@ -15,7 +15,9 @@ MAX_SECONDS = 600  # maximum length of a sequence; all its windows are denoised 
 
 
 def overlap(model: MotionGenerator) -> int:
-    """Returns the number of frames that neighboring windows share, which is even."""
+    """Returns the number of frames that neighboring windows share, which is even; 0 if the model continues frames."""
+    if model.denoiser.context_frames:
+        return 0
     return 2 * round(min(OVERLAP * model.representation.fps, model.facts["max_frames"] / 3) / 2)
 
 
@@ -33,7 +35,7 @@ def part_frames(
         loop: whether the last frame leads to the first one.
     """
     fps, longest = model.representation.fps, model.facts["max_frames"]
-    if is_sequence:
+    if is_sequence or model.denoiser.context_frames:
         return _sequence_frames(model, text, parts, usual, loop)
 
     length = min(round(3 * fps), longest) if usual is None else round(usual)
@@ -53,9 +55,12 @@ def _sequence_frames(
 ) -> list[int]:
     fps, shared = model.representation.fps, overlap(model)
     if usual is None:
-        usual = min(3 * fps, model.facts["max_frames"] - shared * (loop or len(parts) > 1))
+        fitting = model.facts["max_frames"] - shared * (loop or len(parts) > 1)
+        usual = 3 * fps if model.denoiser.context_frames else min(3 * fps, fitting)
     lengths = [round(usual if seconds is None else seconds * fps) for _, seconds in parts]
     for (name, _), length in zip(parts, lengths, strict=True):
+        if length < 1:
+            raise UserError(f"'{name}': {length / fps:g} seconds are too short. Give at least {1 / fps:g}")
         if length < shared:
             short = f"a part of {length / fps:g} seconds is too short"
             raise UserError(f"'{name}': {short}. Give at least {shared / fps:g}, which it shares with its neighbors")

@@ -77,19 +77,19 @@ class Goal(NamedTuple):
 class PositionGuide:
     """Leads motions to positions in the world; a `flame_mdm.batch.Guide`."""
 
-    representation: Representation
+    to_joints: Callable[[Tensor], Tensor]  # normalized features (..., F, D) -> joints (..., F, J, 3) in the world
+    fps: float
     positions: Positions
     bones: Tensor  # (3, N) frame, parent and child of the bones that keep their lengths
     poses: Tensor  # (1, F, D) features that are imposed in any case
     keep: Tensor  # and where
 
     def steer(self, clean: Callable[[Tensor], Tensor], x_t: Tensor) -> Tensor:
-        return steer(clean, x_t, self.representation.to_joints, self.positions)
+        return steer(clean, x_t, self.to_joints, self.positions)
 
     def reach(self, x0_hat: Tensor) -> Tensor:
         imposed, free = torch.where(self.keep, self.poses, x0_hat), ~self.keep.expand_as(x0_hat)
-        sigma = SMOOTHNESS * self.representation.fps
-        return reach(imposed, self.representation.to_joints, self.positions, self.bones, free, sigma)
+        return reach(imposed, self.to_joints, self.positions, self.bones, free, SMOOTHNESS * self.fps)
 
 
 @dataclass(frozen=True)
@@ -108,8 +108,45 @@ class Targets:
                 f"{(frames - 1) / fps:g} seconds. Give an earlier time, or more seconds"
             )
 
-    def edit(self, representation: Representation, frames: int, device: torch.device) -> Edit:
-        """Returns the edit (1, F, D) that leads to the targets: poses are imposed, positions guide the estimates."""
+    def window(self, begin: int, frames: int, here: Sequence[float]) -> "Targets":
+        """Returns the targets of the window of `frames` frames from `begin` on, with frames counted from there.
+
+        If the root is to be somewhere later, it goes part of the way in the window: `here` is its x and z at the start
+        of the window, from where, or from the last target of the root in the window, it moves at an even speed.
+        """
+        end = begin + frames
+        positions, inside = self.positions, (self.positions.frames >= begin) & (self.positions.frames < end)
+        columns = [positions.frames[inside] - begin, positions.joints[inside], positions.axes[inside]]
+        values = positions.values[inside]
+        for axis, start in ((0, here[0]), (2, here[1])):
+            of_root = (positions.joints == 0) & (positions.axes == axis)
+            later = of_root & (positions.frames >= end)
+            if not later.any() or (of_root & (positions.frames == end - 1)).any():
+                continue
+            goal = positions.frames.masked_fill(~later, int(positions.frames.max()) + 1).argmin()
+            since = begin - 1
+            if (passed := of_root & inside).any():
+                last = positions.frames.masked_fill(~passed, -1).argmax()
+                since, start = int(positions.frames[last]), float(positions.values[last])
+            share = (end - 1 - since) / (int(positions.frames[goal]) - since)
+            entry = (frames - 1, 0, axis)
+            columns = [torch.cat([x, x.new_tensor([value])]) for x, value in zip(columns, entry, strict=True)]
+            between = start + share * (float(positions.values[goal]) - start)
+            values = torch.cat([values, values.new_tensor([between])])
+        poses = tuple((frame - begin, features) for frame, features in self.poses if begin <= frame < end)
+        return Targets(Positions(columns[0], columns[1], columns[2], values), poses)
+
+    def edit(
+        self,
+        representation: Representation,
+        frames: int,
+        device: torch.device,
+        to_joints: Callable[[Tensor], Tensor] | None = None,
+    ) -> Edit:
+        """Returns the edit (1, F, D) that leads to the targets: poses are imposed, positions guide the estimates.
+
+        `to_joints` maps normalized features to joints in the world; default: motions start at the origin.
+        """
         imposed = torch.zeros(1, frames, representation.features, device=device)
         keep = torch.zeros_like(imposed, dtype=torch.bool)
         for frame, features in self.poses:
@@ -119,7 +156,8 @@ class Targets:
         stretched = sorted(set(self.positions.frames[self.positions.joints > 0].tolist()))  # not by moving the root
         edges = [(frame, *edge) for frame in stretched for edge in representation.skeleton.edges]
         bones = torch.tensor(edges, dtype=torch.long, device=device).reshape(-1, 3).T
-        guide = PositionGuide(representation, positions, bones, imposed, keep)
+        to_joints = representation.to_joints if to_joints is None else to_joints
+        guide = PositionGuide(to_joints, representation.fps, positions, bones, imposed, keep)
         return Edit(imposed, keep, guide=guide if len(positions.values) else None)
 
 

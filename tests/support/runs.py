@@ -46,6 +46,10 @@ RUN = [
 ]
 """Overrides of a run whose weights `reference` computes."""
 
+TINY_DIP = ["denoiser.latent_dim=16", "denoiser.ff_size=16", "denoiser.num_layers=1", "denoiser.num_heads=2"]
+TINY_DIP += ["condition.features=16", "process.num_train_timesteps=4", "task.num_inference_steps=4"]
+"""Overrides of the smallest model of `synthetic/dip`."""
+
 TWO = ["trainer.devices=2", "trainer.strategy=ddp"]
 
 ALARM = """
@@ -107,9 +111,9 @@ def reference(words: list[str], steps: int, name: str = "quickstart") -> dict[st
     return task.state_dict()
 
 
-def untrained(words: list[str], max_frames: int) -> MotionGenerator:
-    """The model of the quick-start experiment with random weights."""
-    config = compose("quickstart", words)
+def untrained(words: list[str], max_frames: int, name: str = "quickstart") -> MotionGenerator:
+    """The model of a recipe with random weights."""
+    config = compose(name, words)
     torch.manual_seed(0)
     model = MotionGenerator.build(config, instantiate(config["representation"]))
     model.facts |= {"max_frames": max_frames, "dataset": "synthetic", "fingerprint": "f00d"}

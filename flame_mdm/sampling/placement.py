@@ -1,0 +1,63 @@
+"""Places of bodies in the world: turns about the vertical and shifts over the floor, which join blocks of a motion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from flame_mdm.representations import Representation
+from flame_mdm.representations.rotation import rotate_y
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Turn (B,) in radians and shift (B, 3) in meters, y = 0, of B bodies in the world, float64."""
+
+    turn: Tensor
+    shift: Tensor
+
+    @classmethod
+    def origin(cls, count: int, device: torch.device) -> Placement:
+        """Returns the place in which nothing moves."""
+        turn = torch.zeros(count, dtype=torch.float64, device=device)
+        return cls(turn, torch.zeros(count, 3, dtype=torch.float64, device=device))
+
+    @classmethod
+    def fit(cls, local: Tensor, world: Tensor) -> Placement:
+        """Returns the place that moves poses `local` (B, J, 3) to `world` (B, J, 3) with the least squared error.
+
+        Heights are not changed. For equal poses, the error is 0 (Kabsch 1976, for a turn about one axis).
+        """
+        local, world = local.double(), world.double()
+        floor = local.new_tensor([1.0, 0.0, 1.0])
+        from_center, to_center = local.mean(1) * floor, world.mean(1) * floor
+        a, b = local - from_center[:, None], world - to_center[:, None]
+        sine = (a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]).sum(1)
+        cosine = (a[..., 0] * b[..., 0] + a[..., 2] * b[..., 2]).sum(1)
+        turn = torch.atan2(sine, cosine)
+        return cls(turn, to_center - rotate_y(from_center, turn))
+
+    def apply(self, joints: Tensor) -> Tensor:
+        """Moves joints (B, ..., 3) to the world, float64."""
+        ones = (1,) * (joints.ndim - 2)
+        turn = self.turn.view(-1, *ones).expand(joints.shape[:-1])
+        return rotate_y(joints.double(), turn) + self.shift.view(-1, *ones, 3)
+
+    def undo(self, points: Tensor) -> Tensor:
+        """Moves points (B, ..., 3) of the world to where `apply` would move them from."""
+        ones = (1,) * (points.ndim - 2)
+        turn = self.turn.view(-1, *ones).expand(points.shape[:-1])
+        return rotate_y(points.double() - self.shift.view(-1, *ones, 3), -turn)
+
+
+def step_after(representation: Representation, last: Tensor, world: Tensor) -> Placement:
+    """Returns the place of the frame after frames with features `last` (B, D) and joints `world` (B, J, 3).
+
+    A frame holds the turn and the step of the root to the next frame, so that this place does not depend on what the
+    next frame is. Motions are decoded from their first frame on, which then is where this place says.
+    """
+    joints = representation.decode(torch.stack([last, last], 1))
+    here = Placement.fit(joints[:, 0], world)
+    return Placement.fit(joints[:, 0], here.apply(joints[:, 1]))

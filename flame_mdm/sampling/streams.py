@@ -1,0 +1,399 @@
+# pyright: standard
+"""Streams: motions without an end, whose texts change while they run; each block continues the frames before it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Self, Unpack
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from flame_mdm.batch import Condition, Edit, MotionBatch
+from flame_mdm.conditions.target import SLOTS
+from flame_mdm.conditions.vocabulary import check_known
+from flame_mdm.data.synthetic_motions.body import Body
+from flame_mdm.errors import UserError
+from flame_mdm.formats.cleanup import cleanup as clean_joints
+from flame_mdm.formats.motion import Motion
+from flame_mdm.generator import Blocks, MotionGenerator
+from flame_mdm.representations import Representation
+from flame_mdm.representations.rotation import rotate_y
+from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.sampler_options import SamplerOptions
+from flame_mdm.sampling.keywords import SamplerKeywords
+from flame_mdm.sampling.motion_request import check_length
+from flame_mdm.sampling.placement import Placement, step_after
+from flame_mdm.sampling.reading import read_motion, with_features
+from flame_mdm.sampling.targets import Targets
+
+
+def stream(
+    model: MotionGenerator,
+    text: str,
+    start: str | Path | Motion | None = None,
+    seed: int = 0,
+    *,
+    block: int | None = None,
+    cleanup: bool = False,
+    **options: Unpack[SamplerKeywords],
+) -> Stream:
+    """Starts a motion without an end, whose text can be changed at any time.
+
+    Args:
+        model: a model that continues frames (DiP), from `flame_mdm.load`.
+        text: what the person does at first.
+        start: the motion to continue, of which the last frames count: a motion, a file, or "dataset:id", a clip of a
+            prepared data set. Default: a person who stands still.
+        seed: seed of the noise.
+        block: number of frames per block, up to what the model predicts at once. Shorter blocks react sooner to a new
+            text, and cost more per second of motion. Default: what the model predicts at once.
+        cleanup: smooth motions, constant bone lengths, feet that do not slide. Each block is returned when the one
+            after it is computed, which it must fit.
+        options: `guidance_scale`, `sampler`, `num_inference_steps`, `eta` and `spacing`; default: the model's.
+
+    Returns:
+        An iterator of blocks; see `Stream`.
+
+    Raises:
+        UserError: If the model does not continue frames, knows no word of the text that says what happens, or the
+            motion to continue cannot be read or is too short.
+    """
+    prefix, placement = starting_point(model, start)
+    check_text(model, text)
+    streams = Streams(
+        model, [f"{text}#0"], [text], prefix, placement, SamplerOptions(**options), seed=seed, block=block
+    )
+    return Stream(streams, cleanup=cleanup)
+
+
+class Stream(Iterator[Motion]):
+    """A motion without an end: an iterator of blocks, each a `Motion` placed in the world after the one before.
+
+    A block is computed when it is asked for; with `cleanup`, the block after it, too. The same texts at the same times
+    and the same seed give the same motion.
+    """
+
+    def __init__(self, streams: Streams, *, cleanup: bool = False):
+        self._streams = streams
+        self._cleanup = OnlineCleanup(streams.model.representation) if cleanup else None
+
+    @property
+    def frames(self) -> int:
+        """Number of frames of all blocks that were computed so far."""
+        return self._streams.frames[0]
+
+    @property
+    def text(self) -> str:
+        """The text of the next block."""
+        return self._streams.schedules[0].at(self.frames)
+
+    def change(self, text: str, at: float | None = None) -> None:
+        """Changes the text from a time in seconds of the stream on; default: from the next block on.
+
+        A block ends early if the text changes in the middle of it. Blocks that were computed do not change. Raises
+        `UserError` if the model knows no word of the text that says what happens, or the time is over.
+        """
+        fps = self._streams.model.representation.fps
+        frame = self.frames if at is None else round(at * fps)
+        if frame < self.frames:
+            now = self.frames / fps
+            raise UserError(f"at={at:g}: the stream is at {now:g} seconds already. Give a later time, or omit it")
+        check_text(self._streams.model, text)
+        self._streams.schedules[0].add(frame, text)
+
+    def __next__(self) -> Motion:
+        while True:
+            (block,) = next(self._streams)
+            if self._cleanup is None:
+                return block
+            if (cleaned := self._cleanup.add(block)) is not None:
+                return cleaned
+
+
+class OnlineCleanup:
+    """Cleanup of a motion that comes in blocks: each is cleaned together with the block before it and the one after.
+
+    A block is cleaned twice, as the last one of three and as the middle one. The result goes from the first version,
+    which continues the block before without a jump, over to the second, which fits the block after.
+    """
+
+    def __init__(self, representation: Representation):
+        self.representation = representation
+        self.blocks: list[Motion] = []
+        self.version: np.ndarray | None = None  # the first version of the middle block
+
+    def add(self, block: Motion) -> Motion | None:
+        """Takes the next block, and returns the cleaned one before it; None for the first."""
+        self.blocks = [*self.blocks[-2:], block]
+        if len(self.blocks) == 1:
+            return None
+        middle = self.blocks[-2]
+        contacts = self.representation.contacts(np.concatenate([piece.features for piece in self.blocks]))
+        joints = np.concatenate([piece.joints for piece in self.blocks])
+        joints = clean_joints(joints, middle.fps, middle.skeleton, contacts)
+        begin = len(joints) - len(block.joints) - len(middle.joints)
+        cleaned = joints[begin : begin + len(middle.joints)]
+        if self.version is not None:
+            # The body follows its feet from the first frame of the three blocks on, so that places differ.
+            shift = (self.version[0, 0] - cleaned[0, 0]) * np.array([1, 0, 1], np.float32)
+            joints, cleaned = joints + shift, cleaned + shift
+            weight = np.linspace(0, 1, len(cleaned), dtype=np.float32)[:, None, None]
+            cleaned = (1 - weight) * self.version + weight * cleaned
+        self.version = joints[-len(block.joints) :]
+        return replace(middle, joints=cleaned, features=np.zeros((0, 0), np.float32), representation="", cleanup=True)
+
+
+class Schedule:
+    """The conditions of a stream over its frames."""
+
+    def __init__(self, condition: str):
+        self.changes = [(0, condition)]
+
+    @classmethod
+    def of_parts(cls, conditions: Sequence[str], lengths: Sequence[int]) -> Self:
+        """Returns the schedule of consecutive parts with these numbers of frames."""
+        schedule, begin = cls(conditions[0]), 0
+        for condition, length in zip(conditions[1:], lengths, strict=False):
+            begin += length
+            schedule.add(begin, condition)
+        return schedule
+
+    def add(self, frame: int, condition: str) -> None:
+        """Changes the condition from a frame on, until the next change after it."""
+        changes = {**dict(self.changes), frame: condition}
+        self.changes = sorted(changes.items())
+
+    def at(self, frame: int) -> str:
+        """Returns the condition of a frame."""
+        return [condition for begin, condition in self.changes if begin <= frame][-1]
+
+    def until_change(self, frame: int) -> int | None:
+        """Returns the number of frames from a frame to the next change; None if there is none."""
+        return next((begin - frame for begin, _ in self.changes if begin > frame), None)
+
+
+class Streams(Iterator[list[Motion]]):
+    """Several streams that are sampled in one batch; each is the same as alone, up to rounding.
+
+    Args:
+        model: a model that continues frames.
+        ids: B names of the streams, which seed their noise.
+        conditions: B texts or actions at the beginning; "" for unconditioned motions.
+        prefix: (B, C, D) normalized features of the frames before the streams.
+        placement: place in the world of the first frames. None = the first frame is at x = z = 0 and faces +z.
+        options: options of the sampler; those that are None have the values of the model.
+        kind: "text", "action", or "none" for unconditioned motions.
+        seed: seed of the noise.
+        block: number of frames per block; default: all that the model predicts at once.
+
+    Attributes:
+        schedules: conditions of each stream over its frames.
+        frames: number of frames of each stream so far.
+        targets: places in the world that a single stream reaches, by the guidance of sampling and, if the model was
+            trained with targets, also by its own condition. None = it goes anywhere.
+    """
+
+    def __init__(
+        self,
+        model: MotionGenerator,
+        ids: Sequence[str],
+        conditions: Sequence[str],
+        prefix: Tensor,
+        placement: Placement | None,
+        options: SamplerOptions,
+        *,
+        kind: str = "text",
+        seed: int = 0,
+        block: int | None = None,
+    ):
+        check_streams(model)
+        longest = model.block_frames
+        self.block = longest if block is None else block
+        if type(self.block) is not int or not 1 <= self.block <= longest:
+            raise UserError(f"block={block}: this model predicts {longest} frames at once. Give 1 to {longest}")
+        options = options.over(model.sampler_options)
+        model.process.find_sampler(options)
+        self.model, self.kind = model, kind
+        self.blocks = Blocks(model, ids, prefix, options, seed=seed, unconditioned=kind == "none")
+        self.schedules = [Schedule(condition) for condition in conditions]
+        self.frames = [0] * len(ids)
+        self.placement = Placement.origin(len(ids), prefix.device) if placement is None else placement
+        self.targets: Targets | None = None
+        self._root = [0.0, 0.0]  # x and z in the world of the last frame of the first stream
+        self._encoded: tuple[list[str], Condition] | None = None
+
+    def __next__(self) -> list[Motion]:
+        """Returns the next block of each stream; it ends where the next condition begins."""
+        conditions = self._conditions()
+        kept = [self._until_change(row) for row in range(len(self.frames))]
+        x, joints = self._advance(kept)
+        features = self.model.representation.denormalize(x.float())
+        return [
+            self._motion(features[row, :count], joints[row, :count], text)
+            for row, (count, text) in enumerate(zip(kept, conditions, strict=True))
+        ]
+
+    def take(self, lengths: Sequence[int]) -> list[Tensor]:
+        """Returns the next frames (F, D) of each stream, normalized, as many as `lengths` says."""
+        ends = [frame + length for frame, length in zip(self.frames, lengths, strict=True)]
+        parts: list[list[Tensor]] = [[] for _ in ends]
+        while self.frames != ends:
+            kept = [min(self._until_change(row), end - self.frames[row]) for row, end in enumerate(ends)]
+            x, _ = self._advance(kept)
+            for row, count in enumerate(kept):
+                parts[row].append(x[row, :count])
+        return [torch.cat(part) for part in parts]
+
+    def _conditions(self) -> list[str]:
+        """Returns the condition of the next block of each stream."""
+        return [schedule.at(frame) for schedule, frame in zip(self.schedules, self.frames, strict=True)]
+
+    def _until_change(self, row: int) -> int:
+        """Returns the number of frames of the next block of a stream."""
+        change = self.schedules[row].until_change(self.frames[row])
+        return self.block if change is None else min(self.block, change)
+
+    def _advance(self, kept: Sequence[int]) -> tuple[Tensor, Tensor]:
+        """Samples the next block, of which each stream keeps the first `kept` frames.
+
+        Returns normalized features (B, P, D), and joints (B, P, J, 3) in the world, float64.
+        """
+        representation, count = self.model.representation, torch.tensor(kept, device=self.model.device)
+        was_training = self.model.training
+        if was_training:
+            self.model.eval()
+        cond, edit = self._aimed(self._encode(self._conditions()))
+        x = self.blocks.sample(cond, count, edit)
+        if was_training:
+            self.model.train()
+
+        features = representation.denormalize(x.float())
+        joints = self.placement.apply(representation.decode(features))
+        rows, last = torch.arange(len(x), device=x.device), (count - 1).clamp(min=0)
+        after = step_after(representation, features[rows, last], joints[rows, last])
+        moved = count > 0
+        turn = torch.where(moved, after.turn, self.placement.turn)
+        self.placement = Placement(turn, torch.where(moved[:, None], after.shift, self.placement.shift))
+        self._root = joints[0, last[0], 0, [0, 2]].tolist()
+        self.frames = [frame + new for frame, new in zip(self.frames, kept, strict=True)]
+        return x, joints
+
+    def _aimed(self, cond: Condition) -> tuple[Condition, Edit | None]:
+        """Returns the condition and the edit of the next block that lead the first stream to its targets."""
+        if self.targets is None:
+            return cond, None
+        model, placement, frames = self.model, self.placement, self.model.block_frames
+        representation = model.representation
+        window = self.targets.window(self.frames[0], frames, self._root)
+        edit = window.edit(representation, frames, model.device, lambda x: in_world(representation, placement, x))
+        if not (edit.keep.any() or edit.guide):
+            return cond, None
+        if getattr(model.denoiser, "target", None) is not None:
+            cond = replace(cond, target=root_target(window, frames, placement))
+        return cond, edit
+
+    @torch.no_grad()
+    def _encode(self, conditions: list[str]) -> Condition:
+        """Returns the encoded conditions, which are computed again only when they change."""
+        if self._encoded is None or self._encoded[0] != conditions:
+            model, device = self.model, self.model.device
+            x = torch.zeros(len(conditions), 1, model.representation.features, device=device)
+            batch = MotionBatch(x, torch.ones(len(conditions), 1, dtype=torch.bool, device=device), self.blocks.ids)
+            if self.kind == "text":
+                batch.text = conditions
+            elif self.kind == "action":
+                numbers = [model.facts["actions"].index(name) for name in conditions]
+                batch.action = torch.tensor(numbers, device=device)
+            self._encoded = conditions, model.encode(batch, self.kind == "none")
+        return self._encoded[1]
+
+    def _motion(self, features: Tensor, joints: Tensor, text: str) -> Motion:
+        representation = self.model.representation
+        array = joints.cpu().numpy()
+        if not np.isfinite(array).all():
+            raise UserError(f"the model returned non-finite numbers for '{text}'")
+        return Motion(
+            array,
+            representation.fps,
+            representation.skeleton,
+            text,
+            features=features.cpu().numpy(),
+            representation=representation.name,
+        )
+
+
+def in_world(representation: Representation, placement: Placement, x: Tensor) -> Tensor:
+    """Decodes normalized features (..., F, D) to joints (..., F, J, 3) in the world, at the place of one stream."""
+    joints = representation.to_joints(x)
+    turn = placement.turn[0].to(joints).expand(joints.shape[:-1])
+    return rotate_y(joints, turn) + placement.shift[0].to(joints)
+
+
+def root_target(window: Targets, frames: int, placement: Placement) -> Tensor | None:
+    """Returns the target condition (1, 8, 4) of the root's position in the last frame of a block, if there is one."""
+    goal = window.positions
+    of_root = (goal.joints == 0) & (goal.frames == frames - 1)
+    values = dict(zip(goal.axes[of_root].tolist(), goal.values[of_root].tolist(), strict=True))
+    if not {0, 2} <= values.keys():
+        return None
+    device = placement.turn.device
+    point = torch.tensor([[values[0], 0.0, values[2]]], dtype=torch.float64, device=device)
+    slots = torch.zeros(1, len(SLOTS), 4, device=device)
+    slots[0, SLOTS.index("traj"), :3] = placement.undo(point)[0].to(slots)
+    slots[0, SLOTS.index("traj"), 3] = 1
+    return slots
+
+
+def check_streams(model: MotionGenerator) -> None:
+    """Raises `UserError` if a model cannot stream."""
+    if not model.denoiser.context_frames:
+        raise UserError("this model does not continue frames, so it has no streams. Train one, such as bandai/dip")
+    if not model.representation.relative:
+        name = model.representation.name
+        raise UserError(f"representation {name} has positions in the world, which a stream would leave. Use humanml3d")
+
+
+def check_text(model: MotionGenerator, text: str) -> None:
+    """Raises `UserError` if a text is empty or too long, or the model knows no word of it that says what happens."""
+    if not isinstance(text, str) or not text.strip():
+        raise UserError(f"text={text!r}: give a text that says what happens, such as 'a person walks'")
+    check_length(text)
+    if model.conditioned_on != "text":
+        raise UserError(f"text={text}: this model is conditioned on {model.conditioned_on}, not on text")
+    check_known(text, model.facts)
+
+
+def starting_point(model: MotionGenerator, start: str | Path | Motion | None) -> tuple[Tensor, Placement | None]:
+    """Returns the frames (1, C, D) that a stream continues, normalized, and the place of the frame after them.
+
+    Raises `UserError` if the model cannot stream, or the motion cannot be read, or is too short.
+    """
+    check_streams(model)
+    context, representation = model.denoiser.context_frames, model.representation
+    if start is None:
+        features = torch.from_numpy(standing(representation, context).features)
+        return representation.normalize(features.to(model.device))[None], None
+
+    motion = start if isinstance(start, Motion) else read_motion(representation, start)
+    motion = with_features(representation, motion)
+    if len(motion.features) < context:
+        name = motion.id or "the motion"
+        raise UserError(f"start={name}: {len(motion.features)} frames are too short. Give at least {context}")
+    features = torch.from_numpy(motion.features[-context:]).to(model.device)
+    last = torch.from_numpy(motion.joints[-1:]).to(model.device)
+    return representation.normalize(features)[None], step_after(representation, features[-1:], last)
+
+
+def standing(representation: Representation, frames: int) -> Motion:
+    """Returns a person who stands still, with the features of a representation.
+
+    The person is the one of the synthetic motions, so that no data is needed.
+    """
+    body = Body(np.random.default_rng(0), np.zeros(frames + 1))
+    still = Motion(body.joints(), representation.fps, SMPL22, "a person stands still", "standing")
+    motion = with_features(representation, still)
+    return replace(motion, features=motion.features[:frames], joints=motion.joints[:frames])

@@ -1,0 +1,292 @@
+"""Streams: blocks join, depend on texts and seed alone, and `generate` with the same model is a cut of a stream."""
+
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from support.runs import TINY_DIP, untrained
+from torch import Tensor
+
+import flame_mdm
+from flame_mdm import generate, stream
+from flame_mdm.batch import Condition
+from flame_mdm.data.synthetic import Synthetic
+from flame_mdm.denoisers import Denoiser
+from flame_mdm.errors import UserError
+from flame_mdm.formats.motion import Motion
+from flame_mdm.generator import MotionGenerator
+from flame_mdm.sampler_options import SamplerOptions
+from flame_mdm.sampling.editing import edit
+from flame_mdm.sampling.keywords import SamplerKeywords
+from flame_mdm.sampling.placement import Placement
+from flame_mdm.sampling.reading import decoded, with_features
+from flame_mdm.sampling.streams import Streams, standing, starting_point
+from flame_mdm.sampling.targets import errors, read_targets
+
+CONTEXT, BLOCK, FPS = 10, 30, 20.0
+
+
+def built(*words: str) -> MotionGenerator:
+    """A tiny model of `synthetic/dip` with random weights, whose motions are about as large as real ones."""
+    model = untrained([*TINY_DIP, *words], CONTEXT + BLOCK, "synthetic/dip")
+    model.representation.std.fill_(0.05)
+    return model
+
+
+@pytest.fixture(scope="module")
+def model() -> MotionGenerator:
+    return built()
+
+
+def joints(blocks: Any) -> np.ndarray:
+    return np.concatenate([block.joints for block in blocks])
+
+
+def assert_same(ours: np.ndarray, expected: np.ndarray, tolerance: float = 2e-4) -> None:
+    np.testing.assert_allclose(ours, expected, rtol=0, atol=tolerance)
+
+
+class Recalling(Denoiser):
+    """A denoiser that knows a motion (F, D) by heart, and continues any frames of it."""
+
+    def __init__(self, motion: Tensor):
+        super().__init__()
+        self.context_frames, self.motion = CONTEXT, motion
+        self.scale = torch.nn.Parameter(torch.ones(()))
+
+    def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
+        assert cond.prefix is not None
+        windows = self.motion.unfold(0, CONTEXT, 1).transpose(1, 2)
+        starts = [(windows - prefix).square().sum((1, 2)).argmin() + CONTEXT for prefix in cond.prefix]
+        longer = torch.cat([self.motion, self.motion[-1:].expand(x_t.shape[1], -1)])
+        return torch.stack([longer[start : start + x_t.shape[1]] for start in starts])
+
+
+@pytest.fixture(scope="module")
+def walk(model) -> Motion:
+    """A walk of three seconds along a curve, with features."""
+    source = Synthetic(clips=1)
+    for index in range(200):
+        clip = source.clip(index, FPS)
+        if clip.attributes["action"] == "walk" and clip.attributes.get("direction") in ("left", "right"):
+            break
+    motion = Motion(np.asarray(clip.motion), FPS)
+    return with_features(model.representation, motion)
+
+
+@pytest.mark.parametrize("block", [BLOCK, 7, 1])
+def test_blocks_continue_in_the_world_where_the_frames_before_them_end(model, walk, block):
+    knowing = built()
+    features = torch.from_numpy(walk.features)
+    knowing.denoiser = Recalling(knowing.representation.normalize(features))
+    begun = decoded(knowing.representation, features[:CONTEXT], "", "begun")
+    running = stream(knowing, "a person walks", begun, block=block)
+    blocks = list(islice(running, (len(features) - CONTEXT) // block))
+    assert all(len(piece.joints) == block for piece in blocks)
+    whole = decoded(knowing.representation, features, "", "whole").joints
+    new = joints(blocks)
+    assert_same(new, whole[CONTEXT : CONTEXT + len(new)])
+
+
+def test_a_motion_may_stand_anywhere_when_a_stream_continues_it(model, walk):
+    moved = decoded(model.representation, torch.from_numpy(walk.features[:20]), "", "moved")
+    placement = Placement(
+        torch.tensor([0.7], dtype=torch.float64), torch.tensor([[3.0, 0.0, -2.0]], dtype=torch.float64)
+    )
+    here = next(stream(model, "a person walks", moved)).joints
+    moved.joints = placement.apply(torch.from_numpy(moved.joints)[None])[0].numpy().astype(np.float32)
+    there = next(stream(model, "a person walks", moved)).joints
+    assert_same(there, placement.apply(torch.from_numpy(here)[None])[0].numpy())
+
+
+def test_places_are_found_and_undone():
+    generator = torch.Generator().manual_seed(0)
+    pose = torch.randn(4, 22, 3, generator=generator)
+    placement = Placement(
+        torch.tensor([0.0, 1.0, -2.0, 3.1], dtype=torch.float64), torch.randn(4, 3, generator=generator)
+    )
+    placement.shift[:, 1] = 0
+    moved = placement.apply(pose)
+    fitted = Placement.fit(pose, moved)
+    torch.testing.assert_close(fitted.turn, placement.turn)
+    torch.testing.assert_close(fitted.shift, placement.shift.double())
+    torch.testing.assert_close(placement.undo(moved), pose.double())
+
+
+def test_a_text_changes_later_blocks_only(model):
+    plain, changed = stream(model, "a person walks", seed=3), stream(model, "a person walks", seed=3)
+    before = [next(plain), next(plain)], [next(changed), next(changed)]
+    changed.change("a person sits down")
+    after = next(plain), next(changed)
+    assert np.array_equal(joints(before[0]), joints(before[1]))
+    assert not np.allclose(after[0].joints, after[1].joints, atol=1e-3)
+    assert (after[0].text, after[1].text, changed.text) == (
+        "a person walks",
+        "a person sits down",
+        "a person sits down",
+    )
+    assert not np.allclose(next(stream(model, "a person walks", seed=4)).joints, before[0][0].joints, atol=1e-3)
+
+
+def test_texts_at_times_give_the_same_motion_whenever_they_are_typed(model):
+    early, late = stream(model, "a person walks"), stream(model, "a person walks")
+    for text, at in (("a person sits down", 2.25), ("a person waves", 3.5)):
+        early.change(text, at=at)
+    blocks = [next(late)]
+    late.change("a person sits down", at=2.25)
+    blocks.append(next(late))
+    late.change("a person waves", at=3.5)
+    blocks += [next(late), next(late)]
+    assert [len(block.joints) for block in blocks] == [30, 15, 25, 30]
+    assert np.array_equal(joints(islice(early, 4)), joints(blocks))
+    with pytest.raises(UserError, match=r"at=1: the stream is at 5 seconds already\. Give a later time"):
+        late.change("a person jumps", at=1)
+
+
+@pytest.mark.parametrize("frames", [2, 30, 75])
+def test_generate_is_a_cut_of_the_stream(model, frames):
+    motion = generate(model, "a person walks", frames=frames, seed=5)[0]
+    assert len(motion.joints) == frames
+    assert_same(motion.joints, joints(islice(stream(model, "a person walks", seed=5), 3))[:frames])
+    assert motion.parts == ()
+
+
+def test_parts_are_changes_of_the_text(model):
+    motion = generate(model, "a person walks @2 | a person sits down @1.5")[0]
+    running = stream(model, "a person walks")
+    running.change("a person sits down", at=2)
+    assert_same(motion.joints, joints(islice(running, 4))[:70])
+    assert motion.parts == (("a person walks", 0, 40), ("a person sits down", 40, 70))
+
+
+def test_a_motion_is_continued(model, walk):
+    motion = generate(model, "a person sits down", after=walk, seconds=2)[0]
+    assert len(motion.joints) == len(walk.joints) + 40
+    assert_same(motion.joints[: len(walk.joints)], walk.joints)
+    new = joints(islice(stream(model, "a person sits down", walk), 2))
+    assert_same(motion.joints[len(walk.joints) :], new[:40])
+
+
+def test_samples_and_lengths_in_a_batch_are_those_alone(model):
+    together = generate(model, ["a person walks", "a person waves | sits"], samples=2, seconds=[1.0, 2.0])
+    assert [len(motion.joints) for motion in together] == [20, 20, 80, 80]
+    assert not np.allclose(together[0].joints, together[1].joints, atol=1e-3)
+    assert_same(generate(model, "a person walks", frames=20)[0].joints, together[0].joints)
+    assert_same(generate(model, "a person waves | sits", seconds=2.0)[0].joints, together[2].joints)
+
+
+def test_a_batch_of_streams_gives_what_single_ones_give(model):
+    texts = ["a person walks", "a person waves"]
+    prefix, _ = starting_point(model, None)
+    ids = [f"{text}#0" for text in texts]
+    streams = Streams(model, ids, texts, prefix.expand(2, -1, -1), None, SamplerOptions())
+    streams.schedules[1].add(40, "a person sits down")
+    pairs = [next(streams) for _ in range(3)]
+    walking, waving = (stream(model, text) for text in texts)
+    waving.change("a person sits down", at=2)
+    for blocks, alone in zip(zip(*pairs, strict=True), (walking, waving), strict=True):
+        assert_same(joints(blocks), joints(islice(alone, 3)))
+
+
+def test_options_of_the_sampler_reach_the_stream(model):
+    first = next(stream(model, "a person walks")).joints
+    changes: list[SamplerKeywords] = [{"guidance_scale": 1.0}, {"sampler": "ddim"}, {"num_inference_steps": 2}]
+    for options in changes:
+        assert not np.allclose(next(stream(model, "a person walks", **options)).joints, first, atol=1e-4)
+    with pytest.raises(UserError, match="unknown sampler 'dddim'"):
+        stream(model, "a person walks", sampler="dddim")
+
+
+def test_the_path_is_reached_through_many_blocks(model):
+    path = [(0.0, 0.6), (0.4, 1.2)]
+    motion = generate(model, "a person walks", seconds=4, path=path)[0]
+    aims = read_targets(
+        model.representation,
+        {"root": [{"time": 3.8, "position": list(path[-1])}]},
+    )
+    assert errors(motion, aims).max() < 0.03
+    free = generate(model, "a person walks", seconds=4)[0]
+    assert errors(free, aims).max() > 0.1
+
+
+def test_a_model_trained_with_targets_also_reads_them():
+    aiming = built("denoiser=dip_target", "task=generation_targets", "denoiser.context_frames=10")
+    seen: list[Tensor | None] = []
+    aiming.denoiser.register_forward_hook(lambda _, inputs, __: seen.append(inputs[3].target))
+    generate(aiming, "a person walks", seconds=3, path=[(0.5, 1.0)])
+    target = seen[0]
+    assert target is not None
+    # A straight way at an even speed: the first block ends after 30 of the 57 frames to the goal.
+    torch.testing.assert_close(target[0, 6], torch.tensor([0.5 * 30 / 57, 0.0, 30 / 57, 1.0]), rtol=0, atol=1e-4)
+    assert not target[0, [0, 1, 2, 3, 4, 5, 7]].any()
+    seen.clear()
+    next(stream(aiming, "a person walks"))
+    assert seen
+    assert all(target is None for target in seen)
+
+
+def test_a_person_stands_still_before_the_first_block(model):
+    still = standing(model.representation, CONTEXT)
+    assert np.ptp(still.joints, axis=0).max() < 1e-4
+    assert abs(still.joints[..., 1].min()) < 0.01
+    assert 0.8 < still.joints[0, 0, 1] < 1.1
+    columns = model.representation.slices
+    assert np.abs(still.features[:, columns["velocities"]]).max() < 1e-5
+    assert still.features[:, columns["contacts"]].min() == 1
+
+
+def test_cleanup_is_applied_to_generated_motions(model):
+    raw, clean = (generate(model, "a person walks", cleanup=flag)[0] for flag in (False, True))
+    assert clean.cleanup
+    assert not np.allclose(raw.joints, clean.joints, atol=1e-4)
+
+
+def test_online_cleanup_waits_for_one_block_and_has_no_jump_between_blocks(walk):
+    knowing = built()
+    features = torch.from_numpy(walk.features)
+    noisy = features + 0.02 * torch.randn(features.shape, generator=torch.Generator().manual_seed(1))
+    knowing.denoiser = Recalling(knowing.representation.normalize(noisy))
+    begun = decoded(knowing.representation, noisy[:CONTEXT], "", "begun")
+    running = stream(knowing, "a person walks", begun, block=10, cleanup=True)
+    raw = joints(islice(stream(knowing, "a person walks", begun, block=10), 4))
+    first = next(running)
+    assert (running.frames, len(first.joints), first.cleanup, len(first.features)) == (20, 10, True, 0)
+    clean = np.concatenate([first.joints, *(next(running).joints for _ in range(3))])
+    assert np.linalg.norm(clean - raw, axis=-1).mean() < 0.1
+
+    def jumps(motion: np.ndarray) -> np.ndarray:
+        """Change of velocity, in meters per frame, around each frame."""
+        return np.linalg.norm(np.diff(motion, 2, axis=0), axis=-1).max(1)
+
+    seams = np.isin(np.arange(1, len(clean) - 1), [9, 10, 19, 20, 29, 30])
+    assert jumps(clean)[seams].max() <= 1.2 * jumps(clean)[~seams].max()
+    assert jumps(clean).max() < 0.6 * jumps(raw).max()
+
+
+def test_what_such_a_model_cannot_do_is_said_in_one_line(model, walk):
+    short = decoded(model.representation, torch.from_numpy(walk.features[:4]), "", "short")
+    ordinary = untrained(["denoiser.latent_dim=16", "denoiser.num_layers=1"], 60)
+    for call, message in (
+        (lambda: stream(ordinary, "a person walks"), "does not continue frames, so it has no streams"),
+        (lambda: stream(model, "a person walks", short), "start=short: 4 frames are too short. Give at least 10"),
+        (lambda: stream(model, "a person walks", "nowhere.bvh"), "nowhere.bvh"),
+        (lambda: stream(model, "a person walks", block=31), "block=31: this model predicts 30 frames at once"),
+        (lambda: stream(model, " "), "give a text that says what happens"),
+        (lambda: generate(model, "a person walks", loop=True), "loop=true: this model continues frames"),
+        (lambda: generate(model, "a person walks", stages=[]), "trajectory: this model continues frames"),
+        (lambda: generate(model, "a person walks", after=short), "after=short: 4 frames are too short"),
+        (lambda: edit(model, walk, region="in_between"), "this model continues frames and cannot edit"),
+        (lambda: generate(model, "a person walks", seconds=601), "601 seconds are too long. Give at most 600"),
+        (lambda: generate(model, "a person walks", seconds=0), "0 seconds are too short"),
+    ):
+        with pytest.raises((UserError, FileNotFoundError), match=message) as error:
+            call()
+        assert "\n" not in str(error.value)
+
+
+def test_streams_are_public():
+    assert "stream" in flame_mdm.__all__
+    assert Path(flame_mdm.stream.__code__.co_filename).name == "streams.py"

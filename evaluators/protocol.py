@@ -6,7 +6,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -29,6 +29,7 @@ from flame_mdm.seeds import key
 
 FOLDER = EXPERIMENTS / "evaluation"
 QUICK_REPLICATIONS, QUICK_SAMPLES = 2, 64
+CONTEXT_STARTS = 5  # number of frames of a clip at which the context may begin in DiP's code
 Count = Annotated[Int, Field(ge=1)]
 
 
@@ -41,6 +42,8 @@ class DrawnClip:
     frames: np.ndarray  # indices of the frames drawn from the clip
     caption: int | None  # index of the caption drawn from the clip; None = the clip has none
     prompt: str  # name shared by all motions with the same caption and length
+    # indices of the frames that a model gets and continues; they are not measured
+    context: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
 
     @property
     def text(self) -> str:
@@ -88,6 +91,10 @@ class Protocol(ClosedSchema):
     edit: dict[str, Any] | None = None  # motions are edits of real motions: `region` and `joints` of `kept_parts`
     smoothing: Number | None = None  # deviation, in frames, of a Gaussian filter over time of generated features
     batch_size: Count | None = None  # motions per batch of a protocol that measures time; a first batch is not timed
+    # which frames a model that continues frames gets: the first ones of the drawn frames, which are then not measured;
+    # or frames of the clip from one of the first five on, before motions as long as the drawn frames (DiP's code)
+    context: Literal["drawn", "start"] = "drawn"
+    context_frames: Int = 0  # number of these frames, set by `open_protocol`
     only: dict[str, Any] = Field({})  # attributes that evaluated clips must have; {} = all clips of the split
     # values of real motions of the test split, by data set or sha256 of the extractor: metric -> [value, tolerance].
     # If they differ, nothing is generated.
@@ -148,7 +155,10 @@ class Protocol(ClosedSchema):
         return f"{self.name}-{self.version}"
 
     def selected(self, clips: Clips) -> list[Entry]:
-        return [clip for clip in clips.clips if self.only.items() <= clip.attributes.items()]
+        """Returns the clips with the attributes of `only` that are long enough for the context and a frame after it."""
+        shortest = self.context_frames + (CONTEXT_STARTS if self.context == "start" else 1)
+        chosen = [clip for clip in clips.clips if self.only.items() <= clip.attributes.items()]
+        return [clip for clip in chosen if not self.context_frames or clip.length >= shortest]
 
     def rows(self, clips: Clips, seed: int, replication: int, *, purpose: str = "generated") -> list[DrawnClip]:
         """Returns the motions of one replication; another `purpose` gives another draw of clips, captions and crops.
@@ -169,7 +179,16 @@ class Protocol(ClosedSchema):
             name = f"{clip.id}#{again}" if again else clip.id
             generator = np.random.default_rng(key("crop", purpose, seed, replication, name))
             caption = key("caption", purpose, seed, replication, name) % len(clip.captions) if clip.captions else None
-            rows.append(DrawnClip(name, clip, clips.crop(clip.length, generator), caption, name))
+            frames = clips.crop(clip.length, generator)
+            context = frames[: self.context_frames]
+            if self.context_frames and self.context == "start":
+                context = np.arange(self.context_frames) + generator.integers(CONTEXT_STARTS)
+            elif self.context_frames:
+                frames = frames[self.context_frames :]
+                if not len(frames):
+                    length = f"{clip.id}: {len(context)} frames, all of which the model continues"
+                    raise UserError(f"{length}. Give longer crops, such as data.crop.max_frames=196")
+            rows.append(DrawnClip(name, clip, frames, caption, name, context))
         return rows
 
     def prompts(self, clips: Clips, seed: int, replication: int) -> list[DrawnClip]:
@@ -284,8 +303,12 @@ def open_protocol(
 ) -> tuple[Protocol, dict[str, Any]]:
     """Returns a protocol that matches a split and a model, and the options changed by `Protocol.resized`."""
     protocol = load_protocol(name, representation)
+    if model is not None:
+        protocol = protocol.model_copy(update={"context_frames": model.denoiser.context_frames})
     protocol, changed = protocol.resized(len(protocol.selected(clips)), **size)
     protocol.check(clips, model)
+    if protocol.context_frames:
+        changed["context_frames"] = protocol.context_frames
     return protocol, changed
 
 

@@ -5,13 +5,14 @@ import hashlib
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 from typing import Protocol as Interface
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from evaluators.collectives import dealt, is_first, shared, world_size
 from evaluators.protocol import DrawnClip, Protocol
@@ -75,8 +76,6 @@ class Generator:
     progress: bool = True
 
     def __post_init__(self) -> None:
-        if self.model.denoiser.context_frames:
-            raise UserError("this model continues clean frames, and no protocol gives them yet. Evaluate another model")
         total, shown = self.protocol.count(self.clips) // world_size(), self.progress and is_first()
         self.bar = ProgressBar(total=total, desc="generating", unit=" motions", disable=not shown)
 
@@ -142,6 +141,7 @@ class Generator:
             replication=replication,
             unconditioned=self.protocol.condition == "none",
             edit=None if self.protocol.edit is None else self._edit(rows, self.protocol.edit),
+            prefix=self._prefix(rows) if self.model.denoiser.context_frames else None,
             seed=self.seed,
         )
         features = self.model.representation.denormalize(x.float()).cpu().numpy()
@@ -157,6 +157,12 @@ class Generator:
             text=[row.text for row in rows] if condition == "text" else None,
             action=torch.tensor([row.clip.action for row in rows], device=device) if condition == "action" else None,
         )
+
+    def _prefix(self, rows: Sequence[DrawnClip]) -> Tensor:
+        """Returns the normalized frames (B, C, D) that the model continues."""
+        context = real_motions(self.clips, [replace(row, frames=row.context) for row in rows])
+        features = torch.from_numpy(np.stack(context)).to(self.model.device)
+        return self.model.representation.normalize(features)
 
     def _edit(self, rows: Sequence[DrawnClip], parts: Mapping[str, Any]) -> Edit:
         """Returns the real motions of the rows and their kept parts; padding is kept, as zeros."""

@@ -13,6 +13,7 @@ from torch import Tensor
 import flame_mdm
 from flame_mdm import generate, stream
 from flame_mdm.batch import Condition
+from flame_mdm.checkpoints.onnx_export import description
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.denoisers import Denoiser
 from flame_mdm.errors import UserError
@@ -279,6 +280,7 @@ def test_what_such_a_model_cannot_do_is_said_in_one_line(model, walk):
         (lambda: generate(model, "a person walks", stages=[]), "trajectory: this model continues frames"),
         (lambda: generate(model, "a person walks", after=short), "after=short: 4 frames are too short"),
         (lambda: edit(model, walk, region="in_between"), "this model continues frames and cannot edit"),
+        (lambda: description(model), "this model continues frames, which the exported runner does not"),
         (lambda: generate(model, "a person walks", seconds=601), "601 seconds are too long. Give at most 600"),
         (lambda: generate(model, "a person walks", seconds=0), "0 seconds are too short"),
     ):

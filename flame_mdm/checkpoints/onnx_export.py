@@ -69,6 +69,8 @@ def description(model: MotionGenerator) -> dict[str, Any]:
     """
     representation, skeleton, facts = model.representation, model.representation.skeleton, model.facts
     encoder, denoiser = model.condition, model.denoiser
+    if denoiser.context_frames:
+        raise UserError("this model continues frames, which the exported runner does not. Export another model")
     padded = isinstance(denoiser, FIXED_LENGTH) or not denoiser.mask_padding
     words = {"buckets": encoder.buckets, "max_words": encoder.max_words} if isinstance(encoder, LearnedTokens) else {}
     content = {

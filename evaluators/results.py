@@ -17,6 +17,7 @@ from flame_mdm.records import Checkpoint, Cost, Data, ExtractorRecord, ProtocolV
 from flame_mdm.reporting.audit_cards import card_of
 from flame_mdm.safe_io import sha256
 from flame_mdm.training.provenance import environment
+from flame_mdm.training.start import recipe_changes
 
 
 @dataclass(frozen=True)
@@ -143,6 +144,7 @@ def _checkpoint(plan: Plan) -> Checkpoint | None:
         sha256=sha256(file),
         experiment=model.config.get("experiment"),
         config_sha256=digest(model.config),
+        recipe_changes=recipe_changes(model.config),
         selected_by=f"best {best['monitor']}" if file.stem == "best" and "monitor" in best else f"none: {file.stem}",
         averaged_weights=bool(model.config.get("ema")),
         parameters=sum(p.numel() for p in model.parameters() if p.requires_grad),
@@ -175,6 +177,9 @@ def show(result: Result, path: Path) -> None:
         say(f"replications x motions: {usual}" + _intervals(values))
     if result.changed:
         say("differs from the protocol: " + ", ".join(f"{name}={value}" for name, value in result.changed.items()))
+    if result.checkpoint and result.checkpoint.recipe_changes:
+        changes = ", ".join(result.checkpoint.recipe_changes)
+        say(f"the model differs from the recipe {result.checkpoint.experiment}: {changes}")
     say(f"{'':40}{'real motions':>24}{result.baseline or 'generated':>24}")
     for name, value in values.items():
         real = (result.ground_truth or {}).get(name)

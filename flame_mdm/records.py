@@ -97,6 +97,7 @@ class Checkpoint(Schema):
     edit: dict[str, Plain] = Field({})
     experiment: str | None = None
     config_sha256: str = ""
+    recipe_changes: list[str] = Field(default_factory=list)  # "key=value" of keys that differ from the recipe's
     selected_by: str = ""
     averaged_weights: bool | None = None
     parameters: Int | None = None

@@ -145,6 +145,7 @@ def test_a_result_says_what_it_is_and_where_it_comes_from(runs, full):
     checkpoint = result.checkpoint
     assert {len(digest) for digest in (checkpoint.sha256, checkpoint.config_sha256, result.extractor.sha256)} == {64}
     assert (checkpoint.averaged_weights, checkpoint.selected_by) == (True, "none: last")
+    assert "denoiser.latent_dim=" in " ".join(checkpoint.recipe_changes)
     assert (checkpoint.guidance_scale, checkpoint.num_inference_steps, result.cost.nfe) == (1.5, 5, 5)
     assert (result.device, result.environment["packages"]["torch"]) == ("cpu", torch.__version__)
     value = means(result)

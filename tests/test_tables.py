@@ -16,6 +16,7 @@ from evaluators.sources import SampleFolder
 from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.model_files import FORMAT, FORMAT_KEY, weights_sha256
 from flame_mdm.commands.tables import outdated, shows_multimodality
+from flame_mdm.config import compose
 from flame_mdm.errors import UserError
 from flame_mdm.reporting.tables import build as builder
 from flame_mdm.reporting.tables.build import build
@@ -23,6 +24,7 @@ from flame_mdm.reporting.tables.format import Cell, Line, Table, ranks, rendered
 from flame_mdm.reporting.tables.specs import Evaluation, evaluations, load_spec, spec_names
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.safe_io import write_json
+from flame_mdm.training.start import recipe_changes
 
 SPEC = """
 title: "A table, 50 % & more_of_it"
@@ -167,6 +169,26 @@ def test_rows_of_another_evaluator_are_marked_and_not_compared(folder):
         assert all(cell is None or cell.rank == 0 for cell in lines["MFM"].cells), changes
         assert [cell.rank for cell in lines["MDM"].cells if cell] == [1, 2, 2, 1], changes
         assert [line.marks for line in part.lines if line.kind == "real"] == ["a", "b"], changes
+
+
+def test_a_recipe_changed_in_place_is_not_ranked_beside_the_recipe(folder):
+    checkpoint = measured(0, 0, 0)["checkpoint"] | {"recipe_changes": ["denoiser._target_=my_package.MyDenoiser"]}
+    put(request_of(folder, "MFM"), folder, measured(0.410, 0.7, 9.4, checkpoint=checkpoint))
+    part = made(folder).parts[0]
+    lines = {line.label: line for line in part.lines if line.kind == "measured"}
+    assert [lines[name].marks for name in ("MDM", "MFM", "FLAME <b>")] == ["a", "b", "a"]
+    assert all(cell is None or cell.rank == 0 for cell in lines["MFM"].cells)
+    changes = "the model differs from the recipe synthetic/mdm: denoiser._target_=my_package.MyDenoiser"
+    assert ("b", f"as a, but {changes}") in part.notes
+
+
+def test_changes_of_a_recipe_are_found_in_the_configuration_of_a_model():
+    for same in ([], ["seed=3", "run.name=mine", "data_root=/x", "trainer.max_steps=5", "selection=loss"]):
+        assert recipe_changes(compose("quickstart", same)) == [], same
+    config = compose("quickstart", ["denoiser=mdm_unet", "optimizer.lr=0.1", "+process.min_snr=5"])
+    network = "denoiser._target_=flame_mdm.denoisers.unet.MDMUNet"
+    assert recipe_changes(config) == [network, "optimizer.lr=0.1", "process.min_snr=5"]
+    assert recipe_changes({"experiment": "mine"}) == recipe_changes({"experiment": "quickstart"}) == []
 
 
 def test_footnotes_tell_what_was_left_out_the_skeleton_and_how_checkpoints_were_chosen(folder):

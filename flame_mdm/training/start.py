@@ -3,8 +3,8 @@
 from contextlib import nullcontext
 from pathlib import Path
 
-from flame_mdm.config import Config, flatten, movable, read_saved
-from flame_mdm.errors import UserError
+from flame_mdm.config import Config, compose, flatten, movable, read_saved, recipes
+from flame_mdm.errors import UserError, shortened
 
 FREE = (
     *("callbacks", "logger", "data_root", "data.root", "data.num_workers", "data.resident"),
@@ -29,6 +29,27 @@ def train(config: Config) -> None:
 
     with only_run(folder) if rank_zero_only.rank == 0 else nullcontext():
         fit(folder, config)
+
+
+def recipe_changes(config: Config) -> list[str]:
+    """Returns "key=value" of the keys in which a model's configuration differs from the recipe that it names.
+
+    Keys that may differ when a run is resumed, the seed, and keys that the configuration lacks, as those of other
+    versions do, are not compared. If the class of a part differs, its other keys are left out. Recipes that are not in
+    `experiments/` have no changes.
+    """
+    name = config.get("experiment")
+    if name not in recipes():
+        return []
+    recipe = flatten(movable(compose(name)))
+    model = {key: value for key, value in flatten(config).items() if not key.startswith((*FREE, "run", "seed"))}
+    changed = {key: value for key, value in model.items() if value != recipe.get(key)}
+    replaced = tuple(key.removesuffix("_target_") for key in changed if key.endswith("._target_"))
+    return [
+        f"{key}={shortened(str(value), 60)}"
+        for key, value in sorted(changed.items())
+        if key.endswith("._target_") or not key.startswith(replaced)
+    ]
 
 
 def _check_same(folder: Path, config: Config) -> None:

@@ -163,6 +163,10 @@ def _conditions(result: Result, timed: bool, shows_multimodality: bool) -> dict[
         shows_multimodality: whether the table shows multimodality; if not, whether it was measured does not matter.
     """
     protocol, data, extractor, cost = result.protocol, result.data, result.extractor, result.cost
+    checkpoint = result.checkpoint
+    recipe = ""
+    if checkpoint and checkpoint.recipe_changes:
+        recipe = f"the model differs from the recipe {checkpoint.experiment}: {', '.join(checkpoint.recipe_changes)}"
     card = card_of(data, extractor.sha256 if extractor else None)
     shown = {k: v for k, v in result.changed.items() if k != "multimodality" or shows_multimodality}
     changed = ", ".join(f"{k} = {v}" for k, v in shown.items())
@@ -182,6 +186,7 @@ def _conditions(result: Result, timed: bool, shows_multimodality: bool) -> dict[
         "exclusions": _left_out(data.excluded),
         "skeleton": skeleton,
         "changes": f"differs from the protocol: {changed}" if changed else "",
+        "changes of the recipe": recipe,
         "published split": PUBLISHED_SPLIT if result.published_split else "",
         "force": FORCED if result.forced else "",
         "warnings": "; ".join(result.warnings),

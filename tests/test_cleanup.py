@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 import torch
-from support.motions import synthetic
+from support.motions import posed, synthetic
 
 from evaluators.metrics.attributes import read_attributes
 from evaluators.metrics.physics import FootSkating
@@ -84,6 +84,18 @@ def test_contacts_of_the_features_find_feet_that_slide_fast():
     guessed, with_features = (skating([cleanup(slides, FPS, SMPL22, c)]) for c in (None, contacts.numpy()))
     assert guessed > 0.05
     assert with_features < 0.02
+
+
+def test_a_foot_stands_from_the_first_frame_of_its_contact_to_the_frame_after_the_last():
+    """A contact of frame 8 means that the foot stands from frame 8 to frame 9; the body slides by 6 mm per frame."""
+    slides = posed(30, root=np.arange(30)[:, None] * [0.006, 0, 0] + [0, 0.955, 0])
+    contacts = np.zeros((30, 4))
+    contacts[8:16] = 1
+    motion = cleanup(slides.joints, FPS, SMPL22, contacts)
+    toe = motion[:, SMPL22.joints.index("left_foot")][:, [0, 2]]
+    steps = np.linalg.norm(np.diff(toe, axis=0), axis=1)
+    assert (steps[8:16] < 0.001).all(), "from frame 8 to frame 16"
+    assert min(steps[7], steps[16]) > 0.008
 
 
 def test_hands_leave_the_body_without_a_jolt(clips):

@@ -75,6 +75,8 @@ BAD = {
     "model=/etc/passwd": "unknown model '/etc/passwd'", "model=quikstart": "Did you mean quickstart?",
     "text=": "the text is empty", "text=walks+|": "part 2 is empty", "text=" + quote("a\x00b\x1b[31m"): "text=",
     "text=walks+@600+|+waves": "the parts are too long: give at most 30 seconds in total",
+    "text=walks+@20+|+waves+@20": "the parts are too long: give at most 30 seconds in total",
+    "text=walks+|+waves+|+sits&seconds=11": "the parts are too long: give at most 30 seconds in total",
     f"text={'x' * 100_000}": "string should have at most 300 characters",
     "text=walks+%E2%80%AEkcab": "string should match", "file=/etc/passwd": "unknown option file",
     "path=0,nan": "path.0.1=nan: input should be a finite number",
@@ -261,6 +263,23 @@ def generated(server: str, query: str, session: str = "") -> list[Any]:
     output = json.loads(re.findall(rb"^data: (.*process_completed.*)$", stream, re.MULTILINE)[-1])["output"]
     assert "data" in output, (query[:200], output)
     return output["data"]
+
+
+@pytest.mark.parametrize(
+    ("query", "seconds"),
+    [
+        ("text=walks+@10+|+waves+@20", 30),
+        ("text=walks+@20+|+waves+@20", 40),
+        ("text=walks+|+waves+|+sits&seconds=11", 33),
+    ],
+)
+def test_the_parts_of_a_text_are_limited_in_total(query: str, seconds: int):
+    request = parsed(query)
+    if seconds <= 30:
+        making.check_length(request)
+        return
+    with pytest.raises(UserError, match="the parts are too long: give at most 30 seconds in total"):
+        making.check_length(request)
 
 
 @pytest.mark.slow

@@ -37,6 +37,22 @@ def joints_of(file: Glb, character: characters.Character) -> dict[str, np.ndarra
     return {joint: worlds[:, character.file.nodes[number], :3, 3] for joint, number in character.map.items()}
 
 
+ORDERS = {
+    **{"mixamo": "XYZ", "unreal": "ZYX", "unity": "ZXY", "rigify": "XYZ"},
+    **{"lafan1": "ZYX", "soma": "ZYX", "cmu": "ZYX", "100style": "YXZ"},
+}
+
+
+def test_each_skeleton_has_the_euler_order_of_its_program(tmp_path):
+    """In the order of the channels of a BVH file."""
+    assert ORDERS.keys() == presets().keys()
+    for rig, order in ORDERS.items():
+        synthetic("kick").save(tmp_path / "a.bvh", rig=rig)
+        channels = bvh.read(tmp_path / "a.bvh").channels
+        written = {"".join(name[0] for name in names if name.endswith("rotation")) for names in channels if names}
+        assert written == {order}, rig
+
+
 def test_a_known_skeleton_brings_the_joints_back_also_as_a_character_and_does_not_change_the_body(kick, tmp_path):
     kick.save(tmp_path / "b.glb")
     plain = Glb(tmp_path / "b.glb")

@@ -93,7 +93,7 @@ class Studio:
         """Returns the request with a sentence of several actions as a sequence; errors as for `generate`."""
         if not request.text or (model := self.model(request.model)).conditioned_on != "text":
             return request
-        _check_length(request)
+        check_length(request)
         sentence = SamplingRequest(texts=request.text, split=request.split, seconds=request.seconds)
         text = resolve(sentence, model).prompts[0].text
         return checked(request.model_dump() | {"text": text})
@@ -136,12 +136,12 @@ def _numbered(motions: Sequence[Motion], number: int) -> Motion:
 def _plan(model: MotionGenerator, request: DemoRequest) -> tuple[list[tuple[int | None, dict[str, Any]]], bool]:
     if model.conditioned_on != "none" and not request.text:
         raise UserError("the text is empty. Describe what the person does")
-    _check_length(request)
+    check_length(request)
     steps = request.steps(model.conditioned_on)
     return steps, bool(steps[-1][1].pop("cleanup", False))
 
 
-def _check_length(request: DemoRequest) -> None:
+def check_length(request: DemoRequest) -> None:
     """Raises `UserError` if the parts of a text are longer than the page allows."""
     parts = read_parts(request.text) if request.text else []
     if sum(seconds or request.seconds for _, seconds in parts) > MAX_SECONDS:

@@ -70,10 +70,10 @@ def test_a_request_is_resolved_once_and_reads_its_targets_once(tmp_path, monkeyp
     words = [f"text={TEXT}", "seconds=1.5", "num_inference_steps=2", "samples=1", "targets=t.json"]
     with (
         patch.object(resolution, "read_targets", wraps=read_targets) as read,
-        patch.object(resolution, "in_parts", wraps=resolution.in_parts) as split,
+        patch.object(resolution.Reader, "read", autospec=True, side_effect=resolution.Reader.read) as understood,
     ):
         assert main(["sample", "quickstart", *words]) == 0
-    assert (read.call_count, split.call_count) == (1, 1)
+    assert (read.call_count, understood.call_count) == (1, 1)
 
 
 def test_prompts_have_parts_frames_and_unknown_words(model):
@@ -81,12 +81,13 @@ def test_prompts_have_parts_frames_and_unknown_words(model):
     resolved = resolve(SamplingRequest(texts=texts, seconds=1.5), model)
     sentence, bow = resolved.prompts
     assert sentence.text == "a man walks forward | jumps moonily"
-    assert sentence.conditions == ("a man walks forward", "jumps moonily")
+    assert sentence.texts == ("a man walks forward", "jumps moonily")
+    assert sentence.conditions == ("a person walks forward", "a person jumps")
     assert (sentence.frames, bow.frames) == ((30, 30), (40,))
     assert (sentence.is_split, bow.is_split, resolved.is_sequence) == (True, False, True)
     assert (sentence.unknown, bow.unknown) == (("moonily",), ())
     (warning,) = resolved.warnings(model)
-    assert warning.startswith("'jumps moonily': never seen in training: moonily.")
+    assert warning == "'a man walks forward | jumps moonily': not understood: moonily"
 
 
 def test_notes_on_the_motion_to_continue_are_warnings(model, tmp_path):

@@ -22,6 +22,9 @@ import numpy as np
 FORMAT = 1
 MIN_WORDS = 3  # least number of tokens of a graph, with padding
 WORD = re.compile(r"[^\W_]+")
+NUMBERS = frozenset(
+    ["zero", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve"]
+)
 MASK = (1 << 64) - 1
 GRAPHS = ("denoiser.onnx", "joints.onnx", "poses.onnx")  # the last one only for SMPL's joints
 MAX_DESCRIPTION = 64 * 2**20  # bytes of model.json
@@ -300,6 +303,8 @@ def words(text: str) -> list[str]:
 
 def known_form(word: str, seen: set[str]) -> str | None:
     """See `flame_mdm.conditions.vocabulary.known_form`."""
+    if word in NUMBERS and word not in seen:
+        return None
     stems = [word.removesuffix(suffix) for suffix in ("ing", "ed", "es", "s", "d", "") if word.endswith(suffix)]
     stems += [stem[:-1] for stem in stems if len(stem) > 3 and stem[-1] in f"e{stem[-2]}"]
     forms = [stem + ending for stem in stems if len(stem) > 2 for ending in ("", "e", "s", "es", "ing", "ed")]

@@ -160,6 +160,8 @@ def _sample(settings: SampleSettings, request: SamplingRequest, prompts: PromptF
     for prompt in resolved.prompts:
         if prompt.is_split:
             say(f"sampled as a sequence: {prompt.text}. Add split=false to sample it as one action")
+        if prompts is None and prompt.readings:
+            say(f"understood: {', then '.join(reading.summary() for reading in prompt.readings)}")
     say(*(f"warning: {line}" for line in resolved.warnings(model)))
 
     score = None if settings.scorer is None else _score(settings.scorer, model)

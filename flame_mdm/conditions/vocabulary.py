@@ -19,6 +19,9 @@ FUNCTION_WORDS = frozenset(
     )
 )
 """Words that do not tell what happens; a text of these alone says nothing, and none of them is worth a warning."""
+NUMBERS = frozenset(
+    ["zero", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve"]
+)
 SUFFIXES = ("ing", "ed", "es", "s", "d", "")
 BREAK = re.compile(r"[.!?;]+\s+|[.,;]?\s+(?:and\s+)?(?:then|afterwards|after that)\b,?\s*|\s*\n\s*", re.IGNORECASE)
 BEGINNING = re.compile(r"^(?:(?:and|then|first|next|finally|afterwards|after that)\b[\s,]*)+", re.IGNORECASE)
@@ -58,6 +61,8 @@ def known_form(word: str, seen: Collection[str]) -> str | None:
     """Returns the word, or the same word with another ending (walked, walks), if it is known; otherwise None."""
     if word in seen:
         return word
+    if word in NUMBERS:  # "four" is no form of "fours"
+        return None
     stems = [word.removesuffix(suffix) for suffix in SUFFIXES if word.endswith(suffix)]
     stems += [stem[:-1] for stem in stems if len(stem) > 3 and stem[-1] in f"e{stem[-2]}"]  # waving, hopping
     forms = (stem + ending for stem in stems if len(stem) > 2 for ending in ("", "e", "s", "es", "ing", "ed"))

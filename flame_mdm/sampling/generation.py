@@ -159,7 +159,7 @@ def _sample(
 
     covering = windows(model, request, conditions, lengths) if resolved.is_sequence else None
     if request.kind == "text":
-        batch.text = [row.prompt.text for row in rows]
+        batch.text = [" | ".join(row.prompt.conditions) for row in rows]
     elif request.kind == "action" and covering is None:
         labels = [model.facts["actions"].index(name) for (name,) in conditions]
         batch.action = torch.tensor(labels, device=device)
@@ -235,7 +235,7 @@ def _decoded(model: MotionGenerator, resolved: ResolvedRequest, row: _Row, x: Te
         later = prompt.frames[1:]
         ends = np.cumsum([len(features) - sum(later), *later]).tolist()
         begins = [0 if resolved.before is None else len(resolved.before), *ends]
-        motion.parts = tuple(zip(prompt.conditions, begins, ends, strict=False))
+        motion.parts = tuple(zip(prompt.texts, begins, ends, strict=False))
     return motion
 
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from flame_mdm.batch import Edit
+from flame_mdm.conditions.language.reading import Reader, Reading
 from flame_mdm.conditions.vocabulary import advice, check_known, in_parts, unknown_words, unread_words
 from flame_mdm.errors import UserError, shortened
 from flame_mdm.formats.motion import Motion
@@ -35,7 +36,9 @@ class ResolvedPrompt:
     Attributes:
         text: the prompt; a sentence of several actions is written as a sequence, "walks | sits".
         is_split: whether the prompt was such a sentence.
-        conditions: text or action of each part.
+        conditions: caption or action of each part, as the model reads it.
+        texts: words of the prompt for each part.
+        readings: what was understood of the texts, if the model's captions have single actions.
         frames: number of frames of each part. In a continued motion, the first part includes the frames that overlap
             with the motion before.
         unknown: words of the text that the model has never seen in training, or does not read.
@@ -45,7 +48,18 @@ class ResolvedPrompt:
     is_split: bool
     conditions: tuple[str, ...]
     frames: tuple[int, ...]
+    texts: tuple[str, ...] = ()
+    readings: tuple[Reading, ...] = ()
     unknown: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """Parts of a prompt: their words and seconds, the captions that the model reads, and what was understood."""
+
+    parts: list[Part]
+    captions: tuple[str, ...]
+    readings: tuple[Reading, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -73,7 +87,12 @@ class ResolvedRequest:
     def warnings(self, model: MotionGenerator) -> list[str]:
         """Returns notes on the motion to continue, and lines about words unknown to the model or not read."""
         lines = [f"after={self.request.after}: {note}" for note in self.notes]
-        texts = dict.fromkeys(text for prompt in self.prompts if prompt.unknown for text in prompt.conditions)
+        several = len(self.prompts) > 1
+        for prompt in self.prompts:
+            about = f"'{shortened(prompt.text, 60)}': " if several else ""
+            lines += [f"{about}{line}" for reading in prompt.readings for line in reading.warnings()]
+        unread = (prompt for prompt in self.prompts if prompt.unknown and not prompt.readings)
+        texts = dict.fromkeys(text for prompt in unread for text in prompt.conditions)
         for text in texts:
             is_only_text = len(self.prompts) == 1 and text == self.prompts[0].text
             about = "" if is_only_text else f"'{shortened(text, 60)}': "
@@ -100,26 +119,28 @@ def resolve(
     Raises `UserError` if the model cannot do what is requested.
     """
     _check_model(request, model)
-    parts: dict[int, list[Part]] = {}
+    read: dict[int, _Parts] = {}
     for number, prompt in enumerate(request.prompts):
         with _collected(refused, number):
-            parts[number] = _parts(request, model, prompt, check_words)
+            read[number] = _parts(request, model, prompt, check_words)
 
-    is_sequence = request.loop or request.after is not None or any(is_timed(prompt) for prompt in parts.values())
+    is_timed_prompt = any(is_timed(prompt.parts) for prompt in read.values())
+    is_sequence = request.loop or request.after is not None or is_timed_prompt
     before, edit, notes = _continued(request, model)
     shared = 0 if before is None else overlap(model)
     usual_lengths = request.lengths(model.representation.fps)
     resolved: dict[int, ResolvedPrompt] = {}
-    for number, prompt_parts in parts.items():
+    for number, prompt in read.items():
         with _collected(refused, number):
-            conditions = tuple(condition for condition, _ in prompt_parts)
-            is_split = prompt_parts != request.parts[number]
-            text = " | ".join(conditions) if is_split else request.prompts[number]
+            texts = tuple(words for words, _ in prompt.parts)
+            is_split = len(prompt.parts) > len(request.parts[number])
+            text = " | ".join(texts) if is_split else request.prompts[number]
             first, *others = part_frames(
-                model, text, prompt_parts, usual_lengths[number], is_sequence=is_sequence, loop=request.loop
+                model, text, prompt.parts, usual_lengths[number], is_sequence=is_sequence, loop=request.loop
             )
-            unknown = _unknown_words(conditions, model) if request.kind == "text" else ()
-            resolved[number] = ResolvedPrompt(text, is_split, conditions, (shared + first, *others), unknown)
+            frames = (shared + first, *others)
+            unknown = _unknown_words(prompt, model) if request.kind == "text" else ()
+            resolved[number] = ResolvedPrompt(text, is_split, prompt.captions, frames, texts, prompt.readings, unknown)
 
     targets = _targets(request, model, list(resolved.values()))
     for number, prompt in resolved.items():
@@ -166,30 +187,57 @@ def _check_windows(model: MotionGenerator) -> None:
         )
 
 
-def _parts(request: SamplingRequest, model: MotionGenerator, prompt: str, check_words: bool) -> list[Part]:
+def _parts(request: SamplingRequest, model: MotionGenerator, prompt: str, check_words: bool) -> _Parts:
     """Returns the parts of a prompt; a sentence with several actions has a part per action."""
     if request.kind == "none":
-        return [(prompt, None)]
-    splits = request.kind == "text" and request.split and model.representation.relative
-    if splits and "|" not in prompt and "@" not in prompt:
+        return _Parts([(prompt, None)], (prompt,))
+    is_plain = "|" not in prompt and "@" not in prompt
+    is_relative = model.representation.relative
+    if request.kind == "text" and request.split and check_words and Reader.fits(model.facts):
+        return _checked(_read(Reader(model.facts), prompt, is_plain, is_relative), model)
+
+    splits = request.kind == "text" and request.split and is_relative
+    parts = read_parts(prompt)
+    if splits and is_plain:
         sentences = in_parts(prompt, model.facts.get("verbs", ()))
-        parts: list[Part] = [(sentence, None) for sentence in sentences] if len(sentences) > 1 else read_parts(prompt)
-    else:
-        parts = read_parts(prompt)
+        parts = [(sentence, None) for sentence in sentences] if len(sentences) > 1 else parts
     for condition, _ in parts:
         if request.kind == "text" and check_words:
             check_known(condition, model.facts)
         if request.kind == "action" and condition not in (actions := model.facts["actions"]):
             raise UserError(f"unknown action '{condition}'; this model knows: {', '.join(actions) or 'none'}")
-    if is_timed(parts):
+    return _checked(_Parts(parts, tuple(condition for condition, _ in parts)), model)
+
+
+def _read(reader: Reader, prompt: str, is_plain: bool, is_relative: bool) -> _Parts:
+    """Returns the parts of a prompt as a model of single actions reads them.
+
+    A part that the user has separated, or that cannot be a sequence, stays one part. If it names several actions, the
+    model reads its words as they are.
+    """
+    if is_plain and is_relative:
+        reading = reader.read(prompt)
+        if len(reading.texts) == 1:
+            return _Parts(read_parts(prompt), reading.captions, (reading,))
+        return _Parts([(words, None) for words in reading.texts], reading.captions, (reading,))
+
+    parts = read_parts(prompt)
+    readings = tuple(reader.read(words) for words, _ in parts)
+    pairs = zip(parts, readings, strict=True)
+    captions = tuple(read.captions[0] if len(read.captions) == 1 else words for (words, _), read in pairs)
+    return _Parts(parts, captions, readings)
+
+
+def _checked(parts: _Parts, model: MotionGenerator) -> _Parts:
+    if is_timed(parts.parts):
         _check_windows(model)
     return parts
 
 
-def _unknown_words(texts: Sequence[str], model: MotionGenerator) -> tuple[str, ...]:
-    words: list[str] = []
-    for text in texts:
-        words += unknown_words(text, model.facts)
+def _unknown_words(prompt: _Parts, model: MotionGenerator) -> tuple[str, ...]:
+    words = [word for reading in prompt.readings for word in reading.ignored]
+    for text in prompt.captions:
+        words += [] if prompt.readings else unknown_words(text, model.facts)
         words += unread_words(text, model.condition.max_words)
     return tuple(words)
 

@@ -12,7 +12,10 @@ export const words = (text) => text.toLowerCase().match(/[\p{L}\p{N}]+/gu) ?? []
 const digest = async (bytes) => new Uint8Array(await crypto.subtle.digest("SHA-256", bytes));
 const integers = (numbers, shape) => new ort.Tensor("int64", BigInt64Array.from(numbers, BigInt), shape);
 
+const NUMBERS = "zero one two three four five six seven eight nine ten eleven twelve".split(" ");
+
 export function knownForm(word, seen) { // see flame_mdm.conditions.vocabulary.known_form
+  if (NUMBERS.includes(word) && !seen.has(word)) return undefined; // "four" is no form of "fours"
   const stems = ["ing", "ed", "es", "s", "d", ""].filter((end) => word.endsWith(end)).map((end) => word.slice(0, word.length - end.length));
   stems.push(...stems.filter((stem) => stem.length > 3 && ["e", stem.at(-2)].includes(stem.at(-1))).map((stem) => stem.slice(0, -1)));
   const forms = stems.filter((stem) => stem.length > 2).flatMap((stem) => ["", "e", "s", "es", "ing", "ed"].map((end) => stem + end));

@@ -1,0 +1,111 @@
+"""Actions and attributes that a model knows, from the facts in its file."""
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from typing import Any
+
+from flame_mdm.conditions.language.meaning import nearest_to, similarity
+from flame_mdm.conditions.language.morphology import inflections
+from flame_mdm.conditions.language.parsing import understand
+from flame_mdm.conditions.language.tables import Value, actions
+from flame_mdm.conditions.language.understanding import Mention, Understanding
+from flame_mdm.conditions.language.wording import caption, predicate
+
+CHOICES: dict[str, tuple[Value, ...]] = {
+    "direction": ("forward", "backward", "left", "right", "clockwise", "counterclockwise"),
+    "speed": ("slow", "fast"),
+    "count": (1, 2, 3, 4, 5),
+    "side": ("left", "right", "both"),
+}
+"""Values of attributes to choose from."""
+WORDS_OF_VALUES: dict[Value, tuple[str, ...]] = {
+    1: ("once", "one", "single", "a ", "1"),
+    2: ("twice", "two", "2"),
+    3: ("three", "thrice", "3"),
+    4: ("four", "4"),
+    5: ("five", "5"),
+    "fast": ("fast", "quick", "brisk"),
+    "slow": ("slow",),
+    "forward": ("forward", "ahead", "straight"),
+    "backward": ("back", "reverse"),
+    "circle": ("circle",),
+}
+"""Parts of words, one of which a caption contains that states a value."""
+
+
+class Abilities:
+    """Actions and attributes of a model whose captions name one of a list of actions each.
+
+    Args:
+        facts: of the model: "actions", "vocabulary", and "captions" if it has them.
+    """
+
+    def __init__(self, facts: Mapping[str, Any]):
+        self.vocabulary = frozenset(facts["vocabulary"])
+        self.captions: Sequence[str] = facts.get("captions", ())
+        self.names: Sequence[str] = facts["actions"]
+
+    @cached_property
+    def actions(self) -> list[str]:
+        """The actions that the model knows, by their names in `actions.yaml`."""
+        listed: dict[str, None] = {}
+        for name in self.names:
+            plain = name.replace("_", " ").lower()
+            named = [entry.name for entry in actions().values() if plain in entry.names]
+            named = named or [mention.action for mention in understand(plain).mentions[:1]]
+            listed |= dict.fromkeys(named)
+        return [action for action in listed if self.has_words(actions()[action].say.format(side=""))]
+
+    @cached_property
+    def is_simultaneous(self) -> bool:
+        """Whether some caption of the model has two actions at the same time."""
+        marked = [text for text in self.captions if " while " in text or " at the same time" in text]
+        return any(len(step) > 1 for text in marked for step in understand(text).steps)
+
+    def has_words(self, text: str) -> bool:
+        """Returns whether all words of a text are in the vocabulary."""
+        return all(word in self.vocabulary for word in text.replace("-", " ").split())
+
+    def supports(self, action: str, name: str, value: Value) -> bool:
+        """Returns whether the model knows a value of an attribute of an action: a caption states both.
+
+        Without captions, all its words must be in the vocabulary.
+        """
+        words = predicate(Mention(action, {name: value}))
+        if not self.has_words(words):
+            return False
+        if not self.captions or name == "amount":
+            return True
+        if name == "count" and "steps" in actions()[action].takes:
+            return False  # "takes two steps" of captions is as good as "takes a few steps"
+
+        verbs = {form for phrase in actions()[action].phrases for form in inflections(phrase.words[0])}
+        parts = WORDS_OF_VALUES.get(value, (str(value),))
+        for text in self.captions:
+            if any(part in text for part in parts) and verbs & set(text.lower().split()):
+                mentions = understand(text).mentions
+                if any(mention.action == action and mention.attributes.get(name) == value for mention in mentions):
+                    return True
+        return False
+
+    def choices(self, action: str) -> dict[str, list[Value]]:
+        """Returns the values of each attribute that the model knows for an action."""
+        takes = actions()[action].takes
+        listed = {
+            name: [value for value in values if self.supports(action, name, value)]
+            for name, values in CHOICES.items()
+            if name in takes
+        }
+        return {name: values for name, values in listed.items() if values}
+
+    def ranked(self, action: str) -> list[str]:
+        """Returns the actions that the model knows, those with the nearest meanings first."""
+        return sorted(self.actions, key=lambda other: -similarity(action, other))
+
+    def nearest(self, understood: Understanding) -> list[str]:
+        """Returns captions of three known actions: those with the meanings nearest to a sentence, or the first ones."""
+        names = [action for action in understood.nearest if action in self.actions]
+        ranked = nearest_to([word for word in understood.text.lower().split() if word.isalpha()])
+        names += [action for action, _ in ranked if action in self.actions and action not in names]
+        names += [action for action in self.actions if action not in names]
+        return [caption((Mention(action),)) for action in names[:3]]

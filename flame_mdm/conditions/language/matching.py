@@ -1,0 +1,86 @@
+"""Phrases for actions in the words of a sentence."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from flame_mdm.conditions.language.morphology import base_forms
+from flame_mdm.conditions.language.tables import GAP, Phrase, phrases_by_first_word, words_of
+from flame_mdm.conditions.language.tokens import Token
+
+LONGEST_GAP = 4  # maximum number of words for a gap in a phrase
+
+
+@dataclass(frozen=True)
+class Match:
+    """A phrase for an action at the tokens `used`; `is_weak`: no action of its own next to another one."""
+
+    phrase: Phrase
+    used: tuple[int, ...]
+    is_weak: bool
+
+    @property
+    def first(self) -> int:
+        return self.used[0]
+
+    @property
+    def last(self) -> int:
+        return self.used[-1]
+
+
+def find_phrases(tokens: Sequence[Token]) -> list[Match]:
+    """Returns the phrases for actions in a sentence, the longest one at each word; phrases do not overlap."""
+    matches: list[Match] = []
+    number = 0
+    while number < len(tokens):
+        used, phrase = _longest_at(tokens, number)
+        if phrase is None:
+            number += 1
+            continue
+        if not _is_negated(tokens, number):
+            matches.append(Match(phrase, used, _is_weak(tokens, used, phrase)))
+        number = used[-1] + 1
+    return matches
+
+
+def _longest_at(tokens: Sequence[Token], start: int) -> tuple[tuple[int, ...], Phrase | None]:
+    listed = [phrase for base in base_forms(tokens[start].word) for phrase in phrases_by_first_word().get(base, ())]
+    listed.sort(key=lambda phrase: -phrase.size)
+    for phrase in listed:
+        used = _match(tokens, start, phrase.words)
+        if used is not None:
+            return used, phrase
+    return (), None
+
+
+def _match(tokens: Sequence[Token], start: int, words: Sequence[str]) -> tuple[int, ...] | None:
+    """Returns the positions of the words of a phrase from a token on; None if they are not there."""
+    if not words:
+        return ()
+    if words[0] == GAP:
+        for skipped in range(LONGEST_GAP + 1):
+            if any(not token.is_word for token in tokens[start : start + skipped]):
+                return None
+            used = _match(tokens, start + skipped, words[1:])
+            if used is not None:
+                return used
+        return None
+    if start >= len(tokens) or not tokens[start].is_word:
+        return None
+    if words[0] in base_forms(tokens[start].word):
+        rest = _match(tokens, start + 1, words[1:])
+        return None if rest is None else (start, *rest)
+    if tokens[start].word in words_of("determiners"):
+        return _match(tokens, start + 1, words)
+    return None
+
+
+def _is_negated(tokens: Sequence[Token], number: int) -> bool:
+    return number > 0 and tokens[number - 1].word in words_of("negation") and tokens[number].word != "not"
+
+
+def _is_weak(tokens: Sequence[Token], used: Sequence[int], phrase: Phrase) -> bool:
+    """Returns whether a phrase is a general verb, such as "go", or a noun after an article, such as "the guard"."""
+    if phrase.size > 1:
+        return phrase.words in {("stand", "still"), ("take", "step"), ("stand", "around"), ("stand", "there")}
+    before = tokens[used[0] - 1].word if used[0] else ""
+    return phrase.words[0] in words_of("weak") or before in words_of("determiners")

@@ -1,0 +1,86 @@
+"""Meanings of words that no table lists: the nearest actions, and things that are not actions."""
+
+from functools import cache
+
+import numpy as np
+
+from flame_mdm.conditions.language.tables import actions, words_of
+from flame_mdm.conditions.language.vectors import word_table
+
+SIMILAR = 0.65
+"""Similarity from which a word acts as the nearest action. Calibrated: docs/language.md has precision and recall."""
+NEIGHBORS = 5  # words for actions and things that decide whether a word is a thing
+
+
+def nearest_actions(word: str) -> list[tuple[str, float]]:
+    """Returns the actions by the similarity of a word, the nearest first; () if the table lacks the word."""
+    vector = word_table().vector(word)
+    return [] if vector is None else _ranked(vector)
+
+
+def nearest_to(words: list[str]) -> list[tuple[str, float]]:
+    """Returns the actions by the similarity of the mean of several words, the nearest first."""
+    vector = word_table().mean(words)
+    return [] if vector is None else _ranked(vector)
+
+
+def similarity(action: str, other: str) -> float:
+    """Returns the similarity of two actions: the cosine between the means of their words."""
+    names, _, _ = _action_vectors()
+    first, second = names.index(action), names.index(other)
+    centers = _centers()
+    return float(centers[first] @ centers[second])
+
+
+def is_thing(word: str) -> bool:
+    """Returns whether most of the listed words with the nearest meanings are things, not actions."""
+    vector = word_table().vector(word)
+    if vector is None:
+        return False
+    _, rows, vectors = _action_vectors()
+    things = _thing_vectors()
+    scores = np.concatenate([vectors @ vector, things @ vector])
+    nearest = np.argsort(-scores)[:NEIGHBORS]
+    return int((nearest >= len(rows)).sum()) * 2 > NEIGHBORS
+
+
+def _ranked(vector: np.ndarray) -> list[tuple[str, float]]:
+    """Returns the actions by their scores: the mean of the similarities to their nearest word and to their center."""
+    names, rows, vectors = _action_vectors()
+    words = vectors @ vector
+    nearest = np.full(len(names), -1.0)
+    np.maximum.at(nearest, rows, words)
+    scores = (nearest + _centers() @ vector) / 2
+    order = np.argsort(-scores, kind="stable")
+    return [(names[row], float(scores[row])) for row in order]
+
+
+@cache
+def _action_vectors() -> tuple[list[str], np.ndarray, np.ndarray]:
+    """Returns the names of the actions, and of each single word for an action its row in the names and its vector."""
+    table, weak = word_table(), words_of("weak")
+    names = list(actions())
+    rows, vectors = [], []
+    for row, entry in enumerate(actions().values()):
+        single = [phrase.words[0] for phrase in entry.phrases if phrase.size == 1 and phrase.words[0] not in weak]
+        listed = [vector for word in single if (vector := table.vector(word)) is not None]
+        if not listed and (vector := table.mean(list(entry.phrases[0].words))) is not None:
+            listed = [vector]
+        vectors += listed
+        rows += [row] * len(listed)
+    return names, np.array(rows), np.array(vectors)
+
+
+@cache
+def _centers() -> np.ndarray:
+    """Returns the mean vector (N, D) of the words of each action, of length 1."""
+    names, rows, vectors = _action_vectors()
+    centers = np.array([vectors[rows == row].sum(0) for row in range(len(names))])
+    return centers / np.maximum(np.linalg.norm(centers, axis=1, keepdims=True), 1e-9)
+
+
+@cache
+def _thing_vectors() -> np.ndarray:
+    table = word_table()
+    listed = [table.vector(word) for word in sorted(words_of("objects"))]
+    return np.array([vector for vector in listed if vector is not None])

@@ -1,0 +1,183 @@
+"""What a model makes of a sentence: the captions that it reads, and what it does not know."""
+
+from collections.abc import Mapping, Sequence, Set
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from flame_mdm.conditions.language.abilities import Abilities
+from flame_mdm.conditions.language.parsing import understand
+from flame_mdm.conditions.language.tables import Value, actions
+from flame_mdm.conditions.language.understanding import Mention, Step, Understanding
+from flame_mdm.conditions.language.wording import attribute_words, caption, predicate
+from flame_mdm.errors import UserError, shortened
+
+ATTRIBUTES = ("direction", "amount", "speed", "count", "side")
+LONGEST_COUNT = 12  # repetitions that are sampled as several parts, at most
+
+
+@dataclass(frozen=True)
+class Reading:
+    """A sentence as a model reads it.
+
+    Attributes:
+        understanding: what the sentence asks for.
+        steps: what the model does instead: actions that it knows, in their order.
+        captions: caption of each step, which the model reads.
+        texts: words of the sentence for each step.
+        changes: lines about what is sampled differently from what the sentence says.
+        ignored: words and attributes that change nothing, as typed or in words.
+    """
+
+    understanding: Understanding
+    steps: tuple[Step, ...]
+    captions: tuple[str, ...]
+    texts: tuple[str, ...]
+    changes: tuple[str, ...] = ()
+    ignored: tuple[str, ...] = ()
+
+    def summary(self) -> str:
+        """Returns what was understood in one line: "walks forward, then waves twice"."""
+        return ", then ".join(" + ".join(predicate(mention) for mention in step) for step in self.steps)
+
+    def warnings(self) -> list[str]:
+        """Returns lines about what is sampled differently from what the sentence says."""
+        ignored = [f"not understood: {', '.join(self.ignored)}"] if self.ignored else []
+        return [*self.changes, *ignored]
+
+
+class Reader:
+    """Reads sentences for a model whose captions name one of a list of actions each.
+
+    Args:
+        facts: of the model: "actions", "vocabulary", and "captions" if it has them.
+    """
+
+    def __init__(self, facts: Mapping[str, Any]):
+        self.abilities = Abilities(facts)
+
+    @staticmethod
+    def fits(facts: Mapping[str, Any]) -> bool:
+        """Returns whether a model, of these facts, has captions of single actions."""
+        return bool(facts.get("verbs")) and bool(facts.get("actions")) and bool(facts.get("vocabulary"))
+
+    def read(self, text: str) -> Reading:
+        """Returns a sentence as the model reads it.
+
+        Raises `UserError` if it is not English, or names an action that the model does not know.
+        """
+        sentence, style = _without_style(text)
+        understood = understand(sentence)
+        shown = f"'{shortened(text, 60)}'"
+        if understood.is_foreign:
+            raise UserError(f"{shown}: texts are understood in English only. Write it in English")
+        if not understood.steps:
+            raise NotUnderstood(f"{shown}: no word says what happens", self.abilities.nearest(understood))
+
+        notes = _Notes([f"'{typed}' is read as '{word}'" for typed, word in understood.corrected.items()])
+        notes.ignored += understood.unknown
+        steps: list[Step] = []
+        texts: list[str] = []
+        for step in understood.steps:
+            read = tuple(self._mention(mention, shown, notes) for mention in step)
+            parts = [part for one in self._possible(read, notes) for part in self._repeated(one, notes)]
+            steps += parts
+            texts += [read[0].text] if len(parts) == len(step) == 1 else [caption(part) for part in parts]
+
+        special = {word.lower() for word in understood.unknown} & self.abilities.vocabulary
+        captions = [f"{_caption(step, words, special)}{style}" for step, words in zip(steps, texts, strict=True)]
+        ignored = tuple(word for word in dict.fromkeys(notes.ignored) if word.lower() not in special)
+        changes = tuple(dict.fromkeys(notes.changes))
+        return Reading(understood, tuple(steps), tuple(captions), tuple(texts), changes, ignored)
+
+    def _mention(self, mention: Mention, shown: str, notes: "_Notes") -> Mention:
+        """Returns a mention of an action that the model knows, with the attributes that it knows."""
+        action, attributes = self._known_action(mention)
+        if action is None:
+            nearest = [caption((Mention(name),)) for name in self.abilities.ranked(mention.action)[:3]]
+            raise NotUnderstood(f"{shown}: the model does not know '{predicate(Mention(mention.action))}'", nearest)
+
+        if mention.typed:
+            notes.changes.append(f"'{mention.typed}' is read as '{predicate(Mention(action))}'")
+        elif action != mention.action:
+            instead = predicate(Mention(action, attributes))
+            notes.changes.append(
+                f"the model does not know '{predicate(Mention(mention.action))}': it {instead} instead"
+            )
+        stated = dict(attributes)
+        for name in ATTRIBUTES:
+            if name not in mention.attributes:
+                continue
+            value = mention.attributes[name]
+            takes = actions()[action].takes
+            is_repetition = name == "count" and name in takes and "steps" not in takes  # see `_repeated`
+            if is_repetition or (name in takes and self.abilities.supports(action, name, value)):
+                stated[name] = value
+            elif name not in attributes and (name, value) != ("speed", "normal"):
+                unit = " steps" if name == "count" and "steps" in takes else ""
+                notes.ignored.append(f"{value}{unit}" if unit else attribute_words(name, value))
+        return replace(mention, action=action, attributes=stated)
+
+    def _known_action(self, mention: Mention) -> tuple[str | None, dict[str, Value]]:
+        """Returns the action, or one that shows nearly the same, with its attributes; None if the model has none."""
+        if mention.action in self.abilities.actions:
+            return mention.action, {}
+        for like in actions()[mention.action].like:
+            if like.action in self.abilities.actions:
+                return like.action, dict(like.attributes)
+        return None, {}
+
+    def _possible(self, step: Step, notes: "_Notes") -> list[Step]:
+        """Returns the step, or its actions one after the other if the model knows no actions at the same time."""
+        distinct = tuple({mention.action: mention for mention in step}.values())
+        if len(distinct) == 1 or self.abilities.is_simultaneous:
+            return [distinct]
+        both = " and ".join(f"'{predicate(mention)}'" for mention in distinct)
+        notes.changes.append(f"the model cannot do {both} at the same time: they are sampled one after the other")
+        return [(mention,) for mention in distinct]
+
+    def _repeated(self, step: Step, notes: "_Notes") -> list[Step]:
+        """Returns a step as often as its count needs: "kicks four times" is "kicks twice", two times."""
+        mention, *others = step
+        count = mention.attributes.get("count")
+        if count is None or others or self.abilities.supports(mention.action, "count", count):
+            return [step]
+        counts = [n for n in (3, 2, 1) if self.abilities.supports(mention.action, "count", n)]
+        if not counts or int(count) > LONGEST_COUNT:
+            notes.ignored.append(attribute_words("count", count))
+            rest = {name: value for name, value in mention.attributes.items() if name != "count"}
+            return [(replace(mention, attributes=rest),)]
+        repeats: list[int] = []
+        while (missing := int(count) - sum(repeats)) > 0:
+            repeats.append(next(n for n in [*counts, missing] if n <= missing))
+        notes.changes.append(f"{attribute_words('count', count)} is sampled as {' + '.join(map(str, repeats))}")
+        return [(mention.stating(count=n),) for n in repeats]
+
+
+class NotUnderstood(UserError):
+    """A sentence without an action that the model knows; `nearest` are captions with similar meanings."""
+
+    def __init__(self, message: str, nearest: Sequence[str]):
+        suggested = " or ".join(f"'{text}'" for text in nearest)
+        super().__init__(f"{message}. Nearest in meaning: {suggested}" if nearest else f"{message}. Name an action")
+        self.nearest = tuple(nearest)
+
+
+@dataclass
+class _Notes:
+    """Lines about changes, and words that change nothing, collected while a sentence is read."""
+
+    changes: list[str]
+    ignored: list[str] = field(default_factory=list)
+
+
+def _caption(step: Step, words: str, special: Set[str]) -> str:
+    """Returns the caption of a step: the words of the sentence if the model knows one that no table explains."""
+    return words if special & set(words.lower().split()) else caption(step)
+
+
+def _without_style(text: str) -> tuple[str, str]:
+    """Returns a sentence without "in limp style" at its end, which adapters teach, and that ending."""
+    before, separator, style = text.rstrip(" .").rpartition(" in ")
+    if separator and style.endswith(" style") and style.count(" ") == 1:
+        return before, f" in {style}"
+    return text, ""

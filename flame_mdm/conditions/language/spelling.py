@@ -1,0 +1,69 @@
+"""Typos: corrections of one or two letters to a word for motion, its attributes or its subject."""
+
+from functools import cache
+
+from flame_mdm.conditions.language.morphology import inflections
+from flame_mdm.conditions.language.tables import GAP, actions, phrases, words_of
+
+NEVER_CORRECTED = 2  # maximum length of words that are too short to be recognized as another word
+FREQUENT = ("a", "the", "with", "and", "then", "to", "left", "right", "person", "man", "woman", "forward", "times")
+
+
+def distance(first: str, second: str, most: int) -> int:
+    """Returns the number of letters inserted, removed, replaced or swapped with a neighbor; above `most`, most + 1.
+
+    Optimal string alignment distance (Damerau 1964; Levenshtein 1966).
+    """
+    if abs(len(first) - len(second)) > most:
+        return most + 1
+    before: list[int] = []
+    row = list(range(len(second) + 1))
+    for i, letter in enumerate(first, start=1):
+        earlier, before, row = before, row, [i]
+        for j, other in enumerate(second, start=1):
+            cost = min(before[j] + 1, row[j - 1] + 1, before[j - 1] + (letter != other))
+            if i > 1 and j > 1 and letter == second[j - 2] and first[i - 2] == other:
+                cost = min(cost, earlier[j - 2] + 1)
+            row.append(cost)
+        if min(row) > most:
+            return most + 1
+    return min(row[-1], most + 1)
+
+
+@cache
+def corrections(word: str) -> tuple[str, ...]:
+    """Returns the words of the tables that a misspelled word may mean, all equally near; () if none is near.
+
+    A word of four letters or fewer has one wrong letter at most, a longer one two. A number has no typo.
+    """
+    if len(word) <= NEVER_CORRECTED or any(char.isdigit() for char in word):
+        return ()
+    most = 1 if len(word) <= 4 else 2
+    near: dict[int, list[str]] = {}
+    for other in _correct_words():
+        if len(other) > NEVER_CORRECTED and (far := distance(word, other, most)) <= most:
+            # wrong first letters and replaced letters are rarer than missing, added and swapped ones
+            begins_otherwise = sorted(other[:2]) != sorted(word[:2]) and other[0] != word[0]
+            has_replaced = len(other) == len(word) and sorted(other) != sorted(word)
+            near.setdefault(2 * far + begins_otherwise + has_replaced, []).append(other)
+    return tuple(near[min(near)]) if near else ()
+
+
+@cache
+def action_words() -> frozenset[str]:
+    """Returns the forms of all words in the phrases for actions."""
+    bases = {word for entry in actions().values() for phrase in entry.phrases for word in phrase.words}
+    return frozenset(form for base in bases - {GAP} for form in inflections(base))
+
+
+@cache
+def _correct_words() -> tuple[str, ...]:
+    """Returns the words that a typo may mean; those of an action first."""
+    tables = phrases()
+    listed = words_of("body") | words_of("people") | words_of("function") | words_of("objects")
+    for key in ("numbers", "times"):
+        listed |= frozenset(tables[key])
+    for key in ("direction", "speed"):
+        listed |= frozenset(word for words in tables[key].values() for word in words.split())
+    nouns = {form for word in words_of("body") | words_of("objects") for form in inflections(word)[:2]}
+    return tuple(dict.fromkeys([*FREQUENT, *sorted(action_words()), *sorted(listed | nouns)]))

@@ -1,0 +1,109 @@
+"""Tables of the language: `actions.yaml`, which has the words for actions, and `phrases.yaml`, which has all others."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from flame_mdm.safe_io import read_yaml
+
+Value = str | int
+GAP = "..."
+
+
+@dataclass(frozen=True)
+class Phrase:
+    """Words for an action, as base forms; `GAP` stands for up to four words. It may state attributes."""
+
+    words: tuple[str, ...]
+    action: str
+    attributes: Mapping[str, Value] = field(default_factory=dict)
+
+    @property
+    def size(self) -> int:
+        """Number of words without gaps."""
+        return len(self.words) - self.words.count(GAP)
+
+
+@dataclass(frozen=True)
+class ActionEntry:
+    """An action: the attributes that it takes, and how a caption says it; `actions.yaml` describes the fields."""
+
+    name: str
+    phrases: tuple[Phrase, ...]
+    takes: frozenset[str]
+    say: str
+    part: str = "hand"
+    ways: Mapping[str, str] = field(default_factory=dict)
+    usual: str = ""
+    names: tuple[str, ...] = ()
+    like: tuple[Phrase, ...] = ()
+
+
+@cache
+def phrases() -> dict[str, Any]:
+    """Returns the content of `phrases.yaml`."""
+    return read_yaml(Path(__file__).with_name("phrases.yaml"))
+
+
+@cache
+def words_of(*keys: str) -> frozenset[str]:
+    """Returns the words of a list in `phrases.yaml`; `words_of("speed", "slow")` is a list inside another."""
+    entry: Any = phrases()
+    for key in keys:
+        entry = entry[key]
+    return frozenset(entry.split())
+
+
+@cache
+def word_values(key: str) -> dict[str, str]:
+    """Returns the value that each word of a table states: `word_values("speed")["slowly"]` is "slow"."""
+    return {word: value for value, listed in phrases()[key].items() for word in listed.split()}
+
+
+@cache
+def actions() -> dict[str, ActionEntry]:
+    """Returns the actions by name."""
+    content = read_yaml(Path(__file__).with_name("actions.yaml"))
+    return {name: _entry(name, values) for name, values in content.items()}
+
+
+@cache
+def phrases_by_first_word() -> dict[str, list[Phrase]]:
+    """Returns the phrases for actions by their first words, those of most words first."""
+    listed_at: dict[str, list[Phrase]] = {}
+    for entry in actions().values():
+        for phrase in entry.phrases:
+            listed_at.setdefault(phrase.words[0], []).append(phrase)
+    for listed in listed_at.values():
+        listed.sort(key=lambda phrase: -phrase.size)
+    return listed_at
+
+
+def _entry(name: str, values: Mapping[str, Any]) -> ActionEntry:
+    listed = (phrase.strip() for phrase in values["words"].split(","))
+    return ActionEntry(
+        name=name,
+        phrases=tuple(_phrase(phrase, name) for phrase in listed),
+        takes=frozenset(values.get("takes", ())),
+        say=values["say"],
+        part=values.get("part", "hand"),
+        ways=values.get("ways", {}),
+        usual=values.get("usual", ""),
+        names=(name, *values.get("names", ())),
+        like=tuple(_like(phrase) for phrase in values.get("like", ())),
+    )
+
+
+def _phrase(text: str, action: str) -> Phrase:
+    parts = text.replace("-", " ").replace("'", " ").split()
+    stated = dict(part.split("=") for part in parts if "=" in part)
+    return Phrase(tuple(part for part in parts if "=" not in part), action, stated)
+
+
+def _like(text: str) -> Phrase:
+    """Returns another action, and attributes that it must have: "walk speed=slow"."""
+    parts = text.split()
+    name = " ".join(part for part in parts if "=" not in part)
+    return Phrase((name,), name, dict(part.split("=") for part in parts if "=" in part))

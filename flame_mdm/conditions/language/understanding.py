@@ -1,0 +1,62 @@
+"""What a sentence asks for: actions in their order, with their attributes."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+from flame_mdm.conditions.language.tables import Value
+
+
+@dataclass(frozen=True)
+class Mention:
+    """An action that a sentence asks for.
+
+    Attributes:
+        action: its name in `actions.yaml`.
+        attributes: side, count, direction, speed and amount, as far as the sentence states them.
+        text: the words of the sentence about it.
+        start, end: position of its verb in the sentence.
+        typed: the word that was read as this action because of its meaning; "" if the sentence names the action.
+    """
+
+    action: str
+    attributes: Mapping[str, Value] = field(default_factory=dict)
+    text: str = ""
+    start: int = 0
+    end: int = 0
+    typed: str = ""
+
+    def stating(self, **attributes: Value) -> "Mention":
+        """Returns the mention with additional attributes."""
+        return replace(self, attributes={**self.attributes, **attributes})
+
+
+Step = tuple[Mention, ...]
+"""Actions at the same time."""
+
+
+@dataclass(frozen=True)
+class Understanding:
+    """A sentence, as far as it is understood.
+
+    Attributes:
+        text: the sentence as typed.
+        steps: actions in their order.
+        objects: words for things, which change nothing.
+        unknown: words that are not understood; spelled as typed.
+        corrected: words that were read as other ones: as typed -> as read.
+        is_foreign: whether the sentence is in another language than English.
+        nearest: if no action is understood, the three actions with the nearest meanings.
+    """
+
+    text: str
+    steps: tuple[Step, ...] = ()
+    objects: tuple[str, ...] = ()
+    unknown: tuple[str, ...] = ()
+    corrected: Mapping[str, str] = field(default_factory=dict)
+    is_foreign: bool = False
+    nearest: tuple[str, ...] = ()
+
+    @property
+    def mentions(self) -> list[Mention]:
+        """All actions, in their order."""
+        return [mention for step in self.steps for mention in step]

@@ -1,0 +1,62 @@
+"""Words by meaning: a table of vectors for frequent English words and words for motion.
+
+`tools/word_vectors.py` distills it from MiniLM (all-MiniLM-L6-v2, Apache License 2.0); `word_vectors.md` has its source
+and its license.
+"""
+
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from flame_mdm.conditions.language.morphology import base_forms
+from flame_mdm.safe_io import read_npz
+
+FILE = Path(__file__).with_name("word_vectors.npz")
+SMOOTHING = 1e-4  # frequency from which words count less in a mean
+
+
+class WordTable:
+    """Vectors (N, D) of length 1 for N words, most frequent first."""
+
+    def __init__(self, words: Sequence[str], vectors: np.ndarray):
+        self.words = list(words)
+        self.vectors = vectors
+        self._rows = {word: row for row, word in enumerate(self.words)}
+
+    def has(self, word: str) -> bool:
+        """Returns whether the table has exactly this word."""
+        return word in self._rows
+
+    def rank(self, word: str) -> int | None:
+        """Returns the rank in frequency of a word, or of its base form; None if the table has neither."""
+        return next((self._rows[form] for form in base_forms(word) if form in self._rows), None)
+
+    def vector(self, word: str) -> np.ndarray | None:
+        """Returns the vector (D,) of a word, or of a word that it is a form of; None if it is not in the table."""
+        row = self.rank(word)
+        return None if row is None else self.vectors[row]
+
+    def mean(self, words: Sequence[str]) -> np.ndarray | None:
+        """Returns the mean vector (D,) of words, of length 1; None if the table has none of them.
+
+        Frequent words count less: smooth inverse frequency (Arora et al. 2017), with frequencies by Zipf's law.
+        """
+        rows = [row for word in words if (row := self.rank(word)) is not None]
+        if not rows:
+            return None
+        frequencies = 1 / (np.array(rows) + 2) / np.sum(1 / (np.arange(len(self.words)) + 2))
+        weights = SMOOTHING / (SMOOTHING + frequencies)
+        mean = weights @ self.vectors[rows]
+        return mean / max(float(np.linalg.norm(mean)), 1e-9)
+
+
+@cache
+def word_table() -> WordTable:
+    """Returns the table in the package."""
+    arrays = read_npz(FILE)
+    words = arrays["words"].tobytes().decode().split("\n")
+    # 8 bits per number; the scale of each word is lost, because vectors have length 1
+    vectors = arrays["vectors"].astype(np.float32)
+    return WordTable(words, vectors / np.linalg.norm(vectors, axis=1, keepdims=True))

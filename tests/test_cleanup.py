@@ -71,6 +71,15 @@ def test_faults_are_repaired(clips):
         assert np.abs(lengths / np.median(lengths, 0) - 1).max() < 1e-4
 
 
+def test_limbs_stay_above_the_floor_between_poses_that_differ_much():
+    """The frames between a crawl and a walk are means of both poses, with short bones."""
+    crawl, walk = synthetic("crawl").joints, synthetic("walk").joints
+    walk = walk + np.array([0, 0, crawl[-1, 0, 2]], np.float32)
+    share = np.linspace(0, 1, 10, dtype=np.float32)[:, None, None]
+    motion = np.concatenate([crawl, (1 - share) * crawl[-1] + share * walk[0], walk])
+    assert cleanup(motion, FPS, SMPL22)[..., 1].min() > motion[..., 1].min() - 0.02  # -0.2 without bent limbs
+
+
 def test_contacts_of_the_features_find_feet_that_slide_fast():
     """The feet of a run slide about as fast as they would swing, so only the features tell which of them stand."""
     representation = HumanML(fps=FPS, skeleton="smpl22", variant="clean")

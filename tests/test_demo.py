@@ -303,10 +303,14 @@ def test_a_sentence_becomes_parts_and_a_suggestion_a_button(server):
     request = DemoRequest(text="a person walks. Then she waves the lefft hand", **FAST)
     _, notes, query, *_, text = generated(server, request.query())
     assert text == parsed(query).text == "a person walks | she waves the lefft hand"
-    assert 'never seen in training: lefft. <button type="button">she waves the left hand</button></p>' in notes
-    assert generated(server, request.model_copy(update={"split": False}).query())[-1] == request.text
-    assert "knows no word of it" in (refused := generated(server, query_of("text=asdf+qwer"))[1])
-    assert '<button type="button">a person ' in refused
+    assert "&#x27;lefft&#x27; is read as &#x27;left&#x27;" in notes
+    assert '<option value="a person walks | a person waves with the left hand" selected>left</option>' in notes
+    assert '<option value="a person walks | a person waves with the right hand">right</option>' in notes
+    _, notes, *_, text = generated(server, request.model_copy(update={"split": False}).query())
+    assert text == request.text
+    refused = generated(server, query_of("text=asdf+qwer"))[1]
+    assert "no word says what happens. Nearest in meaning:" in refused
+    assert refused.count('<button type="button"><img src="data:image/webp;base64,') == 3
 
 
 @pytest.mark.slow

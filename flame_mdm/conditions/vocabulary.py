@@ -7,6 +7,8 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import cache
 from typing import Any
 
+from flame_mdm.conditions.language.meaning import similar_word
+from flame_mdm.conditions.language.tokens import is_known
 from flame_mdm.errors import UserError, shortened
 
 WORD = re.compile(r"[^\W_]+")
@@ -105,20 +107,31 @@ def unknown_words(text: str, facts: Mapping[str, Any]) -> list[str]:
 
 
 def _suggested(text: str, facts: Mapping[str, Any]) -> str:
-    """Returns " Did you mean '...'?": the text with similar known words, or the nearest training caption, if any."""
+    """Returns " Did you mean '...'?": the text with the known words that are meant, or the nearest training caption.
+
+    A word is meant if the unknown word is no English word and is spelled alike, or if it has a similar meaning; never
+    because an English word is spelled alike (shelf, she). A caption is near if it has a content word of the text.
+    """
     fixed = text.lower()
     for word in (unknown := unknown_words(text, facts)):
-        similar = [other for other in facts["vocabulary"] if other[:1] == word[0]]
-        if not (near := difflib.get_close_matches(word, similar, 1, 0.75)):
+        if (meant := _meant(word, facts["vocabulary"])) is None:
             break
         # a function, because the words of a model may contain backslashes
-        fixed = re.sub(rf"\b{word}\b", lambda _, nearest=near[0]: nearest, fixed)
+        fixed = re.sub(rf"\b{word}\b", lambda _, replacement=meant: replacement, fixed)
     else:
         if unknown:
             return f" Did you mean '{fixed}'?"
-    captions = facts.get("captions", ())
-    near = nearest(text, captions, 1) or plainest(captions)[:1]
+    near = nearest(text, facts.get("captions", ()), 1) if _content(text) else []
     return f" Did you mean '{near[0]}'?" if near else ""
+
+
+def _meant(word: str, vocabulary: Collection[str]) -> str | None:
+    """Returns the known word that an unknown word is a typo of, or that has a similar meaning; otherwise None."""
+    if not is_known(word):
+        similar = [other for other in vocabulary if other[:1] == word[0]]
+        return next(iter(difflib.get_close_matches(word, similar, 1, 0.75)), None)
+    content = [other for other in vocabulary if other not in FUNCTION_WORDS]
+    return similar_word(word, content)
 
 
 def in_parts(text: str, verbs: Collection[str]) -> list[str]:

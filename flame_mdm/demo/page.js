@@ -50,12 +50,17 @@ const editor = (() => {
   document.addEventListener('input', (event) => {
     if (event.target.closest('#parts')) write('text', join(read()))
   })
+  function generate(text) {
+    write('text', text)
+    setTimeout(() => document.querySelector('#go').click(), 50)  // after the field's value has been taken over
+  }
+
+  document.addEventListener('change', (event) => {
+    if (event.target.closest('#notes select')) generate(event.target.value)
+  })
   document.addEventListener('click', (event) => {
     const example = event.target.closest('#examples button, #notes button')
-    if (example) {
-      write('text', example.textContent)
-      setTimeout(() => document.querySelector('#go').click(), 50)  // after the field's value has been taken over
-    }
+    if (example) generate(example.textContent)
     const row = event.target.closest('#parts .remove')?.parentElement, floor = event.target.closest('#floor svg')
     if (row) {
       write('text', join(read().filter((_, index) => row.parentElement.children[index] !== row)))

@@ -9,6 +9,7 @@ from threading import Event, Lock
 from typing import Any
 
 from flame_mdm.checkpoints.loading import find, load
+from flame_mdm.conditions.language.reading import Reader, Reading
 from flame_mdm.conditions.vocabulary import advice
 from flame_mdm.demo.request import MAX_SECONDS, PLUS, DemoRequest, checked
 from flame_mdm.errors import UserError, did_you_mean, one_line
@@ -38,6 +39,7 @@ class Studio:
         self.device = device
         self.files = {name: find(name.partition(PLUS)[0]) for name in sources}
         self._models: dict[str, MotionGenerator] = {}
+        self._readers: dict[str, Reader] = {}
         self._made: OrderedDict[tuple[Any, ...], Sequence[Motion]] = OrderedDict()
         self._working, self._memory = Lock(), Lock()
         self.model(sources[0])
@@ -48,8 +50,18 @@ class Studio:
             raise UserError(f"unknown model {name[:60]!r}.{near} This page has: {', '.join(self.files)}")
         if name not in self._models:
             adapter = name.partition(PLUS)[2]
-            self._models[name] = load(self.files[name], self.device, adapter=[adapter] if adapter else ())
+            model = load(self.files[name], self.device, adapter=[adapter] if adapter else ())
+            if model.conditioned_on == "text" and Reader.fits(model.facts):
+                reader = self._readers[name] = Reader(model.facts)
+                for action in reader.abilities.actions:  # so that the first answer does not wait for its tables
+                    reader.abilities.choices(action)
+            self._models[name] = model
         return self._models[name]
+
+    def reader(self, name: str) -> Reader | None:
+        """Returns the reader of a model whose captions have single actions; None for other models."""
+        self.model(name)
+        return self._readers.get(name)
 
     def motions(
         self, request: DemoRequest, report: Callable[[int], None] = lambda calls: None, stop: Event | None = None
@@ -98,9 +110,17 @@ class Studio:
         text = resolve(sentence, model).prompts[0].text
         return checked(request.model_dump() | {"text": text})
 
+    def readings(self, request: DemoRequest) -> list[Reading]:
+        """Returns what was understood of each part of a request's text; [] for models that read any words."""
+        reader = self.reader(request.model)
+        if reader is None or not request.text or not request.split:
+            return []
+        return [reader.read(words) for words, _ in read_parts(request.text)]
+
     def advice(self, request: DemoRequest) -> list[str]:
+        """Returns lines about words that the model has never seen or does not read."""
         model = self.model(request.model)
-        if model.conditioned_on != "text":
+        if model.conditioned_on != "text" or self.readings(request):
             return []
         texts = [part.text for part in (request, *request.edits) if part.text]
         parts = dict.fromkeys(words for text in texts for words, _ in read_parts(text))

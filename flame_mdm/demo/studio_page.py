@@ -12,7 +12,11 @@ from typing import Any
 
 import gradio as gr
 
+from flame_mdm.conditions.language.parsing import understand
+from flame_mdm.conditions.language.reading import NotUnderstood
+from flame_mdm.conditions.language.tables import actions
 from flame_mdm.data.synthetic import example, prompts
+from flame_mdm.demo.chips import chips
 from flame_mdm.demo.request import MAX_TEXT, DemoRequest, parse_query, query_pairs
 from flame_mdm.demo.studio import FORMATS, Studio
 from flame_mdm.errors import UserError, first_line, markdown_text, one_line
@@ -20,6 +24,7 @@ from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.retarget import presets
 from flame_mdm.generator import MotionGenerator
 from flame_mdm.processes.guidance import STEERING_STEPS
+from flame_mdm.sampling.motion_request import read_parts
 from flame_mdm.visualize import player_page
 from flame_mdm.visualize.render import thumbnail
 
@@ -65,6 +70,8 @@ def build_page(studio: Studio) -> gr.Blocks:
                 progress((calls, max(total, calls + 1)), "Generating", unit="steps")
 
             return _result(ui, studio, request, studio.motions(request, report, stop))
+        except NotUnderstood as error:
+            return {ui.notes: _refusal(error)}
         except UserError as error:
             return {ui.notes: _note("error", first_line(error))}
         finally:
@@ -196,12 +203,36 @@ def _result(ui: SimpleNamespace, studio: Studio, request: DemoRequest, motions: 
     return {
         ui.player: f'<iframe title="Player" sandbox="allow-scripts allow-downloads" srcdoc="{player}"></iframe>',
         ui.text: request.text,
-        ui.notes: "".join(_note("warning", line) for line in studio.advice(request)),
+        ui.notes: _understood(studio, request),
         ui.query: request.query(),
         ui.files: links,
         ui.python: request.python(kind, studio.device),
         ui.chosen: gr.Radio([(str(k + 1), k) for k in range(len(motions))], value=0, visible=len(motions) > 1),
     }
+
+
+def _understood(studio: Studio, request: DemoRequest) -> str:
+    """Returns the chips of a text and the messages about it."""
+    notes = "".join(_note("warning", line) for line in studio.advice(request))
+    readings, reader = studio.readings(request), studio.reader(request.model)
+    if not readings or reader is None:
+        return notes
+    lines = dict.fromkeys(line for reading in readings for line in reading.changes)
+    shown = chips(reader.abilities, read_parts(request.text), readings)
+    return shown + "".join(_note("warning", line) for line in lines) + notes
+
+
+def _refusal(error: NotUnderstood) -> str:
+    """Returns the message about a text without a known action; the nearest actions are buttons with pictures."""
+    message = f'<p class="error" role="alert">{escape(one_line(error.message))}. Nearest in meaning:</p>'
+    return f'{message}<p class="nearest">{_buttons({text: _still(text) for text in error.nearest})}</p>'
+
+
+def _still(text: str) -> str:
+    """Returns the address of a picture of the action in a caption; "" without a picture."""
+    names = actions()[understand(text).mentions[0].action].names
+    drawn = (prompt for prompt, attributes in prompts() if attributes["action"] in names)
+    return next((_picture(prompt) for prompt in drawn), "")
 
 
 def _note(kind: str, line: str) -> str:

@@ -45,7 +45,9 @@ def cleanup(joints: np.ndarray, fps: float, skeleton: Skeleton, contacts: np.nda
     """
     if len(joints) < 4:
         return np.array(joints, np.float32)
-    motion = _constant_bones(_smooth(np.asarray(joints, float)), skeleton)
+    smooth = _smooth(np.asarray(joints, float))
+    motion = _constant_bones(smooth, skeleton)
+    _keep_heights(motion, smooth, skeleton)
     toes = [chain[-1] for chain in skeleton.chains[:2]]
     motion = _follow_feet(motion, toes, fps)
     if contacts is None:
@@ -101,6 +103,28 @@ def _constant_bones(motion: np.ndarray, skeleton: Skeleton) -> np.ndarray:
     return out
 
 
+def _keep_heights(motion: np.ndarray, before: np.ndarray, skeleton: Skeleton) -> None:
+    """Bends the limbs whose feet or hands are lower than before bones got their lengths.
+
+    Where a sequence passes from one pose to a very different one, such as from a crawl to a walk, its poses are means
+    of both, with short bones. At their full lengths, these would reach through the floor.
+    """
+    legs = [chain[1:] for chain in skeleton.chains[:2]]
+    for limb in (*legs, *(_arm(skeleton, side) for side in ("left", "right"))):
+        end = limb[2:]
+        lowered = before[:, end, 1].min(1) - motion[:, end, 1].min(1)
+        shift = np.zeros((len(motion), 3))
+        shift[:, 1] = np.maximum(lowered, 0)
+        if shift.any():
+            _bend(motion, limb, shift)
+
+
+def _arm(skeleton: Skeleton, side: str) -> list[int]:
+    """Returns shoulder, elbow, wrist and, if the skeleton has one, hand of a side."""
+    arm = [skeleton.joints.index(f"{side}_{name}") for name in ("shoulder", "elbow", "wrist")]
+    return arm + [joint for joint, name in enumerate(skeleton.joints) if name == f"{side}_hand"]
+
+
 def _contacts(toes: np.ndarray, root: np.ndarray, fps: float, share: float) -> np.ndarray:
     """Returns (F - 1, 2) in [0, 1]: the confidence that each toe (F, 2, 3) stands on the floor until the next frame."""
     speed = np.linalg.norm(np.diff(toes[..., [0, 2]], axis=0), axis=-1) * fps
@@ -130,8 +154,7 @@ def _follow_feet(motion: np.ndarray, toes: list[int], fps: float) -> np.ndarray:
 
 def _push_out(motion: np.ndarray, skeleton: Skeleton, side: str, fps: float) -> None:
     """Moves a wrist away from the axis of trunk or thigh until neither it nor the hand is inside."""
-    arm = [skeleton.joints.index(f"{side}_{name}") for name in ("shoulder", "elbow", "wrist")]
-    arm += [joint for joint, name in enumerate(skeleton.joints) if name == f"{side}_hand"]
+    arm = _arm(skeleton, side)
     frames = max(1.0, CLEAR * fps)
     other = skeleton.joints.index("right_shoulder" if side == "left" else "left_shoulder")
     aside = unit(motion[:, arm[0]] - motion[:, other])  # a hand near the axis goes to its own side

@@ -57,7 +57,7 @@ class ResolvedPrompt:
 class _Parts:
     """Parts of a prompt: their words and seconds, the captions that the model reads, and what was understood."""
 
-    parts: list[Part]
+    parts: Sequence[Part]
     captions: tuple[str, ...]
     readings: tuple[Reading, ...] = ()
 
@@ -191,14 +191,12 @@ def _parts(request: SamplingRequest, model: MotionGenerator, prompt: str, check_
     """Returns the parts of a prompt; a sentence with several actions has a part per action."""
     if request.kind == "none":
         return _Parts([(prompt, None)], (prompt,))
-    is_plain = "|" not in prompt and "@" not in prompt
-    is_relative = model.representation.relative
-    if request.kind == "text" and request.split and check_words and Reader.fits(model.facts):
-        return _checked(_read(Reader(model.facts), prompt, is_plain, is_relative), model)
+    splits = request.split and model.representation.relative and "|" not in prompt and "@" not in prompt
+    if request.kind == "text" and check_words and Reader.fits(model.facts):
+        return _checked(_read(Reader(model.facts), prompt, splits), model)
 
-    splits = request.kind == "text" and request.split and is_relative
     parts = read_parts(prompt)
-    if splits and is_plain:
+    if request.kind == "text" and splits:
         sentences = in_parts(prompt, model.facts.get("verbs", ()))
         parts = [(sentence, None) for sentence in sentences] if len(sentences) > 1 else parts
     for condition, _ in parts:
@@ -209,13 +207,13 @@ def _parts(request: SamplingRequest, model: MotionGenerator, prompt: str, check_
     return _checked(_Parts(parts, tuple(condition for condition, _ in parts)), model)
 
 
-def _read(reader: Reader, prompt: str, is_plain: bool, is_relative: bool) -> _Parts:
+def _read(reader: Reader, prompt: str, splits: bool) -> _Parts:
     """Returns the parts of a prompt as a model of single actions reads them.
 
-    A part that the user has separated, or that cannot be a sequence, stays one part. If it names several actions, the
-    model reads its words as they are.
+    Unless it is split, a prompt keeps its parts. If one of them names several actions, the model reads its words as
+    they are.
     """
-    if is_plain and is_relative:
+    if splits:
         reading = reader.read(prompt)
         if len(reading.texts) == 1:
             return _Parts(read_parts(prompt), reading.captions, (reading,))

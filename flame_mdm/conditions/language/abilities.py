@@ -44,6 +44,7 @@ class Abilities:
         self.vocabulary = frozenset(facts["vocabulary"])
         self.captions: Sequence[str] = facts.get("captions", ())
         self.names: Sequence[str] = facts["actions"]
+        self._supported: dict[tuple[str, str, Value], bool] = {}
 
     @cached_property
     def actions(self) -> list[str]:
@@ -71,6 +72,12 @@ class Abilities:
 
         Without captions, all its words must be in the vocabulary.
         """
+        key = (action, name, value)
+        if key not in self._supported:
+            self._supported[key] = self._states(action, name, value)
+        return self._supported[key]
+
+    def _states(self, action: str, name: str, value: Value) -> bool:
         words = predicate(Mention(action, {name: value}))
         if not self.has_words(words):
             return False

@@ -33,7 +33,7 @@ CONNECTORS = {
     ("meanwhile",): WHILE,
 }
 """Words that say in which order two clauses happen, the longest first."""
-AT_THE_END = ("simultaneously", "meanwhile", "at", "in", "afterwards", "afterward", "later")
+AT_THE_END = {(word,) for word in ("simultaneously", "meanwhile", "at", "in", "afterwards", "afterward", "later")}
 """First words of connectors that may also stand at the end of the clause to which they belong."""
 NEED_SUBJECT = ("once", "as")
 """Connectors only if a subject follows: "once they have", not "jumps once"."""
@@ -83,7 +83,7 @@ def _clauses(tokens: Sequence[Token], matches: Sequence[Match]) -> Iterator[Clau
 
         link = CONNECTORS.get(words, "")
         number += max(1, len(words))
-        if link and words[0] in AT_THE_END and clause.numbers:
+        if link and words[:1] in AT_THE_END and clause.numbers:
             clause.link = link
             continue
         if clause.numbers:

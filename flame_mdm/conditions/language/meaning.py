@@ -1,5 +1,6 @@
 """Meanings of words that no table lists: the nearest actions, and things that are not actions."""
 
+from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
@@ -30,6 +31,17 @@ def similarity(action: str, other: str) -> float:
     first, second = names.index(action), names.index(other)
     centers = _centers()
     return float(centers[first] @ centers[second])
+
+
+def similar_word(word: str, words: Sequence[str]) -> str | None:
+    """Returns the word with the nearest meaning, if it is similar enough to stand for a word; otherwise None."""
+    vector = word_table().vector(word)
+    pairs = [(other, row) for other in words if (row := word_table().vector(other)) is not None]
+    if vector is None or not pairs:
+        return None
+    scores = np.array([row for _, row in pairs]) @ vector
+    best = int(scores.argmax())
+    return pairs[best][0] if scores[best] >= SIMILAR else None
 
 
 def is_thing(word: str) -> bool:

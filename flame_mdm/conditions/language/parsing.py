@@ -86,9 +86,9 @@ class _Sentence:
                 continue
 
             if during:
-                added, during = [*during[:-1], during[-1] + added[0], *added[1:]], []
+                added, during = [*during[:-1], (*during[-1], *added[0]), *added[1:]], []
             if steps and (clause.link == WHILE or self._is_manner(clause, steps)):
-                steps[-1:] = [steps[-1] + added[0], *added[1:]]
+                steps[-1:] = [(*steps[-1], *added[0]), *added[1:]]
             elif steps and clause.link == AFTER and not clause.is_first:
                 steps[-1:-1] = added
             elif steps and not clause.link and _is_same(steps[-1], added[0]):
@@ -162,7 +162,7 @@ class _Sentence:
             if added and _is_same(added[-1], (mention,)):
                 added[-1] = (added[-1][0].stating(**mention.attributes),)
             elif added and self.tokens[match.first].word.endswith("ing"):
-                added[-1] += (mention,)
+                added[-1] = (*added[-1], mention)
             else:
                 added.append((mention,))
         return added
@@ -204,16 +204,14 @@ class _Sentence:
         return before.action == "idle" or not self.text[before.start : before.end].lower().endswith("ing")
 
     def _words(self, numbers: Sequence[int]) -> str:
-        """Returns the words of a clause as read: as typed, except for corrected words."""
+        """Returns the words of a clause, as typed."""
         words: list[str] = []
         for number in numbers:
             token = self.tokens[number]
-            word = token.typed if token.typed.lower() == token.word else token.word
-            glued = number > 0 and words and self.tokens[number - 1].end == token.start
-            if glued:
-                words[-1] += word
+            if words and self.tokens[number - 1].end == token.start:
+                words[-1] += token.typed
             else:
-                words.append(word)
+                words.append(token.typed)
         return " ".join(words)
 
 
@@ -227,5 +225,5 @@ def _is_same(step: Step, other: Step) -> bool:
 
 def _without_idle(step: Step) -> Step:
     """Returns a step without "stands still", if another action happens at the same time, and without repetitions."""
-    moving = tuple(mention for mention in step if mention.action != "idle") or step[:1]
+    moving = [mention for mention in step if mention.action != "idle"] or step[:1]
     return tuple({mention.action: mention for mention in moving}.values())

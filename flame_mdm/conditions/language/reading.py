@@ -159,6 +159,7 @@ class NotUnderstood(UserError):
     def __init__(self, message: str, nearest: Sequence[str]):
         suggested = " or ".join(f"'{text}'" for text in nearest)
         super().__init__(f"{message}. Nearest in meaning: {suggested}" if nearest else f"{message}. Name an action")
+        self.message = message
         self.nearest = tuple(nearest)
 
 

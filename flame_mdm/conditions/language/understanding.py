@@ -1,6 +1,6 @@
 """What a sentence asks for: actions in their order, with their attributes."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from flame_mdm.conditions.language.tables import Value
@@ -30,7 +30,7 @@ class Mention:
         return replace(self, attributes={**self.attributes, **attributes})
 
 
-Step = tuple[Mention, ...]
+Step = Sequence[Mention]
 """Actions at the same time."""
 
 

@@ -17,7 +17,7 @@ from flame_mdm.conditions.language.understanding import Mention, Understanding
 from flame_mdm.conditions.language.vectors import FILE, word_table
 from flame_mdm.conditions.language.wording import caption, predicate
 from flame_mdm.conditions.vocabulary import known_form
-from flame_mdm.data.synthetic import ACTIONS, prompts
+from flame_mdm.data.synthetic import prompts
 from flame_mdm.errors import UserError
 
 ATTRIBUTES = ("side", "count", "direction", "speed")
@@ -93,7 +93,7 @@ def test_captions_say_what_they_are_understood_to_say():
 
 
 FACTS = {
-    "actions": list(ACTIONS),
+    "actions": list(dict.fromkeys(str(attributes["action"]) for _, attributes in prompts())),
     "verbs": ["walks"],
     "vocabulary": sorted({word for text, _ in prompts() for word in text.lower().split()} | {"crouches", "sits"}),
     "captions": [text for text, _ in prompts()],
@@ -141,6 +141,13 @@ def test_actions_at_the_same_time_are_one_caption_for_a_model_that_knows_them():
     }
     (line,) = Reader(facts).read("while walking, a man waves with the left hand").captions
     assert line == "a person walks forward while waving with the left hand"
+
+
+def test_words_that_no_table_lists_are_read_as_they_are_if_the_model_knows_them():
+    facts = FACTS | {"vocabulary": [*FACTS["vocabulary"], "yodels", "loudly"]}
+    assert Reader(facts).read("a person yodels loudly").captions == ("a person yodels loudly",)
+    with pytest.raises(NotUnderstood):
+        Reader(FACTS).read("a person yodels loudly")
 
 
 @pytest.mark.parametrize("text", ["ein Mann geht langsam", "un homme marche", "人が歩く", "человек идёт"])

@@ -116,7 +116,7 @@ def _keep_heights(motion: np.ndarray, before: np.ndarray, skeleton: Skeleton) ->
         shift = np.zeros((len(motion), 3))
         shift[:, 1] = np.maximum(lowered, 0)
         if shift.any():
-            _bend(motion, limb, shift)
+            bend(motion, limb, shift)
 
 
 def _arm(skeleton: Skeleton, side: str) -> list[int]:

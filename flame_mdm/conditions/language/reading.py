@@ -37,6 +37,8 @@ class Reading:
 
     def summary(self) -> str:
         """Returns what was understood in one line: "walks forward, then waves twice"."""
+        if not self.steps:
+            return self.texts[0]
         return ", then ".join(" + ".join(predicate(mention) for mention in step) for step in self.steps)
 
     def warnings(self) -> list[str]:
@@ -70,6 +72,8 @@ class Reader:
         shown = f"'{shortened(text, 60)}'"
         if understood.is_foreign:
             raise UserError(f"{shown}: texts are understood in English only. Write it in English")
+        if not understood.steps and self.abilities.has_words(" ".join(understood.unknown)) and understood.unknown:
+            return Reading(understood, (), (text,), (text,))
         if not understood.steps:
             raise NotUnderstood(f"{shown}: no word says what happens", self.abilities.nearest(understood))
 

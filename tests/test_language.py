@@ -4,6 +4,7 @@ import json
 from collections import defaultdict
 from itertools import chain
 
+import numpy as np
 import pytest
 from support.fixtures import ROOT
 
@@ -17,7 +18,8 @@ from flame_mdm.conditions.language.understanding import Mention, Understanding
 from flame_mdm.conditions.language.vectors import FILE, word_table
 from flame_mdm.conditions.language.wording import caption, predicate
 from flame_mdm.conditions.vocabulary import known_form
-from flame_mdm.data.synthetic import prompts
+from flame_mdm.data.synthetic import draw_captions, prompts
+from flame_mdm.data.synthetic_actions import ACTIONS
 from flame_mdm.errors import UserError
 
 ATTRIBUTES = ("side", "count", "direction", "speed")
@@ -73,6 +75,17 @@ def test_the_prompts_of_the_synthetic_set_are_understood():
         assert attributes["action"] in names, text
         stated = {"count": 1, "speed": "normal", "amount": "quarter"} | dict(step[0].attributes)
         assert attributes.items() <= (stated | {"action": attributes["action"]}).items(), text
+
+
+def test_captions_of_all_synthetic_actions_are_understood():
+    rng = np.random.default_rng(0)
+    right = []
+    for name, action in ACTIONS.items():
+        captions, _ = draw_captions(rng, action.draw(rng, name), 4)
+        for text in captions:
+            mentions = understand(text).mentions
+            right.append(len(mentions) == 1 and name in actions()[mentions[0].action].names)
+    assert sum(right) / len(right) >= 0.85
 
 
 def test_captions_say_what_they_are_understood_to_say():
@@ -132,6 +145,15 @@ def test_a_reading_says_what_is_different_from_the_sentence():
     )
     (line,) = reader.read("a person limps").warnings()
     assert line == "the model does not know 'limps': it walks forward slowly instead"
+
+
+def test_two_actions_that_a_model_knows_as_one_are_joined():
+    text = "stretches both arms above the head and leans to the left"
+    facts = FACTS | {"actions": [*FACTS["actions"], "stretch sideways"], "captions": []}
+    facts["vocabulary"] = [*FACTS["vocabulary"], "stretches", "sideways"]
+    assert Reader(facts).read(text).captions == ("a person stretches sideways to the left",)
+    with pytest.raises(NotUnderstood, match="the model does not know 'leans'"):
+        Reader(FACTS).read(text)
 
 
 def test_actions_at_the_same_time_are_one_caption_for_a_model_that_knows_them():

@@ -81,7 +81,7 @@ class Reader:
         notes.ignored += understood.unknown
         steps: list[Step] = []
         texts: list[str] = []
-        for step in understood.steps:
+        for step in _joined(understood.steps, self.abilities.actions):
             read = tuple(self._mention(mention, shown, notes) for mention in step)
             parts = [part for one in self._possible(read, notes) for part in self._repeated(one, notes)]
             steps += parts
@@ -173,6 +173,23 @@ class _Notes:
 
     changes: list[str]
     ignored: list[str] = field(default_factory=list)
+
+
+def _joined(steps: Sequence[Step], names: Sequence[str]) -> list[Step]:
+    """Returns the steps with pairs that the model knows as one action: "stretches both arms and leans to the left"."""
+    pairs = {entry.joins: entry.name for entry in actions().values() if entry.joins and entry.name in names}
+    joined: list[Step] = []
+    for step in steps:
+        before = joined[-1] if joined else ()
+        pair = tuple(mention.action for mention in (*before, *step))
+        if pair in pairs and len(before) == 1:
+            text = f"{before[0].text} and {step[0].text}"
+            attributes = {**before[0].attributes, **step[0].attributes}
+            taken = {name: value for name, value in attributes.items() if name in actions()[pairs[pair]].takes}
+            joined[-1] = (replace(step[0], action=pairs[pair], attributes=taken, text=text),)
+        else:
+            joined.append(step)
+    return joined
 
 
 def _caption(step: Step, words: str, special: Set[str]) -> str:

@@ -37,6 +37,8 @@ class ActionEntry:
     part: str = "hand"
     ways: Mapping[str, str] = field(default_factory=dict)
     usual: str = ""
+    joins: tuple[str, ...] = ()
+    before_side: str = "with"
     names: tuple[str, ...] = ()
     like: tuple[Phrase, ...] = ()
 
@@ -91,6 +93,8 @@ def _entry(name: str, values: Mapping[str, Any]) -> ActionEntry:
         part=values.get("part", "hand"),
         ways=values.get("ways", {}),
         usual=values.get("usual", ""),
+        joins=tuple(values.get("joins", ())),
+        before_side="on" if values.get("on") else "with",
         names=(name, *values.get("names", ())),
         like=tuple(_like(phrase) for phrase in values.get("like", ())),
     )

@@ -40,7 +40,7 @@ def predicate(mention: Mention) -> str:
     if "count" in stated:
         words.append(times(int(stated["count"])))
     if "side" in stated and "{side}" not in entry.say:
-        words.append(f"with {_limb(entry.part, stated['side'])}")
+        words.append(f"{entry.before_side} {_limb(entry.part, stated['side'])}")
     return " ".join(word for word in words if word)
 
 

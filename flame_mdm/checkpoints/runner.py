@@ -2,7 +2,8 @@
 
 python runner.py FOLDER "a person walks forward" motion.npz seconds=3 seed=0
 
-The same text, length and seed give the same motion as `flame_mdm.generate`.
+The same caption, length and seed give the same motion as `flame_mdm.generate`, which also understands other
+sentences than captions of the training data.
 """
 
 from __future__ import annotations

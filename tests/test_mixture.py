@@ -61,6 +61,13 @@ def test_minutes_and_actions_are_counted_by_license(people: Path, tmp_path: Path
     assert licenses[2]["clips"] == 3, "a test clip, and a training clip with its mirror image"
 
 
+def test_the_license_of_a_row_counts_more_than_the_license_of_its_data_set(people: Path):
+    (people / "captions.csv").write_text(CAPTIONS.replace("train,MIT", "train,"))
+    source = Mixture({"people": Folder(str(people), license="CC-BY-4.0")})
+    licenses = {clip.id: clip.license for clip in source.clips(20.0)}
+    assert licenses == {"one": "CC-BY-4.0", "two": "CC0", "three": "MIT", "four": "CMU"}
+
+
 def test_stores_without_licenses_are_written_as_before(tmp_path: Path):
     store = write_store(tmp_path / "store", Synthetic(clips=3), HumanML())
     lines = (store.folder / "clips.jsonl").read_text().splitlines()

@@ -285,3 +285,15 @@ def test_windows_of_transitions():
         metric = TransitionJerk(fps, window=10)
         metric.update(joints, torch.ones(2, 40, dtype=torch.bool), kept, torch.arange(2))
         assert metric.compute() == pytest.approx({"peak": 2, "area": area, "windows": 1})
+
+
+@pytest.mark.parametrize(("step", "is_inside"), [(15, False), (16, True), (24, True), (25, False)])
+def test_windows_of_transitions_are_centered_at_the_first_frame_after_them(step: int, is_inside: bool):
+    """The window of 10 frames at frame 20 has frames 15 to 24, so that it contains steps into frames 16 to 24."""
+    joints = torch.zeros(1, 40, 22, 3)
+    joints[:, step:, 3, 0] = 1
+    kept = torch.zeros(1, 40, 22, dtype=torch.bool)
+    kept[:, 20:] = True
+    metric = TransitionJerk(20.0, window=10)
+    metric.update(joints, torch.ones(1, 40, dtype=torch.bool), kept, torch.arange(1))
+    assert (metric.compute()["peak"] > 0) == is_inside

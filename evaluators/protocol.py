@@ -151,6 +151,11 @@ class Protocol(ClosedSchema):
         return extractor
 
     @property
+    def cuts_motions(self) -> bool:
+        """Whether the first frames of motions are not measured, since the model gets them."""
+        return self.context_frames > 0 and self.context == "drawn"
+
+    @property
     def title(self) -> str:
         return f"{self.name}-{self.version}"
 
@@ -307,7 +312,7 @@ def open_protocol(
         protocol = protocol.model_copy(update={"context_frames": model.denoiser.context_frames})
     protocol, changed = protocol.resized(len(protocol.selected(clips)), **size)
     protocol.check(clips, model)
-    if protocol.context_frames:
+    if protocol.cuts_motions:
         changed["context_frames"] = protocol.context_frames
     return protocol, changed
 

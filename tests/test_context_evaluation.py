@@ -7,11 +7,13 @@ import pytest
 import torch
 from support.runs import TINY_DIP, untrained
 
+from evaluators.evaluation import Evaluation
 from evaluators.protocol import Protocol, load_protocol, open_protocol
 from evaluators.sources import Generator, real_motions
 from flame_mdm.config import compose, instantiate
 from flame_mdm.data.crops import Clips
 from flame_mdm.generator import MotionGenerator
+from flame_mdm.records import Value
 
 CONTEXT, FRAMES = 10, 40
 
@@ -47,6 +49,18 @@ def test_the_frames_before_the_measured_ones_are_the_context(protocol, clips, mo
         assert all(len(row.frames) == FRAMES - CONTEXT for row in protocol.rows(clips, 0, 0, purpose=purpose))
     ordinary = load_protocol("synthetic", model.representation)
     assert all(len(row.frames) == FRAMES and not len(row.context) for row in ordinary.rows(clips, 0, 0))
+
+
+def test_expected_values_of_whole_motions_are_not_those_of_cut_ones(protocol, clips, model):
+    bounds = {"expected": {"synthetic": {"foot_skating": [-1.0, 0.0]}}}
+    cut = protocol.model_copy(update=bounds)
+    whole = cut.model_copy(update={"context": "start"})
+    values = {"foot_skating": Value(mean=0.5, ci=None, replications=1, n=1)}
+    for measured, count in ((cut, 0), (whole, 1)):
+        evaluation = Evaluation(measured, clips, None, model.representation)
+        assert len(evaluation._unexpected(values)) == count
+    lines = Evaluation(cut, clips, None, model.representation)._conditions()
+    assert any("the first frames are not measured" in line for line in lines)
 
 
 def test_the_authors_begin_in_one_of_the_first_frames_and_measure_the_whole_length(protocol, clips):

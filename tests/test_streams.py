@@ -132,6 +132,23 @@ def test_a_text_changes_later_blocks_only(model):
     assert not np.allclose(next(stream(model, "a person walks", seed=4)).joints, before[0][0].joints, atol=1e-3)
 
 
+def test_each_block_has_its_own_noise_which_no_text_changes(model):
+    def starts(text: str) -> list[Tensor]:
+        """The noise that each of three blocks starts from."""
+        inputs: list[Tensor] = []
+        hook = model.denoiser.register_forward_hook(lambda _, arguments, __: inputs.append(arguments[0]))
+        running = stream(model, "a person walks", guidance_scale=1.0)
+        next(running)
+        running.change(text)
+        list(islice(running, 2))
+        hook.remove()
+        return inputs[:: len(inputs) // 3]
+
+    sitting, waving = starts("a person sits down"), starts("a person waves")
+    assert all(torch.equal(one, other) for one, other in zip(sitting, waving, strict=True))
+    assert torch.isclose(sitting[0], sitting[1], atol=1e-3).float().mean() < 0.01
+
+
 def test_texts_at_times_give_the_same_motion_whenever_they_are_typed(model):
     early, late = stream(model, "a person walks"), stream(model, "a person walks")
     for text, at in (("a person sits down", 2.25), ("a person waves", 3.5)):

@@ -1,7 +1,9 @@
 # The versions of constraints.txt. Build and use: docs/clusters.md.
 #   docker build -t flame-mdm .
 #   docker build -t flame-mdm:cpu --build-arg TORCH_INDEX=https://download.pytorch.org/whl/cpu .
-FROM python:3.11-slim-bookworm
+#   docker build -t flame-mdm --build-arg BASE=python:3.11-slim-bookworm@sha256:... .  (docker buildx imagetools inspect)
+ARG BASE=python:3.11-slim-bookworm
+FROM $BASE
 
 # PyPI has torch for CUDA, whose libraries come with it.
 ARG TORCH_INDEX=https://pypi.org/simple

@@ -43,7 +43,7 @@ def test_each_prompt_of_a_file_is_sampled_as_if_alone(here, trained, capsys):
     page = lines[-1].removeprefix("6 motions for 3 prompts, a folder for each: ")
     assert page == "samples/quickstart/p.html"
     assert all(json.dumps(text, ensure_ascii=True)[1:-1] in Path(page).read_text() for text in PROMPTS)
-    assert "warning: 'a person jumps: 100%, twice': never seen in training: " in "\n".join(lines)
+    assert "warning: '人が歩く, waving': not understood: 人が歩く" in "\n".join(lines)
     together = {read(path).text: path.parent for path in here.rglob("motion_000.npz")}
     assert set(together) == set(PROMPTS)
     text, file = PROMPTS[1], together[PROMPTS[1]] / "motion_001.npz"
@@ -104,7 +104,7 @@ def test_refused_lines_of_a_file_are_named_at_the_end_and_the_others_are_written
     for line, number, message in zip(
         errors,
         (3, 4, 5, 6),
-        ("3,000 characters are too many", "part 2 is empty", "30 seconds (600 frames)", "knows no word of it"),
+        ("3,000 characters are too many", "part 2 is empty", "30 seconds (600 frames)", "in English only"),
         strict=True,
     ):
         assert line.startswith(f"p.txt, line {number}: ")

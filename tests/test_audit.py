@@ -4,6 +4,7 @@ import json
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ import torch
 from support.fixtures import ROOT
 
 from evaluators import perturbations
-from evaluators.audit import _inputs, _Measure
+from evaluators.audit import _agreement, _inputs, _Measure
 from evaluators.evaluator import Evaluator, Motions
 from evaluators.extractors import Extractor
 from evaluators.metrics.alignment import MotionsForText, TextsForMotion
@@ -200,6 +201,25 @@ def test_an_audit_asks_metrics_that_it_does_not_know(scene):
     assert measure.direction_of("halves") is True
     assert measure.facts_of("halves")["unit"] == "halves"
     assert measure.judges == {}
+
+
+def test_agreement_with_exact_attributes_depends_on_whether_lower_is_better():
+    """Pairs with every attribute have the best scores of both metrics; the scores get worse with each grade."""
+    measure: Any = SimpleNamespace(truth="exact", judges={"distance": -1, "similarity": 1, "blind": 1})
+    scores = [
+        {"exact": [1, 1, 1], "distance": [0.1, 0.2, 0.3], "similarity": [3, 2, 5], "blind": [7, 7, 7]},
+        {"exact": [0, 1, 0], "distance": [0.9, 0.4, 0.8], "similarity": [0, 4, 1], "blind": [7, 7, 8]},
+    ]
+    scores = [{name: np.array(values, float) for name, values in of_set.items()} for of_set in scores]
+    grades = [
+        {"exact": [0.9], "distance": [0.2], "similarity": [3.0], "blind": [7.0]},
+        {"exact": [0.5], "distance": [0.4], "similarity": [1.0], "blind": [None]},
+        {"exact": [0.1], "distance": [0.5], "similarity": [0.5], "blind": [8.0]},
+    ]
+    agreement = _agreement(measure, scores, [{"grades": [{"values": values} for values in grades]}])
+    assert agreement["distance"] == pytest.approx({"auc": 1, "correlation": -1})
+    assert agreement["similarity"] == pytest.approx({"auc": 1, "correlation": 1})
+    assert agreement["blind"] == pytest.approx({"auc": 0.25, "correlation": -1}), "grades without a value do not count"
 
 
 @pytest.mark.slow

@@ -97,6 +97,7 @@ def test_what_is_not_paired_has_no_difference(three, tmp_path, capsys):
     for changes, message in (
         (None, "No evaluation in common"),
         ({"seed": 1}, "not compared: other seed"),
+        ({"data": result()["data"] | {"frames": [24, 40]}}, "not compared: other seed, limits of length or skeleton"),
         ({"invalid_because": ["real motions are off"]}, "not compared: not valid: real motions are off"),
         ({"values": {"fid": of(4.2, [4.1, 4.3], n=65)}}, "not compared: no metric has values per replication"),
         ({"values": result()["values"]}, "evaluate both again; motions are not generated again"),

@@ -230,6 +230,8 @@ def test_bad_edits_are_one_line(diffusion, flow, motion):
         (diffusion, suffix | {"until": 0.3}, "until=0.3 is an option of method=mfm, not of mdm"),
         (diffusion, suffix | {"seconds": 3}, "an edit is as long as its motion: omit seconds"),
         (diffusion, suffix | {"texts": "walks | jumps"}, "an edit keeps a single motion"),
+        (diffusion, {"strength": 0.5, "texts": "walks | jumps | sits"}, "the parts are not as long as the motion"),
+        (diffusion, {"strength": 0.5, "texts": "walks @1.5 | jumps @1"}, "not as long .*, which has 2 seconds"),
         (diffusion, {"regoin": "suffix"}, "edit has no option regoin. Did you mean region"),
         *((diffusion, {"strength": value}, "strength=.*: give a number above 0, up to 1") for value in (0.0, np.nan)),
         (flow, suffix | {"method": "flame"}, "not supported by FlowMatching; this model supports: mdm, mfm"),

@@ -12,7 +12,7 @@ from support.refusals import bounded
 
 from flame_mdm.data.folder import Folder
 from flame_mdm.errors import UserError
-from flame_mdm.formats import glb_animation
+from flame_mdm.formats import glb, glb_animation
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.readers import read
 from flame_mdm.representations.skeleton import SMPL22
@@ -35,6 +35,29 @@ def test_a_motion_comes_back_from_each_kind_of_file_and_rig(ending: str, rig: st
     again.joints[..., 1] -= lift
     assert 0 < lift < 0.04
     assert np.abs(again.joints - motion.posed().joints().numpy()).max() < 0.1 * MILLIMETER
+
+
+def test_splines_of_a_glb_file_have_a_slope_before_and_another_one_after_each_key(tmp_path: Path):
+    """A node goes along x as t^3 in the first second, and as 1 - 4 u + u^3 in the following half second u."""
+    binary = glb.Binary()
+    slopes_before, values, slopes_after = (0, 3, -3.25), (0, 1, -0.875), (0, -4, 0)
+    keys = np.zeros((3, 3, 3), "f4")  # slope before, value and slope after of each key
+    keys[..., 0] = np.transpose([slopes_before, values, slopes_after])
+    times = binary.add(np.array([0, 1, 1.5], "f4"), bounds=True)
+    sampler = {"input": times, "output": binary.add(keys.reshape(9, 3)), "interpolation": "CUBICSPLINE"}
+    channel = {"sampler": 0, "target": {"node": 0, "path": "translation"}}
+    document = {
+        "asset": {"version": "2.0", "extras": {"fps": 20}},
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"name": "hips"}],
+        "animations": [{"samplers": [sampler], "channels": [channel]}],
+    }
+    binary.save(tmp_path / "spline.glb", document)
+
+    t = np.arange(31) / 20
+    expected = np.where(t < 1, t**3, 1 - 4 * (t - 1) + (t - 1) ** 3)
+    positions = glb_animation.read(tmp_path / "spline.glb").positions
+    np.testing.assert_allclose(positions[:, 0], np.stack([expected, 0 * t, 0 * t], 1), atol=1e-6)
 
 
 @needs_third_party

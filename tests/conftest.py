@@ -14,6 +14,7 @@ import torch
 from hypothesis import settings
 from support.distributed import GlooPool
 from support.fixtures import recipe
+from support.npm import node_modules as node_modules
 from support.refusals import Refused
 from support.runs import TINY
 

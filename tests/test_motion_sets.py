@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.npm import node
 from support.refusals import error_of
 
 import flame_mdm
@@ -305,3 +306,22 @@ def contacts(entry: dict[str, Any], foot: str) -> list[tuple[int, int]]:
             spans.append((begin, event["frame"] - 1))
             begin = None
     return [*spans, (begin, entry["frames"] - 1)] if begin is not None else spans
+
+
+@pytest.mark.tools
+@pytest.mark.slow
+def test_in_three_the_clips_blend_without_sliding_feet(locomotion: Path, node_modules: Path):
+    """Stands, starts to walk, walks, runs, stops: a foot that all blended clips have on the floor hardly moves."""
+    clips = described(locomotion)
+    fps = json.loads((locomotion / "set.json").read_text())["fps"]
+    scene = node("three_set.mjs", node_modules, locomotion)
+    for foot, name in enumerate(("left", "right")):
+        footprint = None
+        for frame in scene["frames"]:
+            shown = [(clips[item["name"]], round(item["time"] * fps)) for item in frame["playing"]]
+            stands = all(any(first <= time <= last for first, last in contacts(entry, name)) for entry, time in shown)
+            toe = np.array(frame["toes"][foot])[[0, 2]]
+            footprint = (toe if footprint is None else footprint) if stands else None
+            if footprint is not None:
+                assert np.linalg.norm(toe - footprint) < 3 * CENTIMETER, (name, frame["playing"])
+    assert 4 < scene["place"][2] < 12

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from support.fixtures import ROOT, blender, python_with
 from support.glb import odd_character, write_names
 from support.motions import synthetic
+from support.npm import node
 
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError
@@ -28,41 +29,11 @@ from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.retarget import presets
 from flame_mdm.representations.skeleton import SMPL22
 
-PACKAGES = {
-    "fbx2gltf": "0.9.7",
-    "three": "0.187.0",
-    "@pixiv/three-vrm": "3.5.5",
-    "@pixiv/three-vrm-animation": "3.5.5",
-    "gltf-validator": "2.0.0-dev.3.10",
-}
-"""Packages of npm that read the files; fbx2gltf contains Autodesk's FBX SDK."""
 MILLIMETER = 1e-3
 FRAMES = [0, 7, 20, 39]
 RIGS = [None, *presets()]
 RATES = (20.0, 30.0)
 MOTIONS = 10  # synthetic motions at each frame rate
-
-
-@pytest.fixture(scope="session")
-def node_modules() -> Path:
-    """A folder with the packages of npm; installed once, and again when a version changes."""
-    if shutil.which("npm") is None:
-        pytest.skip("npm is not installed")
-    folder = ROOT / ".pytest_cache" / "npm"
-    manifest = json.dumps({"dependencies": PACKAGES})
-    if not (folder / "package.json").exists() or (folder / "package.json").read_text() != manifest:
-        folder.mkdir(parents=True, exist_ok=True)
-        words = [f"{name}@{version}" for name, version in PACKAGES.items()]
-        subprocess.run(["npm", "install", "--silent", "--no-save", *words], cwd=folder, check=True)
-        (folder / "package.json").write_text(manifest)
-    return folder
-
-
-def node(script: str, folder: Path, *words: object) -> Any:
-    command = ["node", ROOT / "tests/support" / script, folder, *map(str, words)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
 
 
 def autodesk(folder: Path, file: Path) -> Path:

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from flame_mdm.formats.grounding import (
+    FEET,
     GroundedMotion,
     anchored,
     planted,
@@ -199,6 +200,27 @@ def loop(motion: GroundedMotion) -> GroundedMotion:
     share = np.linspace(0, 1, len(cycle)) if leaves else np.zeros(len(cycle))
     cycle = replace(cycle, path=share[:, None] * cycle.path[-1], heading=share * cycle.heading[-1])
     return planted_loop(cycle)
+
+
+def passing(motion: GroundedMotion) -> list[float | None]:
+    """Returns when the left and the right toes, planted, pass the root of a loop, in seconds; None if they never do.
+
+    Two gaits are best blended at these moments, because then both have the foot at the same place.
+    """
+    travel = motion.path[-1] - motion.path[0]
+    distance = np.linalg.norm(travel)
+    times: list[float | None] = []
+    for foot, leg in enumerate(FEET):
+        ahead = motion.local[:, leg[-1]][:, [0, 2]] @ travel / max(float(distance), 1e-9)
+        stands = motion.contacts[:-1, foot] & motion.contacts[1:, foot]
+        crossed = np.flatnonzero(stands & (ahead[:-1] >= 0) & (ahead[1:] < 0))
+        if distance < STILL[0] or not len(crossed):
+            times.append(None)
+            continue
+        frame = int(crossed[0])
+        share = ahead[frame] / (ahead[frame] - ahead[frame + 1])
+        times.append(float((frame + share) / motion.fps))
+    return times
 
 
 def with_neighbors(clips: Sequence[Clip], frames: int) -> tuple[np.ndarray, list[slice]]:

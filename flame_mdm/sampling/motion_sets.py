@@ -278,6 +278,8 @@ def _entry(clip: Clip, still: RiggedClip, files: Mapping[str, str]) -> dict[str,
     }
     if clip.kind == "loop":
         distance, angle = closure(still)
+        times = [None if time is None else round(time, 4) for time in gaits.passing(motion)]
+        entry["passing"] = dict(zip(("left", "right"), times, strict=True))
         entry["closure"] = {"meters": round(distance, 5), "degrees": round(angle, 3)}
     entry["planted_at_start"] = dict(zip(("left", "right"), motion.contacts[0].tolist(), strict=True))
     entry["contacts"] = [event._asdict() for event in contact_events(motion.contacts, motion.fps)]

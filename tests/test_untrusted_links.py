@@ -32,6 +32,7 @@ from flame_mdm.data.store import Store, write_store
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.data.verify import report as verify_data
 from flame_mdm.errors import UserError, say
+from flame_mdm.formats import USD, WRITTEN
 from flame_mdm.formats.motion import Motion
 from flame_mdm.reporting.browse import write_page
 from flame_mdm.reporting.report import write_report
@@ -76,7 +77,11 @@ def encode_captions(root: Path) -> None:
         _encode_frozen=lambda *_, **__: encoded,
         _pretrained=SimpleNamespace(network=None),
     )
-    with pytest.warns(UserWarning, match="rebuilding it") if (root / "text").is_dir() else nullcontext():
+    with (
+        pytest.warns(UserWarning, match="rebuilding it")
+        if (root / "text" / "model-0123.safetensors").exists()
+        else nullcontext()
+    ):
         PretrainedText.precompute(encoder, ["a"], root / "text")
 
 
@@ -178,8 +183,8 @@ def adapter(out: Path) -> None:
 
 def motion_files(out: Path) -> None:
     walk = Motion(next(iter(Synthetic(clips=1).clips(20.0))).motion[:20], 20.0, SMPL22)
-    for ending in ("bvh", "glb", "json", "npz", "npy", "html"):
-        walk.save(out / f"walk.{ending}")
+    for ending in CONVERTED:
+        walk.save(out / f"walk{ending}")
 
 
 def succeed(words: list[str]) -> None:
@@ -191,6 +196,7 @@ def succeed(words: list[str]) -> None:
             raise UserError(errors[-1].removeprefix("error: "))
 
 
+CONVERTED = [ending for ending in WRITTEN if ending not in (".mp4", *USD)]  # others need packages of extras
 CARD = ROOT / "docs" / "benchmarks" / "audit" / "synthetic-none.json"
 SAMPLES = [f"walk/{name}" for name in ("motion_000.npz", "motions.gif", "motions.png", "player.html")]
 WRITERS: dict[str, tuple[Callable[[Path], None], list[str]]] = {
@@ -216,7 +222,7 @@ WRITERS: dict[str, tuple[Callable[[Path], None], list[str]]] = {
     "export": (export, ["model.safetensors"]),
     "runner": (runner_output, ["motion.npz"]),
     "adapt": (adapter, ["mine.safetensors"]),
-    "convert": (motion_files, [f"walk.{ending}" for ending in ("bvh", "glb", "json", "npz", "npy", "html")]),
+    "convert": (motion_files, [f"walk{ending}" for ending in CONVERTED]),
 }
 """What the product writes in a folder of others, and the names of the files."""
 
@@ -253,6 +259,14 @@ def attempt(write: Callable[[Path], None], folder: Path) -> None:
     assert "\n" not in refusal
 
 
+@pytest.mark.parametrize("writer", WRITERS)
+def test_each_writer_writes_its_files_into_a_folder_without_links(tmp_path, writer):
+    write, names = WRITERS[writer]
+    write(tmp_path)
+    lasting = [name for name in names if not name.endswith(".lock")]
+    assert [name for name in lasting if not (tmp_path / name).is_file()] == []
+
+
 @pytest.mark.parametrize("kind", ["link", "hard link", "pipe"])
 @pytest.mark.parametrize(("writer", "name"), CASES)
 def test_a_link_at_the_name_of_a_file_does_not_lead_to_the_file_of_somebody_else(tmp_path, writer, name, kind):
@@ -263,6 +277,17 @@ def test_a_link_at_the_name_of_a_file_does_not_lead_to_the_file_of_somebody_else
     assert victim.read_bytes() == VICTIM
     assert sorted(tmp_path.iterdir()) == [folder, victim]
     assert not [path for path in folder.rglob(".*") if path.name.startswith(".")], "nothing half-written stays"
+
+
+@pytest.mark.parametrize("writer", ["audit cache", "text cache", "evaluate", "prepare", "train"])
+def test_a_link_to_a_file_that_does_not_exist_does_not_create_it(tmp_path, writer):
+    write, names = WRITERS[writer]
+    for name in names:
+        victim, folder = tmp_path / "victim", tmp_path / name.replace("/", "-")
+        (folder / name).parent.mkdir(parents=True)
+        (folder / name).symlink_to(victim)
+        attempt(write, folder)
+        assert not victim.exists()
 
 
 @pytest.mark.parametrize(("writer", "name"), FOLDERS)

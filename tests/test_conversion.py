@@ -22,6 +22,7 @@ from flame_mdm.representations.smpl import SMPL
 from flame_mdm.sampling.reading import read_motion, with_features
 
 ROTATED = [SMPL, Rot6D, Motion272]
+ENDINGS = ["npz", "bvh", "json", "npy", "glb", "fbx"]
 
 
 def canonical(joints: np.ndarray) -> np.ndarray:
@@ -44,7 +45,7 @@ def test_known_rotations_are_kept(kind: type[SMPL] | type[Rot6D] | type[Motion27
 
 
 @pytest.mark.parametrize("kind", ROTATED)
-@pytest.mark.parametrize("ending", ["npz", "bvh", "json", "npy"])
+@pytest.mark.parametrize("ending", ENDINGS)
 def test_files_of_joints_alone_are_fitted_and_the_error_is_stated(
     ending: str, kind: type[SMPL] | type[Rot6D] | type[Motion272], tmp_path: Path
 ):
@@ -79,9 +80,11 @@ def test_joints_of_kit_are_those_of_smpl_mirrored():
 
 
 @pytest.mark.parametrize("representation", [Rifke(12.5), HumanML("kit21", fps=12.5)])
-def test_models_of_kit_take_22_joints(representation: Representation):
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_models_of_kit_take_files_of_22_joints(ending: str, representation: Representation, tmp_path: Path):
     motion = synthetic("walk")
-    encoded = with_features(representation, motion)
+    motion.save(tmp_path / f"a.{ending}")
+    encoded = read_motion(representation, tmp_path / f"a.{ending}", fps=20 if ending == "npy" else None)
     expected = canonical(kit_joints(motion.joints.astype(float)))
     assert encoded.joints.shape[1:] == (21, 3)
     assert abs(len(encoded.joints) - len(motion.joints) * 12.5 / 20) <= 1

@@ -11,9 +11,13 @@ import numpy as np
 import pytest
 import torch
 from support.fixtures import ROOT
+from support.motions import synthetic
+from support.others import amass
+from support.refusals import one_error
 from support.stores import write_amass
 
 from flame_mdm.__main__ import main
+from flame_mdm.config import compose_data, instantiate
 from flame_mdm.data import Clip, hashed_split
 from flame_mdm.data.folder import Folder
 from flame_mdm.data.store import Store, write_store
@@ -358,3 +362,35 @@ def test_an_empty_folder_and_a_missing_one_are_told_apart(tmp_path):
     for name, says in (("empty", "no motions in this folder"), ("absent", "no such folder")):
         with pytest.raises(FileNotFoundError, match=rf"{name}: {says}\. Give a folder of"):
             Folder(str(tmp_path / name)).count()
+
+
+@pytest.mark.parametrize(
+    ("name", "motion", "features"),
+    [
+        *[("smpl", "smpl", 147), ("rot6d", "smpl", 150), ("motion272", "smpl", 272)],
+        *[("kit_legacy", "joints", 251), ("rifke", "joints", 64), ("humanml_clean", "joints", 263)],
+    ],
+)
+def test_every_representation_is_prepared_from_every_kind_of_file(name, motion, features, tmp_path, capsys):
+    folder = tmp_path / "in"
+    folder.mkdir()
+    for ending in ("npz", "bvh", "json", "glb", "fbx"):
+        synthetic("walk").save(folder / f"{ending}.{ending}")
+    np.savez(folder / "amass.npz", **amass(synthetic("walk")))
+    words = ["folder", f"source={folder}", f"data_root={tmp_path}", f"representation={name}", "data.source.workers=1"]
+    assert main(["prepare", *words, f"data.source.motion={motion}"]) == 0, capsys.readouterr().err
+    (path,) = tmp_path.glob("folder-*/store.json")
+    store = Store(path.parent)
+    assert store.info["shape"][1] == features
+    assert ("rotations were fitted to joints, with a mean error" in capsys.readouterr().out) == (motion == "smpl")
+    representation = instantiate(compose_data("folder", [f"representation={name}"])["representation"])
+    clips = {clip.id: representation.decode(torch.from_numpy(np.array(store.motion(clip)))) for clip in store.clips}
+    for joints in clips.values():
+        head, pelvis = joints[:, representation.skeleton.joints.index("head")], joints[:, 0]
+        assert (head - pelvis)[:, 1].mean() > 0.3, "it stands"
+
+    other = "joints" if motion == "smpl" else "smpl"
+    for check in ("check=true", "check=false"):
+        root = f"data_root={tmp_path / 'other'}"
+        assert main(["prepare", *words[:2], root, *words[3:], check, f"data.source.motion={other}"]) == 1
+        assert "data.source.motion=smpl" in one_error(capsys)

@@ -33,6 +33,7 @@ def main(settings: PrepareSettings) -> None:
     representation = instantiate(settings.nodes["representation"])
     data = instantiate(node, representation=representation)
     if settings.check:
+        data.source.suit(representation)
         say(*data.source.check(representation.fps))
         if data.source.failures:
             raise SystemExit(1)

@@ -8,11 +8,14 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
 
 import numpy as np
 
 from flame_mdm.errors import UserError
+
+if TYPE_CHECKING:
+    from flame_mdm.representations import Representation
 
 Split = Literal["train", "val", "test"]
 SPLITS: tuple[Split, ...] = get_args(Split)
@@ -117,6 +120,9 @@ class MotionSource(ABC):
     def check(self, fps: float) -> list[str]:
         """Returns lines to print about the files that are present and missing, at `fps`; prepares nothing."""
         return [f"{self.name}: {self.count()} clips can be prepared"]
+
+    def suit(self, representation: "Representation") -> None:  # noqa: B027 (most sources yield one kind of motion)
+        """Makes `clips` yield raw motions of a representation; raises `UserError` if the options do not fit it."""
 
     def statistics(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Returns mean and std (D,) published with encoded features; None = computed from the training clips."""

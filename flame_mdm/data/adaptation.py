@@ -16,6 +16,7 @@ from flame_mdm.data.datamodule import MotionDataModule, TrainingBatches
 from flame_mdm.data.folder import Folder
 from flame_mdm.data.store import Entry, Store
 from flame_mdm.errors import UserError, say
+from flame_mdm.representations import Representation
 
 DRIFT, FLOAT = 0.05, 0.1
 """Limits in meters of a clip: rise of its floor from the first to the last second, and median height above it."""
@@ -46,6 +47,9 @@ class Lesson(MotionSource):
     def count(self) -> int:
         self.folder.splits = {name: note.split or "train" for name, note in self.folder.notes.items()}
         return self.folder.count() + len(self.kept())
+
+    def suit(self, representation: Representation) -> None:
+        self.folder.suit(representation)
 
     def statistics(self) -> tuple[np.ndarray, np.ndarray]:
         return self.store.mean, self.store.std

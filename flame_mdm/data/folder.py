@@ -5,7 +5,7 @@ import math
 import os
 import re
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -22,8 +22,12 @@ from flame_mdm.formats import ENDINGS, SCENES, motions_in, scenes
 from flame_mdm.formats.checks import LYING
 from flame_mdm.formats.conversion import raw_motion
 from flame_mdm.formats.readers import read_recording
-from flame_mdm.representations import rotation
-from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.representations import Representation, rotation
+from flame_mdm.representations.humanml import HumanML
+from flame_mdm.representations.motion272 import Motion272
+from flame_mdm.representations.rifke import Rifke
+from flame_mdm.representations.rot6d import Rot6D
+from flame_mdm.representations.skeleton import KIT21, SMPL22
 from flame_mdm.representations.smpl import SMPL
 from flame_mdm.safe_io import naming, read_text
 
@@ -93,6 +97,17 @@ class Folder(MotionSource):
             self.options["license"] = license
         self._uprights: defaultdict[str, list[float]] = defaultdict(list)  # of the motions read so far, by layout
         self._notes: Counter[str] = Counter()  # lines about the motions read so far
+        self._representation: Representation | None = None  # whose raw motions are yielded; see `suit`
+
+    def suit(self, representation: Representation) -> None:
+        name, needs_rotations = representation.name, isinstance(representation, SMPL | Rot6D | Motion272)
+        if needs_rotations and self.motion == "joints":
+            raise UserError(
+                f"{name} is made of rotations. Add data.source.motion=smpl: they are read, or fitted to joints"
+            )
+        if isinstance(representation, HumanML | Rifke) and self.motion == "smpl":
+            raise UserError(f"{name} is made of joints. Drop data.source.motion=smpl")
+        self._representation = representation
 
     def count(self) -> int:
         images = sum(self.copies[name] for name in self.files if self.mirror and self.splits[name] == "train")
@@ -129,18 +144,19 @@ class Folder(MotionSource):
             )
             yield from _repeated(clip, self.copies[name])
             if self.mirror and split == "train":
-                image = mirrored(clip, SMPL22.mirror(torch.from_numpy(motion)).numpy(), self.actions)
+                skeleton = SMPL22 if self._representation is None else self._representation.skeleton
+                image = mirrored(clip, skeleton.mirror(torch.from_numpy(motion)).numpy(), self.actions)
                 yield from _repeated(image, self.copies[name])
         if len(self.failures) == len(self.files):
             self.require_all()
         self.leave_out("motions that cannot be read", len(self.failures))
-        self._check_upright()
+        _check_upright(self.path, self._uprights)
 
     def _motions(self, fps: float) -> Iterator[tuple[str, np.ndarray]]:
         """Yields name and motion of each file that can be read, and keeps what was learned of all."""
         self.failures = failures = list[str]()
         self._uprights, self._notes = defaultdict(list), Counter()
-        attempts = in_order(partial(_read, self.motion, fps), self.files.values(), self.workers)
+        attempts = in_order(partial(_read, self.motion, self._representation, fps), self.files.values(), self.workers)
         for name, attempt in zip(self.files, attempts, strict=True):
             if attempt.error:
                 failures.append(attempt.error)
@@ -159,7 +175,7 @@ class Folder(MotionSource):
         splits = Counter(self.splits[name] for name, _ in self._motions(fps))
         if self.failures:
             return [*self.findings(), *self.failure_lines()]
-        self._check_upright()
+        _check_upright(self.path, self._uprights)
         motions = ", ".join(f"{splits[split]} {split}" for split in SPLITS)
         return [*self.findings(), f"{self.name}: {self.count()} clips can be prepared (motions: {motions})"]
 
@@ -174,12 +190,6 @@ class Folder(MotionSource):
         if self.failures:
             more = f" (and {len(self.failures) - 1} more)" if len(self.failures) > 1 else ""
             raise UserError(f"{self.failures[0]}{more}")
-
-    def _check_upright(self) -> None:
-        for layout, uprights in self._uprights.items():
-            if np.median(uprights) < LYING:
-                where = f"{self.path}: the body is lying down in most motions ({layout})"
-                raise UserError(f"{where}; set the axis `up` in skeleton.yaml")
 
     @cached_property
     def files(self) -> dict[str, MotionFile]:
@@ -230,6 +240,15 @@ class Folder(MotionSource):
         """Split of each motion: that of the table, else drawn as in `drawn_splits`."""
         sources = {name: note.source or name for name, note in self.notes.items()}
         return drawn_splits(sources, {name: note.split for name, note in self.notes.items()})
+
+
+def _check_upright(folder: Path, uprights: Mapping[str, Sequence[float]]) -> None:
+    """Raises `UserError` if the body lies in most motions of a layout; `uprights` are those of `Recording`."""
+    for layout, values in uprights.items():
+        if np.median(values) < LYING:
+            raise UserError(
+                f"{folder}: the body is lying down in most motions ({layout}); set the axis `up` in skeleton.yaml"
+            )
 
 
 def _repeated(clip: Clip, copies: int) -> Iterator[Clip]:
@@ -288,8 +307,12 @@ class _Attempt:
     notes: Sequence[str] = ()
 
 
-def _read(kind: str, fps: float, file: MotionFile) -> _Attempt:
-    """Reads joints or, if `kind` is "smpl", a raw motion of SMPL's rotations, at `fps` frames per second."""
+def _read(kind: str, representation: Representation | None, fps: float, file: MotionFile) -> _Attempt:
+    """Reads joints or, if `kind` is "smpl", a raw motion of SMPL's rotations, at `fps` frames per second.
+
+    Without a `representation`, joints are SMPL's 22 and rotations are in AMASS's axes. KIT-ML's representations get
+    its 21 joints, and representations in the camera's axes get rotations in these.
+    """
     path = file.path
     try:
         recording = read_recording(path, fps, as_smpl=True, animation=file.animation)
@@ -299,10 +322,13 @@ def _read(kind: str, fps: float, file: MotionFile) -> _Attempt:
         if len(joints) < SHORTEST:
             raise UserError(f"{path}: {len(joints)} frames at {fps:g} per second, but a motion has at least {SHORTEST}")
         notes = [note for note in recording.motion.notes if note not in doubts.lines]
-        if kind == "joints":
+        of_kit = representation is not None and representation.skeleton is KIT21
+        if kind == "joints" and of_kit and representation is not None:
+            motion = raw_motion(recording.motion, representation).values.numpy().astype(np.float32)
+        elif kind == "joints":
             motion = joints
-        elif recording.smpl is None:
-            fitted = raw_motion(recording.motion, SMPL(fps))
+        elif recording.smpl is None or isinstance(representation, Rot6D):
+            fitted = raw_motion(recording.motion, representation or SMPL(fps))
             motion = fitted.values.numpy().astype(np.float32)
             if fitted.note:
                 centimeters = math.ceil(100 * fitted.error)

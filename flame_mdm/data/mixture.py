@@ -8,6 +8,7 @@ from typing import Literal
 
 from flame_mdm.data import Clip, MotionSource
 from flame_mdm.errors import UserError
+from flame_mdm.representations import Representation
 from flame_mdm.safe_io import read_yaml
 
 Use = Literal["any", "research"]
@@ -85,6 +86,10 @@ class Mixture(MotionSource):
 
     def changed(self, store: Path) -> list[str]:
         return [line for part in self.parts.values() for line in part.changed(store)]
+
+    def suit(self, representation: Representation) -> None:
+        for part in self.parts.values():
+            part.suit(representation)
 
     def check(self, fps: float) -> list[str]:
         self.check_licenses()

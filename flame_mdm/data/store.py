@@ -174,6 +174,7 @@ def write_store(folder: Path, source: MotionSource, representation: Representati
     If another process is writing it, waits and opens the result. If data cannot be read, leaves no files behind.
     Raises `UserError` if `folder` holds anything but an intact store, which is replaced if it existed before the call.
     """
+    source.suit(representation)
     total, before = source.count(), (folder / "store.json").exists()
     lock = folder.with_name(folder.name + ".lock")
     waiting = f"{folder}: another process is preparing it; waiting"

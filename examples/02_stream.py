@@ -1,0 +1,19 @@
+"""Motion without an end, whose text changes while it runs."""
+
+import sys
+
+import flame_mdm
+
+# A DiP model; `make train EXP=synthetic/dip` trains one without a download.
+MODEL = sys.argv[1] if len(sys.argv) > 1 else "runs/synthetic/dip/default"
+
+model = flame_mdm.load(MODEL)
+stream = flame_mdm.stream(model, "a person walks forward", seed=0)
+block = next(stream)
+print(block)
+
+stream.change("a person turns left")  # from the next block on
+for block in stream:  # placed in the world after the block before
+    print(block, "until second", round(stream.frames / block.fps, 1))
+    if stream.frames > 200:
+        break

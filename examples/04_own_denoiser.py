@@ -1,5 +1,7 @@
 """A network of your own, trained and sampled like the others."""
 
+from pathlib import Path
+
 import torch
 from lightning import Trainer
 from torch import nn
@@ -30,9 +32,9 @@ class Convolutions(Denoiser):
 
 
 def main() -> None:
-    # The other parts come from a recipe.
+    # The other parts come from a recipe. The network is named by the module that it is in: this file.
     config = compose("quickstart", ["data.source.clips=100", "condition.pretrain_steps=0"])
-    config["denoiser"] = {"_target_": "__main__.Convolutions", "width": 64, "dropout": 0.1}
+    config["denoiser"] = {"_target_": f"{Path(__file__).stem}.Convolutions", "width": 64, "dropout": 0.1}
     representation = instantiate(config["representation"])
     data = instantiate(config["data"], representation=representation, seed=0)
 

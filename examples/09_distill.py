@@ -9,8 +9,8 @@ OUT = Path("examples_output/09_distill")
 
 if __name__ == "__main__":  # data sets are prepared by processes that import this file
     # 10 steps only show that it runs; by default, a fifth of the steps of the model are trained.
-    words = ["trainer.max_steps=10", "data.source.clips=100", "data_root=examples_output/data", "logger=null"]
-    if code := main(["distill", "quickstart", str(OUT), "callbacks.samples=null", *words]):
+    words = ["trainer.max_steps=10", "data.source.clips=100", "callbacks.samples=null"]
+    if code := main(["distill", "quickstart", str(OUT), *words]):
         raise SystemExit(code)
 
     student = flame_mdm.load(OUT)

@@ -43,7 +43,7 @@ def test_an_example_runs(path: Path, tmp_path: Path):
 def test_the_example_of_streams_runs_with_a_model_that_continues_frames(tmp_path: Path):
     model, data = tmp_path / "dip", tmp_path / "data"
     tiny = [word for word in TINY if not word.startswith(("condition.pretrain", "process."))]
-    words = [*tiny, f"data_root={data}", f"run.dir={model}", "trainer.max_steps=2", "logger=null"]
+    words = [*tiny, f"data_root={data}", f"run.dir={model}", "trainer.max_steps=2", "logger=csv"]
     assert main(["train", "synthetic/dip", *words, "callbacks.samples=null", "callbacks.best=null"]) == 0
     assert "until second" in run(ROOT / "examples" / f"{STREAM}.py", tmp_path, str(model))
 

@@ -22,5 +22,5 @@ if __name__ == "__main__":  # data sets are prepared by processes that import th
 
     values = read_json(RESULT)["values"]
     for name, value in sorted(values.items()):
-        if value is not None:
+        if value is not None and value["mean"] is not None:
             print(name, f"{value['mean']:.3f}", "of", value["n"], "motions")

@@ -1,5 +1,6 @@
 """DiP, the decoder that continues clean frames: its numbers are those of the authors' code."""
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -19,6 +20,7 @@ from flame_mdm.checkpoints.released_options import Options
 from flame_mdm.conditions import Unconditional
 from flame_mdm.conditions.target import SLOTS, TargetConditions, requested
 from flame_mdm.denoisers import Denoiser
+from flame_mdm.errors import UserError
 from flame_mdm.generator import Blocks, MotionGenerator, Parts
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.processes.guidance import classifier_free_guidance
@@ -332,3 +334,39 @@ def test_the_schedule(case):
     steps = torch.arange(config()["steps"])
     signal = schedule.at("signal", steps, torch.zeros(1, 1, 1, dtype=torch.float64)).flatten()
     np.testing.assert_allclose(signal.square().numpy(), arrays()[case], rtol=1e-6)
+
+
+def turned(angle: float) -> Tensor:
+    """One frame (1, 1, 22, 3) of a person whose hips and shoulders face a direction."""
+    joints = torch.zeros(1, 1, 22, 3)
+    right_hip, left_hip, right_shoulder, left_shoulder = SMPL22.facing
+    left = torch.tensor([math.cos(angle), 0.0, -math.sin(angle)])
+    for joint, side in ((right_hip, -1), (left_hip, 1), (right_shoulder, -1), (left_shoulder, 1)):
+        joints[0, 0, joint] = side * left
+    return joints
+
+
+@pytest.mark.parametrize(("modulo_pi", "cost"), [(False, math.pi**2), (True, 0.0)])
+def test_facing_backwards_costs_nothing_in_the_authors_loss_alone(modulo_pi, cost):
+    aims = TargetConditions(SMPL22.joints, SMPL22.facing, choices=[["heading"]], heading_modulo_pi=modulo_pi)
+    forward = aims.draw(turned(0.0), torch.zeros(1))
+    assert forward[0, :, 3].tolist() == [0.0] * 7 + [1.0]
+    torch.testing.assert_close(aims.error(turned(math.pi), forward), torch.tensor([cost]), rtol=0, atol=1e-5)
+    # The error of a small turn is its square, also across 180 degrees, and positive angles turn to the left, to +x.
+    for target, angle in ((0.3, 0.1), (math.pi - 0.1, -math.pi + 0.1)):
+        requested_turn = aims.draw(turned(target), torch.zeros(1))
+        torch.testing.assert_close(requested_turn[0, 7, 0], torch.tensor(target), rtol=0, atol=1e-5)
+        torch.testing.assert_close(aims.error(turned(angle), requested_turn), torch.tensor([0.04]), rtol=0, atol=1e-5)
+
+
+def test_each_choice_of_targets_is_drawn_equally_often():
+    choices = [["pelvis", "heading"], ["traj", "heading"], []]
+    aims = TargetConditions(SMPL22.joints, SMPL22.facing, choices=choices)
+    u = (torch.arange(300) + 0.5) / 300
+    drawn = aims.draw(torch.randn(300, 5, 22, 3, generator=torch.Generator().manual_seed(0)), u)[..., 3]
+    names = [[slot for slot, flag in zip(SLOTS, row, strict=True) if flag] for row in drawn.bool().tolist()]
+    assert [names.count(choice) for choice in choices] == [100, 100, 100]
+    with pytest.raises(UserError, match="Did you mean pelvis"):
+        TargetConditions(SMPL22.joints, SMPL22.facing, choices=[["pelvsi"]])
+    with pytest.raises(UserError, match="the skeleton has no head"):
+        TargetConditions([name for name in SMPL22.joints if name != "head"], SMPL22.facing, choices=[[]])

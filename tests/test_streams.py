@@ -132,6 +132,21 @@ def test_a_text_changes_later_blocks_only(model):
     assert not np.allclose(next(stream(model, "a person walks", seed=4)).joints, before[0][0].joints, atol=1e-3)
 
 
+def test_a_text_is_read_in_the_words_of_the_captions_as_in_generate():
+    reading = built()
+    words = ["a", "person", "walks", "waves", "forward", "with", "the", "left", "hand"]
+    reading.add_facts({"verbs": ["walks", "waves"], "actions": ["walk", "wave"], "vocabulary": words})
+    running = stream(reading, "somebody is strolling forwards")
+    first = next(running)
+    running.change("he waved his left hand")
+    second = next(running)
+    assert (first.text, second.text) == ("somebody is strolling forwards", "he waved his left hand")
+    motion = generate(reading, "somebody is strolling forwards @1.5 | he waved his left hand @1.5")[0]
+    assert_same(motion.joints, joints([first, second]))
+    with pytest.raises(UserError):
+        running.change("xyzzy plugh")
+
+
 def test_each_block_has_its_own_noise_which_no_text_changes(model):
     def starts(text: str) -> list[Tensor]:
         """The noise that each of three blocks starts from."""
@@ -281,7 +296,8 @@ def test_online_cleanup_waits_for_one_block_and_has_no_jump_between_blocks(walk)
 
     seams = np.isin(np.arange(1, len(clean) - 1), [9, 10, 19, 20, 29, 30])
     assert jumps(clean)[seams].max() <= 1.2 * jumps(clean)[~seams].max()
-    assert jumps(clean).max() < 0.6 * jumps(raw).max()
+    assert jumps(clean).max() < jumps(raw).max()
+    assert jumps(clean).mean() < 0.8 * jumps(raw).mean()
 
 
 def test_what_such_a_model_cannot_do_is_said_in_one_line(model, walk):

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from flame_mdm.batch import Condition, Edit, MotionBatch
+from flame_mdm.conditions.language.reading import Reader
 from flame_mdm.conditions.target import SLOTS
 from flame_mdm.conditions.vocabulary import check_known
 from flame_mdm.data.synthetic_motions.body import Body
@@ -63,10 +64,10 @@ def stream(
             motion to continue cannot be read or is too short.
     """
     prefix, placement = starting_point(model, start)
-    check_text(model, text)
-    streams = Streams(
-        model, [f"{text}#0"], [text], prefix, placement, SamplerOptions(**options), seed=seed, block=block
-    )
+    condition = read_text(model, text)
+    chosen = SamplerOptions(**options)
+    streams = Streams(model, [f"{condition}#0"], [condition], prefix, placement, chosen, seed=seed, block=block)
+    streams.texts[condition] = text
     return Stream(streams, cleanup=cleanup)
 
 
@@ -89,7 +90,8 @@ class Stream(Iterator[Motion]):
     @property
     def text(self) -> str:
         """The text of the next block."""
-        return self._streams.schedules[0].at(self.frames)
+        condition = self._streams.schedules[0].at(self.frames)
+        return self._streams.texts[condition]
 
     def change(self, text: str, at: float | None = None) -> None:
         """Changes the text from a time in seconds of the stream on; default: from the next block on.
@@ -102,8 +104,9 @@ class Stream(Iterator[Motion]):
         if frame < self.frames:
             now = self.frames / fps
             raise UserError(f"at={at:g}: the stream is at {now:g} seconds already. Give a later time, or omit it")
-        check_text(self._streams.model, text)
-        self._streams.schedules[0].add(frame, text)
+        condition = read_text(self._streams.model, text)
+        self._streams.texts[condition] = text
+        self._streams.schedules[0].add(frame, condition)
 
     def __next__(self) -> Motion:
         while True:
@@ -192,6 +195,7 @@ class Streams(Iterator[list[Motion]]):
 
     Attributes:
         schedules: conditions of each stream over its frames.
+        texts: texts of the conditions as they were typed, which name the blocks; a condition may be its own text.
         frames: number of frames of each stream so far.
         targets: places in the world that a single stream reaches, by the guidance of sampling and, if the model was
             trained with targets, also by its own condition. None = it goes anywhere.
@@ -222,6 +226,7 @@ class Streams(Iterator[list[Motion]]):
         self.schedules = [Schedule(condition) for condition in conditions]
         self.frames = [0] * len(ids)
         self.placement = Placement.origin(len(ids), prefix.device) if placement is None else placement
+        self.texts = {condition: condition for condition in conditions}
         self.targets: Targets | None = None
         self._root = [0.0, 0.0]  # x and z in the world of the last frame of the first stream
         self._encoded: tuple[list[str], Condition] | None = None
@@ -233,8 +238,8 @@ class Streams(Iterator[list[Motion]]):
         x, joints = self._advance(kept)
         features = self.model.representation.denormalize(x.float())
         return [
-            self._motion(features[row, :count], joints[row, :count], text)
-            for row, (count, text) in enumerate(zip(kept, conditions, strict=True))
+            self._motion(features[row, :count], joints[row, :count], self.texts.get(condition, condition))
+            for row, (count, condition) in enumerate(zip(kept, conditions, strict=True))
         ]
 
     def take(self, lengths: Sequence[int]) -> list[Tensor]:
@@ -357,14 +362,21 @@ def check_streams(model: MotionGenerator) -> None:
         raise UserError(f"representation {name} has positions in the world, which a stream would leave. Use humanml3d")
 
 
-def check_text(model: MotionGenerator, text: str) -> None:
-    """Raises `UserError` if a text is empty or too long, or the model knows no word of it that says what happens."""
+def read_text(model: MotionGenerator, text: str) -> str:
+    """Returns a text as a model reads it: in the words of its captions, if it names one action that they have.
+
+    Raises `UserError` if the text is empty or too long, or the model does not know what it says.
+    """
     if not isinstance(text, str) or not text.strip():
         raise UserError(f"text={text!r}: give a text that says what happens, such as 'a person walks'")
     check_length(text)
     if model.conditioned_on != "text":
         raise UserError(f"text={text}: this model is conditioned on {model.conditioned_on}, not on text")
+    if Reader.fits(model.facts):
+        captions = Reader(model.facts).read(text).captions
+        return captions[0] if len(captions) == 1 else text
     check_known(text, model.facts)
+    return text
 
 
 def starting_point(model: MotionGenerator, start: str | Path | Motion | None) -> tuple[Tensor, Placement | None]:

@@ -18,6 +18,9 @@ html_show_sphinx = html_show_copyright = False
 myst_heading_anchors = 3
 
 
+LINK = re.compile(r"\[([^\]]+)\]\(([\w./-]+\.(?:md|cff))\)")
+
+
 def sidebar(index: str) -> dict[str, list[str]]:
     """Returns the pages of the sidebar by section, those that docs/index.md links to; each page once."""
     seen, sections = {"index"}, {}
@@ -26,6 +29,14 @@ def sidebar(index: str) -> dict[str, list[str]]:
         sections[part.splitlines()[0]] = [page for page in pages if page not in seen]
         seen.update(pages)
     return sections
+
+
+def without_target(link: re.Match[str], folder: Path, name: str) -> str:
+    """Returns a link, or its text alone if it leads to a page of the repository that is not on the site."""
+    base = DOCS.parent if name == "index" and not (folder / link[2]).exists() else folder
+    target = (base / link[2]).resolve()
+    is_on_site = target.is_relative_to(DOCS) or target == DOCS.parent / "README.md"
+    return link[0] if is_on_site or not target.exists() else link[1]
 
 
 def start_page(app: Any, name: str, source: list[str]) -> None:
@@ -37,6 +48,7 @@ def start_page(app: Any, name: str, source: list[str]) -> None:
         source[0] = readme.replace("](docs/", "](") + "".join(f"\n```{{toctree}}\n:hidden:\n{t}\n```\n" for t in trees)
     elif not any(name in pages for pages in sections.values()):
         source[0] = f"---\norphan: true\n---\n\n{source[0]}"
+    source[0] = LINK.sub(lambda link: without_target(link, (DOCS / name).parent, name), source[0])
     source[0] = re.sub(r"\]\((\.\./)+README\.md", lambda match: f"]({'../' * name.count('/')}index.md", source[0])
 
 

@@ -95,7 +95,8 @@ class Condition:
     def with_null(self) -> Condition:
         """Returns the batch followed by its null conditions (2B), for classifier-free guidance in one forward pass."""
         batch = self.pooled.shape[0]
-        twice = self.select(torch.arange(2 * batch, device=self.pooled.device) % batch)
+        rows = torch.arange(batch, device=self.pooled.device)
+        twice = self.select(torch.cat([rows, rows]))
         return twice.drop(torch.arange(2 * batch, device=self.pooled.device) >= batch)
 
     def select(self, rows: Tensor) -> Condition:

@@ -445,7 +445,7 @@ def test_help_and_wrong_words_do_not_wait_for_torch():
     result = subprocess.run(words, capture_output=True, text=True, check=False)
     assert (result.returncode, result.stderr.count("error: ")) == (0, len(REFUSED.splitlines())), result.stderr
     assert "error: unknown command: trian. Did you mean train? `flame-mdm --help` lists the commands\n" in result.stderr
-    assert dir(flame_mdm) == ["Motion", "adapt", "edit", "generate", "load"]
+    assert dir(flame_mdm) == ["Motion", "adapt", "edit", "generate", "load", "stream"]
 
 
 def test_only_errors_that_the_user_can_fix_are_one_line(capsys, monkeypatch):

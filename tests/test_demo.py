@@ -409,7 +409,7 @@ def test_requests_from_eight_clients_are_answered_in_constant_memory(normal):
     def ask(number: int) -> bool:
         request = DemoRequest(text="a person walks", seed=number, samples=2, **FAST)
         player, notes, query, *_ = generated(normal.address, request.query())
-        return "<iframe" in player and notes == "" and parsed(query) == request
+        return "<iframe" in player and "warning" not in notes and parsed(query) == request
 
     def resident() -> int:
         return int(re.findall(r"VmRSS:\s+(\d+) kB", Path(f"/proc/{normal.process}/status").read_text())[0])

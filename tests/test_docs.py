@@ -37,6 +37,7 @@ NOT_COMPOSED = {
     "data.md": ["make evaluate baseline=real data=bandai data.source.mirror=false ..."],
     "evaluation.md": [f"make train EXP={folder}/..." for folder in ("motion_clip", "t2m", "classifier")],
     "first-problems.md": ["make prepare DATA=... SOURCE=/path/to/what/you/downloaded"],
+    "tables.md": ["make train EXP=quickstart denoiser=mine"],
     "motion-faults.md": ["make inspect MOTION=samples/.../motion_000.npz"],
 }
 """Commands of each page that are not composed: they name a part that the reader writes, or leave a name open."""

@@ -60,6 +60,7 @@ def evaluation(resized: bool = False, samples: int | None = None, clips: int = 1
     protocol = SimpleNamespace(
         metrics={},
         resized_samples=resized,
+        cuts_motions=False,
         expected={"synthetic": {"fid": [0.06, 0.01]}},
         samples=samples,
         real_samples=None,

@@ -192,13 +192,23 @@ def test_damaged_motions(refused, bad):
 
 def test_strange_texts_are_legal(trained, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    strange = "walk\x07b\x1b[31m c\x7f {a: [b 走る ü \u202e '; $(rm) `x` \\<script>alert(1)</script> & </style>"
+    strange = "walk\x07b\x1b[31m c\x7f {a: [b \u202e '; $(rm) `x` \\<script>alert(1)</script> & </style>"
     for text in ("walk " * 390, strange):
         out = tmp_path / str(len(text))
         assert main(["sample", f"ckpt={trained}", f"text={text}", "samples=1", "seconds=0.5", f"out={out}"]) == 0
         assert "<script>alert(1)" not in (out / "player.html").read_text(encoding="utf-8")
         with np.load(out / "motion_000.npz") as file:
             assert str(file["text"]) == text
+
+
+def test_a_text_in_another_script_is_refused_in_one_line(trained, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["sample", f"ckpt={trained}", "text=走る \x1b[31mü", "samples=1", "out=out"]) == 1
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
+    assert "English only" in message
+    assert "\x1b" not in message
+    assert not (tmp_path / "out").exists()
 
 
 WRONG: dict[type, list[Any]] = {

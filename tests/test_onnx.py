@@ -43,7 +43,7 @@ NETWORKS = {read_yaml(path)["_target_"]: path.stem for path in RECIPES}  # one r
 CONDITIONS = {"MDMEncoder": "action", "MDMUNet": "none"}  # those of other classes are texts
 VARIANTS = [(name, CONDITIONS.get(target.rpartition(".")[2], "learned")) for target, name in NETWORKS.items()]
 VARIANTS += [("mdm_decoder_token", "learned"), ("mfm_encoder_tokens", "learned")]
-TEXT = "a person kicks with the left foot twice"
+TEXT = "a person kicks twice with the left leg"
 NOTHING = Condition(torch.zeros(1, 0), torch.zeros(1, 0, 0), None)
 
 
@@ -261,7 +261,7 @@ def test_the_page_samples_the_motions_of_the_package(served: tuple[Path, str], t
             expected = flame_mdm.generate(model, TEXT, seconds=2.2, seed=seed)[0]
             joints = np.array(tab.run("joints()")).reshape(expected.joints.shape)
             assert np.abs(joints - expected.joints).max() < 1e-3
-        file = tmp_path / "a-person-kicks-with-the-left-foot-twice.glb"
+        file = tmp_path / "a-person-kicks-twice-with-the-left-leg.glb"
         for ending in ("bvh", "glb"):
             expected.save(tmp_path / f"python.{ending}")
             tab.click(f"#{ending}")

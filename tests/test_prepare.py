@@ -149,7 +149,7 @@ def test_a_missing_source_or_another_set_is_refused_with_where_to_get_it(
     takes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     sets = {path.stem for path in (EXPERIMENTS / "data").glob("*.yaml")}
-    assert sets == {*WHERE, "synthetic", "humanact12_unconstrained", "bandai_compositional"}
+    assert sets == {*WHERE, "synthetic", "package", "humanact12_unconstrained", "bandai_compositional"}
     cases = [(data, [], where) for data, where in WHERE.items()]
     others = WHERE.keys() - {"folder", "bandai"}
     cases += [(data, [f"source={takes}"], "" if data == "kit_temos" else str(takes)) for data in sorted(others)]

@@ -77,6 +77,15 @@ class Reader:
         if not understood.steps:
             raise NotUnderstood(f"{shown}: no word says what happens", self.abilities.nearest(understood))
 
+        try:
+            return self._read_steps(understood, shown, style)
+        except NotUnderstood:
+            if not self.abilities.has_words(sentence) and sentence not in self.abilities.captions:
+                raise
+            return Reading(understood, (), (text,), (text,))
+
+    def _read_steps(self, understood: Understanding, shown: str, style: str) -> Reading:
+        """Returns the actions of a sentence as captions; raises `NotUnderstood` if the model lacks one."""
         notes = _Notes([f"'{typed}' is read as '{word}'" for typed, word in understood.corrected.items()])
         notes.ignored += understood.unknown
         steps: list[Step] = []

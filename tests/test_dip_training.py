@@ -184,7 +184,7 @@ def prepared(data_root: Path, *words: str) -> tuple[GeneratorTask, MotionDataMod
     return task, data
 
 
-@pytest.mark.parametrize("steps", [60, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("steps", [60, pytest.param(1000, marks=pytest.mark.robustness)])
 def test_training_equals_the_loop_in_plain_pytorch(data_root, tmp_path, steps):
     task, data = prepared(data_root, "data.resident=false")
     loop = ReferenceLoop(task, data)

@@ -12,7 +12,8 @@ from support.runs import TINY
 from flame_mdm.__main__ import main
 
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
-LONG = {"04_own_denoiser", "07_train_in_python", "08_evaluate", "09_distill", "10_adapt"}
+SLOW = {"04_own_denoiser", "07_train_in_python"}
+LONG = {"08_evaluate", "09_distill", "10_adapt"}  # half a minute or more each
 STREAM = "02_stream"
 
 
@@ -25,13 +26,15 @@ def run(path: Path, folder: Path, *words: str) -> str:
     return finished.stdout
 
 
+def marks(name: str) -> list[pytest.MarkDecorator]:
+    if name in LONG:
+        return [pytest.mark.robustness]
+    return [pytest.mark.slow] if name in SLOW else []
+
+
 @pytest.mark.parametrize(
     "path",
-    [
-        pytest.param(path, id=path.stem, marks=[pytest.mark.slow] if path.stem in LONG else [])
-        for path in EXAMPLES
-        if path.stem != STREAM
-    ],
+    [pytest.param(path, id=path.stem, marks=marks(path.stem)) for path in EXAMPLES if path.stem != STREAM],
 )
 def test_an_example_runs(path: Path, tmp_path: Path):
     printed = run(path, tmp_path)

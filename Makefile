@@ -43,7 +43,7 @@ test-fast: $(READY) ## run the tests that take a few seconds at most
 test-tools: $(READY) ## run the tests that need outside tools: a browser, ffmpeg, Blender
 	@$(PYTEST) -m tools
 
-test-robustness: $(READY) ## run all malformed inputs, process kills, launchers and full disks; before a release, and after changes to readers
+test-robustness: $(READY) ## run all malformed inputs, process kills, launchers, full disks, benchmarks and long comparisons; before a release, and after changes to readers
 	@FLAME_MDM_FUZZ=all $(PYTEST) --timeout 1800 -m robustness tests
 	@FLAME_MDM_FUZZ=all $(PYTEST) --timeout 1800 -m "not robustness and not tools" tests/test_fuzz.py tests/test_untrusted_*.py
 

@@ -57,9 +57,8 @@ class MotionSource(ABC):
     read them. They are saved in the store, and commands compare them with the recipe's."""
     actions: tuple[str, ...] = ()  # names of the action labels, in the order of their numbers
     verbs: tuple[str, ...] = ()  # all forms of the verbs in the captions, at which sentences are split, or none
-    license: str = (
-        ""  # of all motions, a key of `licenses.yaml` such as "MIT"; empty if unknown or if clips have theirs
-    )
+    license: str = ""
+    """License of all motions, a key of `licenses.yaml` such as "MIT"; empty if unknown, or if clips have their own."""
     captions_may_be_shared: bool = False  # whether the license allows checkpoints to contain captions
     published_split: bool = False
     """Whether the split is the one used in papers although it tests on clips seen in training or leaves no validation

@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hydra.utils import get_class
 from lightning import Trainer
 from support.refusals import one_error
-from support.runs import reference
+from support.runs import built, reference
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
@@ -270,15 +269,8 @@ class Step(nn.Module):
 
 def trained_in_process(rank: int, words: list[str], steps: int) -> dict[str, Tensor]:
     """Trains in one of two processes, and returns the weights."""
-    config = compose("synthetic/dip", words)
-    torch.manual_seed(config["seed"])
-    representation = instantiate(config["representation"])
-    data = instantiate(config["data"], representation=representation, seed=config["seed"])
-    data.setup("fit")
-    torch.manual_seed(config["seed"])
-    kind = get_class(config["task"]["_target_"])
-    task: GeneratorTask = kind.build(config, representation)
-    task.__class__ = type("OfRank", (kind,), {"global_rank": rank})  # type: ignore[arg-type]
+    config, data, task = built(words, "synthetic/dip")
+    task.__class__ = type("OfRank", (type(task),), {"global_rank": rank})  # type: ignore[arg-type]
     task.log_dict = lambda *_, **__: None  # type: ignore[method-assign]
     parallel = DistributedDataParallel(Step(task))
     optimizer = task.make_optimizer()

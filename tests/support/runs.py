@@ -19,8 +19,8 @@ import torch
 from hydra.utils import get_class
 
 from flame_mdm.batch import MotionBatch, collate
-from flame_mdm.config import compose, instantiate
-from flame_mdm.data.datamodule import TrainingBatches
+from flame_mdm.config import Config, compose, instantiate
+from flame_mdm.data.datamodule import MotionDataModule, TrainingBatches
 from flame_mdm.generator import MotionGenerator
 from flame_mdm.task import GeneratorTask
 from flame_mdm.training.distillation import DistillationTask
@@ -79,22 +79,27 @@ def alarm(folder: Path, name: str, **arguments: object) -> list[str]:
     return [f"+callbacks.{name}.{key}={value}" for key, value in values.items()]
 
 
-def reference(words: list[str], steps: int, name: str = "quickstart") -> dict[str, torch.Tensor]:
-    """Weights of one process that averages the gradients of both processes' batches."""
+def built(words: list[str], name: str) -> tuple[Config, MotionDataModule, GeneratorTask]:
+    """A recipe, its data, which are prepared, and its task with the weights at the start of a run."""
     config = compose(name, words)
     torch.manual_seed(config["seed"])
     representation = instantiate(config["representation"])
-    data = instantiate(config["data"], representation=representation, seed=config["seed"])
+    data: MotionDataModule = instantiate(config["data"], representation=representation, seed=config["seed"])
     data.setup("fit")
     torch.manual_seed(config["seed"])
-    kind = get_class(config["task"]["_target_"])
-    task: GeneratorTask = kind.build(config, representation)
+    task: GeneratorTask = get_class(config["task"]["_target_"]).build(config, representation)
+    return config, data, task
+
+
+def reference(words: list[str], steps: int, name: str = "quickstart") -> dict[str, torch.Tensor]:
+    """Weights of one process that averages the gradients of both processes' batches."""
+    config, data, task = built(words, name)
     if isinstance(task, DistillationTask):
         task.start_from_teacher()
     else:
         task.generator.condition.pretrain([clip.captions for clip in data.train.clips], task.seed)
     rank = 0
-    task.__class__ = type("OfRank", (kind,), {"global_rank": property(lambda self: rank)})  # type: ignore[arg-type]
+    task.__class__ = type("OfRank", (type(task),), {"global_rank": property(lambda self: rank)})  # type: ignore[arg-type]
     task.log_dict = lambda *_, **__: None  # type: ignore[method-assign]
     optimizer = task.make_optimizer()
     streams = [

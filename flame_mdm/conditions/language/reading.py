@@ -65,6 +65,9 @@ class Reader:
     def read(self, text: str) -> Reading:
         """Returns a sentence as the model reads it.
 
+        It stays as it is if it is one of the training captions of the model and names an action that the model does not
+        list, or if no table has its words and the model knows all of them.
+
         Raises `UserError` if it is not English, or names an action that the model does not know.
         """
         sentence, style = _without_style(text)
@@ -72,17 +75,18 @@ class Reader:
         shown = f"'{shortened(text, 60)}'"
         if understood.is_foreign:
             raise UserError(f"{shown}: texts are understood in English only. Write it in English")
-        if not understood.steps and self.abilities.has_words(" ".join(understood.unknown)) and understood.unknown:
-            return Reading(understood, (), (text,), (text,))
+        as_typed = Reading(understood, (), (text,), (text,))
         if not understood.steps:
+            if understood.unknown and self.abilities.has_words(" ".join(understood.unknown)):
+                return as_typed
             raise NotUnderstood(f"{shown}: no word says what happens", self.abilities.nearest(understood))
 
         try:
             return self._read_steps(understood, shown, style)
         except NotUnderstood:
-            if not self.abilities.has_words(sentence) and sentence not in self.abilities.captions:
+            if sentence not in self.abilities.captions:
                 raise
-            return Reading(understood, (), (text,), (text,))
+            return as_typed
 
     def _read_steps(self, understood: Understanding, shown: str, style: str) -> Reading:
         """Returns the actions of a sentence as captions; raises `NotUnderstood` if the model lacks one."""

@@ -142,7 +142,7 @@ def test_long_names_and_many_texts(attacked, bad, tmp_path, trained, capfd):
         flame_mdm.generate(flame_mdm.load(trained), [f"text {number}" for number in range(5001)], samples=2)
     caption = "x" * 1_000_000
     short, shown = (Motion(np.zeros((frames, 22, 3)), 20.0, SMPL22, text=caption, id=caption) for frames in (2, 20))
-    with bounded(5):
+    with bounded():
         write_gif(tmp_path / "a.gif", [shown])
         contact_sheet(tmp_path / "a.png", [shown])
         text = player_page([short], caption)

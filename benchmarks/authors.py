@@ -47,7 +47,9 @@ def _stubs() -> dict[str, ModuleType]:
     return {"clip": clip, "model.rotation2xyz": body}
 
 
-def authors_step(repository: str, width: int, layers: int, device: str) -> Callable[[MotionBatch], None]:
+def authors_step(
+    repository: str, width: int, layers: int, device: str
+) -> Callable[[MotionBatch], None]:
     """Returns the authors' training step for HumanML3D, with the defaults of their parser.
 
     Args:
@@ -58,7 +60,16 @@ def authors_step(repository: str, width: int, layers: int, device: str) -> Calla
     """
     sys.path.insert(0, repository)
     sys.modules.update(_stubs())
-    words = ["--save_dir", "none", "--dataset", "humanml", "--latent_dim", str(width), "--layers", str(layers)]
+    words = [
+        "--save_dir",
+        "none",
+        "--dataset",
+        "humanml",
+        "--latent_dim",
+        str(width),
+        "--layers",
+        str(layers),
+    ]
     typed, sys.argv = sys.argv, ["train", *words]
     try:
         arguments = import_module("utils.parser_util").train_args()
@@ -70,7 +81,9 @@ def authors_step(repository: str, width: int, layers: int, device: str) -> Calla
     model.to(device)  # neither `to` nor `train` of the authors' class returns the model
     model.train()
     trainer = import_module("diffusion.fp16_util").MixedPrecisionTrainer(model=model)
-    optimizer = torch.optim.AdamW(trainer.master_params, arguments.lr, weight_decay=arguments.weight_decay)
+    optimizer = torch.optim.AdamW(
+        trainer.master_params, arguments.lr, weight_decay=arguments.weight_decay
+    )
     times = import_module("diffusion.resample").create_named_schedule_sampler("uniform", diffusion)
 
     def step(batch: MotionBatch) -> None:
@@ -80,7 +93,9 @@ def authors_step(repository: str, width: int, layers: int, device: str) -> Calla
 
         trainer.zero_grad()
         t, weights = times.sample(len(batch), motions.device)
-        losses = diffusion.training_losses(model, motions, t, model_kwargs={"y": condition}, dataset=None)
+        losses = diffusion.training_losses(
+            model, motions, t, model_kwargs={"y": condition}, dataset=None
+        )
         trainer.backward((losses["loss"] * weights).mean())
         trainer.optimize(optimizer)
 

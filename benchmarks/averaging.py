@@ -28,7 +28,9 @@ def updates(network: nn.Module) -> dict[str, Callable[[], object]]:
     numbers = count(1)
 
     def framework() -> None:
-        average.on_train_batch_end(SimpleNamespace(global_step=next(numbers)), network, None, None, 0)
+        average.on_train_batch_end(
+            SimpleNamespace(global_step=next(numbers)), network, None, None, 0
+        )
 
     options = EMAWeightAveraging(decay=DECAY)._kwargs
     lightning = AveragedModel(network, use_buffers=True, **options)
@@ -58,7 +60,11 @@ def measure(settings: Settings) -> Section:
         times = take_turns(updates(network), rounds)
         faster[name] = times[LIGHTNING] / times["framework"]
         for update, taken in times.items():
-            row: Row = {"weights": f"{name}, {millions:.1f} M", "update": update, "ms": 1000 * taken}
+            row: Row = {
+                "weights": f"{name}, {millions:.1f} M",
+                "update": update,
+                "ms": 1000 * taken,
+            }
             rows.append(row | {"ratio": taken / times["framework"]})
     return section(
         "Averaged weights",

@@ -66,13 +66,19 @@ def random_clips(count: int) -> Clips:
     lengths = np.minimum(generator.integers(40, 275, count), 199)
     ends = np.cumsum(lengths)
     representation = HumanML(variant="legacy")
-    features = 0.02 * generator.standard_normal((int(ends[-1]), representation.features), np.float32)
+    features = 0.02 * generator.standard_normal(
+        (int(ends[-1]), representation.features), np.float32
+    )
     features[:, 3] += 0.9  # the height of the root, in meters
 
     entries = []
     for number, (end, length) in enumerate(zip(ends, lengths, strict=True)):
         captions = [f"{number} {caption}" for caption in range(CAPTIONS)]
-        entries.append(Entry(f"{number:06d}", int(end - length), int(length), "test", f"{number}", captions, None))
+        entries.append(
+            Entry(
+                f"{number:06d}", int(end - length), int(length), "test", f"{number}", captions, None
+            )
+        )
 
     zeros = np.zeros(representation.features, np.float32)
     store: Any = SimpleNamespace(
@@ -108,12 +114,17 @@ def fid(motions: int, rounds: int) -> list[Row]:
         return metric.compute()
 
     def ours() -> Tensor:
-        sets = [torch.cat([batch.double() for batch in features.split(BATCH)]) for features in (generated, real)]
+        sets = [
+            torch.cat([batch.double() for batch in features.split(BATCH)])
+            for features in (generated, real)
+        ]
         return frechet_distance(*sets)
 
     if motions > WIDTH:  # otherwise, covariances are singular, and torchmetrics loses digits
         torch.testing.assert_close(ours().float(), torchmetrics().float(), rtol=1e-3, atol=1e-3)
-    return ratios(take_turns({TORCHMETRICS: torchmetrics, FRAMEWORK: ours}, rounds), FRAMEWORK, "FID", "ms")
+    return ratios(
+        take_turns({TORCHMETRICS: torchmetrics, FRAMEWORK: ours}, rounds), FRAMEWORK, "FID", "ms"
+    )
 
 
 def measure(settings: Settings) -> Section:
@@ -133,7 +144,10 @@ def measure(settings: Settings) -> Section:
     repeated = protocol.multimodality.replications if protocol.multimodality else 0
     total = times[once] * (protocol.replications - repeated) + times[several] * repeated
     times["whole protocol, estimated"] = total
-    table: list[Row] = [{"part": name, "seconds": taken, "ratio": taken / times[once]} for name, taken in times.items()]
+    table: list[Row] = [
+        {"part": name, "seconds": taken, "ratio": taken / times[once]}
+        for name, taken in times.items()
+    ]
 
     distances = fid(motions, 1 if settings.quick else 10)
     return section(

@@ -20,7 +20,11 @@ def motion(seed: int) -> Tensor:
     """Returns joints (FRAMES, 22, 3) in meters of a body that bends its joints while moving in a circle."""
     rng = torch.Generator().manual_seed(seed)
     phase = torch.linspace(0, 2 * torch.pi, FRAMES, dtype=torch.float64)
-    bend = 0.2 * torch.randn(22, 3, generator=rng, dtype=torch.float64) * torch.sin(3 * phase)[:, None, None]
+    bend = (
+        0.2
+        * torch.randn(22, 3, generator=rng, dtype=torch.float64)
+        * torch.sin(3 * phase)[:, None, None]
+    )
     bend[:, 0, 1] = phase
     root = torch.stack([torch.sin(phase), torch.ones_like(phase), torch.cos(phase)], -1)
     offsets = 0.25 * torch.tensor(SMPL22.raw_offsets, dtype=torch.float64)
@@ -44,10 +48,21 @@ def loop(joints: np.ndarray, heading: np.ndarray) -> np.ndarray:
         c, s = np.cos(heading[t]), np.sin(heading[t])
         to_body = np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])
         local = [to_body @ (joint - joints[t, 0] * [1, 0, 1]) for joint in joints[t]]
-        velocity = [to_body @ (after - before) for before, after in zip(joints[t], joints[t + 1], strict=True)]
-        arcs = [np.eye(3)] + [arc(rest[joint], local[joint] - local[parent]) for joint, parent in bones]
+        velocity = [
+            to_body @ (after - before)
+            for before, after in zip(joints[t], joints[t + 1], strict=True)
+        ]
+        arcs = [np.eye(3)] + [
+            arc(rest[joint], local[joint] - local[parent]) for joint, parent in bones
+        ]
 
-        row = [heading[t + 1] - heading[t], velocity[0][0], velocity[0][2], joints[t, 0, 1], *np.concatenate(local[1:])]
+        row = [
+            heading[t + 1] - heading[t],
+            velocity[0][0],
+            velocity[0][2],
+            joints[t, 0, 1],
+            *np.concatenate(local[1:]),
+        ]
         for joint, parent in bones:
             row += (arcs[parent].T @ arcs[joint]).T[:2].ravel().tolist()
         row += np.concatenate(velocity).tolist()
@@ -68,7 +83,9 @@ def measure(settings: Settings) -> Section:
     heading = HumanML._heading(clean, joints).numpy()
     difference = np.abs(loop(joints.numpy(), heading) - clean.encode(motions[0]).numpy()).max()
     if difference > 1e-5:
-        raise SystemExit(f"the features of the loop and of the representation differ by {difference:.1e}")
+        raise SystemExit(
+            f"the features of the loop and of the representation differ by {difference:.1e}"
+        )
 
     features = torch.stack(clean.encode_many(motions))
     runs: dict[str, tuple[Callable[[], object], int]] = {
@@ -79,12 +96,15 @@ def measure(settings: Settings) -> Section:
         f"encode legacy, {CLIPS} clips": (lambda: legacy.encode_many(motions), CLIPS),
         f"decode, {CLIPS} clips": (lambda: clean.decode(features), CLIPS),
     }
-    times = take_turns({name: turn for name, (turn, _) in runs.items()}, rounds, clock=time.process_time)
+    times = take_turns(
+        {name: turn for name, (turn, _) in runs.items()}, rounds, clock=time.process_time
+    )
     rates = {name: runs[name][1] * FRAMES / taken for name, taken in times.items()}
 
     slow, fast = rates["encode, loop over frames and joints"], rates[f"encode clean, {CLIPS} clips"]
     rows: list[Row] = [
-        {"features": name, "frames per second": rate, "ratio": rate / slow} for name, rate in rates.items()
+        {"features": name, "frames per second": rate, "ratio": rate / slow}
+        for name, rate in rates.items()
     ]
     return section(
         "HumanML3D's features",

@@ -77,7 +77,9 @@ def built(folder: Path) -> tuple[list[MotionBatch], GeneratorTask]:
 def loss_of(task: GeneratorTask, batch: MotionBatch) -> Tensor:
     model = task.generator
     cond = model.condition(batch)
-    return model.process.loss(model.denoiser, batch.x, batch.mask, cond, auxiliary=task.losses)["loss"].mean()
+    return model.process.loss(model.denoiser, batch.x, batch.mask, cond, auxiliary=task.losses)[
+        "loss"
+    ].mean()
 
 
 class Bare(LightningModule):
@@ -85,10 +87,11 @@ class Bare(LightningModule):
 
     def __init__(self, task: GeneratorTask):
         super().__init__()
+        # In a list, so that its parameters are not registered twice
         self.denoiser, self.task = (
             task.generator.denoiser,
             [task],
-        )  # in a list, so that its parameters are not registered twice
+        )
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
         loss = loss_of(self.task[0], batch)
@@ -122,7 +125,14 @@ def bare(steps: int, folder: Path) -> float:
 def framework(steps: int, folder: Path, *words: str) -> float:
     """Returns seconds per step of the complete framework."""
     run = Path(tempfile.mkdtemp(dir=folder))
-    words = (*QUIET, *TINY, f"data_root={folder / 'data'}", f"run.dir={run}", f"trainer.max_steps={steps}", *words)
+    words = (
+        *QUIET,
+        *TINY,
+        f"data_root={folder / 'data'}",
+        f"run.dir={run}",
+        f"trainer.max_steps={steps}",
+        *words,
+    )
     clock = Clock()
     config = compose("quickstart", words)
     config["callbacks"]["clock"] = {"_target_": f"{__name__}.clock"}
@@ -161,7 +171,9 @@ def parts(steps: int, folder: Path) -> dict[str, float]:
         laps["seeding"] = time.thread_time()
         cond = model.condition(batch)
         laps["condition"] = time.thread_time()
-        loss = model.process.loss(model.denoiser, batch.x, batch.mask, cond, auxiliary=task.losses)["loss"].mean()
+        loss = model.process.loss(model.denoiser, batch.x, batch.mask, cond, auxiliary=task.losses)[
+            "loss"
+        ].mean()
         laps["forward pass and loss"] = time.thread_time()
         loss.backward()
         laps["backward pass"] = time.thread_time()
@@ -199,9 +211,12 @@ def measure(settings: Settings) -> Section:
     times = {name: statistics.median(values) for name, values in taken.items()}
     split["everything else, mostly batches and Lightning"] = times[FRAMEWORK] - sum(split.values())
     shares: list[Row] = [
-        {"part": name, "ms": 1000 * value, "share": f"{value / times[FRAMEWORK]:.0%}"} for name, value in split.items()
+        {"part": name, "ms": 1000 * value, "share": f"{value / times[FRAMEWORK]:.0%}"}
+        for name, value in split.items()
     ]
-    ratio, without = (times[name] / times[BARE] for name in (FRAMEWORK, "framework without averaged weights"))
+    ratio, without = (
+        times[name] / times[BARE] for name in (FRAMEWORK, "framework without averaged weights")
+    )
     return section(
         "Host cost of a training step",
         f"""An almost empty network: one transformer layer of width 16, 4 clips per batch, no text encoder. Its step

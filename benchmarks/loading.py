@@ -30,7 +30,9 @@ STEP, LOADER, RESIDENT = "step", "loader, one core", "resident, one core"
 
 def training(features: int) -> Callable[[MotionBatch], None]:
     """Returns a training step (forward, backward, update) of MDM's encoder in its size for CPU runs."""
-    model = MDMEncoder(features, features, 512, latent_dim=128, ff_size=256, num_layers=4, num_heads=4, dropout=0.0)
+    model = MDMEncoder(
+        features, features, 512, latent_dim=128, ff_size=256, num_layers=4, num_heads=4, dropout=0.0
+    )
     optimizer = torch.optim.AdamW(model.parameters(), fused=True)
 
     def step(batch: MotionBatch) -> None:
@@ -59,7 +61,9 @@ def measure(settings: Settings) -> Section:
 
     with tempfile.TemporaryDirectory() as folder:
         source, crop = Synthetic(clips), Units(24, 60, 4)
-        data = MotionDataModule(source, HumanML(), root=folder, name="s", batch_size=BATCH, crop=crop)
+        data = MotionDataModule(
+            source, HumanML(), root=folder, name="s", batch_size=BATCH, crop=crop
+        )
         data.prepare_data()
         loaded, gathered = batches_of(data, resident=False), batches_of(data, resident=True)
 
@@ -76,7 +80,9 @@ def measure(settings: Settings) -> Section:
         rows = [_row(name, taken / count, wait, 1) for name, taken in times.items()]
         for workers in (1, 2):
             name = f"loader, {workers} worker{'s' if workers > 1 else ''}, wall time"
-            taken = take_turns({name: several(batches_of(data, resident=False, workers=workers))}, rounds)[name]
+            taken = take_turns(
+                {name: several(batches_of(data, resident=False, workers=workers))}, rounds
+            )[name]
             rows.append(_row(name, taken / count, wait, workers))
 
     lengths = torch.cat([batch.lengths for batch in shown]).float().mean()

@@ -81,8 +81,14 @@ def measure(settings: Settings) -> Section:
             raise SystemExit(finished.stderr)
 
         frames, seconds, *memory = json.loads(finished.stdout.splitlines()[-1])
-        row: Row = {"frames": frames, "processor seconds": seconds, "clips per second and core": clips / seconds}
-        rows.append(row | {name: part / MEBIBYTE for name, part in zip(MEMORY, memory, strict=True)})
+        row: Row = {
+            "frames": frames,
+            "processor seconds": seconds,
+            "clips per second and core": clips / seconds,
+        }
+        rows.append(
+            row | {name: part / MEBIBYTE for name, part in zip(MEMORY, memory, strict=True)}
+        )
         growth.append((frames, memory[0]))
 
     (few, small), (many, large) = growth[0], growth[-1]

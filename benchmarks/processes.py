@@ -50,7 +50,13 @@ class Clock(Callback):
 
 def step_seconds(folder: Path, processes: int, steps: int, number: int) -> float:
     """Returns the median time between steps in seconds."""
-    words = ["quickstart", *QUIET, *SMALL, f"trainer.max_steps={steps}", f"run.dir=run{processes}-{number}"]
+    words = [
+        "quickstart",
+        *QUIET,
+        *SMALL,
+        f"trainer.max_steps={steps}",
+        f"run.dir=run{processes}-{number}",
+    ]
     words += [
         f"data.batch_size={CLIPS // processes}",
         f"+callbacks.clock={{_target_: clock.Clock, warm: {steps // 5}}}",
@@ -62,7 +68,9 @@ def step_seconds(folder: Path, processes: int, steps: int, number: int) -> float
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(paths)}
     environment |= {"GLOO_SOCKET_IFNAME": "lo"}
     command = [sys.executable, "-m", "flame_mdm", "train", *words]
-    finished = subprocess.run(command, capture_output=True, text=True, cwd=folder, env=environment, check=False)
+    finished = subprocess.run(
+        command, capture_output=True, text=True, cwd=folder, env=environment, check=False
+    )
     if finished.returncode:
         raise SystemExit(finished.stdout + finished.stderr)
     return statistics.median(json.loads((folder / "steps.json").read_text()))
@@ -73,7 +81,10 @@ def measure(settings: Settings) -> Section:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "clock.py").write_text(CLOCK)
-        pairs = [[step_seconds(folder, count, steps, number) for count in (1, 2)] for number in range(rounds)]
+        pairs = [
+            [step_seconds(folder, count, steps, number) for count in (1, 2)]
+            for number in range(rounds)
+        ]
 
     one, two = (statistics.median(values) for values in zip(*pairs, strict=True))
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()

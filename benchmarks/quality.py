@@ -32,7 +32,9 @@ def values(run: Run) -> dict[str, float]:
     losses = run.curves.get("val/loss", {})
     result = list(run.results.values())[-1].values if run.results else None
     if not losses or not result:
-        raise SystemExit(f"{run.folder}: not validated or not evaluated. Run `make evaluate CKPT={run.folder}`")
+        raise SystemExit(
+            f"{run.folder}: not validated or not evaluated. Run `make evaluate CKPT={run.folder}`"
+        )
 
     numbers = {"val/loss": losses[max(losses)]}
     for name, label in METRICS.items():
@@ -53,7 +55,9 @@ def read_runs(folder: Path) -> dict[str, dict[str, BySeed]]:
         speeds = runs.setdefault(name, {speed: {} for speed in SPEEDS})
         speeds[config["run"].get("speed", "reference")][config["seed"]] = values(run)
     if not runs:
-        raise SystemExit(f"{folder}: contains no runs. docs/speed.md has the commands that train and evaluate them")
+        raise SystemExit(
+            f"{folder}: contains no runs. docs/speed.md has the commands that train and evaluate them"
+        )
     return runs
 
 

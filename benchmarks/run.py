@@ -97,14 +97,20 @@ def render(sections: dict[str, Any]) -> str:
 
     lines.append("\n## Machine\n")
     for number, facts in enumerate(machines, 1):
-        lines.append(f"{number}. " + ", ".join(f"{key}: {value}" for key, value in json.loads(facts).items()))
+        lines.append(
+            f"{number}. " + ", ".join(f"{key}: {value}" for key, value in json.loads(facts).items())
+        )
 
     for name in order:
         section = sections[name]
         number = machines.index(json.dumps(section["machine"])) + 1
         script = section.get("script", f"benchmarks/{name.removesuffix('_cuda')}.py")
         title = section["title"] + (" on a GPU" if name.endswith("_cuda") else "")
-        lines += [f"\n## {title}\n", body(section), f"\n`{script}`, {section['date']}, machine {number}."]
+        lines += [
+            f"\n## {title}\n",
+            body(section),
+            f"\n`{script}`, {section['date']}, machine {number}.",
+        ]
     return "\n".join(lines) + "\n"
 
 
@@ -117,7 +123,9 @@ def _position(name: str) -> tuple[int, bool]:
 def chosen(only: str, settings: Settings) -> list[str]:
     """Returns the scripts to run; ends with one line if they, or what they need, do not exist."""
     if settings.device not in ("cpu", "cuda"):
-        raise SystemExit(f"DEVICE={settings.device}: give cpu, or cuda on a machine with a CUDA GPU")
+        raise SystemExit(
+            f"DEVICE={settings.device}: give cpu, or cuda on a machine with a CUDA GPU"
+        )
     if settings.device == "cuda" and not torch.cuda.is_available():
         raise SystemExit("DEVICE=cuda: torch finds no CUDA GPU on this machine")
     if settings.mdm_repo and not (Path(settings.mdm_repo) / "model" / "mdm.py").is_file():
@@ -151,7 +159,10 @@ def main(*words: str) -> None:
     for number, name in enumerate(names, 1):
         print(f"{number}/{len(names)} {name}", flush=True)
         start = time.perf_counter()
-        section = run(name, settings) | {"date": datetime.date.today().isoformat(), "machine": machine()}
+        section = run(name, settings) | {
+            "date": datetime.date.today().isoformat(),
+            "machine": machine(),
+        }
         sections[name + ("_cuda" if settings.device == "cuda" else "")] = section
         data.write_text(json.dumps(sections, indent=1) + "\n")
         PAGE.write_text(render(sections))

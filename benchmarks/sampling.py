@@ -67,7 +67,9 @@ class Size:
 def inputs(batch: int, size: Size) -> tuple[Tensor, Tensor, Condition]:
     """Returns noise (B, F, D), mask (B, F) and a condition with a null."""
     device = size.device
-    null = Condition(torch.zeros(1, 512, device=device), torch.zeros(1, 0, 512, device=device), None)
+    null = Condition(
+        torch.zeros(1, 512, device=device), torch.zeros(1, 0, 512, device=device), None
+    )
     noise = torch.randn(batch, size.frames, FEATURES, device=device)
     pooled = torch.randn(batch, 512, device=device)
     cond = Condition(pooled, torch.zeros(batch, 0, 512, device=device), None, null)
@@ -91,7 +93,9 @@ def latency(denoise: Denoise, size: Size) -> list[Row]:
 
         runs: dict[str, Callable[[], object]] = {}
         for steps in (1, 2, 4):
-            runs[f"{steps}, distilled"] = partial(sample, denoise, options=options("consistency", steps))
+            runs[f"{steps}, distilled"] = partial(
+                sample, denoise, options=options("consistency", steps)
+            )
         runs["10"] = partial(sample, guided, options=options("ancestral", 10))
         times = take_turns(runs, size.rounds, size.device)
 
@@ -101,7 +105,9 @@ def latency(denoise: Denoise, size: Size) -> list[Row]:
             if estimate > size.longest:
                 times[f"{steps:,}, estimated from 10"] = estimate
             else:
-                times[f"{steps:,}"] = take_turns(run, 1 if estimate > 1 else size.rounds, size.device)[""]
+                times[f"{steps:,}"] = take_turns(
+                    run, 1 if estimate > 1 else size.rounds, size.device
+                )[""]
 
         for name, taken in times.items():
             first = first or taken
@@ -118,14 +124,20 @@ def samplers(denoise: Denoise, size: Size) -> list[Row]:
     for process, sampler, steps in RUNS:
         name = f"{sampler} {steps}"
         counted[name] = Counted(classifier_free_guidance(denoise, GUIDANCE, FEATURES))
-        turns[name] = partial(process.sample, counted[name], lambda draw: fixed, mask, cond, options(sampler, steps))
+        turns[name] = partial(
+            process.sample, counted[name], lambda draw: fixed, mask, cond, options(sampler, steps)
+        )
     times = take_turns(turns, size.rounds, size.device)
 
     rows: list[Row] = []
     for _, sampler, steps in RUNS:
         name = f"{sampler} {steps}"
         calls = counted[name].calls // (size.rounds + 1)
-        row: Row = {"sampler": sampler, "steps": "" if sampler == "dopri5" else str(steps), "network calls": calls}
+        row: Row = {
+            "sampler": sampler,
+            "steps": "" if sampler == "dopri5" else str(steps),
+            "network calls": calls,
+        }
         row |= {"ms": 1000 * times[name], "ms per call": 1000 * times[name] / calls}
         rows.append(row | {"ratio": times[name] / next(iter(times.values()))})
     return rows
@@ -144,7 +156,9 @@ def loops(size: Size) -> list[Row]:
     guided = classifier_free_guidance(constant, GUIDANCE, FEATURES)
     columns = ("alone", "guided", "edited", "guided and edited")
     rows: list[Row] = []
-    for process, sampler in {(type(process), sampler): (process, sampler) for process, sampler, _ in RUNS}.values():
+    for process, sampler in {
+        (type(process), sampler): (process, sampler) for process, sampler, _ in RUNS
+    }.values():
         row: Row = {"sampler": sampler}
         for column, (edit, denoise) in zip(
             columns, product((None, Edit(fixed, keep, "x0")), (constant, guided)), strict=True
@@ -153,7 +167,15 @@ def loops(size: Size) -> list[Row]:
                 row[column] = None
                 continue
             counted = Counted(denoise)
-            run = partial(process.sample, counted, lambda draw: fixed, mask, cond, options(sampler, 50), edit=edit)
+            run = partial(
+                process.sample,
+                counted,
+                lambda draw: fixed,
+                mask,
+                cond,
+                options(sampler, 50),
+                edit=edit,
+            )
             rounds = 2 * size.rounds
             taken = take_turns({"": run}, rounds, size.device)[""]
             row[column] = 1000 * taken * (rounds + 1) / counted.calls

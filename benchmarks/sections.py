@@ -32,17 +32,29 @@ class Settings:
 
     quick: bool = False  # tiny sizes, which show only that everything runs
     device: str = "cpu"  # or cuda
-    mdm_repo: str | None = None  # path of a clone of the authors' code, GuyTevet/motion-diffusion-model
+    mdm_repo: str | None = (
+        None  # path of a clone of the authors' code, GuyTevet/motion-diffusion-model
+    )
     runs: str | None = None  # folder of trained and evaluated runs, for quality.py
 
 
 def section(title: str, text: str, summary: str, tables: Mapping[str, Sequence[Row]]) -> Section:
-    return {"title": title, "text": " ".join(text.split()), "summary": summary, "tables": dict(tables)}
+    return {
+        "title": title,
+        "text": " ".join(text.split()),
+        "summary": summary,
+        "tables": dict(tables),
+    }
 
 
-def ratios(times: Mapping[str, float], reference: str, name: str, unit: str = "ms per step") -> list[Row]:
+def ratios(
+    times: Mapping[str, float], reference: str, name: str, unit: str = "ms per step"
+) -> list[Row]:
     """Returns rows of times in milliseconds, with their ratios to one of them."""
-    return [{name: key, unit: 1000 * taken, "ratio": taken / times[reference]} for key, taken in times.items()]
+    return [
+        {name: key, unit: 1000 * taken, "ratio": taken / times[reference]}
+        for key, taken in times.items()
+    ]
 
 
 def cell(value: str | float | None) -> str:
@@ -64,7 +76,10 @@ def table(rows: Sequence[Row]) -> str:
 
 def body(content: Section) -> str:
     """Returns the text and tables of a section as Markdown."""
-    tables = [f"{caption[:1].upper()}{caption[1:]}:\n\n{table(rows)}" for caption, rows in content["tables"].items()]
+    tables = [
+        f"{caption[:1].upper()}{caption[1:]}:\n\n{table(rows)}"
+        for caption, rows in content["tables"].items()
+    ]
     return "\n\n".join([content["text"], *tables])
 
 

@@ -35,7 +35,14 @@ TINY = [
     "data_root=data",
 ]
 CHECKPOINT = "ckpt=first/checkpoints/last.ckpt"
-EVALUATION = ["protocol=synthetic", "extractor=none", "quick=true", "replications=1", "samples=8", "data_root=data"]
+EVALUATION = [
+    "protocol=synthetic",
+    "extractor=none",
+    "quick=true",
+    "replications=1",
+    "samples=8",
+    "data_root=data",
+]
 WORK: dict[str, tuple[list[str], list[str]]] = {
     "train": (["quickstart", *TINY], ["run.dir=run{}"]),
     "sample": ([CHECKPOINT, "text=a person walks", "samples=1", "seconds=0.5"], ["out=samples{}"]),
@@ -49,7 +56,9 @@ def run(folder: Path, *words: str) -> None:
     """Runs one process from start to end."""
     command = [sys.executable, *words]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    finished = subprocess.run(command, capture_output=True, text=True, cwd=folder, env=environment, check=False)
+    finished = subprocess.run(
+        command, capture_output=True, text=True, cwd=folder, env=environment, check=False
+    )
     if "Traceback" in finished.stderr:
         raise SystemExit(finished.stderr)
 
@@ -65,7 +74,8 @@ def measure(settings: Settings) -> Section:
     rounds = 1 if settings.quick else 3
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        run(folder, "-m", "flame_mdm", "train", "quickstart", *TINY, "run.dir=first")  # also prepares the data
+        # Also prepares the data
+        run(folder, "-m", "flame_mdm", "train", "quickstart", *TINY, "run.dir=first")
 
         turns: dict[str, Callable[[], object]] = {TORCH: partial(run, folder, "-c", "import torch")}
         for command in commands:
@@ -73,11 +83,14 @@ def measure(settings: Settings) -> Section:
             module = ["-m", "flame_mdm", command]
             turns[f"{command} --help"] = partial(run, folder, *module, "--help")
             turns[f"{command}, misspelled key"] = partial(run, folder, *module, *recipe, "seeed=1")
-            turns[f"{command}, minimal work"] = partial(minimal_work, folder, command, itertools.count())
+            turns[f"{command}, minimal work"] = partial(
+                minimal_work, folder, command, itertools.count()
+            )
         times = take_turns(turns, rounds)
 
     rows: list[Row] = [
-        {"command": f"`{name}`", "seconds": taken, "ratio": taken / times[TORCH]} for name, taken in times.items()
+        {"command": f"`{name}`", "seconds": taken, "ratio": taken / times[TORCH]}
+        for name, taken in times.items()
     ]
     answered = times[f"{commands[0]} --help"]
     started = times[f"{commands[0]}, minimal work"] / times[TORCH]

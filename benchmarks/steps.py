@@ -52,7 +52,9 @@ def training_step(task: GeneratorTask, batch: MotionBatch) -> Tensor:
     real = torch.ones(rows, TOKENS, dtype=torch.bool)
     null = Condition(torch.zeros(1, features), torch.zeros(1, TOKENS, features), real[:1])
     cond = Condition(torch.zeros(rows, features), torch.zeros(rows, TOKENS, features), real, null)
-    return generator.process.loss(generator.denoiser, batch.x, batch.mask, cond, auxiliary=task.losses)["loss"].mean()
+    return generator.process.loss(
+        generator.denoiser, batch.x, batch.mask, cond, auxiliary=task.losses
+    )["loss"].mean()
 
 
 class Peer(nn.Module):
@@ -89,7 +91,9 @@ def build_task(config: dict[str, Any]) -> GeneratorTask:
     return GeneratorTask.build(config, instantiate(config["representation"]))
 
 
-def recipe_step(config: dict[str, Any], speed: str, device: str) -> tuple[Callable[[MotionBatch], None], int]:
+def recipe_step(
+    config: dict[str, Any], speed: str, device: str
+) -> tuple[Callable[[MotionBatch], None], int]:
     """Returns a training step of a recipe, and the multiple of frames to which it pads."""
     config = deepcopy(config)
     config["trainer"]["accelerator"] = device
@@ -128,7 +132,12 @@ def full_size(settings: Settings) -> tuple[list[Row], str]:
     """Returns rows of the full-size step, and a text about the batches."""
     words = ["data.batch_size=16"]
     if settings.quick:
-        words = ["data.batch_size=2", "denoiser.latent_dim=16", "denoiser.ff_size=32", "denoiser.num_layers=1"]
+        words = [
+            "data.batch_size=2",
+            "denoiser.latent_dim=16",
+            "denoiser.ff_size=32",
+            "denoiser.num_layers=1",
+        ]
     config, device = compose("humanml3d/mdm", words), settings.device
     rows, width, layers = (
         config["data"]["batch_size"],
@@ -174,12 +183,17 @@ def backbones(names: Sequence[str], rounds: int, device: str) -> list[Row]:
         parameters = sum(p.numel() for p in build_task(config).parameters() if p.requires_grad)
 
         steps = {speed: recipe_step(config, speed, device)[0] for speed in SPEEDS}
-        times = take_turns({speed: partial(step, batch) for speed, step in steps.items()}, rounds, device)
+        times = take_turns(
+            {speed: partial(step, batch) for speed, step in steps.items()}, rounds, device
+        )
 
         row: Row = {"network": name, "parameters, M": parameters / 1e6}
         row |= {f"ms, {speed}": 1000 * taken for speed, taken in times.items()}
         row["times as fast"] = times["reference"] / times["fast"]
-        row |= {f"frames per second, {speed}": int(lengths.sum()) / taken for speed, taken in times.items()}
+        row |= {
+            f"frames per second, {speed}": int(lengths.sum()) / taken
+            for speed, taken in times.items()
+        }
         rows.append(row)
     return rows
 
@@ -188,17 +202,27 @@ def quickstart(clips: int, steps: int, rounds: int) -> list[Row]:
     """Returns a row per speed of the quickstart's step, trained by the complete framework; the speeds take turns."""
     times: dict[str, list[float]] = {speed: [] for speed in SPEEDS}
     with tempfile.TemporaryDirectory() as name:
-        words = [*QUIET, f"data_root={name}/data", f"data.source.clips={clips}", f"trainer.max_steps={steps}"]
+        words = [
+            *QUIET,
+            f"data_root={name}/data",
+            f"data.source.clips={clips}",
+            f"trainer.max_steps={steps}",
+        ]
         words.append(f"trainer.log_every_n_steps={max(1, steps // 15)}")
         for speed in SPEEDS * rounds:
             folder = Path(tempfile.mkdtemp(dir=name))
             fit(folder, compose("quickstart", [*words, f"run.dir={folder}", f"speed={speed}"]))
             history = read_history(folder)["train/seconds_per_step"]
-            times[speed] += [value for step, value in history.items() if step >= steps // 3]  # the first warm up
+            # The first warm up
+            times[speed] += [value for step, value in history.items() if step >= steps // 3]
 
     medians = {speed: statistics.median(taken) for speed, taken in times.items()}
     return [
-        {"training": f"speed={speed}", "ms per step": 1000 * taken, "times as fast": medians["reference"] / taken}
+        {
+            "training": f"speed={speed}",
+            "ms per step": 1000 * taken,
+            "times as fast": medians["reference"] / taken,
+        }
         for speed, taken in medians.items()
     ]
 

@@ -29,11 +29,15 @@ def measure(settings: Settings) -> Section:
 
     captions = [" ".join(words) for words in itertools.product(*PARTS)]
     x, mask = torch.zeros(size, 1, 1), torch.ones(size, 1, dtype=torch.bool)
-    batch = MotionBatch(x, mask, [""] * size, list(itertools.islice(itertools.cycle(captions), size)))
+    batch = MotionBatch(
+        x, mask, [""] * size, list(itertools.islice(itertools.cycle(captions), size))
+    )
     with tempfile.TemporaryDirectory() as folder:
         cached.precompute(batch.text, Path(folder))
         cached.load_cache(batch.text, Path(folder))
-        times = take_turns({"encoded": lambda: live(batch), "cached": lambda: cached(batch)}, rounds)
+        times = take_turns(
+            {"encoded": lambda: live(batch), "cached": lambda: cached(batch)}, rounds
+        )
 
     return section(
         "Text encoding",

@@ -45,17 +45,27 @@ def start_page(app: Any, name: str, source: list[str]) -> None:
     if name == "index":
         readme = (DOCS.parent / "README.md").read_text(encoding="utf-8")
         trees = (f":caption: {title}\n\n" + "\n".join(pages) for title, pages in sections.items())
-        source[0] = readme.replace("](docs/", "](") + "".join(f"\n```{{toctree}}\n:hidden:\n{t}\n```\n" for t in trees)
+        source[0] = readme.replace("](docs/", "](") + "".join(
+            f"\n```{{toctree}}\n:hidden:\n{t}\n```\n" for t in trees
+        )
     elif not any(name in pages for pages in sections.values()):
         source[0] = f"---\norphan: true\n---\n\n{source[0]}"
     source[0] = LINK.sub(lambda link: without_target(link, (DOCS / name).parent, name), source[0])
-    source[0] = re.sub(r"\]\((\.\./)+README\.md", lambda match: f"]({'../' * name.count('/')}index.md", source[0])
+    source[0] = re.sub(
+        r"\]\((\.\./)+README\.md", lambda match: f"]({'../' * name.count('/')}index.md", source[0]
+    )
 
 
-def add_help(app: Any, what: str, name: str, documented: Any, options: Any, lines: list[str]) -> None:
+def add_help(
+    app: Any, what: str, name: str, documented: Any, options: Any, lines: list[str]
+) -> None:
     """Adds the help texts of a dataclass, which the command line also shows, to its description."""
     if is_dataclass(documented):
-        helps = {entry.name: entry.metadata["help"] for entry in fields(documented) if "help" in entry.metadata}
+        helps = {
+            entry.name: entry.metadata["help"]
+            for entry in fields(documented)
+            if "help" in entry.metadata
+        }
         lines += [f":param {field}: {text}" for field, text in helps.items()] + [""]
 
 

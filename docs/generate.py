@@ -16,7 +16,10 @@ HEAD = "<!-- Written by docs/generate.py; do not edit. -->\n"
 def head(name: str) -> tuple[str, str]:
     """Returns the head comment of a recipe: what it is (paper, table, row), and its deviations."""
     lines = (EXPERIMENTS / f"{name}.yaml").read_text().splitlines()[1:]
-    comment = " ".join(line.removeprefix("#").strip() for line in takewhile(lambda line: line.startswith("#"), lines))
+    comment = " ".join(
+        line.removeprefix("#").strip()
+        for line in takewhile(lambda line: line.startswith("#"), lines)
+    )
     what, _, deviations = comment.partition("Deviations")
     return what.strip(), ("Deviations" + deviations if deviations else "")
 
@@ -34,9 +37,15 @@ about the same length, every sample of a batch has the same weight, and checkpoi
     page += "\n| recipe | what it reproduces |\n|---|---|\n"
     for name in sorted(recipes(), key=lambda name: ("/" in name, name)):
         what, deviations = head(name)
-        what = re.sub(r"(Kim|Tevet|Hu) et al\., (AAAI |ICLR )?\d{4}, arXiv:[\d.]+(, )?", "", what).replace(" ()", "")
-        what = re.sub(r" (Not a (row of (the|a) paper|benchmark row)|Trains in [\w ']+)\.", "", what)
-        deviations = re.sub(r"^Deviations(:| from)\s*", lambda m: "" if m[1] == ":" else "from ", deviations)
+        what = re.sub(
+            r"(Kim|Tevet|Hu) et al\., (AAAI |ICLR )?\d{4}, arXiv:[\d.]+(, )?", "", what
+        ).replace(" ()", "")
+        what = re.sub(
+            r" (Not a (row of (the|a) paper|benchmark row)|Trains in [\w ']+)\.", "", what
+        )
+        deviations = re.sub(
+            r"^Deviations(:| from)\s*", lambda m: "" if m[1] == ":" else "from ", deviations
+        )
         if ", table" not in what:
             what = re.split(r"(?<!al)\. ", what)[0].rstrip(".") + "."
         folded = f" <details><summary>deviations</summary>{deviations}</details>"
@@ -69,7 +78,9 @@ def printed(text: str) -> Any:
 
 TABLES = published_tables()
 
-DEVIATIONS = {("humanml3d/mdm_unet", "parameters"): "no code is public; the widths are chosen to come close"}
+DEVIATIONS = {
+    ("humanml3d/mdm_unet", "parameters"): "no code is public; the widths are chosen to come close"
+}
 """Deviations of recipes from their papers, by (recipe, key), with the reason."""
 
 
@@ -90,20 +101,33 @@ of a text encoder (MFM: CLIP, T5; MDM: sentence-BERT), the checkpoint is our cho
 """
     for title, published in TABLES.items():
         columns = {name: hyperparameters(name) for name in published}
-        rows = [key for key in HYPERPARAMETERS if any(key in papers for papers in published.values())]
+        rows = [
+            key for key in HYPERPARAMETERS if any(key in papers for papers in published.values())
+        ]
         cells = {
-            key: [_cell(ours.get(key), published[name].get(key)) for name, ours in columns.items()] for key in rows
+            key: [_cell(ours.get(key), published[name].get(key)) for name, ours in columns.items()]
+            for key in rows
         }
         equal = [key for key in rows if all(cell.startswith("**") for cell in cells[key])]
-        shared = (HYPERPARAMETERS[key] + f" {cells[key][0]}" * (len(set(cells[key])) == 1) for key in equal)
+        shared = (
+            HYPERPARAMETERS[key] + f" {cells[key][0]}" * (len(set(cells[key])) == 1)
+            for key in equal
+        )
         page += f"\n## {title}\n\n" + f"As in the paper: {'; '.join(shared)}.\n" * bool(equal)
         if equal != rows:
             page += f"\n| | {' | '.join(f'`{name}`' for name in columns)} |\n|---|{'---|' * len(columns)}\n"
-        page += "".join(f"| {HYPERPARAMETERS[key]} | {' | '.join(cells[key])} |\n" for key in rows if key not in equal)
+        page += "".join(
+            f"| {HYPERPARAMETERS[key]} | {' | '.join(cells[key])} |\n"
+            for key in rows
+            if key not in equal
+        )
     page += "\n## Deviations from the papers\n\n"
     for (name, key), reason in DEVIATIONS.items():
         page += f"- `{name}`, {HYPERPARAMETERS[key]}: {reason}.\n"
-    return page + "\n[Recipes](recipes.md) lists deviations that the tables of the papers do not cover.\n"
+    return (
+        page
+        + "\n[Recipes](recipes.md) lists deviations that the tables of the papers do not cover.\n"
+    )
 
 
 def _cell(ours: Any, papers: Any) -> str:

@@ -58,13 +58,17 @@ def audit(request: EvaluationRequest, cache: Path, resamples: int) -> AuditCard:
     data = open_data(request, None)
     info, representation = data.store.info, data.representation.to(request.device or "cpu")
     if not isinstance(representation, HumanML):
-        raise UserError(f"an audit needs joint positions, not {representation.name}. Add representation=humanml_clean")
+        raise UserError(
+            f"an audit needs joint positions, not {representation.name}. Add representation=humanml_clean"
+        )
     clips = data.clips(request.split)
     protocol, _ = open_protocol(str(request.protocol), clips, representation, None, replications=1)
     extractor = protocol.open_extractor(request.extractor, representation, info["dataset"])
     rows = protocol.rows(clips, request.seed, 0)[: request.samples]
     again = {row.clip.id: row for row in protocol.rows(clips, request.seed, 0, purpose="real")}
-    recipe = extractor.task.config.get("experiment") if isinstance(extractor, OwnExtractor) else None
+    recipe = (
+        extractor.task.config.get("experiment") if isinstance(extractor, OwnExtractor) else None
+    )
     name = str(recipe or Path(str(request.extractor)).name)
     facts = {
         "extractor": extractor and {"sha256": extractor.sha256, "name": name},
@@ -75,7 +79,9 @@ def audit(request: EvaluationRequest, cache: Path, resamples: int) -> AuditCard:
         "seed": request.seed,
         "motions": len(rows),
     }
-    evaluator = Evaluator(extractor, protocol.metrics, representation, batch_size=request.batch_size or 64)
+    evaluator = Evaluator(
+        extractor, protocol.metrics, representation, batch_size=request.batch_size or 64
+    )
     scene = Scene(data, rows, real_motions(clips, rows), representation, request.seed)
     texts = [text_of(row, row.text) for row in rows] if protocol.condition == "text" else []
     perturbations = perturbations_of(scene, bool(texts))
@@ -92,16 +98,25 @@ def audit(request: EvaluationRequest, cache: Path, resamples: int) -> AuditCard:
     with ProgressBar(total=steps, desc="audit", unit=" sets") as bar:
         inputs: dict[str, Inputs] = {}
         for name, make in sets.items():
-            inputs[name] = _inputs(evaluator, folder / f"{name.replace(' ', '-')}.npz", [row.id for row in rows], make)
+            inputs[name] = _inputs(
+                evaluator, folder / f"{name.replace(' ', '-')}.npz", [row.id for row in rows], make
+            )
             bar.update()
         measure = _Measure(evaluator, inputs, texts, scene.draws("bootstrap"), resamples)
         measured = _measured(measure, scene, perturbations, texts, bar)
     packages = environment()["packages"]
-    return check_shape({"format": FORMAT, **facts, "resamples": resamples, "packages": packages, **measured}, AuditCard)
+    return check_shape(
+        {"format": FORMAT, **facts, "resamples": resamples, "packages": packages, **measured},
+        AuditCard,
+    )
 
 
 def _measured(
-    measure: _Measure, scene: Scene, perturbations: Sequence[Perturbation], texts: Sequence[Text], bar: ProgressBar
+    measure: _Measure,
+    scene: Scene,
+    perturbations: Sequence[Perturbation],
+    texts: Sequence[Text],
+    bar: ProgressBar,
 ) -> dict[str, Any]:
     """Returns what a card says about the metrics and about each perturbation at each grade."""
     base = measure(measure.inputs[BASE], texts)
@@ -111,7 +126,9 @@ def _measured(
         changed, wrong = measure.inputs[BASE], texts
         for grade in perturbation.grades:
             changed, wrong = perturbation.apply(scene, grade, measure.inputs, texts)
-            grades.append({"grade": float(grade), "values": _differences(measure(changed, wrong), base)})
+            grades.append(
+                {"grade": float(grade), "values": _differences(measure(changed, wrong), base)}
+            )
             bar.update()
         if perturbation.group == "meaning":
             scores.append(measure.scores(changed, wrong))
@@ -135,7 +152,9 @@ def _inputs(evaluator: Evaluator, path: Path, ids: list[str], make: Motions) -> 
     features = extracted.get("generated")
     inputs: Inputs = {} if features is None else {"features": features.double().numpy()}
     for name, metric in audited_metrics(evaluator).items():
-        inputs |= {_named(name, part): values for part, values in metric.readings(extracted).items()}
+        inputs |= {
+            _named(name, part): values for part, values in metric.readings(extracted).items()
+        }
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as temporary:
         np.savez(temporary, allow_pickle=False, **inputs)
@@ -145,7 +164,11 @@ def _inputs(evaluator: Evaluator, path: Path, ids: list[str], make: Motions) -> 
 def audited_metrics(evaluator: Evaluator) -> dict[str, SampleMetric]:
     """Returns the metrics of an evaluator whose inputs an audit has, by name."""
     metrics = make_metrics(evaluator.metrics)
-    return {name: metric for name, metric in metrics.items() if AVAILABLE.issuperset(required_inputs(metric))}
+    return {
+        name: metric
+        for name, metric in metrics.items()
+        if AVAILABLE.issuperset(required_inputs(metric))
+    }
 
 
 def _named(metric: str, part: str) -> str:
@@ -167,11 +190,17 @@ class _Measure:
         draws: np.random.Generator,
         resamples: int,
     ):
-        self.metrics, self.extractor, self.inputs = audited_metrics(evaluator), evaluator.extractor, inputs
+        self.metrics, self.extractor, self.inputs = (
+            audited_metrics(evaluator),
+            evaluator.extractor,
+            inputs,
+        )
         count = len(next(iter(inputs[BASE].values())))
         resampled = draws.multinomial(count, np.full(count, 1 / count), resamples)
         self.weights = np.concatenate([np.ones((1, count), int), resampled])
-        self.reasons: dict[str, str] = {} if self.extractor else {"extractor": "metrics that need features"}
+        self.reasons: dict[str, str] = (
+            {} if self.extractor else {"extractor": "metrics that need features"}
+        )
         self.encoded: dict[str, Tensor] = {}
         self.real_texts, self.of_motions = texts, {}
 
@@ -194,7 +223,9 @@ class _Measure:
         except UserError as error:
             self.reasons[name] = str(error)
             return {}
-        values = {_named(name, part): x for part, x in computed.items() if _is_audited(metric, part)}
+        values = {
+            _named(name, part): x for part, x in computed.items() if _is_audited(metric, part)
+        }
         if inputs is self.inputs[BASE] and not OF_TEXTS.intersection(required_inputs(metric)):
             self.of_motions[name] = values  # the same for other captions
         return values
@@ -228,7 +259,9 @@ class _Measure:
     @property
     def truth(self) -> str | None:
         """Name of the value that reads every requested attribute exactly; None if no metric does."""
-        exact = {name: metric.exact for name, metric in self.metrics.items() if metric.exact is not None}
+        exact = {
+            name: metric.exact for name, metric in self.metrics.items() if metric.exact is not None
+        }
         return next((_named(name, part) for name, part in exact.items()), None)
 
     @property
@@ -241,9 +274,13 @@ class _Measure:
                 names[_named(name, part)] = -1 if metric.direction_of(part) is False else 1
         return names
 
-    def _rows(self, name: str, metric: SampleMetric, inputs: Inputs, texts: Sequence[Text]) -> dict[str, Any] | None:
+    def _rows(
+        self, name: str, metric: SampleMetric, inputs: Inputs, texts: Sequence[Text]
+    ) -> dict[str, Any] | None:
         """Returns the inputs of a metric, float64, with its readings; None if they are not known."""
-        required = set(required_inputs(metric)) | ({"generated"} if "generated" in metric.states else set())
+        required = set(required_inputs(metric)) | (
+            {"generated"} if "generated" in metric.states else set()
+        )
         rows: dict[str, Any] = {}
         if "generated" in required:
             if "features" not in inputs:
@@ -253,7 +290,9 @@ class _Measure:
                 "real": torch.from_numpy(self.inputs[REAL]["features"]),
             }
         if required & OF_TEXTS:
-            if not texts or ("requested" in required and not all("action" in text.requested for text in texts)):
+            if not texts or (
+                "requested" in required and not all("action" in text.requested for text in texts)
+            ):
                 return None
             rows["requested"] = [text.requested for text in texts]
         if "text" in required:
@@ -262,8 +301,12 @@ class _Measure:
             rows["paired"] = torch.from_numpy(self.inputs[STORED]["features"])
             rows["paired_text"] = self._encoded(self.real_texts)
         prefix = f"{name}/"
-        own = {key: values for key, values in inputs.items() if key == name or key.startswith(prefix)}
-        return rows | {key.removeprefix(name).removeprefix("/"): values for key, values in own.items()}
+        own = {
+            key: values for key, values in inputs.items() if key == name or key.startswith(prefix)
+        }
+        return rows | {
+            key.removeprefix(name).removeprefix("/"): values for key, values in own.items()
+        }
 
     def _encoded(self, texts: Sequence[Text]) -> Tensor:
         """Returns features (N, E) of texts, float64; each caption is encoded once."""
@@ -286,14 +329,20 @@ def _interval(values: np.ndarray) -> list[float | None]:
     return [float(f"{x:.6g}") for x in pair] if np.isfinite(pair).all() else [None, None]
 
 
-def _differences(values: Mapping[str, np.ndarray], base: Mapping[str, np.ndarray]) -> dict[str, list[float | None]]:
+def _differences(
+    values: Mapping[str, np.ndarray], base: Mapping[str, np.ndarray]
+) -> dict[str, list[float | None]]:
     """Returns value and interval, difference from real motions and its interval, by metric."""
-    pairs = {name: (values.get(name, np.full_like(real, np.nan)), real) for name, real in base.items()}
+    pairs = {
+        name: (values.get(name, np.full_like(real, np.nan)), real) for name, real in base.items()
+    }
     return {name: [*_interval(x), *_interval(x - real)] for name, (x, real) in pairs.items()}
 
 
 def _agreement(
-    measure: _Measure, scores: Sequence[Mapping[str, np.ndarray]], perturbations: Sequence[Mapping[str, Any]]
+    measure: _Measure,
+    scores: Sequence[Mapping[str, np.ndarray]],
+    perturbations: Sequence[Mapping[str, Any]],
 ) -> dict[str, dict[str, float | None]]:
     """Returns how well metrics of pairs agree with exact attributes, by metric; {} if these are not known.
 
@@ -310,7 +359,9 @@ def _agreement(
         if name in scores[0]:
             score = np.concatenate([of_set[name] for of_set in scores]) * sign
             larger = mannwhitneyu(score[right], score[~right], method="asymptotic")[0]
-            both = [(grade[name][0], grade[truth][0]) for grade in grades if grade[name][0] is not None]
+            both = [
+                (grade[name][0], grade[truth][0]) for grade in grades if grade[name][0] is not None
+            ]
             agreement[name] = {
                 "auc": float(larger / (right.sum() * (~right).sum())),
                 "correlation": float(np.corrcoef(rankdata(both, axis=0).T)[0, 1]),

@@ -62,7 +62,9 @@ class Evaluate(Callback):
         size = {"replications": self.replications, "samples": self.samples, "multimodality": False}
         protocol, _ = open_protocol(self.name, clips, representation, model, **size)
         extractor = protocol.open_extractor(self.path, representation, data.store.info["dataset"])
-        self.evaluation = Evaluation(protocol, clips, extractor, representation, batch_size=self.batch_size)
+        self.evaluation = Evaluation(
+            protocol, clips, extractor, representation, batch_size=self.batch_size
+        )
         self.next = trainer.global_step
 
     def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -73,7 +75,9 @@ class Evaluate(Callback):
         protocol = self.evaluation.protocol
         options, edit = sampling_options(protocol, pl_module.generator)
         size: dict[str, Any] = {"seed": 0, "batch_size": self.batch_size, "progress": False}
-        source = Generator(pl_module.generator, protocol, self.evaluation.clips, options, edit, **size)
+        source = Generator(
+            pl_module.generator, protocol, self.evaluation.clips, options, edit, **size
+        )
         measured = self.evaluation.run(source, ground_truth=not self.real, force=True)
         values = measured.values or {}
         self.real = self.real or measured.ground_truth or {}
@@ -85,10 +89,14 @@ class Evaluate(Callback):
             rows = []
             for metric, value in values.items():
                 real = self.real.get(metric)
-                rows.append([metric, *(getattr(value, column) for column in columns), real and real.mean])
+                rows.append(
+                    [metric, *(getattr(value, column) for column in columns), real and real.mean]
+                )
             head = ["metric", *columns, "real motions"]
             for logger in trainer.loggers:
-                log_table(logger, f"evaluation/{protocol.name}", head, rows, trainer.global_step - 1)
+                log_table(
+                    logger, f"evaluation/{protocol.name}", head, rows, trainer.global_step - 1
+                )
 
     def _add(self, name: str, value: Value, real: Value | None) -> None:
         """Adds the value by which checkpoints are selected, and the curves of dashboards."""
@@ -104,7 +112,9 @@ class Evaluate(Callback):
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         # Computed at the start, since averaged weights are swapped out by now.
         pl_module.log_dict(self.curves)
-        pl_module.log_dict({name: x for name, x in self.values.items() if name not in self.curves}, logger=False)
+        pl_module.log_dict(
+            {name: x for name, x in self.values.items() if name not in self.curves}, logger=False
+        )
         self.values, self.curves = {}, {}
 
 

@@ -44,7 +44,9 @@ def evaluate(request: EvaluationRequest) -> None:
         plan = Plan(request, device)
         result = make_result(request, plan)
         parts = (plan.protocol, plan.clips, plan.extractor, plan.representation)
-        evaluation = Evaluation(*parts, request.seed, plan.batch_size, training=plan.data.clips("train"))
+        evaluation = Evaluation(
+            *parts, request.seed, plan.batch_size, training=plan.data.clips("train")
+        )
         measured = evaluation.run(plan.source, force=request.force, resamples=request.resamples)
         if is_first():
             reasons = measured.invalid_because + result.invalid_because
@@ -59,14 +61,22 @@ class Evaluation:
 
     protocol: Protocol  # what is measured
     clips: Clips  # the split
-    extractor: Extractor | None  # an opened extractor; None = metrics that need features have no value
+    # An opened extractor; None = metrics that need features have no value
+    extractor: Extractor | None
     representation: Representation  # of the motions, on the device to compute on
     seed: int = 0  # of all random draws
     batch_size: int = 64  # of the extractor
-    training: Clips | None = None  # the training split, for metrics that look for copies of its motions
+    training: Clips | None = (
+        None  # the training split, for metrics that look for copies of its motions
+    )
 
     def run(
-        self, source: Source | None, *, ground_truth: bool = True, force: bool = False, resamples: int = 0
+        self,
+        source: Source | None,
+        *,
+        ground_truth: bool = True,
+        force: bool = False,
+        resamples: int = 0,
     ) -> Measured:
         """Evaluates real motions of all replications, and then the motions of the source, if there is one.
 
@@ -100,21 +110,31 @@ class Evaluation:
                 forced=bool(unexpected) and source is not None and force,
                 warnings=[*self._conditions(), *generated.warnings],
                 cost=None if source is None else mean_cost(generated.costs),
-                seeds=[key("draws", self.seed, replication) for replication in range(self.protocol.replications)],
+                seeds=[
+                    key("draws", self.seed, replication)
+                    for replication in range(self.protocol.replications)
+                ],
             )
         )
 
     @cached_property
     def evaluator(self) -> Evaluator:
         """Evaluator of the motions of each replication."""
-        skips = self.extractor is None and self.protocol.extractor is not None  # with extractor=none
+        # With extractor=none
+        skips = self.extractor is None and self.protocol.extractor is not None
         evaluator = Evaluator(
-            self.extractor, self.protocol.metrics, self.representation, self.batch_size, skip_features=skips
+            self.extractor,
+            self.protocol.metrics,
+            self.representation,
+            self.batch_size,
+            skip_features=skips,
         )
         if evaluator.reads("nearest") and self.training is not None:
             windows = self.protocol.rows(self.training, self.seed, 0, purpose="training")
             whole = [replace(row, frames=np.arange(row.clip.length)) for row in windows]
-            motions = [self._motions(rows, real_motions(self.training, rows)) for rows in (whole, windows)]
+            motions = [
+                self._motions(rows, real_motions(self.training, rows)) for rows in (whole, windows)
+            ]
             evaluator.training = evaluator.training_motions(*motions)
         return evaluator
 
@@ -124,13 +144,19 @@ class Evaluation:
         several = self.protocol.multimodality
         return several and replace(self.evaluator, metrics=several.metrics)
 
-    def _score(self, evaluator: Evaluator, motions: Rows, paired: Rows, real: Rows, replication: int) -> Scores:
-        values, reasons = evaluator.score(motions, paired, real, key("draws", self.seed, replication))
+    def _score(
+        self, evaluator: Evaluator, motions: Rows, paired: Rows, real: Rows, replication: int
+    ) -> Scores:
+        values, reasons = evaluator.score(
+            motions, paired, real, key("draws", self.seed, replication)
+        )
         real_counts = dict.fromkeys(filter(evaluator.compares_sets, values), len(real["keys"]))
         units = {name: evaluator.unit_of(name) for name in values}
         return Scores(values, reasons, len(motions["keys"]), real_counts, units)
 
-    def _measure_real(self, source: Source | None, ground_truth: bool) -> tuple[list[tuple[Rows, Rows]], Outcome]:
+    def _measure_real(
+        self, source: Source | None, ground_truth: bool
+    ) -> tuple[list[tuple[Rows, Rows]], Outcome]:
         """Measures real motions; also returns for each replication those that the source's motions are compared with.
 
         The first of each pair are the real motions of the same clips, the second are for comparisons of sets.
@@ -142,16 +168,24 @@ class Evaluation:
             real = self.evaluator.reference()
             if real is None:
                 features = real_motions(self.clips, again)
-                real = replace(self.evaluator, training=None).extract(self._motions(again, features))
+                real = replace(self.evaluator, training=None).extract(
+                    self._motions(again, features)
+                )
             real = _without_joints(real)
             paired = self._paired(self.protocol.rows(self.clips, self.seed, replication))
             if ground_truth:
                 scores.append(self._score(self.evaluator, paired, paired, real, replication))
             if source is not None:
-                for checked in filter(None, (self.evaluator, self.several)):  # before motions are generated
+                # Before motions are generated
+                for checked in filter(None, (self.evaluator, self.several)):
                     checked.check(paired)
                 # All replications are kept in memory; joints, the largest part, only if metrics compare them.
-                real_sets.append((paired if self.evaluator.reads("real_joints") else _without_joints(paired), real))
+                real_sets.append(
+                    (
+                        paired if self.evaluator.reads("real_joints") else _without_joints(paired),
+                        real,
+                    )
+                )
         return real_sets, Outcome(scores)
 
     def _paired(self, rows: Sequence[DrawnClip]) -> Rows:
@@ -170,9 +204,13 @@ class Evaluation:
             mean = value.mean if value else None
             if mean is None:
                 if not self.evaluator.skip_features:
-                    lines.append(f"{metric} of real motions, expected {expected:g}, could not be computed")
+                    lines.append(
+                        f"{metric} of real motions, expected {expected:g}, could not be computed"
+                    )
             elif not abs(mean - expected) <= tolerance:
-                lines.append(f"real motions have {metric} {mean:.4g}, expected {expected:g} +- {tolerance:g}")
+                lines.append(
+                    f"real motions have {metric} {mean:.4g}, expected {expected:g} +- {tolerance:g}"
+                )
         return lines
 
     def _expected(self) -> dict[str, list[float]]:
@@ -182,26 +220,39 @@ class Evaluation:
         if self.clips.clips[0].split != "test" and info["clips"]["test"]:
             return {}
         names = [info["dataset"], *([self.extractor.sha256] if self.extractor else [])]
-        return {metric: bounds for name in names for metric, bounds in self.protocol.expected.get(name, {}).items()}
+        return {
+            metric: bounds
+            for name in names
+            for metric, bounds in self.protocol.expected.get(name, {}).items()
+        }
 
     def _conditions(self) -> list[str]:
         """Returns what restricts the meaning of the values: repeated clips, and bounds that were not checked."""
         lines = []
         clips = len(self.protocol.selected(self.clips))
-        drawn = {"motions": self.protocol.samples, "real motions for comparisons of sets": self.protocol.real_samples}
+        drawn = {
+            "motions": self.protocol.samples,
+            "real motions for comparisons of sets": self.protocol.real_samples,
+        }
         for purpose, count in drawn.items():
             if count is not None and count > clips:
-                lines.append(f"{count} {purpose} of {clips} clips: clips are repeated, which changes distances of sets")
+                lines.append(
+                    f"{count} {purpose} of {clips} clips: clips are repeated, which changes distances of sets"
+                )
         if self.protocol.resized_samples and self._expected():
             lines.append(
                 "the expected values of real motions were not checked: they hold for the number of motions of the "
                 "protocol alone"
             )
         if self.protocol.cuts_motions and self._expected():
-            lines.append("the expected values of real motions were not checked: the first frames are not measured here")
+            lines.append(
+                "the expected values of real motions were not checked: the first frames are not measured here"
+            )
         return lines
 
-    def _measure(self, source: Source, real_sets: Sequence[tuple[Rows, Rows]], resamples: int) -> Outcome:
+    def _measure(
+        self, source: Source, real_sets: Sequence[tuple[Rows, Rows]], resamples: int
+    ) -> Outcome:
         """Measures the source's motions of each replication, compared with the real ones."""
         scores, costs, warnings = [], [], []
         resampled: Mapping[str, list[float | None]] = {}
@@ -209,18 +260,23 @@ class Evaluation:
             rows = self.protocol.rows(self.clips, self.seed, replication)
             samples = source(f"rep_{replication}", rows, replication)
             costs.append(samples.cost)
-            if len(samples.rows) != len(rows):  # motions from another system may not cover all clips
+            # Motions from another system may not cover all clips
+            if len(samples.rows) != len(rows):
                 ids = {row.id for row in samples.rows}
                 paired = _select(paired, [i for i, row in enumerate(rows) if row.id in ids])
             generated = self.evaluator.extract(self._generated(samples))
             scores.append(self._score(self.evaluator, generated, paired, real, replication))
             if not replication:
                 warnings = self._warnings(generated, real)
-                resampled = self.evaluator.resample(generated, paired, real, key("draws", self.seed, 0), resamples)
+                resampled = self.evaluator.resample(
+                    generated, paired, real, key("draws", self.seed, 0), resamples
+                )
         counts = [replication.count for replication in scores]
         if len(set(counts)) > 1:
             numbers = ", ".join(map(str, counts))
-            warnings.append(f"replications of {numbers} motions: values that depend on this number are mixed")
+            warnings.append(
+                f"replications of {numbers} motions: values that depend on this number are mixed"
+            )
         return Outcome(scores, resampled, warnings, costs)
 
     def _measure_multimodality(self, source: Source, evaluator: Evaluator) -> Outcome:
@@ -234,14 +290,22 @@ class Evaluation:
             motions = paired = nothing
             if generates:
                 rows = self.protocol.prompts(self.clips, self.seed, replication)
-                motions = evaluator.extract(self._generated(source(f"multimodality_{replication}", rows, replication)))
+                motions = evaluator.extract(
+                    self._generated(source(f"multimodality_{replication}", rows, replication))
+                )
                 real = self._paired(rows[:: several.samples])
                 paired = _select(real, [i // several.samples for i in range(len(rows))])
             scores.append(self._score(evaluator, motions, paired, nothing, replication))
         if generates:
             return Outcome(scores)
-        reason = "not computed in a quick evaluation" if self.protocol.quick else "there is one sample per clip"
-        return Outcome(scores, not_computed={"multimodality": f"{reason}: it needs several samples per prompt"})
+        reason = (
+            "not computed in a quick evaluation"
+            if self.protocol.quick
+            else "there is one sample per clip"
+        )
+        return Outcome(
+            scores, not_computed={"multimodality": f"{reason}: it needs several samples per prompt"}
+        )
 
     def _generated(self, samples: Samples) -> Motions:
         """Returns the motions to measure; smooths each over time, without padding, as FLAME's code does."""
@@ -254,18 +318,25 @@ class Evaluation:
         lines: list[str] = []
         count, others = len(generated["keys"]), len(real["keys"])
         for name, config in self.protocol.metrics.items():
-            if "generated" in generated and config["_target_"].endswith(FrechetMotionDistance.__name__):
+            if "generated" in generated and config["_target_"].endswith(
+                FrechetMotionDistance.__name__
+            ):
                 width = generated["generated"].shape[1]
                 if min(count, others) < 2 * width:
                     few = f"{min(count, others)} motions are fewer than twice the {width} features"
                     lines.append(f"{name}: biased upwards: {few}")
                 if count != others:
                     numbers = f"{count} generated and {others} real motions"
-                    lines.append(f"{name}: {numbers}. Compare it only with values for the same two numbers")
+                    lines.append(
+                        f"{name}: {numbers}. Compare it only with values for the same two numbers"
+                    )
         return lines
 
     def _motions(
-        self, rows: Sequence[DrawnClip], features: list[np.ndarray], captions: list[str] | None = None
+        self,
+        rows: Sequence[DrawnClip],
+        features: list[np.ndarray],
+        captions: list[str] | None = None,
     ) -> Motions:
         """Returns motions with the conditions of their rows; `captions` replace the captions of the rows."""
         condition = self.protocol.condition
@@ -282,7 +353,9 @@ class Evaluation:
             ids=[row.id for row in rows],
             features=features,
             captions=texts,
-            tokens=[row.tokens(caption) for row, caption in zip(rows, texts, strict=True)] if texts else None,
+            tokens=[row.tokens(caption) for row, caption in zip(rows, texts, strict=True)]
+            if texts
+            else None,
             inputs=inputs,
             edit=self.protocol.edit,
         )
@@ -293,7 +366,9 @@ def _without_joints(rows: Rows) -> Rows:
 
 
 def _select(rows: Rows, indices: list[int]) -> Rows:
-    return {n: v[indices] if isinstance(v, Tensor) else [v[i] for i in indices] for n, v in rows.items()}
+    return {
+        n: v[indices] if isinstance(v, Tensor) else [v[i] for i in indices] for n, v in rows.items()
+    }
 
 
 def _refuse(unexpected: Sequence[str]) -> None:

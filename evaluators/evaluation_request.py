@@ -21,25 +21,49 @@ MIN_RESAMPLES = 100
 class EvaluationKeys:
     """Keys of an evaluation that are the same on the command line and in Python, with their help texts."""
 
-    protocol: str | None = option(None, "a name in experiments/evaluation, or a file; default: the model decides")
-    extractor: str | None = option(None, "a motion-CLIP, or as the protocol requires; none = no extractor")
-    smpl: str | None = option(lambda: os.environ.get("FLAME_MDM_SMPL"), "SMPL's model file (.pkl or .npz), for joints")
-    from_samples: str | None = option(None, "a folder of motions of other systems, instead of ckpt; needs data=")
-    baseline: str | None = option(None, "real, shuffled, noisy or static motions, instead of ckpt; needs data=")
+    protocol: str | None = option(
+        None, "a name in experiments/evaluation, or a file; default: the model decides"
+    )
+    extractor: str | None = option(
+        None, "a motion-CLIP, or as the protocol requires; none = no extractor"
+    )
+    smpl: str | None = option(
+        lambda: os.environ.get("FLAME_MDM_SMPL"), "SMPL's model file (.pkl or .npz), for joints"
+    )
+    from_samples: str | None = option(
+        None, "a folder of motions of other systems, instead of ckpt; needs data="
+    )
+    baseline: str | None = option(
+        None, "real, shuffled, noisy or static motions, instead of ckpt; needs data="
+    )
     split: Literal["train", "val", "test"] = option("test", "train, val or test")
     seed: int = option(0, "seed of the noise and of the drawn motions")
-    replications: int | None = option(None, "replications and samples: override the protocol; the result says so")
+    replications: int | None = option(
+        None, "replications and samples: override the protocol; the result says so"
+    )
     samples: int | None = option(None, "number of motions")
-    resamples: int = option(0, "sets of motions drawn with replacement, for 95 % intervals over motions, such as 200")
-    multimodality: bool = option(True, "false = skip metrics that need several samples per prompt; the result says so")
-    quick: bool = option(False, "two replications of 64 motions, to check that everything works; the result says so")
-    force: bool = option(False, "generate even if real motions miss the expected values; the result says so")
+    resamples: int = option(
+        0, "sets of motions drawn with replacement, for 95 % intervals over motions, such as 200"
+    )
+    multimodality: bool = option(
+        True, "false = skip metrics that need several samples per prompt; the result says so"
+    )
+    quick: bool = option(
+        False, "two replications of 64 motions, to check that everything works; the result says so"
+    )
+    force: bool = option(
+        False, "generate even if real motions miss the expected values; the result says so"
+    )
     method: str | None = same_option(EditRequest, "method")
     until: float | None = same_option(EditRequest, "until")
     strength: float | None = same_option(EditRequest, "strength")
-    batch_size: int | None = option(None, "motions at once: 64, or what a protocol that measures time says")
+    batch_size: int | None = option(
+        None, "motions at once: 64, or what a protocol that measures time says"
+    )
     device: str | None = option(None, "default: cuda if available")
-    data_root: str = option("", "folder of the prepared data sets; default: the checkpoint's, or FLAME_MDM_DATA")
+    data_root: str = option(
+        "", "folder of the prepared data sets; default: the checkpoint's, or FLAME_MDM_DATA"
+    )
     out: str | None = option(None, "the JSON file; default: next to the generated motions")
 
 
@@ -64,19 +88,32 @@ class EvaluationRequest(EvaluationKeys):
     @classmethod
     def of(cls, config: Config) -> EvaluationRequest:
         kinds = (cls, SamplerOptions)
-        own, options = ({key.name: config[key.name] for key in fields(kind) if key.name in config} for kind in kinds)
+        own, options = (
+            {key.name: config[key.name] for key in fields(kind) if key.name in config}
+            for kind in kinds
+        )
         return cls(**own, options=SamplerOptions(**options))
 
     def __post_init__(self) -> None:
         _ = self.editing  # checks its keys
-        what = [name for name in ("ckpt", "from_samples", "baseline") if getattr(self, name) is not None]
+        what = [
+            name for name in ("ckpt", "from_samples", "baseline") if getattr(self, name) is not None
+        ]
         if len(what) != 1:
-            raise UserError("give exactly one of ckpt=FILE, from_samples=FOLDER and baseline=NAME, such as shuffled")
+            raise UserError(
+                "give exactly one of ckpt=FILE, from_samples=FOLDER and baseline=NAME, such as shuffled"
+            )
         if what != ["ckpt"] and not self.data:
             raise UserError(f"{what[0]} needs a data set. Add data=NAME, such as data=humanml3d")
         if what != ["ckpt"] and self.protocol is None:
-            raise UserError(f"{what[0]} needs a protocol. Add protocol=NAME, such as protocol=text_to_motion")
+            raise UserError(
+                f"{what[0]} needs a protocol. Add protocol=NAME, such as protocol=text_to_motion"
+            )
         if what == ["from_samples"] and (self.quick or self.samples or self.replications):
-            raise UserError("from_samples evaluates all motions of the files. Remove quick, samples and replications")
+            raise UserError(
+                "from_samples evaluates all motions of the files. Remove quick, samples and replications"
+            )
         if self.resamples and self.resamples < MIN_RESAMPLES:
-            raise UserError(f"resamples={self.resamples}: give 0, or {MIN_RESAMPLES} or more for a 95 % interval")
+            raise UserError(
+                f"resamples={self.resamples}: give 0, or {MIN_RESAMPLES} or more for a 95 % interval"
+            )

@@ -30,7 +30,12 @@ from flame_mdm.seeds import key
 
 CHUNK = 64  # motions per metric update; more do not fit into a processor's cache
 FEATURES = {"generated", "real", "text", "logits"}  # inputs of metrics that an extractor provides
-PAIRED = {"generated": "real", "joints": "real_joints", "nearest": "real_nearest", "references": "references"}
+PAIRED = {
+    "generated": "real",
+    "joints": "real_joints",
+    "nearest": "real_nearest",
+    "references": "references",
+}
 """Inputs of paired real motions -> their names among the inputs of the generated motions."""
 
 
@@ -41,9 +46,14 @@ class Motions:
     ids: list[str]  # unique names
     features: list[np.ndarray]  # (F, D) float32 each, in the data's units
     captions: list[str] | None = None  # of motions with text
-    tokens: list[list[str] | None] | None = None  # "word/PART" tokens of the captions, if the data has them
-    inputs: dict[str, Any] = field(default_factory=dict)  # further inputs, by the names in `evaluators.metrics`
-    edit: Mapping[str, Any] | None = None  # parts kept from real motions: `region` and `joints` of `kept_parts`
+    tokens: list[list[str] | None] | None = (
+        None  # "word/PART" tokens of the captions, if the data has them
+    )
+    # Further inputs, by the names in `evaluators.metrics`
+    inputs: dict[str, Any] = field(default_factory=dict)
+    edit: Mapping[str, Any] | None = (
+        None  # parts kept from real motions: `region` and `joints` of `kept_parts`
+    )
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -65,8 +75,12 @@ class Evaluator:
     metrics: Mapping[str, Config]  # mappings with the `_target_` of a metric, by name
     representation: Representation
     batch_size: int = 64
-    skip_features: bool = False  # whether metrics of features have no value, instead of raising for lack of input
-    training: TrainingMotions | None = None  # motions that generated ones may be copies of; None = not measured
+    skip_features: bool = (
+        False  # whether metrics of features have no value, instead of raising for lack of input
+    )
+    training: TrainingMotions | None = (
+        None  # motions that generated ones may be copies of; None = not measured
+    )
 
     @torch.no_grad()
     def extract(self, motions: Motions) -> Rows:
@@ -74,14 +88,20 @@ class Evaluator:
         rows: Rows = {"keys": keys_of(motions.ids), **motions.inputs}
         # Batches of similar lengths need little padding.
         order = np.argsort([len(x) for x in motions.features], kind="stable").tolist()
-        batches = [order[begin : begin + self.batch_size] for begin in range(0, len(order), self.batch_size)]
+        batches = [
+            order[begin : begin + self.batch_size]
+            for begin in range(0, len(order), self.batch_size)
+        ]
         parts = dealt(partial(self._batch, motions), batches)
         texts = [text for indices in batches if (text := self._texts(motions, indices)) is not None]
         back = np.argsort(order, kind="stable")
         unordered = [motion for batch, _ in parts for motion in batch]
         rows["joints"] = joints = [unordered[i] for i in back]
         if batches:
-            rows |= {name: torch.cat([features[name] for _, features in parts])[back] for name in parts[0][1]}
+            rows |= {
+                name: torch.cat([features[name] for _, features in parts])[back]
+                for name in parts[0][1]
+            }
         if texts:
             rows["text"] = torch.cat(texts)[back]
         if motions.captions is not None:
@@ -91,7 +111,9 @@ class Evaluator:
             rows["contacts"] = [torch.from_numpy(x[:, contacts] > 0.5) for x in motions.features]
         if motions.edit is not None:
             edit = EditRequest(**motions.edit)
-            rows["kept"] = [kept_parts(self.representation, len(motion), edit)[1] for motion in joints]
+            rows["kept"] = [
+                kept_parts(self.representation, len(motion), edit)[1] for motion in joints
+            ]
         if self.training is not None and joints:
             rows["nearest"] = self.training.nearest(joints, rows.get("generated"))
         return rows
@@ -102,7 +124,9 @@ class Evaluator:
         joints = replace(self, extractor=None).extract(whole)["joints"]
         frames = [poses(motion, facing) for motion in joints]
         lengths = torch.tensor([len(motion) for motion in frames])
-        return TrainingMotions(torch.cat(frames), lengths, self.extract(windows).get("generated"), facing)
+        return TrainingMotions(
+            torch.cat(frames), lengths, self.extract(windows).get("generated"), facing
+        )
 
     @torch.no_grad()
     def reference(self) -> Rows | None:
@@ -110,29 +134,43 @@ class Evaluator:
         features = self.extractor and self.extractor.reference()
         if features is None:
             return None
-        return {"generated": features, "keys": keys_of([f"reference {number}" for number in range(len(features))])}
+        return {
+            "generated": features,
+            "keys": keys_of([f"reference {number}" for number in range(len(features))]),
+        }
 
-    def _batch(self, motions: Motions, indices: Sequence[int]) -> tuple[list[Tensor], dict[str, Tensor]]:
+    def _batch(
+        self, motions: Motions, indices: Sequence[int]
+    ) -> tuple[list[Tensor], dict[str, Tensor]]:
         for i in indices:
             if not np.isfinite(motions.features[i]).all():
                 raise UserError(f"motion {motions.ids[i]} is not finite. Did the model diverge?")
         where = self.representation.mean.device
         lengths = [len(motions.features[i]) for i in indices]
-        x = pad_sequence([torch.from_numpy(motions.features[i]) for i in indices], batch_first=True).to(where)
+        x = pad_sequence(
+            [torch.from_numpy(motions.features[i]) for i in indices], batch_first=True
+        ).to(where)
         mask = length_mask(torch.tensor(lengths, device=where))
         padded = self.representation.decode(x)
-        joints = [motion[:length].clone() for motion, length in zip(padded.cpu(), lengths, strict=True)]
+        joints = [
+            motion[:length].clone() for motion, length in zip(padded.cpu(), lengths, strict=True)
+        ]
         if self.extractor is None:
             return joints, {}
         features = self.extractor.motions(x, padded.where(mask[..., None, None], 0.0), mask)
-        return joints, {"generated" if name == "features" else name: x.float().cpu() for name, x in features.items()}
+        return joints, {
+            "generated" if name == "features" else name: x.float().cpu()
+            for name, x in features.items()
+        }
 
     def _texts(self, motions: Motions, indices: Sequence[int]) -> Tensor | None:
         """Returns features of some captions. Every process computes all of them, since extractors cache captions."""
         if self.extractor is None or motions.captions is None:
             return None
         tokens = motions.tokens or [None] * len(motions)
-        text = self.extractor.texts([motions.captions[i] for i in indices], [tokens[i] for i in indices])
+        text = self.extractor.texts(
+            [motions.captions[i] for i in indices], [tokens[i] for i in indices]
+        )
         return None if text is None else text.float().cpu()
 
     def score(
@@ -178,7 +216,9 @@ class Evaluator:
         """Returns all metrics with the motions, and those of them that can be computed."""
         metrics = make_metrics(self.metrics, seed=key("metric", seed) % 2**32)
         for metric in metrics.values():
-            metric.distributed_available_fn = bool  # returns False: no synchronization, this process has all motions
+            metric.distributed_available_fn = (
+                bool  # returns False: no synchronization, this process has all motions
+            )
         count = len(generated["keys"])
         usable = self.check(generated, metrics) if count else {}
         sets = {name: metric for name, metric in usable.items() if isinstance(metric, TwoSets)}
@@ -186,7 +226,9 @@ class Evaluator:
         for begin in range(0, count, CHUNK):
             part = slice(begin, begin + CHUNK)
             if sets:
-                update_metrics(sets, generated=generated["generated"][part], keys=generated["keys"][part])
+                update_metrics(
+                    sets, generated=generated["generated"][part], keys=generated["keys"][part]
+                )
             update_metrics(others, **_chunk(generated, paired, part))
         if "generated" in real:
             update_metrics(sets, real=real["generated"], real_keys=real["keys"])
@@ -210,12 +252,21 @@ class Evaluator:
         """Returns whether a metric requires an input."""
         return any(name in required_inputs(metric) for metric in self.declared.values())
 
-    def check(self, motions: Rows, metrics: Mapping[str, SampleMetric] | None = None) -> dict[str, SampleMetric]:
+    def check(
+        self, motions: Rows, metrics: Mapping[str, SampleMetric] | None = None
+    ) -> dict[str, SampleMetric]:
         """Returns the metrics that can be computed, without `skip_features` all; `UserError` if an input is missing."""
-        available = {*motions, "mask", "real_mask", *(PAIRED[name] for name in PAIRED if name in motions)}
+        available = {
+            *motions,
+            "mask",
+            "real_mask",
+            *(PAIRED[name] for name in PAIRED if name in motions),
+        }
         usable = {}
         for name, metric in (self.declared if metrics is None else metrics).items():
-            needed = ["generated", "keys"] if isinstance(metric, TwoSets) else required_inputs(metric)
+            needed = (
+                ["generated", "keys"] if isinstance(metric, TwoSets) else required_inputs(metric)
+            )
             missing = [row for row in needed if row not in available]
             if not missing:
                 usable[name] = metric
@@ -254,7 +305,9 @@ def _values(
             result = metric.nothing
         for part, value in result.items() if isinstance(result, dict) else [("", result)]:
             if value is not None and not math.isfinite(value):
-                reasons[name] = f"{type(metric).__name__}: the value is {value}: too few or degenerate samples"
+                reasons[name] = (
+                    f"{type(metric).__name__}: the value is {value}: too few or degenerate samples"
+                )
                 value = None
             values[f"{name}/{part}".rstrip("/")] = value
     return values, reasons

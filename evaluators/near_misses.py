@@ -5,7 +5,11 @@ from collections.abc import Sequence
 
 from flame_mdm.data.store import Entry
 
-ACTION = ("action", "content")  # names of the attribute that says what is done; clips without it have no near misses
+# Names of the attribute that says what is done; clips without it have no near misses
+ACTION = (
+    "action",
+    "content",
+)
 UNSAID = "normal"  # value that captions do not mention: such captions are less exact, but not wrong
 
 _Stated = frozenset[tuple[str, str | int | float]]
@@ -27,11 +31,17 @@ def near_misses(clips: Sequence[Entry]) -> list[dict[str, list[str]]]:
 
 def _stated(clip: Entry) -> _Stated:
     """Returns the attributes of a clip; in its action, they are slots: "wave-left-hand" is "wave-{side}-hand"."""
-    stated = {name: value for name, value in clip.attributes.items() if isinstance(value, str | int | float)}
+    stated = {
+        name: value
+        for name, value in clip.attributes.items()
+        if isinstance(value, str | int | float)
+    }
     action = next((str(stated.pop(name)) for name in ACTION if name in stated), "")
     names = {str(value): f"{{{name}}}" for name, value in stated.items()}
     if action:
-        stated["action"] = "-".join(names.get(word, word.removesuffix("s")) for word in action.split("-"))
+        stated["action"] = "-".join(
+            names.get(word, word.removesuffix("s")) for word in action.split("-")
+        )
     return frozenset(stated.items())
 
 

@@ -42,7 +42,9 @@ def wobble(joints: Joints, millimeters: float, draws: Draws, fps: float) -> Join
     along = draws.standard_normal(joints.shape[1:])
     phase = draws.uniform(0, 2 * np.pi, (1, joints.shape[1]))
     sine = np.sin(2 * np.pi * WOBBLE / fps * np.arange(len(joints))[:, None] + phase)
-    return joints + millimeters / 1000 * sine[..., None] * along / np.linalg.norm(along, axis=-1, keepdims=True)
+    return joints + millimeters / 1000 * sine[..., None] * along / np.linalg.norm(
+        along, axis=-1, keepdims=True
+    )
 
 
 def skate(joints: Joints, factor: float) -> Joints:
@@ -72,7 +74,9 @@ def pop(joints: Joints, centimeters: float, draws: Draws, *, last: bool = False)
 
 def draw_in(joints: Joints, centimeters: float) -> Joints:
     """Moves the wrists toward the axis of the trunk, as far as it at most, and the elbows half as far."""
-    names = next(skeleton.joints for skeleton in SKELETONS.values() if len(skeleton) == joints.shape[1])
+    names = next(
+        skeleton.joints for skeleton in SKELETONS.values() if len(skeleton) == joints.shape[1]
+    )
     changed, neck = joints.copy(), joints[:, names.index("neck")]
     for side in ("left", "right"):
         elbow, wrist = (names.index(f"{side}_{name}") for name in ("elbow", "wrist"))
@@ -174,7 +178,11 @@ class ChangedJoints(Perturbation):
         changed = []
         for row, joints in zip(scene.rows, scene.joints, strict=True):
             options = {"draws": scene.draws(self.name, row.id), "fps": scene.fps}
-            changed.append(self.change(joints, self.sign * grade, **{name: options[name] for name in self.takes}))
+            changed.append(
+                self.change(
+                    joints, self.sign * grade, **{name: options[name] for name in self.takes}
+                )
+            )
         return encode(scene.representation, changed)
 
     def apply(
@@ -257,7 +265,9 @@ class DroppedActions(Perturbation):
         kept = [i for i in self.order(scene) if scene.actions[i] not in gone]
         left = set(kept)
         picked = np.array([i if i in left else kept[i % len(kept)] for i in range(len(scene))])
-        return {name: x[picked] for name, x in sets[BASE].items()}, [texts[i] for i in picked] if texts else []
+        return {name: x[picked] for name, x in sets[BASE].items()}, [
+            texts[i] for i in picked
+        ] if texts else []
 
 
 @dataclass(frozen=True)
@@ -297,7 +307,9 @@ def _reversed(scene: Scene) -> list[np.ndarray]:
 def _other_half(scene: Scene) -> list[np.ndarray]:
     order = scene.draws("other half").permutation(len(scene))
     other = dict(zip(order.tolist(), np.roll(order, 1).tolist(), strict=True))
-    joined = [continue_with(x, scene.joints[other[i]], scene.fps) for i, x in enumerate(scene.joints)]
+    joined = [
+        continue_with(x, scene.joints[other[i]], scene.fps) for i, x in enumerate(scene.joints)
+    ]
     return encode(scene.representation, joined)
 
 
@@ -306,7 +318,11 @@ def _memorized(scene: Scene) -> list[np.ndarray]:
     training, copies = scene.data.clips("train"), []
     for row in scene.rows:
         same = [clip for clip in training.clips if clip.captions == row.clip.captions]
-        same = same or [clip for clip in training.clips if clip.action == row.clip.action] or [row.clip]
+        same = (
+            same
+            or [clip for clip in training.clips if clip.action == row.clip.action]
+            or [row.clip]
+        )
         draws = scene.draws("memorized", row.id)
         clip = same[int(draws.integers(len(same)))]
         copies.append(DrawnClip(row.id, clip, training.crop(clip.length, draws), None, row.id))
@@ -322,7 +338,11 @@ def through_others(representation: HumanML) -> list[Perturbation]:
     """Returns a perturbation for each other representation of the same skeleton and frame rate."""
     files = sorted((EXPERIMENTS / "representation").glob("humanml*.yaml"))
     others: list[HumanML] = [instantiate(read_yaml(path)) for path in files]
-    about, skeleton, fps = "encoded and decoded by another representation", representation.skeleton, representation.fps
+    about, skeleton, fps = (
+        "encoded and decoded by another representation",
+        representation.skeleton,
+        representation.fps,
+    )
     return [
         ChangedSet(f"through {other.name}", "plumbing", about, make=partial(_through, other))
         for other in others
@@ -333,7 +353,9 @@ def through_others(representation: HumanML) -> list[Perturbation]:
 def perturbations_of(scene: Scene, captioned: bool) -> list[Perturbation]:
     """Returns the perturbations that motions and their captions allow; near misses also by attribute."""
     listed = [*PERTURBATIONS, *through_others(scene.representation)]
-    return [offered for perturbation in listed for offered in perturbation.offered(scene, captioned)]
+    return [
+        offered for perturbation in listed for offered in perturbation.offered(scene, captioned)
+    ]
 
 
 # fmt: off

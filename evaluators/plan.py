@@ -51,20 +51,31 @@ class Plan:
         names = ("replications", "samples", "quick", "multimodality", "batch_size")
         size = {name: getattr(request, name) for name in names}
         protocol, self.changed = open_protocol(name, self.clips, self.representation, model, **size)
-        self.extractor = protocol.open_extractor(request.extractor, self.representation, data.store.info["dataset"])
+        self.extractor = protocol.open_extractor(
+            request.extractor, self.representation, data.store.info["dataset"]
+        )
         self.batch_size = protocol.batch_size or request.batch_size or 64
         self.sampling: dict[str, Any] = {}
         if model is not None and self.file is not None:
             options, edit = sampling_options(protocol, model, request.options, request.editing)
             self.sampling = options.chosen() | {"edit": edit}
             folder = self._motions_folder(request, self.file, protocol)
-            cached: dict[str, Any] = {"seed": request.seed, "batch_size": self.batch_size, "folder": folder}
+            cached: dict[str, Any] = {
+                "seed": request.seed,
+                "batch_size": self.batch_size,
+                "folder": folder,
+            }
             self.source = Generator(model, protocol, self.clips, options, edit, **cached)
             path = folder / "result"
         elif request.baseline is not None:
             self.source = Baseline(request.baseline, self.clips, protocol.condition, request.seed)
             split = f"-{request.split}" if request.split != "test" else ""
-            path = Path("runs/baselines") / data.store.info["dataset"] / protocol.title / f"{request.baseline}{split}"
+            path = (
+                Path("runs/baselines")
+                / data.store.info["dataset"]
+                / protocol.title
+                / f"{request.baseline}{split}"
+            )
         else:
             self.source = SampleFolder(Path(str(request.from_samples)), self.representation)
             sizes = {"replications": len(self.source.files), "samples": None}
@@ -73,7 +84,13 @@ class Plan:
             path = Path(str(request.from_samples)) / protocol.title
         self.protocol = protocol
         suffix = f"-{self.extractor.sha256[:8]}" if self.extractor else ""
-        suffix += "-quick" if request.quick else f"-{protocol.replications}x" if "replications" in self.changed else ""
+        suffix += (
+            "-quick"
+            if request.quick
+            else f"-{protocol.replications}x"
+            if "replications" in self.changed
+            else ""
+        )
         self.path = Path(request.out or path.with_name(f"{path.name}{suffix}.json"))
 
     def _motions_folder(self, request: EvaluationRequest, file: Path, protocol: Protocol) -> Path:
@@ -85,7 +102,11 @@ class Plan:
             run = Path("runs") / str(request.ckpt)
         else:
             run = file.parent.parent if file.parent.name == "checkpoints" else file.parent
-        used = self.sampling | {"seed": request.seed, "split": request.split, "samples": protocol.samples}
+        used = self.sampling | {
+            "seed": request.seed,
+            "split": request.split,
+            "samples": protocol.samples,
+        }
         used |= {"data": self.data.store.fingerprint}
         used |= {"batch_size": self.batch_size} if protocol.batch_size else {}
         folder = run / "evaluation" / protocol.title / f"{sha256(file)[:16]}-{digest(used)[:8]}"
@@ -114,7 +135,9 @@ def open_data(request: EvaluationRequest, model: MotionGenerator | None) -> Moti
         raise UserError(f"the checkpoint generates {names}")
     data = instantiate(module | {"root": root}, representation=representation, seed=0)
     if not isinstance(data, MotionDataModule):
-        raise UserError(f"{request.ckpt}: its recipe names {type(data).__name__} as the data set. Add data=NAME")
+        raise UserError(
+            f"{request.ckpt}: its recipe names {type(data).__name__} as the data set. Add data=NAME"
+        )
     data.setup("test")
     return data
 
@@ -141,7 +164,9 @@ def sampling_options(
     if protocol.edit is not None:
         edit, options = method_options(model.process, editing, options)
     elif editing != EditRequest():
-        raise UserError(f"protocol {protocol.name} does not edit motions. Remove method, until and strength")
+        raise UserError(
+            f"protocol {protocol.name} does not edit motions. Remove method, until and strength"
+        )
     options = options.over(model.sampler_options)
     model.process.find_sampler(options)
     return options, edit

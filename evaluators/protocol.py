@@ -53,12 +53,20 @@ class DrawnClip:
     @property
     def requested(self) -> dict[str, Any]:
         """The attributes of the clip that rules know; clips with one of `UNREAD` are not scored."""
-        return {name: value for name, value in self.clip.attributes.items() if name in (*ATTRIBUTES, *UNREAD)}
+        return {
+            name: value
+            for name, value in self.clip.attributes.items()
+            if name in (*ATTRIBUTES, *UNREAD)
+        }
 
     def tokens(self, caption: str) -> list[str] | None:
         """Returns the "word/PART" tokens of a caption of the clip, if the data has them."""
         tagged = self.clip.attributes.get("tokens")
-        return tagged[self.clip.captions.index(caption)] if tagged and caption in self.clip.captions else None
+        return (
+            tagged[self.clip.captions.index(caption)]
+            if tagged and caption in self.clip.captions
+            else None
+        )
 
 
 class Multimodality(ClosedSchema):
@@ -80,27 +88,47 @@ class Protocol(ClosedSchema):
     model_config = ConfigDict(strict=True, frozen=True)
 
     name: str  # name of the file, with that of the variant
-    version: Int  # raised when the protocol changes; values of different versions are not comparable
+    version: (
+        Int  # raised when the protocol changes; values of different versions are not comparable
+    )
     condition: Literal["text", "action", "none"]  # condition of the generated motions
-    extractor: Config | None  # mapping with the `_target_` of an `Extractor`, and its `path` unless it must be given
+    # Mapping with the `_target_` of an `Extractor`, and its `path` unless it must be given
+    extractor: Config | None
     metrics: dict[str, Config]  # mappings with the `_target_` of a metric, by name
     replications: Count  # number of repetitions of the evaluation
-    samples: Count | None = None  # motions per replication; clips are drawn at random. None = each clip once
-    real_samples: Count | None = None  # real motions in comparisons of sets, drawn likewise; None = each clip once
-    multimodality: Multimodality | None = None  # a second evaluation with several motions per prompt
-    edit: dict[str, Any] | None = None  # motions are edits of real motions: `region` and `joints` of `kept_parts`
-    smoothing: Number | None = None  # deviation, in frames, of a Gaussian filter over time of generated features
-    batch_size: Count | None = None  # motions per batch of a protocol that measures time; a first batch is not timed
+    samples: Count | None = (
+        None  # motions per replication; clips are drawn at random. None = each clip once
+    )
+    real_samples: Count | None = (
+        None  # real motions in comparisons of sets, drawn likewise; None = each clip once
+    )
+    multimodality: Multimodality | None = (
+        None  # a second evaluation with several motions per prompt
+    )
+    edit: dict[str, Any] | None = (
+        None  # motions are edits of real motions: `region` and `joints` of `kept_parts`
+    )
+    smoothing: Number | None = (
+        None  # deviation, in frames, of a Gaussian filter over time of generated features
+    )
+    batch_size: Count | None = (
+        None  # motions per batch of a protocol that measures time; a first batch is not timed
+    )
     # which frames a model that continues frames gets: the first ones of the drawn frames, which are then not measured;
     # or frames of the clip from one of the first five on, before motions as long as the drawn frames (DiP's code)
     context: Literal["drawn", "start"] = "drawn"
     context_frames: Int = 0  # number of these frames, set by `open_protocol`
-    only: dict[str, Any] = Field({})  # attributes that evaluated clips must have; {} = all clips of the split
+    # Attributes that evaluated clips must have; {} = all clips of the split
+    only: dict[str, Any] = Field({})
     # values of real motions of the test split, by data set or sha256 of the extractor: metric -> [value, tolerance].
     # If they differ, nothing is generated.
-    expected: dict[str, dict[str, Annotated[list[Number], Field(min_length=2, max_length=2)]]] = Field({})
+    expected: dict[str, dict[str, Annotated[list[Number], Field(min_length=2, max_length=2)]]] = (
+        Field({})
+    )
     quick: bool = False  # whether the evaluation is a quick one, set by `resized`
-    resized_samples: bool = False  # whether the number of motions is not that of the file, set by `resized`
+    resized_samples: bool = (
+        False  # whether the number of motions is not that of the file, set by `resized`
+    )
     sha256: str = ""  # hash of the content of the file, set by `load_protocol`
 
     def resized(
@@ -117,23 +145,37 @@ class Protocol(ClosedSchema):
 
         A quick evaluation has few motions and replications. `batch_size` is for protocols that measure time.
         """
-        defaults = {"replications": QUICK_REPLICATIONS, "samples": min(QUICK_SAMPLES, clips)} if quick else {}
+        defaults = (
+            {"replications": QUICK_REPLICATIONS, "samples": min(QUICK_SAMPLES, clips)}
+            if quick
+            else {}
+        )
         changed: dict[str, Any] = {}
-        for name, number in {"replications": replications, "samples": samples, "batch_size": batch_size}.items():
+        for name, number in {
+            "replications": replications,
+            "samples": samples,
+            "batch_size": batch_size,
+        }.items():
             value = defaults.get(name) if number is None else number
             if value is not None and value < 1:
                 raise UserError(f"{name}={value}: must be at least 1")
-            if value not in (None, getattr(self, name)) and (name != "batch_size" or self.batch_size):
+            if value not in (None, getattr(self, name)) and (
+                name != "batch_size" or self.batch_size
+            ):
                 changed[name] = value
         several = self.multimodality
         if several and "replications" in changed:
-            several = several.model_copy(update={"replications": min(changed["replications"], several.replications)})
+            several = several.model_copy(
+                update={"replications": min(changed["replications"], several.replications)}
+            )
         if several and not multimodality:
             several, changed["multimodality"] = None, False
         sizes = {"quick": quick, "multimodality": several, "resized_samples": "samples" in changed}
         return self.model_copy(update=changed | sizes), changed
 
-    def open_extractor(self, path: str | None, representation: Representation, dataset: str) -> Extractor | None:
+    def open_extractor(
+        self, path: str | None, representation: Representation, dataset: str
+    ) -> Extractor | None:
         """Opens an extractor at `path`, or that of the protocol; None if it is not needed, or `path` is "none".
 
         Raises `UserError` or `FileNotFoundError` if it is missing, or belongs to another representation or data set.
@@ -146,7 +188,9 @@ class Protocol(ClosedSchema):
                 f"protocol {self.name} needs a feature extractor. Give extractor=FILE, or extractor=none to skip the "
                 "metrics that need features"
             )
-        extractor: Extractor = instantiate(self.extractor, path=path, device=representation.mean.device)
+        extractor: Extractor = instantiate(
+            self.extractor, path=path, device=representation.mean.device
+        )
         extractor.check(representation, dataset)
         return extractor
 
@@ -165,17 +209,23 @@ class Protocol(ClosedSchema):
         chosen = [clip for clip in clips.clips if self.only.items() <= clip.attributes.items()]
         return [clip for clip in chosen if not self.context_frames or clip.length >= shortest]
 
-    def rows(self, clips: Clips, seed: int, replication: int, *, purpose: str = "generated") -> list[DrawnClip]:
+    def rows(
+        self, clips: Clips, seed: int, replication: int, *, purpose: str = "generated"
+    ) -> list[DrawnClip]:
         """Returns the motions of one replication; another `purpose` gives another draw of clips, captions and crops.
 
         Raises `UserError` if the split has no clip to evaluate on.
         """
         drawn = () if purpose == "generated" else (purpose,)
-        entries = sorted(self.selected(clips), key=lambda clip: key("sample", *drawn, seed, replication, clip.id))
+        entries = sorted(
+            self.selected(clips), key=lambda clip: key("sample", *drawn, seed, replication, clip.id)
+        )
         if not entries:
             only = "".join(f" and {name}={value}" for name, value in self.only.items())
             reason = f"the split has no clip with at least {clips.crop.min_frames} frames{only}"
-            raise UserError(f"{reason}. Choose another with split=..., or add a `split` column to captions.csv")
+            raise UserError(
+                f"{reason}. Choose another with split=..., or add a `split` column to captions.csv"
+            )
         count = self.samples if purpose == "generated" else self.real_samples
         rows = []
         for number in range(len(entries) if count is None else count):
@@ -183,7 +233,11 @@ class Protocol(ClosedSchema):
             again = number // len(entries)
             name = f"{clip.id}#{again}" if again else clip.id
             generator = np.random.default_rng(key("crop", purpose, seed, replication, name))
-            caption = key("caption", purpose, seed, replication, name) % len(clip.captions) if clip.captions else None
+            caption = (
+                key("caption", purpose, seed, replication, name) % len(clip.captions)
+                if clip.captions
+                else None
+            )
             frames = clips.crop(clip.length, generator)
             context = frames[: self.context_frames]
             if self.context_frames and self.context == "start":
@@ -192,7 +246,9 @@ class Protocol(ClosedSchema):
                 frames = frames[self.context_frames :]
                 if not len(frames):
                     length = f"{clip.id}: {len(context)} frames, all of which the model continues"
-                    raise UserError(f"{length}. Give longer crops, such as data.crop.max_frames=196")
+                    raise UserError(
+                        f"{length}. Give longer crops, such as data.crop.max_frames=196"
+                    )
             rows.append(DrawnClip(name, clip, frames, caption, name, context))
         return rows
 
@@ -201,19 +257,31 @@ class Protocol(ClosedSchema):
         assert self.multimodality is not None
         prompts = self.rows(clips, seed, replication)[: self.multimodality.prompts]
         numbers = range(self.multimodality.samples)
-        return [replace(row, id=f"{row.id}~{number}", prompt=row.id) for row in prompts for number in numbers]
+        return [
+            replace(row, id=f"{row.id}~{number}", prompt=row.id)
+            for row in prompts
+            for number in numbers
+        ]
 
     def count(self, clips: Clips) -> int:
         """Returns the number of motions that a model generates in the whole evaluation."""
         rows = self.samples or len(self.selected(clips))
         several = None if self.quick else self.multimodality
-        again = several.replications * several.samples * min(several.prompts or rows, rows) if several else 0
+        again = (
+            several.replications * several.samples * min(several.prompts or rows, rows)
+            if several
+            else 0
+        )
         return self.replications * rows + again
 
     def check(self, clips: Clips, model: MotionGenerator | None) -> None:
         """Raises `UserError` if there is no clip, one lacks the caption or label, or the model another condition."""
         rows, condition, fault = self.rows(clips, 0, 0), self.condition, ""
-        drawn = {"text": [row.caption for row in rows], "action": [row.clip.action for row in rows], "none": []}
+        drawn = {
+            "text": [row.caption for row in rows],
+            "action": [row.clip.action for row in rows],
+            "none": [],
+        }
         if None in drawn[condition]:
             fault = f"the data set {clips.store.info['dataset']} has clips without {condition}"
         elif model is not None and condition not in ("none", model.conditioned_on):
@@ -251,8 +319,12 @@ def _protocols(path: Path) -> dict[str, Config]:
     """Returns the protocols in a file by name: its own, if it has metrics, and its variants."""
     content = read_yaml(path)
     variants = content.pop("variants", {}) if isinstance(content, dict) else None
-    if not isinstance(variants, dict) or not all(isinstance(variant, dict) for variant in variants.values()):
-        raise UserError(f"{path}: not a protocol: it needs keys such as condition and metrics; variants are mappings")
+    if not isinstance(variants, dict) or not all(
+        isinstance(variant, dict) for variant in variants.values()
+    ):
+        raise UserError(
+            f"{path}: not a protocol: it needs keys such as condition and metrics; variants are mappings"
+        )
     protocols = {f"{path.stem}_{name}": content | variant for name, variant in variants.items()}
     return {path.stem: content} | protocols if "metrics" in content else protocols
 
@@ -271,7 +343,11 @@ def load_protocol(name: str, representation: Representation) -> Protocol:
     def filled(node: Any) -> Any:
         if isinstance(node, dict):
             return {name: filled(value) for name, value in node.items()}
-        return [filled(value) for value in node] if isinstance(node, list) else placeholders.get(str(node), node)
+        return (
+            [filled(value) for value in node]
+            if isinstance(node, list)
+            else placeholders.get(str(node), node)
+        )
 
     config = filled(protocol_config(name))
     plain(config, f"protocol {name}")
@@ -304,7 +380,11 @@ def digest(values: Any) -> str:
 
 
 def open_protocol(
-    name: str, clips: Clips, representation: Representation, model: MotionGenerator | None, **size: Any
+    name: str,
+    clips: Clips,
+    representation: Representation,
+    model: MotionGenerator | None,
+    **size: Any,
 ) -> tuple[Protocol, dict[str, Any]]:
     """Returns a protocol that matches a split and a model, and the options changed by `Protocol.resized`."""
     protocol = load_protocol(name, representation)

@@ -13,7 +13,15 @@ from evaluators.plan import Plan
 from evaluators.protocol import digest
 from evaluators.sources import SampleFolder
 from flame_mdm.errors import say
-from flame_mdm.records import Checkpoint, Cost, Data, ExtractorRecord, ProtocolVersion, Result, Value
+from flame_mdm.records import (
+    Checkpoint,
+    Cost,
+    Data,
+    ExtractorRecord,
+    ProtocolVersion,
+    Result,
+    Value,
+)
 from flame_mdm.reporting.audit_cards import card_of
 from flame_mdm.safe_io import sha256
 from flame_mdm.training.provenance import environment
@@ -27,7 +35,8 @@ class Scores:
     values: Mapping[str, float | None]  # by name, `metric` or `metric/part`; None if not computable
     reasons: Mapping[str, str]  # why a value is missing, by metric
     count: int  # motions
-    real_counts: Mapping[str, int]  # real motions that sets are compared with, by the names of such values
+    # Real motions that sets are compared with, by the names of such values
+    real_counts: Mapping[str, int]
     units: Mapping[str, str]  # by name
 
 
@@ -36,7 +45,8 @@ class Outcome:
     """What a part of an evaluation measured: real motions, generated ones, or several per prompt."""
 
     scores: Sequence[Scores] = ()  # by replication
-    resampled: Mapping[str, list[float | None]] = field(default_factory=dict)  # by name, see `Value`
+    # By name, see `Value`
+    resampled: Mapping[str, list[float | None]] = field(default_factory=dict)
     warnings: Sequence[str] = ()
     costs: Sequence[Cost] = ()
     not_computed: Mapping[str, str] = field(default_factory=dict)
@@ -85,7 +95,12 @@ def mean_ci(values: Sequence[float]) -> tuple[float, float | None]:
 def mean_cost(costs: Sequence[Cost]) -> Cost:
     """Returns the mean cost over replications; None if one of them used no model."""
     values = {name: [getattr(cost, name) for cost in costs] for name in Cost.model_fields}
-    return Cost(**{name: None if None in numbers else float(np.mean(numbers)) for name, numbers in values.items()})
+    return Cost(
+        **{
+            name: None if None in numbers else float(np.mean(numbers))
+            for name, numbers in values.items()
+        }
+    )
 
 
 def make_result(request: EvaluationRequest, plan: Plan) -> Result:
@@ -104,14 +119,18 @@ def make_result(request: EvaluationRequest, plan: Plan) -> Result:
     card = card_of(data, extractor.sha256 if extractor else None)
     return Result(
         quick=request.quick,
-        protocol=ProtocolVersion(name=protocol.name, version=protocol.version, sha256=protocol.sha256),
+        protocol=ProtocolVersion(
+            name=protocol.name, version=protocol.version, sha256=protocol.sha256
+        ),
         changed=plan.changed,
         split=request.split,
         published_split=info["published_split"],
         data=data,
         seed=request.seed,
         extractor=extractor
-        and ExtractorRecord(sha256=extractor.sha256, path=_extractor_path(request, plan), data=extractor.fingerprint),
+        and ExtractorRecord(
+            sha256=extractor.sha256, path=_extractor_path(request, plan), data=extractor.fingerprint
+        ),
         checkpoint=_checkpoint(plan),
         samples_sha256=plan.source.sha256 if isinstance(plan.source, SampleFolder) else None,
         baseline=request.baseline,
@@ -145,7 +164,9 @@ def _checkpoint(plan: Plan) -> Checkpoint | None:
         experiment=model.config.get("experiment"),
         config_sha256=digest(model.config),
         recipe_changes=recipe_changes(model.config),
-        selected_by=f"best {best['monitor']}" if file.stem == "best" and "monitor" in best else f"none: {file.stem}",
+        selected_by=f"best {best['monitor']}"
+        if file.stem == "best" and "monitor" in best
+        else f"none: {file.stem}",
         averaged_weights=bool(model.config.get("ema")),
         parameters=sum(p.numel() for p in model.parameters() if p.requires_grad),
         prediction={"epsilon": "noise"}.get(model.process.prediction, model.process.prediction),
@@ -162,7 +183,9 @@ def _overlaps(request: EvaluationRequest, plan: Plan) -> list[str]:
     trained["training data of the extractor"] = extractor.fingerprint if extractor else None
     for what, fingerprint in trained.items():
         if fingerprint and fingerprint != evaluated:
-            reasons.append(f"{what} {fingerprint} and evaluated data {evaluated} differ: splits may overlap")
+            reasons.append(
+                f"{what} {fingerprint} and evaluated data {evaluated} differ: splits may overlap"
+            )
     if extractor is not None and extractor.fingerprint == evaluated and request.split == "train":
         reasons.append("the extractor was trained on the evaluated split, train")
     return reasons
@@ -176,7 +199,10 @@ def show(result: Result, path: Path) -> None:
     if usual:
         say(f"replications x motions: {usual}" + _intervals(values))
     if result.changed:
-        say("differs from the protocol: " + ", ".join(f"{name}={value}" for name, value in result.changed.items()))
+        say(
+            "differs from the protocol: "
+            + ", ".join(f"{name}={value}" for name, value in result.changed.items())
+        )
     if result.checkpoint and result.checkpoint.recipe_changes:
         changes = ", ".join(result.checkpoint.recipe_changes)
         say(f"the model differs from the recipe {result.checkpoint.experiment}: {changes}")
@@ -191,7 +217,9 @@ def show(result: Result, path: Path) -> None:
     for name, reason in result.not_computed.items():
         say(f"not computed: {name}: {reason}")
     if result.stand_in_skeleton:
-        say("warning: joints were computed with a stand-in skeleton. Give SMPL's model file for its own: smpl=FILE")
+        say(
+            "warning: joints were computed with a stand-in skeleton. Give SMPL's model file for its own: smpl=FILE"
+        )
     for reason in result.warnings:
         say(f"warning: {reason}")
     for reason in result.invalid_because:
@@ -199,7 +227,9 @@ def show(result: Result, path: Path) -> None:
     if result.audit is not None:
         say(f"audit of this evaluator, of {result.audit_motions} motions: {result.audit}")
     else:
-        say(f"not audited: no one has checked what this evaluator sees. To do so: make audit DATA={data.dataset}")
+        say(
+            f"not audited: no one has checked what this evaluator sees. To do so: make audit DATA={data.dataset}"
+        )
     say(f"written: {path}")
 
 
@@ -208,7 +238,9 @@ def _intervals(values: Mapping[str, Value | None]) -> str:
     shown = [value for value in values.values() if value and value.half is not None]
     if not shown:
         return ""
-    return "; +-: 95 % interval over " + ("motions" if shown[0].resampled and shown[0].ci is None else "replications")
+    return "; +-: 95 % interval over " + (
+        "motions" if shown[0].resampled and shown[0].ci is None else "replications"
+    )
 
 
 def _cell(value: Value | None, usual: str) -> str:

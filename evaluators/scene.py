@@ -51,7 +51,9 @@ class Scene:
     @cached_property
     def joints(self) -> list[np.ndarray]:
         """Joint positions (F, J, 3) of each motion in meters, y up, float64."""
-        return [self.representation.decode(torch.from_numpy(x)).double().numpy() for x in self.features]
+        return [
+            self.representation.decode(torch.from_numpy(x)).double().numpy() for x in self.features
+        ]
 
     @property
     def actions(self) -> list[int]:
@@ -68,7 +70,9 @@ class Scene:
 
         The kinds are `RANDOM`, `NEAR`, and, if near misses differ in several attributes, "near misses: ATTRIBUTE".
         """
-        texts = {caption: text_of(row, caption) for row in self.rows for caption in row.clip.captions}
+        texts = {
+            caption: text_of(row, caption) for row in self.rows for caption in row.clip.captions
+        }
         contradicting = near_misses([row.clip for row in self.rows])
         attributes = sorted({name for misses in contradicting for name in misses})
         kinds = [RANDOM, NEAR]
@@ -85,5 +89,7 @@ class Scene:
                     options = misses[sorted(misses)[draws.integers(len(misses))]]
                 elif kind == RANDOM:
                     options = [caption for caption in texts if caption not in row.clip.captions]
-                wrong[kind].append(texts[options[draws.integers(len(options))]] if options else None)
+                wrong[kind].append(
+                    texts[options[draws.integers(len(options))]] if options else None
+                )
         return {kind: chosen for kind, chosen in wrong.items() if any(chosen)}

@@ -39,7 +39,9 @@ class Samples:
     rows: list[DrawnClip]  # what was requested, in order
     features: list[np.ndarray]
     cost: Cost = field(default_factory=Cost)
-    captions: list[str] | None = None  # captions of the motions, if they differ from those of the rows
+    captions: list[str] | None = (
+        None  # captions of the motions, if they differ from those of the rows
+    )
 
 
 class Source(Interface):
@@ -53,7 +55,9 @@ class Source(Interface):
 def real_motions(clips: Clips, rows: Sequence[DrawnClip]) -> list[np.ndarray]:
     """Returns features (F, D) of the real motions of the rows, in the data's units."""
     store, rebase = clips.store, clips.representation.rebase
-    return [np.ascontiguousarray(rebase(store.motion(row.clip)[row.frames]), np.float32) for row in rows]
+    return [
+        np.ascontiguousarray(rebase(store.motion(row.clip)[row.frames]), np.float32) for row in rows
+    ]
 
 
 @dataclass
@@ -85,13 +89,23 @@ class Generator:
         if path is not None and shared(path.exists()):
             content = shared(self._read(path, rows) if is_first() else None)
             assert content is not None
-            return Samples(rows, _split(content), Cost(**{name: float(content[name]) for name in Cost.model_fields}))
+            return Samples(
+                rows,
+                _split(content),
+                Cost(**{name: float(content[name]) for name in Cost.model_fields}),
+            )
         order = np.argsort([-len(row.frames) for row in rows], kind="stable").tolist()
-        batches = [order[first : first + self.batch_size] for first in range(0, len(order), self.batch_size)]
+        batches = [
+            order[first : first + self.batch_size]
+            for first in range(0, len(order), self.batch_size)
+        ]
         if self.protocol.batch_size is not None:
-            self._sample([rows[i] for i in batches[0]], replication)  # not timed: slower than the others
+            # Not timed: slower than the others
+            self._sample([rows[i] for i in batches[0]], replication)
         try:
-            parts = dealt(lambda indices: self._generate([rows[i] for i in indices], replication), batches)
+            parts = dealt(
+                lambda indices: self._generate([rows[i] for i in indices], replication), batches
+            )
         except BaseException:
             self.bar.close()  # ends the line of the progress bar
             raise
@@ -113,7 +127,9 @@ class Generator:
         self.bar.update(len(rows))
         return content
 
-    def _generate(self, rows: Sequence[DrawnClip], replication: int) -> tuple[list[np.ndarray], int, float]:
+    def _generate(
+        self, rows: Sequence[DrawnClip], replication: int
+    ) -> tuple[list[np.ndarray], int, float]:
         """Returns the motions of a batch, the number of denoiser calls, and seconds."""
         calls = 0
 
@@ -145,7 +161,9 @@ class Generator:
             seed=self.seed,
         )
         features = self.model.representation.denormalize(x.float()).cpu().numpy()
-        return [motion[: len(row.frames)].copy() for row, motion in zip(rows, features, strict=True)]
+        return [
+            motion[: len(row.frames)].copy() for row, motion in zip(rows, features, strict=True)
+        ]
 
     def _batch(self, rows: Sequence[DrawnClip]) -> MotionBatch:
         device, condition = self.model.device, self.protocol.condition
@@ -155,7 +173,9 @@ class Generator:
             mask=mask,
             ids=[row.id for row in rows],
             text=[row.text for row in rows] if condition == "text" else None,
-            action=torch.tensor([row.clip.action for row in rows], device=device) if condition == "action" else None,
+            action=torch.tensor([row.clip.action for row in rows], device=device)
+            if condition == "action"
+            else None,
         )
 
     def _prefix(self, rows: Sequence[DrawnClip]) -> Tensor:
@@ -200,17 +220,26 @@ class SampleFolder:
         index = {name: number for number, name in enumerate(ids)}
         unknown = sorted(index.keys() - {row.id for row in rows})
         if unknown:
-            raise UserError(f"{path}: names {len(unknown)} clips that are not in the split, such as {unknown[0]}")
+            raise UserError(
+                f"{path}: names {len(unknown)} clips that are not in the split, such as {unknown[0]}"
+            )
         if len(index) < len(ids):
             raise UserError(f"{path}: repeats ids. Give each clip of the split at most once")
         if "joints" in content:
-            joints = [torch.from_numpy(np.ascontiguousarray(x, np.float32)) for x in _split(content, "joints")]
-            features = [x.numpy().astype(np.float32) for x in self.representation.encode_many(joints)]
+            joints = [
+                torch.from_numpy(np.ascontiguousarray(x, np.float32))
+                for x in _split(content, "joints")
+            ]
+            features = [
+                x.numpy().astype(np.float32) for x in self.representation.encode_many(joints)
+            ]
         else:
             features = _split(content)
         if features[0].shape[1] != self.representation.features:
             expected = f"{self.representation.features} of {self.representation.name}"
-            raise UserError(f"{path}: {features[0].shape[1]} features per frame, not the {expected}")
+            raise UserError(
+                f"{path}: {features[0].shape[1]} features per frame, not the {expected}"
+            )
         requested = [row for row in rows if row.id in index]
         captions = content.get("captions")
         texts = None if captions is None else [str(captions[index[row.id]]) for row in requested]
@@ -226,7 +255,12 @@ class Baseline:
     """
 
     def __init__(self, kind: str, clips: Clips, condition: str, seed: int):
-        kinds = {"real": self._real, "shuffled": self._shuffled, "noisy": self._noisy, "static": self._static}
+        kinds = {
+            "real": self._real,
+            "shuffled": self._shuffled,
+            "noisy": self._noisy,
+            "static": self._static,
+        }
         if kind not in kinds:
             raise UserError(f"baseline={kind}: unknown baseline. Choose one of {', '.join(kinds)}")
         if kind == "shuffled" and condition == "none":
@@ -244,7 +278,11 @@ class Baseline:
             generator = np.random.default_rng(key("baseline", self.seed, replication, row.id))
             spare = row.clip.length - 1 - int(row.frames[-1] - row.frames[0])
             begin = generator.integers(spare + 1) if spare > 0 else row.frames[0]
-            moved.append(DrawnClip(row.id, row.clip, row.frames - row.frames[0] + begin, row.caption, row.prompt))
+            moved.append(
+                DrawnClip(
+                    row.id, row.clip, row.frames - row.frames[0] + begin, row.caption, row.prompt
+                )
+            )
         return real_motions(self.clips, moved)
 
     def _shuffled(self, rows: Sequence[DrawnClip], replication: int) -> list[np.ndarray]:
@@ -255,7 +293,9 @@ class Baseline:
         order = sorted(range(len(rows)), key=ranks.__getitem__)
         largest = max(Counter(names).values())
         if 2 * largest > len(rows):
-            raise UserError(f"baseline=shuffled: {largest} of {len(rows)} motions have the same caption or label")
+            raise UserError(
+                f"baseline=shuffled: {largest} of {len(rows)} motions have the same caption or label"
+            )
         motions = real_motions(self.clips, rows)
         shuffled = {order[i]: motions[order[i - largest]] for i in range(len(rows))}
         return [shuffled[i] for i in range(len(rows))]
@@ -275,14 +315,20 @@ class Baseline:
         where = representation.mean.device
         joints = [representation.decode(x.to(where)).cpu() for x in held]
         if any((x - x[:1]).abs().max() > 1e-4 for x in joints):
-            longer = [x[:1].expand(len(x) + 1, -1, -1) for x in joints]  # encoders may need one more frame
-            held = [x[: len(y)] for x, y in zip(representation.encode_many(longer), motions, strict=True)]
+            # Encoders may need one more frame
+            longer = [x[:1].expand(len(x) + 1, -1, -1) for x in joints]
+            held = [
+                x[: len(y)]
+                for x, y in zip(representation.encode_many(longer), motions, strict=True)
+            ]
         return [x.numpy().copy() for x in held]
 
 
 def sample_files(folder: Path) -> list[Path]:
     """Returns the files of a `SampleFolder`, one per replication; raises `UserError` if there are none."""
-    files = [path for path in folder.glob("*.npz") if not path.name.startswith((".", "multimodality_"))]
+    files = [
+        path for path in folder.glob("*.npz") if not path.name.startswith((".", "multimodality_"))
+    ]
     if not files:
         raise UserError(f"from_samples={folder}: no .npz file in this folder")
     for path in files:
@@ -303,16 +349,32 @@ def read_samples(path: Path) -> dict[str, np.ndarray]:
     content = read_npz(path)
     frames = {name: content[name] for name in ("features", "joints") if name in content}
     if not {"ids", "lengths"} <= content.keys() or not frames:
-        raise UserError(f"{path}: needs ids, lengths and features or joints, but holds {[*content]}")
-    ids, lengths, captions = content["ids"], content["lengths"], content.get("captions", content["ids"])
+        raise UserError(
+            f"{path}: needs ids, lengths and features or joints, but holds {[*content]}"
+        )
+    ids, lengths, captions = (
+        content["ids"],
+        content["lengths"],
+        content.get("captions", content["ids"]),
+    )
     numbers = lengths.dtype.kind in "iu" and ids.dtype.kind == captions.dtype.kind == "U"
     whole = numbers and ids.ndim == 1 and ids.shape == lengths.shape == captions.shape and len(ids)
-    if not whole or lengths.min() < 1 or any(len(x) != sum(lengths.tolist()) for x in frames.values() if x.ndim):
+    if (
+        not whole
+        or lengths.min() < 1
+        or any(len(x) != sum(lengths.tolist()) for x in frames.values() if x.ndim)
+    ):
         raise UserError(f"{path}: ids, lengths, captions and frames do not match. Write it again")
     for name, array in frames.items():
-        if array.dtype.kind not in "fiu" or array.dtype.itemsize > 8 or array.ndim != 2 + (name == "joints"):
+        if (
+            array.dtype.kind not in "fiu"
+            or array.dtype.itemsize > 8
+            or array.ndim != 2 + (name == "joints")
+        ):
             shape = "(frames, joints, 3)" if name == "joints" else "(frames, features)"
-            raise UserError(f"{path}: {name} is not an array {shape} of real numbers. Write it again")
+            raise UserError(
+                f"{path}: {name} is not an array {shape} of real numbers. Write it again"
+            )
     return content
 
 
@@ -320,10 +382,23 @@ def _split(content: Mapping[str, np.ndarray], name: str = "features") -> list[np
     return np.split(content[name].astype(np.float32), np.cumsum(content["lengths"])[:-1])
 
 
-def _write(path: Path, rows: Sequence[DrawnClip], features: Sequence[np.ndarray], cost: Cost, condition: str) -> None:
-    captions: dict[str, Any] = {"captions": [row.text for row in rows]} if condition == "text" else {}
+def _write(
+    path: Path,
+    rows: Sequence[DrawnClip],
+    features: Sequence[np.ndarray],
+    cost: Cost,
+    condition: str,
+) -> None:
+    captions: dict[str, Any] = (
+        {"captions": [row.text for row in rows]} if condition == "text" else {}
+    )
     ids, lengths = [row.id for row in rows], [len(x) for x in features]
     with atomic_write(path) as temporary:
         np.savez(
-            temporary, ids=ids, lengths=lengths, features=np.concatenate(features), **cost.model_dump(), **captions
+            temporary,
+            ids=ids,
+            lengths=lengths,
+            features=np.concatenate(features),
+            **cost.model_dump(),
+            **captions,
         )

@@ -8,7 +8,10 @@ FOLDER = Path("examples_output/01_generate")
 FOLDER.mkdir(parents=True, exist_ok=True)
 
 model = flame_mdm.load("quickstart")  # or a run directory, a model file, a model on the hub
-texts = ["a person waves with the left hand", "a person walks in a circle clockwise, then sits down"]
+texts = [
+    "a person waves with the left hand",
+    "a person walks in a circle clockwise, then sits down",
+]
 motions = flame_mdm.generate(model, texts, seconds=3, samples=2, seed=0, cleanup=True)
 
 # Two samples of the first text are followed by two samples of the second text.

@@ -24,7 +24,8 @@ class Convolutions(Denoiser):
         self.layer = nn.Conv1d(width, width, 7, padding=3)
         self.write = nn.Linear(width, out_features)
 
-    def forward(self, x_t, t, mask, cond):  # (B, F, D), (B,), (B, F), Condition -> (B, F, out_features)
+    # (B, F, D), (B,), (B, F), Condition -> (B, F, out_features)
+    def forward(self, x_t, t, mask, cond):
         x = self.read(x_t) + self.condition(t, cond.pooled)[:, None]
         x = x * mask[..., None]  # padding must not change real frames
         x = x + self.layer(x.mT).mT.relu()
@@ -42,7 +43,10 @@ def main() -> None:
     network = Convolutions(features, parts.process.out_features(features), parts.condition.features)
     options = {key: value for key, value in config["task"].items() if key != "_target_"}
     task = GeneratorTask(
-        replace(parts, denoiser=network), losses=config["losses"], optimizer=config["optimizer"], **options
+        replace(parts, denoiser=network),
+        losses=config["losses"],
+        optimizer=config["optimizer"],
+        **options,
     )
     task.config = task.generator.config = config
     trainer = Trainer(max_steps=10, accelerator="cpu", logger=False, enable_checkpointing=False)

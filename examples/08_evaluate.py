@@ -18,7 +18,14 @@ if __name__ == "__main__":  # data sets are prepared by processes that import th
     run("prepare", "synthetic", "force=true")
 
     # `quick` checks that everything works: two replications of 64 motions, and the result says so.
-    run("evaluate", "quickstart", "data=synthetic", "quick=true", "multimodality=false", f"out={RESULT}")
+    run(
+        "evaluate",
+        "quickstart",
+        "data=synthetic",
+        "quick=true",
+        "multimodality=false",
+        f"out={RESULT}",
+    )
 
     values = read_json(RESULT)["values"]
     for name, value in sorted(values.items()):

@@ -36,15 +36,22 @@ def main(argv: Sequence[str] | None = None) -> int:
     if not words or words[0] in ("-h", "--help"):
         say("usage: flame-mdm COMMAND OBJECT [OUT] [key=value ...]", "")
         say(*(f"  {name:10} {purpose}" for name, purpose in COMMANDS.items()), "")
-        say("An object is an existing path, the name of a recipe or data set, or a model on the Hugging Face hub.")
+        say(
+            "An object is an existing path, the name of a recipe or data set, or a model on the Hugging Face hub."
+        )
         say("`flame-mdm COMMAND --help` explains a command.")
         return 0 if words else 2
     name, *rest = words
     if name not in COMMANDS:
         near = did_you_mean(name, COMMANDS)
-        say(f"error: unknown command: {name}.{near} `flame-mdm --help` lists the commands", error=True)
+        say(
+            f"error: unknown command: {name}.{near} `flame-mdm --help` lists the commands",
+            error=True,
+        )
         return 1
-    command = import_module(f"flame_mdm.commands.{'import_released' if name == 'import' else name}").main
+    command = import_module(
+        f"flame_mdm.commands.{'import_released' if name == 'import' else name}"
+    ).main
     if name == "train":  # Hydra composes its recipe
         return command(rest)
     settings = get_type_hints(command)["settings"]

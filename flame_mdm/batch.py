@@ -87,9 +87,15 @@ class Condition:
             tokens = torch.where(drop[:, None, None], null.tokens.to(self.tokens), self.tokens)
             return replace(self, pooled=pooled, tokens=tokens)
         size = max(self.tokens.shape[1], null.tokens.shape[1])
-        tokens = torch.where(drop[:, None, None], pad_to(null.tokens.to(self.tokens), size), pad_to(self.tokens, size))
+        tokens = torch.where(
+            drop[:, None, None],
+            pad_to(null.tokens.to(self.tokens), size),
+            pad_to(self.tokens, size),
+        )
         replaced = drop[:, None]
-        token_mask = (replaced & pad_to(null.token_mask, size)) | (~replaced & pad_to(self.token_mask, size))
+        token_mask = (replaced & pad_to(null.token_mask, size)) | (
+            ~replaced & pad_to(self.token_mask, size)
+        )
         return replace(self, pooled=pooled, tokens=tokens, token_mask=token_mask)
 
     def with_null(self) -> Condition:

@@ -12,7 +12,8 @@ from typing import Any, TextIO
 
 MAX_LINE = 2_000
 """Maximum length of an error line, whose middle is left out beyond; the framework's own messages are shorter."""
-DIRECTIONS = re.compile("[\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]")  # bidirectional control characters of Unicode
+# Bidirectional control characters of Unicode
+DIRECTIONS = re.compile("[\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]")
 
 
 class UserError(ValueError):
@@ -42,7 +43,9 @@ def shortened(text: str, most: int = MAX_LINE) -> str:
 def printable(text: str) -> str:
     r"""Returns the text with control and direction characters escaped (`\x1b`); it cannot control a terminal."""
     return "".join(
-        char if char == "\t" or unicodedata.category(char) not in ("Cc", "Cf", "Cs", "Zl", "Zp") else _escaped(char)
+        char
+        if char == "\t" or unicodedata.category(char) not in ("Cc", "Cf", "Cs", "Zl", "Zp")
+        else _escaped(char)
         for char in text
     )
 

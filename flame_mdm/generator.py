@@ -69,7 +69,9 @@ def sampling_defaults(
     if num_inference_steps is None:  # a recipe may come from a file
         raise UserError("task.num_inference_steps=null: give the number of sampling steps")
     try:
-        return SamplerOptions(guidance_scale=guidance_scale, sampler=sampler, num_inference_steps=num_inference_steps)
+        return SamplerOptions(
+            guidance_scale=guidance_scale, sampler=sampler, num_inference_steps=num_inference_steps
+        )
     except UserError as error:
         raise UserError(f"task.{error}") from error
 
@@ -106,7 +108,9 @@ class MotionGenerator(Model, nn.Module):
         self.config, self.facts = {}, {}
 
     @classmethod
-    def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:
+    def build(
+        cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()
+    ) -> Self:
         """Builds the generator of a recipe; `actions` are the names of the actions in its data."""
         parts = Parts.build(config, representation, len(actions))
         section = config["task"]
@@ -175,8 +179,18 @@ class MotionGenerator(Model, nn.Module):
         ids = ["shared"] * len(batch) if shared_noise else batch.ids
         if self.denoiser.context_frames:
             if edit is not None or windows is not None or trajectory is not None:
-                raise UserError("this model continues motions block by block: omit edits, windows and trajectory")
-            blocks = Blocks(self, ids, prefix, options, seed=seed, replication=replication, unconditioned=unconditioned)
+                raise UserError(
+                    "this model continues motions block by block: omit edits, windows and trajectory"
+                )
+            blocks = Blocks(
+                self,
+                ids,
+                prefix,
+                options,
+                seed=seed,
+                replication=replication,
+                unconditioned=unconditioned,
+            )
             count = ceil_div(batch.mask.shape[1], self.block_frames)
             x = torch.cat([blocks.sample(cond) for _ in range(count)], 1)[:, : batch.mask.shape[1]]
             if was_training:
@@ -193,11 +207,17 @@ class MotionGenerator(Model, nn.Module):
             mask = pad_to(mask, max(frames, self.facts.get("max_frames", 0)))
             if edit is not None:
                 padded = mask.shape[1]
-                edit = replace(edit, known=pad_to(edit.known, padded), keep=~pad_to(~edit.keep, padded))
+                edit = replace(
+                    edit, known=pad_to(edit.known, padded), keep=~pad_to(~edit.keep, padded)
+                )
 
         features = self.representation.features
-        noise = seeded_noise(ids, mask.shape[1], features, seed=seed, replication=replication, like=batch.x)
-        x = self.process.sample(denoise, noise, mask, cond, options, edit=edit, trajectory=trajectory)
+        noise = seeded_noise(
+            ids, mask.shape[1], features, seed=seed, replication=replication, like=batch.x
+        )
+        x = self.process.sample(
+            denoise, noise, mask, cond, options, edit=edit, trajectory=trajectory
+        )
         if was_training:
             self.train()
         return x[:, :frames]
@@ -227,7 +247,9 @@ class MotionGenerator(Model, nn.Module):
         context = self.denoiser.context_frames
         if not context:
             return None, batch
-        return batch.x[:, :context], replace(batch, x=batch.x[:, context:], mask=batch.mask[:, context:])
+        return batch.x[:, :context], replace(
+            batch, x=batch.x[:, context:], mask=batch.mask[:, context:]
+        )
 
 
 class Blocks:
@@ -261,13 +283,17 @@ class Blocks:
         expected = (len(ids), model.denoiser.context_frames, model.representation.features)
         if prefix is None or tuple(prefix.shape) != expected:
             shape = None if prefix is None else tuple(prefix.shape)
-            raise UserError(f"prefix of shape {shape}: this model continues frames of shape {expected}. Give these")
+            raise UserError(
+                f"prefix of shape {shape}: this model continues frames of shape {expected}. Give these"
+            )
         self.model, self.ids, self.prefix, self.options = model, list(ids), prefix, options
         self.seed, self.replication, self.unconditioned = seed, replication, unconditioned
         self.number = 0  # of the next block
 
     @torch.no_grad()
-    def sample(self, cond: Condition, kept: Tensor | None = None, edit: Edit | None = None) -> Tensor:
+    def sample(
+        self, cond: Condition, kept: Tensor | None = None, edit: Edit | None = None
+    ) -> Tensor:
         """Samples the next block (B, P, D), normalized.
 
         Args:
@@ -278,7 +304,9 @@ class Blocks:
         model, prefix = self.model, self.prefix
         frames, features = model.block_frames, model.representation.features
         names = [f"{name}\x1f{self.number}" for name in self.ids]
-        noise = seeded_noise(names, frames, features, seed=self.seed, replication=self.replication, like=prefix)
+        noise = seeded_noise(
+            names, frames, features, seed=self.seed, replication=self.replication, like=prefix
+        )
         mask = torch.ones(len(prefix), frames, dtype=torch.bool, device=prefix.device)
         cond = replace(cond, prefix=prefix)
         denoise = model.guided(cond, self.options, self.unconditioned)
@@ -299,12 +327,18 @@ class DistilledGenerator(MotionGenerator):
     def __init__(self, parts: Parts, sampler_options: SamplerOptions):
         super().__init__(parts, sampler_options)
         # Edits cannot rewrite a path, since the sampler of students forgets it.
-        self.process.edit_modes = tuple(mode for mode in self.process.edit_modes if mode != "trajectory")
+        self.process.edit_modes = tuple(
+            mode for mode in self.process.edit_modes if mode != "trajectory"
+        )
 
     def check_request(self, options: SamplerOptions | None, unconditioned: bool) -> None:
         """Raises `UserError` for guidance and motions without condition, which a student has not learned."""
         scale = None if options is None else options.guidance_scale
         if scale not in (None, 1):
-            raise UserError(f"guidance_scale={scale}: the guidance is built into this distilled model. Omit it")
+            raise UserError(
+                f"guidance_scale={scale}: the guidance is built into this distilled model. Omit it"
+            )
         if unconditioned and self.condition.features:
-            raise UserError(f"this distilled model needs a {self.condition.reads}, as in its training. Add one")
+            raise UserError(
+                f"this distilled model needs a {self.condition.reads}, as in its training. Add one"
+            )

@@ -70,7 +70,12 @@ class MotionLosses(nn.Module):
         super().__init__()
         self.to_joints = to_joints
         self.feet, self.edges = list(feet), list(edges)
-        self.joints, self.velocity, self.foot_contact, self.bone_length = joints, velocity, foot_contact, bone_length
+        self.joints, self.velocity, self.foot_contact, self.bone_length = (
+            joints,
+            velocity,
+            foot_contact,
+            bone_length,
+        )
         self.root_relative, self.velocity_features = root_relative, velocity_features
 
     def forward(self, x0_hat: Tensor, x: Tensor, mask: Tensor) -> dict[str, Tensor]:
@@ -79,7 +84,9 @@ class MotionLosses(nn.Module):
         moving = mask[:, 1:]
         losses: dict[str, Tensor] = {}
         if self.velocity:
-            velocity, real_velocity = (motion[..., : self.velocity_features].diff(dim=1) for motion in (x0_hat, x))
+            velocity, real_velocity = (
+                motion[..., : self.velocity_features].diff(dim=1) for motion in (x0_hat, x)
+            )
             losses["velocity"] = self.velocity * masked_mse(velocity, real_velocity, moving)
         if not (self.joints or self.foot_contact or self.bone_length):
             return losses
@@ -89,10 +96,14 @@ class MotionLosses(nn.Module):
         if self.joints:
             losses["joints"] = self.joints * masked_mse(predicted, real, mask)
         if self.foot_contact:
-            in_contact = real[:, :, self.feet].diff(dim=1).norm(dim=-1, keepdim=True) <= CONTACT_SPEED
+            in_contact = (
+                real[:, :, self.feet].diff(dim=1).norm(dim=-1, keepdim=True) <= CONTACT_SPEED
+            )
             slide = torch.where(in_contact, predicted[:, :, self.feet].diff(dim=1), 0.0)
             losses["foot_contact"] = self.foot_contact * masked_mean(slide.square(), moving)
         if self.bone_length:
-            lengths, real_lengths = (bone_lengths(joints, self.edges) for joints in (predicted, real))
+            lengths, real_lengths = (
+                bone_lengths(joints, self.edges) for joints in (predicted, real)
+            )
             losses["bone_length"] = self.bone_length * masked_mse(lengths, real_lengths, mask)
         return losses

@@ -14,7 +14,9 @@ class ProgressBar(tqdm):
     """tqdm's bar in a terminal; elsewhere, a plain line at the beginning, about every 30 seconds, and at the end."""
 
     SECONDS = 30.0
-    monitor_interval = 0  # tqdm would swallow the exception of a signal that comes while its monitor thread starts
+    monitor_interval = (
+        0  # tqdm would swallow the exception of a signal that comes while its monitor thread starts
+    )
 
     def __init__(self, *args: Any, **options: Any):
         rare = {} if sys.stderr.isatty() else {"mininterval": self.SECONDS}
@@ -39,7 +41,8 @@ class ProgressBar(tqdm):
         def write(text: str) -> None:
             nonlocal end
             if text:
-                with suppress(BrokenPipeError):  # the reader of the output has ended, as `head` does
+                # The reader of the output has ended, as `head` does
+                with suppress(BrokenPipeError):
                     file.write(end + text.rstrip())
                     file.flush()
                 end = "\n"

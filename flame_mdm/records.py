@@ -21,11 +21,12 @@ class Value(Schema):
     n: Int | None  # motions per replication; None if replications have different numbers
     per_replication: list[Number | None] = Field(default_factory=list)
     n_per_replication: list[Int] = Field(default_factory=list)
-    n_real: Int | None = None  # real motions that a set of motions is compared with; None = no comparison of sets
+    n_real: Int | None = (
+        None  # real motions that a set of motions is compared with; None = no comparison of sets
+    )
     unit: str = ""
-    resampled: list[Number | None] = Field(
-        default_factory=list
-    )  # values of the motions of the first replication, drawn again and again
+    # Values of the motions of the first replication, drawn again and again
+    resampled: list[Number | None] = Field(default_factory=list)
 
     @property
     def half(self) -> float | None:
@@ -97,7 +98,8 @@ class Checkpoint(Schema):
     edit: dict[str, Plain] = Field({})
     experiment: str | None = None
     config_sha256: str = ""
-    recipe_changes: list[str] = Field(default_factory=list)  # "key=value" of keys that differ from the recipe's
+    # "key=value" of keys that differ from the recipe's
+    recipe_changes: list[str] = Field(default_factory=list)
     selected_by: str = ""
     averaged_weights: bool | None = None
     parameters: Int | None = None
@@ -132,7 +134,8 @@ class Measured(Schema):
     values: dict[str, Value | None] | None
     not_computed: dict[str, str]  # reasons by metric
     invalid_because: list[str]  # [] if the values are valid
-    forced: bool = False  # whether motions were generated although real motions do not have the expected values
+    # Whether motions were generated although real motions do not have the expected values
+    forced: bool = False
     warnings: list[str] = Field(default_factory=list)
     cost: Cost | None = None
     seeds: list[Int] = Field(default_factory=list)  # of metrics, by replication
@@ -145,7 +148,9 @@ class Result(Measured):
     protocol: ProtocolVersion
     changed: dict[str, Plain] = Field({})  # options that differ from the protocol
     split: str
-    published_split: bool = False  # whether it tests on clips seen in training, or has no validation clips
+    published_split: bool = (
+        False  # whether it tests on clips seen in training, or has no validation clips
+    )
     data: Data
     seed: Int
     extractor: ExtractorRecord | None
@@ -207,7 +212,9 @@ class AuditedMetric(ClosedSchema):
     """What a metric declares about one of its values."""
 
     unit: str = ""
-    sees_meaning: bool = True  # whether it may see that a motion shows something other than requested
+    sees_meaning: bool = (
+        True  # whether it may see that a motion shows something other than requested
+    )
     sums_up: bool = True  # whether the value sums up the other values of the metric
     exact: bool = False  # whether it reads attributes from the joints, without a network
     depends_on_count: bool = False  # whether it is biased by the number of motions
@@ -232,13 +239,18 @@ class AuditCard(ClosedSchema):
     seed: Int
     resamples: Int
     packages: dict[str, str]
-    metrics: dict[str, bool | None]  # whether higher values are better; None = values near those of real motions
+    # Whether higher values are better; None = values near those of real motions
+    metrics: dict[str, bool | None]
     facts: dict[str, AuditedMetric] = Field({})  # by metric; earlier versions wrote none
-    real: dict[str, Annotated[list[Number | None], Field(min_length=2, max_length=2)]]  # and half widths of intervals
+    # And half widths of intervals
+    real: dict[str, Annotated[list[Number | None], Field(min_length=2, max_length=2)]]
     perturbations: Annotated[list[AuditedPerturbation], Field(min_length=1)]
     not_computed: dict[str, str]
-    truth: dict[str, dict[str, Number | None]]  # agreement with exact attributes: `auc` and `correlation`, by metric
+    # Agreement with exact attributes: `auc` and `correlation`, by metric
+    truth: dict[str, dict[str, Number | None]]
 
 
 def read_result(path: Path) -> Result:
-    return read_json(path, Result, "delete it, then run `flame-mdm evaluate` or `flame-mdm tables` again")
+    return read_json(
+        path, Result, "delete it, then run `flame-mdm evaluate` or `flame-mdm tables` again"
+    )

@@ -25,7 +25,9 @@ class RunConfig(Schema):
     """The keys of the configuration of a run that pages read."""
 
     experiment: str | None
-    name: Annotated[str | Int | Number, Field(validation_alias=AliasPath("run", "name"))] = "default"
+    name: Annotated[str | Int | Number, Field(validation_alias=AliasPath("run", "name"))] = (
+        "default"
+    )
     max_steps: Annotated[Int, Field(validation_alias=AliasPath("trainer", "max_steps"))]
 
 
@@ -71,7 +73,9 @@ def made_by(path: str | Path) -> str:
     """Returns how to get a missing checkpoint or extractor: the command that creates it, or where to find it."""
     name = Path(path).as_posix()
     recipe = re.fullmatch(r"runs/(.+)/default/checkpoints/.+", name)
-    where = f"{name} is missing" + '; see "Extractors" in docs/evaluation.md' * name.startswith("assets/")
+    where = f"{name} is missing" + '; see "Extractors" in docs/evaluation.md' * name.startswith(
+        "assets/"
+    )
     return f"make train EXP={recipe[1]}" if recipe else where
 
 
@@ -94,18 +98,24 @@ class Run:
     @property
     def samples(self) -> Path | None:
         folders = [path.parent for path in self.folder.glob("samples/step_*/motion_000.npz")]
-        return max((path for path in folders if path.name.removeprefix("step_").isdecimal()), default=None)
+        return max(
+            (path for path in folders if path.name.removeprefix("step_").isdecimal()), default=None
+        )
 
     @property
     def steps(self) -> int:
         """Number of training steps that the curves cover."""
-        trained = (curve for name, curve in self.curves.items() if name.startswith(("train/", "samples/")))
+        trained = (
+            curve for name, curve in self.curves.items() if name.startswith(("train/", "samples/"))
+        )
         return max((max(curve) + 1 for curve in trained), default=0)
 
 
 def check_run(folder: Path) -> None:
     if not (folder / CONFIG).exists():
-        raise UserError(f"{folder}: contains no {CONFIG}; give a run directory, such as runs/synthetic/mdm/default")
+        raise UserError(
+            f"{folder}: contains no {CONFIG}; give a run directory, such as runs/synthetic/mdm/default"
+        )
 
 
 def read_run(folder: Path) -> Run:
@@ -119,7 +129,10 @@ def read_run(folder: Path) -> Run:
     provenance: Provenance | None = None
     if (folder / PROVENANCE).exists():
         provenance = read_json(folder / PROVENANCE, Provenance, "delete it; the page then omits it")
-    results = {path.relative_to(folder).as_posix(): read_result(path) for path in sorted(folder.glob(RESULTS))}
+    results = {
+        path.relative_to(folder).as_posix(): read_result(path)
+        for path in sorted(folder.glob(RESULTS))
+    }
     return Run(folder, config, provenance, read_history(folder), results)
 
 
@@ -146,6 +159,8 @@ def records(path: Path) -> list[dict[str, Any]]:
                 raise ValueError("it has no integer step")
             "".join(record).encode()  # a lone surrogate cannot be written again
         except (ValueError, RecursionError) as error:
-            raise UserError(f"{path}: line {number} is damaged; delete that line ({error})") from error
+            raise UserError(
+                f"{path}: line {number} is damaged; delete that line ({error})"
+            ) from error
         complete.append(record)
     return complete

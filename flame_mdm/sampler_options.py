@@ -9,7 +9,11 @@ from flame_mdm.config.options import option
 from flame_mdm.errors import UserError
 
 MAX_STEPS = 100_000  # maximum number of steps of a diffusion or sampler
-SPACINGS = ("linspace", "stride")  # how diffusion places steps; see `flame_mdm.processes.schedules.timesteps`
+# How diffusion places steps; see `flame_mdm.processes.schedules.timesteps`
+SPACINGS = (
+    "linspace",
+    "stride",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,15 +24,21 @@ class SamplerOptions:
     refuses the others. Raises `UserError` if a value is invalid for every model.
     """
 
-    guidance_scale: float | None = option(None, "scale of classifier-free guidance; 1 = off. Default: the recipe's")
+    guidance_scale: float | None = option(
+        None, "scale of classifier-free guidance; 1 = off. Default: the recipe's"
+    )
     sampler: str | None = option(
-        None, "ancestral, ddim, dpm_solver_pp_2m; euler, midpoint, heun, rk4, dopri5; consistency. null = the recipe's"
+        None,
+        "ancestral, ddim, dpm_solver_pp_2m; euler, midpoint, heun, rk4, dopri5; consistency. null = the recipe's",
     )
     num_inference_steps: int | Sequence[int] | None = option(
-        None, "number of sampling steps; for diffusion also a list of steps, [0,2,5,9]. Default: the recipe's"
+        None,
+        "number of sampling steps; for diffusion also a list of steps, [0,2,5,9]. Default: the recipe's",
     )
     eta: float | None = option(None, "randomness of the sampler ddim, from 0 (default) to 1")
-    spacing: str | None = option(None, "how diffusion places a number of steps: linspace (default) or stride")
+    spacing: str | None = option(
+        None, "how diffusion places a number of steps: linspace (default) or stride"
+    )
 
     def __post_init__(self) -> None:
         for name in ("guidance_scale", "eta"):
@@ -43,14 +53,22 @@ class SamplerOptions:
             raise UserError(f"spacing={self.spacing} is unknown: choose from {', '.join(SPACINGS)}")
         steps = self.num_inference_steps
         listed, least = (steps, 0) if isinstance(steps, list | tuple) else ([steps], 1)
-        if steps is not None and not all(type(step) is int and least <= step <= MAX_STEPS for step in listed):
-            raise UserError(f"num_inference_steps={steps}: give a number of steps, or a list, up to {MAX_STEPS:,}")
-        object.__setattr__(self, "num_inference_steps", tuple(steps) if isinstance(steps, list) else steps)
+        if steps is not None and not all(
+            type(step) is int and least <= step <= MAX_STEPS for step in listed
+        ):
+            raise UserError(
+                f"num_inference_steps={steps}: give a number of steps, or a list, up to {MAX_STEPS:,}"
+            )
+        object.__setattr__(
+            self, "num_inference_steps", tuple(steps) if isinstance(steps, list) else steps
+        )
 
     def chosen(self) -> dict[str, Any]:
         """Returns the options that are not None, as plain values."""
         values = {option.name: getattr(self, option.name) for option in fields(self)}
-        return {k: list(v) if isinstance(v, tuple) else v for k, v in values.items() if v is not None}
+        return {
+            k: list(v) if isinstance(v, tuple) else v for k, v in values.items() if v is not None
+        }
 
     def over(self, defaults: Self) -> Self:
         """Returns these options, with `defaults` for those that are None."""

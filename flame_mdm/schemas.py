@@ -10,12 +10,14 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError,
 from flame_mdm import safe_io
 from flame_mdm.errors import UserError, did_you_mean
 
-MAX_INTEGER = 2**63 - 1  # maximum integer in a file; larger ones overflow when they are plotted or logged
+# Maximum integer in a file; larger ones overflow when they are plotted or logged
+MAX_INTEGER = 2**63 - 1
 LIMIT = 4 * safe_io.MEBIBYTE
 """Maximum size of a file of results, lengths or provenance. Typical files have 10 to 300 KiB."""
 T = TypeVar("T")
 Int = Annotated[int, Field(gt=-(2**63), lt=2**63)]
-Number = Annotated[float, Field(gt=-1e300, lt=1e300)]  # a finite number that does not overflow when it is plotted
+# A finite number that does not overflow when it is plotted
+Number = Annotated[float, Field(gt=-1e300, lt=1e300)]
 Plain = str | bool | Int | Number | None
 
 
@@ -38,10 +40,20 @@ class ClosedSchema(Schema):
 
 
 EXPECTED = {
-    **{"string": "a text", "bool": "true or false", "int": "a whole number", "float": "a number", "finite": "a number"},
+    **{
+        "string": "a text",
+        "bool": "true or false",
+        "int": "a whole number",
+        "float": "a number",
+        "finite": "a number",
+    },
     **{"less": "a smaller number", "greater": "a larger number", "none": "null"},
     **{"dict": "a mapping", "model": "a mapping", "list": "a list"},
-    **{"string_too_short": "a non-empty text", "too_short": "a longer list or mapping", "too_long": "a shorter list"},
+    **{
+        "string_too_short": "a non-empty text",
+        "too_short": "a longer list or mapping",
+        "too_long": "a shorter list",
+    },
 }
 """Expected content, by the type of a pydantic error or its first word."""
 
@@ -54,7 +66,9 @@ def check_shape(content: Any, kind: type[T] | Any, strict: bool = True) -> T:
     Raises `ValueError`, with key, found value and expected type. Dataclasses need `strict` = False: "1" is a number.
     """
     if large := _too_large(content):
-        raise ValueError(f"{large[:40]} ... is too large for a JSON integer; the maximum is {MAX_INTEGER:,}")
+        raise ValueError(
+            f"{large[:40]} ... is too large for a JSON integer; the maximum is {MAX_INTEGER:,}"
+        )
     try:
         return _adapter(kind).validate_python(content, strict=strict)
     except ValidationError as error:
@@ -73,7 +87,9 @@ def _first_error(error: ValidationError, content: Any) -> str:
     first: Any = error.errors(include_url=False)[0]
     keys, kind, context = [], first["type"], first.get("ctx", {})
     for key in first["loc"]:  # pydantic also lists the members of unions, which are no keys
-        if (isinstance(content, dict) and key in content) or (isinstance(content, list) and isinstance(key, int)):
+        if (isinstance(content, dict) and key in content) or (
+            isinstance(content, list) and isinstance(key, int)
+        ):
             content = content[key]
             keys.append(str(key))
     name = ".".join(keys) or "the file"
@@ -85,8 +101,14 @@ def _first_error(error: ValidationError, content: Any) -> str:
         return ": ".join(filter(None, [".".join(keys), str(context["error"])]))
     shown = json.dumps(content, default=str)
     shown = shown if len(shown) < 40 else f"{shown[:36]} ..."
-    expected = context["expected"] if kind == "literal_error" else EXPECTED.get(kind, EXPECTED.get(kind.split("_")[0]))
-    return f"{name} is {shown}, not {expected}" if expected else f"{name} is {shown}: {first['msg']}"
+    expected = (
+        context["expected"]
+        if kind == "literal_error"
+        else EXPECTED.get(kind, EXPECTED.get(kind.split("_")[0]))
+    )
+    return (
+        f"{name} is {shown}, not {expected}" if expected else f"{name} is {shown}: {first['msg']}"
+    )
 
 
 def read_json(path: Path, kind: type[T] | Any, remedy: str = "") -> T:

@@ -36,7 +36,9 @@ def seed_generator(number: int, device: torch.device) -> None:
 
 
 # as signed 64-bit integers
-_GOLDEN, _MIX1, _MIX2 = (v - (1 << 64) for v in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB))
+_GOLDEN, _MIX1, _MIX2 = (
+    v - (1 << 64) for v in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB)
+)
 
 
 def _shift_right(x: Counters, bits: int) -> Counters:
@@ -78,10 +80,14 @@ def normal(keys: Tensor, frames: int, features: int) -> Tensor:
     pairs = (features + 1) // 2
     u, v = uniform(keys, (frames, pairs))
     radius, angle = torch.sqrt(-2 * torch.log(u)), 2 * math.pi * v
-    return torch.stack([radius * torch.cos(angle), radius * torch.sin(angle)], -1).flatten(2)[..., :features]
+    return torch.stack([radius * torch.cos(angle), radius * torch.sin(angle)], -1).flatten(2)[
+        ..., :features
+    ]
 
 
-def seeded_noise(ids: Sequence[str], frames: int, features: int, *, seed: int, replication: int, like: Tensor) -> Noise:
+def seeded_noise(
+    ids: Sequence[str], frames: int, features: int, *, seed: int, replication: int, like: Tensor
+) -> Noise:
     """Returns the noise of a sampling run for the motions named `ids`, on the device of `like`."""
     keys = torch.tensor([key("noise", seed, replication, name) for name in ids], device=like.device)
     return lambda draw: normal(_hash(keys + draw), frames, features).to(like.dtype)

@@ -10,7 +10,9 @@ from multiprocessing import active_children
 from types import FrameType
 from typing import Any, NoReturn
 
-_received: BaseException | None = None  # the exception of the first signal that the running command received
+_received: BaseException | None = (
+    None  # the exception of the first signal that the running command received
+)
 
 
 @contextmanager
@@ -28,7 +30,9 @@ def stoppable(signums: Sequence[int]) -> Iterator[None]:
         raise exception(number)
 
     hook = sys.unraisablehook
-    before = {n: signal.signal(n, stop) for n in signums if signal.getsignal(n) is not signal.SIG_IGN}
+    before = {
+        n: signal.signal(n, stop) for n in signums if signal.getsignal(n) is not signal.SIG_IGN
+    }
     try:
         yield
     except Exception:
@@ -76,12 +80,16 @@ class StopRequest:
         self.signum, self.time = signum, time.monotonic()
         # print is not reentrant, and the signal may have interrupted another print.
         with suppress(BrokenPipeError):
-            os.write(1, b"\nstopping at the end of this step; press Ctrl-C or send SIGTERM again to stop immediately\n")
+            os.write(
+                1,
+                b"\nstopping at the end of this step; press Ctrl-C or send SIGTERM again to stop immediately\n",
+            )
 
 
 def kill_children() -> None:
     """Kills all child processes, including suspended ones, for which Python would wait forever."""
-    signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # otherwise, torch's handler raises an error for each of them
+    # Otherwise, torch's handler raises an error for each of them
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     for process in active_children():
         process.kill()
 

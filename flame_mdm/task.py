@@ -36,7 +36,9 @@ class Task(Model, LightningModule):
         self.prepare_data_per_node = False  # the machines of a cluster share the data folder
 
     @classmethod
-    def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:
+    def build(
+        cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()
+    ) -> Self:
         """Builds the task of a recipe, with the sizes that depend on other parts."""
         raise NotImplementedError
 
@@ -154,19 +156,33 @@ class GeneratorTask(Task):
         self.register_load_state_dict_pre_hook(_name_as_task)
         representation = parts.representation
         skeleton = representation.skeleton
-        self.losses = MotionLosses(representation.to_joints, skeleton.feet, skeleton.edges, **losses)
-        self.targets = None if targets is None else TargetConditions(skeleton.joints, skeleton.facing, **targets)
+        self.losses = MotionLosses(
+            representation.to_joints, skeleton.feet, skeleton.edges, **losses
+        )
+        self.targets = (
+            None
+            if targets is None
+            else TargetConditions(skeleton.joints, skeleton.facing, **targets)
+        )
         if (self.targets is None) != (getattr(parts.denoiser, "target", None) is None):
             raise UserError("task.targets and denoiser.target_encoder: give both, or none of them")
         self.cond_drop_prob, self.compiles = cond_drop_prob, compile
         self.val_losses = torch.nn.ModuleDict()
 
     @classmethod
-    def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:
+    def build(
+        cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()
+    ) -> Self:
         """Builds the task of a recipe; `actions` are the names of the actions in its data."""
         parts = Parts.build(config, representation, len(actions))
         section = {name: value for name, value in config["task"].items() if name != "_target_"}
-        task = cls(parts, losses=config["losses"], optimizer=config["optimizer"], seed=config["seed"], **section)
+        task = cls(
+            parts,
+            losses=config["losses"],
+            optimizer=config["optimizer"],
+            seed=config["seed"],
+            **section,
+        )
         # The same objects: what training adds to the facts, sampling reads.
         task.config = task.generator.config = config
         task.facts = task.generator.facts = {"actions": list(actions)}
@@ -191,7 +207,9 @@ class GeneratorTask(Task):
         shortest = int(data.crop.draw(data.crop.min_frames, lambda count: 0)[1])
         if context >= shortest:
             advice = "Increase data.crop.min_frames, or decrease denoiser.context_frames"
-            raise UserError(f"data.crop: a sample of {shortest} frames has none after a prefix of {context}. {advice}")
+            raise UserError(
+                f"data.crop: a sample of {shortest} frames has none after a prefix of {context}. {advice}"
+            )
         if self.generator.conditioned_on == "text":
             captions = (caption for clip in data.train.clips for caption in clip.captions)
             self.add_facts(vocabulary(captions, share=data.source.captions_may_be_shared))
@@ -226,15 +244,21 @@ class GeneratorTask(Task):
         """Returns the loss of one batch. Random draws are functions of (seed, batch number, rank)."""
         seed_generator(key("step", self.seed, batch_idx, self.global_rank), self.device)
         targeted = None if self.targets is None else torch.rand(2, len(batch), device=self.device)
-        batch, cond = _conditioned(self.generator, self.targets, batch, None if targeted is None else targeted[0])
+        batch, cond = _conditioned(
+            self.generator, self.targets, batch, None if targeted is None else targeted[0]
+        )
         if self.targets is not None and targeted is not None:
             cond = replace(cond, target_mask=targeted[1] >= self.targets.drop_prob)
-        if cond.null is not None:  # even if the probability is 0, since DDP requires a gradient for every parameter
+        # Even if the probability is 0, since DDP requires a gradient for every parameter
+        if cond.null is not None:
             cond = cond.drop(self.dropped(batch))
         terms = self.loss_terms(batch, cond)
         trainer = self._trainer  # None where a step is computed without one
         if trainer is None or (trainer.global_step + 1) % trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
-            self.log_dict({f"train/{name}": value.mean() for name, value in terms.items()}, batch_size=len(batch))
+            self.log_dict(
+                {f"train/{name}": value.mean() for name, value in terms.items()},
+                batch_size=len(batch),
+            )
         return terms["loss"].mean()
 
     def dropped(self, batch: MotionBatch) -> Tensor:
@@ -242,7 +266,11 @@ class GeneratorTask(Task):
         return torch.rand(len(batch), device=self.device) < self.cond_drop_prob
 
     def loss_terms(
-        self, batch: MotionBatch, cond: Condition, u: Tensor | None = None, noise: Tensor | None = None
+        self,
+        batch: MotionBatch,
+        cond: Condition,
+        u: Tensor | None = None,
+        noise: Tensor | None = None,
     ) -> dict[str, Tensor]:
         """Returns the losses (B,) of the motions of a batch by name; "loss" is their sum.
 
@@ -258,7 +286,15 @@ class GeneratorTask(Task):
                 terms["target"] = self.targets.error(joints, cond.target, batch.lengths)
             return terms
 
-        return process.loss(self.generator.denoiser, batch.x, batch.mask, cond, t=t, noise=noise, auxiliary=auxiliary)
+        return process.loss(
+            self.generator.denoiser,
+            batch.x,
+            batch.mask,
+            cond,
+            t=t,
+            noise=noise,
+            auxiliary=auxiliary,
+        )
 
     def losses_of(self, batch: MotionBatch) -> dict[str, Tensor]:
         """Returns the losses (B,) of clips. Each clip always gets the same time, noise and target."""
@@ -283,7 +319,10 @@ class GeneratorTask(Task):
 
 
 def _conditioned(
-    generator: MotionGenerator, targets: TargetConditions | None, batch: MotionBatch, u: Tensor | None
+    generator: MotionGenerator,
+    targets: TargetConditions | None,
+    batch: MotionBatch,
+    u: Tensor | None,
 ) -> tuple[MotionBatch, Condition]:
     """Returns the motions to predict, without the frames of the prefix, and their conditions.
 

@@ -41,7 +41,13 @@ def tiny(tmp_path: Path, data_root: Path) -> list[str]:
 def trained(tmp_path_factory, data_root) -> Path:
     """A checkpoint of a tiny model; its data is prepared."""
     folder = tmp_path_factory.mktemp("trained")
-    words = [*TINY, f"data_root={data_root}", f"run.dir={folder}", "callbacks.samples=null", "callbacks.best=null"]
+    words = [
+        *TINY,
+        f"data_root={data_root}",
+        f"run.dir={folder}",
+        "callbacks.samples=null",
+        "callbacks.best=null",
+    ]
     assert main(["train", "quickstart", *words, "trainer.max_steps=2", "logger=csv"]) == 0
     return folder / "checkpoints" / "last.ckpt"
 
@@ -77,7 +83,9 @@ def refused(tmp_path, monkeypatch, capfd, trained, data_root) -> Iterator[Refuse
     refused = Refused(folder, capfd, [trained.parent.parent, data_root])
     yield refused
     assert refused.count > 0
-    assert not refused.faults, f"{len(refused.faults)} of {refused.count}:\n" + "\n".join(refused.faults)
+    assert not refused.faults, f"{len(refused.faults)} of {refused.count}:\n" + "\n".join(
+        refused.faults
+    )
 
 
 @pytest.fixture

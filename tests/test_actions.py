@@ -76,7 +76,9 @@ def test_arrays_and_plain_values_are_read(tmp_path: Path):
         content = restricted_pickle.read(tmp_path / "x.pkl")
         assert all(content[key] == CONTENT[key] for key in ("number", "raw", "y"))
         assert (content["big"].tolist(), content["texts"].tolist()) == ([0, 1, 2], ["a", "bc"])
-        for one, other in zip([*content["poses"], *content["ragged"]], [*CONTENT["poses"], *ragged], strict=True):
+        for one, other in zip(
+            [*content["poses"], *content["ragged"]], [*CONTENT["poses"], *ragged], strict=True
+        ):
             np.testing.assert_array_equal(one, other)
             assert one.dtype == other.dtype
     numbers = np.array([1.5, -2.5])  # as Python 2 wrote it
@@ -99,7 +101,9 @@ ATTACKS = {
 def test_anything_else_is_refused_before_it_runs(named: str, tmp_path: Path):
     for protocol in (0, 2, 4, 5):
         path = written(tmp_path / "x.pkl", ATTACKS[named](tmp_path / "run"), protocol)
-        with pytest.raises(ValueError, match=rf"x\.pkl: not read as a pickle: it names .*{named}") as error:
+        with pytest.raises(
+            ValueError, match=rf"x\.pkl: not read as a pickle: it names .*{named}"
+        ) as error:
             restricted_pickle.read(path)
         assert "\n" not in str(error.value)
         assert os.listdir(tmp_path) == ["x.pkl"]  # noqa: PTH208
@@ -126,7 +130,9 @@ def data_of(source, root: Path, **options) -> MotionDataModule:
 
 def test_humanact12_from_raw_file_to_batch(tmp_path: Path):
     raw = str(write_humanact12(tmp_path / "raw"))
-    ours, published = (data_of(HumanAct12(raw, flag), tmp_path / str(flag)) for flag in (False, True))
+    ours, published = (
+        data_of(HumanAct12(raw, flag), tmp_path / str(flag)) for flag in (False, True)
+    )
     assert HumanAct12(raw).count() == len(ours.store.clips) == 360
     assert ours.store.info["actions"] == list(HumanAct12.actions)
     assert [clip.action for clip in ours.store.clips] == [k % 12 for k in range(360)]
@@ -150,7 +156,9 @@ def test_samples_are_those_of_actor(stem: str, tmp_path: Path):
         raw = write_humanact12(tmp_path / number, poses=[pose], joints3D=[joints], y=[label])
         expected = arrays[f"a2m/inp_{number}"].transpose(2, 0, 1).reshape(-1, 150)
         crop = Fixed(frames=len(expected))
-        data = data_of(HumanAct12(str(raw), published_split=True), raw.parent, batch_size=1, crop=crop, seed=0)
+        data = data_of(
+            HumanAct12(str(raw), published_split=True), raw.parent, batch_size=1, crop=crop, seed=0
+        )
         low, high, drawn = (int(value) for value in arrays[f"a2m/shift_draw_{number}"])
         starts = [int(data.train.draw([0], batch)[0][0]) for batch in range(400)]
         assert set(starts) == set(range(max(low, 0), max(high, 0) + 1))
@@ -173,22 +181,30 @@ def test_another_humanact12_file_is_named(tmp_path: Path):
             write_store(tmp_path / "store", HumanAct12(str(path)), Rot6D())
     with pytest.raises(ValueError, match="it contains list"):
         HumanAct12(str(written(tmp_path / "humanact12poses.pkl", [1]))).count()
-    with pytest.raises(FileNotFoundError, match=r"no humanact12poses\.pkl; the data set is published with ACTOR"):
+    with pytest.raises(
+        FileNotFoundError, match=r"no humanact12poses\.pkl; the data set is published with ACTOR"
+    ):
         HumanAct12(str(tmp_path / "nowhere")).count()
 
 
 def test_unconditioned_motions_are_compared_with_the_reference_motions(tmp_path: Path):
     """24 joints as models generate them, y up, and the same as the 15 of the file, y down and not from the pelvis."""
     motion = torch.randn(70, 20, 24, 3, generator=torch.Generator().manual_seed(0))
-    shown = (motion[:, :, list(UNCONSTRAINED_JOINTS)] * torch.tensor([1.0, -1.0, -1.0]) + 3).permute(0, 2, 3, 1)
+    shown = (
+        motion[:, :, list(UNCONSTRAINED_JOINTS)] * torch.tensor([1.0, -1.0, -1.0]) + 3
+    ).permute(0, 2, 3, 1)
     torch.save(Unconstrained().state_dict(), tmp_path / "humanact12_gru_modi_struct.pth.tar")
-    with pytest.raises(FileNotFoundError, match=r"humanact12_unconstrained_modi_struct\.npy: no such file"):
+    with pytest.raises(
+        FileNotFoundError, match=r"humanact12_unconstrained_modi_struct\.npy: no such file"
+    ):
         UnconstrainedExtractor(str(tmp_path))
     more_joints = np.pad(shown.numpy(), ((0, 0), (0, 3), (0, 0), (0, 0)))
     np.save(tmp_path / "humanact12_unconstrained_modi_struct.npy", more_joints)
     extractor = UnconstrainedExtractor(str(tmp_path))
     with torch.no_grad():
-        features = extractor.motions(motion, motion, torch.ones(motion.shape[:2], dtype=torch.bool))["features"]
+        features = extractor.motions(
+            motion, motion, torch.ones(motion.shape[:2], dtype=torch.bool)
+        )["features"]
         torch.testing.assert_close(extractor.reference(), features, atol=1e-5, rtol=1e-4)
 
 
@@ -197,7 +213,11 @@ def smpl_model(**changed) -> dict:
     rng = np.random.default_rng(0)
     regressor = rng.random((24, 50)) * (rng.random((24, 50)) < 0.3)
     parents = np.array([[2**32 - 1, *SMPL24.parents[1:]], range(24)])
-    model = {"J_regressor": regressor, "v_template": rng.normal(size=(50, 3)), "kintree_table": parents}
+    model = {
+        "J_regressor": regressor,
+        "v_template": rng.normal(size=(50, 3)),
+        "kintree_table": parents,
+    }
     return model | {"bs_style": "lbs"} | changed
 
 
@@ -206,20 +226,33 @@ def test_smpls_offsets_come_from_its_file_without_running_code(tmp_path: Path, m
     np.savez(tmp_path / "SMPL.npz", **model)
     positions = model["J_regressor"] @ model["v_template"]
     offsets = np.array(load_offsets(tmp_path / "SMPL.npz"))
-    np.testing.assert_allclose(offsets, [*positions[:1], *(positions - positions[list(SMPL24.parents)])[1:]])
-    array = type("Ch", (), {"__module__": "chumpy.ch", "__init__": lambda self, x: self.__dict__.update(x=x)})
+    np.testing.assert_allclose(
+        offsets, [*positions[:1], *(positions - positions[list(SMPL24.parents)])[1:]]
+    )
+    array = type(
+        "Ch", (), {"__module__": "chumpy.ch", "__init__": lambda self, x: self.__dict__.update(x=x)}
+    )
     with monkeypatch.context() as patch:
         for name in ("chumpy", "chumpy.ch"):
             patch.setitem(sys.modules, name, types.SimpleNamespace(Ch=array))
-        parts = {"J_regressor": csc_matrix(model["J_regressor"]), "v_template": array(model["v_template"])}
-        paths = [written(tmp_path / f"SMPL_{protocol}.pkl", model | parts, protocol) for protocol in (0, 2, 4)]
+        parts = {
+            "J_regressor": csc_matrix(model["J_regressor"]),
+            "v_template": array(model["v_template"]),
+        }
+        paths = [
+            written(tmp_path / f"SMPL_{protocol}.pkl", model | parts, protocol)
+            for protocol in (0, 2, 4)
+        ]
     for path in paths:
         np.testing.assert_allclose(load_offsets(path), offsets)
         with pytest.raises(ValueError, match=r"it names (scipy|copy_?reg)"):
             restricted_pickle.read(path)
     attack, wrong = Attack(os.mkdir, str(tmp_path / "run")), "not a SMPL model of 24 joints"
     wrongs = {"J_regressor": np.ones((52, 50)), "v_template": 3, "kintree_table": np.zeros((2, 24))}
-    for name, value, message in (("v_template", attack, "not read as"), *((*item, wrong) for item in wrongs.items())):
+    for name, value, message in (
+        ("v_template", attack, "not read as"),
+        *((*item, wrong) for item in wrongs.items()),
+    ):
         with pytest.raises(ValueError, match=rf"bad\.pkl: {message}"):
             load_offsets(written(tmp_path / "bad.pkl", smpl_model(**{name: value})))
     assert not (tmp_path / "run").exists()
@@ -242,7 +275,9 @@ def test_classifiers_see_smpls_joints_or_the_result_says_that_they_do_not(tmp_pa
         assert result["skeleton"] == {"stand_in": not smpl, "smpl_sha256": digest if smpl else None}
         assert ("stand-in skeleton" in capsys.readouterr().out) == (not smpl)
         diversity.append(result["values"]["diversity"]["mean"])
-    assert diversity[0] != pytest.approx(diversity[1], rel=1e-3), "the classifier sees the same joints"
+    assert diversity[0] != pytest.approx(diversity[1], rel=1e-3), (
+        "the classifier sees the same joints"
+    )
     assert main([*words, "smpl=absent.pkl"]) == 1
     assert "absent.pkl: no such file" in capsys.readouterr().err
 
@@ -251,34 +286,57 @@ def test_uestc_from_raw_files_to_batch(tmp_path: Path):
     raw = str(write_uestc(tmp_path / "uestc"))
     store = data_of(UESTC(raw), tmp_path).store
     assert len(store.info["actions"]) == 40
-    assert store.info["excluded"] == {"videos of view 8, side 2": 1, "training clips that are too short": 1}
+    assert store.info["excluded"] == {
+        "videos of view 8, side 2": 1,
+        "training clips that are too short": 1,
+    }
     clips = {clip.id: clip for clip in store.clips}
     assert len(clips) == len(VIDEOS) - 2
-    assert clips["a5_d1_p005_c1"].length == 44  # the test set is not filtered, but cut to the frames of the video
+    # The test set is not filtered, but cut to the frames of the video
+    assert clips["a5_d1_p005_c1"].length == 44
     assert {"a3_d8_p003_c2", "a5_d1_p001_c1"}.isdisjoint(clips)
     assert clips["a3_d8_p004_c1"].attributes == {"subject": 4, "view": 8, "side": 1}
     assert all(clip.action == int(name[1:].split("_")[0]) for name, clip in clips.items())
-    train, val, test = ({c.attributes["subject"] for c in clips.values() if c.split == split} for split in SPLITS)
+    train, val, test = (
+        {c.attributes["subject"] for c in clips.values() if c.split == split} for split in SPLITS
+    )
     assert (len(val), train, test) == (5, set(TRAIN_SUBJECTS) - val, {3, 4, 5, 118})
     published = UESTC(raw, published_split=True)
     assert len(published.actions) == 40, "a model has to know them before the data is prepared"
-    assert Counter(published.split(subject) for subject in range(1, 119)) == {"train": 51, "test": 67}
+    assert Counter(published.split(subject) for subject in range(1, 119)) == {
+        "train": 51,
+        "test": 67,
+    }
 
 
 def test_front_view_is_actors_camera():
     """Against the depth that reproduces the size of the picture, solved from the joints."""
     rng = np.random.default_rng(1)
-    pose, joints, camera = rng.normal(size=(5, 72)), rng.normal(size=(5, 49, 3)), rng.uniform(0.2, 0.9, (5, 4))
+    pose, joints, camera = (
+        rng.normal(size=(5, 72)),
+        rng.normal(size=(5, 49, 3)),
+        rng.uniform(0.2, 0.9, (5, 4)),
+    )
     places = []
     for points, (scale, _, x, y) in zip(joints, camera, strict=True):
         picture = (scale * (points[:, :2] + [x, y]) + 1) / 2 * 540
-        places.append([x, y, 500 * np.linalg.norm(np.ptp(points[:, :2], 0)) / np.linalg.norm(np.ptp(picture, 0))])
+        places.append(
+            [
+                x,
+                y,
+                500 * np.linalg.norm(np.ptp(points[:, :2], 0)) / np.linalg.norm(np.ptp(picture, 0)),
+            ]
+        )
     places = np.array(places) - places[0]
     for side, angle in ((2, -5 * np.pi / 4), (1, 0.0)):
         motion = front_view(pose, joints[:, uestc.ROOT], camera, uestc.Video(0, "x", 0, 5, 1, side))
         turn = Rotation.from_rotvec([0.0, angle, 0.0]).as_matrix()
-        np.testing.assert_allclose(motion[:, :3], (joints[:, uestc.ROOT] + places) @ turn.T, atol=1e-5)
-        turned, before = (Rotation.from_rotvec(vectors).as_matrix() for vectors in (motion[:, 3:6], pose[:, :3]))
+        np.testing.assert_allclose(
+            motion[:, :3], (joints[:, uestc.ROOT] + places) @ turn.T, atol=1e-5
+        )
+        turned, before = (
+            Rotation.from_rotvec(vectors).as_matrix() for vectors in (motion[:, 3:6], pose[:, :3])
+        )
         np.testing.assert_allclose(turned, turn @ before, atol=1e-5)
         np.testing.assert_allclose(motion[:, 6:], pose[:, 3:], atol=1e-6)
 
@@ -294,7 +352,9 @@ def test_damaged_lists_are_named(tmp_path: Path):
         with pytest.raises(UserError, match=message):
             list(UESTC(str(folder)).clips(20.0))
     (folder / "info/names.txt").unlink()
-    with pytest.raises(FileNotFoundError, match=r"info/names\.txt: not found; it is published with the poses"):
+    with pytest.raises(
+        FileNotFoundError, match=r"info/names\.txt: not found; it is published with the poses"
+    ):
         list(UESTC(str(folder)).clips(20.0))
 
 
@@ -319,7 +379,9 @@ def trained(tmp_path_factory, data) -> Path:
 
 
 def measure(out: Path, *words: str) -> dict:
-    assert main(["evaluate", f"out={out}", "device=cpu", "replications=1", "samples=150", *words]) == 0
+    assert (
+        main(["evaluate", f"out={out}", "device=cpu", "replications=1", "samples=150", *words]) == 0
+    )
     return json.loads(out.read_text())
 
 
@@ -327,7 +389,13 @@ def measure(out: Path, *words: str) -> dict:
 def test_training_by_recipe_learns_the_actions(trained, data, tmp_path):
     accuracy = read_history(trained.parent.parent)["val/accuracy"]
     assert accuracy[max(accuracy)] > 0.5  # by chance: about 1 in 11
-    words = ["baseline=shuffled", *DATA, data, "protocol=action_to_motion_own", f"extractor={trained}"]
+    words = [
+        "baseline=shuffled",
+        *DATA,
+        data,
+        "protocol=action_to_motion_own",
+        f"extractor={trained}",
+    ]
     result = measure(tmp_path / "real.json", *words)
     assert result["ground_truth"]["accuracy"]["mean"] > 0.5, "motions that were not trained on"
     assert result["values"]["accuracy"]["mean"] < 0.2, "those of other actions"
@@ -338,13 +406,21 @@ def test_training_by_recipe_learns_the_actions(trained, data, tmp_path):
 @pytest.mark.slow
 def test_a_model_of_actions_is_measured_by_it(trained, data, tmp_path):
     words = [word for word in TINY if not word.startswith(("condition", "data.source"))]
-    words += [RUN[0], "condition=action", "condition.features=16", data, f"run.dir={tmp_path / 'run'}"]
+    words += [
+        RUN[0],
+        "condition=action",
+        "condition.features=16",
+        data,
+        f"run.dir={tmp_path / 'run'}",
+    ]
     assert main(["train", "quickstart", *words, "trainer.max_steps=1"]) == 0
     shown = (tmp_path / "run" / "samples" / "step_0000001").glob("*.npz")
     texts = [str(np.load(file)["text"]) for file in sorted(shown)]
     assert texts == list(Synthetic.actions)[: len(texts)], "actions instead of the recipe's prompts"
     model = tmp_path / "run" / "checkpoints" / "last.ckpt"
-    result = measure(tmp_path / "result.json", f"ckpt={model}", f"extractor={trained}", "num_inference_steps=2")
+    result = measure(
+        tmp_path / "result.json", f"ckpt={model}", f"extractor={trained}", "num_inference_steps=2"
+    )
     assert result["protocol"]["name"] == "action_to_motion_own"
     assert result["values"]["accuracy"]["mean"] < result["ground_truth"]["accuracy"]["mean"]
     assert result["values"]["fid"]["mean"] > 2 * result["ground_truth"]["fid"]["mean"]
@@ -355,9 +431,13 @@ def test_what_was_not_made_for_one_another_is_refused(trained, data, tmp_path, c
     extractor = OwnClassifierExtractor(str(trained))
     own = extractor.task.representation
     extractor.check(own, "synthetic")
-    with pytest.raises(UserError, match=r"trained on .* of synthetic at .*, but the motions are .* of bandai"):
+    with pytest.raises(
+        UserError, match=r"trained on .* of synthetic at .*, but the motions are .* of bandai"
+    ):
         extractor.check(own, "bandai")
-    with pytest.raises(UserError, match=r"rot6d-25 of synthetic at 20\. Train one with make train EXP=classifier"):
+    with pytest.raises(
+        UserError, match=r"rot6d-25 of synthetic at 20\. Train one with make train EXP=classifier"
+    ):
         extractor.check(Rot6D(), "synthetic")
 
     released = tmp_path / "released.tar"
@@ -379,15 +459,24 @@ def test_data_without_labels_is_refused(monkeypatch, tmp_path, capsys):
     whole = list(Synthetic(clips=40).clips(20.0))
     bare = [replace(clip, action=None if clip.id.endswith("7") else clip.action) for clip in whole]
     monkeypatch.setattr(Synthetic, "clips", lambda *_: iter(bare))
-    words = ["data.source.clips=40", "data.batch_size=8", f"data_root={tmp_path}", f"run.dir={tmp_path / 'run'}"]
+    words = [
+        "data.source.clips=40",
+        "data.batch_size=8",
+        f"data_root={tmp_path}",
+        f"run.dir={tmp_path / 'run'}",
+    ]
     assert main(["train", "classifier/synthetic", *RUN, *words]) == 1
-    assert re.search(r"\d clips have no action label, such as synthetic_0_0000\d7\.", capsys.readouterr().err)
+    assert re.search(
+        r"\d clips have no action label, such as synthetic_0_0000\d7\.", capsys.readouterr().err
+    )
 
 
 def test_recipes_build_the_sizes_of_their_data():
     for words in (["synthetic"], ["synthetic", "task=classifier_stgcn"], ["humanact12"], ["uestc"]):
         config = compose(f"classifier/{words[0]}", words[1:])
-        task = ClassifierTask.build(config, instantiate(config["representation"]), actions=list("abcdefg"))
+        task = ClassifierTask.build(
+            config, instantiate(config["representation"]), actions=list("abcdefg")
+        )
         joints = torch.randn(2, 12, len(task.representation.skeleton.parents), 3)
         mask = length_mask(torch.tensor([12, 7]))
         assert task.network.logits(joints, mask).shape == (2, 7)

@@ -14,7 +14,17 @@ from support.fixtures import ROOT
 FILES = sorted([*(ROOT / "flame_mdm").rglob("*.py"), *(ROOT / "evaluators").rglob("*.py")])
 
 AXES = {"denoisers", "processes", "conditions", "representations"}
-GROUND = {"errors", "signals", "sampler_options", "losses", "safe_io", "config", "batch", "seeds", "progress"}
+GROUND = {
+    "errors",
+    "signals",
+    "sampler_options",
+    "losses",
+    "safe_io",
+    "config",
+    "batch",
+    "seeds",
+    "progress",
+}
 MODELS = GROUND | AXES | {"visualize", "formats", "data", "generator", "task"}
 ALL = MODELS | {"sampling", "checkpoints", "schemas", "records", "runs", "reporting", "training"}
 MAY_IMPORT: dict[str, set[str]] = {
@@ -39,7 +49,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "schemas": GROUND,
     "records": GROUND | {"schemas"},
     "runs": GROUND | {"schemas", "records"},
-    "reporting": GROUND | {"representations", "visualize", "formats", "data", "schemas", "records", "runs"},
+    "reporting": GROUND
+    | {"representations", "visualize", "formats", "data", "schemas", "records", "runs"},
     "sampling": MODELS | {"schemas"},
     "checkpoints": MODELS | {"schemas"},
     "training": ALL - {"training"},
@@ -55,7 +66,10 @@ MAY_IMPORT: dict[str, set[str]] = {
 @cache
 def sources() -> dict[str, str]:
     """Text of each module, by its dotted name."""
-    names = [".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for path in FILES]
+    names = [
+        ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+        for path in FILES
+    ]
     return {name: path.read_text() for name, path in zip(names, FILES, strict=True)}
 
 
@@ -70,9 +84,16 @@ def imports(texts: Mapping[str, str]) -> dict[str, set[str]]:
                 assert not node.level, f"{name}: relative import"
                 for alias in node.names:
                     module = f"{node.module}.{alias.name}"
-                    graph[name].add(module if module in texts or node.module == "flame_mdm" else str(node.module))
+                    graph[name].add(
+                        module
+                        if module in texts or node.module == "flame_mdm"
+                        else str(node.module)
+                    )
     own = ("flame_mdm", "evaluators")
-    return {name: {module for module in used if module.split(".")[0] in own} for name, used in graph.items()}
+    return {
+        name: {module for module in used if module.split(".")[0] in own}
+        for name, used in graph.items()
+    }
 
 
 def part(module: str) -> str:
@@ -103,7 +124,11 @@ def strings_with_evaluators(text: str) -> list[str]:
     """Strings, apart from docstrings, that name a module inside `evaluators`."""
     nodes = list(ast.walk(ast.parse(text)))
     docstrings = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
-    strings = [str(node.value) for node in nodes if isinstance(node, ast.Constant) and id(node) not in docstrings]
+    strings = [
+        str(node.value)
+        for node in nodes
+        if isinstance(node, ast.Constant) and id(node) not in docstrings
+    ]
     return [string for string in strings if re.search(r"\bevaluators\.\w", string)]
 
 
@@ -123,7 +148,13 @@ def test_the_rules_are_those_of_the_design():
     assert cycle(MAY_IMPORT) == []
     assert [name for name, parts in MAY_IMPORT.items() if "evaluators" in parts] == ["commands"]
     assert [name for name, parts in MAY_IMPORT.items() if "commands" in parts] == ["__main__"]
-    assert not reachable("reporting") & {"task", "denoisers", "checkpoints", "sampling", "evaluators"}
+    assert not reachable("reporting") & {
+        "task",
+        "denoisers",
+        "checkpoints",
+        "sampling",
+        "evaluators",
+    }
     assert all(not MAY_IMPORT[axis] & AXES for axis in AXES)
     assert not reachable("visualize") & {"formats", "data", "task"}
     assert not reachable("formats") & {"data", "task"}
@@ -132,8 +163,14 @@ def test_the_rules_are_those_of_the_design():
 
 
 def test_strings_outside_commands_name_no_module_of_the_evaluators():
-    texts = {name: text for name, text in sources().items() if part(name) not in ("commands", "evaluators")}
-    assert {name: found for name, text in texts.items() if (found := strings_with_evaluators(text))} == {}
+    texts = {
+        name: text
+        for name, text in sources().items()
+        if part(name) not in ("commands", "evaluators")
+    }
+    assert {
+        name: found for name, text in texts.items() if (found := strings_with_evaluators(text))
+    } == {}
 
 
 def test_these_checks_can_fail(tmp_path):
@@ -145,32 +182,55 @@ def test_these_checks_can_fail(tmp_path):
     ):
         assert len(upward(imports({name: line}))) == 1
     text = "from flame_mdm import config\nimport flame_mdm.task\nfrom flame_mdm.data.store import Store\nimport torch\n"
-    assert imports({"a": text})["a"] == {"flame_mdm.config", "flame_mdm.task", "flame_mdm.data.store"}
-    texts = {"flame_mdm.data.a": "from flame_mdm.data import b", "flame_mdm.data.b": "import flame_mdm.data.a"}
+    assert imports({"a": text})["a"] == {
+        "flame_mdm.config",
+        "flame_mdm.task",
+        "flame_mdm.data.store",
+    }
+    texts = {
+        "flame_mdm.data.a": "from flame_mdm.data import b",
+        "flame_mdm.data.b": "import flame_mdm.data.a",
+    }
     assert set(cycle(imports(texts))) == texts.keys()
     text = '"""See evaluators.run."""\nmodule = "evaluators.protocol:change"\nimport_module(f"evaluators.{module}")\n'
     assert strings_with_evaluators(text) == ["evaluators.protocol:change"]
-    lines = ["torch.load(f)", "torch.load(f, weights_only=False)", "np.load(f, allow_pickle=True)", "yaml.load(f)"]
-    lines += ["pickle.load(f)", "os.system(f)", "run(f, shell=True)", "M.from_pretrained(f, trust_remote_code=f)"]
+    lines = [
+        "torch.load(f)",
+        "torch.load(f, weights_only=False)",
+        "np.load(f, allow_pickle=True)",
+        "yaml.load(f)",
+    ]
+    lines += [
+        "pickle.load(f)",
+        "os.system(f)",
+        "run(f, shell=True)",
+        "M.from_pretrained(f, trust_remote_code=f)",
+    ]
     assert unsafe_calls("\n".join(lines)) == lines
     long = "\n".join(["def f(given):", *["    pass"] * 80])
     wide = "\n".join(["class A:", *[f"    def f{n}(self): pass" for n in range(16)]])
-    assert shape(long) == ["f: function of 81 lines", "given: filler name"]
+    assert shape(long) == ["f: function of 80 statements", "given: filler name"]
     assert shape(wide) == ["A: class of 16 methods"]
-    assert shape("found = 1\n" * 451)[:2] == ["module of 451 lines", "found: filler name"]
+    assert shape("found = 1\n" * 451)[:2] == ["module of 451 statements", "found: filler name"]
     assert undocumented("import ast\nclass A: pass\nclass _B: pass") == ["A", "module"]
 
 
 def undocumented(text: str) -> list[str]:
     """Public classes without a docstring, and "module" if it has none."""
     tree = ast.parse(text)
-    classes = [node for node in tree.body if isinstance(node, ast.ClassDef) and not node.name.startswith("_")]
+    classes = [
+        node
+        for node in tree.body
+        if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
+    ]
     lacking = [node.name for node in classes if not ast.get_docstring(node)]
     return lacking + ["module"] * bool(tree.body and not ast.get_docstring(tree))
 
 
 def test_modules_and_public_classes_say_what_they_are():
-    assert {name: lacking for name, text in sources().items() if (lacking := undocumented(text))} == {}
+    assert {
+        name: lacking for name, text in sources().items() if (lacking := undocumented(text))
+    } == {}
 
 
 def test_requests_are_checked_before_torch_is_imported():
@@ -178,7 +238,16 @@ def test_requests_are_checked_before_torch_is_imported():
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
 
 
-UNSAFE = {"eval", "exec", "os.system", "os.popen", "pickle.load", "pickle.loads", "pickle.Unpickler", "joblib.load"}
+UNSAFE = {
+    "eval",
+    "exec",
+    "os.system",
+    "os.popen",
+    "pickle.load",
+    "pickle.loads",
+    "pickle.Unpickler",
+    "joblib.load",
+}
 UNSAFE |= {"yaml.load", "yaml.unsafe_load", "yaml.full_load", "torch.hub.load"}
 
 
@@ -189,7 +258,9 @@ def unsafe_calls(text: str) -> list[str]:
         called = ast.unparse(node.func)
         options = {"weights_only": str(called != "torch.load")}
         options |= {str(keyword.arg): ast.unparse(keyword.value) for keyword in node.keywords}
-        switches = {options.get(name, "False") for name in ("allow_pickle", "shell", "trust_remote_code")}
+        switches = {
+            options.get(name, "False") for name in ("allow_pickle", "shell", "trust_remote_code")
+        }
         if called in UNSAFE or switches != {"False"} or options["weights_only"] != "True":
             unsafe.append(ast.unparse(node))
     return unsafe
@@ -201,16 +272,59 @@ ON_DEMAND = ["torch.load(path, map_location='cpu', weights_only=not run_code)"]
 
 def test_no_untrusted_file_or_word_is_executed():
     unsafe = {name: calls for name, text in sources().items() if (calls := unsafe_calls(text))}
-    assert all(part(name) == "checkpoints" and calls == ON_DEMAND for name, calls in unsafe.items()), unsafe
+    assert all(
+        part(name) == "checkpoints" and calls == ON_DEMAND for name, calls in unsafe.items()
+    ), unsafe
 
 
-WRITERS = {"np.save", "np.savez", "np.savez_compressed", "torch.save", "onnx.save", "json.dump", "pickle.dump"}
-WRITERS |= {"os.open", "os.replace", "os.rename", "os.link", "os.symlink", "os.truncate", "os.mkfifo"}
-WRITERS |= {f"shutil.{name}" for name in ("copy", "copy2", "copyfile", "copytree", "move", "make_archive")}
-WRITING_METHODS = {"save", "save_file", "write_text", "write_bytes", "rename", "symlink_to", "hardlink_to", "touch"}
-OPENERS = {"open": 1, "io.open": 1, "gzip.open": 1, "tarfile.open": 1, "zipfile.ZipFile": 1, "ZipFile": 1}
+WRITERS = {
+    "np.save",
+    "np.savez",
+    "np.savez_compressed",
+    "torch.save",
+    "onnx.save",
+    "json.dump",
+    "pickle.dump",
+}
+WRITERS |= {
+    "os.open",
+    "os.replace",
+    "os.rename",
+    "os.link",
+    "os.symlink",
+    "os.truncate",
+    "os.mkfifo",
+}
+WRITERS |= {
+    f"shutil.{name}" for name in ("copy", "copy2", "copyfile", "copytree", "move", "make_archive")
+}
+WRITING_METHODS = {
+    "save",
+    "save_file",
+    "write_text",
+    "write_bytes",
+    "rename",
+    "symlink_to",
+    "hardlink_to",
+    "touch",
+}
+OPENERS = {
+    "open": 1,
+    "io.open": 1,
+    "gzip.open": 1,
+    "tarfile.open": 1,
+    "zipfile.ZipFile": 1,
+    "ZipFile": 1,
+}
 """Functions that open a file, and the position of the mode; of a method `open`, the mode is the first argument."""
-TEMPORARIES = {"atomic_write", "atomic_folder", "temporary_beside", "_temporary", "TemporaryDirectory", "mkdtemp"}
+TEMPORARIES = {
+    "atomic_write",
+    "atomic_folder",
+    "temporary_beside",
+    "_temporary",
+    "TemporaryDirectory",
+    "mkdtemp",
+}
 TEMPORARIES |= {"BytesIO", "token_hex"}
 """Functions whose result names a file of this process alone; the runner, which stands alone, draws its own name."""
 
@@ -223,7 +337,11 @@ def writing_calls(text: str) -> list[str]:
         writers = [node for node in within(scope) if isinstance(node, ast.Call) and is_writer(node)]
         temporary = temporary_names(scope) if writers else set()
         function = getattr(scope, "name", "module")
-        calls += [f"{function}: {ast.unparse(node.func)}" for node in writers if not names_in(node) & temporary]
+        calls += [
+            f"{function}: {ast.unparse(node.func)}"
+            for node in writers
+            if not names_in(node) & temporary
+        ]
     return sorted(set(calls))
 
 
@@ -249,15 +367,26 @@ def temporary_names(scope: ast.AST) -> set[str]:
         elif isinstance(node, ast.Assign):
             bindings += [(target, node.value) for target in node.targets]
     links = [(names_in(target), names_in(value)) for target, value in bindings]
-    temporary = {name for target, value in bindings if called_names(value) & TEMPORARIES for name in names_in(target)}
-    while new := {name for target, used in links if used & temporary for name in target} - temporary:
+    temporary = {
+        name
+        for target, value in bindings
+        if called_names(value) & TEMPORARIES
+        for name in names_in(target)
+    }
+    while (
+        new := {name for target, used in links if used & temporary for name in target} - temporary
+    ):
         temporary |= new
     return temporary
 
 
 def called_names(node: ast.AST) -> set[str]:
     """Last names of the functions that an expression calls."""
-    return {ast.unparse(call.func).split(".")[-1] for call in ast.walk(node) if isinstance(call, ast.Call)}
+    return {
+        ast.unparse(call.func).split(".")[-1]
+        for call in ast.walk(node)
+        if isinstance(call, ast.Call)
+    }
 
 
 def is_writer(call: ast.Call) -> bool:
@@ -266,7 +395,9 @@ def is_writer(call: ast.Call) -> bool:
         modes = [keyword.value for keyword in call.keywords if keyword.arg == "mode"]
         modes += call.args[OPENERS.get(called, 0) :][:1]
         texts = [str(mode.value) for mode in modes if isinstance(mode, ast.Constant)]
-        return called == "os.open" or any(re.fullmatch("[rbt]*[wax+][wax+bt]*([:|].*)?", text) for text in texts)
+        return called == "os.open" or any(
+            re.fullmatch("[rbt]*[wax+][wax+bt]*([:|].*)?", text) for text in texts
+        )
     one = len(call.args) == 1 and not call.keywords  # a text's `replace` takes two arguments
     return called in WRITERS or method in WRITING_METHODS or (method == "replace" and one)
 
@@ -274,7 +405,10 @@ def is_writer(call: ast.Call) -> bool:
 PUBLIC = "a method that writes under a temporary name itself"
 INSIDE = "in the temporary folder that the caller has opened"
 MAY_WRITE = {
-    "flame_mdm.checkpoints.onnx_export": {"_shrink: onnx.save": INSIDE, "write_graph: program.save": INSIDE},
+    "flame_mdm.checkpoints.onnx_export": {
+        "_shrink: onnx.save": INSIDE,
+        "write_graph: program.save": INSIDE,
+    },
     "flame_mdm.commands.convert": {"_convert: motion.save": PUBLIC},
     "flame_mdm.commands.sample": {"_write_files: written.save": PUBLIC},
     "flame_mdm.data.store": {
@@ -325,19 +459,34 @@ def test_files_are_written_under_a_temporary_name():
             "torch.save(x, path)",
             "json.dump(x, open(path, 'w'))",
         ),
-        *("shutil.copy(x, path)", "os.replace(x, path)", "x.replace(path)", "x.rename(path)", "path.symlink_to(x)"),
+        *(
+            "shutil.copy(x, path)",
+            "os.replace(x, path)",
+            "x.replace(path)",
+            "x.rename(path)",
+            "path.symlink_to(x)",
+        ),
         "os.open(path, os.O_WRONLY)",
     ],
 )
 def test_a_call_that_writes_in_place_is_seen_and_one_to_a_temporary_file_is_not(call):
     assert writing_calls(f"def f(path, x):\n    {call}")
-    assert writing_calls(f"def f(path, x):\n    with atomic_write(path) as temporary:\n        {call}")
+    assert writing_calls(
+        f"def f(path, x):\n    with atomic_write(path) as temporary:\n        {call}"
+    )
     made = f"with atomic_folder(out) as made:\n        path = x = made / 'part'\n        {call}"
     assert not writing_calls(f"def f(out):\n    {made}")
 
 
 @pytest.mark.parametrize(
-    "call", ["open(path)", "path.open('rb')", "text.replace('a', 'b')", "zipfile.ZipFile(path)", "Cache.open(path, a)"]
+    "call",
+    [
+        "open(path)",
+        "path.open('rb')",
+        "text.replace('a', 'b')",
+        "zipfile.ZipFile(path)",
+        "Cache.open(path, a)",
+    ],
 )
 def test_a_call_that_reads_is_not_taken_for_one_that_writes(call):
     assert not writing_calls(f"def f(path, text):\n    {call}")
@@ -349,16 +498,27 @@ KEPT = {"flame_mdm.batch": ["known: filler name"]}
 """`Edit.known`, the name of the kept part in the papers on inpainting."""
 
 
+def statements(node: ast.AST) -> int:
+    """The number of statements in a module or function."""
+    return sum(isinstance(part, ast.stmt) for part in ast.walk(node) if part is not node)
+
+
 def shape(text: str) -> list[str]:
     """Modules and functions that are too long, classes with too many methods, and filler names."""
-    faults = [f"module of {len(text.splitlines())} lines"] * (len(text.splitlines()) > 450)
-    for node in ast.walk(ast.parse(text)):
+    faults = []
+    module = ast.parse(text)
+    if statements(module) > 320:
+        faults.append(f"module of {statements(module)} statements")
+    for node in ast.walk(module):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-            lines = (node.end_lineno or 0) - node.lineno + 1
-            faults += [f"{node.name}: function of {lines} lines"] * (lines > 80)
+            if statements(node) > 60:
+                faults.append(f"{node.name}: function of {statements(node)} statements")
         elif isinstance(node, ast.ClassDef):
-            methods = sum(isinstance(item, ast.FunctionDef | ast.AsyncFunctionDef) for item in node.body)
-            faults += [f"{node.name}: class of {methods} methods"] * (methods > 15)
+            methods = sum(
+                isinstance(item, ast.FunctionDef | ast.AsyncFunctionDef) for item in node.body
+            )
+            if methods > 15:
+                faults.append(f"{node.name}: class of {methods} methods")
         elif isinstance(node, ast.arg) and node.arg in FILLERS:
             faults.append(f"{node.arg}: filler name")
         elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store) and node.id in FILLERS:

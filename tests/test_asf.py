@@ -66,14 +66,20 @@ def test_joints_in_closed_form_and_missing_skeletons_and_rates(files):
     positions = motion.positions()
     assert positions[0].tolist() == [[10, 20, 30], [10, 20, 30], [12, 20, 30], [12, 23, 30]]
     # the arm's x axis is the world's y: by 90 degrees about it, x becomes -z; then the root turns x to y
-    np.testing.assert_allclose(positions[1], [[10, 20, 30], [10, 20, 30], [10, 20, 28], [7, 20, 28]], atol=1e-12)
+    np.testing.assert_allclose(
+        positions[1], [[10, 20, 30], [10, 20, 30], [10, 20, 28], [7, 20, 28]], atol=1e-12
+    )
     turns = (("ZYX", [30, 20, 10]), ("Z", 90), ("ZX", [50, 40]))
-    root, axes, turned = (Rotation.from_euler(order, angles, degrees=True).as_matrix() for order, angles in turns)
+    root, axes, turned = (
+        Rotation.from_euler(order, angles, degrees=True).as_matrix() for order, angles in turns
+    )
     arm = root @ axes @ turned @ axes.T
     np.testing.assert_allclose(positions[2, 2:], [arm @ [2, 0, 0], arm @ [2, 3, 0]], atol=1e-12)
     (files / "07.asf").rename(files / "someone.asf")  # the only skeleton of the folder
     np.testing.assert_array_equal(asf.read(files / "07_01.amc", 120).frames, motion.frames)
-    with pytest.raises(UserError, match="AMC files contain no frame rate: give fps=120, or `fps: 120` in skeleton"):
+    with pytest.raises(
+        UserError, match="AMC files contain no frame rate: give fps=120, or `fps: 120` in skeleton"
+    ):
         asf.read(files / "07_01.amc", None)
     (files / "someone.asf").unlink()
     with pytest.raises(UserError, match=r"no skeleton 07\.asf next to it"):
@@ -89,8 +95,16 @@ def test_joints_in_closed_form_and_missing_skeletons_and_rates(files):
         ("arm 40 50", "leg 40 50", "line 12: leg is no moving bone"),
         ("arm 40 50\n", "", "line 11: frame 3 ends without arm"),
         (MOTION, "", "line 1: not an AMC file"),
-        (MOTION, "version https://git-lfs.github.com/spec/v1\n", "a Git LFS pointer instead of the file"),
-        ("dof rx rz", "dof rx l", "07.asf, line 19: degrees of freedom must be among rx, ry and rz"),
+        (
+            MOTION,
+            "version https://git-lfs.github.com/spec/v1\n",
+            "a Git LFS pointer instead of the file",
+        ),
+        (
+            "dof rx rz",
+            "dof rx l",
+            "07.asf, line 19: degrees of freedom must be among rx, ry and rz",
+        ),
         ("axis 0 0 90 XYZ", "axis 0 0 90 XXZ", "line 19: an order of axes is needed"),
         ("    arm hand", "    arm foot", "line 29: bone foot is unknown"),
         ("   position 0 0 0", "   position 0 1 0", "line 8: a root whose position is not 0 0 0"),

@@ -24,7 +24,16 @@ from evaluators.scene import Text
 from flame_mdm.__main__ import main
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.records import AuditCard, AuditedPerturbation
-from flame_mdm.reporting.audit_cards import CitedCard, Seen, card_name, card_of, findings, read_card, seen, write_card
+from flame_mdm.reporting.audit_cards import (
+    CitedCard,
+    Seen,
+    card_name,
+    card_of,
+    findings,
+    read_card,
+    seen,
+    write_card,
+)
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.safe_io import write_json
 from flame_mdm.schemas import check_shape
@@ -44,7 +53,9 @@ class Linear(Extractor):
         return {"features": mean @ torch.randn(features.shape[-1], 3, generator=generator)}
 
     def texts(self, captions, tokens):
-        rows = [torch.randn(3, generator=torch.Generator().manual_seed(key(text))) for text in captions]
+        rows = [
+            torch.randn(3, generator=torch.Generator().manual_seed(key(text))) for text in captions
+        ]
         return torch.stack(rows)
 
 
@@ -55,10 +66,17 @@ def scene(tmp_path_factory):
     protocol = load_protocol("synthetic", representation)
     physics = load_protocol("text_to_motion_2026", representation).metrics
     metrics = protocol.metrics | {name: physics[name] for name in ("mbench", "kimodo", "edge")}
-    evaluator = Evaluator(Linear(), {k: v for k, v in metrics.items() if k != "diversity"}, representation)
+    evaluator = Evaluator(
+        Linear(), {k: v for k, v in metrics.items() if k != "diversity"}, representation
+    )
     clips = list(Synthetic(clips=40, seed=5).clips(20.0))
-    features = [representation.encode(torch.from_numpy(np.asarray(clip.motion))).numpy() for clip in clips]
-    ids, captions = [clip.id for clip in clips], [clip.captions[0] + "." * i for i, clip in enumerate(clips)]
+    features = [
+        representation.encode(torch.from_numpy(np.asarray(clip.motion))).numpy() for clip in clips
+    ]
+    ids, captions = (
+        [clip.id for clip in clips],
+        [clip.captions[0] + "." * i for i, clip in enumerate(clips)],
+    )
     requested: list[Mapping[str, Any]] = [dict(clip.attributes) for clip in clips]
     found = evaluator.extract(Motions(ids, features, captions, inputs={"requested": requested}))
     other = evaluator.extract(Motions(ids, [x[8:] for x in features]))
@@ -66,9 +84,16 @@ def scene(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cache")
     sets = {
         name: _inputs(evaluator, folder / f"{name}.npz", ids, lambda x=x: x)
-        for name, x in ((BASE, features), ("as stored", features), (REAL, [x[8:] for x in features]))
+        for name, x in (
+            (BASE, features),
+            ("as stored", features),
+            (REAL, [x[8:] for x in features]),
+        )
     }
-    texts = [Text(caption, None, attributes) for caption, attributes in zip(captions, requested, strict=True)]
+    texts = [
+        Text(caption, None, attributes)
+        for caption, attributes in zip(captions, requested, strict=True)
+    ]
     measure = _Measure(evaluator, sets, texts, np.random.default_rng(0), 50)
     return measure, sets, texts, values, found
 
@@ -77,8 +102,20 @@ def test_values_without_resampling_are_those_of_an_evaluation(scene):
     measure, sets, texts, values, _ = scene
     found = measure(sets[BASE], texts)
     compared = {name: found[name][0] for name in found if name in values and "_for_" not in name}
-    assert {"fid", "mm_dist", "mclip_score", "mid", "jitter", "foot_skating", "attributes/action"} <= compared.keys()
-    assert {"mbench/foot_floating", "kimodo/skate_ratio", "kimodo/contact_consistency"} <= compared.keys()
+    assert {
+        "fid",
+        "mm_dist",
+        "mclip_score",
+        "mid",
+        "jitter",
+        "foot_skating",
+        "attributes/action",
+    } <= compared.keys()
+    assert {
+        "mbench/foot_floating",
+        "kimodo/skate_ratio",
+        "kimodo/contact_consistency",
+    } <= compared.keys()
     assert compared == pytest.approx({name: values[name] for name in compared}, rel=1e-9)
     assert not any(name.startswith("edge") for name in found), "not defined at 20 frames per second"
 
@@ -104,7 +141,8 @@ def test_intervals_are_those_of_a_bootstrap_over_motions(scene):
     cosines = measure.scores(sets[BASE], texts)["mclip_score"]
     resampled = measure(sets[BASE], texts)["mclip_score"][1:]
     assert resampled.std() == pytest.approx(cosines.std() / len(cosines) ** 0.5, rel=0.25)
-    assert (measure(sets[BASE], texts)["fid"] == measure(sets[BASE], texts[::-1])["fid"]).all()  # captions alone
+    # Captions alone
+    assert (measure(sets[BASE], texts)["fid"] == measure(sets[BASE], texts[::-1])["fid"]).all()
 
 
 @pytest.fixture(scope="module")
@@ -112,19 +150,32 @@ def card() -> AuditCard:
     """A card with a metric that sees from 2 on, clearly from 5, and one that rewards."""
     grades = {1: 0.1, 2: 0.5, 5: 2.0}
     values = [
-        {"grade": float(g), "values": {"fid": [1 + d, 0.3, d, 0.2], "jitter": [9 - d, 5.0, -d, 0.01]}}
+        {
+            "grade": float(g),
+            "values": {"fid": [1 + d, 0.3, d, 0.2], "jitter": [9 - d, 5.0, -d, 0.01]},
+        }
         for g, d in grades.items()
     ]
     shared = {"group": "joints", "about": "noise <b>", "unit": "mm"}
     still = [{"grade": 1.0, "values": {"fid": [1.0, 0.9, 0.0, 0.0], "jitter": [None] * 4}}]
     content = {
-        **{"format": 1, "split": "test", "motions": 40, "seed": 0, "resamples": 10, "packages": {"torch": "2"}},
+        **{
+            "format": 1,
+            "split": "test",
+            "motions": 40,
+            "seed": 0,
+            "resamples": 10,
+            "packages": {"torch": "2"},
+        },
         "extractor": {"sha256": "ab" * 32, "name": "motion_clip/x"},
         "protocol": {"name": "text_to_motion", "version": 1},
         "data": {"dataset": "x", "fingerprint": "f", "frames": [24, 60]},
         "metrics": {"fid": False, "jitter": False},
         "real": {"fid": [1.0, 0.9], "jitter": [9.0, 5.0]},
-        "perturbations": [{"name": "noise", "grades": values, **shared}, {"name": "still", "grades": still, **shared}],
+        "perturbations": [
+            {"name": "noise", "grades": values, **shared},
+            {"name": "still", "grades": still, **shared},
+        ],
         **{"not_computed": {}, "truth": {"fid": {"auc": 0.9, "correlation": -0.5}}},
     }
     return check_shape(content, AuditCard)
@@ -138,8 +189,13 @@ def test_a_grade_is_seen_from_where_all_stronger_ones_differ_and_findings_are_se
     assert seen(card, still, "jitter") is None
     back = noise.model_dump()
     back["grades"][2]["values"]["fid"] = [1.1, 0.3, 0.1, 0.2]
-    assert seen(card, check_shape(back, AuditedPerturbation), "fid") == Seen(None, None, rewarded=False, monotone=False)
-    assert findings(card) == ["No metric sees: still.", "jitter rates better than real motions: noise."]
+    assert seen(card, check_shape(back, AuditedPerturbation), "fid") == Seen(
+        None, None, rewarded=False, monotone=False
+    )
+    assert findings(card) == [
+        "No metric sees: still.",
+        "jitter rates better than real motions: noise.",
+    ]
 
 
 def test_pages_escape_and_show_one_card_or_two(card, tmp_path):
@@ -147,20 +203,35 @@ def test_pages_escape_and_show_one_card_or_two(card, tmp_path):
     assert page.name.startswith("x-abababababab-40-")
     assert page.read_text().count("<polyline") == 2
     assert "| noise (mm) | 2 → 5 | 1 → – |" in text.read_text()
-    fewer = {"extractor": None, "metrics": {"jitter": False}, "perturbations": card.perturbations[:1]}
+    fewer = {
+        "extractor": None,
+        "metrics": {"jitter": False},
+        "perturbations": card.perturbations[:1],
+    }
     page, text = write_card([card, card.model_copy(update=fewer)], tmp_path)
     assert "-and-x-none-40-" in page.name
     assert "| noise (mm) | 2 → 5 / not computed | 1 → – / 1 → – |" in text.read_text()
     assert page.read_text().count("<polyline") == 3
     content = card.model_dump_json()
-    for own in ('"jitter"', '"mm"', '"noise <b>"', '"motion_clip/x"', '"test"', '"torch"', '"x"', '"f"'):
+    for own in (
+        '"jitter"',
+        '"mm"',
+        '"noise <b>"',
+        '"motion_clip/x"',
+        '"test"',
+        '"torch"',
+        '"x"',
+        '"f"',
+    ):
         content = content.replace(own, json.dumps("<img src=x onerror=alert(1)>"))
     for path in write_card([check_shape(json.loads(content), AuditCard)], tmp_path, "escaped"):
         assert "<img" not in path.read_text()
         assert path.read_text().count("&lt;img src=x onerror=alert(1)&gt;") > 10
 
 
-def test_the_strongest_card_that_fits_is_cited_and_a_weaker_one_overwrites_nothing(card, tmp_path, monkeypatch):
+def test_the_strongest_card_that_fits_is_cited_and_a_weaker_one_overwrites_nothing(
+    card, tmp_path, monkeypatch
+):
     monkeypatch.setenv("FLAME_MDM_AUDITS", str(tmp_path))
     assert card_of(card.data, "ab" * 32) is None
     crop = card.data.model_copy(update={"frames": [24, 40]})
@@ -170,7 +241,11 @@ def test_the_strongest_card_that_fits_is_cited_and_a_weaker_one_overwrites_nothi
     assert len(list(tmp_path.iterdir())) == 4, "every card is kept"
     cited = card_of(card.data, "ab" * 32)
     assert cited is not None
-    assert (cited.motions, str(cited).endswith("(41 motions)"), cited.path.parent) == (41, True, tmp_path)
+    assert (cited.motions, str(cited).endswith("(41 motions)"), cited.path.parent) == (
+        41,
+        True,
+        tmp_path,
+    )
     other = card_of(crop, "ab" * 32)
     assert other is not None
     assert other.motions == 900
@@ -205,12 +280,26 @@ def test_an_audit_asks_metrics_that_it_does_not_know(scene):
 
 def test_agreement_with_exact_attributes_depends_on_whether_lower_is_better():
     """Pairs with every attribute have the best scores of both metrics; the scores get worse with each grade."""
-    measure: Any = SimpleNamespace(truth="exact", judges={"distance": -1, "similarity": 1, "blind": 1})
+    measure: Any = SimpleNamespace(
+        truth="exact", judges={"distance": -1, "similarity": 1, "blind": 1}
+    )
     scores = [
-        {"exact": [1, 1, 1], "distance": [0.1, 0.2, 0.3], "similarity": [3, 2, 5], "blind": [7, 7, 7]},
-        {"exact": [0, 1, 0], "distance": [0.9, 0.4, 0.8], "similarity": [0, 4, 1], "blind": [7, 7, 8]},
+        {
+            "exact": [1, 1, 1],
+            "distance": [0.1, 0.2, 0.3],
+            "similarity": [3, 2, 5],
+            "blind": [7, 7, 7],
+        },
+        {
+            "exact": [0, 1, 0],
+            "distance": [0.9, 0.4, 0.8],
+            "similarity": [0, 4, 1],
+            "blind": [7, 7, 8],
+        },
     ]
-    scores = [{name: np.array(values, float) for name, values in of_set.items()} for of_set in scores]
+    scores = [
+        {name: np.array(values, float) for name, values in of_set.items()} for of_set in scores
+    ]
     grades = [
         {"exact": [0.9], "distance": [0.2], "similarity": [3.0], "blind": [7.0]},
         {"exact": [0.5], "distance": [0.4], "similarity": [1.0], "blind": [None]},
@@ -219,21 +308,39 @@ def test_agreement_with_exact_attributes_depends_on_whether_lower_is_better():
     agreement = _agreement(measure, scores, [{"grades": [{"values": values} for values in grades]}])
     assert agreement["distance"] == pytest.approx({"auc": 1, "correlation": -1})
     assert agreement["similarity"] == pytest.approx({"auc": 1, "correlation": 1})
-    assert agreement["blind"] == pytest.approx({"auc": 0.25, "correlation": -1}), "grades without a value do not count"
+    assert agreement["blind"] == pytest.approx({"auc": 0.25, "correlation": -1}), (
+        "grades without a value do not count"
+    )
 
 
 @pytest.mark.slow
 def test_an_audit_resumes_and_gives_the_same_card(tmp_path, monkeypatch, capsys):
-    names = ("jitter", "mirrored", "near misses", "missing actions", "memorized", "fewer", "half precision")
+    names = (
+        "jitter",
+        "mirrored",
+        "near misses",
+        "missing actions",
+        "memorized",
+        "fewer",
+        "half precision",
+    )
     few = [perturbation for perturbation in PERTURBATIONS if perturbation.name in names]
     monkeypatch.setattr(perturbations, "PERTURBATIONS", few)
     passes: list[int] = []
     extract = Evaluator.extract
-    monkeypatch.setattr(Evaluator, "extract", lambda self, x: passes.append(len(x)) or extract(self, x))
+    monkeypatch.setattr(
+        Evaluator, "extract", lambda self, x: passes.append(len(x)) or extract(self, x)
+    )
     assert main(["prepare", "synthetic", "data.source.clips=400", f"data_root={tmp_path}"]) == 0
     (path,) = tmp_path.glob("synthetic-*/clips.jsonl")
     clips = path.read_text().count('"test"')
-    words = ["audit", "data=synthetic", "data.source.clips=400", f"data_root={tmp_path}", "resamples=100"]
+    words = [
+        "audit",
+        "data=synthetic",
+        "data.source.clips=400",
+        f"data_root={tmp_path}",
+        "resamples=100",
+    ]
     words += ["extractor=none", f"out={tmp_path / 'out'}"]
     assert main(words) == 0
     (path,) = (tmp_path / "out").glob("synthetic-none-*.json")
@@ -243,7 +350,8 @@ def test_an_audit_resumes_and_gives_the_same_card(tmp_path, monkeypatch, capsys)
     by_name = {perturbation.name: perturbation for perturbation in card.perturbations}
     truth = [grade.values["attributes/all"][0] or 0 for grade in by_name["near misses"].grades]
     assert sorted(truth, reverse=True) == truth
-    assert (card.real["attributes/all"][0] or 0) > 0.95 > truth[-1]  # exact attributes see every wrong caption
+    # Exact attributes see every wrong caption
+    assert (card.real["attributes/all"][0] or 0) > 0.95 > truth[-1]
     jitter = seen(card, by_name["jitter"], "jitter")
     assert (jitter and jitter.grade, "fid" in card.metrics) == (1, False)
     assert card.not_computed == {"extractor": "metrics that need features"}
@@ -273,12 +381,18 @@ def test_committed_cards_are_listed_complete_and_small(path, tmp_path):
     )
     for written in write_card([card], tmp_path, path.stem):
         kept = path.with_suffix(written.suffix)
-        assert kept.read_bytes() == written.read_bytes(), f"flame-mdm audit cards={path} out={path.parent}"
+        assert kept.read_bytes() == written.read_bytes(), (
+            f"flame-mdm audit cards={path} out={path.parent}"
+        )
         assert kept.stat().st_size <= 300_000
     assert card.motions >= 368
     by_name = {perturbation.name: perturbation for perturbation in card.perturbations}
     for name in ("wrong captions", "near misses"):
         responses = {metric: seen(card, by_name[name], metric) for metric in card.metrics}
-        noticed = {metric for metric, response in responses.items() if response and response.grade is not None}
+        noticed = {
+            metric
+            for metric, response in responses.items()
+            if response and response.grade is not None
+        }
         assert "fid" not in noticed
         assert bool(noticed) == any(fact.sees_meaning for fact in card.facts.values())

@@ -27,10 +27,17 @@ def coded(folder: Path, rules: Arrays) -> Babel:
     for file, part, frames, fps in rules["babel_files"].tolist():
         write_amass(folder / "amass" / f"CMU/subject/{file:03d}_poses.npz", frames, fps)
         rows = [row for row in rules["babel_labels"].tolist() if row[0] == file]
-        labels = [label(text(row[4]), [text(c) for c in row[5:] if c >= 0] or None, row[2], row[3]) for row in rows]
-        entry = sequence(f"CMU/subject/{file:03d}_poses.npz", labels, BABEL_FILES[part].startswith("extra"))
+        labels = [
+            label(text(row[4]), [text(c) for c in row[5:] if c >= 0] or None, row[2], row[3])
+            for row in rows
+        ]
+        entry = sequence(
+            f"CMU/subject/{file:03d}_poses.npz", labels, BABEL_FILES[part].startswith("extra")
+        )
         sequences[BABEL_FILES[part]][str(file)] = entry
-    return open_babel(write_babel(folder / "babel", sequences), folder / "amass", published_split=True)
+    return open_babel(
+        write_babel(folder / "babel", sequences), folder / "amass", published_split=True
+    )
 
 
 def open_babel(babel: Path, amass: Path, published_split: bool = False) -> Babel:
@@ -72,7 +79,9 @@ def test_clips_are_those_of_flame(stem: str, tmp_path: Path):
 def test_labels_become_texts_and_bad_ones_are_counted(small: tuple[Path, Path]):
     babel, amass = small
     source = open_babel(babel, amass)
-    texts = [(w.label.text, w.start) for w in source.windows if w.label.motion.endswith("/01_01_poses")]
+    texts = [
+        (w.label.text, w.start) for w in source.windows if w.label.motion.endswith("/01_01_poses")
+    ]
     walks = [("walk", 0), ("walk", 10), ("walk", 20), ("walk", 30)]
     moves = [("move", start) for _, start in walks]
     assert sorted(texts) == sorted([*walks, *moves, ("step", 20), ("wave", 40)])
@@ -92,7 +101,12 @@ def test_windows_share_the_frames_of_their_motions(small: tuple[Path, Path], tmp
     assert all(store.info["clips"].values())
     assert len(store.features) == 300 * 23 < sum(clip.length for clip in store.clips)
     assert store.info["excluded"]["transitions"] == 21
-    assert {caption for clip in store.clips for caption in clip.captions} == {"walk", "move", "step", "wave"}
+    assert {caption for clip in store.clips for caption in clip.captions} == {
+        "walk",
+        "move",
+        "step",
+        "wave",
+    }
     clip = store.clips[-1]
     expected = SMPL().encode(torch.from_numpy(frames_of(small[1], clip.source)))
     start = clip.attributes["start"]
@@ -106,14 +120,22 @@ def test_the_official_training_set_stays_whole_and_val_is_divided_by_motion(tmp_
     labels, sequences = [label("walk", ["walk"], 0.0, 8.0)], {}
     parts = (names[:20], names[20:24], [*names[24:52], names[3]], names[52:])
     for part, listed in zip(BABEL_FILES, parts, strict=True):
-        sequences[part] = {name: sequence(name, labels, part.startswith("extra")) for name in listed}
+        sequences[part] = {
+            name: sequence(name, labels, part.startswith("extra")) for name in listed
+        }
     source = open_babel(write_babel(tmp_path / "babel", sequences), tmp_path / "amass")
-    assert all((window.split == "train") == window.id.startswith("train") for window in source.windows)
+    assert all(
+        (window.split == "train") == window.id.startswith("train") for window in source.windows
+    )
     splits = {window.label.motion: window.split for window in source.windows}
     assert Counter(splits.values()) == {"train": 24, "val": 28, "test": 8}
-    assert len({(window.label.motion, window.split) for window in source.windows}) == 60, "a motion in two splits"
+    assert len({(window.label.motion, window.split) for window in source.windows}) == 60, (
+        "a motion in two splits"
+    )
     assert source.excluded == {"labels of the val part on motions of the train part": 1}
-    flames = Counter(w.split for w in open_babel(tmp_path / "babel", tmp_path / "amass", True).windows)
+    flames = Counter(
+        w.split for w in open_babel(tmp_path / "babel", tmp_path / "amass", True).windows
+    )
     assert flames["val"] + flames["test"] == 4 * 37
 
 
@@ -123,7 +145,9 @@ def test_absent_and_damaged_files_are_named(small: tuple[Path, Path]):
     with pytest.raises(ValueError, match=r"03_01_poses\.npz: damaged"):
         open_babel(*small).count()
     shutil.rmtree(small[1] / "CMU/03")
-    with pytest.raises(FileNotFoundError, match=r"CMU: 1 of 23 recordings are missing, such as CMU/03/03_01_poses"):
+    with pytest.raises(
+        FileNotFoundError, match=r"CMU: 1 of 23 recordings are missing, such as CMU/03/03_01_poses"
+    ):
         open_babel(*small).count()
     with pytest.raises(FileNotFoundError, match=r"register at https://amass"):
         open_babel(small[0], small[0] / "none").count()

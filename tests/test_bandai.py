@@ -12,7 +12,17 @@ from support.fixtures import SHARED, needs_third_party, third_party
 from support.stores import BONES, TAKES, synthetic_take
 
 from flame_mdm.data import Clip, archives, bandai
-from flame_mdm.data.bandai import CONTENTS_1, JOINTS, STYLES_1, STYLES_2, TAKES_2, Bandai, captions, side_of, split_of
+from flame_mdm.data.bandai import (
+    CONTENTS_1,
+    JOINTS,
+    STYLES_1,
+    STYLES_2,
+    TAKES_2,
+    Bandai,
+    captions,
+    side_of,
+    split_of,
+)
 from flame_mdm.errors import UserError
 from flame_mdm.formats import bvh
 from flame_mdm.representations.skeleton import SMPL22, SMPL24
@@ -53,7 +63,11 @@ def test_clips_of_a_folder(tiny):
     assert [clip.id for clip in originals] == sorted(TAKES)
     for clip in originals:
         frames = (TAKES[clip.id] - 1) * 20 // 30 + 1
-        assert (clip.motion.shape, clip.motion.dtype, clip.source) == ((frames, 22, 3), np.float32, clip.id)
+        assert (clip.motion.shape, clip.motion.dtype, clip.source) == (
+            (frames, 22, 3),
+            np.float32,
+            clip.id,
+        )
         assert (f"M{clip.id}" in ids) == (clip.split == "train")
         assert Bandai.actions[clip.action or 0] == clip.attributes["content"]
         assert clip.attributes["dataset"] == int(clip.id[8])
@@ -70,8 +84,11 @@ def test_bones_keep_their_length_and_joints_their_position(tiny):
         motion, take = by_id[id_], synthetic_take(seed, TAKES[id_])
         lengths = np.linalg.norm(motion[:, 1:] - motion[:, SMPL22.parents[1:]], axis=2)
         np.testing.assert_allclose(lengths, np.tile(lengths[:1], (len(lengths), 1)), atol=1e-6)
-        expected = take.positions()[::3, [take.joints.index(name) for name in JOINTS.values()]] / 100
-        expected[:, 3] = 0.6 * expected[:, 0] + 0.4 * expected[:, 6]  # spine1 lies between pelvis and spine2
+        expected = (
+            take.positions()[::3, [take.joints.index(name) for name in JOINTS.values()]] / 100
+        )
+        # Spine1 lies between pelvis and spine2
+        expected[:, 3] = 0.6 * expected[:, 0] + 0.4 * expected[:, 6]
         np.testing.assert_allclose(motion[::2][: len(expected)], expected, atol=1e-6)
 
 
@@ -83,12 +100,18 @@ def test_mirrored_copies(tiny):
     for clip in mirrored:
         original = by_id[clip.id[1:]]
         assert (clip.split, clip.source) == ("train", original.id)
-        np.testing.assert_array_equal(SMPL22.mirror(torch.from_numpy(clip.motion)).numpy(), original.motion)
+        np.testing.assert_array_equal(
+            SMPL22.mirror(torch.from_numpy(clip.motion)).numpy(), original.motion
+        )
         side = str(original.attributes.get("side", ""))
         assert clip.attributes.get("side", "") == swapped.get(side, side)
-        ours, theirs = ([c.replace(",", " ,").split() for c in some.captions] for some in (clip, original))
+        ours, theirs = (
+            [c.replace(",", " ,").split() for c in some.captions] for some in (clip, original)
+        )
         assert ours == [[swapped.get(word, word) for word in words] for words in theirs]
-    wrong_side = "dataset-2_walk-turn-right_masculine_006"  # this take turns to the other side than named
+    wrong_side = (
+        "dataset-2_walk-turn-right_masculine_006"  # this take turns to the other side than named
+    )
     for name, content, side in (
         ("Mdataset-2_walk-turn-left_normal_001", "walk-turn-right", "right"),
         ("Mdataset-1_bye_giant_001", "bye", "left"),
@@ -124,9 +147,14 @@ def test_smpl_rotations_show_the_joints(tiny):
     by_id = {clip.id: clip for clip in clips(tiny, motion="smpl")}
     for joints in clips(tiny):
         rotations = by_id[joints.id]
-        assert (rotations.motion.shape, rotations.motion.dtype) == ((len(joints.motion), 75), np.float32)
+        assert (rotations.motion.shape, rotations.motion.dtype) == (
+            (len(joints.motion), 75),
+            np.float32,
+        )
         same([Clip(**{**vars(rotations), "motion": joints.motion})], [joints])
-        np.testing.assert_allclose(decoded(rotations.motion, resting_offsets())[:, :22], joints.motion, atol=1e-5)
+        np.testing.assert_allclose(
+            decoded(rotations.motion, resting_offsets())[:, :22], joints.motion, atol=1e-5
+        )
         assert not rotations.motion[:, -6:].any()
         if joints.id[0] == "M":
             mirrored = SMPL24.mirror(torch.from_numpy(decoded(by_id[joints.id[1:]].motion))).numpy()
@@ -136,7 +164,9 @@ def test_smpl_rotations_show_the_joints(tiny):
 def test_the_rest_pose_is_that_of_smpl():
     take = synthetic_take(0, 1)
     turned = [bandai.REST.get(name, np.eye(3)) for name in take.joints]
-    local = np.stack([turned[max(parent, 0)].T @ own for parent, own in zip(take.parents, turned, strict=True)])
+    local = np.stack(
+        [turned[max(parent, 0)].T @ own for parent, own in zip(take.parents, turned, strict=True)]
+    )
     motion = bandai.smpl_motion(take, local[None], take.offsets[None])
     np.testing.assert_allclose(motion[0, :3], [0, -0.03, 0.939], atol=1e-6)
     upright = Rotation.from_matrix(bandai.AXES).as_matrix()
@@ -148,7 +178,9 @@ def test_the_rest_pose_is_that_of_smpl():
         if name.endswith(("shoulder", "elbow", "wrist", "knee", "ankle")):
             assert bones[joint] @ expected[joint] > 1 - 1e-6, name
         if name.endswith("foot"):
-            assert np.arctan2(*bones[joint, [0, 2]]) == pytest.approx(np.arctan2(*expected[joint, [0, 2]]), abs=1e-3)
+            assert np.arctan2(*bones[joint, [0, 2]]) == pytest.approx(
+                np.arctan2(*expected[joint, [0, 2]]), abs=1e-3
+            )
     at = dict(zip(SMPL24.joints, decoded(motion)[0] - decoded(motion)[0, 0], strict=True))
     assert at["left_wrist"][0] > 0.6 > -0.6 > at["right_wrist"][0]
     assert at["head"][1] > 0.5 > -0.8 > at["left_ankle"][1]
@@ -156,7 +188,11 @@ def test_the_rest_pose_is_that_of_smpl():
 
 def published() -> list[tuple[int, str, str, int]]:
     """Data set, content, style and number of all takes whose BVH file was published."""
-    counts = {(2, c, style): n for c, row in TAKES_2.items() for style, n in zip(STYLES_2, row, strict=True)}
+    counts = {
+        (2, c, style): n
+        for c, row in TAKES_2.items()
+        for style, n in zip(STYLES_2, row, strict=True)
+    }
     only_normal = {"call": 2, "punch": 2, "slash": 2, "kick": 1, "respond": 1, "dance-short": 1}
     counts |= {(1, content, "normal"): count for content, count in only_normal.items()}
     for content in set(CONTENTS_1) - set(only_normal) - {"dance-long"}:
@@ -187,14 +223,24 @@ def test_compositional_split_holds_out_whole_combinations():
     held_out = [take for take, split in splits.items() if split == "test"]
     both = []
     for part in (seen, held_out):  # mirror images included
-        named = {(name, style) for _, content, style, _ in part for name in (content, bandai.swap_sides(content))}
-        both.append({text for name, style in named for text in captions(name, style, side_of(name))})
+        named = {
+            (name, style)
+            for _, content, style, _ in part
+            for name in (content, bandai.swap_sides(content))
+        }
+        both.append(
+            {text for name, style in named for text in captions(name, style, side_of(name))}
+        )
     assert not both[0] & both[1]
     for part in (1, 2):  # content, style: each is seen, in other combinations
-        assert {take[part] for take in held_out} <= {take[part] for take in splits if splits[take] == "train"}
+        assert {take[part] for take in held_out} <= {
+            take[part] for take in splits if splits[take] == "train"
+        }
     assert {style for dataset, _, style, _ in held_out if dataset == 2} == set(STYLES_2)
     # Other takes stay where they are, except test takes, which are used for training.
-    assert all(splits[take] == {"test": "train"}.get(split_of(*take), split_of(*take)) for take in seen)
+    assert all(
+        splits[take] == {"test": "train"}.get(split_of(*take), split_of(*take)) for take in seen
+    )
     assert splits[1, "walk", "old", 1] == splits[2, "walk", "elderly", 6] == "test"
 
 
@@ -232,9 +278,17 @@ def test_wrong_input_is_explained(tiny, tmp_path):
         path.parent.mkdir(parents=True)
         path.touch()
     for path, exclude, message in (
-        (tiny, ["dataset-1_walk_hapy_001"], "data.source.exclude: .* has no dataset-1_walk_hapy_001"),
+        (
+            tiny,
+            ["dataset-1_walk_hapy_001"],
+            "data.source.exclude: .* has no dataset-1_walk_hapy_001",
+        ),
         (tmp_path / "notes.txt", [], "notes.txt: neither a folder nor a zip or tar archive"),
-        (tmp_path / "swim", [], "dataset-1_swim_happy_001.bvh: .* no content swim with style happy"),
+        (
+            tmp_path / "swim",
+            [],
+            "dataset-1_swim_happy_001.bvh: .* no content swim with style happy",
+        ),
         (tmp_path / "twice", [], f"{HAPPY} exists twice, as .*one/.* and .*two/"),
     ):
         with pytest.raises(UserError, match=message):
@@ -252,7 +306,9 @@ def originals(tmp_path_factory) -> dict[str, Path]:
     cases = {f"dataset-{d}_{case.split('_', 1)[1]}": case for case in CASES for d in (1, 2)}
     files: dict[str, Path] = {}
     folder = tmp_path_factory.mktemp("originals")
-    for name, data in archives.members(ARCHIVE, lambda name: name.endswith(".bvh") and Path(name).stem in cases):
+    for name, data in archives.members(
+        ARCHIVE, lambda name: name.endswith(".bvh") and Path(name).stem in cases
+    ):
         file = files[cases[Path(name).stem]] = folder / Path(name).name
         file.write_bytes(data)
         if len(files) == len(CASES):
@@ -284,7 +340,10 @@ def test_limbs_of_real_takes_point_the_same_way_on_smpls_body(case, originals):
     vectors = dict(zip(SMPL24.joints, motion[:, 3:].reshape(-1, 24, 3).swapaxes(0, 1), strict=True))
     for side, sign in (("left", -1), ("right", 1)):
         for name in ("shoulder", "elbow", "wrist", "knee", "ankle"):
-            assert cosines[:, SMPL22.joints.index(f"{side}_{name}") - 1].min() > 1 - 1e-5, (side, name)
+            assert cosines[:, SMPL22.joints.index(f"{side}_{name}") - 1].min() > 1 - 1e-5, (
+                side,
+                name,
+            )
         elbow = vectors[f"{side}_elbow"]
         assert sign * elbow[:, 1].mean() > 0.8 * np.linalg.norm(elbow, axis=1).mean()
         assert np.abs(vectors[f"{side}_knee"][:, 1]).max() < 0.2  # the shin does not twist

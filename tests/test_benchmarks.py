@@ -40,7 +40,11 @@ def test_the_page_is_rendered_from_the_figures_and_keeps_those_that_are_not_meas
     run.main("only=averaging,host", "device=", "mdm_repo=", "runs=")
     data = page.with_suffix(".json")
     figures = json.loads(data.read_text())
-    figures["host"] |= {"date": "2001-02-03", "script": "benchmarks/host.py at commit x", "machine": {"cores": 1}}
+    figures["host"] |= {
+        "date": "2001-02-03",
+        "script": "benchmarks/host.py at commit x",
+        "machine": {"cores": 1},
+    }
     data.write_text(json.dumps(figures))
 
     run.main("only=averaging")
@@ -51,17 +55,25 @@ def test_the_page_is_rendered_from_the_figures_and_keeps_those_that_are_not_meas
     assert "Steps:\n\n| training | ms |\n| --- | ---: |\n| host | 1,234 |" in text
     assert "`benchmarks/host.py at commit x`, 2001-02-03, machine 1." in text
     assert "`benchmarks/averaging.py`, " in text
-    assert text.index("## Title of host") < text.index("## Title of averaging"), "in the order of the scripts"
+    assert text.index("## Title of host") < text.index("## Title of averaging"), (
+        "in the order of the scripts"
+    )
     assert "torch: " in text.split("## Machine")[1].split("##")[0]
 
     run.main("only=host")
-    assert "at commit x" not in page.read_text(), "a section that is measured again names no earlier script"
+    assert "at commit x" not in page.read_text(), (
+        "a section that is measured again names no earlier script"
+    )
 
 
 def test_all_sections_are_measured_unless_only_some_are_named(page):
     run.main()
     assert tuple(json.loads(page.with_suffix(".json").read_text())) == run.SECTIONS
-    scripts = {path.stem for path in (ROOT / "benchmarks").glob("*.py")} - {"run", "sections", "authors"}
+    scripts = {path.stem for path in (ROOT / "benchmarks").glob("*.py")} - {
+        "run",
+        "sections",
+        "authors",
+    }
     assert scripts == {*run.SECTIONS, *run.ON_REQUEST}
 
 
@@ -214,13 +226,30 @@ def test_the_authors_step_trains_the_network_of_a_clone(tmp_path, monkeypatch):
 
 def trained(folder: Path, speed: str, seed: int, loss: float, fid: float) -> Run:
     keys: dict[str, Any] = {"speed": speed} if speed == "fast" else {}
-    config = {"data": {"name": "own"}, "trainer": {"max_steps": 1500}, "ema": {"decay": 0.9}, "run": keys, "seed": seed}
-    values = {"fid": Value(mean=fid, ci=0.0, replications=1, n=9, per_replication=[]), "jitter": None}
+    config = {
+        "data": {"name": "own"},
+        "trainer": {"max_steps": 1500},
+        "ema": {"decay": 0.9},
+        "run": keys,
+        "seed": seed,
+    }
+    values = {
+        "fid": Value(mean=fid, ci=0.0, replications=1, n=9, per_replication=[]),
+        "jitter": None,
+    }
     evaluated: Any = SimpleNamespace(values=values)
-    return Run(folder, config, None, {"val/loss": {9: 100.0, 19: loss}}, {"evaluation/result.json": evaluated})
+    return Run(
+        folder,
+        config,
+        None,
+        {"val/loss": {9: 100.0, 19: loss}},
+        {"evaluation/result.json": evaluated},
+    )
 
 
-def test_quality_has_intervals_over_seeds_and_of_the_differences_of_equal_seeds(tmp_path, monkeypatch):
+def test_quality_has_intervals_over_seeds_and_of_the_differences_of_equal_seeds(
+    tmp_path, monkeypatch
+):
     runs = {}
     for seed, loss in enumerate((1.0, 2.0, 3.0)):
         runs[f"a{seed}"] = trained(tmp_path, "reference", seed, loss, fid=5.0 + seed)
@@ -244,22 +273,31 @@ def test_quality_has_intervals_over_seeds_and_of_the_differences_of_equal_seeds(
     (tmp_path / "b2" / "config.yaml").unlink()
     with pytest.raises(SystemExit, match="needs the same two or more seeds in both speeds"):
         quality.measure(settings)
-    monkeypatch.setattr(quality, "read_run", lambda folder: Run(folder, runs["a0"].config, None, {}, {}))
+    monkeypatch.setattr(
+        quality, "read_run", lambda folder: Run(folder, runs["a0"].config, None, {}, {})
+    )
     with pytest.raises(SystemExit, match="not validated or not evaluated"):
         quality.measure(settings)
 
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(name, marks=() if name == "averaging" else pytest.mark.robustness) for name in run.SECTIONS],
+    [
+        pytest.param(name, marks=() if name == "averaging" else pytest.mark.robustness)
+        for name in run.SECTIONS
+    ],
 )
 def test_every_benchmark_runs_at_a_toy_size(name, tmp_path, monkeypatch):
     monkeypatch.setattr(run, "PAGE", tmp_path / "speed.md")
     measured = run.run(name, Settings(quick=True))
     assert list(tmp_path.iterdir()) == []
-    numbers = [value for rows in measured["tables"].values() for row in rows for value in row.values()]
+    numbers = [
+        value for rows in measured["tables"].values() for row in rows for value in row.values()
+    ]
     assert all(math.isfinite(value) for value in numbers if isinstance(value, int | float))
     assert any(isinstance(value, float) for value in numbers)
     columns = [{tuple(row) for row in rows} for rows in measured["tables"].values()]
     assert all(len(names) == 1 for names in columns)
-    assert measured["title"] in run.render({name: measured | {"date": "2001-02-03", "machine": run.machine()}})
+    assert measured["title"] in run.render(
+        {name: measured | {"date": "2001-02-03", "machine": run.machine()}}
+    )

@@ -19,9 +19,26 @@ from flame_mdm.formats import characters
 from flame_mdm.formats.characters import known_skeletons
 
 pytestmark = [pytest.mark.tools, pytest.mark.slow, pytest.mark.timeout(900)]
-WALK = {"sentence": "a person walks forward", "seconds": 2.2, "seed": 1, "in_place": False, "onto_selected": False}
-KICK = {"sentence": "a person kicks with the left foot twice", "seconds": 3, "seed": 0, "onto_selected": False}
-WAVE = {"sentence": "a person waves with both hands", "seconds": 3, "seed": 2, "in_place": False, "onto_selected": True}
+WALK = {
+    "sentence": "a person walks forward",
+    "seconds": 2.2,
+    "seed": 1,
+    "in_place": False,
+    "onto_selected": False,
+}
+KICK = {
+    "sentence": "a person kicks with the left foot twice",
+    "seconds": 3,
+    "seed": 0,
+    "onto_selected": False,
+}
+WAVE = {
+    "sentence": "a person waves with both hands",
+    "seconds": 3,
+    "seed": 2,
+    "in_place": False,
+    "onto_selected": True,
+}
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +53,13 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def run(package: Path, requests: list[Any], folder: Path) -> list[Any]:
     """What tests/support/blender_extension.py finds: names and joints (F, J, 3) of each motion, or an error."""
     (folder / "requests.json").write_text(json.dumps(requests))
-    command = [blender(), ROOT / "tests/support/blender_extension.py", package, folder / "requests.json", folder]
+    command = [
+        blender(),
+        ROOT / "tests/support/blender_extension.py",
+        package,
+        folder / "requests.json",
+        folder,
+    ]
     environment = os.environ | {"BLENDER_USER_RESOURCES": str(folder / "blender"), "PYTHONPATH": ""}
     done = subprocess.run(command, check=False, capture_output=True, text=True, env=environment)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -49,7 +72,8 @@ def test_blender_shows_the_motions_of_the_package(package: Path, tmp_path: Path)
     synthetic("kick").save(hero, rig="mixamo")
     model = flame_mdm.load("quickstart")
     walk, kick, wave = (
-        flame_mdm.generate(model, r["sentence"], seconds=r["seconds"], seed=r["seed"])[0] for r in (WALK, KICK, WAVE)
+        flame_mdm.generate(model, r["sentence"], seconds=r["seconds"], seed=r["seed"])[0]
+        for r in (WALK, KICK, WAVE)
     )
     requests = [[WALK, 20, None], [KICK | {"in_place": True}, 30, None], [WAVE, 20, str(hero)]]
     first, second, third = run(package, requests, tmp_path)
@@ -71,9 +95,15 @@ def test_blender_shows_the_motions_of_the_package(package: Path, tmp_path: Path)
     assert (tmp_path / "picture.png").stat().st_size > 10_000
 
 
-def test_what_cannot_be_generated_and_damage_are_refused_in_one_line(package: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_generated_and_damage_are_refused_in_one_line(
+    package: Path, tmp_path: Path
+) -> None:
     requests = [WALK | {"sentence": "qwer asdf"}, WALK | {"sentence": " "}, WALK | {"seconds": 9}]
-    errors = run(package, [[request, 20, None] for request in [*requests, WALK | {"onto_selected": True}]], tmp_path)
+    errors = run(
+        package,
+        [[request, 20, None] for request in [*requests, WALK | {"onto_selected": True}]],
+        tmp_path,
+    )
     # files of the model are read by the runner, which tests/test_onnx.py damages
     damaged, hero = tmp_path / "flame_mdm.zip", tmp_path / "hero.glb"
     with zipfile.ZipFile(package) as source, zipfile.ZipFile(damaged, "w") as target:
@@ -81,7 +111,13 @@ def test_what_cannot_be_generated_and_damage_are_refused_in_one_line(package: Pa
             target.writestr(item, source.read(item)[: -9 if item == "skeletons.json" else None])
     synthetic("kick").save(hero, rig="mixamo")
     errors += run(damaged, [[WAVE, 20, str(hero)]], tmp_path)
-    messages = ("knows no word", "sentence is empty", "give 0.1 to 3", "select an arm", "skeletons.json is damaged")
+    messages = (
+        "knows no word",
+        "sentence is empty",
+        "give 0.1 to 3",
+        "select an arm",
+        "skeletons.json is damaged",
+    )
     for error, message in zip(errors, messages, strict=True):
         assert message in error
         assert "\n" not in error

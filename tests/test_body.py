@@ -29,7 +29,9 @@ def test_the_mesh_is_one_closed_symmetric_surface_in_its_stored_pose():
     a, b, c = (points[triangles[:, k]] for k in range(3))
     assert 0.05 < (a * np.cross(b, c)).sum() / 6 < 0.09  # cubic meters; a person of 1.78 m has 0.07
     assert 1.7 < np.ptp(points[:, 1]) < 1.85
-    assert {tuple(p) for p in points.round(5).tolist()} == {tuple(p) for p in (points * [-1, 1, 1]).round(5).tolist()}
+    assert {tuple(p) for p in points.round(5).tolist()} == {
+        tuple(p) for p in (points * [-1, 1, 1]).round(5).tolist()
+    }
     np.testing.assert_allclose(mannequin().weights.sum(1), 1)
     assert ((mannequin().weights > 0).sum(1) <= 4).all()
     left = mannequin().weights @ np.array(sides(SMPL22), float)[list(ANCHORS)]
@@ -48,13 +50,16 @@ def test_joints_of_the_body_are_those_of_the_motion_and_soles_are_on_the_floor()
     turns: Any = {"left_hip": (-50, 10, 0), "left_knee": (70, 0, 0), "right_shoulder": (0, 30, 60)}
     motion = posed(scale=0.93, spine2=(15, 0, 9), **turns)
     drawn = fit_body(motion)
-    np.testing.assert_allclose(drawn.starts[0, :22] - [0, drawn.lift, 0], motion.joints[0], atol=1e-6)
+    np.testing.assert_allclose(
+        drawn.starts[0, :22] - [0, drawn.lift, 0], motion.joints[0], atol=1e-6
+    )
     points, normals = drawn.skinned(0)
     assert points[:, 1].min() == pytest.approx(0, abs=0.004)  # the right foot stands
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1)
     solved = Motion(motion.joints, 20)
     assert fit_body(solved).skinned(0)[0][:, 1].min() == pytest.approx(0, abs=0.004)
-    moves = (drawn.turns[0, :22] @ drawn.joints[..., None])[..., 0]  # a rigid bone maps both its ends to joints
+    # A rigid bone maps both its ends to joints
+    moves = (drawn.turns[0, :22] @ drawn.joints[..., None])[..., 0]
     for parent, joint in SMPL22.edges:
         end = drawn.starts[0, parent] - moves[parent] + drawn.turns[0, parent] @ drawn.joints[joint]
         assert np.linalg.norm(end - drawn.starts[0, joint]) < 1e-4, SMPL22.joints[joint]
@@ -63,8 +68,12 @@ def test_joints_of_the_body_are_those_of_the_motion_and_soles_are_on_the_floor()
 def test_a_twisted_wrist_turns_the_forearm_by_degrees_toes_bend_and_the_head_is_level():
     drawn = fit_body(posed(left_wrist=(80, 0, 0)))
     turned = degrees(drawn.turns[0] @ fit_body(posed()).turns[0].mT)
-    helper = next(bone for bone, joint in enumerate(ANCHORS[22:], 22) if SMPL22.joints[joint] == "left_elbow")
-    assert turned[[JOINT["left_elbow"], helper, JOINT["left_wrist"]]] == pytest.approx([0, 44, 80], abs=1.5)
+    helper = next(
+        bone for bone, joint in enumerate(ANCHORS[22:], 22) if SMPL22.joints[joint] == "left_elbow"
+    )
+    assert turned[[JOINT["left_elbow"], helper, JOINT["left_wrist"]]] == pytest.approx(
+        [0, 44, 80], abs=1.5
+    )
     # toes bend where the heel rises, and the head is level, also after a long bow
     raised = posed(left_ankle=(40, 0, 0), left_knee=(10, 0, 0), neck=(25, 0, 0))
     raised.joints[:, :, 1] -= raised.joints[..., 10, 1].min()  # the toes stand on the floor
@@ -85,11 +94,14 @@ def test_the_nearest_triangle_is_drawn_and_pictures_show_the_body_in_its_clothes
     square = np.array([[2.0, 18], [18, 18], [18, 2], [2, 2]])
     at, triangles = np.concatenate([square, square]), np.array([[0, 1, 2], [0, 2, 3]])
     colors = np.repeat([[10.0, 20, 30], [200, 100, 0]], 4, axis=0)
-    render._rasterize(image, at, np.repeat([1.0, 2.0], 4), colors, np.concatenate([triangles, triangles + 4]))
+    render._rasterize(
+        image, at, np.repeat([1.0, 2.0], 4), colors, np.concatenate([triangles, triangles + 4])
+    )
     assert (image[2:18, 2:18] == [10, 20, 30]).all()
     assert (image[:, :2] == 255).all()
     assert (image[18:] == 255).all()
-    render._rasterize(image, at, np.repeat([3.0, 0.5], 4), colors, triangles[:, ::-1])  # seen from inside
+    # Seen from inside
+    render._rasterize(image, at, np.repeat([3.0, 0.5], 4), colors, triangles[:, ::-1])
     assert (image[2:18, 2:18] == [10, 20, 30]).all()
     # pictures show the body in its clothes
     image = frames_array(posed(), 192)[0].astype(int)
@@ -102,7 +114,10 @@ def test_the_nearest_triangle_is_drawn_and_pictures_show_the_body_in_its_clothes
 def test_a_motion_that_no_body_fits_says_why():
     drawn = posed().try_fit()[0]
     for motion, reason in (
-        (posed(scale=3.0), r"left_knee is 1\.17 m long, the body's is 0\.392 m\. Is the unit right\?"),
+        (
+            posed(scale=3.0),
+            r"left_knee is 1\.17 m long, the body's is 0\.392 m\. Is the unit right\?",
+        ),
         (sway(3, skeleton=KIT21), "computed only for the 22 joints of SMPL"),
         (Motion(np.zeros((3, 22, 3)), 20), "has no length"),
     ):
@@ -110,17 +125,26 @@ def test_a_motion_that_no_body_fits_says_why():
             fit_body(motion)
         assert motion.try_fit()[0] is None
         assert frames_array(motion, 64).shape == (len(motion.joints), 64, 64, 3)  # its skeleton
-        assert render._lines(motion, None, 200, 200) == [*render._lines(motion, drawn, 200, 200), "(no body fits)"]
+        assert render._lines(motion, None, 200, 200) == [
+            *render._lines(motion, drawn, 200, 200),
+            "(no body fits)",
+        ]
 
 
-@pytest.mark.parametrize("matrix", [np.ones((3, 3)), np.zeros((3, 3)), -np.eye(3), np.full((3, 3), np.nan)])
-def test_matrices_that_are_no_rotations_are_the_reason_for_a_skeleton_in_pictures_and_pages(matrix: np.ndarray):
+@pytest.mark.parametrize(
+    "matrix", [np.ones((3, 3)), np.zeros((3, 3)), -np.eye(3), np.full((3, 3), np.nan)]
+)
+def test_matrices_that_are_no_rotations_are_the_reason_for_a_skeleton_in_pictures_and_pages(
+    matrix: np.ndarray,
+):
     motion = posed(3)
     assert motion.poses is not None
     motion.poses.rotations[1, JOINT["left_knee"]] = torch.from_numpy(matrix)
     body, reason = motion.try_fit()
     assert body is None
-    assert reason == "the matrix of left_knee in frame 1 is not a rotation, so a body cannot be drawn"
+    assert (
+        reason == "the matrix of left_knee in frame 1 is not a rotation, so a body cannot be drawn"
+    )
     assert reason in player_page([motion])
     assert frames_array(motion, 64).shape == (3, 64, 64, 3)
 
@@ -141,7 +165,9 @@ def test_bodies_in_files_are_drawn_and_damaged_ones_named(tmp_path):
     body = load_body(str(tmp_path / "other.npz"))
     assert fit_body(motion, body).mesh is body
     for name in ("a.glb", "a.gif"):
-        assert motion.save(tmp_path / name, body=body).startswith(f"{tmp_path / name}: 1 frames at 20 per second, ")
+        assert motion.save(tmp_path / name, body=body).startswith(
+            f"{tmp_path / name}: 1 frames at 20 per second, "
+        )
         motion.save(tmp_path / f"mannequin_{name}")
         assert (tmp_path / name).read_bytes() != (tmp_path / f"mannequin_{name}").read_bytes()
     assert player_page([motion], body=body) != player_page([motion])
@@ -162,12 +188,20 @@ class StandIn:
     built = 0
 
     def __init__(self, **options: str) -> None:
-        assert options == {"rig": "anny", "topology": "notoes_collapse10pc", "skinning_method": "lbs"}
+        assert options == {
+            "rig": "anny",
+            "topology": "notoes_collapse10pc",
+            "skinning_method": "lbs",
+        }
         StandIn.built += 1
         joints = {name: mannequin().joints[JOINT[name]] for name in SMPL22.joints}
         bones = [(bone, joint) for joint, bone in HEADS.items() if joint != "head"]
         bones += [("clavicle", "collar"), ("shoulder01", "collar")]
-        heads = {f"{bone}.{letter}": joints[f"{side}_{joint}"] for bone, joint in bones for letter, side in SIDES}
+        heads = {
+            f"{bone}.{letter}": joints[f"{side}_{joint}"]
+            for bone, joint in bones
+            for letter, side in SIDES
+        }
         heads |= {"head": joints["head"], "neck01": joints["neck"] - [0, 0.02, 0]}
         spine = np.linspace(joints["pelvis"], heads["neck01"], 6)
         heads |= {f"spine0{5 - k}": spine[k] for k in range(5)}
@@ -182,7 +216,10 @@ class StandIn:
         axes = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
         return {
             key: torch.from_numpy(size * (points + np.array([0, 1, 0])) @ axes.T)[None]
-            for key, points in (("rest_vertices", mannequin().points), ("rest_bone_heads", self.heads))
+            for key, points in (
+                ("rest_vertices", mannequin().points),
+                ("rest_bone_heads", self.heads),
+            )
         }
 
 
@@ -196,7 +233,9 @@ def test_anny_is_made_once_and_fitted_like_the_mannequin(tmp_path, monkeypatch):
     assert load_body(str(file)).points.shape == body.points.shape == mannequin().points.shape
     motion = posed(left_knee=(60, 0, 0), left_hip=(-30, 0, 0))
     drawn = fit_body(motion, body)
-    np.testing.assert_allclose(drawn.starts[0, :22] - [0, drawn.lift, 0], motion.joints[0], atol=1e-6)
+    np.testing.assert_allclose(
+        drawn.starts[0, :22] - [0, drawn.lift, 0], motion.joints[0], atol=1e-6
+    )
     for name in ("a.glb", "a.gif"):
         motion.save(tmp_path / name, body=body)
         motion.save(tmp_path / f"mannequin_{name}")
@@ -207,7 +246,10 @@ def test_shapes_that_anny_cannot_have_are_refused(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setitem(sys.modules, "anny", None)
     for name, message in (
-        ("anny age=old", "age=old is not one of gender, age, height, weight with a number from 0 to 1"),
+        (
+            "anny age=old",
+            "age=old is not one of gender, age, height, weight with a number from 0 to 1",
+        ),
         ("anny age=1.1", r"age=1\.1 is not one of"),
         ("anny", r'body=anny needs the package anny\. Run pip install "flame-mdm\[body\]"'),
     ):

@@ -24,10 +24,16 @@ def entry(name: str, split: str = "train", *captions: str) -> Entry:
 
 
 def test_clips_are_found_by_words_and_split_with_their_mirrored_copies():
+    # No clip is called arch
     entries = [
         *(entry("Ma", "train", "waves the left hand"), entry("a", "train", "waves the right hand")),
-        *(entry("b", "val", "Kicks twice"), entry("March", "train", "marches"), entry("c"), entry("Mc")),
-    ]  # no clip is called arch
+        *(
+            entry("b", "val", "Kicks twice"),
+            entry("March", "train", "marches"),
+            entry("c"),
+            entry("Mc"),
+        ),
+    ]
     for split, search, expected in (
         (None, "", [["a", "Ma"], ["b"], ["March"], ["c", "Mc"]]),
         ("val", "", [["b"]]),
@@ -37,7 +43,9 @@ def test_clips_are_found_by_words_and_split_with_their_mirrored_copies():
         (None, "left right", []),
         (None, "mc", [["c", "Mc"]]),
     ):
-        assert [[clip.id for clip in family] for family in find(entries, split, search)] == expected, (split, search)
+        assert [
+            [clip.id for clip in family] for family in find(entries, split, search)
+        ] == expected, (split, search)
 
 
 def test_clips_are_chosen_evenly_and_not_too_many():
@@ -57,7 +65,9 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
     """Five clips with markup in every text, one of them longer than the page shows, one mirrored."""
     walk = synthetic().joints
     texts = [HOSTILE, "walks"]
-    clips = [Clip(f"{k}{HOSTILE}", walk, texts, "train" if k else "val", f"{k}", 0) for k in range(3)]
+    clips = [
+        Clip(f"{k}{HOSTILE}", walk, texts, "train" if k else "val", f"{k}", 0) for k in range(3)
+    ]
     clips.append(Clip(f"3{HOSTILE}", np.concatenate([walk] * 8), texts, "train", "3", 0))
     source = OwnClips(*clips, Clip(f"M3{HOSTILE}", walk, [], "train", "3", 0))
     source.name, source.actions = HOSTILE, (HOSTILE,)
@@ -74,7 +84,8 @@ def test_a_page_shows_every_clip_and_its_texts_as_text(store, tmp_path):
     page = page_of(store, tmp_path / "p.html")
     assert page.tags.count("script") == 3
     assert not {"img", "link", "iframe"} & set(page.tags)
-    assert " ".join(page.texts.values()).count(HOSTILE) >= 5  # title, heading, data set, what was left out, actions
+    # Title, heading, data set, what was left out, actions
+    assert " ".join(page.texts.values()).count(HOSTILE) >= 5
     assert [m["id"] for m in page.motions] == [*(f"{k}{HOSTILE}" for k in range(4)), f"M3{HOSTILE}"]
     assert [m["group"] for m in page.motions] == ["val", "train", "train", "train", "train"]
     assert page.motions[4]["beside"] == page.motions[3]["id"]
@@ -86,8 +97,18 @@ def test_a_page_shows_every_clip_and_its_texts_as_text(store, tmp_path):
     assert "(the first 15 of" in page.motions[3]["caption"]
     about = describe(store)  # of all clips
     lengths = [clip.length for clip in store.clips if clip.split == "train"]
-    cells = [4, f"{sum(lengths) / 20 / 60:.1f}", min(lengths), f"{np.median(lengths):g}", max(lengths), 6, 2]
-    assert "<tr><td>train</td>" + "".join(f'<td class="number">{cell}</td>' for cell in cells) in about
+    cells = [
+        4,
+        f"{sum(lengths) / 20 / 60:.1f}",
+        min(lengths),
+        f"{np.median(lengths):g}",
+        max(lengths),
+        6,
+        2,
+    ]
+    assert (
+        "<tr><td>train</td>" + "".join(f'<td class="number">{cell}</td>' for cell in cells) in about
+    )
     assert '<tr><td>val</td><td class="number">1</td>' in about
 
 
@@ -95,7 +116,9 @@ def test_the_command_shows_what_is_searched_and_writes_it(tmp_path, data_root, c
     out = tmp_path / "page.html"
 
     def run(*words: str) -> int:
-        return main(["browse", "data=synthetic", TINY[0], f"data_root={data_root}", f"out={out}", *words])
+        return main(
+            ["browse", "data=synthetic", TINY[0], f"data_root={data_root}", f"out={out}", *words]
+        )
 
     assert run("clips=10") == 0
     assert "page.html: 10 of 120 clips" in capsys.readouterr().out
@@ -107,10 +130,14 @@ def test_the_command_shows_what_is_searched_and_writes_it(tmp_path, data_root, c
     folder = tmp_path / "real motions"
     assert run("split=test", "clips=4", f"motions={folder}") == 0
     motions, files = Page(out).motions, sorted(folder.glob("*.npz"))
-    assert [path.name for path in files] == [f"motion_{n:03d}_{m['id']}.npz" for n, m in enumerate(motions)]
+    assert [path.name for path in files] == [
+        f"motion_{n:03d}_{m['id']}.npz" for n, m in enumerate(motions)
+    ]
     for path, shown in zip(files, motions, strict=True):
         file = read(path)
-        assert (file.fps, len(file.joints)) == (20, min(shown["frames"], 60)), "cut as for evaluation"
+        assert (file.fps, len(file.joints)) == (20, min(shown["frames"], 60)), (
+            "cut as for evaluation"
+        )
         assert file.text
         assert file.text in shown["caption"].split(" · ")
         with np.load(path) as arrays:
@@ -136,9 +163,13 @@ def test_a_page_narrows_down_in_a_browser(store, tmp_path):
             ("filter", "walks 3", "input", [3, 4]),  # the copy has no such caption, but comes along
             ("filter", "", "input", [0, 1, 2, 3, 4]),
         ):
-            tab.run(f"element('{field}').value = '{value}'; element('{field}').dispatchEvent(new Event('{event}'))")
+            tab.run(
+                f"element('{field}').value = '{value}'; element('{field}').dispatchEvent(new Event('{event}'))"
+            )
             assert tab.run("shown().map((m) => motions.indexOf(m))") == shown, value
-            assert tab.run("element('count').textContent") == ("" if len(shown) == 5 else f"{len(shown)} of 5")
+            assert tab.run("element('count').textContent") == (
+                "" if len(shown) == 5 else f"{len(shown)} of 5"
+            )
         assert tab.run("element('each').checked")
         columns = tab.run("motions.map((m) => +m.figure.style.gridColumnStart)")
         assert columns[4] == columns[3] + 1  # a copy beside its original

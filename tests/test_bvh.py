@@ -62,7 +62,10 @@ def tree(seed: int, frames: int = 7) -> bvh.Bvh:
 
 def test_the_hierarchy_and_its_motion_are_read(parse):
     motion = parse(ARM)
-    assert (motion.joints, motion.parents) == (("Hips", "Arm", "Hand", "Hand.end", "Slider"), (-1, 0, 1, 2, 0))
+    assert (motion.joints, motion.parents) == (
+        ("Hips", "Arm", "Hand", "Hand.end", "Slider"),
+        (-1, 0, 1, 2, 0),
+    )
     assert motion.channels[1:] == (("Yrotation", "Xrotation", "Zrotation"), (), (), ("Yposition",))
     assert motion.offsets.tolist() == [[1, 2, 3], [5, 0, 0], [0, -2, 0], [0, 0, 1], [0, 7, 9]]
     assert (motion.frames.shape, motion.frames.dtype, motion.fps) == ((3, 10), np.float64, 30)
@@ -81,17 +84,27 @@ def test_the_hierarchy_and_its_motion_are_read(parse):
     rotations = motion.rotations()[2]
     hips = matrix("Z", 10) @ matrix("X", 20) @ matrix("Y", 30)
     shoulder = matrix("Y", 40) @ matrix("X", 50) @ matrix("Z", 60)
-    np.testing.assert_allclose(rotations, [hips, shoulder, np.eye(3), np.eye(3), np.eye(3)], atol=1e-12)
+    np.testing.assert_allclose(
+        rotations, [hips, shoulder, np.eye(3), np.eye(3), np.eye(3)], atol=1e-12
+    )
     positions = positions[2]
     np.testing.assert_allclose(positions[1], np.array([4, 5, 6]) + hips @ [5, 0, 0], atol=1e-12)
-    np.testing.assert_allclose(positions[2], positions[1] + hips @ shoulder @ [0, -2, 0], atol=1e-12)
+    np.testing.assert_allclose(
+        positions[2], positions[1] + hips @ shoulder @ [0, -2, 0], atol=1e-12
+    )
     np.testing.assert_allclose(positions[3], positions[2] + hips @ shoulder @ [0, 0, 1], atol=1e-12)
     np.testing.assert_allclose(positions[4], np.array([4, 5, 6]) + hips @ [0, 9.5, 9], atol=1e-12)
 
 
 def test_fps_is_the_one_the_rounded_frame_time_stands_for(parse):
     for time, fps in (
-        *(("0.0333333", 30), ("0.0333", 30), ("0.008333", 120), ("8.33333E-03", 120), ("0.08", 12.5)),
+        *(
+            ("0.0333333", 30),
+            ("0.0333", 30),
+            ("0.008333", 120),
+            ("8.33333E-03", 120),
+            ("0.08", 12.5),
+        ),
         *(("0.016666", 60), ("0.01668335", 1 / 0.01668335), (".25", 4), ("2", 0.5)),
     ):
         assert parse(ARM.replace("0.0333333", time)).fps == fps, time
@@ -116,15 +129,21 @@ def test_resampling_turns_at_a_constant_rate_and_keeps_bones_and_the_last_frame(
         assert len(rotations) == len(translations) == expected
         shared = slice(0, len(rotations[::2]))  # times 0, 0.1, 0.2, ... are frames of both
         np.testing.assert_allclose(rotations[::2], motion.rotations()[::3][shared], atol=1e-12)
-        np.testing.assert_allclose(translations[::2], motion.translations()[::3][shared], atol=1e-12)
+        np.testing.assert_allclose(
+            translations[::2], motion.translations()[::3][shared], atol=1e-12
+        )
 
     frames = "0 0 0 170 0 0 0 0 0 7\n3 6 9 -170 0 0 0 90 0 7\n"
     motion = parse(ARM[: ARM.index("0 0 0 0 0 0")].replace("Frames:\t3", "Frames:\t2") + frames)
     rotations, translations = motion.resample(120)
-    expected = Rotation.from_euler("z", [[170], [175], [180], [185], [190]], degrees=True).as_matrix()
+    expected = Rotation.from_euler(
+        "z", [[170], [175], [180], [185], [190]], degrees=True
+    ).as_matrix()
     np.testing.assert_allclose(rotations[:, 0], expected, atol=1e-12)
     np.testing.assert_allclose(rotations[1, 1], matrix("X", 22.5), atol=1e-12)
-    np.testing.assert_allclose(translations[:, 0], [[3 * k, 6 * k, 9 * k] for k in (0, 0.25, 0.5, 0.75, 1)], atol=1e-12)
+    np.testing.assert_allclose(
+        translations[:, 0], [[3 * k, 6 * k, 9 * k] for k in (0, 0.25, 0.5, 0.75, 1)], atol=1e-12
+    )
     positions, _ = bvh.forward_kinematics(motion.parents, rotations, translations)
     lengths = np.linalg.norm(positions[:, [1, 2]] - positions[:, [0, 1]], axis=-1)
     np.testing.assert_allclose(lengths, np.tile([5, 2], (5, 1)), rtol=1e-14)
@@ -137,8 +156,16 @@ def test_damaged_files_are_named_with_the_line(parse):
         (ARM[:60], 5, "ends inside the hierarchy"),
         (ARM.replace("OFFSET 5 0 0", "OFFSET 5 nan 0"), 8, "found 5 nan 0"),
         (ARM.replace("    OFFSET 5 0 0\n", ""), 10, "without OFFSET"),
-        (ARM.replace("Yrotation Xrotation Zrotation", "Yrotation Yrotation Zrotation"), 9, "channels"),
-        (ARM.replace("Yrotation Xrotation Zrotation", "Yrotation Wrotation Zrotation"), 9, "channels"),
+        (
+            ARM.replace("Yrotation Xrotation Zrotation", "Yrotation Yrotation Zrotation"),
+            9,
+            "channels",
+        ),
+        (
+            ARM.replace("Yrotation Xrotation Zrotation", "Yrotation Wrotation Zrotation"),
+            9,
+            "channels",
+        ),
         (ARM.replace("  JOINT Arm\n  {", "  JOINT Arm\n"), 8, "expected {"),
         (ARM.replace("ROOT", "LIMB"), 2, "unexpected LIMB"),
         (ARM.replace("9.5\n", "9.5\n1 2\n"), 20, r"expected 10 finite number\(s\), found 1 2"),
@@ -149,7 +176,11 @@ def test_damaged_files_are_named_with_the_line(parse):
         (ARM.replace("0.0333333", "fast"), 16, "expected Frame Time:"),
         (ARM.replace("Frames:\t3", "Frames:\t4"), 19, "contains 3 frames, but says 4"),
         (ARM.replace("Frames:\t3", "Frames:\t2"), 19, "contains 3 frames, but says 2"),
-        (ARM[: ARM.index("0 0 0 0")].replace("Frames:\t3", "Frames:\t0"), 16, "contains 0 frames, but says 0"),
+        (
+            ARM[: ARM.index("0 0 0 0")].replace("Frames:\t3", "Frames:\t0"),
+            16,
+            "contains 0 frames, but says 0",
+        ),
         (ARM.replace("50 60 9.5", "50 60 oops"), 19, "expected 10 finite"),
         (ARM.replace("0 90 -3 90", "0 90 inf 90"), 18, "expected 10 finite"),
     ):

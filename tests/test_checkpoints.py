@@ -50,7 +50,11 @@ def released_file(folder: Path, state: dict, args: dict | str) -> list[str]:
     """Words of an import command for a released file of these contents."""
     torch.save(state, folder / "model.pt")
     (folder / "args.json").write_text(args if isinstance(args, str) else json.dumps(args, indent=4))
-    return [str(folder / "model.pt"), str(folder / "args.json"), f"out={folder / 'ours.safetensors'}"]
+    return [
+        str(folder / "model.pt"),
+        str(folder / "args.json"),
+        f"out={folder / 'ours.safetensors'}",
+    ]
 
 
 @cache
@@ -59,9 +63,15 @@ def imported(stem: str, mask_frames: bool, time_token: bool) -> MotionGenerator:
     arrays = golden(stem)
     config, width = meta(arrays)["config"], weights(arrays)["output_process.poseFinal.bias"].numel()
     keys = ("arch", "emb_trans_dec", "text_encoder_type", "cond_mask_prob")
-    args = {key: config[key] for key in keys if key in config} | {"dataset": WIDTHS[width], "mask_frames": mask_frames}
+    args = {key: config[key] for key in keys if key in config} | {
+        "dataset": WIDTHS[width],
+        "mask_frames": mask_frames,
+    }
     with tempfile.TemporaryDirectory() as name:
-        words = ["mfm" if stem == "mfm" else "mdm", *released_file(Path(name), weights(arrays), args)]
+        words = [
+            "mfm" if stem == "mfm" else "mdm",
+            *released_file(Path(name), weights(arrays), args),
+        ]
         words += [f"num_heads={config.get('num_heads', config.get('heads'))}"]
         words += ["time_token=true"] if time_token else []
         if args["dataset"] in NORMALIZED:
@@ -88,17 +98,25 @@ def imported_flame() -> MotionGenerator:
         model = load(name)
     assert torch.equal(model.condition.get_buffer("pooler_weight"), state["lm.pooler.dense.weight"])
     assert torch.equal(model.condition.get_buffer("pooler_bias"), state["lm.pooler.dense.bias"])
-    assert model.config["process"]["clip_x0"], "released FLAME was sampled with the clamp of its code"
+    assert model.config["process"]["clip_x0"], (
+        "released FLAME was sampled with the clamp of its code"
+    )
     return model
 
 
 def condition(arrays: Arrays, model: MotionGenerator, dtype: torch.dtype) -> Condition:
     """The fixture's condition, its null included: zeros in place of the embedding."""
     batch = len(arrays["in/x_t"])
-    pooled, tokens, token_mask = torch.zeros(batch, model.condition.features), torch.zeros(batch, 0, 0), None
+    pooled, tokens, token_mask = (
+        torch.zeros(batch, model.condition.features),
+        torch.zeros(batch, 0, 0),
+        None,
+    )
     if "in/action" in arrays:
         labels = torch.from_numpy(arrays["in/action"])[:, 0]
-        clips = MotionBatch(torch.zeros(batch, 1, 1), torch.ones(batch, 1, dtype=torch.bool), [], action=labels)
+        clips = MotionBatch(
+            torch.zeros(batch, 1, 1), torch.ones(batch, 1, dtype=torch.bool), [], action=labels
+        )
         pooled = model.condition(clips).pooled
     elif "in/text_mask" in arrays:
         tokens = torch.from_numpy(arrays["in/text_embed"]).transpose(0, 1)
@@ -121,7 +139,15 @@ def assert_output(arrays: Arrays, case: str, y: torch.Tensor) -> None:
 
 
 def mdm_cases() -> list:
-    names = ("cond", "uncond", "cfg", "train_cond_drop", "cond_last_sample_alone", "legacy_cond", "legacy_uncond")
+    names = (
+        "cond",
+        "uncond",
+        "cfg",
+        "train_cond_drop",
+        "cond_last_sample_alone",
+        "legacy_cond",
+        "legacy_uncond",
+    )
     names += ("cond_maskframes", "uncond_maskframes", "cfg_maskframes", "cond_scalar_t")
     stems = [stem for stem in MDM if (GOLDEN / f"{stem}.npz").is_file()]
     cases = [(stem, name) for stem in stems for name in names if f"out/{name}" in golden(stem)]
@@ -141,7 +167,10 @@ def test_mdm_outputs(stem: str, case: str, dtype: torch.dtype) -> None:
     t = torch.from_numpy(arrays["in/t"])
     # MFM's network takes a row number cut from its time in [0, 1].
     t = (t * 1000).floor() if t.is_floating_point() else t.float()
-    mask, all_of_them = torch.from_numpy(arrays["in/mask"])[:, 0, 0], torch.ones(len(x_t), dtype=torch.bool)
+    mask, all_of_them = (
+        torch.from_numpy(arrays["in/mask"])[:, 0, 0],
+        torch.ones(len(x_t), dtype=torch.bool),
+    )
     if case == "cond_scalar_t":
         t = t[:1].expand(len(t))
     if case == "cond_last_sample_alone":
@@ -162,21 +191,29 @@ def test_mdm_outputs(stem: str, case: str, dtype: torch.dtype) -> None:
 
 @pytest.mark.golden
 @pytest.mark.parametrize("dtype", DTYPES, ids=str)
-@pytest.mark.parametrize("case", ["model", "model_null_text", "cfg_model_fn"], ids=lambda c: f"flame_text2motion-{c}")
+@pytest.mark.parametrize(
+    "case", ["model", "model_null_text", "cfg_model_fn"], ids=lambda c: f"flame_text2motion-{c}"
+)
 @torch.no_grad()
 def test_flame_outputs(case: str, dtype: torch.dtype) -> None:
     arrays = golden("flame_text2motion")
     denoiser = copy.deepcopy(imported_flame().denoiser).to(dtype)
     pooled = torch.from_numpy(arrays["lm/pooler_output"]).to(dtype)
     tokens = torch.from_numpy(arrays["lm/last_hidden_state"]).to(dtype)
-    everywhere = torch.ones(tokens.shape[:2], dtype=torch.bool)  # the authors attend to the padding of the text
+    # The authors attend to the padding of the text
+    everywhere = torch.ones(tokens.shape[:2], dtype=torch.bool)
     null = Condition(pooled[-1:], tokens[-1:], everywhere[-1:])
     cond = Condition(pooled[:-1], tokens[:-1], everywhere[:-1], null)
     batch = len(cond.pooled)
     if case == "cfg_model_fn":
         x_t = torch.from_numpy(arrays["cfg/x_t"])[:batch].transpose(1, 2).to(dtype)
-        t, mask = torch.from_numpy(arrays["cfg/t"])[:batch], torch.ones(x_t.shape[:2], dtype=torch.bool)
-        y, without = denoiser(x_t.repeat(2, 1, 1), t.repeat(2), mask.repeat(2, 1), cond.with_null()).chunk(2)
+        t, mask = (
+            torch.from_numpy(arrays["cfg/t"])[:batch],
+            torch.ones(x_t.shape[:2], dtype=torch.bool),
+        )
+        y, without = denoiser(
+            x_t.repeat(2, 1, 1), t.repeat(2), mask.repeat(2, 1), cond.with_null()
+        ).chunk(2)
         mean, scale = slice(0, x_t.shape[-1]), meta(arrays)["config"]["scale"]
         y[..., mean] = without[..., mean] + scale * (y[..., mean] - without[..., mean])
     else:
@@ -193,30 +230,110 @@ def test_every_weight_of_the_released_sizes_has_its_target_and_text_encoders_are
     path = GOLDEN / "state_dict_manifest.json"
     manifest = json.loads(path.read_text()) if path.is_file() else {}
     for name in (name for name in manifest if name.startswith(("mdm_", "mfm_", "flame_hml"))):
-        state = {key: torch.empty(shape, device="meta") for key, shape in manifest[name]["keys"].items()}
+        state = {
+            key: torch.empty(shape, device="meta") for key, shape in manifest[name]["keys"].items()
+        }
         if name.startswith("flame"):
-            released = import_flame(state | {"lm.embeddings.word_embeddings.weight": torch.empty(3)})
+            released = import_flame(
+                state | {"lm.embeddings.word_embeddings.weight": torch.empty(3)}
+            )
         else:
-            args: dict[str, Any] = {"arch": next((a for a in ("trans_dec", "gru") if a in name), "trans_enc")}
-            args |= {"emb_trans_dec": name.endswith("_emb"), "text_encoder_type": "bert" if "bert" in name else "clip"}
-            released = import_mdm(state | {"clip_model.positional_embedding": torch.empty(3)}, Options(**args))
+            args: dict[str, Any] = {
+                "arch": next((a for a in ("trans_dec", "gru") if a in name), "trans_enc")
+            }
+            args |= {
+                "emb_trans_dec": name.endswith("_emb"),
+                "text_encoder_type": "bert" if "bert" in name else "clip",
+            }
+            released = import_mdm(
+                state | {"clip_model.positional_embedding": torch.empty(3)}, Options(**args)
+            )
         action = 0 if released.action_embedding is None else released.action_embedding.numel()
-        assert sum(x.numel() for x in released.state.values()) + action == manifest[name]["n_params"], name
+        assert (
+            sum(x.numel() for x in released.state.values()) + action == manifest[name]["n_params"]
+        ), name
 
 
 MDM_ARGUMENTS = {
-    **{"arch": "trans_enc", "batch_size": 64, "cond_mask_prob": 0.1, "cuda": True, "data_dir": "", "device": 0},
-    **{"dataset": "humanml", "diffusion_steps": 1000, "emb_trans_dec": False, "eval_batch_size": 32, "seed": 10},
-    **{"eval_during_training": False, "eval_num_samples": 1000, "eval_rep_times": 3, "eval_split": "test"},
-    **{"lambda_fc": 0.0, "lambda_rcxyz": 0.0, "lambda_vel": 0.0, "latent_dim": 512, "layers": 8, "lr": 0.0001},
-    **{"log_interval": 1000, "lr_anneal_steps": 0, "noise_schedule": "cosine", "num_frames": 0, "use_ema": True},
-    **{"num_steps": 600000, "overwrite": False, "resume_checkpoint": "", "save_dir": "save/x", "weight_decay": 0.0},
-    **{"save_interval": 50000, "sigma_small": True, "train_platform_type": "NoPlatform", "unconstrained": False},
-    **{"text_encoder_type": "clip", "mask_frames": True, "pos_embed_max_len": 5000, "context_len": 0, "pred_len": 0},
-    **{"lambda_target_loc": 0.0, "multi_target_cond": False, "multi_encoder_type": "single", "target_enc_layers": 1},
-    **{"emb_policy": "add", "avg_model_beta": 0.9999, "adam_beta2": 0.999, "gen_during_training": False},
-    **{"gen_num_samples": 3, "gen_num_repetitions": 2, "gen_guidance_param": 2.5, "autoregressive": False},
-    **{"autoregressive_include_prefix": False, "autoregressive_init": "data", "target_joint_names": "DIMP_FINAL"},
+    **{
+        "arch": "trans_enc",
+        "batch_size": 64,
+        "cond_mask_prob": 0.1,
+        "cuda": True,
+        "data_dir": "",
+        "device": 0,
+    },
+    **{
+        "dataset": "humanml",
+        "diffusion_steps": 1000,
+        "emb_trans_dec": False,
+        "eval_batch_size": 32,
+        "seed": 10,
+    },
+    **{
+        "eval_during_training": False,
+        "eval_num_samples": 1000,
+        "eval_rep_times": 3,
+        "eval_split": "test",
+    },
+    **{
+        "lambda_fc": 0.0,
+        "lambda_rcxyz": 0.0,
+        "lambda_vel": 0.0,
+        "latent_dim": 512,
+        "layers": 8,
+        "lr": 0.0001,
+    },
+    **{
+        "log_interval": 1000,
+        "lr_anneal_steps": 0,
+        "noise_schedule": "cosine",
+        "num_frames": 0,
+        "use_ema": True,
+    },
+    **{
+        "num_steps": 600000,
+        "overwrite": False,
+        "resume_checkpoint": "",
+        "save_dir": "save/x",
+        "weight_decay": 0.0,
+    },
+    **{
+        "save_interval": 50000,
+        "sigma_small": True,
+        "train_platform_type": "NoPlatform",
+        "unconstrained": False,
+    },
+    **{
+        "text_encoder_type": "clip",
+        "mask_frames": True,
+        "pos_embed_max_len": 5000,
+        "context_len": 0,
+        "pred_len": 0,
+    },
+    **{
+        "lambda_target_loc": 0.0,
+        "multi_target_cond": False,
+        "multi_encoder_type": "single",
+        "target_enc_layers": 1,
+    },
+    **{
+        "emb_policy": "add",
+        "avg_model_beta": 0.9999,
+        "adam_beta2": 0.999,
+        "gen_during_training": False,
+    },
+    **{
+        "gen_num_samples": 3,
+        "gen_num_repetitions": 2,
+        "gen_guidance_param": 2.5,
+        "autoregressive": False,
+    },
+    **{
+        "autoregressive_include_prefix": False,
+        "autoregressive_init": "data",
+        "target_joint_names": "DIMP_FINAL",
+    },
     **{"external_mode": False},
 }
 """Names and defaults of the options of MDM's training, without the prefix and the targets of DiP."""
@@ -243,9 +360,25 @@ wandb: {project: motionfm}
 """
 """Names and defaults of the options of MFM's configuration."""
 FLAME_HYPERPARAMETERS = {
-    **{"diffusion_steps": 1000, "beta_schedule": "squaredcos_cap_v2", "schedule_sampler": "uniform", "lr": 0.0001},
-    **{"text_replace_prob": 0.25, "weight_decay": 0.0, "ema_start": 100, "ema_update": 10, "ema_decay": 0.99},
-    **{"sampling_strategy": "ddpm", "epoch_sample_every": 50, "sample_fps": 20, "sampling_length": 200},
+    **{
+        "diffusion_steps": 1000,
+        "beta_schedule": "squaredcos_cap_v2",
+        "schedule_sampler": "uniform",
+        "lr": 0.0001,
+    },
+    **{
+        "text_replace_prob": 0.25,
+        "weight_decay": 0.0,
+        "ema_start": 100,
+        "ema_update": 10,
+        "ema_decay": 0.99,
+    },
+    **{
+        "sampling_strategy": "ddpm",
+        "epoch_sample_every": 50,
+        "sample_fps": 20,
+        "sampling_length": 200,
+    },
     **{"sampling_texts": ["walking"], "guidance_scale": 8.0},
 }
 """Names and defaults of the hyperparameters of FLAME's Lightning module."""
@@ -254,22 +387,37 @@ FLAME_HYPERPARAMETERS = {
 def small_state(features: int = 3) -> dict[str, torch.Tensor]:
     """A state dict with the authors' names."""
     state = {"input_process.poseEmbedding.weight": torch.ones(8, features)}
-    state |= {"input_process.poseEmbedding.bias": torch.ones(8), "output_process.poseFinal.bias": torch.ones(features)}
+    state |= {
+        "input_process.poseEmbedding.bias": torch.ones(8),
+        "output_process.poseFinal.bias": torch.ones(features),
+    }
     state |= {"output_process.poseFinal.weight": torch.ones(features, 8)}
     for i in (0, 2):
         state[f"embed_timestep.time_embed.{i}.weight"] = torch.ones(8, 8)
         state[f"embed_timestep.time_embed.{i}.bias"] = torch.ones(8)
     layer = torch.nn.TransformerEncoderLayer(8, 4, 16)
-    return state | {f"seqTransEncoder.layers.0.{key}": value for key, value in layer.state_dict().items()}
+    return state | {
+        f"seqTransEncoder.layers.0.{key}": value for key, value in layer.state_dict().items()
+    }
 
 
 def test_every_weight_is_used_or_the_import_fails() -> None:
     state = small_state()
-    lacking = {key: value for key, value in state.items() if key != "seqTransEncoder.layers.0.linear2.bias"}
+    lacking = {
+        key: value for key, value in state.items() if key != "seqTransEncoder.layers.0.linear2.bias"
+    }
     short = state | {"seqTransEncoder.layers.0.linear1.bias": torch.ones(2)}
     for weights_, options, message in (
-        (state | {"embed_style.weight": torch.ones(1)}, Options(), r"unknown keys embed_style\.weight"),
-        (state, Options(arch="trans_dec"), r"unknown keys seqTransEncoder\.layers\.0\.linear1\.bias.* and 7 more"),
+        (
+            state | {"embed_style.weight": torch.ones(1)},
+            Options(),
+            r"unknown keys embed_style\.weight",
+        ),
+        (
+            state,
+            Options(arch="trans_dec"),
+            r"unknown keys seqTransEncoder\.layers\.0\.linear1\.bias.* and 7 more",
+        ),
         (lacking, Options(), r"Missing key.*transformer\.layers\.0\.feed_forward\.3\.bias"),
         ({}, Options(), r"output\.weight is missing"),
         (short, Options(), r"size mismatch for .*feed_forward\.0\.bias: .*\[2\].*\[16\]"),
@@ -288,14 +436,24 @@ def test_every_weight_is_used_or_the_import_fails() -> None:
         ),
         ("mdm", {"pred_len": 40}, "context_len=0, pred_len=40: both are positive"),
         ("mdm", {"emb_policy": "concat"}, "emb_policy=concat: known for trans_dec with bert"),
-        ("mdm", {"emb_before_mask": True}, "emb_before_mask=True: changes the model in a way that is not imported"),
-        ("mdm", {"rope_base": 100}, "rope_base=100: an unknown option, which may change the network"),
+        (
+            "mdm",
+            {"emb_before_mask": True},
+            "emb_before_mask=True: changes the model in a way that is not imported",
+        ),
+        (
+            "mdm",
+            {"rope_base": 100},
+            "rope_base=100: an unknown option, which may change the network",
+        ),
         ("mfm", {"model": {"skip_connections": True}}, "skip_connections=True: an unknown option"),
         ("mfm", {"ode_kwargs": {"order": 3}}, "ode_kwargs.order=3: an unknown option"),
         ("mfm", {"ode_kwargs": {"atol": "1e-3"}}, "ode_kwargs.atol=1e-3: changes the model"),
     ],
 )
-def test_options_that_change_a_released_model_are_refused(refused, tmp_path, kind, options, message):
+def test_options_that_change_a_released_model_are_refused(
+    refused, tmp_path, kind, options, message
+):
     words = released_file(tmp_path, small_state(150), {"dataset": "uestc", **options})
     refused("import", kind, *words, says=f"args.json: {message}")
 
@@ -303,7 +461,12 @@ def test_options_that_change_a_released_model_are_refused(refused, tmp_path, kin
 DIP_FILES = {
     "no target": ({"emb_policy": "ADD"}, "", {"memory": "add"}),
     "target": (
-        {"emb_policy": "CONCAT", "lambda_target_loc": 1.0, "multi_target_cond": True, "multi_encoder_type": "single"},
+        {
+            "emb_policy": "CONCAT",
+            "lambda_target_loc": 1.0,
+            "multi_target_cond": True,
+            "multi_encoder_type": "single",
+        },
         "state_single/",
         {"memory": "concat", "target_encoder": "single", "target_layers": 1},
     ),
@@ -320,7 +483,12 @@ def test_released_models_that_continue_frames(tmp_path, kind, averaged):
     state = weights(arrays) | (weights(arrays, encoder) if encoder else {})
     raw = {name: value + 1 for name, value in state.items()}
     names = ("arch", "text_encoder_type", "context_len", "pred_len", "mask_frames", "emb_trans_dec")
-    args = MDM_ARGUMENTS | {name: config[name] for name in names} | options | {"diffusion_steps": config["steps"]}
+    args = (
+        MDM_ARGUMENTS
+        | {name: config[name] for name in names}
+        | options
+        | {"diffusion_steps": config["steps"]}
+    )
     words = released_file(tmp_path, {"model": raw, "model_avg": state}, args)
     words += [f"stats={statistics_folder(tmp_path, 263)}", f"num_heads={config['num_heads']}"]
     assert main(["import", "mdm", *words, *([] if averaged else ["averaged=false"])]) == 0
@@ -330,13 +498,21 @@ def test_released_models_that_continue_frames(tmp_path, kind, averaged):
     assert {name: denoiser[name] for name in expected} == expected
     assert model.denoiser.context_frames == config["context_len"]
     assert model.block_frames == config["pred_len"]
-    assert (model.sampler_options.guidance_scale, model.sampler_options.num_inference_steps) == (7.5, config["steps"])
-    assert torch.equal(model.denoiser.input.bias, (state if averaged else raw)["input_process.poseEmbedding.bias"])  # type: ignore[union-attr]
+    assert (model.sampler_options.guidance_scale, model.sampler_options.num_inference_steps) == (
+        7.5,
+        config["steps"],
+    )
+    bias = (state if averaged else raw)["input_process.poseEmbedding.bias"]
+    assert torch.equal(model.denoiser.input.bias, bias)  # type: ignore[union-attr]
 
 
 def test_a_released_model_whose_options_name_a_missing_encoder_is_refused(refused, tmp_path):
-    words = released_file(tmp_path, small_state(150), {"dataset": "uestc", "lambda_target_loc": 1.0})
-    refused("import", "mdm", *words, says="model.pt: released weights: embed_target_cond is missing")
+    words = released_file(
+        tmp_path, small_state(150), {"dataset": "uestc", "lambda_target_loc": 1.0}
+    )
+    refused(
+        "import", "mdm", *words, says="model.pt: released weights: embed_target_cond is missing"
+    )
 
 
 @pytest.mark.parametrize("kind", ["flame", "mclip"])
@@ -358,15 +534,33 @@ def test_options_of_the_authors_codes_are_known(tmp_path):
 
 def test_options_of_mdm(tmp_path):
     state = small_state(150) | {"embed_action.action_embedding": torch.randn(12, 8)}
-    args = {"dataset": "humanact12", "cond_mask_prob": 0, "lambda_vel": 1.0, "diffusion_steps": 50, "num_frames": 40}
+    args = {
+        "dataset": "humanact12",
+        "cond_mask_prob": 0,
+        "lambda_vel": 1.0,
+        "diffusion_steps": 50,
+        "num_frames": 40,
+    }
     args |= {"noise_schedule": "linear", "sigma_small": False}
     assert main(["import", "mdm", *released_file(tmp_path, state, args)]) == 0
     model = load(tmp_path)
     options, process = model.sampler_options, model.config["process"]
     assert (model.facts["actions"][9], model.facts["max_frames"]) == ("phone", 40)
-    assert (options.guidance_scale, options.num_inference_steps, model.config["losses"]["velocity"]) == (1, 50, 1)
-    assert (process["num_train_timesteps"], process["schedule"], process["variance"]) == (50, "linear", "fixed_large")
-    assert generate(model, actions=["phone"], frames=24, num_inference_steps=3)[0].joints.shape == (24, 24, 3)
+    assert (
+        options.guidance_scale,
+        options.num_inference_steps,
+        model.config["losses"]["velocity"],
+    ) == (1, 50, 1)
+    assert (process["num_train_timesteps"], process["schedule"], process["variance"]) == (
+        50,
+        "linear",
+        "fixed_large",
+    )
+    assert generate(model, actions=["phone"], frames=24, num_inference_steps=3)[0].joints.shape == (
+        24,
+        24,
+        3,
+    )
 
 
 def test_options_of_mfm(tmp_path):
@@ -382,12 +576,17 @@ def test_options_of_mfm(tmp_path):
         assert main(["import", "mfm", *released_file(tmp_path, small_state(150), options)]) == 0
         model = load(tmp_path)
         process, losses = model.config["process"], model.config["losses"]
-        assert (model.sampler_options.sampler, model.sampler_options.num_inference_steps) == (sampler, steps)
+        assert (model.sampler_options.sampler, model.sampler_options.num_inference_steps) == (
+            sampler,
+            steps,
+        )
         assert (process["odeint_grid"], process["quantize_time"]) == (odeint_grid, True)
         assert (model.config["denoiser"]["num_heads"], losses["joints"]) == (2, 1)
 
 
-def test_averaged_weights_are_taken_and_models_that_attend_to_padding_are_sampled_at_their_length(tmp_path):
+def test_averaged_weights_are_taken_and_models_that_attend_to_padding_are_sampled_at_their_length(
+    tmp_path,
+):
     averaged = small_state(150)
     last = {key: value + 1 for key, value in averaged.items()}
     words = released_file(tmp_path, {"model": last, "model_avg": averaged}, {"dataset": "uestc"})
@@ -404,8 +603,18 @@ def test_averaged_weights_are_taken_and_models_that_attend_to_padding_are_sample
 def test_imports_that_cannot_be_are_one_line(refused, bad):
     statistics_folder(bad, 150)
     for kind, change, more, message in (
-        ("mdm", {}, [f"stats={bad}"], "model.pt: features of uestc are not normalized. Leave out stats=FOLDER"),
-        ("mdm", {"dataset": "humanml"}, [], "150 features, but not the 263 of humanml-legacy-smpl22"),
+        (
+            "mdm",
+            {},
+            [f"stats={bad}"],
+            "model.pt: features of uestc are not normalized. Leave out stats=FOLDER",
+        ),
+        (
+            "mdm",
+            {"dataset": "humanml"},
+            [],
+            "150 features, but not the 263 of humanml-legacy-smpl22",
+        ),
         (
             "mdm",
             {"dataset": "amass"},
@@ -421,13 +630,23 @@ def test_imports_that_cannot_be_are_one_line(refused, bad):
         refused("import", kind, *words, *more, says=message)
     state = {f"net.{key}": value for key, value in weights(golden("flame_text2motion")).items()}
     torch.save({"state_dict": state}, bad / "a.ckpt")
-    refused("import", "flame", str(bad / "a.ckpt"), f"out={bad}", says="lm.pooler.dense.weight is missing")
+    refused(
+        "import",
+        "flame",
+        str(bad / "a.ckpt"),
+        f"out={bad}",
+        says="lm.pooler.dense.weight is missing",
+    )
     assert not (bad / "ours.safetensors").exists()
 
 
 def test_statistics_have_to_fit(refused, bad):
     words = ["mdm", *released_file(bad, small_state(263), {"dataset": "humanml"}), f"stats={bad}"]
-    refused("import", *words[:-1], says="features of humanml3d are normalized. Give stats=FOLDER with Mean.npy")
+    refused(
+        "import",
+        *words[:-1],
+        says="features of humanml3d are normalized. Give stats=FOLDER with Mean.npy",
+    )
     refused("import", *words, says="Mean.npy: no such file")
     for name, value, says in (
         ("Mean.npy", np.zeros(251), "Mean.npy: shape (251,), expected (263,) finite numbers"),
@@ -439,7 +658,9 @@ def test_statistics_have_to_fit(refused, bad):
         refused("import", *words, says=says)
     statistics_folder(bad, 263)
     assert main(["import", *words]) == 0
-    assert np.array_equal(load(bad).representation.mean, np.load(bad / "Mean.npy").astype(np.float32))
+    assert np.array_equal(
+        load(bad).representation.mean, np.load(bad / "Mean.npy").astype(np.float32)
+    )
 
 
 def test_pickles_of_objects_are_read_on_demand_only(refused, bad):
@@ -466,7 +687,10 @@ def test_a_model_file_is_the_checkpoint(trained, data_root, tmp_path, capsys):
     torch.testing.assert_close(after.state_dict(), before.state_dict(), rtol=0, atol=0)
     assert after.facts == before.facts
     content = model_files.read_model_file(file)
-    assert model_files.read_model_file(hub.export(file, tmp_path / "again"))["origin"] == content["origin"]
+    assert (
+        model_files.read_model_file(hub.export(file, tmp_path / "again"))["origin"]
+        == content["origin"]
+    )
     assert (content["origin"]["steps"], content["config"]["data"]["root"]) == (2, "data")
     for path in (trained.parent.parent, data_root, tmp_path):
         assert str(path).encode() not in file.read_bytes(), "it tells where it was made"
@@ -485,9 +709,18 @@ def test_damaged_foreign_and_absent_files_are_one_line(trained, tmp_path):
     for content, message in (
         (whole[:-10], "damaged, or not a .safetensors file"),
         (bytes(flipped), "it has changed since it was written"),
-        (whole.replace(b'\\"steps\\": 2', b'\\"steps\\": 9'), "it has changed since it was written"),
-        (whole.replace(b'\\"format\\": 2', b'\\"format\\": 3'), "has format 3, but this version reads 2"),
-        (whole.replace(b'\\"format\\": 2', b'\\"format\\": 1'), "written by version 0.1 of flame_mdm"),
+        (
+            whole.replace(b'\\"steps\\": 2', b'\\"steps\\": 9'),
+            "it has changed since it was written",
+        ),
+        (
+            whole.replace(b'\\"format\\": 2', b'\\"format\\": 3'),
+            "has format 3, but this version reads 2",
+        ),
+        (
+            whole.replace(b'\\"format\\": 2', b'\\"format\\": 1'),
+            "written by version 0.1 of flame_mdm",
+        ),
         (whole.replace(b'\\"origin\\"', b'\\"oregon\\"'), "its recipe cannot be read"),
     ):
         assert content != whole
@@ -502,7 +735,10 @@ def test_damaged_foreign_and_absent_files_are_one_line(trained, tmp_path):
         (tmp_path / "empty", r"this folder holds no \.safetensors file"),
         (tmp_path, r"holds a\.safetensors, b\.safetensors\. Name the file"),
         ("nobody/model.ckpt", "no such checkpoint"),
-        ("nobody/model@v1", r"^nobody/model@v1: no such file or folder, and .* cannot be downloaded.*$"),
+        (
+            "nobody/model@v1",
+            r"^nobody/model@v1: no such file or folder, and .* cannot be downloaded.*$",
+        ),
     ):
         with one_line_error(message):
             load(name)
@@ -514,8 +750,15 @@ def test_push_writes_a_card_and_uploads_these_files_alone(trained, tmp_path, cap
     assert main([*words, "dry_run=true"]) == 0
     card, fingerprint = (folder / "README.md").read_text(), load(trained).facts["fingerprint"]
     assert card.startswith("---\nlicense: mit\n")
-    assert all(fact in card for fact in ('flame_mdm.load("me/walker")', "| data | synthetic |", fingerprint))
-    assert {path.name for path in folder.iterdir()} == {"README.md", "config.yaml", "model.safetensors"}
+    assert all(
+        fact in card
+        for fact in ('flame_mdm.load("me/walker")', "| data | synthetic |", fingerprint)
+    )
+    assert {path.name for path in folder.iterdir()} == {
+        "README.md",
+        "config.yaml",
+        "model.safetensors",
+    }
     model = model_files.read_model_file(folder / "model.safetensors")
     for dataset, terms in (("bandai", "license: cc-by-nc-4.0"), ("humanml3d", "license: other")):
         model["facts"]["dataset"] = dataset
@@ -532,17 +775,24 @@ def test_push_writes_a_card_and_uploads_these_files_alone(trained, tmp_path, cap
     assert "notes.txt" not in api.upload_folder.call_args.kwargs["allow_patterns"]
     capsys.readouterr()
     api.create_repo.side_effect = RuntimeError("no token\nlog in")
-    assert error_of(capsys, *words) == f"error: me/walker: upload failed: no token. The files are in {folder}"
+    assert (
+        error_of(capsys, *words)
+        == f"error: me/walker: upload failed: no token. The files are in {folder}"
+    )
 
 
 @pytest.mark.slow
 def test_a_model_is_sampled_without_importing_lightning_and_the_compiler():
     program = "import sys, flame_mdm; flame_mdm.generate(flame_mdm.load('quickstart'), 'a person walks', seconds=1)"
     slow = "{'lightning', 'torchmetrics', 'transformers', 'torch._dynamo', 'scipy.stats'}"
-    subprocess.run([sys.executable, "-c", f"{program}; assert not {slow} & {{*sys.modules}}"], check=True)
+    subprocess.run(
+        [sys.executable, "-c", f"{program}; assert not {slow} & {{*sys.modules}}"], check=True
+    )
 
 
 def test_a_folder_of_runs_names_the_runs_below_it(tmp_path):
     (tmp_path / "x" / "default" / "checkpoints").mkdir(parents=True)
-    with pytest.raises(UserError, match=r"x: no run, but there are runs below it\. Give one: .*x/default$"):
+    with pytest.raises(
+        UserError, match=r"x: no run, but there are runs below it\. Give one: .*x/default$"
+    ):
         find(tmp_path / "x")

@@ -36,7 +36,9 @@ def skating(motions: list[np.ndarray]) -> float:
 
 def peak(motions: list[np.ndarray]) -> float:
     """Mean of the maximum acceleration of a joint, in meters per squared frame."""
-    return float(np.mean([np.linalg.norm(np.diff(motion, n=2, axis=0), axis=-1).max() for motion in motions]))
+    return float(
+        np.mean([np.linalg.norm(np.diff(motion, n=2, axis=0), axis=-1).max() for motion in motions])
+    )
 
 
 def bones(motion: np.ndarray) -> np.ndarray:
@@ -45,7 +47,10 @@ def bones(motion: np.ndarray) -> np.ndarray:
 
 def test_real_motion_hardly_changes(clips):
     after = [cleanup(clip.motion, FPS, SMPL22) for clip in clips]
-    change = [np.linalg.norm(new - clip.motion, axis=-1).mean() for new, clip in zip(after, clips, strict=True)]
+    change = [
+        np.linalg.norm(new - clip.motion, axis=-1).mean()
+        for new, clip in zip(after, clips, strict=True)
+    ]
     assert np.mean(change) < 0.003
     assert skating(after) <= skating([clip.motion for clip in clips]) + 0.005
     for new, clip in zip(after, clips, strict=True):
@@ -57,7 +62,8 @@ def test_faults_are_repaired(clips):
     rng = np.random.default_rng(0)
     faulty = []
     for motion in real:
-        bad = motion + rng.normal(0, 0.008, motion.shape).astype(np.float32)  # trembling joints of changing bones
+        # Trembling joints of changing bones
+        bad = motion + rng.normal(0, 0.008, motion.shape).astype(np.float32)
         bad[..., 2] += 0.4 / FPS * np.arange(len(bad))[:, None]  # the body slides
         bad[-3, 18:] += 0.3  # the arms pop in one of the last frames
         faulty.append(bad)
@@ -77,7 +83,8 @@ def test_limbs_stay_above_the_floor_between_poses_that_differ_much():
     walk = walk + np.array([0, 0, crawl[-1, 0, 2]], np.float32)
     share = np.linspace(0, 1, 10, dtype=np.float32)[:, None, None]
     motion = np.concatenate([crawl, (1 - share) * crawl[-1] + share * walk[0], walk])
-    assert cleanup(motion, FPS, SMPL22)[..., 1].min() > motion[..., 1].min() - 0.02  # -0.2 without bent limbs
+    # -0.2 without bent limbs
+    assert cleanup(motion, FPS, SMPL22)[..., 1].min() > motion[..., 1].min() - 0.02
 
 
 def test_contacts_of_the_features_find_feet_that_slide_fast():
@@ -90,7 +97,9 @@ def test_contacts_of_the_features_find_feet_that_slide_fast():
     assert contacts is not None
     slides = representation.decode(features).numpy()
     slides[..., 2] += 1.8 / FPS * np.sin(2.5 * np.arange(len(slides)))[:, None]
-    guessed, with_features = (skating([cleanup(slides, FPS, SMPL22, c)]) for c in (None, contacts.numpy()))
+    guessed, with_features = (
+        skating([cleanup(slides, FPS, SMPL22, c)]) for c in (None, contacts.numpy())
+    )
     assert guessed > 0.05
     assert with_features < 0.02
 
@@ -114,7 +123,10 @@ def test_hands_leave_the_body_without_a_jolt(clips):
     pull = np.exp(-(((np.arange(len(motion)) - 25) / 7) ** 2))[:, None, None]
     motion = motion + pull * (draw_in(motion, 25) - motion)
     after = cleanup(motion, FPS, SMPL22)
-    kinds = [{fault.kind for fault in find_faults(Motion(x, FPS))} & {"inside", "pop"} for x in (motion, after)]
+    kinds = [
+        {fault.kind for fault in find_faults(Motion(x, FPS))} & {"inside", "pop"}
+        for x in (motion, after)
+    ]
     assert kinds == [{"inside"}, set()]
     jerk = [np.linalg.norm(np.diff(x, n=3, axis=0), axis=-1).mean() for x in (motion, after)]
     assert jerk[1] < 1.1 * jerk[0]
@@ -132,7 +144,11 @@ def test_any_length_and_skeleton():
 
 def test_what_no_longer_fits_is_dropped(tmp_path):
     motion = synthetic("walk")
-    motion.features, motion.contacts, motion.poses = np.zeros((9, 263)), np.zeros((9, 4), bool), motion.posed()
+    motion.features, motion.contacts, motion.poses = (
+        np.zeros((9, 263)),
+        np.zeros((9, 4), bool),
+        motion.posed(),
+    )
     after = cleaned(motion)
     assert (motion.cleanup, after.cleanup, after.poses, after.contacts) == (False, True, None, None)
     assert not after.features.size

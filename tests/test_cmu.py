@@ -34,7 +34,12 @@ def motionbuilder(tree: bvh.Bvh) -> bvh.Bvh:
     offsets = np.where(np.isin(tree.joints, lost)[:, None], 0, tree.offsets)
     pose = np.concatenate([tree.frames[:1, :3], np.zeros((1, tree.frames.shape[1] - 3))], 1)
     frames = np.concatenate([pose, tree.frames])
-    return replace(tree, joints=tuple(names.get(name, name) for name in tree.joints), offsets=offsets, frames=frames)
+    return replace(
+        tree,
+        joints=tuple(names.get(name, name) for name in tree.joints),
+        offsets=offsets,
+        frames=frames,
+    )
 
 
 def mapped(tree: bvh.Bvh, fields: dict) -> np.ndarray:
@@ -52,17 +57,27 @@ def folder(tmp_path: Path) -> Path:
     write_asf(motions / "02" / "02.asf")
     for seed, name in enumerate(("02_01", "02_02", "02_03")):
         write_amc(motions / "02" / f"{name}.amc", 400, seed)
-    bvh.write(motionbuilder(asf.read(motions / "02" / "02_02.amc", 120)), motions / "60" / "60_01.bvh")
+    bvh.write(
+        motionbuilder(asf.read(motions / "02" / "02_02.amc", 120)), motions / "60" / "60_01.bvh"
+    )
     rows = ["CMU/02/02_01_poses.npy,0,60,000001.npy", "CMU/02/02_02_poses.npy,6,66,000002.npy"]
     rows += ["CMU/9/9_1_poses.npy,0,60,000003.npy", "CMU/60/60_01_poses.npy,20,130,000004.npy"]
-    table = ["source_path,start_frame,end_frame,new_name", *rows, "KIT/3/x_poses.npy,0,99,000009.npy"]
+    table = [
+        "source_path,start_frame,end_frame,new_name",
+        *rows,
+        "KIT/3/x_poses.npy,0,99,000009.npy",
+    ]
     (clone / "index.csv").write_text("\n".join(table) + "\n")
     for name in ("000001", "000002", "000003", "000004"):
         for mirrored, side in (("", "left"), ("M", "right")):
             part = f"the {side} arm swings#the/DET arm/NOUN#0.5#2.75\n" * (name == "000002")
             text = f"a person walks to the {side}#a/DET person/NOUN#0.0#0.0\n{part}"
             (clone / "HumanML3D" / "texts" / f"{mirrored}{name}.txt").write_text(text)
-    for split, names in {"train": ("000001", "000003", "000004"), "val": (), "test": ("000002",)}.items():
+    for split, names in {
+        "train": ("000001", "000003", "000004"),
+        "val": (),
+        "test": ("000002",),
+    }.items():
         listed = [mark + name for name in names for mark in ("", "M")]
         (clone / "HumanML3D" / f"{split}.txt").write_text("\n".join(listed))
     sentence = {"duration": 400 / 120, "annotations": [{"text": "Somebody moves."}]}
@@ -92,7 +107,10 @@ def test_clips_have_their_motion_captions_and_splits(folder):
     recording = asf.read(folder / "motions/02/02_02.amc", 120)
     tree, fields = cmu.standardize(recording)
     joints = mapped(replace(tree, frames=tree.frames[::6]), fields)[6:66]
-    for name, motion in (("000002", joints), ("M000002", SMPL22.mirror(torch.from_numpy(joints)).numpy())):
+    for name, motion in (
+        ("000002", joints),
+        ("M000002", SMPL22.mirror(torch.from_numpy(joints)).numpy()),
+    ):
         expected = humanml.encode(torch.from_numpy(motion))
         np.testing.assert_allclose(store.motion(clips[name]), expected, atol=1e-5)
     assert clips["000004"].length == 109, "60 frames per second: 401 frames are 6.7 s"
@@ -114,15 +132,23 @@ def test_conversions_have_the_joints_of_the_original(folder):
     np.testing.assert_allclose(both[0], both[1], atol=1e-5)
     hips = both[0][:, [1, 2]].mean(1) - both[0][:, 0]
     scale = 0.82 / cmu.ADULT_LEG
-    assert np.linalg.norm(hips, axis=1) == pytest.approx(0.085 * scale, rel=1e-4), "SMPL's pelvis is above the hips"
+    assert np.linalg.norm(hips, axis=1) == pytest.approx(0.085 * scale, rel=1e-4), (
+        "SMPL's pelvis is above the hips"
+    )
 
 
 DAZ = {"hip": "", "abdomen": "hip", "chest": "abdomen", "neck": "chest", "head": "neck"}
 for mark in "lr":
     legs = ("Buttock", "Thigh", "Shin", "Foot", "Foot.end")
     arms = ("Collar", "Shldr", "ForeArm", "Hand")
-    DAZ |= {mark + name: mark + above if above else "hip" for name, above in zip(legs, ("", *legs), strict=False)}
-    DAZ |= {mark + name: mark + above if above else "chest" for name, above in zip(arms, ("", *arms), strict=False)}
+    DAZ |= {
+        mark + name: mark + above if above else "hip"
+        for name, above in zip(legs, ("", *legs), strict=False)
+    }
+    DAZ |= {
+        mark + name: mark + above if above else "chest"
+        for name, above in zip(arms, ("", *arms), strict=False)
+    }
 
 
 @pytest.mark.parametrize("kind", ["original", "conversion", "daz"])
@@ -148,20 +174,33 @@ def test_rotations_are_those_of_the_positions(folder):
     joints = SMPL().decode(torch.from_numpy(np.array(store.motion(clip)))).numpy()[:, :22]
     assert joints[..., 1].min() == pytest.approx(0, abs=0.06), "the adult body stands on the floor"
     speed = np.linalg.norm(np.diff(joints[:, 0], axis=0), axis=1) * 20
-    assert speed.mean() == pytest.approx(1.2 * cmu.ADULT_LEG / 0.82, rel=0.05), "and walks as it does, to its scale"
+    assert speed.mean() == pytest.approx(1.2 * cmu.ADULT_LEG / 0.82, rel=0.05), (
+        "and walks as it does, to its scale"
+    )
 
 
 def test_rates_of_1200_frames():
     """KIT-ML's duration decides, then HumanML3D's last frame, then CMU's list, then the file."""
-    cases = [(120.0, 10.0, None, True, 120), (120.0, 20.0, None, False, 60), (120.0, None, 201, False, 120)]
-    cases += [(120.0, None, 202, False, 60), (120.0, None, None, True, 60), (60.0, None, 390, False, 60)]
+    cases = [
+        (120.0, 10.0, None, True, 120),
+        (120.0, 20.0, None, False, 60),
+        (120.0, None, 201, False, 120),
+    ]
+    cases += [
+        (120.0, None, 202, False, 60),
+        (120.0, None, None, True, 60),
+        (60.0, None, 390, False, 60),
+    ]
     for *evidence, rate in [*cases, (None, None, None, False, 120)]:
         assert cmu.decide_rate(1200, *evidence) == rate, evidence
 
 
 def test_bad_recordings_are_listed_and_the_good_ones_prepared(folder, capsys):
     motions = folder / "motions"
-    files = {"02/02_01.amc": "version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "18_01.bvh": "known as bad"}
+    files = {
+        "02/02_01.amc": "version https://git-lfs.github.com/spec/v1\noid sha256:0\n",
+        "18_01.bvh": "known as bad",
+    }
     files["02/02_03.amc"] = (motions / "02/02_03.amc").read_text().replace("ltibia", "lshin", 1)
     files["02/02_02.bvh"] = "not read, the original is there"
     for name, text in files.items():
@@ -172,7 +211,11 @@ def test_bad_recordings_are_listed_and_the_good_ones_prepared(folder, capsys):
     assert re.search(r"left out: \S*/02_01\.amc", output)
     assert "lshin is no moving bone of the skeleton" in output
     assert "excluded: 1 recordings known to be bad" in output
-    assert Store(folder / "cmu-humanml-legacy-smpl22").info["clips"] == {"train": 2, "val": 0, "test": 5}
+    assert Store(folder / "cmu-humanml-legacy-smpl22").info["clips"] == {
+        "train": 2,
+        "val": 0,
+        "test": 5,
+    }
 
 
 TABLE = """id,begin,end,text,action,split
@@ -189,33 +232,56 @@ def test_captions_of_ones_own(folder, capsys):
     """In the folder of the motions or another one, without a clone of HumanML3D."""
     (folder / "mine").mkdir()
     (folder / "mine" / "captions.csv").write_text(TABLE)
-    words = ["data=cmu", f"source={folder / 'motions'}", f"data_root={folder}", "data.source.workers=1"]
-    assert main(["prepare", *words, f"data.source.captions={folder / 'mine'}"]) == 0, capsys.readouterr().err
+    words = [
+        "data=cmu",
+        f"source={folder / 'motions'}",
+        f"data_root={folder}",
+        "data.source.workers=1",
+    ]
+    assert main(["prepare", *words, f"data.source.captions={folder / 'mine'}"]) == 0, (
+        capsys.readouterr().err
+    )
     store = Store(folder / "cmu-humanml-legacy-smpl22")
     clips = {clip.id: clip for clip in store.clips}
     assert clips.keys() == {"02_01", "02_02@0.5-2.75", "60_01"}
     assert clips["02_01"].captions == ["a person walks", "somebody goes"]
     assert (clips["02_02@0.5-2.75"].split, clips["60_01"].split) == ("test", "val")
-    assert [store.info["actions"][clips[name].action] for name in sorted(clips)] == ["walk", "swing", "dance"]
+    assert [store.info["actions"][clips[name].action] for name in sorted(clips)] == [
+        "walk",
+        "swing",
+        "dance",
+    ]
     assert store.info["excluded"]["parts in captions.csv without their recording"] == 1
     assert clips["02_01"].split == "train"
     assert clips["60_01"].length > 100, "60 frames per second, without the T-pose"
     tree, fields = cmu.standardize(asf.read(folder / "motions/02/02_02.amc", 120))
     joints = mapped(replace(tree, frames=tree.frames[::6]), fields)[10:55]
-    read = {clip.id: clip for clip in cmu.CMU(str(folder / "motions"), str(folder / "mine"), workers=1).clips(20.0)}
+    read = {
+        clip.id: clip
+        for clip in cmu.CMU(str(folder / "motions"), str(folder / "mine"), workers=1).clips(20.0)
+    }
     np.testing.assert_allclose(read["02_02@0.5-2.75"].motion, joints, atol=1e-5)
 
 
 @pytest.mark.parametrize(
     ("row", "message"),
     [
-        ("walk,,,a,b,", "captions.csv, line 2: id 'walk' is not the name of a recording, such as 02_01"),
-        ("02_01,3,1,a,b,", "captions.csv, line 2: begin '3', end '1': not a part of a recording, in seconds"),
+        (
+            "walk,,,a,b,",
+            "captions.csv, line 2: id 'walk' is not the name of a recording, such as 02_01",
+        ),
+        (
+            "02_01,3,1,a,b,",
+            "captions.csv, line 2: begin '3', end '1': not a part of a recording, in seconds",
+        ),
         ("02_01,x,1,a,b,", "begin 'x', end '1': not numbers of seconds"),
         ("02_01,nan,1,a,b,", "begin 'nan', end '1': not numbers of seconds"),
         ("02_01,,,a,b,tset", "captions.csv, line 2: unknown split 'tset'"),
         ("02_01,,,,b,\n02_02,,,a,b,", "1 of 2 parts have no text, such as 02_01"),
-        ("02_01,,,a,b,\n02_01,,,a,c,", "captions.csv, line 3: 02_01 has two values of split, source or action"),
+        (
+            "02_01,,,a,b,\n02_01,,,a,c,",
+            "captions.csv, line 3: 02_01 has two values of split, source or action",
+        ),
         ("99_01,,,a,b,", "no captions of the recordings in"),
     ],
 )
@@ -248,7 +314,9 @@ def test_wrong_folders_get_one_line(folder):
 def real(tmp_path_factory):
     """Some files of the archive, unpacked into a folder that lives as long as the factory."""
     wanted = ("asf_amc/01.", "asf_amc/02", "daz_bvh/02_0", ".json", ".csv")
-    return archives.as_folder(ARCHIVE, tmp_path_factory, lambda name: any(part in name for part in wanted))
+    return archives.as_folder(
+        ARCHIVE, tmp_path_factory, lambda name: any(part in name for part in wanted)
+    )
 
 
 @needs_third_party
@@ -256,12 +324,16 @@ def real(tmp_path_factory):
 def test_angles_are_those_of_the_public_conversion(real):
     """The first frame of 02_03.bvh in https://github.com/una-dinosauria/cmu-mocap: Euler angles z, y, x."""
     motion = asf.read(real / "asf_amc/02_03.amc", 120)
-    expected: dict[str, tuple[float, ...]] = {"root": (9.2872, 16.95, -34.2762, 1.1618, 3.3939, 8.2094)}
+    expected: dict[str, tuple[float, ...]] = {
+        "root": (9.2872, 16.95, -34.2762, 1.1618, 3.3939, 8.2094)
+    }
     expected |= {"rtoes": (-1.1835, 6.9042, -19.4319), "lradius": (128.0347, -53.758, -92.2485)}
     expected |= {"lowerneck": (-2.7887, 3.2343, -15.4607)}
     columns = dict(zip(motion.joints, motion.columns(), strict=True))
     for name, angles in expected.items():
-        np.testing.assert_allclose(motion.frames[0, columns[name]], angles, atol=1.1e-4, err_msg=name)
+        np.testing.assert_allclose(
+            motion.frames[0, columns[name]], angles, atol=1.1e-4, err_msg=name
+        )
 
 
 @needs_third_party
@@ -269,7 +341,9 @@ def test_angles_are_those_of_the_public_conversion(real):
 def test_the_archive(real):
     """Rates as CMU lists them; Daz-friendly files agree with the original ones at the same bone lengths."""
     listed = json.loads((real / "cmu_fps.json").read_text())
-    assert {t for t, entry in listed.items() if entry["fps"] == 60} == {t for t in listed if is_at_60(t)}
+    assert {t for t, entry in listed.items() if entry["fps"] == 60} == {
+        t for t in listed if is_at_60(t)
+    }
     names = ["02_04", "02_05", "02_07", "02_08", "02_09"]
     for name in names:
         whole = cmu.Item("a", "test", "a", [])
@@ -281,5 +355,9 @@ def test_the_archive(real):
         joints = [SMPL22.assemble(bone, torch.zeros(len(bone), 3).double()) for bone in same]
         assert float(torch.linalg.vector_norm(joints[0] - joints[1], dim=-1).mean()) < 0.02, name
     clips = {clip.id: clip for clip in cmu.CMU(str(real), workers=1).clips(20)}
-    assert {"000327", "M000327", "kit02278"} & clips.keys() == {"000327", "M000327"}, "02_06 takes 18 seconds"
-    assert clips["kit02279"].captions == ["A person is doing sidewards punches like with paddle at ping-pong."]
+    assert {"000327", "M000327", "kit02278"} & clips.keys() == {"000327", "M000327"}, (
+        "02_06 takes 18 seconds"
+    )
+    assert clips["kit02279"].captions == [
+        "A person is doing sidewards punches like with paddle at ping-pong."
+    ]

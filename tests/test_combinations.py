@@ -15,12 +15,22 @@ from flame_mdm.processes.flow_matching import FlowMatching
 from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.task import GeneratorTask
 
-TINY = {"latent_dim": 16, "ff_size": 16, "num_layers": 1, "num_heads": 2, "channels": [8, 8], "num_groups": 4}
+TINY = {
+    "latent_dim": 16,
+    "ff_size": 16,
+    "num_layers": 1,
+    "num_heads": 2,
+    "channels": [8, 8],
+    "num_groups": 4,
+}
 CONTEXT = 3
 TINY |= {"context_frames": CONTEXT}
 FLOW = "flow_matching"
 PROCESSES = {
-    **{prediction: {"process": "diffusion", "prediction": prediction} for prediction in ("x0", "epsilon", "velocity")},
+    **{
+        prediction: {"process": "diffusion", "prediction": prediction}
+        for prediction in ("x0", "epsilon", "velocity")
+    },
     **{"learned_range": {"process": "flame"}, FLOW: {"process": FLOW}},
 }
 CALLS_A_STEP = {"midpoint": 2, "heun": 2, "rk4": 4}
@@ -60,10 +70,16 @@ def build(denoiser: str, process: str, condition: str = "learned") -> GeneratorT
     config["process"] = part("process", options.pop("process")) | options
     if "num_train_timesteps" in config["process"]:
         config["process"]["num_train_timesteps"] = 10
-    config["condition"] = part("condition", condition) | ({} if condition == "none" else {"features": 16})
+    config["condition"] = part("condition", condition) | (
+        {} if condition == "none" else {"features": 16}
+    )
     if condition == "action" and "project_condition" in parameters(config["denoiser"]["_target_"]):
         config["denoiser"] = config["denoiser"] | {"project_condition": False}
-    config["task"] = config["task"] | {"cond_drop_prob": 0.5, "guidance_scale": 2.5, "num_inference_steps": 4}
+    config["task"] = config["task"] | {
+        "cond_drop_prob": 0.5,
+        "guidance_scale": 2.5,
+        "num_inference_steps": 4,
+    }
     config["task"]["sampler"] = samplers(process)[0]
     if "target_encoder" in config["denoiser"]:
         config["task"]["targets"] = recipe("task=generation_targets")["task"]["targets"]
@@ -76,7 +92,9 @@ def build(denoiser: str, process: str, condition: str = "learned") -> GeneratorT
     return task
 
 
-def generated(task: GeneratorTask, motions: MotionBatch, options: SamplerOptions | None = None) -> Tensor:
+def generated(
+    task: GeneratorTask, motions: MotionBatch, options: SamplerOptions | None = None
+) -> Tensor:
     """Samples motions; those of a denoiser with a context continue the same random frames."""
     x = torch.randn(CONTEXT, 263, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     prefix = x.expand(len(motions), -1, -1) if task.generator.denoiser.context_frames else None
@@ -90,7 +108,13 @@ def samplers(process: str) -> list[str]:
 def batch(rows: slice = slice(None), frames: int | None = None) -> MotionBatch:
     """Motions of mixed lengths; `rows` chooses some, `frames` pads further."""
     mask = length_mask(torch.tensor(LENGTHS)[rows], frames)
-    x = torch.randn(len(LENGTHS), max(LENGTHS), 263, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    x = torch.randn(
+        len(LENGTHS),
+        max(LENGTHS),
+        263,
+        generator=torch.Generator().manual_seed(1),
+        dtype=torch.float64,
+    )
     x = torch.nn.functional.pad(x, (0, 0, 0, 20))[rows, : mask.shape[1]] * mask[..., None]
     ids = [f"motion {i}" for i in range(len(LENGTHS))][rows]
     return MotionBatch(x, mask, ids, TEXTS[rows], torch.arange(len(LENGTHS))[rows])
@@ -105,8 +129,11 @@ PAIRS = [(process, "learned") for process in PROCESSES] + [("x0", "action"), ("x
 @each_denoiser
 def test_trains_and_samples(denoiser, process, condition, monkeypatch):
     task, motions = build(denoiser, process, condition), batch()
-    if condition == "none" and DENOISERS[denoiser].get("max_tokens"):  # reads tokens in place of the pooled vector
-        with pytest.raises(ValueError, match="needs condition tokens, but the condition encoder has none"):
+    # Reads tokens in place of the pooled vector
+    if condition == "none" and DENOISERS[denoiser].get("max_tokens"):
+        with pytest.raises(
+            ValueError, match="needs condition tokens, but the condition encoder has none"
+        ):
             generated(task, motions)
         return
     logged: dict[str, Tensor] = {}
@@ -119,7 +146,11 @@ def test_trains_and_samples(denoiser, process, condition, monkeypatch):
         loss = task.training_step(motions, step)
         assert loss.isfinite()
         loss.backward()
-        reached |= {name for name, p in task.named_parameters() if p.grad is not None and p.grad.abs().sum() > 0}
+        reached |= {
+            name
+            for name, p in task.named_parameters()
+            if p.grad is not None and p.grad.abs().sum() > 0
+        }
         optimizer.step()
     assert reached == {name for name, _ in task.named_parameters()}, "parameters without a gradient"
     assert {"train/loss", "train/mse"} <= logged.keys()
@@ -144,14 +175,20 @@ def test_a_motion_does_not_depend_on_padding_or_neighbors(denoiser, process):
             torch.testing.assert_close(other, together[row, :length], rtol=0, atol=1e-8)
 
 
-@pytest.mark.parametrize(("process", "sampler"), [(p, s) for p in ("x0", FLOW) for s in samplers(p)])
+@pytest.mark.parametrize(
+    ("process", "sampler"), [(p, s) for p in ("x0", FLOW) for s in samplers(p)]
+)
 def test_one_encoding_a_run_and_one_forward_a_call(process, sampler):
     for guidance_scale, copies in ((2.5, 2), (1.0, 1)):
         task, encodings, forwards = build("mdm_decoder_text", process), [], []
         model = task.generator
         model.condition.register_forward_hook(lambda *_, calls=encodings: calls.append(1))
-        model.denoiser.register_forward_hook(lambda _, x, __, calls=forwards: calls.append(len(x[0])))
-        options = SamplerOptions(sampler=sampler, num_inference_steps=5, guidance_scale=guidance_scale)
+        model.denoiser.register_forward_hook(
+            lambda _, x, __, calls=forwards: calls.append(len(x[0]))
+        )
+        options = SamplerOptions(
+            sampler=sampler, num_inference_steps=5, guidance_scale=guidance_scale
+        )
         model.generate(batch(), options)
         assert len(encodings) == 1
         assert set(forwards) == {copies * len(LENGTHS)}

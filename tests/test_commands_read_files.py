@@ -36,8 +36,14 @@ class Row:
 LYING = "the body is lying down"
 ROWS = {
     "f01_stageii.npz": [Row(STANDS)],
-    "f02_y_up.npz": [Row(LIES, f"{LYING}.*up=y", refused_by_prepare=LYING), Row(STANDS, keys={"up": "y"})],
-    "f03_z_up.bvh": [Row(LIES, f"{LYING}.*up=z", refused_by_prepare=LYING), Row(STANDS, keys={"up": "z"})],
+    "f02_y_up.npz": [
+        Row(LIES, f"{LYING}.*up=y", refused_by_prepare=LYING),
+        Row(STANDS, keys={"up": "y"}),
+    ],
+    "f03_z_up.bvh": [
+        Row(LIES, f"{LYING}.*up=z", refused_by_prepare=LYING),
+        Row(STANDS, keys={"up": "z"}),
+    ],
     "f03_swapped_sides.bvh": [Row("", "the toes point backwards. Exchange left and right")],
     "f04_rotmat_216.npz": [Row("", "216.*rotation matrices: convert them to axis-angle")],
     "f05_json_z_up.json": [Row(STANDS), Row(STANDS, keys={"up": "z"})],
@@ -45,10 +51,14 @@ ROWS = {
     "f09_names_with_spaces.bvh": [Row(STANDS)],
     "f09_prefix_underscore.bvh": [Row(STANDS)],
     "f09_smpl_capital.bvh": [Row(STANDS)],
-    "f12_thirty_joints.npz": [Row("", "30 joints, not those of SOMA.*Write the names of all joints.*skeleton.yaml")],
+    "f12_thirty_joints.npz": [
+        Row("", "30 joints, not those of SOMA.*Write the names of all joints.*skeleton.yaml")
+    ],
     "f12_body_only_66.npz": [Row(STANDS)],
     "f12_rate_of_one_element.npz": [Row(STANDS)],
-    "f13_shorter_person.npz": [Row(STANDS, r"the feet are \d cm below the floor.*the body in the file is smaller")],
+    "f13_shorter_person.npz": [
+        Row(STANDS, r"the feet are \d cm below the floor.*the body in the file is smaller")
+    ],
     "f14_two_people.bvh": [Row(STANDS, "2 people in the file")],
     "f15_half.npz": [Row(STANDS)],
     "f18_git_lfs_pointer.bvh": [Row("", "a Git LFS pointer.*git lfs pull")],
@@ -58,16 +68,22 @@ CASES = [(name, row) for name, rows in ROWS.items() for row in rows]
 
 
 def check_convert(path: Path, row: Row, expected: float, out: Path, capsys) -> None:
-    code = main(["convert", str(path), str(out), *(f"{key}={value}" for key, value in row.keys.items())])
+    code = main(
+        ["convert", str(path), str(out), *(f"{key}={value}" for key, value in row.keys.items())]
+    )
     printed = "".join(capsys.readouterr())
     assert re.search(row.says, printed, re.DOTALL), printed
     assert (code == 0) == out.exists() == bool(row.result)
     if row.result:
         height = head_height(np.load(out))
-        assert (height < 0.5) if row.result == LIES else (height == pytest.approx(expected, abs=0.02))
+        assert (
+            (height < 0.5) if row.result == LIES else (height == pytest.approx(expected, abs=0.02))
+        )
 
 
-@pytest.mark.parametrize(("name", "row"), CASES, ids=[f"{name} {row.keys or ''}" for name, row in CASES])
+@pytest.mark.parametrize(
+    ("name", "row"), CASES, ids=[f"{name} {row.keys or ''}" for name, row in CASES]
+)
 def test_every_command_reads_or_refuses_a_file_alike(name: str, row: Row, tmp_path: Path, capsys):
     folder = tmp_path / "in"
     folder.mkdir()
@@ -83,7 +99,9 @@ def test_every_command_reads_or_refuses_a_file_alike(name: str, row: Row, tmp_pa
     assert code in ((0, 3) if row.result else (1,))
 
     if row.keys:
-        (folder / "skeleton.yaml").write_text("".join(f"{key}: {value}\n" for key, value in row.keys.items()))
+        (folder / "skeleton.yaml").write_text(
+            "".join(f"{key}: {value}\n" for key, value in row.keys.items())
+        )
     words = [f"source={folder}", f"data_root={tmp_path}", "check=true", "data.source.workers=1"]
     code = main(["prepare", "folder", *words])
     printed = "".join(capsys.readouterr())
@@ -108,20 +126,43 @@ def test_a_character_that_is_compressed_is_refused(tmp_path: Path, capsys):
     COLLECTED["f09_smpl_capital.bvh"](tmp_path / "a.bvh")
     COLLECTED["f11_meshopt.glb"](tmp_path / "b.glb")
     for character in [tmp_path / "b.glb", *([FILES / "f11_meshopt.glb"] if FILES.exists() else [])]:
-        assert main(["convert", str(tmp_path / "a.bvh"), str(tmp_path / "o.glb"), f"character={character}"]) == 1
+        assert (
+            main(
+                [
+                    "convert",
+                    str(tmp_path / "a.bvh"),
+                    str(tmp_path / "o.glb"),
+                    f"character={character}",
+                ]
+            )
+            == 1
+        )
         assert "it requires EXT_meshopt_compression" in capsys.readouterr().err
 
 
-FOLDERS = {  # what check says and its exit code; the motions that `convert` writes and its exit code
+# What check says and its exit code; the motions that `convert` writes and its exit code
+FOLDERS = {
     "f02_folder": ("2 clips can be prepared", 0, ["a", "b"], 0),
-    "f07_check_rc": (r"bad\.bvh, line 164: .* 1 of 2 motions of .* cannot be prepared", 1, ["good"], 1),
-    "f07_one_frame": (r"rest\.bvh: 1 frames at 20 .* 1 of 2 motions of .* cannot be prepared", 1, ["rest", "walk"], 0),
+    "f07_check_rc": (
+        r"bad\.bvh, line 164: .* 1 of 2 motions of .* cannot be prepared",
+        1,
+        ["good"],
+        1,
+    ),
+    "f07_one_frame": (
+        r"rest\.bvh: 1 frames at 20 .* 1 of 2 motions of .* cannot be prepared",
+        1,
+        ["rest", "walk"],
+        0,
+    ),
     "f08_batch": (r"b\.bvh, line 4: .* 1 of 3 motions of .* cannot be prepared", 1, ["a", "c"], 1),
     "f08_macos": ("1 clips can be prepared", 0, ["a"], 0),
 }
 
 
-@pytest.mark.skipif(not FILES.exists(), reason="the files of other programs are outside of the repository")
+@pytest.mark.skipif(
+    not FILES.exists(), reason="the files of other programs are outside of the repository"
+)
 @pytest.mark.parametrize("name", FOLDERS)
 def test_folders_of_the_collection(name: str, tmp_path: Path, capsys):
     says, code, converted, converts = FOLDERS[name]
@@ -131,7 +172,9 @@ def test_folders_of_the_collection(name: str, tmp_path: Path, capsys):
     assert re.search(says, printed, re.DOTALL), printed
     assert main(["convert", str(FILES / name), str(tmp_path / "out"), "format=npy"]) == converts
     assert sorted(path.stem for path in (tmp_path / "out").iterdir()) == converted
-    assert main(["inspect", str(FILES / name), str(tmp_path / "page.html")]) in ((1,) if converts else (0, 3))
+    assert main(["inspect", str(FILES / name), str(tmp_path / "page.html")]) in (
+        (1,) if converts else (0, 3)
+    )
     assert (tmp_path / "page.html").exists()
     if name == "f02_folder":
         assert head_height(np.load(tmp_path / "out" / "a.npy")) == pytest.approx(1.57, abs=0.02)

@@ -23,7 +23,9 @@ def three(tmp_path) -> list[Path]:
     first = a_run(tmp_path / "a", name="one", optimizer={"lr": 0.1, "same": 1})
     second = a_run(tmp_path / "b", name="two", optimizer={"lr": 0.2, "same": 1}, extra="<em>")
     third = a_run(tmp_path / "c", name="three", optimizer={"lr": 0.2, "same": 1})
-    for at, (folder, prompts) in enumerate([(first, PROMPTS), (second, PROMPTS[::-1]), (third, PROMPTS[1:])], 1):
+    for at, (folder, prompts) in enumerate(
+        [(first, PROMPTS), (second, PROMPTS[::-1]), (third, PROMPTS[1:])], 1
+    ):
         motions(folder / "samples" / "step_0000009", prompts, at)
     return [first, second, third]
 
@@ -38,7 +40,9 @@ def test_a_page_puts_runs_side_by_side(three, tmp_path):
     put(three[1], values={"fid": {"mean": 7.5, "ci": 0.5, "replications": 2, "n": 64}}, quick=True)
     put(three[1], "y", split="val")
     text = page(three, tmp_path / "out.html")
-    table = text[text.index("Configuration differences") : text.index("Motions for the same prompts")]
+    table = text[
+        text.index("Configuration differences") : text.index("Motions for the same prompts")
+    ]
     assert "<td>optimizer.lr</td><td>0.1</td><td>0.2</td>" in table
     assert "<td>extra</td><td>–</td><td>&lt;em&gt;</td>" in table
     assert "same" not in table
@@ -46,8 +50,12 @@ def test_a_page_puts_runs_side_by_side(three, tmp_path):
     (scene,) = players(text)
     labels = ["mine/one", "mine/two", "mine/three"]
     names = [(motion["caption"], motion["id"]) for motion in scene]
-    assert names == [(prompt, label) for prompt in PROMPTS[1:] for label in labels], "prompts that all have"
-    assert [round(motion["center"][0] - 0.5) for motion in scene] == [1, 2, 3] * 2, "each under its own name"
+    assert names == [(prompt, label) for prompt in PROMPTS[1:] for label in labels], (
+        "prompts that all have"
+    )
+    assert [round(motion["center"][0] - 0.5) for motion in scene] == [1, 2, 3] * 2, (
+        "each under its own name"
+    )
     assert text.count("<h3>p version 3") == 2, "splits are not compared"
     for words in ("7.5 ± 0.5", "Quick run — not for publication", "mine/one 0.001953"):
         assert words in text, words
@@ -79,7 +87,12 @@ def test_differences_are_shown_or_not(three, tmp_path, capsys):
     assert low < -0.2967 < high < 0
     assert lines["jitter"][-3:] == lines["static"][-3:] == ["no", "difference", "shown"]
     assert lines["few"] == ["few", "1", "–", "not", "tested:", "one", "replication"]
-    marks = "[2] mine/two − [1] mine/one", "-0.2967", "no difference shown", "do not cover another training run"
+    marks = (
+        "[2] mine/two − [1] mine/one",
+        "-0.2967",
+        "no difference shown",
+        "do not cover another training run",
+    )
     assert all(words in text for words in marks)
 
 
@@ -97,9 +110,18 @@ def test_what_is_not_paired_has_no_difference(three, tmp_path, capsys):
     for changes, message in (
         (None, "No evaluation in common"),
         ({"seed": 1}, "not compared: other seed"),
-        ({"data": result()["data"] | {"frames": [24, 40]}}, "not compared: other seed, limits of length or skeleton"),
-        ({"invalid_because": ["real motions are off"]}, "not compared: not valid: real motions are off"),
-        ({"values": {"fid": of(4.2, [4.1, 4.3], n=65)}}, "not compared: no metric has values per replication"),
+        (
+            {"data": result()["data"] | {"frames": [24, 40]}},
+            "not compared: other seed, limits of length or skeleton",
+        ),
+        (
+            {"invalid_because": ["real motions are off"]},
+            "not compared: not valid: real motions are off",
+        ),
+        (
+            {"values": {"fid": of(4.2, [4.1, 4.3], n=65)}},
+            "not compared: no metric has values per replication",
+        ),
         ({"values": result()["values"]}, "evaluate both again; motions are not generated again"),
         ({"protocol": {"name": "q", "version": 3}}, "q version 3, synthetic test, data abc"),
         ({"extractor": {"sha256": "0" * 64}}, "No evaluation in common"),
@@ -114,13 +136,28 @@ def test_what_is_not_paired_has_no_difference(three, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_runs_are_sampled_for_prompts_or_for_the_captions_of_a_folder_of_motions(tmp_path, trained, data_root, capsys):
+def test_runs_are_sampled_for_prompts_or_for_the_captions_of_a_folder_of_motions(
+    tmp_path, trained, data_root, capsys
+):
     model, other = trained.parent.parent, tmp_path / "b"
-    words = [*TINY, f"data_root={data_root}", f"run.dir={other}", "run.name=longer", "trainer.max_steps=4"]
-    assert main(["train", "quickstart", *words, "callbacks.samples=null", "callbacks.best=null"]) == 0
+    words = [
+        *TINY,
+        f"data_root={data_root}",
+        f"run.dir={other}",
+        "run.name=longer",
+        "trainer.max_steps=4",
+    ]
+    assert (
+        main(["train", "quickstart", *words, "callbacks.samples=null", "callbacks.best=null"]) == 0
+    )
     (tmp_path / "prompts.txt").write_text("a person hops\n\na person walks\na person hops\n")
     (scene,) = players(
-        page([model, other], tmp_path / "out.html", f"prompts={tmp_path / 'prompts.txt'}", "seconds=1.5")
+        page(
+            [model, other],
+            tmp_path / "out.html",
+            f"prompts={tmp_path / 'prompts.txt'}",
+            "seconds=1.5",
+        )
     )
     assert [motion["id"] for motion in scene] == ["quickstart", "quickstart/longer"] * 2
     assert [motion["caption"] for motion in scene[::2]] == ["a person hops", "a person walks"]
@@ -129,7 +166,13 @@ def test_runs_are_sampled_for_prompts_or_for_the_captions_of_a_folder_of_motions
 
     real = tmp_path / "real"
     real.mkdir()
-    files = [("a person walks", 20), ("a person jumps", 25), ("a person walks", 20), ("", 20), ("a person turns", 90)]
+    files = [
+        ("a person walks", 20),
+        ("a person jumps", 25),
+        ("a person walks", 20),
+        ("", 20),
+        ("a person turns", 90),
+    ]
     joints = np.random.default_rng(0).random((90, 22, 3)).astype(np.float32)
     for number, (text, frames) in enumerate(files):
         np.savez(real / f"motion_{number:03d}.npz", joints=joints[:frames], fps=10.0, text=text)
@@ -140,9 +183,16 @@ def test_runs_are_sampled_for_prompts_or_for_the_captions_of_a_folder_of_motions
     assert names == [(text, label) for text in texts for label in ("quickstart", "real")]
     generated = scene[::2]
     assert [motion["frames"] for motion in scene[1::2]] == [20, 25, 20, 90]
-    assert [motion["frames"] for motion in generated] == [40, 50, 40, 60], "as long, at 20 frames per second"
-    assert generated[0]["joints"] != generated[2]["joints"], "two motions for a prompt that is there twice"
-    assert "1 of 4 motions are shortened to 3 seconds, the maximum length for quickstart" in capsys.readouterr().out
+    assert [motion["frames"] for motion in generated] == [40, 50, 40, 60], (
+        "as long, at 20 frames per second"
+    )
+    assert generated[0]["joints"] != generated[2]["joints"], (
+        "two motions for a prompt that is there twice"
+    )
+    assert (
+        "1 of 4 motions are shortened to 3 seconds, the maximum length for quickstart"
+        in capsys.readouterr().out
+    )
 
     items = data_of(page([model, real], tmp_path / "rate.html", "rate=true"))["items"]
     assert sorted(item["prompt"] for item in items) == sorted(texts)
@@ -155,7 +205,9 @@ def test_runs_are_sampled_for_prompts_or_for_the_captions_of_a_folder_of_motions
 def test_folders_of_motions_are_compared_without_a_run(tmp_path):
     folders = [motions(tmp_path / name / "walks", PROMPTS, at) for at, name in enumerate("ab")]
     (scene,) = players(page(folders, tmp_path / "out.html"))
-    assert {motion["id"] for motion in scene} == {str(folder) for folder in folders}, "by path: both are called walks"
+    assert {motion["id"] for motion in scene} == {str(folder) for folder in folders}, (
+        "by path: both are called walks"
+    )
     text = (tmp_path / "out.html").read_text()
     assert "Configuration differences" not in text
     assert "No evaluation in common" not in text
@@ -165,7 +217,9 @@ def test_a_rating_page_hides_whose_motions_it_shows(three, tmp_path):
     text = page(three, tmp_path / "rate.html", "rate=true")
     assert "Which animation better fits the following description?" in text
     items = data_of(text)["items"]
-    pairs = [("mine/two", prompt) for prompt in PROMPTS] + [("mine/three", prompt) for prompt in PROMPTS[1:]]
+    pairs = [("mine/two", prompt) for prompt in PROMPTS] + [
+        ("mine/three", prompt) for prompt in PROMPTS[1:]
+    ]
     assert sorted((item["b"], item["prompt"]) for item in items) == sorted(pairs)
     for item in items:
         scene = data_of(item["player"])
@@ -173,7 +227,9 @@ def test_a_rating_page_hides_whose_motions_it_shows(three, tmp_path):
         assert not any(motion["caption"] for motion in scene)
         assert not any(label in item["player"] for label in ("mine/one", "mine/two", "mine/three"))
         left, right = (motion["center"][0] for motion in scene)
-        assert (left < right) == (item["left"] == "a"), "a is the first run, which stands at the smallest x"
+        assert (left < right) == (item["left"] == "a"), (
+            "a is the first run, which stands at the smallest x"
+        )
     assert page(three, tmp_path / "again.html", "rate=true") == text
 
 
@@ -181,12 +237,16 @@ def test_sides_and_order_are_drawn(tmp_path):
     prompts = tuple(f"prompt {number}" for number in range(24))
     folders = [motions(tmp_path / name, prompts, at) for name, at in (("a", 0), ("b", 1))]
     out = tmp_path / "rate.html"
-    first, other = (data_of(page(folders, out, "rate=true", f"seed={seed}"))["items"] for seed in (0, 1))
+    first, other = (
+        data_of(page(folders, out, "rate=true", f"seed={seed}"))["items"] for seed in (0, 1)
+    )
     for items in (first, other):
         assert 5 < sum(item["left"] == "a" for item in items) < 19
         assert [item["prompt"] for item in items] != list(prompts)
     assert [item["prompt"] for item in first] != [item["prompt"] for item in other]
-    assert {item["prompt"]: item["left"] for item in first} != {item["prompt"]: item["left"] for item in other}
+    assert {item["prompt"]: item["left"] for item in first} != {
+        item["prompt"]: item["left"] for item in other
+    }
 
 
 def test_only_runs_with_a_common_prompt_are_rated(tmp_path, capsys):
@@ -197,8 +257,12 @@ def test_only_runs_with_a_common_prompt_are_rated(tmp_path, capsys):
     assert not (tmp_path / "rate.html").exists()
 
 
-def ratings(path: Path, choices: str, rater: str = "ann", a: str = "ours", b: str = "real", study: str = "s") -> Path:
-    answers = [{"prompt": f"p{k}", "a": a, "b": b, "choice": choice} for k, choice in enumerate(choices)]
+def ratings(
+    path: Path, choices: str, rater: str = "ann", a: str = "ours", b: str = "real", study: str = "s"
+) -> Path:
+    answers = [
+        {"prompt": f"p{k}", "a": a, "b": b, "choice": choice} for k, choice in enumerate(choices)
+    ]
     path.write_text(json.dumps({"format": 1, "study": study, "rater": rater, "ratings": answers}))
     return path
 

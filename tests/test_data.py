@@ -43,7 +43,9 @@ def root(tmp_path_factory) -> Path:
 
 def module(root: Path, crop: Crop, **options: Any) -> MotionDataModule:
     source = Synthetic(clips=40, seed=1)
-    return MotionDataModule(source, HumanML(), root=str(root), name="s", batch_size=4, crop=crop, **options)
+    return MotionDataModule(
+        source, HumanML(), root=str(root), name="s", batch_size=4, crop=crop, **options
+    )
 
 
 @pytest.fixture
@@ -83,9 +85,13 @@ def test_the_same_input_gives_the_same_fingerprint(store, tmp_path, monkeypatch)
     again = write_store(tmp_path / "again", Synthetic(clips=40, seed=1), HumanML())
     assert store.fingerprint == again.fingerprint != other.fingerprint
     info = store.info
-    print_of = partial(_fingerprint, store.folder, info["representation"], info["fps"], std=store.std, version=1)
+    print_of = partial(
+        _fingerprint, store.folder, info["representation"], info["fps"], std=store.std, version=1
+    )
     zero = np.zeros_like(store.mean)
-    assert print_of(mean=store.mean) == print_of(mean=store.mean - 1e-9) == store.fingerprint, "nor does rounding"
+    assert print_of(mean=store.mean) == print_of(mean=store.mean - 1e-9) == store.fingerprint, (
+        "nor does rounding"
+    )
     assert print_of(mean=zero + 4e-23) == print_of(mean=zero - 3e-22)
     assert print_of(mean=store.mean + 0.01) != store.fingerprint
     assert print_of(mean=store.mean, version=2) != store.fingerprint
@@ -113,7 +119,9 @@ def test_the_fingerprint_tells_each_field_of_a_clip(tmp_path, changed):
 
 
 def test_damaged_files_are_named(store, tmp_path):
-    for name, part in product(("features.npy", "clips.jsonl", "statistics.npz", "store.json"), (None, 0, 0.5)):
+    for name, part in product(
+        ("features.npy", "clips.jsonl", "statistics.npz", "store.json"), (None, 0, 0.5)
+    ):
         path = shutil.copytree(store.folder, tmp_path / f"{name}-{part}") / name
         content = path.read_bytes()
         path.unlink()
@@ -135,11 +143,17 @@ def test_damaged_files_are_named(store, tmp_path):
     [
         ([clip("a"), clip("b", motion=np.full((30, 22, 3), np.nan))], "clip b: "),
         ([clip("a"), clip("b", motion=np.zeros((30, 21, 3)))], "clip b: "),
-        ([clip("a", "train", "take"), clip("Ma", "test", "take")], "clips of take are in both train and test"),
+        (
+            [clip("a", "train", "take"), clip("Ma", "test", "take")],
+            "clips of take are in both train and test",
+        ),
         ([clip("a"), clip("a")], "two clips have the same id"),
         ([clip("a", "test")], "no clip is in the training split"),
         ([clip("a", motion=np.zeros((9, 263)), encoded="other")], "clip a: published as other"),
-        ([clip("a", motion=np.zeros((9, 5)), encoded=ENCODED)], r"clip a: shape \(9, 5\), not \(frames, 263\)"),
+        (
+            [clip("a", motion=np.zeros((9, 5)), encoded=ENCODED)],
+            r"clip a: shape \(9, 5\), not \(frames, 263\)",
+        ),
     ],
 )
 def test_bad_clips_stop_preparation_and_leave_nothing(clips, message, tmp_path):
@@ -167,7 +181,8 @@ def test_integers_are_uniform_and_independent():
     first, second, many = below(6), below(6), below(np.tile([1, 2, 3], 20_000))
     for a, b in ((first, second), (first[:-1], first[1:])):
         expected, counts = len(a) / 36, np.bincount(6 * a + b, minlength=36)
-        assert ((counts - expected) ** 2 / expected).sum() < 70  # chi-squared with 35 degrees: p < 0.0005 beyond
+        # Chi-squared with 35 degrees: p < 0.0005 beyond
+        assert ((counts - expected) ** 2 / expected).sum() < 70
     assert [set(many[k::3].tolist()) for k in range(3)] == [{0}, {0, 1}, {0, 1, 2}]
 
 
@@ -180,24 +195,32 @@ def test_batches_are_a_function_of_their_number_and_processes_share_them():
 
     stream = batches(40)
     assert batches(23, first=17) == stream[17:]
-    assert len({index for batch in stream[:12] for index, _ in batch}) == 96, "a pass has no clip twice"
+    assert len({index for batch in stream[:12] for index, _ in batch}) == 96, (
+        "a pass has no clip twice"
+    )
     assert all(number == n for n, batch in enumerate(stream) for _, number in batch)
     assert [batches(20, rank=rank, world=2) for rank in (0, 1)] == [stream[0::2], stream[1::2]]
     lengths = np.random.default_rng(0).integers(24, 60, 31)
     for world in (1, 2, 3):
         parts = [evaluation_batches(lengths, 4, rank=rank, world=world) for rank in range(world)]
-        assert sorted(index for part in parts for batch in part for index, _ in batch) == list(range(31))
+        assert sorted(index for part in parts for batch in part for index, _ in batch) == list(
+            range(31)
+        )
 
 
 def test_statistics_of_frames_read_in_parts_are_those_of_all_frames(tmp_path, monkeypatch):
     rng = np.random.default_rng(0)
-    frames = (rng.normal(size=(997, 64)) * 10 ** rng.uniform(-2, 2, 64) + rng.normal(size=64)).astype(np.float32)
+    frames = (
+        rng.normal(size=(997, 64)) * 10 ** rng.uniform(-2, 2, 64) + rng.normal(size=64)
+    ).astype(np.float32)
     constant = torch.arange(64) >= 50
     frames[:, 50:] = rng.normal(size=14)
     parts = Frames(lambda: np.split(frames, np.sort(rng.integers(0, 997, 30))), 997)
     whole = torch.from_numpy(frames)
     for size in (1, 7, 64, 996, 997, 5000):
-        assert all(torch.equal(*pair) for pair in zip(parts.split(size), whole.split(size), strict=True))
+        assert all(
+            torch.equal(*pair) for pair in zip(parts.split(size), whole.split(size), strict=True)
+        )
     mean, std = Rifke().statistics(parts)
     whole = whole.double()
     assert torch.equal(mean, whole.mean(0).float())
@@ -215,14 +238,21 @@ def rotations(root: Path, **options: Any) -> MotionDataModule:
     draw = np.random.default_rng(0)
     splits = ("train", "train", "train", "val")
     motions = [draw.normal(size=(20 + number, 150)).astype(np.float32) for number in range(24)]
-    options_of = ({"encoded": "rot6d-25", "action": number % 3, "motion": x} for number, x in enumerate(motions))
-    clips = [clip(f"{number}", splits[number % 4], **facts) for number, facts in enumerate(options_of)]
+    options_of = (
+        {"encoded": "rot6d-25", "action": number % 3, "motion": x}
+        for number, x in enumerate(motions)
+    )
+    clips = [
+        clip(f"{number}", splits[number % 4], **facts) for number, facts in enumerate(options_of)
+    ]
     for number in (0, 1, 3):
         clips[number].captions.clear()
     source = OwnClips(*clips)
     source.actions = ("a", "b", "c")
     source.statistics = lambda: (np.full(150, 0.3), np.full(150, 1.7))
-    data = MotionDataModule(source, Rot6D(), root=str(root), name="r", batch_size=3, crop=Units(8, 24, 4), **options)
+    data = MotionDataModule(
+        source, Rot6D(), root=str(root), name="r", batch_size=3, crop=Units(8, 24, 4), **options
+    )
     data.prepare_data()
     return data
 
@@ -246,7 +276,9 @@ def assert_equal(first: Iterable[MotionBatch], second: Iterable[MotionBatch]) ->
 @pytest.mark.parametrize("crop", CROPS, ids=lambda crop: type(crop).__name__)
 def test_batches_are_those_of_the_data_loader(root, crop):
     for (rank, world, step), kind in product(((0, 1, 0), (0, 1, 17), (1, 2, 5)), ("train", "val")):
-        on, off = (loader(module(root, crop, resident=r), kind, step, rank, world) for r in (True, False))
+        on, off = (
+            loader(module(root, crop, resident=r), kind, step, rank, world) for r in (True, False)
+        )
         assert (isinstance(on, ResidentLoader), isinstance(off, ResidentLoader)) == (True, False)
         assert_equal(islice(on, 30), islice(off, 30))
         if kind != "train":
@@ -271,7 +303,9 @@ def test_a_store_of_another_representation_is_refused(root):
 
 def test_cuts_of_adapted_features_labels_and_missing_captions(tmp_path):
     for kind in ("train", "val"):
-        first, second = (list(islice(loader(rotations(tmp_path, resident=r), kind), 12)) for r in (True, False))
+        first, second = (
+            list(islice(loader(rotations(tmp_path, resident=r), kind), 12)) for r in (True, False)
+        )
         assert_equal(first, second)
         assert all(batch.action is not None for batch in first)
         moved = torch.cat([batch.x[:, 0, 144:147] for batch in first])
@@ -282,7 +316,9 @@ def test_cuts_of_adapted_features_labels_and_missing_captions(tmp_path):
 
 def test_batches_are_padded_to_few_lengths(root):
     options = ({"resident": True, "pad_multiple": 7}, {"resident": False, "pad_multiple": 7}, {})
-    first, second, plain = (list(islice(loader(module(root, CROPS[0], **o), "train"), 40)) for o in options)
+    first, second, plain = (
+        list(islice(loader(module(root, CROPS[0], **o), "train"), 40)) for o in options
+    )
     assert_equal(first, second)
     assert {batch.x.shape[1] for batch in first} <= {*range(0, 60, 7), 60}
     for padded, batch in zip(first, plain, strict=True):
@@ -307,12 +343,18 @@ def test_what_fits_into_free_memory_is_kept(root, option, share, devices, kept, 
     if option == "auto":
         assert data.choose_device(more=size) is None
     monkeypatch.setattr(datamodule, "free_memory", lambda device: 2**20)
-    with pytest.raises(UserError, match=r"data\.resident=true: .* take \d+\.\d of 0\.0 GiB that cpu has free"):
+    with pytest.raises(
+        UserError, match=r"data\.resident=true: .* take \d+\.\d of 0\.0 GiB that cpu has free"
+    ):
         module(root, CROPS[0], resident=True).setup("fit")
 
 
 def test_free_memory_is_that_of_the_machine_or_the_container(monkeypatch):
-    texts = {"meminfo": "MemFree: 1 kB\nMemAvailable: 2048 kB\n", "memory.max": "max\n", "memory.current": "1000\n"}
+    texts = {
+        "meminfo": "MemFree: 1 kB\nMemAvailable: 2048 kB\n",
+        "memory.max": "max\n",
+        "memory.current": "1000\n",
+    }
     monkeypatch.setattr(resident.Path, "read_text", lambda path: texts[path.name])
     assert free_memory(torch.device("cpu")) == 2**21
     texts["memory.max"] = "5000\n"

@@ -30,9 +30,13 @@ ENDINGS = (".glb", ".bvh", ".gif", ".fbx", ".npz")
 
 def features(kind: str, width: int) -> Tensor:
     """Features (F, D) whose 6D rotations are degenerate, all of them or many."""
-    signs = torch.randint(0, 2, (FRAMES, width), generator=torch.Generator().manual_seed(0)) * 2.0 - 1
+    signs = (
+        torch.randint(0, 2, (FRAMES, width), generator=torch.Generator().manual_seed(0)) * 2.0 - 1
+    )
     noise = torch.randn(FRAMES, 1, generator=torch.Generator().manual_seed(1))
-    return {"signs": signs, "parallel": noise.expand(FRAMES, width).clone(), "zeros": 0 * signs}[kind]
+    return {"signs": signs, "parallel": noise.expand(FRAMES, width).clone(), "zeros": 0 * signs}[
+        kind
+    ]
 
 
 def saved(motion: Motion, folder: Path) -> list[str]:
@@ -55,9 +59,12 @@ def test_any_features_decode_to_rotations_and_to_motions_that_can_be_written(
     motion = decoded(representation, features(kind, representation.features), kind, kind)
     assert np.isfinite(motion.joints).all()
     refusals = saved(motion, tmp_path)
-    if make is Motion272 and kind != "signs":  # its joints are features of their own, and all are at one point
+    # Its joints are features of their own, and all are at one point
+    if make is Motion272 and kind != "signs":
         assert len(refusals) == 3
-        assert {message.partition(",")[0] for message in refusals} == {"the bone that ends in left_hip has no length"}
+        assert {message.partition(",")[0] for message in refusals} == {
+            "the bone that ends in left_hip has no length"
+        }
     else:
         assert not refusals
     assert player_page([motion])
@@ -65,14 +72,18 @@ def test_any_features_decode_to_rotations_and_to_motions_that_can_be_written(
     again = read(tmp_path / "motion.npz")
     assert again.poses is not None
     turns = again.poses.rotations
-    torch.testing.assert_close(torch.linalg.det(turns), torch.ones(turns.shape[:2], dtype=turns.dtype))
+    torch.testing.assert_close(
+        torch.linalg.det(turns), torch.ones(turns.shape[:2], dtype=turns.dtype)
+    )
     assert not saved(again, tmp_path)
     assert again.try_fit()[1] == ""
     assert player_page([again])
 
 
 @pytest.mark.parametrize("joints", [range(22), range(4)], ids=["all", "pelvis"])
-def test_a_frame_whose_joints_are_at_one_point_does_not_spoil_a_motion(joints: range, tmp_path: Path) -> None:
+def test_a_frame_whose_joints_are_at_one_point_does_not_spoil_a_motion(
+    joints: range, tmp_path: Path
+) -> None:
     positions = posed(4).joints.copy()
     positions[2, list(joints)] = positions[2, :1]
     motion = Motion(positions, 20)
@@ -83,13 +94,26 @@ def test_a_frame_whose_joints_are_at_one_point_does_not_spoil_a_motion(joints: r
 
 def test_rotations_that_features_do_not_determine_are_counted() -> None:
     across, along, nothing = [1.0, 0, 0, 0, 1, 0], [1.0, 2, 3, -2, -4, -6], [0.0] * 6
-    rows = torch.tensor([across, along, nothing, [*across[:3], 0, 0, 0], [0, 0, 0, *across[3:]], [1e-20] * 3 + [1] * 3])
+    rows = torch.tensor(
+        [
+            across,
+            along,
+            nothing,
+            [*across[:3], 0, 0, 0],
+            [0, 0, 0, *across[3:]],
+            [1e-20] * 3 + [1] * 3,
+        ]
+    )
     assert is_degenerate(rows).tolist() == [False, True, True, True, True, True]
-    assert is_degenerate(torch.randn(1000, 6, generator=torch.Generator().manual_seed(0))).sum() == 0
+    assert (
+        is_degenerate(torch.randn(1000, 6, generator=torch.Generator().manual_seed(0))).sum() == 0
+    )
 
 
 @pytest.mark.parametrize("make", REPRESENTATIONS)
-def test_frames_with_degenerate_rotations_are_named_in_one_line(make: Callable[[], Representation]) -> None:
+def test_frames_with_degenerate_rotations_are_named_in_one_line(
+    make: Callable[[], Representation],
+) -> None:
     representation = make()
     sound = torch.randn(FRAMES, representation.features, generator=torch.Generator().manual_seed(0))
     broken = sound.clone()
@@ -115,4 +139,6 @@ def test_a_command_prints_the_line(
     words = ["text=a person walks", "seconds=1", "samples=2", f"out={tmp_path}"]
     assert main(["sample", "quickstart", *words]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert any(line.startswith("warning: 2 of 40 frames have degenerate rotations, ") for line in lines)
+    assert any(
+        line.startswith("warning: 2 of 40 frames have degenerate rotations, ") for line in lines
+    )

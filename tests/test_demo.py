@@ -40,7 +40,9 @@ EDITED = DemoRequest(
     ),
 )  # fmt: skip
 
-PATH = DemoRequest(text="a person walks @1 | a person waves", path=((0.4, 0.5), (0.123456789, 1.2)), **FAST)
+PATH = DemoRequest(
+    text="a person walks @1 | a person waves", path=((0.4, 0.5), (0.123456789, 1.2)), **FAST
+)
 
 
 def parsed(query: str) -> DemoRequest:
@@ -48,7 +50,12 @@ def parsed(query: str) -> DemoRequest:
 
 
 def test_a_link_reproduces_its_request_and_names_every_option_that_is_not_left_to_the_model():
-    for request in (DemoRequest(text="a person walks"), EDITED, PATH, DemoRequest(text="ü & = # % + ' \" <b>")):
+    for request in (
+        DemoRequest(text="a person walks"),
+        EDITED,
+        PATH,
+        DemoRequest(text="ü & = # % + ' \" <b>"),
+    ):
         assert parsed(request.query()) == parsed(request.query() + "&__theme=dark") == request
     sampling = ["guidance_scale", "num_inference_steps", "sampler", "cleanup", "split"]
     keys = ["model", "text", "seconds", "samples", "seed", *sampling, "edit", "edit"]
@@ -56,7 +63,9 @@ def test_a_link_reproduces_its_request_and_names_every_option_that_is_not_left_t
 
 
 def test_way_points_are_reached_at_a_constant_speed_just_before_the_end():
-    request = DemoRequest(text="a person walks @4 | a person waves", seconds=1.2, path=((0.0, 3.0), (1.0, 3.0)))
+    request = DemoRequest(
+        text="a person walks @4 | a person waves", seconds=1.2, path=((0.0, 3.0), (1.0, 3.0))
+    )
     points = request.targets("text")["root"]
     assert points == [{"time": 3.75, "position": [0.0, 3.0]}, {"time": 5.0, "position": [1.0, 3.0]}]
     assert request.targets("none")["root"][1]["time"] == 1.0  # the text is not used: no parts
@@ -97,7 +106,9 @@ BAD = {
 def query_of(bad: str) -> str:
     keys = {key for key, _ in parse_qsl(bad, keep_blank_values=True)}
     rest = {"text": "a person walks", **FAST}
-    return "&".join([bad, urlencode({key: value for key, value in rest.items() if key not in keys})])
+    return "&".join(
+        [bad, urlencode({key: value for key, value in rest.items() if key not in keys})]
+    )
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +118,10 @@ def studio() -> making.Studio:
 
 def test_the_python_lines_and_the_files_give_the_same_motions(studio, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for request in (PATH.model_copy(update={"edits": (DemoEdit(strength=0.5, samples=2),)}), EDITED):
+    for request in (
+        PATH.model_copy(update={"edits": (DemoEdit(strength=0.5, samples=2),)}),
+        EDITED,
+    ):
         ours, names = studio.motions(request), dict[str, Any]()
         exec(request.python("text", "cpu"), names)
         for motion, program in zip(ours, names["motions"], strict=True):
@@ -119,7 +133,11 @@ def test_the_python_lines_and_the_files_give_the_same_motions(studio, tmp_path, 
     assert all(studio.file(EDITED, 1, ".bvh", rig).startswith(b"HIERARCHY") for rig in presets())
     for rig in ("unreal", "unity", "mixamo"):
         assert studio.file(EDITED, 1, ".fbx", rig).startswith(b"Kaydara FBX Binary")
-    for wrong, says in (((2, ".bvh"), "there are 2 motions"), ((0, ".exe"), "not a format"), ((0, ".bvh", "no"), "no")):
+    for wrong, says in (
+        ((2, ".bvh"), "there are 2 motions"),
+        ((0, ".exe"), "not a format"),
+        ((0, ".bvh", "no"), "no"),
+    ):
         with pytest.raises(UserError, match=says):
             studio.file(EDITED, *wrong)
 
@@ -163,8 +181,13 @@ def test_an_invalid_origin_is_refused():
 
 def test_a_wrong_port_and_a_missing_package_are_one_line(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "gradio", None)
-    assert error_of(capsys, "demo", "port=99999").startswith("error: port=99999: give a number from 0 to 65535")
-    assert error_of(capsys, "demo") == 'error: the demo needs the package gradio. Run pip install "flame-mdm[demo]"'
+    assert error_of(capsys, "demo", "port=99999").startswith(
+        "error: port=99999: give a number from 0 to 65535"
+    )
+    assert (
+        error_of(capsys, "demo")
+        == 'error: the demo needs the package gradio. Run pip install "flame-mdm[demo]"'
+    )
 
 
 INSIDE = """
@@ -197,13 +220,16 @@ sessions = [len(gradio.state_holder.session_data), demo.SESSIONS]
 statuses = [file.status_code for file in files]
 print(json.dumps({"routes": routes, "sessions": sessions, "files": statuses, "names": names}), flush=True)
 """
-NORMAL = "from flame_mdm.__main__ import main; sys.exit(main(['demo', 'port=0', 'hosts=demo.example']))"
+NORMAL = (
+    "from flame_mdm.__main__ import main; sys.exit(main(['demo', 'port=0', 'hosts=demo.example']))"
+)
 
 
 class Server(NamedTuple):
     address: str
     process: int
-    inside: dict[str, Any]  # what a demo in the same process, which is not served, says about itself
+    # What a demo in the same process, which is not served, says about itself
+    inside: dict[str, Any]
 
 
 @pytest.fixture(scope="module")
@@ -215,7 +241,9 @@ def normal(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests")])}
     with (
         errors.open("w") as file,
-        subprocess.Popen(words, stdout=subprocess.PIPE, stderr=file, text=True, cwd=ROOT, env=environment) as running,
+        subprocess.Popen(
+            words, stdout=subprocess.PIPE, stderr=file, text=True, cwd=ROOT, env=environment
+        ) as running,
     ):
         assert running.stdout is not None
         inside = json.loads(running.stdout.readline())
@@ -239,7 +267,9 @@ def get(address: str, data: bytes | None = None, **headers: str) -> tuple[int, b
     headers = {key.replace("_", "-"): value for key, value in headers.items()}
     headers |= {"Content-Type": "application/json"} if data else {}
     try:
-        with urllib.request.urlopen(urllib.request.Request(address, data, headers), timeout=120) as answer:
+        with urllib.request.urlopen(
+            urllib.request.Request(address, data, headers), timeout=120
+        ) as answer:
             return answer.status, answer.read()
     except urllib.error.HTTPError as error:
         return error.code, error.read()
@@ -247,20 +277,30 @@ def get(address: str, data: bytes | None = None, **headers: str) -> tuple[int, b
 
 def body_of(function: int, *data: Any, session: str = "") -> bytes:
     session = session or f"s{random.getrandbits(40)}"
-    call = {"data": data, "event_data": None, "fn_index": function, "trigger_id": None, "session_hash": session}
+    call = {
+        "data": data,
+        "event_data": None,
+        "fn_index": function,
+        "trigger_id": None,
+        "session_hash": session,
+    }
     return json.dumps(call).encode()
 
 
 def generated(server: str, query: str, session: str = "") -> list[Any]:
     """Outputs of the page for a query string."""
     session = session or f"s{random.getrandbits(40)}"
-    config = re.findall(r"window.gradio_config = (\{.*?\});</script>", get(server)[1].decode(), re.DOTALL)[0]
+    config = re.findall(
+        r"window.gradio_config = (\{.*?\});</script>", get(server)[1].decode(), re.DOTALL
+    )[0]
     functions = json.loads(config)["dependencies"]
     show = next(function["id"] for function in functions if len(function["outputs"]) == 7)
     status, body = get(f"{server}/gradio_api/queue/join", body_of(show, query, session=session))
     assert status == 200, body
     _, stream = get(f"{server}/gradio_api/queue/data?session_hash={session}")
-    output = json.loads(re.findall(rb"^data: (.*process_completed.*)$", stream, re.MULTILINE)[-1])["output"]
+    output = json.loads(re.findall(rb"^data: (.*process_completed.*)$", stream, re.MULTILINE)[-1])[
+        "output"
+    ]
     assert "data" in output, (query[:200], output)
     return output["data"]
 
@@ -289,12 +329,19 @@ def test_a_bad_request_gets_one_clear_line(server):
         if len(query := query_of(bad)) > 15_000:
             continue
         notes = generated(server, query)[1]
-        text = re.sub("<[^>]*>", "", notes).replace("&lt;", "<").replace("&gt;", ">").replace("&#x27;", "'")
+        text = (
+            re.sub("<[^>]*>", "", notes)
+            .replace("&lt;", "<")
+            .replace("&gt;", ">")
+            .replace("&#x27;", "'")
+        )
         one = notes.count("<p") == 1 and 'class="error" role="alert"' in notes and len(text) < 300
         if not one or words not in text or re.search(r"<(script|b|img)\b", notes):
             wrong.append((bad[:40], text[:300]))
         status, body = get(f"{server}/motion.bvh?{query}")
-        if status != 400 or not (body.decode() in text or text in body.decode() or b"not in memory" in body):
+        if status != 400 or not (
+            body.decode() in text or text in body.decode() or b"not in memory" in body
+        ):
             wrong.append((bad[:40], body[:300]))
     assert not wrong
 
@@ -304,8 +351,14 @@ def test_a_sentence_becomes_parts_and_a_suggestion_a_button(server):
     _, notes, query, *_, text = generated(server, request.query())
     assert text == parsed(query).text == "a person walks | she waves the lefft hand"
     assert "&#x27;lefft&#x27; is read as &#x27;left&#x27;" in notes
-    assert '<option value="a person walks | a person waves with the left hand" selected>left</option>' in notes
-    assert '<option value="a person walks | a person waves with the right hand">right</option>' in notes
+    assert (
+        '<option value="a person walks | a person waves with the left hand" selected>left</option>'
+        in notes
+    )
+    assert (
+        '<option value="a person walks | a person waves with the right hand">right</option>'
+        in notes
+    )
     _, notes, *_, text = generated(server, request.model_copy(update={"split": False}).query())
     assert text == request.text
     refused = generated(server, query_of("text=asdf+qwer"))[1]
@@ -328,12 +381,24 @@ def test_no_function_and_no_route_opens_a_file(normal, tmp_path):
         for route in routes:
             named = re.sub(r"\{(path|path_or_url|url_path)(:path)?\}", path, route)
             named = re.sub(r"\{(\w+)(:\w+)?\}", "generate", named)
-            posts.append((named, json.dumps({"data": [file], "fn_index": 6, "session_hash": "s", **file}).encode()))
+            posts.append(
+                (
+                    named,
+                    json.dumps(
+                        {"data": [file], "fn_index": 6, "session_hash": "s", **file}
+                    ).encode(),
+                )
+            )
             if "heartbeat" not in route and "{" in route:
                 gets.append((named, None))
         for route, data in [*posts, *gets]:
             status, body = get(f"{normal.address}{quote(route)}", data)
-            if status not in (400, 404) or b"SECRET" in body or b"root:" in body or path.encode() in body:
+            if (
+                status not in (400, 404)
+                or b"SECRET" in body
+                or b"root:" in body
+                or path.encode() in body
+            ):
                 opened.append(f"{status} {route} {data} {body[:100]!r}")
     assert opened == []
     assert "<iframe" in generated(normal.address, query_of("seed=3"))[0]
@@ -346,7 +411,11 @@ def test_requests_of_other_sites_and_for_other_names_are_refused(server):
     assert get(server, Host="demo.example", Origin="https://demo.example")[0] == 200
     for origin in ("http://evil.example", "null", "http://127.0.0.1:1"):
         assert get(server, Origin=origin)[0] == 403
-    assert get(motion, Sec_Fetch_Site="cross-site")[0] == get(motion, Sec_Fetch_Site="same-site")[0] == 403
+    assert (
+        get(motion, Sec_Fetch_Site="cross-site")[0]
+        == get(motion, Sec_Fetch_Site="same-site")[0]
+        == 403
+    )
     assert get(server, Sec_Fetch_Site="cross-site", Origin=server)[0] == 200  # a link to the page
 
 
@@ -382,7 +451,10 @@ def test_a_link_with_too_many_options_is_refused_on_the_page(server):
 
 def test_bodies_are_counted_as_they_arrive(server):
     host, port = server.removeprefix("http://").split(":")
-    head, sent = f"POST /gradio_api/queue/join HTTP/1.1\r\nHost: {host}\r\nTransfer-Encoding: chunked\r\n\r\n", 0
+    head, sent = (
+        f"POST /gradio_api/queue/join HTTP/1.1\r\nHost: {host}\r\nTransfer-Encoding: chunked\r\n\r\n",
+        0,
+    )
     with socket.create_connection((host, int(port)), timeout=60) as connection:
         connection.sendall(head.encode())
         with contextlib.suppress(OSError):  # the server closes the connection
@@ -400,7 +472,9 @@ def test_files_come_from_memory_while_the_model_works_and_old_sessions_are_forgo
 
 
 def test_downloads_are_named_after_their_rig(normal):
-    names = [f'attachment; filename="a-person-walks-1{rig}.bvh"' for rig in ("", "-unreal", "-unity")]
+    names = [
+        f'attachment; filename="a-person-walks-1{rig}.bvh"' for rig in ("", "-unreal", "-unity")
+    ]
     assert normal.inside["names"] == names
 
 
@@ -412,7 +486,9 @@ def test_requests_from_eight_clients_are_answered_in_constant_memory(normal):
         return "<iframe" in player and "warning" not in notes and parsed(query) == request
 
     def resident() -> int:
-        return int(re.findall(r"VmRSS:\s+(\d+) kB", Path(f"/proc/{normal.process}/status").read_text())[0])
+        return int(
+            re.findall(r"VmRSS:\s+(\d+) kB", Path(f"/proc/{normal.process}/status").read_text())[0]
+        )
 
     with ThreadPoolExecutor(8) as clients:
         assert all(clients.map(ask, range(20)))  # fills the memory of results
@@ -433,7 +509,9 @@ def test_a_person_uses_the_page(server, tmp_path):
         click(tab, "Generate")
         link = tab.wait("location.search.includes('right') && location.href")
         files = tab.run(f"Object.fromEntries({LINKS}.map(a => [a.text, a.href]))")
-        programs = [f"{name} {kind}" for name in ("Unreal", "Unity", "Mixamo") for kind in ("FBX", "GLB")]
+        programs = [
+            f"{name} {kind}" for name in ("Unreal", "Unity", "Mixamo") for kind in ("FBX", "GLB")
+        ]
         assert list(files)[:12] == ["Blender", *programs, "BVH", "FBX", "GLB", "NPZ", "MP4"]
         shown = joints_of(files["NPZ"])
         assert shown.shape == (60, 22, 3)
@@ -450,13 +528,21 @@ def test_a_person_uses_the_page(server, tmp_path):
             tab.open("about:blank")
             tab.open(address)
             query = tab.wait("document.querySelector('#files a')?.href").partition("?")[2]
-            assert tab.run("document.querySelector('#ask textarea').value") == "a person waves with the right hand"
+            assert (
+                tab.run("document.querySelector('#ask textarea').value")
+                == "a person waves with the right hand"
+            )
             np.testing.assert_array_equal(joints_of(f"{server}/motion.npz?{query}"), expected)
-        assert [url for url in tab.requested if not url.startswith((server, "data:", "blob:", "about:"))] == []
+        assert [
+            url for url in tab.requested if not url.startswith((server, "data:", "blob:", "about:"))
+        ] == []
         assert tab.errors == []
         tab.size(390, 844)
         tab.open(link)
-        tab.wait("document.querySelectorAll('#examples img').length > 8 && !!document.querySelector('#files a')", 60)
+        tab.wait(
+            "document.querySelectorAll('#examples img').length > 8 && !!document.querySelector('#files a')",
+            60,
+        )
         assert tab.run("document.documentElement.scrollWidth <= innerWidth")
         example = tab.run("document.querySelectorAll('#examples button')[3].textContent")
         tab.click("#examples button:nth-child(4)")
@@ -507,7 +593,9 @@ def test_a_person_writes_a_sequence_in_rows_and_draws_a_path(server, tmp_path):
 
 
 def click(tab: Any, label: str) -> None:
-    tab.run(f"[...document.querySelectorAll('button')].find(b => b.innerText.trim() === {json.dumps(label)}).click()")
+    tab.run(
+        f"[...document.querySelectorAll('button')].find(b => b.innerText.trim() === {json.dumps(label)}).click()"
+    )
 
 
 def joints_of(address: str) -> np.ndarray:

@@ -34,7 +34,10 @@ def tiny(path: str | Path, out_features: int = D, **options) -> Denoiser:
 
 def batch(lengths: list[int] = LENGTHS, frames: int | None = None, tokens: int = 5):
     """x_t, t, mask, cond; noise stands past the end of the motions and in masked tokens."""
-    size, normal = len(lengths), partial(torch.randn, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    size, normal = (
+        len(lengths),
+        partial(torch.randn, generator=torch.Generator().manual_seed(1), dtype=torch.float64),
+    )
     x_t, t = normal(size, max(lengths), D), torch.tensor([0.0, 437.25, 999.0])[:size]
     pooled, text = normal(size, C), normal(size, tokens, C)
     mask = length_mask(torch.tensor(lengths), frames)
@@ -71,7 +74,11 @@ def test_shape_determinism_and_padding(path: Path) -> None:
         assert_same(y_longer[i, :length], y[i, :length])
         row, tokens = slice(i, i + 1), i % 5 + 1
         alone = cond.select(torch.tensor([i]))
-        alone = replace(alone, tokens=alone.tokens[:, :tokens], token_mask=torch.ones(1, tokens, dtype=torch.bool))
+        alone = replace(
+            alone,
+            tokens=alone.tokens[:, :tokens],
+            token_mask=torch.ones(1, tokens, dtype=torch.bool),
+        )
         y_alone = denoiser(x_t[row, :length], t[row], mask[row, :length], alone)
         assert_same(y_alone[0], y[i, :length])
 
@@ -90,18 +97,29 @@ def test_dropped_condition_is_the_null_and_time_is_continuous(path: Path) -> Non
     assert_same(mixed[1], y_null[1])
     assert_same(mixed[::2], y[::2])
     assert ((y - y_null)[mask].abs() > 1e-6).any(), "the condition has no effect"
-    later, much_later = ((denoiser(x_t, t + more, mask, cond) - y)[mask].abs().max() for more in (1e-4, 0.5))
+    later, much_later = (
+        (denoiser(x_t, t + more, mask, cond) - y)[mask].abs().max() for more in (1e-4, 0.5)
+    )
     assert 100 * later < much_later > 1e-6
 
 
 def test_paper_sizes() -> None:
     sizes = {"mdm_encoder": 17_880_327, "mdm_decoder": 26_293_511, "mdm_decoder_token": 26_293_511}
     sizes |= {"dip": 26_424_583, "dip_target": 26_704_135}
-    sizes |= {"mdm_gru": 4_472_071, "mdm_unet": 23_565_959, "flame": 64_905_766}  # U-Net: 23.47M in the paper
+    # U-Net: 23.47M in the paper
+    sizes |= {
+        "mdm_gru": 4_472_071,
+        "mdm_unet": 23_565_959,
+        "flame": 64_905_766,
+    }
     for name, parameters in sizes.items():
         with torch.device("meta"):
             config = read_yaml(ROOT / "experiments" / "denoiser" / f"{name}.yaml")
-            widths = {"flame": (147, 294, 768), "dip": (263, 263, 768), "dip_target": (263, 263, 768)}
+            widths = {
+                "flame": (147, 294, 768),
+                "dip": (263, 263, 768),
+                "dip_target": (263, 263, 768),
+            }
             denoiser = instantiate(config, *widths.get(name, (263, 263, 512)))
         assert sum(p.numel() for p in denoiser.parameters()) == parameters, name
 
@@ -111,7 +129,9 @@ def test_runs_under_bf16_autocast(path: Path) -> None:
     denoiser, (x_t, t, mask, cond) = tiny(path).float(), batch()
     assert cond.prefix is not None
     assert cond.target is not None
-    single = {name: getattr(cond, name).float() for name in ("pooled", "tokens", "prefix", "target")}
+    single = {
+        name: getattr(cond, name).float() for name in ("pooled", "tokens", "prefix", "target")
+    }
     inputs = x_t.float(), t, mask, replace(cond, **single, null=None)
     exact = denoiser(*inputs)
     with torch.autocast("cpu", dtype=torch.bfloat16):
@@ -153,7 +173,9 @@ def test_flame_returns_zeros_past_the_end_and_knows_lengths_up_to_max_frames() -
 
 
 def test_flame_rounds_lengths_down_to_those_of_its_training() -> None:
-    flame, exact = (FLAME(D, D, C, **TRANSFORMER, max_frames=20, length_unit=unit).double() for unit in (4, 1))
+    flame, exact = (
+        FLAME(D, D, C, **TRANSFORMER, max_frames=20, length_unit=unit).double() for unit in (4, 1)
+    )
     exact.load_state_dict(flame.state_dict())
     whole, other = batch([12, 8, 4], frames=12), batch([12, 3, 15], frames=15)
     assert torch.equal(flame(*whole), exact(*whole))
@@ -172,20 +194,30 @@ def test_token_positions_do_not_move_the_frames() -> None:
     x_t, t, mask, cond = batch()
     two = torch.tensor([True, True, False, False, False]).expand(3, 5)
     fewer = Condition(cond.pooled, cond.tokens[:, :2], two[:, :2])
-    assert_same(encoder(x_t, t, mask, Condition(cond.pooled, cond.tokens, two)), encoder(x_t, t, mask, fewer))
+    assert_same(
+        encoder(x_t, t, mask, Condition(cond.pooled, cond.tokens, two)),
+        encoder(x_t, t, mask, fewer),
+    )
     with pytest.raises(UserError, match=r"denoiser\.max_tokens=5: give at least 6"):
         encoder(*batch(tokens=6))
 
 
 def test_the_prefix_acts_on_every_frame_and_has_no_output() -> None:
-    decoder = MDMDecoder(D, D, C, **TRANSFORMER, token_memory=True, context_frames=3).double().eval()
+    decoder = (
+        MDMDecoder(D, D, C, **TRANSFORMER, token_memory=True, context_frames=3).double().eval()
+    )
     x_t, t, mask, cond = batch()
     assert cond.prefix is not None
-    y, moved = decoder(x_t, t, mask, cond), decoder(x_t, t, mask, replace(cond, prefix=cond.prefix + 1))
+    y, moved = (
+        decoder(x_t, t, mask, cond),
+        decoder(x_t, t, mask, replace(cond, prefix=cond.prefix + 1)),
+    )
     assert y.shape == x_t.shape
     assert ((y - moved).abs().amax(-1)[mask] > 1e-6).all()
     for prefix, frames in ((None, 0), (cond.prefix[:, 1:], 2)):
-        with pytest.raises(UserError, match=f"a prefix of {frames} frames: this denoiser continues 3 clean frames"):
+        with pytest.raises(
+            UserError, match=f"a prefix of {frames} frames: this denoiser continues 3 clean frames"
+        ):
             decoder(x_t, t, mask, replace(cond, prefix=prefix))
 
 
@@ -208,12 +240,21 @@ def test_bad_options_are_named() -> None:
     three_heads: dict[str, Any] = TRANSFORMER | {"num_heads": 3}
     for build, message in (
         (lambda: MDMEncoder(D, D, C, **three_heads), r"latent_dim \(16\) .* num_heads \(3\)"),
-        (lambda: MDMEncoder(D, D, C, **TRANSFORMER, project_condition=False), "needs latent_dim=12"),
+        (
+            lambda: MDMEncoder(D, D, C, **TRANSFORMER, project_condition=False),
+            "needs latent_dim=12",
+        ),
         (lambda: MDMUNet(D, D, C, **unet, num_groups=3), r"num_groups \(3\)"),
         (lambda: decoder(*batch(tokens=0)), "the condition encoder has none"),
         (lambda: MDMDecoder(D, D, C, **TRANSFORMER, memory="concat"), "Set token_memory=true"),
-        (lambda: MDMDecoder(D, D, C, **TRANSFORMER, context_frames=-1), "context_frames=-1: give the number"),
-        (lambda: MDMDecoder(D, D, C, **TRANSFORMER, target_encoder="single", target_layers=0), "target_layers=0"),
+        (
+            lambda: MDMDecoder(D, D, C, **TRANSFORMER, context_frames=-1),
+            "context_frames=-1: give the number",
+        ),
+        (
+            lambda: MDMDecoder(D, D, C, **TRANSFORMER, target_encoder="single", target_layers=0),
+            "target_layers=0",
+        ),
     ):
         with pytest.raises(UserError, match=message):
             build()

@@ -62,19 +62,28 @@ def denoiser(encoder: str = "", dtype: torch.dtype = torch.float32, **changes: A
     state = weights(arrays())
     if encoder:
         state |= weights(arrays(), f"state_{encoder}/")
-    options = {name: config()[name] for name in ("arch", "text_encoder_type", "context_len", "pred_len", "mask_frames")}
-    released = import_mdm(state, Options(**options | {"num_heads": config()["num_heads"], **changes}))
+    options = {
+        name: config()[name]
+        for name in ("arch", "text_encoder_type", "context_len", "pred_len", "mask_frames")
+    }
+    released = import_mdm(
+        state, Options(**options | {"num_heads": config()["num_heads"], **changes})
+    )
     network = released.network(*released.features, **released.options | {"dropout": 0.0})
     network.load_state_dict(released.state)
     return network.to(dtype).eval()
 
 
-def condition(dtype: torch.dtype, group: str = "in", rows: int | None = None, **parts: Tensor) -> Condition:
+def condition(
+    dtype: torch.dtype, group: str = "in", rows: int | None = None, **parts: Tensor
+) -> Condition:
     """The text of a group of the fixture, and the prefix of the inputs."""
     tokens = array(f"{group}/text_embed", dtype).transpose(0, 1)
     token_mask = ~torch.from_numpy(arrays()[f"{group}/text_mask"])
     null = Condition(torch.zeros_like(tokens[:1, 0]), torch.zeros_like(tokens[:1, :1]), None)
-    cond = Condition(tokens[:, 0], tokens, token_mask, null, **{"prefix": prefix_of("in/prefix", dtype)} | parts)
+    cond = Condition(
+        tokens[:, 0], tokens, token_mask, null, **{"prefix": prefix_of("in/prefix", dtype)} | parts
+    )
     return cond if rows is None else cond.select(torch.arange(rows))
 
 
@@ -82,7 +91,9 @@ def target(dtype: torch.dtype) -> Tensor:
     return requested(array("target/cond", dtype), array("target/valid").bool())
 
 
-def output(network: Denoiser, cond: Condition, case: str, mask: Tensor, dtype: torch.dtype) -> Tensor:
+def output(
+    network: Denoiser, cond: Condition, case: str, mask: Tensor, dtype: torch.dtype
+) -> Tensor:
     """The output of a case: with its condition, without it, or guided."""
     x_t, t = motions(arrays()["in/x_t"], dtype), array("in/t").float()
     if case.startswith("uncond"):
@@ -111,14 +122,20 @@ def test_padding_counts_if_it_is_not_masked(case):
     mask = array("in/mask").bool()[:, 0, 0]
     network = denoiser(mask_frames=False)
     assert not network.mask_padding
-    assert_golden(arrays(), case, output(network, condition(torch.float32), case.split("/")[1], mask, torch.float32))
+    assert_golden(
+        arrays(),
+        case,
+        output(network, condition(torch.float32), case.split("/")[1], mask, torch.float32),
+    )
 
 
 @cases("out/cond_time_token")
 def test_a_token_of_the_time_comes_before_the_prefix(case):
     mask = array("in/mask").bool()[:, 0, 0]
     network = denoiser(emb_trans_dec=True)
-    assert_golden(arrays(), case, output(network, condition(torch.float32), "cond", mask, torch.float32))
+    assert_golden(
+        arrays(), case, output(network, condition(torch.float32), "cond", mask, torch.float32)
+    )
 
 
 @cases("concat/cond", "concat/uncond", "concat/cfg")
@@ -127,7 +144,9 @@ def test_the_time_as_a_token_of_the_memory(case):
     network = denoiser(emb_policy="concat")
     y = output(network, condition(torch.float32), case.split("/")[1], mask, torch.float32)
     assert_golden(arrays(), case, y)
-    assert not torch.allclose(y, output(denoiser(), condition(torch.float32), case.split("/")[1], mask, torch.float32))
+    assert not torch.allclose(
+        y, output(denoiser(), condition(torch.float32), case.split("/")[1], mask, torch.float32)
+    )
 
 
 @cases("full/cond")
@@ -155,14 +174,19 @@ def test_targets_are_embedded_as_by_the_authors(case):
 
 
 @cases(
-    *[f"{name}/cond" for name in TARGETED], "target_single/cfg", "target_single_concat/cond", "target_single_concat/cfg"
+    *[f"{name}/cond" for name in TARGETED],
+    "target_single/cfg",
+    "target_single_concat/cond",
+    "target_single_concat/cfg",
 )
 def test_the_network_with_targets(case):
     group, kind = case.split("/")
     encoder = group.split("_")[1]
     network = denoiser(encoder, **({"emb_policy": "concat"} if group.endswith("concat") else {}))
     mask = array("in/mask").bool()[:, 0, 0]
-    y = output(network, condition(torch.float32, target=target(torch.float32)), kind, mask, torch.float32)
+    y = output(
+        network, condition(torch.float32, target=target(torch.float32)), kind, mask, torch.float32
+    )
     assert_golden(arrays(), case, y)
 
 
@@ -186,7 +210,9 @@ def representation(dtype: torch.dtype) -> HumanML:
 
 
 def targets(**options: Any) -> TargetConditions:
-    return TargetConditions(SMPL22.joints, SMPL22.facing, choices=[[]], heading_modulo_pi=True, **options)
+    return TargetConditions(
+        SMPL22.joints, SMPL22.facing, choices=[[]], heading_modulo_pi=True, **options
+    )
 
 
 @cases("target/location_of_all", "target/cond")
@@ -207,7 +233,9 @@ def losses(group: str, dtype: torch.dtype) -> tuple[dict[str, Tensor], Denoiser]
     network = denoiser(encoder, dtype)
     network.zero_grad()
     features, aims = representation(dtype), targets()
-    cond = condition(dtype, prefix=prefix_of("loss/prefix", dtype)).drop(array("in/cond_drop").bool())
+    cond = condition(dtype, prefix=prefix_of("loss/prefix", dtype)).drop(
+        array("in/cond_drop").bool()
+    )
     if encoder:
         cond = replace(cond, target=target(dtype), target_mask=~array("in/target_drop").bool())
 
@@ -236,7 +264,9 @@ def diffusion(dtype: torch.dtype) -> GaussianDiffusion:
 def our_names(theirs: list[str]) -> list[str]:
     """Our names of the authors' weights."""
     state = dict.fromkeys(weights(arrays()) | dict.fromkeys(theirs), torch.zeros(0))
-    names, _ = released_weights.layer_names(state, "seqTransDecoder", released_weights.DECODER_LAYER)
+    names, _ = released_weights.layer_names(
+        state, "seqTransDecoder", released_weights.DECODER_LAYER
+    )
     prefixes = released_weights.NAMES["mdm"] | names
     return list(released_weights.renamed(dict.fromkeys(theirs, torch.zeros(0)), prefixes))
 
@@ -284,11 +314,20 @@ def test_ten_steps_of_sampling(case):
         denoise = classifier_free_guidance(network, config()["sample_scale"], start.shape[-1])
     options = SamplerOptions(sampler="ancestral", num_inference_steps=config()["steps"])
     with torch.no_grad():
-        x = diffusion(torch.float32).sample(denoise, recorded(start, draws), real(start), cond, options)
+        x = diffusion(torch.float32).sample(
+            denoise, recorded(start, draws), real(start), cond, options
+        )
     assert_golden(arrays(), case, x)
 
 
-STREAMS = ("out", "out_one_text", "out_include_prefix", "out_concat", "out_target_single", "out_target_single_concat")
+STREAMS = (
+    "out",
+    "out_one_text",
+    "out_include_prefix",
+    "out_concat",
+    "out_target_single",
+    "out_target_single_concat",
+)
 
 
 @cases(*[f"ar/{name}" for name in STREAMS])
@@ -296,7 +335,9 @@ def test_a_loop_over_windows(case, monkeypatch):
     name = case.removeprefix("ar/")
     rows, windows = config()["ar_bs"], config()["ar_windows"]
     encoder = "single" if "target_single" in name else ""
-    model = loop_model(denoiser(encoder, **({"emb_policy": "concat"} if name.endswith("concat") else {})))
+    model = loop_model(
+        denoiser(encoder, **({"emb_policy": "concat"} if name.endswith("concat") else {}))
+    )
     prefix = motions(arrays()["ar/prefix"])
     options = SamplerOptions(guidance_scale=config()["sample_scale"]).over(model.sampler_options)
     blocks = Blocks(model, ["a"] * rows, prefix, options)
@@ -309,11 +350,17 @@ def test_a_loop_over_windows(case, monkeypatch):
     monkeypatch.setattr("flame_mdm.generator.seeded_noise", stored)
     parts = [prefix] if name == "out_include_prefix" else []
     for window in range(windows):
-        tokens = torch.from_numpy(arrays()["ar/text_embed"][0 if name == "out_one_text" else window]).transpose(0, 1)
-        token_mask = ~torch.from_numpy(arrays()["ar/text_mask"][0 if name == "out_one_text" else window])
+        tokens = torch.from_numpy(
+            arrays()["ar/text_embed"][0 if name == "out_one_text" else window]
+        ).transpose(0, 1)
+        token_mask = ~torch.from_numpy(
+            arrays()["ar/text_mask"][0 if name == "out_one_text" else window]
+        )
         null = Condition(torch.zeros_like(tokens[:1, 0]), torch.zeros_like(tokens[:1, :1]), None)
         cond = Condition(tokens[:, 0], tokens, token_mask, null)
-        parts.append(blocks.sample(replace(cond, target=target(torch.float32)[:rows] if encoder else None)))
+        parts.append(
+            blocks.sample(replace(cond, target=target(torch.float32)[:rows] if encoder else None))
+        )
     assert_golden(arrays(), case, torch.cat(parts, 1)[:, : config()["ar_required"]])
 
 
@@ -348,25 +395,38 @@ def turned(angle: float) -> Tensor:
 
 @pytest.mark.parametrize(("modulo_pi", "cost"), [(False, math.pi**2), (True, 0.0)])
 def test_facing_backwards_costs_nothing_in_the_authors_loss_alone(modulo_pi, cost):
-    aims = TargetConditions(SMPL22.joints, SMPL22.facing, choices=[["heading"]], heading_modulo_pi=modulo_pi)
+    aims = TargetConditions(
+        SMPL22.joints, SMPL22.facing, choices=[["heading"]], heading_modulo_pi=modulo_pi
+    )
     forward = aims.draw(turned(0.0), torch.zeros(1))
     assert forward[0, :, 3].tolist() == [0.0] * 7 + [1.0]
-    torch.testing.assert_close(aims.error(turned(math.pi), forward), torch.tensor([cost]), rtol=0, atol=1e-5)
+    torch.testing.assert_close(
+        aims.error(turned(math.pi), forward), torch.tensor([cost]), rtol=0, atol=1e-5
+    )
     # The error of a small turn is its square, also across 180 degrees, and positive angles turn to the left, to +x.
     for target, angle in ((0.3, 0.1), (math.pi - 0.1, -math.pi + 0.1)):
         requested_turn = aims.draw(turned(target), torch.zeros(1))
         torch.testing.assert_close(requested_turn[0, 7, 0], torch.tensor(target), rtol=0, atol=1e-5)
-        torch.testing.assert_close(aims.error(turned(angle), requested_turn), torch.tensor([0.04]), rtol=0, atol=1e-5)
+        torch.testing.assert_close(
+            aims.error(turned(angle), requested_turn), torch.tensor([0.04]), rtol=0, atol=1e-5
+        )
 
 
 def test_each_choice_of_targets_is_drawn_equally_often():
     choices = [["pelvis", "heading"], ["traj", "heading"], []]
     aims = TargetConditions(SMPL22.joints, SMPL22.facing, choices=choices)
     u = (torch.arange(300) + 0.5) / 300
-    drawn = aims.draw(torch.randn(300, 5, 22, 3, generator=torch.Generator().manual_seed(0)), u)[..., 3]
-    names = [[slot for slot, flag in zip(SLOTS, row, strict=True) if flag] for row in drawn.bool().tolist()]
+    drawn = aims.draw(torch.randn(300, 5, 22, 3, generator=torch.Generator().manual_seed(0)), u)[
+        ..., 3
+    ]
+    names = [
+        [slot for slot, flag in zip(SLOTS, row, strict=True) if flag]
+        for row in drawn.bool().tolist()
+    ]
     assert [names.count(choice) for choice in choices] == [100, 100, 100]
     with pytest.raises(UserError, match="Did you mean pelvis"):
         TargetConditions(SMPL22.joints, SMPL22.facing, choices=[["pelvsi"]])
     with pytest.raises(UserError, match="the skeleton has no head"):
-        TargetConditions([name for name in SMPL22.joints if name != "head"], SMPL22.facing, choices=[[]])
+        TargetConditions(
+            [name for name in SMPL22.joints if name != "head"], SMPL22.facing, choices=[[]]
+        )

@@ -29,7 +29,12 @@ CONTEXT, WIDTH, HEADS, LAYERS, HIDDEN, TEXT = 10, 16, 2, 1, 24, 12
 DECAY, DROP, STEPS = 0.9999, 0.1, 10
 
 WORDS = [
-    *("data.source.clips=120", "data.batch_size=8", f"denoiser.latent_dim={WIDTH}", f"denoiser.ff_size={HIDDEN}"),
+    *(
+        "data.source.clips=120",
+        "data.batch_size=8",
+        f"denoiser.latent_dim={WIDTH}",
+        f"denoiser.ff_size={HIDDEN}",
+    ),
     *(f"denoiser.num_layers={LAYERS}", f"denoiser.num_heads={HEADS}", "condition.features=16"),
     *("trainer.accelerator=cpu", "trainer.enable_progress_bar=false", "speed=reference"),
 ]
@@ -66,12 +71,18 @@ class ReferenceNetwork(nn.Module):
         super().__init__()
         self.pose_embedding = nn.Linear(features, WIDTH)
         self.text_embedding = nn.Linear(TEXT, WIDTH)
-        self.time_embedding = nn.Sequential(nn.Linear(WIDTH, WIDTH), nn.SiLU(), nn.Linear(WIDTH, WIDTH))
-        layer = nn.TransformerDecoderLayer(WIDTH, HEADS, HIDDEN, dropout=0.0, activation="gelu", batch_first=True)
+        self.time_embedding = nn.Sequential(
+            nn.Linear(WIDTH, WIDTH), nn.SiLU(), nn.Linear(WIDTH, WIDTH)
+        )
+        layer = nn.TransformerDecoderLayer(
+            WIDTH, HEADS, HIDDEN, dropout=0.0, activation="gelu", batch_first=True
+        )
         self.decoder = nn.TransformerDecoder(layer, LAYERS)
         self.pose_final = nn.Linear(WIDTH, features)
 
-    def forward(self, prefix: Tensor, x_t: Tensor, t: Tensor, tokens: Tensor, padding: Tensor) -> Tensor:
+    def forward(
+        self, prefix: Tensor, x_t: Tensor, t: Tensor, tokens: Tensor, padding: Tensor
+    ) -> Tensor:
         time = self.time_embedding(positions(10)[t])
         memory = self.text_embedding(tokens) + time[:, None]
         frames = self.pose_embedding(torch.cat([prefix, x_t], 1))
@@ -90,10 +101,20 @@ class ReferenceNetwork(nn.Module):
 def our_name(name: str) -> str:
     """Our name of a weight of the reference."""
     for theirs, ours in (
-        *(("pose_embedding", "input"), ("text_embedding", "condition.projection"), ("pose_final", "output")),
+        *(
+            ("pose_embedding", "input"),
+            ("text_embedding", "condition.projection"),
+            ("pose_final", "output"),
+        ),
         *(("time_embedding", "condition.time_embedding"), ("decoder.layers", "transformer.layers")),
-        *(("self_attn.in_proj_", "self_attention.qkv."), ("self_attn.out_proj", "self_attention.out")),
-        *(("multihead_attn.in_proj_", "cross_attention.qkv."), ("multihead_attn.out_proj", "cross_attention.out")),
+        *(
+            ("self_attn.in_proj_", "self_attention.qkv."),
+            ("self_attn.out_proj", "self_attention.out"),
+        ),
+        *(
+            ("multihead_attn.in_proj_", "cross_attention.qkv."),
+            ("multihead_attn.out_proj", "cross_attention.out"),
+        ),
         *(("linear1", "feed_forward.0"), ("linear2", "feed_forward.3"), ("norm1", "self_norm")),
         *(("norm2", "cross_norm"), ("norm3", "feed_forward_norm")),
     ):
@@ -112,7 +133,9 @@ def positions(count: int) -> Tensor:
 
 def signal_levels() -> Tensor:
     """The products of 1 - beta of the cosine schedule, with each beta at most 0.999."""
-    level = [math.cos((step / STEPS + 0.008) / 1.008 * math.pi / 2) ** 2 for step in range(STEPS + 1)]
+    level = [
+        math.cos((step / STEPS + 0.008) / 1.008 * math.pi / 2) ** 2 for step in range(STEPS + 1)
+    ]
     betas = [min(1 - after / before, 0.999) for before, after in pairwise(level)]
     return torch.cumprod(1 - torch.tensor(betas, dtype=torch.float64), 0)
 
@@ -126,7 +149,9 @@ class ReferenceLoop:
         self.network.take_weights(task)
         self.average = [parameter.detach().clone() for parameter in self.network.parameters()]
         self.optimizer = torch.optim.AdamW(self.network.parameters(), lr=1e-3, weight_decay=0.0)
-        batches = TrainingBatches(data.train.lengths, data.batch_size, seed=data.seed, first=0, rank=0, world=1)
+        batches = TrainingBatches(
+            data.train.lengths, data.batch_size, seed=data.seed, first=0, rank=0, world=1
+        )
         self.batches = enumerate(batches)
 
     def step(self) -> float:
@@ -168,10 +193,14 @@ class ReferenceLoop:
 
 def prepared(data_root: Path, *words: str) -> tuple[GeneratorTask, MotionDataModule]:
     """A tiny task of `synthetic/dip` in float64, without geometric losses, and its data."""
-    config = compose("synthetic/dip", [*WORDS, f"data_root={data_root}", "losses.velocity=0", *words])
+    config = compose(
+        "synthetic/dip", [*WORDS, f"data_root={data_root}", "losses.velocity=0", *words]
+    )
     torch.manual_seed(0)
     representation = instantiate(config["representation"])
-    data: MotionDataModule = instantiate(config["data"], representation=representation, seed=config["seed"])
+    data: MotionDataModule = instantiate(
+        config["data"], representation=representation, seed=config["seed"]
+    )
     data.prepare_data()
     data.setup("fit")
     features = config["condition"]["features"]
@@ -209,7 +238,9 @@ def test_training_equals_the_loop_in_plain_pytorch(data_root, tmp_path, steps):
 
     # `fit` leaves the averaged weights in the task.
     ours = dict(task.generator.denoiser.named_parameters())
-    for (name, parameter), averaged in zip(loop.network.named_parameters(), loop.average, strict=True):
+    for (name, parameter), averaged in zip(
+        loop.network.named_parameters(), loop.average, strict=True
+    ):
         torch.testing.assert_close(ours[our_name(name)].detach(), averaged, rtol=0, atol=1e-7)
         assert (parameter - averaged).abs().max() > 1e-6
 
@@ -226,7 +257,12 @@ def test_windows_are_uniform_over_all_places_of_a_clip():
 
 
 def test_clips_without_a_frame_to_predict_are_refused_before_training(tmp_path, data_root, capsys):
-    words = [*WORDS, f"data_root={data_root}", f"run.dir={tmp_path / 'run'}", "denoiser.context_frames=40"]
+    words = [
+        *WORDS,
+        f"data_root={data_root}",
+        f"run.dir={tmp_path / 'run'}",
+        "denoiser.context_frames=40",
+    ]
     assert main(["train", "synthetic/dip", *words]) == 1
     assert "data.crop: a sample of 40 frames has none after a prefix of 40" in one_error(capsys)
 
@@ -274,7 +310,9 @@ def trained_in_process(rank: int, words: list[str], steps: int) -> dict[str, Ten
     task.log_dict = lambda *_, **__: None  # type: ignore[method-assign]
     parallel = DistributedDataParallel(Step(task))
     optimizer = task.make_optimizer()
-    stream = TrainingBatches(data.train.lengths, data.batch_size, seed=config["seed"], first=0, rank=rank, world=2)
+    stream = TrainingBatches(
+        data.train.lengths, data.batch_size, seed=config["seed"], first=0, rank=rank, world=2
+    )
     for number, draws in zip(range(steps), stream, strict=False):
         optimizer.zero_grad()
         parallel(collate([data.train[draw] for draw in draws]), number).backward()
@@ -285,7 +323,12 @@ def trained_in_process(rank: int, words: list[str], steps: int) -> dict[str, Ten
 
 def test_two_processes_train_as_one_with_both_batches(data_root, pool):
     prepared(data_root)
-    sgd = ["ema=null", "optimizer._target_=torch.optim.SGD", "optimizer.lr=0.05", "data.batch_size=2"]
+    sgd = [
+        "ema=null",
+        "optimizer._target_=torch.optim.SGD",
+        "optimizer.lr=0.05",
+        "data.batch_size=2",
+    ]
     words = [*WORDS, *sgd, f"data_root={data_root}"]
     expected = reference(words, 3, "synthetic/dip")
     for weights in pool.run(trained_in_process, (0, words, 3), (1, words, 3)):

@@ -100,7 +100,9 @@ def test_the_exact_student_of_gaussian_data_has_no_loss(process):
     torch.manual_seed(0)
     times = torch.tensor(process.grid(10)).double()
     exact = gains(process, times)
-    student = denoiser(process, lambda a, s, t: exact[(t[:, None] - times).abs().argmin(1)][:, None])
+    student = denoiser(
+        process, lambda a, s, t: exact[(t[:, None] - times).abs().argmin(1)][:, None]
+    )
     assert loss(process, student, times).max() < 1e-9
     exact[0] += 0.1
     assert loss(process, student, times)[0] > 1e-3
@@ -132,7 +134,10 @@ def student(trained, data_root, tmp_path_factory) -> Path:
 
 
 def test_a_student_starts_as_its_teacher_and_keeps_its_hash_data_and_text_encoder(trained, student):
-    content, teacher = read_checkpoint(student / "checkpoints" / "last.ckpt"), read_checkpoint(trained)
+    content, teacher = (
+        read_checkpoint(student / "checkpoints" / "last.ckpt"),
+        read_checkpoint(trained),
+    )
     assert content["config"]["distillation"]["teacher"] == str(trained)
     assert content["facts"]["teacher"] == weights_sha256(trained)
     assert content["facts"]["fingerprint"] == teacher["facts"]["fingerprint"]
@@ -142,10 +147,14 @@ def test_a_student_starts_as_its_teacher_and_keeps_its_hash_data_and_text_encode
         torch.testing.assert_close(after, value, atol=0.05, rtol=0)
 
 
-def test_the_target_of_a_student_has_its_averaged_weights(trained, data_root, tmp_path, monkeypatch):
+def test_the_target_of_a_student_has_its_averaged_weights(
+    trained, data_root, tmp_path, monkeypatch
+):
     students, targets = [], []
 
-    def recorded(process: Process, student: nn.Module, follower: nn.Module, *rest: Any, **options: Any) -> Any:
+    def recorded(
+        process: Process, student: nn.Module, follower: nn.Module, *rest: Any, **options: Any
+    ) -> Any:
         if torch.is_grad_enabled():  # not in validation
             students.append(parameters_to_vector(student.parameters()).detach())
             targets.append(parameters_to_vector(follower.parameters()).detach())
@@ -157,11 +166,15 @@ def test_the_target_of_a_student_has_its_averaged_weights(trained, data_root, tm
     initial, first, second, third = students
     assert not torch.equal(second, third)
     average = (first + second) / 2
-    for target, expected in zip(targets, (initial, first, average, (average + third) / 2), strict=True):
+    for target, expected in zip(
+        targets, (initial, first, average, (average + third) / 2), strict=True
+    ):
         torch.testing.assert_close(target, expected)
 
 
-def test_a_student_is_sampled_edited_led_chained_and_exported_without_its_teacher(trained, student, tmp_path):
+def test_a_student_is_sampled_edited_led_chained_and_exported_without_its_teacher(
+    trained, student, tmp_path
+):
     assert main(["export", str(student), str(tmp_path / "student.safetensors")]) == 0
     hidden = trained.rename(trained.with_suffix(".away"))
     try:
@@ -174,10 +187,19 @@ def test_a_student_is_sampled_edited_led_chained_and_exported_without_its_teache
     assert [len(x_t) for x_t, *_ in seen] == [1] * 4
     assert len(flame_mdm.generate(model, "a person walks @1 | a person waves @1")[0].joints) == 40
     targets = {"root": [{"time": 0.8, "position": [0.1, 0.2]}]}
-    assert abs(flame_mdm.generate(model, targets=targets, **text)[0].joints[16, 0, [0, 2]] - [0.1, 0.2]).max() < 0.01
-    edited = flame_mdm.edit(model, motion, "a person waves", joints="left_arm", num_inference_steps=1)[0]
+    assert (
+        abs(
+            flame_mdm.generate(model, targets=targets, **text)[0].joints[16, 0, [0, 2]] - [0.1, 0.2]
+        ).max()
+        < 0.01
+    )
+    edited = flame_mdm.edit(
+        model, motion, "a person waves", joints="left_arm", num_inference_steps=1
+    )[0]
     assert edited.feature_error < 1e-5
-    with pytest.raises(UserError, match="guidance_scale=2: the guidance is built into this distilled model"):
+    with pytest.raises(
+        UserError, match="guidance_scale=2: the guidance is built into this distilled model"
+    ):
         flame_mdm.generate(model, guidance_scale=2, **text)
     with pytest.raises(UserError, match="needs a text"):
         flame_mdm.generate(model)
@@ -188,7 +210,9 @@ def as_version_0_2(run: Path, name: str, old_name: str) -> None:
     last = run / "checkpoints" / "last.ckpt"
     content = torch.load(last, weights_only=True)
     assert name in content["config"]["task"]["_target_"]
-    content["config"]["task"]["_target_"] = content["config"]["task"]["_target_"].replace(name, old_name)
+    content["config"]["task"]["_target_"] = content["config"]["task"]["_target_"].replace(
+        name, old_name
+    )
     torch.save(content, last)
     config = (run / "config.yaml").read_text()
     assert name in config
@@ -212,13 +236,21 @@ def test_a_resumed_distillation_ends_in_the_same_weights(trained, data_root, tmp
     capsys.readouterr()
     again["facts"]["teacher"] = "another"
     torch.save(again, last)
-    assert "weights have changed since this run began" in error_of(capsys, *words, "trainer.max_steps=6")
+    assert "weights have changed since this run began" in error_of(
+        capsys, *words, "trainer.max_steps=6"
+    )
 
 
-@pytest.mark.parametrize("words", [["seed=1,2", "--multirun"], ["launch=local", "seed=1,2"], ["launch=local"]])
-def test_a_sweep_of_students_starts_from_a_recipe_that_all_nodes_read(trained, tmp_path, monkeypatch, capsys, words):
+@pytest.mark.parametrize(
+    "words", [["seed=1,2", "--multirun"], ["launch=local", "seed=1,2"], ["launch=local"]]
+)
+def test_a_sweep_of_students_starts_from_a_recipe_that_all_nodes_read(
+    trained, tmp_path, monkeypatch, capsys, words
+):
     started = []
-    monkeypatch.setattr(sweeps, "hydra_main", lambda **source: lambda _: lambda: started.append((source, sys.argv)))
+    monkeypatch.setattr(
+        sweeps, "hydra_main", lambda **source: lambda _: lambda: started.append((source, sys.argv))
+    )
     run = tmp_path / "run"
     assert main(["distill", str(trained), str(run), *words]) == 0, capsys.readouterr().err
     ((source, argv),) = started
@@ -233,14 +265,21 @@ def test_a_sweep_of_students_starts_from_a_recipe_that_all_nodes_read(trained, t
 def test_two_processes_are_one_with_both_batches(student, tmp_path):
     config, run = str(student / "config.yaml"), tmp_path / "run"
     parts = ("speed=reference", "logger=csv", "callbacks.best=null")
-    words = ["run.speed=reference", "lr_decay=0", *(word for word in RUN if word not in parts), f"run.dir={run}"]
+    words = [
+        "run.speed=reference",
+        "lr_decay=0",
+        *(word for word in RUN if word not in parts),
+        f"run.dir={run}",
+    ]
     code, _, err = finish(spawn(["flame_mdm", "train", config, *words, *TWO]))
     assert code == 0, err
     ours = read_checkpoint(run / "checkpoints" / "last.ckpt")["state_dict"]
     torch.testing.assert_close(ours, reference(words, 4, config), rtol=1e-4, atol=1e-6)
 
 
-def test_a_model_that_cannot_be_a_teacher_gets_one_line(trained, student, data_root, tmp_path, capsys, monkeypatch):
+def test_a_model_that_cannot_be_a_teacher_gets_one_line(
+    trained, student, data_root, tmp_path, capsys, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("FLAME_MDM_DATA", str(data_root))
     content = torch.load(trained, weights_only=True)
@@ -255,26 +294,48 @@ def test_a_model_that_cannot_be_a_teacher_gets_one_line(trained, student, data_r
         ([student], f"distilled already. Give its teacher, {trained}"),
         (["process.ckpt"], "predicts noise, whose clean estimate is divided"),
         (["untrained.ckpt"], "was not trained by this framework"),
-        ([*own, "distillation.teacher=representation.ckpt"], "has representation.fps=30, but the student has 20. Both"),
-        ([*own, "distillation.teacher=gone.ckpt"], "distillation.teacher=gone.ckpt: no such checkpoint"),
+        (
+            [*own, "distillation.teacher=representation.ckpt"],
+            "has representation.fps=30, but the student has 20. Both",
+        ),
+        (
+            [*own, "distillation.teacher=gone.ckpt"],
+            "distillation.teacher=gone.ckpt: no such checkpoint",
+        ),
     ):
         assert says in error_of(capsys, "distill", *words)
     assert {path.stem for path in tmp_path.iterdir()} == {"untrained", "process", "representation"}
 
 
-ABOUT: About = {"name": "", "action": False, "rank": 2, "words": [], "rows": [], "captions": [], "base": ""}
+ABOUT: About = {
+    "name": "",
+    "action": False,
+    "rank": 2,
+    "words": [],
+    "rows": [],
+    "captions": [],
+    "base": "",
+}
 
 
 def build(*words: str) -> MotionGenerator:
     config = compose("quickstart", [*TINY, *words])
     task = MotionGenerator.build(config, instantiate(config["representation"]))
-    task.facts |= {"max_frames": 40, "vocabulary": ["a", "person", "walks"], "captions": ["a person walks"]}
+    task.facts |= {
+        "max_frames": 40,
+        "vocabulary": ["a", "person", "walks"],
+        "captions": ["a person walks"],
+    }
     return task.eval()
 
 
 def write(task: MotionGenerator, about: About, file: Path) -> None:
     """Writes the checkpoint of an adaptation, and its adapter next to it."""
-    content = {"config": task.config | {"adapter": about}, "facts": task.facts, "state_dict": task.state_dict()}
+    content = {
+        "config": task.config | {"adapter": about},
+        "facts": task.facts,
+        "state_dict": task.state_dict(),
+    }
     torch.save(content | {"global_step": 3, "flame_mdm_format": 2}, file.with_suffix(".ckpt"))
     write_adapter(file, file.with_suffix(".ckpt"))
 
@@ -285,13 +346,26 @@ def taught(tmp_path_factory):
     folder = tmp_path_factory.mktemp("adapters")
     torch.manual_seed(0)
     base = build()
-    write_model_file(folder / "base.safetensors", base.state_dict(), config=base.config, facts=base.facts, origin={})
+    write_model_file(
+        folder / "base.safetensors",
+        base.state_dict(),
+        config=base.config,
+        facts=base.facts,
+        origin={},
+    )
     sha = weights_sha256(folder / "base.safetensors")
     for name in ("limp", "march"):
         task, new = build(), [name, "in", "style"]
         assert isinstance(task.condition, LearnedTokens)
         rows = word_rows(task.condition, new, base.facts["vocabulary"])
-        about: About = {**ABOUT, "name": name, "words": new, "rows": rows, "captions": ["a person limps"], "base": sha}
+        about: About = {
+            **ABOUT,
+            "name": name,
+            "words": new,
+            "rows": rows,
+            "captions": ["a person limps"],
+            "base": sha,
+        }
         attach(task, about)
         copy_weights(task, folder / "base.safetensors")
         task.facts["vocabulary"] = [*base.facts["vocabulary"], name, "in", "style"]
@@ -310,7 +384,9 @@ def sampled(model, text="a person walks in limp style") -> torch.Tensor:
 
 def test_strength_0_is_the_base_and_1_the_trained_model(taught):
     file, adapter = taught / "base.safetensors", taught / "limp.safetensors"
-    none, full = (sampled(flame_mdm.load(file, adapter=adapter, strength=strength)) for strength in (0, 1))
+    none, full = (
+        sampled(flame_mdm.load(file, adapter=adapter, strength=strength)) for strength in (0, 1)
+    )
     base = sampled(flame_mdm.load(file))
     assert torch.equal(none, base)
     unmerged, checkpoint = build(), read_checkpoint(taught / "limp.ckpt")
@@ -328,12 +404,22 @@ def test_several_adapters_add_up_and_export_merges_them(taught, tmp_path):
     name, table = "denoiser.transformer.layers.0.feed_forward.0.weight", "condition.words.weight"
     expected = read_checkpoint(taught / "base.safetensors")["state_dict"]
     for strength, file in zip((0.5, 2), files, strict=True):
-        part, rows = load_file(file), read_checkpoint(file.with_suffix(".ckpt"))["config"]["adapter"]["rows"]
+        part, rows = (
+            load_file(file),
+            read_checkpoint(file.with_suffix(".ckpt"))["config"]["adapter"]["rows"],
+        )
         expected[name] = expected[name] + strength * part[f"{name}.up"] @ part[f"{name}.down"]
-        expected[table] = expected[table].index_add(0, torch.tensor(rows), strength * 10 * part[f"{table}.vectors"])
+        expected[table] = expected[table].index_add(
+            0, torch.tensor(rows), strength * 10 * part[f"{table}.vectors"]
+        )
     for key in (name, table):
         torch.testing.assert_close(both.state_dict()[key], expected[key])
-    merged = export(taught / "base.safetensors", tmp_path / "merged.safetensors", adapter=files, strength=[0.5, 2])
+    merged = export(
+        taught / "base.safetensors",
+        tmp_path / "merged.safetensors",
+        adapter=files,
+        strength=[0.5, 2],
+    )
     assert torch.equal(sampled(flame_mdm.load(merged)), sampled(both))
 
 
@@ -351,7 +437,9 @@ def test_what_is_no_adapter_of_the_base_is_refused(taught, tmp_path):
         with pytest.raises(UserError, match=message):
             flame_mdm.load(taught / "base.safetensors", adapter=tmp_path / "x.safetensors")
     with pytest.raises(UserError, match="give one number, or one for each of 1 adapters"):
-        flame_mdm.load(taught / "base.safetensors", adapter=taught / "limp.safetensors", strength=[1, 2])
+        flame_mdm.load(
+            taught / "base.safetensors", adapter=taught / "limp.safetensors", strength=[1, 2]
+        )
     with pytest.raises(UserError, match="an adapter, which changes a model"):
         flame_mdm.load(taught / "limp.safetensors")
     model = build()
@@ -365,16 +453,22 @@ def test_files_contain_the_changes_of_later_layers_and_for_actions_of_all(tmp_pa
     about: About = {**ABOUT, "action": action}
     model = build("denoiser.num_layers=3")
     attach(model, about)
-    assert len([parameter for parameter in model.parameters() if parameter.requires_grad]) == 3 * 2 * 4
+    assert (
+        len([parameter for parameter in model.parameters() if parameter.requires_grad]) == 3 * 2 * 4
+    )
     write(model, about, tmp_path / "limp.safetensors")
-    assert {name.split("layers.")[1][0] for name in load_file(tmp_path / "limp.safetensors")} == kept
+    assert {
+        name.split("layers.")[1][0] for name in load_file(tmp_path / "limp.safetensors")
+    } == kept
 
 
 def test_new_words_get_rows_that_no_known_word_has():
     encoder = LearnedTokens(16, buckets=50, heads=2)
     (row,) = word_rows(encoder, ["limp"], [])
     first, second = hashed("limp", 50)
-    other = next(w for n in range(10**4) if first in hashed(w := f"w{n}", 50) and second not in hashed(w, 50))
+    other = next(
+        w for n in range(10**4) if first in hashed(w := f"w{n}", 50) and second not in hashed(w, 50)
+    )
     assert (row, word_rows(encoder, ["limp"], [other])) == (first, [second])
 
 
@@ -394,7 +488,9 @@ def clips(tmp_path) -> Path:
 
 
 @pytest.mark.slow
-def test_from_clips_to_a_prompt_and_resumed(trained, clips, tmp_path, monkeypatch, data_root, capsys):
+def test_from_clips_to_a_prompt_and_resumed(
+    trained, clips, tmp_path, monkeypatch, data_root, capsys
+):
     monkeypatch.setattr(adaptation, "SAMPLED", 10)
     monkeypatch.chdir(tmp_path)
     words = ["adapt", str(trained), "whole", f"source={clips}", "name=limp", *STEPS]
@@ -411,24 +507,52 @@ def test_from_clips_to_a_prompt_and_resumed(trained, clips, tmp_path, monkeypatc
     assert "sampling 10 motions of it instead" in capsys.readouterr().out
     store, base = Store(next(Path("whole/data").glob("limp-*"))), flame_mdm.load(trained)
     np.testing.assert_array_equal(store.mean, base.representation.mean)
-    assert {clip.captions[0] for clip in store.clips if not clip.source.startswith("prior/")} == {STYLED}
-    assert main(["sample", str(trained), "out", f"text={STYLED}", "adapter=whole/limp.safetensors", "samples=1"]) == 0
+    assert {clip.captions[0] for clip in store.clips if not clip.source.startswith("prior/")} == {
+        STYLED
+    }
+    assert (
+        main(
+            [
+                "sample",
+                str(trained),
+                "out",
+                f"text={STYLED}",
+                "adapter=whole/limp.safetensors",
+                "samples=1",
+            ]
+        )
+        == 0
+    )
     assert "never seen" not in capsys.readouterr().out
 
 
 def test_an_adaptation_keeps_the_captions_of_the_users_clips_and_the_text_encoder(monkeypatch):
     config = compose("quickstart", [*TINY, "task.cond_drop_prob=1"])
     task = adaptation.AdaptationTask.build(config, instantiate(config["representation"]))
-    batch = MotionBatch(torch.zeros(3, 2, 263), torch.ones(3, 2, dtype=torch.bool), ["limp", "prior/limp", "a/prior/b"])
+    batch = MotionBatch(
+        torch.zeros(3, 2, 263),
+        torch.ones(3, 2, dtype=torch.bool),
+        ["limp", "prior/limp", "a/prior/b"],
+    )
     assert task.dropped(batch).tolist() == [False, True, False]
     monkeypatch.setattr(task.generator.condition, "pretrain", lambda *_: pytest.fail("trained"))
     task.pretrain()
 
 
 @pytest.mark.slow
-def test_all_weights_and_half_of_each_batch_from_the_data_of_the_base(trained, clips, tmp_path, data_root, monkeypatch):
+def test_all_weights_and_half_of_each_batch_from_the_data_of_the_base(
+    trained, clips, tmp_path, data_root, monkeypatch
+):
     monkeypatch.setenv("FLAME_MDM_DATA", str(data_root))
-    words = ["adapt", str(trained), str(tmp_path / "run"), f"source={clips}", "name=limp", "full=true", *STEPS]
+    words = [
+        "adapt",
+        str(trained),
+        str(tmp_path / "run"),
+        f"source={clips}",
+        "name=limp",
+        "full=true",
+        *STEPS,
+    ]
     assert main([*words, "trainer.max_steps=2"]) == 0
     model, base = flame_mdm.load(tmp_path / "run" / "limp.safetensors"), flame_mdm.load(trained)
     assert not torch.equal(*(of.state_dict()["denoiser.output.weight"] for of in (model, base)))
@@ -448,7 +572,11 @@ def test_unusable_requests_are_refused(refused, trained, clips, tmp_path):
     refused(*lesson, "losses.velocity=3", says="keeps the losses of its base")
     refused(*lesson[:2], f"source={tmp_path / 'none'}", "name=limp", says="no such folder")
     joints = next(iter(Synthetic(clips=1).clips(20.0))).motion
-    np.savez(clips / "rising", joints=joints + np.linspace(0, 0.3, len(joints))[:, None, None] * [0, 1, 0], fps=20)
+    np.savez(
+        clips / "rising",
+        joints=joints + np.linspace(0, 0.3, len(joints))[:, None, None] * [0, 1, 0],
+        fps=20,
+    )
     refused(*lesson, says="1 of 4 motions have no caption")
     (clips / "rising.txt").write_text("a person rises")
     refused(*lesson, says="rising drifts upward by")
@@ -458,7 +586,9 @@ def test_the_demo_offers_a_model_with_and_without_an_adapter(taught):
     base, adapter = str(taught / "base.safetensors"), str(taught / "limp.safetensors")
     studio = Studio([base, f"{base} + {adapter}"], "cpu")
     expected = flame_mdm.load(base, adapter=adapter).state_dict()
-    torch.testing.assert_close(studio.model(f"{base} + {adapter}").state_dict(), expected, rtol=0, atol=0)
+    torch.testing.assert_close(
+        studio.model(f"{base} + {adapter}").state_dict(), expected, rtol=0, atol=0
+    )
     request = DemoRequest(model=f"{base} + {adapter}", text="a person walks")
     assert f"flame_mdm.load({base!r}, adapter={adapter!r})" in request.python("text", "cpu")
 

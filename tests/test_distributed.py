@@ -35,8 +35,16 @@ def test_two_processes_are_one_with_both_batches(tiny, tmp_path):
     ours = ["callbacks.samples.every_n_steps=2", "trainer.max_steps=4"]
     code, out, err = finish(spawn(["flame_mdm", "train", "quickstart", *words, *TWO, *ours]))
     assert code == 0, err
-    assert "batch: 2 clips = 1 x 2 processes x 1 accumulated; optimizer.lr=0.05 is not scaled with the batch" in out
-    assert out.count("steps: 0 to 4") == out.count("player: ") == err.count("preparing synthetic:   0%") == 1
+    assert (
+        "batch: 2 clips = 1 x 2 processes x 1 accumulated; optimizer.lr=0.05 is not scaled with the batch"
+        in out
+    )
+    assert (
+        out.count("steps: 0 to 4")
+        == out.count("player: ")
+        == err.count("preparing synthetic:   0%")
+        == 1
+    )
     expected = reference(words, 4)
     trained = read_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")["state_dict"]
     torch.testing.assert_close(trained, expected, rtol=1e-4, atol=1e-6)
@@ -45,7 +53,9 @@ def test_two_processes_are_one_with_both_batches(tiny, tmp_path):
     config = compose("quickstart", words)
     task = load_task(tmp_path / "run" / "checkpoints" / "last.ckpt", GeneratorTask)
     task.load_state_dict(expected)
-    data = instantiate(config["data"], representation=task.generator.representation, seed=config["seed"])
+    data = instantiate(
+        config["data"], representation=task.generator.representation, seed=config["seed"]
+    )
     data.setup("fit")
     with torch.no_grad():
         for index, batch in enumerate(data.val_dataloader()):
@@ -62,19 +72,44 @@ def test_torchrun_starts_a_killed_group_again(tiny, tmp_path):
     counter = "TORCHELASTIC_RESTART_COUNT"
     alarms = [
         *alarm(tmp_path, "kill", step=3, rank=0, attempt=0, counter=counter, signal="SIGKILL"),
-        *alarm(tmp_path, "end", step=6, rank=0, attempt=1, counter=counter, signal="SIGTERM", parent=True),
+        *alarm(
+            tmp_path,
+            "end",
+            step=6,
+            rank=0,
+            attempt=1,
+            counter=counter,
+            signal="SIGTERM",
+            parent=True,
+        ),
     ]
     torchrun = ["torch.distributed.run", "--nproc-per-node=2", "--max-restarts=1", "--standalone"]
-    command = [*torchrun, "-m", "flame_mdm", "train", "quickstart", *words, *TWO, *alarms, "trainer.max_steps=100000"]
+    command = [
+        *torchrun,
+        "-m",
+        "flame_mdm",
+        "train",
+        "quickstart",
+        *words,
+        *TWO,
+        *alarms,
+        "trainer.max_steps=100000",
+    ]
     path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
     # Else torchrun keeps its store, and the new group finds the addresses of the dead one in there.
-    _, out, err = finish(spawn(command, PYTHONPATH=path, TORCH_DISABLE_SHARE_RDZV_TCP_STORE="1", PYTHONUNBUFFERED="1"))
+    _, out, err = finish(
+        spawn(
+            command, PYTHONPATH=path, TORCH_DISABLE_SHARE_RDZV_TCP_STORE="1", PYTHONUNBUFFERED="1"
+        )
+    )
     for line in ("steps: 0 to 100000", "died; taking over its run directory", "steps: 2 to 100000"):
         assert out.count(line) == 1, err
     step = int(re.findall(r"stopped at step (\d+)", out)[0])
     checkpoint = read_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")
     assert checkpoint["global_step"] == step >= 6
-    torch.testing.assert_close(checkpoint["state_dict"], reference(words, step), rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(
+        checkpoint["state_dict"], reference(words, step), rtol=1e-4, atol=1e-6
+    )
     assert not (tmp_path / "run" / "run.lock").exists()
 
 
@@ -84,7 +119,8 @@ def test_data_is_prepared_once_and_no_process_is_without_a_validation_batch(tiny
     representation = instantiate(config["representation"])
     data = instantiate(config["data"], representation=representation, seed=0)
     for part in (data, GeneratorTask.build(config, representation)):
-        assert part.prepare_data_per_node is False  # by which Lightning asks the first process of the first machine
+        # By which Lightning asks the first process of the first machine
+        assert part.prepare_data_per_node is False
     data.prepare_data()
     data.setup("fit")
     for world, batches in ((1, 5), (2, 3), (7, 5)):
@@ -102,7 +138,9 @@ def test_processes_are_started_with_the_words_of_one_job(tiny, tmp_path, monkeyp
     monkeypatch.setattr(sys, "argv", ["flame-mdm", "train"])
     folder = f"run.dir={tmp_path / 'sweep'}"
     assert main(["train", "quickstart", *tiny[:-1], folder, "seed=1,2", "--multirun"]) == 0
-    assert [config["run"]["dir"] for _, config in seen] == [str(tmp_path / "sweep" / f"seed={n}") for n in (1, 2)]
+    assert [config["run"]["dir"] for _, config in seen] == [
+        str(tmp_path / "sweep" / f"seed={n}") for n in (1, 2)
+    ]
     for (command, *words), config in seen:
         assert command == "train"
         assert config["callbacks"]["checkpoints"]["folder"] == f"{config['run']['dir']}/checkpoints"
@@ -112,14 +150,25 @@ def test_processes_are_started_with_the_words_of_one_job(tiny, tmp_path, monkeyp
 @pytest.mark.robustness
 def test_a_slurm_job_that_runs_out_of_time_is_requeued_and_ends_as_if_it_had_not(tiny, tmp_path):
     """Two tasks; SIGUSR2, which submitit asks SLURM for, comes at step 1 of 3."""
-    path = os.pathsep.join([str(tmp_path), str(ROOT), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
+    path = os.pathsep.join([str(tmp_path), str(ROOT), os.environ.get("PYTHONPATH", "")]).rstrip(
+        os.pathsep
+    )
     programs = os.pathsep.join([str(ROOT / "tests" / "support" / "slurm"), os.environ["PATH"]])
-    cluster = {"CLUSTER": str(tmp_path), "PYTHONPATH": path, "PATH": programs}  # has SLURM as far as submitit needs it
+    # Has SLURM as far as submitit needs it
+    cluster = {
+        "CLUSTER": str(tmp_path),
+        "PYTHONPATH": path,
+        "PATH": programs,
+    }
     cluster |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port())}
     words = [*tiny, *RUN, "callbacks.samples=null", "trainer.max_steps=3"]
-    time_over = alarm(tmp_path, "time", step=1, rank=0, attempt=0, counter="SLURM_RESTART_COUNT", signal="SIGUSR2")
+    time_over = alarm(
+        tmp_path, "time", step=1, rank=0, attempt=0, counter="SLURM_RESTART_COUNT", signal="SIGUSR2"
+    )
     launch = ["launch=slurm", "hydra.launcher.partition=gpu", "hydra.launcher.timeout_min=90"]
-    code, out, err = finish(spawn(["flame_mdm", "train", "quickstart", *words, *time_over, *TWO, *launch], **cluster))
+    code, out, err = finish(
+        spawn(["flame_mdm", "train", "quickstart", *words, *time_over, *TWO, *launch], **cluster)
+    )
     logs = "\n".join(path.read_text() for path in (tmp_path / "run" / ".submitit").rglob("*.out"))
     assert code == 0, out + err + logs
     assert (tmp_path / "listed").read_text() == "requeue 7\n"
@@ -133,7 +182,14 @@ def test_a_slurm_job_that_runs_out_of_time_is_requeued_and_ends_as_if_it_had_not
 
     script = tmp_path / "script.sh"
     listed = set(re.findall(r"^#SBATCH --(.+)$", script.read_text(), re.MULTILINE))
-    options = {"nodes=1", "ntasks-per-node=2", "gpus-per-node=2", "time=90", "partition=gpu", "requeue"}
+    options = {
+        "nodes=1",
+        "ntasks-per-node=2",
+        "gpus-per-node=2",
+        "time=90",
+        "partition=gpu",
+        "requeue",
+    }
     assert options | {"job-name=quickstart", "signal=USR2@120"} <= listed
     assert_lints("shellcheck", "--severity=warning", script)
 
@@ -143,11 +199,20 @@ def test_jobs_of_a_sweep_run_in_processes_and_folders_of_their_own(tiny, tmp_pat
     """On this machine; the second one is refused."""
     (tmp_path / "sweep" / "seed=2").mkdir(parents=True)
     (tmp_path / "sweep" / "seed=2" / "config.yaml").write_text("run: {dir: another}\n")
-    words = ["train", "quickstart", *tiny[:-1], f"run.dir={tmp_path / 'sweep'}", "trainer.max_steps=0", "seed=1,2"]
+    words = [
+        "train",
+        "quickstart",
+        *tiny[:-1],
+        f"run.dir={tmp_path / 'sweep'}",
+        "trainer.max_steps=0",
+        "seed=1,2",
+    ]
     words += ["launch=local", "hydra.launcher.timeout_min=5"]
     code, out, err = finish(spawn(["flame_mdm", *words], PYTHONPATH=str(ROOT)))
     assert code == 1, out + err
-    logs = "\n".join(path.read_text() for path in (tmp_path / "sweep" / ".submitit").rglob("*log.*"))
+    logs = "\n".join(
+        path.read_text() for path in (tmp_path / "sweep" / ".submitit").rglob("*log.*")
+    )
     assert "seed=1: already trained for 0 steps" in logs
     assert "seed=2 holds a run with another configuration" in logs
 
@@ -155,7 +220,14 @@ def test_jobs_of_a_sweep_run_in_processes_and_folders_of_their_own(tiny, tmp_pat
 @pytest.mark.robustness
 def test_evaluations_run_as_jobs_of_a_launcher(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    words = ["evaluate", "missing.ckpt", "extractor=none", "seed=0,1", "launch=local", "hydra.launcher.timeout_min=5"]
+    words = [
+        "evaluate",
+        "missing.ckpt",
+        "extractor=none",
+        "seed=0,1",
+        "launch=local",
+        "hydra.launcher.timeout_min=5",
+    ]
     code, out, err = finish(spawn(["flame_mdm", *words], PYTHONPATH=str(ROOT)))
     assert code == 1, out + err
     assert "waiting for the jobs; their output is in runs/sweeps/.submitit" in out
@@ -199,7 +271,11 @@ def assert_lints(program: str, *words: str | Path) -> None:
 
 def test_the_container_file_is_clean_and_copies_what_is_there():
     assert_lints("hadolint", ROOT / "Dockerfile")
-    lines = [line.split() for line in (ROOT / "Dockerfile").read_text().splitlines() if line.startswith("COPY")]
+    lines = [
+        line.split()
+        for line in (ROOT / "Dockerfile").read_text().splitlines()
+        if line.startswith("COPY")
+    ]
     copied = {name for _, *names, _ in lines for name in names}
     assert {"flame_mdm", "evaluators", "experiments", "constraints.txt", "pyproject.toml"} <= copied
     left_out = set((ROOT / ".dockerignore").read_text().split())

@@ -69,7 +69,11 @@ def motion(diffusion) -> Motion:
 
 @pytest.mark.parametrize("length", [8, 37])
 def test_regions(diffusion, motion, length):
-    part = replace(motion, joints=motion.joints[:1].repeat(length, 0), features=motion.features[:1].repeat(length, 0))
+    part = replace(
+        motion,
+        joints=motion.joints[:1].repeat(length, 0),
+        features=motion.features[:1].repeat(length, 0),
+    )
     for region, kept in (
         ("in_between", lambda i: i < int(0.25 * length) or i >= int(0.75 * length)),
         ("prediction", lambda i: i < int(0.25 * length)),
@@ -96,7 +100,9 @@ def test_frames_and_joints_meet_and_the_upper_body_is_what_mdm_resamples(diffusi
     assert (keep == keep[0]).all()
     lower = np.isin(np.arange(22), (0, 1, 2, 4, 5, 7, 8, 10, 11))
     positions, rotations = (np.repeat(lower[1:], size) for size in (3, 6))
-    assert keep[0].tolist() == [True] * 4 + [*positions, *rotations, *np.repeat(lower, 3)] + [True] * 4
+    assert (
+        keep[0].tolist() == [True] * 4 + [*positions, *rotations, *np.repeat(lower, 3)] + [True] * 4
+    )
 
 
 @pytest.mark.parametrize("skeleton", [SMPL22, SMPL24, KIT21], ids=lambda s: s.name)
@@ -106,7 +112,11 @@ def test_parts_of_the_body(skeleton):
     assert {skeleton.mirrored[joint] for joint in parts["left_arm"]} == set(parts["right_arm"])
     assert {skeleton.mirrored[joint] for joint in parts["left_leg"]} == set(parts["right_leg"])
     assert set(skeleton.feet) <= set(parts["legs"]) == set(parts["lower_body"]) - {0}
-    assert {skeleton.joints[j] for j in parts["right_arm"]} >= {"right_shoulder", "right_elbow", "right_wrist"}
+    assert {skeleton.joints[j] for j in parts["right_arm"]} >= {
+        "right_shoulder",
+        "right_elbow",
+        "right_wrist",
+    }
     expected = sorted([*parts["right_leg"], skeleton.joints.index("left_elbow")])
     assert find_joints(skeleton, ["right_leg", "left_elbow"]) == expected
 
@@ -152,7 +162,10 @@ def test_other_methods_keep_roughly(diffusion, flow, motion):
         default = edit(flow, motion, region="in_between")[0]
     assert (len(repeated), len(rewritten)) == (3 * 3 + 1, 25)
     assert default.feature_error > 1e-3
-    six, five = (edit(flow, motion, region="in_between", until=time, num_inference_steps=25)[0] for time in (0.2, 0.19))
+    six, five = (
+        edit(flow, motion, region="in_between", until=time, num_inference_steps=25)[0]
+        for time in (0.2, 0.19)
+    )
     assert np.array_equal(default.features, six.features)
     assert not np.array_equal(default.features, five.features)
     assert edit(flow, motion, region="in_between", method="mdm")[0].feature_error == 0
@@ -161,7 +174,9 @@ def test_other_methods_keep_roughly(diffusion, flow, motion):
 def test_world_error_tells_of_a_suffix_that_has_moved(diffusion, motion):
     assert edit(diffusion, motion, region="prediction")[0].joint_error < 1e-5
     suffix = edit(diffusion, motion, region="suffix")[0]
-    moved = np.linalg.norm(suffix.joints - motion.joints, axis=-1)[int(0.75 * len(motion.joints)) :].max()
+    moved = np.linalg.norm(suffix.joints - motion.joints, axis=-1)[
+        int(0.75 * len(motion.joints)) :
+    ].max()
     assert suffix.joint_error == pytest.approx(moved)
     assert moved > 0.1
 
@@ -171,7 +186,9 @@ def test_world_error_tells_of_a_suffix_that_has_moved(diffusion, motion):
 def test_a_variation_starts_from_the_noised_motion(kind, strength, motion, request):
     model = request.getfixturevalue(kind)
     with inputs_of(model.denoiser) as seen:
-        varied = edit(model, motion, strength=strength, num_inference_steps=10, guidance_scale=1.0)[0]
+        varied = edit(model, motion, strength=strength, num_inference_steps=10, guidance_scale=1.0)[
+            0
+        ]
     assert len(seen) == round(10 * strength)
     assert not varied.keep.any()
     assert (varied.feature_error, varied.joint_error) == (0, 0)
@@ -180,12 +197,24 @@ def test_a_variation_starts_from_the_noised_motion(kind, strength, motion, reque
     noise = seeded_noise(["#0"], *known.shape[1:], seed=0, replication=0, like=known)(0)
     time = t / 1000 if kind == "flow" else t
     torch.testing.assert_close(x_t, model.process.corrupt(known, noise, time), rtol=0, atol=1e-4)
-    assert edit(model, motion, strength=strength, joints="upper_body", method="mdm")[0].feature_error == 0
+    assert (
+        edit(model, motion, strength=strength, joints="upper_body", method="mdm")[0].feature_error
+        == 0
+    )
 
 
 def test_an_edit_depends_on_its_own_seed_alone(diffusion, motion):
-    one = flame_mdm.edit(diffusion, motion, "a person jumps", region="in_between", samples=1, seed=3)[0]
-    many = edit(diffusion, motion, ["a person jumps", "a person bows"], region="in_between", samples=2, seed=3)
+    one = flame_mdm.edit(
+        diffusion, motion, "a person jumps", region="in_between", samples=1, seed=3
+    )[0]
+    many = edit(
+        diffusion,
+        motion,
+        ["a person jumps", "a person bows"],
+        region="in_between",
+        samples=2,
+        seed=3,
+    )
     np.testing.assert_allclose(one.features, many[0].features, atol=1e-5)
     assert [m.text for m in many] == ["a person jumps"] * 2 + ["a person bows"] * 2
     assert isinstance(one, Edited)
@@ -220,22 +249,65 @@ def test_bad_edits_are_one_line(diffusion, flow, motion):
     cases: list[tuple[MotionGenerator, dict, str]] = [
         (diffusion, {}, r"no part of the motion is kept: choose region.*strength=0\.5"),
         (diffusion, {"region": [0, 40]}, "no part of the motion is kept"),
-        (diffusion, {"region": [5, 5]}, r"region=\[5, 5\] is not a range of this motion, which has 40 frames \(2 sec"),
+        (
+            diffusion,
+            {"region": [5, 5]},
+            r"region=\[5, 5\] is not a range of this motion, which has 40 frames \(2 sec",
+        ),
         (diffusion, {"region": [[1, 2], 3]}, r"write \[begin, end\], or sev"),
-        (diffusion, {"region": [1, 2], "region_seconds": [1, 2]}, "give region or region_seconds, not both"),
-        (diffusion, {"region": "inbetween"}, "region=inbetween is unknown. Did you mean in_between"),
-        (diffusion, {"joints": "uper_body"}, "no joint or part 'uper_body'. Did you mean upper_body"),
-        (diffusion, suffix | {"method": "mfm"}, "method=mfm is not supported by GaussianDiffusion; .* mdm, flame"),
-        (diffusion, suffix | {"method": "repaint"}, "method=repaint is unknown. Use mdm, flame, flame_code"),
+        (
+            diffusion,
+            {"region": [1, 2], "region_seconds": [1, 2]},
+            "give region or region_seconds, not both",
+        ),
+        (
+            diffusion,
+            {"region": "inbetween"},
+            "region=inbetween is unknown. Did you mean in_between",
+        ),
+        (
+            diffusion,
+            {"joints": "uper_body"},
+            "no joint or part 'uper_body'. Did you mean upper_body",
+        ),
+        (
+            diffusion,
+            suffix | {"method": "mfm"},
+            "method=mfm is not supported by GaussianDiffusion; .* mdm, flame",
+        ),
+        (
+            diffusion,
+            suffix | {"method": "repaint"},
+            "method=repaint is unknown. Use mdm, flame, flame_code",
+        ),
         (diffusion, suffix | {"until": 0.3}, "until=0.3 is an option of method=mfm, not of mdm"),
         (diffusion, suffix | {"seconds": 3}, "an edit is as long as its motion: omit seconds"),
         (diffusion, suffix | {"texts": "walks | jumps"}, "an edit keeps a single motion"),
-        (diffusion, {"strength": 0.5, "texts": "walks | jumps | sits"}, "the parts are not as long as the motion"),
-        (diffusion, {"strength": 0.5, "texts": "walks @1.5 | jumps @1"}, "not as long .*, which has 2 seconds"),
+        (
+            diffusion,
+            {"strength": 0.5, "texts": "walks | jumps | sits"},
+            "the parts are not as long as the motion",
+        ),
+        (
+            diffusion,
+            {"strength": 0.5, "texts": "walks @1.5 | jumps @1"},
+            "not as long .*, which has 2 seconds",
+        ),
         (diffusion, {"regoin": "suffix"}, "edit has no option regoin. Did you mean region"),
-        *((diffusion, {"strength": value}, "strength=.*: give a number above 0, up to 1") for value in (0.0, np.nan)),
-        (flow, suffix | {"method": "flame"}, "not supported by FlowMatching; this model supports: mdm, mfm"),
-        (short, suffix, r"walk: 40 frames, but .* at most 36 \(1.8 seconds\): select a part with cut="),
+        *(
+            (diffusion, {"strength": value}, "strength=.*: give a number above 0, up to 1")
+            for value in (0.0, np.nan)
+        ),
+        (
+            flow,
+            suffix | {"method": "flame"},
+            "not supported by FlowMatching; this model supports: mdm, mfm",
+        ),
+        (
+            short,
+            suffix,
+            r"walk: 40 frames, but .* at most 36 \(1.8 seconds\): select a part with cut=",
+        ),
     ]
     for model, options, message in cases:
         with one_line_error(message):
@@ -251,9 +323,17 @@ def test_motions_that_cannot_be_read_are_one_line(diffusion, store, tmp_path):
             {},
             r"motion\.npz.* shape \(9, 21, 3\), but humanml-clean-smpl22",
         ),
-        ({"joints": joints[..., 0], "fps": 20}, {}, r"motion\.npz.* joints of shape \(9, 22\), not"),
+        (
+            {"joints": joints[..., 0], "fps": 20},
+            {},
+            r"motion\.npz.* joints of shape \(9, 22\), not",
+        ),
         ({"fps": 20}, {}, r"motion\.npz.* contains neither joints nor poses"),
-        (clean | {"features": joints[..., 0]}, {}, r"motion\.npz.* features of shape \(9, 22\), not"),
+        (
+            clean | {"features": joints[..., 0]},
+            {},
+            r"motion\.npz.* features of shape \(9, 22\), not",
+        ),
         (tmp_path / "absent.npz", {}, r"absent\.npz: no such file"),
         ("kit:1", {}, "no prepared data set"),
         ("walk", {}, r"Give a \.npz, \.bvh, .* file, or dataset:id"),
@@ -267,7 +347,9 @@ def test_motions_that_cannot_be_read_are_one_line(diffusion, store, tmp_path):
         with one_line_error(message):
             read_motion(diffusion.representation, path, data_root=store, **options)
     np.savez(file, joints=joints[:, :21], fps=20)
-    with one_line_error(r"motion.npz: the model needs rotations of SMPL's joints, which kit21 does not determine"):
+    with one_line_error(
+        r"motion.npz: the model needs rotations of SMPL's joints, which kit21 does not determine"
+    ):
         read_motion(SMPL(), file)
 
 

@@ -22,9 +22,23 @@ from evaluators.evaluation_request import EvaluationRequest
 from evaluators.evaluator import Evaluator, Motions, Rows
 from evaluators.extractors import MotionCLIPExtractor
 from evaluators.plan import Plan, sampling_options
-from evaluators.protocol import FOLDER, DrawnClip, default_protocol, load_protocol, protocol_config, protocol_names
+from evaluators.protocol import (
+    FOLDER,
+    DrawnClip,
+    default_protocol,
+    load_protocol,
+    protocol_config,
+    protocol_names,
+)
 from evaluators.results import _overlaps
-from evaluators.sources import Baseline, Generator, SampleFolder, Samples, read_samples, real_motions
+from evaluators.sources import (
+    Baseline,
+    Generator,
+    SampleFolder,
+    Samples,
+    read_samples,
+    real_motions,
+)
 from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.loading import load
 from flame_mdm.checkpoints.locating import SHIPPED
@@ -45,11 +59,23 @@ from flame_mdm.seeds import key
 pytestmark = pytest.mark.slow
 
 DATA = ("data=synthetic", "data.source.clips=400")
-GENERATOR = ["data.source.clips=400", *TINY[1:], "callbacks.samples=null", "trainer.val_check_interval=2"]
+GENERATOR = [
+    "data.source.clips=400",
+    *TINY[1:],
+    "callbacks.samples=null",
+    "trainer.val_check_interval=2",
+]
 CLIP = [
     *("data.source.clips=400", "data.batch_size=16", "condition=learned", "condition.features=16"),
-    *(f"task.network.{size}" for size in ("latent_dim=16", "ff_size=16", "num_layers=1", "num_heads=2")),
-    *("task.network.embedding_dim=4", "trainer.accelerator=cpu", "trainer.enable_progress_bar=false"),
+    *(
+        f"task.network.{size}"
+        for size in ("latent_dim=16", "ff_size=16", "num_layers=1", "num_heads=2")
+    ),
+    *(
+        "task.network.embedding_dim=4",
+        "trainer.accelerator=cpu",
+        "trainer.enable_progress_bar=false",
+    ),
     "trainer.val_check_interval=2",
 ]
 
@@ -61,22 +87,49 @@ class Runs:
         self.root = folder / "data"
         data = [f"data_root={self.root}", "trainer.max_steps=2"]
         assert main(["train", "quickstart", *GENERATOR, *data, f"run.dir={folder / 'model'}"]) == 0
-        assert main(["train", "motion_clip/synthetic", *CLIP, *data, f"run.dir={folder / 'clip'}"]) == 0
-        self.model, self.clip = (folder / name / "checkpoints" / "last.ckpt" for name in ("model", "clip"))
+        assert (
+            main(["train", "motion_clip/synthetic", *CLIP, *data, f"run.dir={folder / 'clip'}"])
+            == 0
+        )
+        self.model, self.clip = (
+            folder / name / "checkpoints" / "last.ckpt" for name in ("model", "clip")
+        )
 
     def copy(self, folder: Path) -> Path:
         """The model in another folder; its motions are kept there, and no test sees those of another."""
         return (
-            Path(shutil.copytree(self.model.parent, folder / "model" / "checkpoints", dirs_exist_ok=True)) / "last.ckpt"
+            Path(
+                shutil.copytree(
+                    self.model.parent, folder / "model" / "checkpoints", dirs_exist_ok=True
+                )
+            )
+            / "last.ckpt"
         )
 
     def evaluate(self, out: Path, *words: str, model: Path | None = None) -> Any:
         model = model or self.copy(out.parent)
-        assert main(["evaluate", f"ckpt={model}", f"extractor={self.clip}", f"out={out}", "device=cpu", *words]) == 0
+        assert (
+            main(
+                [
+                    "evaluate",
+                    f"ckpt={model}",
+                    f"extractor={self.clip}",
+                    f"out={out}",
+                    "device=cpu",
+                    *words,
+                ]
+            )
+            == 0
+        )
         return read_result(out)
 
     def of_others(self, out: Path, *words: str, root: Path | None = None) -> Any:
-        data = [*DATA, f"data_root={root or self.root}", "protocol=synthetic", f"extractor={self.clip}"]
+        data = [
+            *DATA,
+            f"data_root={root or self.root}",
+            "protocol=synthetic",
+            f"extractor={self.clip}",
+        ]
         assert main(["evaluate", *data, f"out={out}", "device=cpu", *words]) == 0
         return read_result(out)
 
@@ -90,7 +143,9 @@ class Runs:
         """A protocol on the test split, by default with one replication, without multimodality and features."""
         data = self.data()
         protocol = load_protocol(name, data.representation)
-        protocol, _ = protocol.resized(len(data.test), **{"replications": 1, "multimodality": False} | size)
+        protocol, _ = protocol.resized(
+            len(data.test), **{"replications": 1, "multimodality": False} | size
+        )
         extractor = MotionCLIPExtractor(str(self.clip)) if features else None
         return Evaluation(protocol, data.test, extractor, data.representation)
 
@@ -114,7 +169,11 @@ def full(runs, tmp_path_factory) -> tuple[Any, Path]:
 
 def means(measured: Measured) -> dict[str, Any]:
     values = {"real": measured.ground_truth or {}, "generated": measured.values or {}}
-    return {f"{kind} {name}": v and v.mean for kind, named in values.items() for name, v in named.items()}
+    return {
+        f"{kind} {name}": v and v.mean
+        for kind, named in values.items()
+        for name, v in named.items()
+    }
 
 
 def changed(evaluation: Evaluation, **options) -> Evaluation:
@@ -130,23 +189,49 @@ def test_a_result_says_what_it_is_and_where_it_comes_from(runs, full):
     assert json.loads(out.read_text()) == result.model_dump(), "nothing is written that is not read"
     protocol: Any = load_protocol("synthetic", load(runs.model).representation)
     data = runs.data()
-    assert {name.split("/")[0] for name in result.values} == {*protocol.metrics, *protocol.multimodality.metrics}
+    assert {name.split("/")[0] for name in result.values} == {
+        *protocol.metrics,
+        *protocol.multimodality.metrics,
+    }
     assert {name.split("/")[0] for name in result.ground_truth} == set(protocol.metrics)
     for name, value in result.values.items():
-        assert (value.replications, value.n) == (2, len(data.test) if name != "multimodality" else 20 * 20)
+        assert (value.replications, value.n) == (
+            2,
+            len(data.test) if name != "multimodality" else 20 * 20,
+        )
         assert value.mean is None or value.mean == pytest.approx(sum(value.per_replication) / 2)
     assert result.values["attributes/action"].ci is not None
     assert result.values["diversity"].mean is None, "not 0"
     assert "300" in result.not_computed["diversity"]
-    assert result.protocol.model_dump() == {"name": "synthetic", "version": 2, "sha256": protocol.sha256}
-    assert (result.split, result.quick, result.seed, result.invalid_because) == ("test", False, 0, [])
-    assert (result.changed, len(set(result.seeds)), result.data.excluded) == ({"replications": 2}, 2, {})
+    assert result.protocol.model_dump() == {
+        "name": "synthetic",
+        "version": 2,
+        "sha256": protocol.sha256,
+    }
+    assert (result.split, result.quick, result.seed, result.invalid_because) == (
+        "test",
+        False,
+        0,
+        [],
+    )
+    assert (result.changed, len(set(result.seeds)), result.data.excluded) == (
+        {"replications": 2},
+        2,
+        {},
+    )
     assert result.data.fingerprint == data.store.fingerprint == result.extractor.data
     checkpoint = result.checkpoint
-    assert {len(digest) for digest in (checkpoint.sha256, checkpoint.config_sha256, result.extractor.sha256)} == {64}
+    assert {
+        len(digest)
+        for digest in (checkpoint.sha256, checkpoint.config_sha256, result.extractor.sha256)
+    } == {64}
     assert (checkpoint.averaged_weights, checkpoint.selected_by) == (True, "none: last")
     assert "denoiser.latent_dim=" in " ".join(checkpoint.recipe_changes)
-    assert (checkpoint.guidance_scale, checkpoint.num_inference_steps, result.cost.nfe) == (1.5, 5, 5)
+    assert (checkpoint.guidance_scale, checkpoint.num_inference_steps, result.cost.nfe) == (
+        1.5,
+        5,
+        5,
+    )
     assert (result.device, result.environment["packages"]["torch"]) == ("cpu", torch.__version__)
     value = means(result)
     assert value["real attributes/all"] > 0.95 > 0.5 > value["generated attributes/all"]
@@ -157,19 +242,38 @@ def test_a_result_says_what_it_is_and_where_it_comes_from(runs, full):
 def test_quick_results_few_motions_and_clips_left_out_are_marked(runs, tmp_path, capsys):
     root = Path(shutil.copytree(runs.root, tmp_path / "data"))
     (path,) = root.glob("*/store.json")
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"excluded": {"motions of HumanAct12": 1191}}))
-    words = ["baseline=real", "data.crop.min_frames=50", "quick=true", "samples=7", "replications=1"]
+    path.write_text(
+        json.dumps(json.loads(path.read_text()) | {"excluded": {"motions of HumanAct12": 1191}})
+    )
+    words = [
+        "baseline=real",
+        "data.crop.min_frames=50",
+        "quick=true",
+        "samples=7",
+        "replications=1",
+    ]
     result = runs.of_others(tmp_path / "result.json", *words, root=root)
     test = [clip.length for clip in runs.data().store.clips if clip.split == "test"]
     long = sum(length >= 50 for length in test)
     assert 0 < long < len(test)
-    excluded = {"motions of HumanAct12": 1191, "test clips shorter than 50 frames": len(test) - long}
-    assert (result.quick, result.changed, result.data.excluded) == (True, {"replications": 1, "samples": 7}, excluded)
+    excluded = {
+        "motions of HumanAct12": 1191,
+        "test clips shorter than 50 frames": len(test) - long,
+    }
+    assert (result.quick, result.changed, result.data.excluded) == (
+        True,
+        {"replications": 1, "samples": 7},
+        excluded,
+    )
     biased, unequal = result.warnings
     assert biased == "fid: biased upwards: 7 motions are fewer than twice the 4 features"
     assert unequal.startswith(f"fid: 7 generated and {long} real motions.")
     out = capsys.readouterr().out
-    for words in ("excluded from the data set: 1191 motions of HumanAct12", "QUICK RUN, NOT FOR PUBLICATION", biased):
+    for words in (
+        "excluded from the data set: 1191 motions of HumanAct12",
+        "QUICK RUN, NOT FOR PUBLICATION",
+        biased,
+    ):
         assert words in out
 
 
@@ -203,7 +307,12 @@ def killed(words: list[str]) -> None:
 
 
 def test_a_killed_evaluation_goes_on_to_the_same_result(runs, tmp_path, monkeypatch):
-    words = ["ckpt=model/checkpoints/last.ckpt", f"extractor={runs.clip}", "replications=2", "samples=12"]
+    words = [
+        "ckpt=model/checkpoints/last.ckpt",
+        f"extractor={runs.clip}",
+        "replications=2",
+        "samples=12",
+    ]
     words += ["multimodality=false", "out=result.json", "device=cpu"]
     results = []
     for name in ("killed", "undisturbed"):
@@ -216,7 +325,11 @@ def test_a_killed_evaluation_goes_on_to_the_same_result(runs, tmp_path, monkeypa
             assert process.exitcode == -signal.SIGKILL
             kept = motions(Path("result.json"))
             partial, whole = sorted(path.name for path in kept.iterdir())
-            assert (partial[:7], whole, Path("result.json").exists()) == (".rep_1.", "rep_0.npz", False)
+            assert (partial[:7], whole, Path("result.json").exists()) == (
+                ".rep_1.",
+                "rep_0.npz",
+                False,
+            )
             stamp = (kept / whole).stat().st_mtime_ns
         assert main(["evaluate", *words]) == 0
         results.append(json.loads(Path("result.json").read_text()))
@@ -228,11 +341,15 @@ def test_a_killed_evaluation_goes_on_to_the_same_result(runs, tmp_path, monkeypa
 def test_other_metrics_need_no_new_motions(runs, full, tmp_path, monkeypatch):
     monkeypatch.setattr(Generator, "_generate", lambda *_: pytest.fail("sampled again"))
     model = full[1].parent / "model" / "checkpoints" / "last.ckpt"
-    result = runs.evaluate(tmp_path / "result.json", "replications=2", "extractor=none", model=model)
+    result = runs.evaluate(
+        tmp_path / "result.json", "replications=2", "extractor=none", model=model
+    )
     assert "extractor" in result.not_computed
     of_joints = ("attributes", "foot_skating", "penetration", "floating", "jitter", "static_share")
     for name, value in result.values.items():
-        assert value.mean == (full[0].values[name].mean if name.startswith(of_joints) else None), name
+        assert value.mean == (full[0].values[name].mean if name.startswith(of_joints) else None), (
+            name
+        )
 
 
 def again(rows: Rows, indices: np.ndarray) -> Rows:
@@ -246,7 +363,10 @@ def again(rows: Rows, indices: np.ndarray) -> Rows:
 
 def test_a_bootstrap_measures_each_motion_as_often_as_it_is_drawn(runs):
     evaluation = runs.evaluation(features=True)
-    metrics = {name: metric for name, metric in evaluation.protocol.metrics.items() if name != "mid"}  # ill-conditioned
+    # Ill-conditioned
+    metrics = {
+        name: metric for name, metric in evaluation.protocol.metrics.items() if name != "mid"
+    }
     evaluator = Evaluator(evaluation.extractor, metrics, evaluation.representation)
     rows = [evaluation.protocol.rows(evaluation.clips, 0, replication) for replication in range(2)]
     first, second = (evaluation._paired(drawn) for drawn in rows)
@@ -258,7 +378,9 @@ def test_a_bootstrap_measures_each_motion_as_often_as_it_is_drawn(runs):
         values, _ = evaluator.score(again(first, own), again(first, own), again(second, others), 3)
         assert values.keys() == drawn.keys()
         for name, value in values.items():
-            assert drawn[name][number] == (None if value is None else pytest.approx(value, rel=1e-5)), name
+            assert drawn[name][number] == (
+                None if value is None else pytest.approx(value, rel=1e-5)
+            ), name
     assert drawn["fid"][0] != drawn["fid"][1]
 
 
@@ -266,12 +388,22 @@ def test_a_single_replication_has_no_interval_but_the_one_over_motions(runs, tmp
     words = ["baseline=noisy", "extractor=none", "replications=1", "resamples=100"]
     result = runs.of_others(tmp_path / "result.json", *words)
     jitter = result.values["jitter"]
-    assert (jitter.ci, jitter.replications, len(jitter.resampled), jitter.unit) == (None, 1, 100, "m/s^3")
+    assert (jitter.ci, jitter.replications, len(jitter.resampled), jitter.unit) == (
+        None,
+        1,
+        100,
+        "m/s^3",
+    )
     assert 0 < jitter.half < jitter.mean
     assert result.ground_truth["jitter"].half is None
     out = capsys.readouterr().out
     count = len(runs.data().test)
-    for words in (f"1 x {count}; +-: 95 % interval over motions", "jitter (m/s^3)", "replications=1", "synthetic test"):
+    for words in (
+        f"1 x {count}; +-: 95 % interval over motions",
+        "jitter (m/s^3)",
+        "replications=1",
+        "synthetic test",
+    ):
         assert words in out
 
 
@@ -336,7 +468,9 @@ def test_processes_share_the_work_and_get_one_result(runs, tmp_path, pool):
     both, single = (pool.run(shares, *((runs, *size),) * 2) for size in ((33, tmp_path), (1, None)))
     baselines, ends = (pool.run(function, *((runs,),) * 2) for function in (of_baseline, stopped))
     assert both[0] == both[1]
-    assert shares(runs, 33, tmp_path) == both[0], "the same motions have the same values, to the last bit"
+    assert shares(runs, 33, tmp_path) == both[0], (
+        "the same motions have the same values, to the last bit"
+    )
     assert {path.name for path in tmp_path.iterdir()} == {"rep_0.npz", "multimodality_0.npz"}
     assert means(shares(runs, 33, tmp_path / "alone")) == means(both[0])
     for file in (tmp_path / "alone").iterdir():
@@ -346,7 +480,9 @@ def test_processes_share_the_work_and_get_one_result(runs, tmp_path, pool):
     assert (single[0].values["jitter"].n, single[0].cost.nfe) == (1, 5)
     assert means(shares(runs, 1, None)) == means(single[0])
     alone, passes = of_baseline(runs)
-    assert passes == 2 * 3, "real, real again for comparisons of sets, and measured; in each replication"
+    assert passes == 2 * 3, (
+        "real, real again for comparisons of sets, and measured; in each replication"
+    )
     assert baselines == [(alone, passes)] * 2
     assert ends == ["UserError", "SystemExit"], "one says why"
 
@@ -359,18 +495,27 @@ def test_motions_of_others_are_measured_alike(runs, full, tmp_path):
         order = np.random.default_rng(0).permutation(len(content["ids"]))
         parts = np.split(content["features"], np.cumsum(content["lengths"])[:-1])
         features = np.concatenate([parts[i] for i in order])
-        np.savez(folder / path.name, ids=content["ids"][order], lengths=content["lengths"][order], features=features)
+        np.savez(
+            folder / path.name,
+            ids=content["ids"][order],
+            lengths=content["lengths"][order],
+            features=features,
+        )
     measure = partial(runs.of_others, out, f"from_samples={folder}")
     result = measure()
     assert result.checkpoint is None
     assert len(result.samples_sha256) == 64
     for name, value in result.values.items():
-        assert value == full[0].values[name] if name != "multimodality" else value.mean is None, name
+        assert value == full[0].values[name] if name != "multimodality" else value.mean is None, (
+            name
+        )
 
     path, data = folder / "rep_0.npz", runs.data()
     (folder / "rep_1.npz").unlink()
     decode = data.representation.decode
-    shown = [decode(torch.from_numpy(data.store.motion(clip).copy())).numpy() for clip in data.test.clips]
+    shown = [
+        decode(torch.from_numpy(data.store.motion(clip).copy())).numpy() for clip in data.test.clips
+    ]
     motion = {"lengths": [len(x) for x in shown], "joints": np.concatenate(shown)}
     np.savez(path, ids=[clip.id for clip in data.test.clips], **motion)
     assert means(measure("extractor=none"))["generated attributes/all"] > 0.95, "joints are encoded"
@@ -385,7 +530,9 @@ def test_every_protocol_can_be_read_and_one_is_the_default_for_condition_and_dat
     for name in protocol_names():
         protocol = load_protocol(name, HumanML())
         assert (protocol.name, protocol.version >= 1) == (name, True)
-        values, reasons = Evaluator(None, protocol.metrics, HumanML()).score(nothing, nothing, nothing, 0)
+        values, reasons = Evaluator(None, protocol.metrics, HumanML()).score(
+            nothing, nothing, nothing, 0
+        )
         assert (set(values.values()), reasons) == ({None} if protocol.metrics else set(), {}), name
         assert all(set(table) <= set(values) for table in protocol.expected.values()), name
     for model, name in {
@@ -412,12 +559,19 @@ def test_variants_replace_options_of_their_file(tmp_path):
     assert flame == plain | {"name": "text_to_motion_flame", "smoothing": 1.0}
 
     (tmp_path / "mine.yaml").write_text((FOLDER / "editing.yaml").read_text())
-    assert protocol_config(str(tmp_path / "mine_upper_body.yaml"))["edit"] == {"joints": "upper_body"}
+    assert protocol_config(str(tmp_path / "mine_upper_body.yaml"))["edit"] == {
+        "joints": "upper_body"
+    }
 
 
 def test_other_sampling_options_have_other_folders_of_motions(runs):
     folders = []
-    base: dict[str, Any] = {"sampler": "ddim", "num_inference_steps": 3, "eta": 0.0, "spacing": "linspace"}
+    base: dict[str, Any] = {
+        "sampler": "ddim",
+        "num_inference_steps": 3,
+        "eta": 0.0,
+        "spacing": "linspace",
+    }
     changed: list[dict[str, Any]] = [
         {},
         {"eta": 0.5},
@@ -439,7 +593,10 @@ def test_captions_crops_and_second_draws_are_functions_of_seed_replication_and_i
     protocol = load_protocol("synthetic", data.representation)
     rows = {row.id: row for row in protocol.rows(data.test, 0, 1)}
     for row in protocol.model_copy(update={"samples": 10}).rows(data.test, 0, 1):
-        assert (row.caption, row.frames.tolist()) == (rows[row.id].caption, rows[row.id].frames.tolist())
+        assert (row.caption, row.frames.tolist()) == (
+            rows[row.id].caption,
+            rows[row.id].frames.tolist(),
+        )
     for replication, seed, purpose in ((1, 1, {}), (0, 2, {}), (0, 1, {"purpose": "real"})):
         others = protocol.rows(data.test, replication, seed, **purpose)
         assert any(row.caption != rows[row.id].caption for row in others)
@@ -458,17 +615,25 @@ def test_unexpected_values_of_real_motions_stop_before_anything_is_generated(run
     measured = evaluation.run(source, force=True)
     assert measured.forced
     assert "expected 0.5" in measured.invalid_because[0]
-    right = changed(evaluation, expected={"synthetic": {"attributes/all": [1.0, 0.05]}}).run(source, force=True)
+    right = changed(evaluation, expected={"synthetic": {"attributes/all": [1.0, 0.05]}}).run(
+        source, force=True
+    )
     assert (right.forced, right.invalid_because) == (False, [])
-    with pytest.raises(UserError, match=r"real motions have attributes/all .*, expected 0\.5 \+- 0\.05.*force=true"):
+    with pytest.raises(
+        UserError, match=r"real motions have attributes/all .*, expected 0\.5 \+- 0\.05.*force=true"
+    ):
         evaluation.run(unused)
     resized = runs.evaluation(samples=8)
     resized = changed(resized, expected={"synthetic": {"attributes/all": [0.5, 0.05]}})
     measured = resized.run(Baseline("real", evaluation.clips, "text", 0))
     assert measured.invalid_because == [], "bounds hold for the number of motions of the protocol"
     assert "the expected values of real motions were not checked" in measured.warnings[0]
-    uncomputed = changed(runs.evaluation(features=True), expected={"synthetic": {"diversity": [4.0, 0.5]}})
-    assert uncomputed.run(None).invalid_because == ["diversity of real motions, expected 4, could not be computed"]
+    uncomputed = changed(
+        runs.evaluation(features=True), expected={"synthetic": {"diversity": [4.0, 0.5]}}
+    )
+    assert uncomputed.run(None).invalid_because == [
+        "diversity of real motions, expected 4, could not be computed"
+    ]
     others = replace(evaluation, clips=runs.data().clips("val"))
     assert others.run(None).invalid_because == [], "nothing is expected of other splits"
     others.clips.store.info["clips"]["test"] = 0  # HumanAct12 is tested on its training clips
@@ -500,19 +665,37 @@ def test_what_does_not_fit_is_refused(runs, tmp_path):
             Plan(EvaluationRequest(**values), "cpu")
         assert message in str(refusal.value)
     for old, new, message in (
-        ("normalize: true", "normalise: true", r"Did you mean metrics\.motions_for_text\.normalize\?"),
+        (
+            "normalize: true",
+            "normalise: true",
+            r"Did you mean metrics\.motions_for_text\.normalize\?",
+        ),
         ("  prompts: 20", "  promts: 20", "Did you mean prompts"),
         ("condition: text", "condition: music", "condition"),
         ("replications: 5", "replications: many", "not a whole number"),
-        ("replications: 5", "replications: 5\nexpected: {x: {fidd: [0, 1]}}", "called fidd. Did you mean fid"),
+        (
+            "replications: 5",
+            "replications: 5\nexpected: {x: {fidd: [0, 1]}}",
+            "called fidd. Did you mean fid",
+        ),
     ):
         with pytest.raises(UserError, match=message):
             load_protocol(own(tmp_path, old, new), HumanML())
     accuracy, drift = "accuracy.ActionAccuracy", "reconstruction.KeptDrift"
     clip = "extractor: {_target_: evaluators.extractors.MotionCLIPExtractor, path: motion_clip_synthetic}"
     for old, new, features, message in (
-        ("diversity.Diversity, pairs: 300, replace: false", accuracy, True, r"diversity \(ActionAccuracy\)"),
-        ("diversity.TextMultimodality, samples: 20, pairs: 10", accuracy, True, "missing input: logits"),
+        (
+            "diversity.Diversity, pairs: 300, replace: false",
+            accuracy,
+            True,
+            r"diversity \(ActionAccuracy\)",
+        ),
+        (
+            "diversity.TextMultimodality, samples: 20, pairs: 10",
+            accuracy,
+            True,
+            "missing input: logits",
+        ),
         ("physics.Floating", drift, True, r"metric floating \(KeptDrift\): missing input: kept"),
         (clip, "extractor: null", False, "missing input: generated"),
     ):
@@ -530,7 +713,9 @@ def test_metrics_of_2026(runs):
     assert values[f"{minilm}/positives"] >= values[f"{equal}/positives"] >= 1
     assert values[f"{equal}/single_top3"] == values["real motions_for_text/top3"]
     assert values["real tmr/threshold_t2m_top10"] >= values["real tmr/all_t2m_top10"] > 0
-    assert 0 < values["real kimodo/contact_consistency"] <= 1, "the contacts are read from the features"
+    assert 0 < values["real kimodo/contact_consistency"] <= 1, (
+        "the contacts are read from the features"
+    )
     assert values["real edge/pfc"] is None, "defined at 30 frames per second"
     evaluation = runs.evaluation("editing_in_between_2026")
     values = means(evaluation.run(runs.generator(evaluation)))
@@ -540,12 +725,17 @@ def test_metrics_of_2026(runs):
 
 
 def test_smoothing_takes_each_motion_for_itself(runs):
-    rough, smooth = runs.evaluation("text_to_motion", samples=8), runs.evaluation("text_to_motion_flame", samples=8)
+    rough, smooth = (
+        runs.evaluation("text_to_motion", samples=8),
+        runs.evaluation("text_to_motion_flame", samples=8),
+    )
     one, other = (evaluation.run(runs.generator(evaluation)) for evaluation in (rough, smooth))
     assert other.values["jitter"].mean < 0.5 * one.values["jitter"].mean
     assert other.ground_truth == one.ground_truth
     step = np.repeat([[0.0], [1.0]], 20, axis=0)
-    (smoothed,) = smooth._generated(Samples(smooth.protocol.rows(smooth.clips, 0, 0)[:1], [step])).features
+    (smoothed,) = smooth._generated(
+        Samples(smooth.protocol.rows(smooth.clips, 0, 0)[:1], [step])
+    ).features
     assert smoothed[[0, 39], 0] == pytest.approx([0, 1], abs=1e-9)
     assert smoothed[19:21].mean() == pytest.approx(0.5)
     assert 0.25 < smoothed[19, 0] < 0.35, "a normal distribution with a deviation of one frame"
@@ -563,9 +753,13 @@ def test_latency_is_that_of_one_motion_at_a_time_after_a_first_one(runs, tmp_pat
     result = runs.evaluate(tmp_path / "one.json", "protocol=latency", "extractor=none")
     assert (result.cost.batch_size, result.changed, result.checkpoint.prediction) == (1, {}, "x0")
     assert result.checkpoint.training_hours * result.checkpoint.training_memory_gib > 0
-    result = runs.evaluate(tmp_path / "eight.json", "protocol=latency", "extractor=none", "batch_size=8")
+    result = runs.evaluate(
+        tmp_path / "eight.json", "protocol=latency", "extractor=none", "batch_size=8"
+    )
     assert (result.cost.batch_size, result.changed) == (8, {"batch_size": 8})
-    assert sizes == [1] * 17 + [8] * 3, "the first batches are not timed; motions of batches of 1 are not read"
+    assert sizes == [1] * 17 + [8] * 3, (
+        "the first batches are not timed; motions of batches of 1 are not read"
+    )
 
 
 @pytest.mark.parametrize("name", ["prediction", "interpolation", "upper_body"])
@@ -577,14 +771,21 @@ def test_edits_keep_what_they_are_to_keep(runs, tmp_path, name):
     values = means(evaluation.run(source))
     assert values["generated displacement/ade"] > 0.01
     in_place = name in ("prediction", "upper_body")
-    assert (values["generated kept_drift/largest"] < 1e-4) is in_place, "behind a new part, kept frames start elsewhere"
+    assert (values["generated kept_drift/largest"] < 1e-4) is in_place, (
+        "behind a new part, kept frames start elsewhere"
+    )
     assert values["real kept_drift/largest"] == 0
-    rows, representation = evaluation.protocol.rows(evaluation.clips, 0, 0), evaluation.representation
+    rows, representation = (
+        evaluation.protocol.rows(evaluation.clips, 0, 0),
+        evaluation.representation,
+    )
     content = read_samples(tmp_path / "rep_0.npz")
     generated = np.split(content["features"], np.cumsum(content["lengths"])[:-1])
     upper = representation.joint_features(find_joints(representation.skeleton, "upper_body"))
     lower = (representation.joint_features(range(22)) & ~upper).numpy()
-    for row, motion, real in zip(rows, generated, real_motions(evaluation.clips, rows), strict=True):
+    for row, motion, real in zip(
+        rows, generated, real_motions(evaluation.clips, rows), strict=True
+    ):
         assert len(row.frames) == len(motion)
         kept = np.zeros_like(real, bool) | lower
         if name != "upper_body":
@@ -602,9 +803,14 @@ def test_shuffled_motions_are_all_there_and_belong_to_what_others_ask_for(runs):
     for condition in ("text", "action"):
         requests = [row.text if condition == "text" else row.clip.action for row in rows]
         requested = dict(zip(real, requests, strict=True))
-        shuffled = [x.tobytes() for x in Baseline("shuffled", clips, condition, 0)("rep_0", rows, 0).features]
+        shuffled = [
+            x.tobytes()
+            for x in Baseline("shuffled", clips, condition, 0)("rep_0", rows, 0).features
+        ]
         assert sorted(shuffled) == sorted(real)
-        assert all(requested[motion] != request for request, motion in zip(requests, shuffled, strict=True))
+        assert all(
+            requested[motion] != request for request, motion in zip(requests, shuffled, strict=True)
+        )
         with pytest.raises(UserError, match="2 of 3 motions have the same caption or label"):
             Baseline("shuffled", clips, condition, 0)("rep_0", [rows[0], rows[0], rows[1]], 0)
     with pytest.raises(UserError, match="real, shuffled, noisy, static"):
@@ -613,23 +819,38 @@ def test_shuffled_motions_are_all_there_and_belong_to_what_others_ask_for(runs):
         Baseline("shuffled", clips, "none", 0)
 
 
-@pytest.mark.parametrize("extractor", ["none", None, "motion_clip_synthetic", "clip", "clip/checkpoints/last.ckpt"])
+@pytest.mark.parametrize(
+    "extractor", ["none", None, "motion_clip_synthetic", "clip", "clip/checkpoints/last.ckpt"]
+)
 def test_an_evaluation_in_training_takes_the_extractors_that_evaluate_takes(runs, extractor):
-    source = str(runs.clip.parents[2] / extractor) if (extractor or "").startswith("clip") else extractor
+    source = (
+        str(runs.clip.parents[2] / extractor) if (extractor or "").startswith("clip") else extractor
+    )
     callback = Evaluate("synthetic", source, every_n_steps=1)
     assert callback.path == source
 
 
-def test_a_missing_extractor_of_the_selection_stops_before_training(runs, tmp_path, capsys, monkeypatch):
+def test_a_missing_extractor_of_the_selection_stops_before_training(
+    runs, tmp_path, capsys, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     words = [*GENERATOR, f"data_root={runs.root}", "run.dir=run", "trainer.max_steps=2"]
     assert main(["train", "quickstart", *words, "selection=babel"]) == 1
     error = capsys.readouterr().err
-    assert "callbacks.evaluate.extractor=runs/motion_clip/babel/default/checkpoints/last.ckpt: no such file" in error
-    assert "make train EXP=motion_clip/babel. Or choose by the validation loss: selection=loss" in error
+    assert (
+        "callbacks.evaluate.extractor=runs/motion_clip/babel/default/checkpoints/last.ckpt: no such file"
+        in error
+    )
+    assert (
+        "make train EXP=motion_clip/babel. Or choose by the validation loss: selection=loss"
+        in error
+    )
     assert not Path("run").exists()
     assert main(["train", "quickstart", *words, "selection=t2m"]) == 1
-    assert 'assets/t2m/synthetic is missing; see "Extractors" in docs/evaluation.md' in capsys.readouterr().err
+    assert (
+        'assets/t2m/synthetic is missing; see "Extractors" in docs/evaluation.md'
+        in capsys.readouterr().err
+    )
 
 
 def test_the_evaluator_in_the_package_finds_texts_with_the_attributes_of_real_motions(runs):
@@ -637,10 +858,19 @@ def test_the_evaluator_in_the_package_finds_texts_with_the_attributes_of_real_mo
     assert isinstance(plan.extractor, MotionCLIPExtractor)
     assert plan.extractor.path == SHIPPED["motion_clip_synthetic"]
     assert plan.extractor.path.stat().st_size < 3e6
-    clips = [clip for number in range(400) if (clip := Synthetic(clips=4000).clip(number, 20)).split == "test"]
+    clips = [
+        clip
+        for number in range(400)
+        if (clip := Synthetic(clips=4000).clip(number, 20)).split == "test"
+    ]
     lines = [plan.representation.encode(torch.from_numpy(clip.motion)) for clip in clips]
-    motions = torch.cat([plan.extractor.task(x[None], torch.ones(1, len(x), dtype=torch.bool)) for x in lines])
+    motions = torch.cat(
+        [plan.extractor.task(x[None], torch.ones(1, len(x), dtype=torch.bool)) for x in lines]
+    )
     texts = plan.extractor.task.text([clip.captions[0] for clip in clips])
     nearest = torch.cdist(motions, texts).argmin(1).tolist()
-    right = [clips[other].attributes == clip.attributes for clip, other in zip(clips, nearest, strict=True)]
+    right = [
+        clips[other].attributes == clip.attributes
+        for clip, other in zip(clips, nearest, strict=True)
+    ]
     assert (len(right) > 30, np.mean(right) > 0.9) == (True, True)

@@ -14,7 +14,12 @@ from evaluators.results import Outcome, Scores
 from flame_mdm.records import Value
 from flame_mdm.sampler_options import SamplerOptions
 
-BASE: dict[str, Any] = {"sampler": "ddim", "num_inference_steps": 3, "eta": 0.0, "spacing": "linspace"}
+BASE: dict[str, Any] = {
+    "sampler": "ddim",
+    "num_inference_steps": 3,
+    "eta": 0.0,
+    "spacing": "linspace",
+}
 CHANGES: dict[str, dict[str, Any]] = {
     "eta": {"eta": 0.5},
     "spacing": {"spacing": "stride"},
@@ -45,7 +50,10 @@ def scores(count: int, value: float | None = 1.0) -> Scores:
 
 
 def test_a_mean_over_unequal_numbers_of_motions_has_no_single_number():
-    mixed, equal = Outcome([scores(64), scores(5)]).values["fid"], Outcome([scores(64), scores(64, 2.0)]).values["fid"]
+    mixed, equal = (
+        Outcome([scores(64), scores(5)]).values["fid"],
+        Outcome([scores(64), scores(64, 2.0)]).values["fid"],
+    )
     assert mixed is not None
     assert equal is not None
     assert (mixed.n, mixed.n_per_replication) == (None, [64, 5])
@@ -55,7 +63,9 @@ def test_a_mean_over_unequal_numbers_of_motions_has_no_single_number():
     assert missing.mean is None, "not the mean of those that could be computed"
 
 
-def evaluation(resized: bool = False, samples: int | None = None, clips: int = 100, split: str = "test") -> Evaluation:
+def evaluation(
+    resized: bool = False, samples: int | None = None, clips: int = 100, split: str = "test"
+) -> Evaluation:
     """An evaluation whose real motions are expected to have an FID of 0.06 within 0.01."""
     protocol = SimpleNamespace(
         metrics={},
@@ -77,7 +87,9 @@ def value(mean: float) -> dict[str, Value | None]:
 
 def test_bounds_of_real_motions_hold_for_the_number_of_motions_of_the_protocol():
     assert evaluation()._unexpected(value(0.065)) == []
-    assert evaluation()._unexpected(value(0.08)) == ["real motions have fid 0.08, expected 0.06 +- 0.01"]
+    assert evaluation()._unexpected(value(0.08)) == [
+        "real motions have fid 0.08, expected 0.06 +- 0.01"
+    ]
     assert evaluation(split="val")._unexpected(value(0.08)) == []
     assert evaluation(resized=True)._unexpected(value(0.08)) == []
     (line,) = evaluation(resized=True)._conditions()

@@ -21,7 +21,9 @@ def run(path: Path, folder: Path, *words: str) -> str:
     """Runs an example in a folder, and returns what it prints."""
     environment = os.environ | {"PYTHONPATH": str(ROOT), "FLAME_MDM_DATA": str(folder / "data")}
     line = [sys.executable, str(path), *words]
-    finished = subprocess.run(line, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    finished = subprocess.run(
+        line, cwd=folder, env=environment, capture_output=True, text=True, check=False
+    )
     assert finished.returncode == 0, finished.stderr[-2000:]
     return finished.stdout
 
@@ -34,7 +36,11 @@ def marks(name: str) -> list[pytest.MarkDecorator]:
 
 @pytest.mark.parametrize(
     "path",
-    [pytest.param(path, id=path.stem, marks=marks(path.stem)) for path in EXAMPLES if path.stem != STREAM],
+    [
+        pytest.param(path, id=path.stem, marks=marks(path.stem))
+        for path in EXAMPLES
+        if path.stem != STREAM
+    ],
 )
 def test_an_example_runs(path: Path, tmp_path: Path):
     printed = run(path, tmp_path)
@@ -47,7 +53,10 @@ def test_the_example_of_streams_runs_with_a_model_that_continues_frames(tmp_path
     model, data = tmp_path / "dip", tmp_path / "data"
     tiny = [word for word in TINY if not word.startswith(("condition.pretrain", "process."))]
     words = [*tiny, f"data_root={data}", f"run.dir={model}", "trainer.max_steps=2", "logger=csv"]
-    assert main(["train", "synthetic/dip", *words, "callbacks.samples=null", "callbacks.best=null"]) == 0
+    assert (
+        main(["train", "synthetic/dip", *words, "callbacks.samples=null", "callbacks.best=null"])
+        == 0
+    )
     assert "until second" in run(ROOT / "examples" / f"{STREAM}.py", tmp_path, str(model))
 
 

@@ -33,7 +33,10 @@ FPS = 20.0
 def walking(heading: ArrayLike, root: np.ndarray) -> Poses:
     swing = np.degrees(0.5 * np.sin(2 * np.pi * np.arange(len(root)) / FPS))
     none, bend = np.zeros_like(swing), np.maximum(swing, 0)
-    turns: dict[str, Any] = {"pelvis": np.stack([none + 6, none, 0.1 * swing], -1), "left_shoulder": (0, 0, -69)}
+    turns: dict[str, Any] = {
+        "pelvis": np.stack([none + 6, none, 0.1 * swing], -1),
+        "left_shoulder": (0, 0, -69),
+    }
     for side, sign in (("left", 1), ("right", -1)):
         turns[f"{side}_hip"] = np.stack([-sign * swing, none, none], -1)
         turns[f"{side}_knee"] = np.stack([34 - bend, none, none], -1)
@@ -44,12 +47,16 @@ def walking(heading: ArrayLike, root: np.ndarray) -> Poses:
 def two_circles() -> Poses:
     """Walks counterclockwise about the origin, twice, in 8 seconds."""
     angle = np.linspace(0, 4 * np.pi, 161)
-    return walking(angle + np.pi, np.stack([1.5 * np.cos(angle), 0.95 + 0 * angle, -1.5 * np.sin(angle)], -1))
+    return walking(
+        angle + np.pi, np.stack([1.5 * np.cos(angle), 0.95 + 0 * angle, -1.5 * np.sin(angle)], -1)
+    )
 
 
 @pytest.fixture(scope="module")
 def circle() -> Motion:
-    return Motion(two_circles().joints().float().numpy(), FPS, text="a person walks </b> é", id="circle")
+    return Motion(
+        two_circles().joints().float().numpy(), FPS, text="a person walks </b> é", id="circle"
+    )
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +69,8 @@ def test_recorded_motion_comes_out_exactly_and_neither_limbs_flip_nor_angles_jum
     for joints in clips:
         poses = solve(joints, FPS)
         torch.testing.assert_close(poses.joints(), joints, rtol=0, atol=1e-6)
-        assert largest_step(poses.rotations) < 70  # a punch stretches the elbow by 50 degrees per frame
+        # A punch stretches the elbow by 50 degrees per frame
+        assert largest_step(poses.rotations) < 70
     poses = solve(clips[1], FPS)
     angles = continuous_euler(poses.rotations)
     for joint, order in ((0, "YZX"), (16, "YXZ")):
@@ -77,7 +85,8 @@ def test_turns_and_backward_walks_do_not_flip_and_bent_limbs_show_their_twist():
         poses = solve(made.joints(), FPS)
         torch.testing.assert_close(poses.joints(), made.joints(), rtol=0, atol=1e-9)
         assert largest_step(poses.rotations) < 1.3 * largest_step(made.rotations) < 20
-        assert degrees(made.rotations.mT @ poses.rotations)[:, [0, 9]].max() < 5e-5  # pelvis and chest are exact
+        # Pelvis and chest are exact
+        assert degrees(made.rotations.mT @ poses.rotations)[:, [0, 9]].max() < 5e-5
     # bent limbs show their twist
     turns: dict[str, Any]
     for side, sign in (("left", 1), ("right", -1)):
@@ -91,8 +100,12 @@ def test_turns_and_backward_walks_do_not_flip_and_bent_limbs_show_their_twist():
             assert degrees(solved @ made.rotations[:, joint].mT).max() < 6, (side, limb)
 
 
-def test_bones_that_change_length_are_met_on_average_and_joints_without_rotations_are_refused(clips):
-    noisy = clips[0] + 0.005 * torch.randn(clips[0].shape, generator=torch.Generator().manual_seed(0))
+def test_bones_that_change_length_are_met_on_average_and_joints_without_rotations_are_refused(
+    clips,
+):
+    noisy = clips[0] + 0.005 * torch.randn(
+        clips[0].shape, generator=torch.Generator().manual_seed(0)
+    )
     poses = solve(noisy, FPS)
     lengths = torch.linalg.vector_norm(SMPL22.bones(poses.joints()), dim=-1)
     torch.testing.assert_close(lengths, lengths[:1].expand_as(lengths))
@@ -108,18 +121,26 @@ def test_bones_that_change_length_are_met_on_average_and_joints_without_rotation
 def test_files_bring_joints_back_and_angles_of_bvh_do_not_jump(tmp_path, circle):
     features = np.arange(6, dtype=np.float32).reshape(3, 2)
     for ending in (".bvh", ".json", ".npy", ".npz"):
-        replace(circle, features=features, representation="mine").save(tmp_path / f"circle{ending}", seed=3)
+        replace(circle, features=features, representation="mine").save(
+            tmp_path / f"circle{ending}", seed=3
+        )
         again = read(tmp_path / f"circle{ending}", fps=FPS if ending == ".npy" else None)
         np.testing.assert_allclose(again.joints, circle.joints, rtol=0, atol=2e-5)
         assert (again.fps, again.id) == (FPS, "circle")
         assert again.text == ("" if ending in (".bvh", ".npy") else circle.text)
     np.testing.assert_array_equal(again.features, features)
-    assert (again.representation, again.poses, np.load(tmp_path / "circle.npz")["seed"]) == ("mine", None, 3)
+    assert (again.representation, again.poses, np.load(tmp_path / "circle.npz")["seed"]) == (
+        "mine",
+        None,
+        3,
+    )
     assert len(list(tmp_path.iterdir())) == 4
     circle.save(tmp_path / "rest.bvh", rest_pose=True)
     tree = bvh.read(tmp_path / "rest.bvh")
     layout, names = tree_layout(tree, {})
-    np.testing.assert_allclose(layout.apply(tree.positions(), names)[0], circle.posed().rest(), atol=1e-4)
+    np.testing.assert_allclose(
+        layout.apply(tree.positions(), names)[0], circle.posed().rest(), atol=1e-4
+    )
     np.testing.assert_allclose(read(tmp_path / "rest.bvh").joints, circle.joints, atol=1e-4)
     # BVH is in centimeters, and its angles do not jump
     file = bvh.read(tmp_path / "circle.bvh")
@@ -130,7 +151,9 @@ def test_files_bring_joints_back_and_angles_of_bvh_do_not_jump(tmp_path, circle)
     yaw = file.frames[:, file.channels[0].index("Yrotation")]
     assert yaw[-1] - yaw[0] == pytest.approx(720, abs=1)
     for unit in (1.0, 0.005):
-        with pytest.raises(UserError, match=r"the legs are .* m long .*The unit may be 0\.01 \(centimeters\)"):
+        with pytest.raises(
+            UserError, match=r"the legs are .* m long .*The unit may be 0\.01 \(centimeters\)"
+        ):
             read(tmp_path / "circle.bvh", unit=unit)
 
 
@@ -149,7 +172,11 @@ def test_amass_files_are_those_of_amass_and_keep_rotations(tmp_path):
         assert (file["mocap_frame_rate"].item(), file["betas"].shape) == (20.0, (16,))
     # a head that turns about itself shows in no joint position
     head = SMPL22.joints.index("head")
-    for width, rate in ((72, "mocap_framerate"), (156, "mocap_framerate"), (165, "mocap_frame_rate")):
+    for width, rate in (
+        (72, "mocap_framerate"),
+        (156, "mocap_framerate"),
+        (165, "mocap_frame_rate"),
+    ):
         poses = 0.2 * np.random.default_rng(0).normal(size=(9, width))
         arrays: dict[str, Any] = {"poses": poses, "trans": np.zeros((9, 3)), rate: 60.0}
         np.savez(tmp_path / "a.npz", **arrays)
@@ -157,28 +184,50 @@ def test_amass_files_are_those_of_amass_and_keep_rotations(tmp_path):
         assert recording.fps == 60
         for ending in (".bvh", ".glb", ".npz"):
             recording.save(tmp_path / f"b{ending}")
-        expected = rotation.axis_angle_to_matrix(torch.from_numpy(poses[:, 3 * head : 3 * head + 3]))
+        expected = rotation.axis_angle_to_matrix(
+            torch.from_numpy(poses[:, 3 * head : 3 * head + 3])
+        )
         vectors = torch.from_numpy(np.load(tmp_path / "b.npz")["poses"])[:, 3 * head : 3 * head + 3]
         file = bvh.read(tmp_path / "b.bvh")
         of_bvh = torch.from_numpy(file.rotations())[:, file.joints.index("head")]
-        of_glb = torch.from_numpy(Glb(tmp_path / "b.glb").curves()[head, "rotation"][:, [3, 0, 1, 2]])
-        for turns in (rotation.axis_angle_to_matrix(vectors), of_bvh, rotation.quaternion_to_matrix(of_glb)):
+        of_glb = torch.from_numpy(
+            Glb(tmp_path / "b.glb").curves()[head, "rotation"][:, [3, 0, 1, 2]]
+        )
+        for turns in (
+            rotation.axis_angle_to_matrix(vectors),
+            of_bvh,
+            rotation.quaternion_to_matrix(of_glb),
+        ):
             torch.testing.assert_close(turns.double(), expected, rtol=0, atol=1e-5)
 
 
-def test_features_that_are_rotations_of_smpl_are_exported_and_those_of_humanml_are_not(tmp_path, circle):
+def test_features_that_are_rotations_of_smpl_are_exported_and_those_of_humanml_are_not(
+    tmp_path, circle
+):
     raw = 0.2 * torch.randn(9, 75, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     for representation in (SMPL(FPS), Rot6D(FPS)):
         features = representation.encode(raw)
         joints = representation.decode(features).numpy()
-        np.savez(tmp_path / "a.npz", joints=joints, features=features, fps=FPS, representation=representation.name)
+        np.savez(
+            tmp_path / "a.npz",
+            joints=joints,
+            features=features,
+            fps=FPS,
+            representation=representation.name,
+        )
         made = read(tmp_path / "a.npz")
         np.testing.assert_allclose(made.posed().joints(), joints[:, :22], atol=1e-5)
         made.save(tmp_path / "b.npz")
         again = np.load(tmp_path / "b.npz")["poses"]
-        np.testing.assert_allclose(again[:, 3:66], raw[:, 6:69], atol=1e-5)  # all but the root, whose world differs
+        # All but the root, whose world differs
+        np.testing.assert_allclose(again[:, 3:66], raw[:, 6:69], atol=1e-5)
     for name, features in (("a", np.zeros((160, 263))), ("b", np.full((160, 263), 7.0))):
-        arrays = {"joints": circle.joints, "features": features, "fps": FPS, "representation": "humanml263"}
+        arrays = {
+            "joints": circle.joints,
+            "features": features,
+            "fps": FPS,
+            "representation": "humanml263",
+        }
         np.savez(tmp_path / f"{name}.npz", **arrays)
         read(tmp_path / f"{name}.npz").save(tmp_path / f"{name}.bvh")
     assert (tmp_path / "a.bvh").read_text() == (tmp_path / "b.bvh").read_text()
@@ -205,7 +254,8 @@ def test_glb_holds_the_motion_and_a_body_on_its_joints(tmp_path, circle):
     skin, primitive = file.document["skins"][0], file.document["meshes"][0]["primitives"][0]
     assert skin["joints"] == list(range(22))
     position, normal, joint, weight = (
-        file.array(primitive["attributes"][key]) for key in ("POSITION", "NORMAL", "JOINTS_0", "WEIGHTS_0")
+        file.array(primitive["attributes"][key])
+        for key in ("POSITION", "NORMAL", "JOINTS_0", "WEIGHTS_0")
     )
     assert joint.max() < 22
     np.testing.assert_array_equal(weight.astype(int).sum(1), 255)
@@ -230,10 +280,20 @@ def test_what_does_not_fit_a_file_is_refused(tmp_path, circle):
     kit = sway(5, 12.5, KIT21)
     for motion, name, options, message in (
         (circle, "a.glb", {"rest_pose": True}, "rest_pose is only for .bvh"),
-        (circle, "a.bvh", {"rig": "miximo"}, r"rig=miximo: unknown\. Did you mean mixamo\? Use one of mixamo, unreal"),
+        (
+            circle,
+            "a.bvh",
+            {"rig": "miximo"},
+            r"rig=miximo: unknown\. Did you mean mixamo\? Use one of mixamo, unreal",
+        ),
         (circle, "a.npz", {"rig": "mixamo"}, r"rig is only for"),
         (kit, "a.bvh", {}, r"\.json or \.npy"),
-        (circle, "walk.npz.txt", {}, "unknown kind of motion file. Use one of .bvh, .glb, .fbx, .usda"),
+        (
+            circle,
+            "walk.npz.txt",
+            {},
+            "unknown kind of motion file. Use one of .bvh, .glb, .fbx, .usda",
+        ),
     ):
         with pytest.raises(UserError, match=message):
             motion.save(tmp_path / name, **options)

@@ -41,7 +41,9 @@ from flame_mdm.representations.rot6d import Rot6D
 FLIP = torch.tensor([1.0, -1.0, -1.0])
 
 
-def assert_padding_is_not_seen(network: nn.Module, x: Tensor, lengths: list[int], atol: float = 1e-5) -> None:
+def assert_padding_is_not_seen(
+    network: nn.Module, x: Tensor, lengths: list[int], atol: float = 1e-5
+) -> None:
     """Outputs of motions (B, F, ...) are the same alone, without what follows their end."""
     with torch.no_grad():
         together = network(x, length_mask(torch.tensor(lengths), x.shape[1]))
@@ -52,14 +54,19 @@ def assert_padding_is_not_seen(network: nn.Module, x: Tensor, lengths: list[int]
 
 STATISTICS = (("mean", 0.0), ("std", 1.0))
 T2M_PARTS = ("movement_encoder", "text_encoder", "motion_encoder")
-TINY = dict.fromkeys(("movement_hidden", "movement_latent", "text_hidden", "motion_hidden", "embedding"), 8)
+TINY = dict.fromkeys(
+    ("movement_hidden", "movement_latent", "text_hidden", "motion_hidden", "embedding"), 8
+)
 
 
 def t2m(arrays: Arrays) -> T2MEvaluator:
     state = weights(arrays)
     mardm = "in/feats" in arrays  # MARDM's evaluator sees 67 features and has statistics of its own
     features = 67 if mardm else arrays["in/motions"].shape[2]
-    mean, std = (torch.from_numpy(arrays[f"in/{n}"]) if mardm else torch.full((features,), v) for n, v in STATISTICS)
+    mean, std = (
+        torch.from_numpy(arrays[f"in/{n}"]) if mardm else torch.full((features,), v)
+        for n, v in STATISTICS
+    )
     network = T2MEvaluator(
         mean,
         std,
@@ -71,7 +78,9 @@ def t2m(arrays: Arrays) -> T2MEvaluator:
         embedding=len(state["text_encoder/output_net.3.weight"]),
         max_frames=arrays["in/feats" if mardm else "in/motions"].shape[1],
     )
-    names = {name.replace("/", "."): value for name, value in state.items() if "contrast" not in name}
+    names = {
+        name.replace("/", "."): value for name, value in state.items() if "contrast" not in name
+    }
     network.load_state_dict({"mean": network.mean, "std": network.std, **names})
     return network.eval()
 
@@ -81,12 +90,18 @@ def t2m(arrays: Arrays) -> T2MEvaluator:
 def test_t2m_and_mardms_variant_give_the_authors_embeddings(stem):
     arrays = golden(stem)
     network = t2m(arrays)
-    captions = (torch.from_numpy(arrays[f"in/{name}"]) for name in ("word_embs", "pos_onehot", "cap_lens"))
+    captions = (
+        torch.from_numpy(arrays[f"in/{name}"]) for name in ("word_embs", "pos_onehot", "cap_lens")
+    )
     theirs = torch.from_numpy(arrays["out/align_idx"])  # the authors sort by length
     with torch.no_grad():
         text = network.text(Words(*captions))
         if stem == "essential67":
-            prefix, x, lengths = "", torch.from_numpy(arrays["in/feats"]), torch.from_numpy(arrays["in/lengths"])
+            prefix, x, lengths = (
+                "",
+                torch.from_numpy(arrays["in/feats"]),
+                torch.from_numpy(arrays["in/lengths"]),
+            )
             movements = network.movement_encoder(torch.from_numpy(arrays["out/normed"]))
             motion = network(x, length_mask(lengths, x.shape[1]))
             assert torch.equal(network(x[..., :67], length_mask(lengths, x.shape[1])), motion)
@@ -105,7 +120,9 @@ def test_t2m_and_mardms_variant_give_the_authors_embeddings(stem):
 
 
 @pytest.mark.golden
-@pytest.mark.parametrize("features", [pytest.param(f, id=f"state_dict_manifest-t2m_{f}") for f in (263, 251)])
+@pytest.mark.parametrize(
+    "features", [pytest.param(f, id=f"state_dict_manifest-t2m_{f}") for f in (263, 251)]
+)
 def test_recipes_of_t2m_have_the_sizes_of_the_released_networks(features):
     manifest = json.loads((GOLDEN / "state_dict_manifest.json").read_text())
     config = compose({263: "t2m/humanml3d", 251: "t2m/kit"}[features])
@@ -114,7 +131,10 @@ def test_recipes_of_t2m_have_the_sizes_of_the_released_networks(features):
         network = T2MTask.build(config, representation).network
     keys = (f"t2m_movement_encoder_{features}", "t2m_text_encoder", "t2m_motion_encoder")
     for ours, theirs in zip(T2M_PARTS, keys, strict=True):
-        shapes = {name: list(value.shape) for name, value in network.get_submodule(ours).state_dict().items()}
+        shapes = {
+            name: list(value.shape)
+            for name, value in network.get_submodule(ours).state_dict().items()
+        }
         assert shapes == manifest[theirs]["keys"]
 
 
@@ -130,7 +150,9 @@ def test_t2m_normalizes_with_its_own_statistics_and_sees_nothing_past_the_end():
     assert torch.equal(plain(contacts, mask), plain(x, mask))
     assert_padding_is_not_seen(scaled, x, [12, 8])
     for length in (3, 200):
-        with pytest.raises(UserError, match=f"motions of 4 to 196 frames, but these have {length} to {length}"):
+        with pytest.raises(
+            UserError, match=f"motions of 4 to 196 frames, but these have {length} to {length}"
+        ):
             plain(torch.zeros(1, length, 20), torch.ones(1, length, dtype=torch.bool))
 
 
@@ -142,14 +164,20 @@ VECTORS = np.arange(len(WORDS) * 300, dtype=np.float64).reshape(len(WORDS), 300)
 def slots(words: Words, caption: int) -> list[tuple[int, str]]:
     """Row of the vector and part of speech of each slot of a caption."""
     assert (words.parts.sum(2) == 1).all()
-    rows, parts = (words.vectors[caption, :, 0] / 300).int().tolist(), words.parts[caption].argmax(1).tolist()
+    rows, parts = (
+        (words.vectors[caption, :, 0] / 300).int().tolist(),
+        words.parts[caption].argmax(1).tolist(),
+    )
     return [(row, PARTS_OF_SPEECH[part]) for row, part in zip(rows, parts, strict=True)]
 
 
 def test_words_have_vectors_and_parts_of_speech(tmp_path):
     write_words(tmp_path, WORDS, VECTORS)
     vectors = WordVectors.read(tmp_path)
-    captions = [["a/DET", "person/NOUN", "walk/VERB", "zigzag/NOUN", "left/ADJ", "hand/NOUN", "hop/X"], ["a/DET"] * 25]
+    captions = [
+        ["a/DET", "person/NOUN", "walk/VERB", "zigzag/NOUN", "left/ADJ", "hand/NOUN", "hop/X"],
+        ["a/DET"] * 25,
+    ]
     words = vectors(captions)
     assert (words.vectors.shape, words.parts.shape) == ((2, 22, 300), (2, 22, 15))
     without_vector = (0, "OTHER")
@@ -191,8 +219,13 @@ def released_folder(folder: Path, features: int) -> T2MEvaluator:
     np.save(folder / "mean.npy", mean)
     np.save(folder / "std.npy", std)
     used = features if features == 67 else None
-    network = T2MEvaluator(torch.from_numpy(mean), torch.from_numpy(std), used_features=used, **TINY).eval()
-    torch.save({name: network.get_submodule(name).state_dict() for name in T2M_PARTS}, folder / "finest.tar")
+    network = T2MEvaluator(
+        torch.from_numpy(mean), torch.from_numpy(std), used_features=used, **TINY
+    ).eval()
+    torch.save(
+        {name: network.get_submodule(name).state_dict() for name in T2M_PARTS},
+        folder / "finest.tar",
+    )
     return network
 
 
@@ -210,7 +243,9 @@ def test_the_released_t2m_is_read_whole_or_not_at_all(tmp_path):
         full, short = (extractor.texts(["", "", ""], captions) for extractor in (legacy, extractor))
     assert short.shape == (3, 8)
     assert not torch.allclose(short[0], short[1], atol=1e-6)
-    assert not torch.allclose(full[0], short[0], atol=1e-3), "the slots behind the caption are read, too"
+    assert not torch.allclose(full[0], short[0], atol=1e-3), (
+        "the slots behind the caption are read, too"
+    )
     torch.testing.assert_close(full[2], short[2])
     with pytest.raises(UserError, match="tagged words"):
         extractor.texts(["walk"], [None])
@@ -222,7 +257,9 @@ def test_the_released_t2m_is_read_whole_or_not_at_all(tmp_path):
     file = torch.load(tmp_path / "finest.tar")
     file["text_encoder"].pop("hidden")
     torch.save(file, tmp_path / "finest.tar")
-    with pytest.raises(UserError, match=r"finest\.tar: not the weights of _TextEncoder: Missing key.*hidden"):
+    with pytest.raises(
+        UserError, match=r"finest\.tar: not the weights of _TextEncoder: Missing key.*hidden"
+    ):
         load_t2m(tmp_path)
 
 
@@ -247,7 +284,9 @@ def test_mardms_clip_gives_the_authors_vectors(stem):
         text = network.text(torch.from_numpy(arrays["in/tokens"]))
     assert_within(motion, arrays, "out/clip_motion", like="clip_motion")
     assert_within(text, arrays, "out/clip_text", like="clip_text")
-    assert (motion * text).sum(-1).mean().item() == pytest.approx(float(arrays["out/clip_score"]), abs=1e-6)
+    assert (motion * text).sum(-1).mean().item() == pytest.approx(
+        float(arrays["out/clip_score"]), abs=1e-6
+    )
 
 
 def test_released_evaluators_of_mardm_are_read(tmp_path, small_networks):
@@ -272,7 +311,9 @@ def test_released_evaluators_of_mardm_are_read(tmp_path, small_networks):
 
 @pytest.mark.golden
 @needs_third_party
-@pytest.mark.parametrize("start", [pytest.param(s, id=f"humanact12_gru-{s or 'given'}") for s in ("", "_h0_zero")])
+@pytest.mark.parametrize(
+    "start", [pytest.param(s, id=f"humanact12_gru-{s or 'given'}") for s in ("", "_h0_zero")]
+)
 def test_the_gru_gives_the_authors_features_and_logits(start):
     arrays = third_party("humanact12_gru")
     network = ActionGRU().eval()
@@ -292,9 +333,13 @@ def test_classifiers_of_joints_stop_at_the_end_and_do_not_see_where_the_motion_s
         x, mask = torch.randn(3, 60, joints, 3), length_mask(torch.tensor([60, 31, 1]))
         assert_padding_is_not_seen(network, x, [60, 31, 1])
         features = network(x, mask)
-        torch.testing.assert_close(network(x + torch.tensor([3.0, -1, 2]), mask), features, atol=1e-4, rtol=0)
+        torch.testing.assert_close(
+            network(x + torch.tensor([3.0, -1, 2]), mask), features, atol=1e-4, rtol=0
+        )
         path = torch.linspace(0, 1, 60)[:, None, None]
-        assert not torch.allclose(network(x + path, mask), features, atol=1e-3), "but which way it goes"
+        assert not torch.allclose(network(x + path, mask), features, atol=1e-3), (
+            "but which way it goes"
+        )
 
 
 NETWORKS = {"uestc": UESTC, "unconstrained": Unconstrained}
@@ -307,7 +352,9 @@ def formula_weights(network: nn.Module) -> None:
         value = state[name]
         if name == "A" or name.endswith("num_batches_tracked"):
             continue
-        wave = torch.cos(1.3 * number + 0.61803398875 * torch.arange(value.numel(), dtype=torch.float64))
+        wave = torch.cos(
+            1.3 * number + 0.61803398875 * torch.arange(value.numel(), dtype=torch.float64)
+        )
         wave = wave.reshape(value.shape)
         one_sided = name.startswith("edge_importance") or name.endswith("running_var")
         if one_sided or (value.ndim == 1 and name.endswith("weight")):
@@ -320,7 +367,9 @@ def formula_weights(network: nn.Module) -> None:
 
 
 @pytest.mark.golden
-@pytest.mark.parametrize("name", [pytest.param(n, id=f"stgcn-{n}") for n in groups(golden("stgcn"), "adjacency_A")])
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, id=f"stgcn-{n}") for n in groups(golden("stgcn"), "adjacency_A")]
+)
 def test_stgcn_gives_the_authors_features_and_logits(name):
     """Also for motions as this project gives them: 25 x 6 features, or 24 joints with y up."""
     arrays = golden("stgcn")
@@ -337,13 +386,19 @@ def test_stgcn_gives_the_authors_features_and_logits(name):
         assert_within(network.fcn(features[..., None, None])[..., 0, 0], arrays, f"{name}/yhat")
         if name == "uestc":
             way = torch.randn(*x.shape[:2], 1, 6)
-            assert_within(network(torch.cat([x, way], 2).flatten(2), mask), arrays, f"{name}/features")
+            assert_within(
+                network(torch.cat([x, way], 2).flatten(2), mask), arrays, f"{name}/features"
+            )
         else:
             joints = torch.randn(*x.shape[:2], 24, 3)
             joints[:, :, [15, 12, 16, 18, 20, 17, 19, 21, 0, 1, 4, 7, 2, 5, 8]] = x * FLIP
             seen = x - x[:, :, 8:9]  # from the pelvis
-            torch.testing.assert_close(network(joints, mask), STGCN.forward(network, seen, mask), atol=1e-5, rtol=0)
-            torch.testing.assert_close(network(joints + 7, mask), network(joints, mask), atol=1e-4, rtol=0)
+            torch.testing.assert_close(
+                network(joints, mask), STGCN.forward(network, seen, mask), atol=1e-5, rtol=0
+            )
+            torch.testing.assert_close(
+                network(joints + 7, mask), network(joints, mask), atol=1e-4, rtol=0
+            )
 
 
 def small() -> JointSTGCN:
@@ -358,7 +413,9 @@ def test_stgcn_classifies_and_sees_nothing_past_the_end():
         with torch.no_grad():
             features, logits = network(x, mask), network.logits(x, mask)
         assert (features.shape, logits.shape) == ((3, network.fcn.in_channels), (3, actions))
-        torch.testing.assert_close(logits, features @ network.fcn.weight.flatten(1).T + network.fcn.bias)
+        torch.testing.assert_close(
+            logits, features @ network.fcn.weight.flatten(1).T + network.fcn.bias
+        )
         assert_padding_is_not_seen(network, x, [20, 13, 1])
 
 
@@ -379,11 +436,16 @@ def test_released_weights_are_loaded_whole_or_not_at_all(tmp_path, kind):
     write(state)
     extractor = ClassifierExtractor(kind, str(path))
     assert not extractor.network.training
-    assert all(torch.equal(value, state[name]) for name, value in extractor.network.state_dict().items())
+    assert all(
+        torch.equal(value, state[name]) for name, value in extractor.network.state_dict().items()
+    )
     x, mask = torch.randn(3, 20, 150), length_mask(torch.tensor([20, 9, 20]))
     with torch.no_grad():
         outputs = extractor.motions(x, Rot6D().decode(x), mask)
-    assert (outputs["logits"].shape, len(outputs["features"])) == ((3, 40 if kind == "uestc" else 12), 3)
+    assert (outputs["logits"].shape, len(outputs["features"])) == (
+        (3, 40 if kind == "uestc" else 12),
+        3,
+    )
     assert extractor.texts(["walk"], [None]) is None
     extractor.check(Rot6D(), extractor.made_for[1])
     with pytest.raises(UserError, match="bandai"):
@@ -392,7 +454,10 @@ def test_released_weights_are_loaded_whole_or_not_at_all(tmp_path, kind):
         with pytest.raises(UserError, match="not recurrent"):
             ClassifierExtractor(kind, str(path), random_start=True)
     for content, message in (
-        ({k: v for k, v in state.items() if k != name}, rf"not the weights of {make.__name__}: Missing key.*{name}"),
+        (
+            {k: v for k, v in state.items() if k != name},
+            rf"not the weights of {make.__name__}: Missing key.*{name}",
+        ),
         ({**state, "extra": torch.zeros(1)}, "Unexpected key.*extra"),
         ({**state, "extra": _Runs()}, r"holds Python objects \(_pytest"),
     ):
@@ -409,11 +474,16 @@ def test_released_weights_are_loaded_whole_or_not_at_all(tmp_path, kind):
 def test_a_random_start_is_a_function_of_the_motion(tmp_path):
     torch.save({"model": ActionGRU().state_dict()}, tmp_path / "gru")
     path = str(tmp_path / "gru")
-    plain, legacy = (ClassifierExtractor("humanact12", path, random_start=start) for start in (False, True))
+    plain, legacy = (
+        ClassifierExtractor("humanact12", path, random_start=start) for start in (False, True)
+    )
     x, mask = torch.randn(3, 20, 150), length_mask(torch.tensor([20, 9, 20]))
     joints = Rot6D().decode(x)
     with torch.no_grad():
-        drawn, again = legacy.motions(x, joints, mask), legacy.motions(x.flip(0), joints.flip(0), mask.flip(0))
+        drawn, again = (
+            legacy.motions(x, joints, mask),
+            legacy.motions(x.flip(0), joints.flip(0), mask.flip(0)),
+        )
         alone = legacy.motions(x[1:2, :9], joints[1:2, :9], mask[1:2, :9])
         zero = plain.motions(x, joints, mask)
     for name in ("features", "logits"):
@@ -421,4 +491,6 @@ def test_a_random_start_is_a_function_of_the_motion(tmp_path):
         torch.testing.assert_close(drawn[name][1:2], alone[name])
         assert not torch.allclose(drawn[name], zero[name], atol=1e-3)
     network: Any = legacy.network
-    assert not torch.allclose(network.linear2(drawn["features"]), drawn["logits"], atol=1e-3), "two draws"
+    assert not torch.allclose(network.linear2(drawn["features"]), drawn["logits"], atol=1e-3), (
+        "two draws"
+    )

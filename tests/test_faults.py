@@ -36,7 +36,12 @@ from flame_mdm.training.guards import lost_worker
 pytestmark = pytest.mark.slow
 
 STORE = "synthetic-humanml-clean-smpl22"
-QUIET = ["callbacks.samples=null", "callbacks.best=null", "logger=csv", "callbacks.checkpoints.every_n_steps=2"]
+QUIET = [
+    "callbacks.samples=null",
+    "callbacks.best=null",
+    "logger=csv",
+    "callbacks.checkpoints.every_n_steps=2",
+]
 
 
 def words(root: Path, run: Path, *more: str) -> list[str]:
@@ -56,11 +61,15 @@ def file_limit(size: int) -> Iterator[None]:
 
 def test_a_full_disk_leaves_the_checkpoint_before(tmp_path):
     checkpoints = AtomicCheckpoints(tmp_path)
-    checkpoints.save_checkpoint({"global_step": 1, "config": {}, "facts": {}, "state_dict": {}}, tmp_path / LAST)
+    checkpoints.save_checkpoint(
+        {"global_step": 1, "config": {}, "facts": {}, "state_dict": {}}, tmp_path / LAST
+    )
     before = (tmp_path / LAST).read_bytes()
     message = r"last\.ckpt: the checkpoint of step 2 cannot be written .*File too large"
     with file_limit(100_000), pytest.raises(UserError, match=message):
-        checkpoints.save_checkpoint({"global_step": 2, "state_dict": {"a": torch.zeros(100_000)}}, tmp_path / LAST)
+        checkpoints.save_checkpoint(
+            {"global_step": 2, "state_dict": {"a": torch.zeros(100_000)}}, tmp_path / LAST
+        )
     assert [path.name for path in tmp_path.iterdir()] == [LAST]
     assert (tmp_path / LAST).read_bytes() == before
 
@@ -68,9 +77,21 @@ def test_a_full_disk_leaves_the_checkpoint_before(tmp_path):
 def test_a_preparation_without_room_leaves_nothing(tmp_path, capsys):
     for size in (0, 100_000):
         with file_limit(size):
-            assert main(["prepare", "data=synthetic", "data.source.clips=60", f"data_root={tmp_path / 'data'}"]) == 1
+            assert (
+                main(
+                    [
+                        "prepare",
+                        "data=synthetic",
+                        "data.source.clips=60",
+                        f"data_root={tmp_path / 'data'}",
+                    ]
+                )
+                == 1
+            )
         line = capsys.readouterr().err.splitlines()[-1]
-        assert line.startswith(f"error: {tmp_path / 'data' / STORE}: cannot be written: File too large. ")
+        assert line.startswith(
+            f"error: {tmp_path / 'data' / STORE}: cannot be written: File too large. "
+        )
         assert f" are free on the disk of {tmp_path / 'data'}" in line
         assert list(tmp_path.iterdir()) == []
 
@@ -109,13 +130,17 @@ def test_which_second_signal_ends_a_run_at_once(monkeypatch):
 
 def test_torch_messages_about_lost_workers_are_understood(tmp_path, monkeypatch):
     assert lost_worker(RuntimeError("Caught ValueError in DataLoader worker process 0.")) is None
-    assert "ended unexpectedly" in str(lost_worker(ConnectionResetError(104, "Connection reset by peer")))
+    assert "ended unexpectedly" in str(
+        lost_worker(ConnectionResetError(104, "Connection reset by peer"))
+    )
     for message in (
         "DataLoader worker (pid 12) is killed by signal: Killed. ",
         "DataLoader worker (pid(s) 12, 13) exited unexpectedly",
         "DataLoader worker (pid 12) exited unexpectedly with exit code 1. Details",
     ):
-        assert str(lost_worker(RuntimeError(message))).startswith("a data loading process was killed")
+        assert str(lost_worker(RuntimeError(message))).startswith(
+            "a data loading process was killed"
+        )
         monkeypatch.setattr("torch.save", Mock(side_effect=RuntimeError(message)))
         with pytest.raises(UserError) as caught:
             AtomicCheckpoints(tmp_path).save_checkpoint({"global_step": 1}, tmp_path / LAST)
@@ -135,14 +160,20 @@ def prepare(folder: Path, log: Path) -> None:
     original, Synthetic.clips = Synthetic.clips, clips  # type: ignore[method-assign]
     parallel.PATIENCE = 1e9  # a slow machine would start processes, which this daemon may not
     with log.open("w", buffering=1) as file, redirect_stdout(file), redirect_stderr(file):
-        code = main(["prepare", "data=synthetic", "data.source.clips=100", f"data_root={folder / 'data'}"])
+        code = main(
+            ["prepare", "data=synthetic", "data.source.clips=100", f"data_root={folder / 'data'}"]
+        )
     os._exit(code)
 
 
 @pytest.mark.parametrize("dies", [False, True])
-def test_two_processes_prepare_the_same_data_once_and_one_takes_over_if_the_other_dies(dies, tmp_path):
+def test_two_processes_prepare_the_same_data_once_and_one_takes_over_if_the_other_dies(
+    dies, tmp_path
+):
     context, logs = multiprocessing.get_context("fork"), [tmp_path / "first", tmp_path / "second"]
-    first, second = (context.Process(target=prepare, args=(tmp_path, log), daemon=True) for log in logs)
+    first, second = (
+        context.Process(target=prepare, args=(tmp_path, log), daemon=True) for log in logs
+    )
     first.start()
     while not (tmp_path / "begun").exists():
         time.sleep(0.01)
@@ -155,15 +186,22 @@ def test_two_processes_prepare_the_same_data_once_and_one_takes_over_if_the_othe
     (tmp_path / "go").touch()
     second.join(60)
     first.join(60)
-    assert [first.exitcode, second.exitcode] == [-signal.SIGKILL if dies else 0, 0], logs[1].read_text()
+    assert [first.exitcode, second.exitcode] == [-signal.SIGKILL if dies else 0, 0], logs[
+        1
+    ].read_text()
     assert [path.name for path in (tmp_path / "data").iterdir()] == [STORE]
-    assert ("preparing synthetic" in logs[1].read_text()) == dies, "otherwise it opens what the other has written"
-    assert len({log.read_text().splitlines()[-1] for log in logs[dies:]}) == 1, "the fingerprint is the same"
+    assert ("preparing synthetic" in logs[1].read_text()) == dies, (
+        "otherwise it opens what the other has written"
+    )
+    assert len({log.read_text().splitlines()[-1] for log in logs[dies:]}) == 1, (
+        "the fingerprint is the same"
+    )
     Store(tmp_path / "data" / STORE).verify()
 
 
 @pytest.mark.parametrize(
-    ("signum", "code", "fails"), [(signal.SIGTERM, 143, True), (signal.SIGINT, 130, True), (signal.SIGINT, 130, False)]
+    ("signum", "code", "fails"),
+    [(signal.SIGTERM, 143, True), (signal.SIGINT, 130, True), (signal.SIGINT, 130, False)],
 )
 def test_a_library_that_fails_after_a_signal_does_not_hide_it(signum, code, fails, capsys):
     def command() -> None:
@@ -174,7 +212,8 @@ def test_a_library_that_fails_after_a_signal_does_not_hide_it(signum, code, fail
             if fails:
                 raise OSError("cannot close the file")
 
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # shells ignore it for jobs in the background
+    # Shells ignore it for jobs in the background
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     handlers = list(map(signal.getsignal, (signal.SIGINT, signal.SIGTERM)))
     try:
         assert guarded(command, (signal.SIGINT, signal.SIGTERM)) == code
@@ -209,7 +248,8 @@ def test_a_signal_that_a_library_swallows_stops_the_next_step_of_a_progress_bar(
 
 
 def test_an_ignored_signal_stays_ignored():
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # as a shell does for a job in the background
+    # As a shell does for a job in the background
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         assert guarded(lambda: os.kill(os.getpid(), signal.SIGINT), (signal.SIGINT,)) == 0
     finally:
@@ -224,16 +264,24 @@ def result(folder: Path) -> Any:
     """What must be the same after kills."""
     content = read_checkpoint(folder / "checkpoints" / LAST)
     states = content["state_dict"], content["current_model_state"]
-    return content["global_step"], [{name: x.numpy().tobytes() for name, x in state.items()} for state in states]
+    return content["global_step"], [
+        {name: x.numpy().tobytes() for name, x in state.items()} for state in states
+    ]
 
 
 @pytest.mark.robustness
 def test_kills_at_random_moments_change_nothing(data_root, tmp_path):
     """Of a training; tests/test_evaluate.py kills an evaluation, tests/test_prepare.py interrupts a preparation."""
-    often = ["trainer.val_check_interval=50", "callbacks.checkpoints.every_n_steps=10", "trainer.max_steps=500"]
+    often = [
+        "trainer.val_check_interval=50",
+        "callbacks.checkpoints.every_n_steps=10",
+        "trainer.max_steps=500",
+    ]
 
     def start(folder: Path) -> subprocess.Popen[str]:
-        return spawn(["flame_mdm", "train", *words(data_root, folder, "denoiser.dropout=0.1", *often)])
+        return spawn(
+            ["flame_mdm", "train", *words(data_root, folder, "denoiser.dropout=0.1", *often)]
+        )
 
     draw, begin = random.Random(0), time.monotonic()
     assert finish(start(tmp_path / "whole"))[0] == 0

@@ -44,7 +44,11 @@ def test_a_motion_on_each_rig_is_read_back(rig: str | None, tmp_path: Path):
     expected = clip(rig)
     positions, _ = expected.world()
     positions[..., 1] += expected.lift
-    moving = [joint for joint, parent in enumerate(expected.parents) if parent >= 0 or joint in expected.moves]
+    moving = [
+        joint
+        for joint, parent in enumerate(expected.parents)
+        if parent >= 0 or joint in expected.moves
+    ]
     names = [expected.joints[joint] for joint in moving]
     assert distance(motion, names, positions[:, moving]) < 0.01 * MILLIMETER
     assert (motion.fps, motion.animation) == (20, "a person kicks")
@@ -116,7 +120,9 @@ def test_the_scene_has_what_single_programs_need(tmp_path: Path):
     for model in objects.all("Model"):
         properties = model.first("Properties70")
         assert properties is not None
-        moved = next(entry for entry in properties.all("P") if entry.properties[0] == "Lcl Translation")
+        moved = next(
+            entry for entry in properties.all("P") if entry.properties[0] == "Lcl Translation"
+        )
         offsets[model.properties[1].partition("\x00")[0]] = moved.properties[4:]
     assert offsets["root"] == [0, 0, pytest.approx(-0.01)]
 
@@ -156,7 +162,9 @@ def test_the_skin_is_bound_in_its_own_pose(tmp_path: Path):
         ("minimal.vrma", None, "walk"),
     ],
 )
-def test_files_of_other_writers_give_the_right_positions(name: str, animation: str | None, key: str):
+def test_files_of_other_writers_give_the_right_positions(
+    name: str, animation: str | None, key: str
+):
     read = fbx_scene.read if name.endswith(".fbx") else glb_animation.read
     motion = read(FILES / name, animation)
     stem = "minimal_vrma" if name.endswith(".vrma") else "mixamo_not_tpose"
@@ -171,7 +179,9 @@ def test_files_of_other_writers_give_the_right_positions(name: str, animation: s
 def test_the_animation_is_chosen_by_name_or_number():
     assert glb_animation.animations(FILES / "mixamo_not_tpose.glb") == ["Walk", "Wave", "Turn"]
     assert fbx_scene.animations(FILES / "mixamo_prerotation.fbx") == ["Walk"]
-    with pytest.raises(UserError, match=r"animation=Wawe: .*Did you mean Wave.*1 Walk, 2 Wave, 3 Turn"):
+    with pytest.raises(
+        UserError, match=r"animation=Wawe: .*Did you mean Wave.*1 Walk, 2 Wave, 3 Turn"
+    ):
         glb_animation.read(FILES / "mixamo_not_tpose.glb", "Wawe")
     with pytest.raises(UserError, match=r"animation=4: no such animation"):
         glb_animation.read(FILES / "mixamo_not_tpose.glb", 4)
@@ -224,7 +234,14 @@ def animated(tmp_path: Path, **properties: tuple[float, ...]) -> AnimatedNodes:
     curve = objects.add("AnimationCurve", 6, "\x00\x01AnimCurve", "")
     curve.add("KeyTime", np.array([0, fbx_scene.TICKS], "<i8"))
     curve.add("KeyValueFloat", np.array([0.0, 3.0], "<f4"))
-    pairs = ((1, 0, None), (2, 1, None), (4, 3, None), (5, 4, None), (5, 2, "Lcl Translation"), (6, 5, "d|X"))
+    pairs = (
+        (1, 0, None),
+        (2, 1, None),
+        (4, 3, None),
+        (5, 4, None),
+        (5, 2, "Lcl Translation"),
+        (6, 5, "d|X"),
+    )
     for child, parent, target in pairs:
         connections.add("C", "OP" if target else "OO", child, parent, *([target] if target else []))
     fbx.write(tmp_path / "scene.fbx", root)
@@ -253,7 +270,9 @@ def test_pivots_offsets_and_orders_of_rotation_follow_the_documented_formula(tmp
     np.testing.assert_allclose(motion.positions[0, 1], [0, 0, 1], atol=1e-9)
 
     # half a turn about x around the pivot (0, 1, 0): the child is on the pivot and stays
-    motion = animated(tmp_path, RotationPivot=(0.0, 1.0, 0.0), **{"Lcl Rotation": (180.0, 0.0, 0.0)})
+    motion = animated(
+        tmp_path, RotationPivot=(0.0, 1.0, 0.0), **{"Lcl Rotation": (180.0, 0.0, 0.0)}
+    )
     np.testing.assert_allclose(motion.positions[0, 1], [0, 1, 0], atol=1e-9)
 
     # scaled by 2 around the pivot (0, 1, 0): the child stays as well
@@ -283,7 +302,9 @@ def header(version: int = fbx.VERSION) -> bytes:
 def wide_record(name: bytes, properties: bytes = b"", count: int = 0) -> bytes:
     """The bytes of a record without children in a file of version 7.5."""
     start = len(header())
-    head = struct.pack("<QQQB", start + 25 + len(name) + len(properties), count, len(properties), len(name))
+    head = struct.pack(
+        "<QQQB", start + 25 + len(name) + len(properties), count, len(properties), len(name)
+    )
     return head + name + properties
 
 
@@ -318,12 +339,21 @@ def nested() -> bytes:
 REFUSED = {
     "empty": (b"", "not an FBX file"),
     "text": (b"hello", "not an FBX file"),
-    "ascii": (b"; FBX 7.7.0 project file\nFBXHeaderExtension:  {\n", "in ASCII. Export it as binary FBX"),
+    "ascii": (
+        b"; FBX 7.7.0 project file\nFBXHeaderExtension:  {\n",
+        "in ASCII. Export it as binary FBX",
+    ),
     "old": (header(6100), r"FBX version 6\.1, but only version 7"),
     "header alone": (header(), "damaged"),
     "endless name": (header() + struct.pack("<IIIB", 60, 0, 0, 255) + b"A" * 20, "ends outside"),
-    "record that ends before it begins": (header() + struct.pack("<IIIB", 5, 0, 0, 0) + bytes(40), "ends outside"),
-    "record past the end": (header() + struct.pack("<IIIB", 10**6, 0, 0, 0) + bytes(40), "ends outside"),
+    "record that ends before it begins": (
+        header() + struct.pack("<IIIB", 5, 0, 0, 0) + bytes(40),
+        "ends outside",
+    ),
+    "record past the end": (
+        header() + struct.pack("<IIIB", 10**6, 0, 0, 0) + bytes(40),
+        "ends outside",
+    ),
     "many properties": (header(7700) + wide_record(b"A", b"C\x01", 10**9), "properties in 2 bytes"),
     "unknown property": (header(7700) + wide_record(b"A", b"Z\x01", 1), "unknown property"),
     "bomb": (bomb(), "an array of"),
@@ -360,7 +390,9 @@ def changed(tmp_path: Path, change: str) -> Path:
     if change == "cycle":
         connections.add("C", "OO", models[0], models[5])
     elif change == "no animation":
-        objects.children = [record for record in objects.children if record.name != "AnimationStack"]
+        objects.children = [
+            record for record in objects.children if record.name != "AnimationStack"
+        ]
     elif change == "two layers":
         objects.add("AnimationLayer", 5, "second\x00\x01AnimLayer", "")
         stack = objects.first("AnimationStack")

@@ -35,8 +35,12 @@ from flame_mdm.sampling.reading import read_motion
 def test_arrays_that_are_not_needed_are_never_opened(tmp_path: Path):
     parts = amass(walk())
     np.savez(tmp_path / "plain.npz", **parts)
-    np.savez(tmp_path / "a_stageii.npz", **parts, markers_latent_vids=np.array({"a": 1}, dtype=object))
-    np.testing.assert_array_equal(read(tmp_path / "a_stageii.npz").joints, read(tmp_path / "plain.npz").joints)
+    np.savez(
+        tmp_path / "a_stageii.npz", **parts, markers_latent_vids=np.array({"a": 1}, dtype=object)
+    )
+    np.testing.assert_array_equal(
+        read(tmp_path / "a_stageii.npz").joints, read(tmp_path / "plain.npz").joints
+    )
     np.testing.assert_allclose(read(tmp_path / "plain.npz").joints, walk().joints, atol=1e-5)
     parts["poses"] = np.array([{}])
     np.savez(tmp_path / "b.npz", **parts)
@@ -55,7 +59,11 @@ def test_shapes_are_read_by_their_layout_and_rates_of_one_element_are_rates(tmp_
     poses = parts.pop("poses")
     np.savez(path, root_orient=poses[:, :3], pose_body=poses[:, 3:66], **parts)
     np.testing.assert_allclose(read(path).joints, expected, atol=1e-5)
-    for numbers, advice in ((216, "rotation matrices"), (144, "6D rotations"), (69, "not 66, 72, 156, 165")):
+    for numbers, advice in (
+        (216, "rotation matrices"),
+        (144, "6D rotations"),
+        (69, "not 66, 72, 156, 165"),
+    ):
         np.savez(path, poses=np.zeros((40, numbers)), **parts)
         with pytest.raises(UserError, match=advice):
             read(path)
@@ -63,7 +71,9 @@ def test_shapes_are_read_by_their_layout_and_rates_of_one_element_are_rates(tmp_
     assert read(path).fps == 60
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        halves: dict[str, Any] = {name: np.asarray(values, np.float16) for name, values in amass(walk()).items()}
+        halves: dict[str, Any] = {
+            name: np.asarray(values, np.float16) for name, values in amass(walk()).items()
+        }
         np.savez(path, **halves)
         np.testing.assert_allclose(read(path).joints, expected, atol=0.02)
 
@@ -135,7 +145,10 @@ def test_a_key_acts_or_is_refused(key: str, kind: str, tmp_path: Path):
     if after is None:
         assert any(word in message for word in (key, "unit", "toes", "legs")), message
     else:
-        assert after.joints.shape != before.joints.shape or np.abs(after.joints - before.joints).max() > 0.01
+        assert (
+            after.joints.shape != before.joints.shape
+            or np.abs(after.joints - before.joints).max() > 0.01
+        )
 
 
 def test_up_of_commands_and_of_json_files_acts(tmp_path: Path):
@@ -145,14 +158,24 @@ def test_up_of_commands_and_of_json_files_acts(tmp_path: Path):
     upright = read(tmp_path / "a.npz", up="y")
     assert not upright.notes
     assert head_height(upright.joints) == pytest.approx(head_height(motion.joints), abs=1e-4)
-    assert np.median(upright.joints[..., 1].min(1)) == pytest.approx(0, abs=0.02), "feet on the floor"
+    assert np.median(upright.joints[..., 1].min(1)) == pytest.approx(0, abs=0.02), (
+        "feet on the floor"
+    )
     recording = read_recording(tmp_path / "a.npz", up="y", as_smpl=True)
     assert recording.smpl is not None
     turned = motion.joints @ np.array(TURNED["z"], float).T
-    content = {"joints": turned.tolist(), "fps": 20, "caption": "", "names": SMPL22.joints, "unit": "metre"}
+    content = {
+        "joints": turned.tolist(),
+        "fps": 20,
+        "caption": "",
+        "names": SMPL22.joints,
+        "unit": "metre",
+    }
     for stated, key in (({"up": "z"}, None), ({}, "z"), ({"up": "z"}, "z")):
         (tmp_path / "a.json").write_text(json.dumps(content | stated))
-        np.testing.assert_allclose(read(tmp_path / "a.json", up=key).joints, motion.joints, atol=1e-4)
+        np.testing.assert_allclose(
+            read(tmp_path / "a.json", up=key).joints, motion.joints, atol=1e-4
+        )
     (tmp_path / "a.json").write_text(json.dumps(content | {"up": "down"}))
     with pytest.raises(UserError, match="up: down"):
         read(tmp_path / "a.json")
@@ -169,7 +192,9 @@ def test_every_entrance_checks_sides_size_and_orientation(tmp_path: Path, capsys
         "convert": lambda: main(["convert", str(path), str(tmp_path / "o.npy")]),
         "inspect": lambda: main(["inspect", str(path), str(tmp_path / "o.html")]),
         "edit, after": lambda: read_motion(HumanML(), path).notes,
-        "prepare": lambda: main(["prepare", "folder", f"source={folder}", f"data_root={tmp_path}", "check=true"]),
+        "prepare": lambda: main(
+            ["prepare", "folder", f"source={folder}", f"data_root={tmp_path}", "check=true"]
+        ),
         "adapt": lambda: check_clips(folder, 20.0),
     }
 
@@ -179,7 +204,10 @@ def test_every_entrance_checks_sides_size_and_orientation(tmp_path: Path, capsys
         except UserError as error:
             return str(error)
 
-    mirrored, small = replace(walk(), joints=swapped(walk())), replace(walk(), joints=0.4 * walk().joints)
+    mirrored, small = (
+        replace(walk(), joints=swapped(walk())),
+        replace(walk(), joints=0.4 * walk().joints),
+    )
     for motion, words in ((mirrored, "the toes point backwards"), (small, "people's are")):
         write_bvh(path, motion)
         for name, enter in entrances.items():
@@ -195,7 +223,8 @@ def test_a_rest_pose_in_front_is_left_out_and_said(tmp_path: Path, capsys):
     np.savez(tmp_path / "b.npz", joints=np.concatenate([rest[None], motion.joints]), fps=20)
     parts = amass(motion)
     still: dict[str, Any] = {
-        name: np.concatenate([parts[name][:1] * (name == "trans"), parts[name]]) for name in ("poses", "trans")
+        name: np.concatenate([parts[name][:1] * (name == "trans"), parts[name]])
+        for name in ("poses", "trans")
     }
     still["poses"][0, 0] = np.pi / 2
     np.savez(tmp_path / "c.npz", **(parts | still))
@@ -205,15 +234,21 @@ def test_a_rest_pose_in_front_is_left_out_and_said(tmp_path: Path, capsys):
         assert any("the first frame is a rest pose" in note for note in again.notes), name
         np.testing.assert_allclose(again.joints, motion.joints, atol=0.01)
     check_clips(tmp_path, 20.0)
-    assert "4 motions: the first frame is a rest pose and is left out" in capsys.readouterr().out, "adapt says it"
+    assert "4 motions: the first frame is a rest pose and is left out" in capsys.readouterr().out, (
+        "adapt says it"
+    )
     source = Folder(str(tmp_path), workers=1)
     assert [len(clip.motion) for clip in source.clips(20.0)] == [30] * 4
     assert "4 motions: the first frame is a rest pose and is left out" in source.findings()
-    smooth = posed(30, left_shoulder=np.linspace([0, 0, 0], [0, 0, -70], 30), right_shoulder=[0, 0, 0])
+    smooth = posed(
+        30, left_shoulder=np.linspace([0, 0, 0], [0, 0, -70], 30), right_shoulder=[0, 0, 0]
+    )
     smooth.save(tmp_path / "e.json")
     kept = json.loads((tmp_path / "e.json").read_text())
     (tmp_path / "e.json").write_text(json.dumps({"joints": kept["joints"], "fps": 20}))
-    assert len(read(tmp_path / "e.json").joints) == 30, "a motion that begins in a rest pose is kept"
+    assert len(read(tmp_path / "e.json").joints) == 30, (
+        "a motion that begins in a rest pose is kept"
+    )
 
 
 def test_legs_that_flip_are_noticed(tmp_path: Path):
@@ -230,14 +265,23 @@ def test_legs_that_flip_are_noticed(tmp_path: Path):
     assert "a leg flips" in source.failures[0]
 
 
-def test_check_and_preparation_agree_and_one_bad_file_stops_nothing(tmp_path: Path, monkeypatch, capsys):
+def test_check_and_preparation_agree_and_one_bad_file_stops_nothing(
+    tmp_path: Path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
     Path("mine").mkdir()
     np.savez("mine/a.npz", joints=walk(60).joints, fps=20)
     np.savez("mine/c.npz", joints=walk(50).joints, fps=20)
     np.savez("mine/one.npz", joints=walk(1).joints, fps=20)
     Path("mine/b.bvh").write_text("HIERARCHY\n")
-    words = ["prepare", "folder", "source=mine", "data.name=ours", "data_root=data", "data.source.workers=1"]
+    words = [
+        "prepare",
+        "folder",
+        "source=mine",
+        "data.name=ours",
+        "data_root=data",
+        "data.source.workers=1",
+    ]
     assert main([*words, "check=true"]) == 1
     checked = capsys.readouterr().out
     assert main(words) == 1
@@ -251,7 +295,9 @@ def test_check_and_preparation_agree_and_one_bad_file_stops_nothing(tmp_path: Pa
     assert store.info["excluded"] == {"motions that cannot be read": 2}
     assert store.info["version"] == 2
 
-    assert main(["inspect", "ours", "data_root=data"]) in (0, 3), "a data set prepared under its name"
+    assert main(["inspect", "ours", "data_root=data"]) in (0, 3), (
+        "a data set prepared under its name"
+    )
     assert "of 2 motions" in capsys.readouterr().out
     Path("mine/one.npz").unlink()
     assert main(["inspect", "mine/", "page.html"]) == 1
@@ -266,9 +312,17 @@ def test_check_and_preparation_agree_and_one_bad_file_stops_nothing(tmp_path: Pa
 def test_files_that_are_no_motions_are_left_out_of_folders(tmp_path: Path):
     np.savez(tmp_path / "a.npz", joints=walk().joints, fps=20)
     (tmp_path / "meta.json").write_text('{"joints": ["Hips"], "license": "CC0"}')
-    (tmp_path / "b.json").write_text(json.dumps({"fps": 20, "joints": walk().joints.tolist()}, indent=1))
+    (tmp_path / "b.json").write_text(
+        json.dumps({"fps": 20, "joints": walk().joints.tolist()}, indent=1)
+    )
     (tmp_path / "__MACOSX").mkdir()
-    for name in ("._a.bvh", "__MACOSX/._a.bvh", "__MACOSX/a.bvh", "shape.npz", "neutral_stagei.npz"):
+    for name in (
+        "._a.bvh",
+        "__MACOSX/._a.bvh",
+        "__MACOSX/a.bvh",
+        "shape.npz",
+        "neutral_stagei.npz",
+    ):
         (tmp_path / name).write_bytes(b"\0\5\26\7")
     assert list(Folder(str(tmp_path), workers=1).files) == ["a", "b"]
     assert main(["convert", str(tmp_path), str(tmp_path / "out"), "format=npy"]) == 0
@@ -283,7 +337,9 @@ def test_files_that_are_no_motions_are_left_out_of_folders(tmp_path: Path):
         ("a.xyz", "neither a motion file (.npz"),
     ],
 )
-def test_files_of_other_kinds_are_refused_with_a_way_out(name: str, says: str, tmp_path: Path, capsys):
+def test_files_of_other_kinds_are_refused_with_a_way_out(
+    name: str, says: str, tmp_path: Path, capsys
+):
     (tmp_path / name).write_bytes(b"x")
     assert main(["convert", str(tmp_path / name), str(tmp_path / "o.npy")]) == 1
     assert says in capsys.readouterr().err
@@ -304,7 +360,9 @@ def test_extensions_that_compress_a_character_are_named(tmp_path: Path):
         if is_read:
             glb.read(tmp_path / "b.glb")
             continue
-        with pytest.raises(UserError, match=rf"b\.glb: it requires {name}, .* without this compression\Z"):
+        with pytest.raises(
+            UserError, match=rf"b\.glb: it requires {name}, .* without this compression\Z"
+        ):
             glb.read(tmp_path / "b.glb")
 
 
@@ -322,7 +380,9 @@ def test_two_people_and_rates_of_cmu_are_said(tmp_path: Path):
     motion.save(tmp_path / "60_01.bvh", rig="cmu")
     motion.save(tmp_path / "02_01.bvh", rig="cmu")
     assert (read(tmp_path / "60_01.bvh").fps, read(tmp_path / "02_01.bvh").fps) == (60, 120)
-    assert "CMU recorded it at 60 frames per second, not 120" in read(tmp_path / "60_01.bvh").notes[0]
+    assert (
+        "CMU recorded it at 60 frames per second, not 120" in read(tmp_path / "60_01.bvh").notes[0]
+    )
     assert read(tmp_path / "60_01.bvh", fps=120).fps == 120
 
 
@@ -339,7 +399,9 @@ def test_a_smaller_body_is_said_and_cubic_splines_resample_own_files_everywhere(
 FILES = SHARED / "data" / "files-of-others"
 
 
-@pytest.mark.skipif(not FILES.exists(), reason="the files of other programs are outside of the repository")
+@pytest.mark.skipif(
+    not FILES.exists(), reason="the files of other programs are outside of the repository"
+)
 @pytest.mark.parametrize(
     ("name", "keys", "head", "note"),
     [

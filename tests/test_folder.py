@@ -30,7 +30,9 @@ from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.representations.smpl import SMPL
 from flame_mdm.sampling.reading import read_motion
 
-WALK = next(c for c in Synthetic(clips=30).clips(30.0) if c.attributes["action"] == "walk").motion.astype(float)
+WALK = next(
+    c for c in Synthetic(clips=30).clips(30.0) if c.attributes["action"] == "walk"
+).motion.astype(float)
 """(F, 22, 3) meters, y up, 30 frames a second."""
 
 
@@ -57,7 +59,10 @@ def write_table(folder: Path, rows: list[dict]) -> None:
 
 
 INCH = 1 / 2.54
-MIXAMO = {joint: name if isinstance(name, str) else next(iter(name)) for joint, name in LAYOUTS["Mixamo"].map.items()}
+MIXAMO = {
+    joint: name if isinstance(name, str) else next(iter(name))
+    for joint, name in LAYOUTS["Mixamo"].map.items()
+}
 CHANNELS = ("Xposition", "Yposition", "Zposition", "Zrotation", "Xrotation", "Yrotation")
 
 
@@ -93,10 +98,17 @@ def arrays(tmp_path: Path) -> Path:
     (tmp_path / "deep").mkdir()
     np.savez(tmp_path / "deep" / "two.npz", joints=WALK[:50].astype(np.float32), fps=30)
     poses = np.tile(np.eye(1, 156) * np.pi / 2, (60, 1))
-    np.savez(tmp_path / "three.npz", poses=poses, trans=np.linspace((0, 0, 1), (1, 0, 1), 60), mocap_framerate=60.0)
+    np.savez(
+        tmp_path / "three.npz",
+        poses=poses,
+        trans=np.linspace((0, 0, 1), (1, 0, 1), 60),
+        mocap_framerate=60.0,
+    )
     skeleton(tmp_path, fps=30)
     for name in ("one", "deep/two", "three"):
-        (tmp_path / f"{name}.txt").write_text("a person walks\nsomeone goes ahead#someone/NOUN#0.0#0.0\n\n")
+        (tmp_path / f"{name}.txt").write_text(
+            "a person walks\nsomeone goes ahead#someone/NOUN#0.0#0.0\n\n"
+        )
     return tmp_path
 
 
@@ -118,7 +130,9 @@ def test_smpl_rotations_are_kept(tmp_path: Path):
     write_amass(tmp_path / "x.npz", 31, 60.0)
     with np.load(tmp_path / "x.npz") as file:
         recorded = np.concatenate([file["trans"], file["poses"]], 1)[::2]
-    ours, theirs = (SMPL().encode(torch.from_numpy(x)) for x in (only(tmp_path, motion="smpl"), recorded))
+    ours, theirs = (
+        SMPL().encode(torch.from_numpy(x)) for x in (only(tmp_path, motion="smpl"), recorded)
+    )
     np.testing.assert_allclose(ours.numpy(), theirs.numpy(), atol=1e-5)
 
 
@@ -153,7 +167,14 @@ def test_a_skeleton_file_maps_any_joints(tmp_path: Path):
     order = np.random.default_rng(0).permutation(22)
     np.save(tmp_path / "x.npy", WALK[:, order][..., [0, 2, 1]] * [100, -100, 100])  # y up -> z up
     names = [f"bone {SMPL22.joints[k]}" for k in order]
-    skeleton(tmp_path, fps=30, unit=0.01, up="z", joints=names, map={j: f"bone {j}" for j in SMPL22.joints})
+    skeleton(
+        tmp_path,
+        fps=30,
+        unit=0.01,
+        up="z",
+        joints=names,
+        map={j: f"bone {j}" for j in SMPL22.joints},
+    )
     np.testing.assert_allclose(only(tmp_path), WALK, atol=1e-5)
 
 
@@ -161,8 +182,14 @@ def test_the_table_gives_captions_actions_splits_and_sources(tmp_path: Path):
     rows = []
     for k, action in enumerate(("turn left", "turn right", "walk", "walk")):
         np.savez(tmp_path / f"{k}.npz", joints=WALK + 0.01 * k, fps=30)
-        facts = {"action": action, "split": "val" if k == 3 else "train", "source": f"take {(k + 1) // 2}"}
-        rows += [{"id": k, "text": text, **facts} for text in ("turns Left, clockwise", "is bright")]
+        facts = {
+            "action": action,
+            "split": "val" if k == 3 else "train",
+            "source": f"take {(k + 1) // 2}",
+        }
+        rows += [
+            {"id": k, "text": text, **facts} for text in ("turns Left, clockwise", "is bright")
+        ]
     write_table(tmp_path, rows)
     source = Folder(str(tmp_path), mirror=True)
     store = write_store(tmp_path / "store", source, HumanML())
@@ -173,27 +200,66 @@ def test_the_table_gives_captions_actions_splits_and_sources(tmp_path: Path):
     assert clips["0"].captions == ["turns Left, clockwise", "is bright"]
     assert clips["M0"].captions == ["turns Right, counterclockwise", "is bright"]
     assert [clips[i].action for i in ("0", "M0", "2", "M2")] == [0, 1, 2, 2]
-    assert [clips[i].source for i in ("0", "M0", "1", "2", "M2")] == ["take 0", "take 0", "take 1", "take 1", "take 1"]
+    assert [clips[i].source for i in ("0", "M0", "1", "2", "M2")] == [
+        "take 0",
+        "take 0",
+        "take 1",
+        "take 1",
+        "take 1",
+    ]
 
 
 HEADLESS = {joint: f"{joint} b" for joint in SMPL22.joints}
 BAD = {
-    "no motion": (lambda f: [p.unlink() for p in f.rglob("*.np*")], "no motions in this folder. Give a folder"),
-    "twice": (lambda f: np.savez(f / "one.npz", joints=WALK, fps=30), r"one\.npz: has the same name as one\.npy"),
-    "no caption": (lambda f: (f / "one.txt").unlink(), "1 of 3 motions have no caption, such as one"),
-    "unknown id": (lambda f: write_table(f, [{"id": "once", "text": "a"}]), r"captions\.csv, line 2: .*'once'"),
-    "cells": (lambda f: (f / "captions.csv").write_text("id,text\none,a, b\n"), r"line 2: not one cell per column"),
-    "split": (lambda f: write_table(f, [{"id": "one", "split": "dev"}]), "line 2: unknown split 'dev'; use train, val"),
-    "columns": (lambda f: write_table(f, [{"id": "one", "name": "a"}]), r"captions\.csv: its columns are \['id', 'na"),
+    "no motion": (
+        lambda f: [p.unlink() for p in f.rglob("*.np*")],
+        "no motions in this folder. Give a folder",
+    ),
+    "twice": (
+        lambda f: np.savez(f / "one.npz", joints=WALK, fps=30),
+        r"one\.npz: has the same name as one\.npy",
+    ),
+    "no caption": (
+        lambda f: (f / "one.txt").unlink(),
+        "1 of 3 motions have no caption, such as one",
+    ),
+    "unknown id": (
+        lambda f: write_table(f, [{"id": "once", "text": "a"}]),
+        r"captions\.csv, line 2: .*'once'",
+    ),
+    "cells": (
+        lambda f: (f / "captions.csv").write_text("id,text\none,a, b\n"),
+        r"line 2: not one cell per column",
+    ),
+    "split": (
+        lambda f: write_table(f, [{"id": "one", "split": "dev"}]),
+        "line 2: unknown split 'dev'; use train, val",
+    ),
+    "columns": (
+        lambda f: write_table(f, [{"id": "one", "name": "a"}]),
+        r"captions\.csv: its columns are \['id', 'na",
+    ),
     "two splits": (
         lambda f: write_table(f, [{"id": "one", "split": split} for split in ("val", "test")]),
         "line 3: one has two values of split: val and test",
     ),
     "no rate": (lambda f: (f / "skeleton.yaml").unlink(), r"one\.npy: no frame rate in the file"),
-    "up": (lambda f: np.savez(f / "deep/two.npz", joints=WALK[..., [0, 2, 1]] * [1, -1, 1], fps=9), "is lying down"),
-    "yaml key": (lambda f: skeleton(f, rate=30), r"skeleton\.yaml: rate: Extra inputs are .* Use map, joints"),
-    "yaml map": (lambda f: skeleton(f, map={"pelvis": "Hips"}), r"skeleton\.yaml: map: no joint given for head"),
-    "map": (lambda f: skeleton(f, fps=30, map=HEADLESS), r"two\.npz: the map in skeleton\.yaml uses .* head b"),
+    "up": (
+        lambda f: np.savez(f / "deep/two.npz", joints=WALK[..., [0, 2, 1]] * [1, -1, 1], fps=9),
+        "is lying down",
+    ),
+    "yaml key": (
+        lambda f: skeleton(f, rate=30),
+        r"skeleton\.yaml: rate: Extra inputs are .* Use map, joints",
+    ),
+    "yaml map": (
+        lambda f: skeleton(f, map={"pelvis": "Hips"}),
+        r"skeleton\.yaml: map: no joint given for head",
+    ),
+    "map": (
+        lambda f: skeleton(f, fps=30, map=HEADLESS),
+        r"two\.npz: the map in skeleton\.yaml uses .* head b",
+    ),
 }
 
 
@@ -212,7 +278,9 @@ def test_rotations_are_fitted_to_files_of_joints_and_the_error_is_stated(arrays:
     clips = {clip.id: clip.motion for clip in source.clips(20.0)}
     assert set(clips) == {"deep_two", "one", "three"}
     fitted = SMPL().decode(SMPL().encode(torch.from_numpy(clips["one"]))).numpy()
-    traveled = np.linalg.norm(fitted[-1, 0] - fitted[0, 0]) / np.linalg.norm(WALK[-1, 0] - WALK[0, 0])
+    traveled = np.linalg.norm(fitted[-1, 0] - fitted[0, 0]) / np.linalg.norm(
+        WALK[-1, 0] - WALK[0, 0]
+    )
     assert 0.8 < traveled < 1.25
     upright = fitted[:, SMPL22.joints.index("head"), 1] - fitted[:, 0, 1]
     assert (upright > 0.5).all()
@@ -232,10 +300,14 @@ def test_motions_are_excluded_by_name(arrays: Path):
 def test_wrong_units_are_refused_with_the_unit_that_fits(tmp_path: Path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     mixamo(tmp_path / "mine" / "a.bvh", INCH)
-    message = r"a\.bvh: the legs are 0\.3\d+ m long .*The unit may be 0\.0254 \(inches\): set `unit`"
+    message = (
+        r"a\.bvh: the legs are 0\.3\d+ m long .*The unit may be 0\.0254 \(inches\): set `unit`"
+    )
     with pytest.raises(ValueError, match=message):
         only(tmp_path / "mine")
-    assert [main(["convert", "mine/a.bvh", "out=a.glb", *words]) for words in ([], ["unit=0.0254"])] == [1, 0]
+    assert [
+        main(["convert", "mine/a.bvh", "out=a.glb", *words]) for words in ([], ["unit=0.0254"])
+    ] == [1, 0]
     assert re.search(message, capsys.readouterr().err)
     for content in ({"children": True}, {"unit": 0.0254}):
         skeleton(tmp_path / "mine", **content)
@@ -252,10 +324,15 @@ def test_convert_and_edit_read_files_as_prepare_does(tmp_path: Path, monkeypatch
     np.testing.assert_allclose(np.load("b.npy")[..., 2], np.load("a.npy")[..., 1], atol=1e-5)
     skeleton(tmp_path / "mine", unit=0.0254)
     edited = read_motion(HumanML(), "mine/deep/a.bvh").joints
-    np.testing.assert_allclose(np.ptp(edited[0, :, 1]), np.ptp(np.load("b.npy")[0, :, 1]), atol=1e-3)
-    assert np.ptp(read_motion(HumanML(), "mine/deep/a.bvh", up="z").joints[0, :, 1]) < 0.6, "it lies"
+    np.testing.assert_allclose(
+        np.ptp(edited[0, :, 1]), np.ptp(np.load("b.npy")[0, :, 1]), atol=1e-3
+    )
+    assert np.ptp(read_motion(HumanML(), "mine/deep/a.bvh", up="z").joints[0, :, 1]) < 0.6, (
+        "it lies"
+    )
     np.savez("mine/made.npz", joints=WALK, fps=30, text="a person walks")
-    np.testing.assert_allclose(read("mine/made.npz").joints, WALK, atol=1e-6)  # made here: in meters, y up
+    # Made here: in meters, y up
+    np.testing.assert_allclose(read("mine/made.npz").joints, WALK, atol=1e-6)
 
 
 def test_feet_without_toes_end_at_the_end_sites(tmp_path: Path):
@@ -321,7 +398,10 @@ def test_from_ten_motions_on_each_split_has_some(tmp_path: Path):
         if set(hashed.values()) == {"train", "val", "test"}:
             assert splits == hashed
         assert sum(splits[name] != hashed[name] for name in splits) <= 2
-        write_table(folder, [{"id": n, "text": "a", "source": f"take {k % 4}"} for k, n in enumerate(splits)])
+        write_table(
+            folder,
+            [{"id": n, "text": "a", "source": f"take {k % 4}"} for k, n in enumerate(splits)],
+        )
         taken = Folder(str(folder))
         of_source = {(taken.notes[name].source, split) for name, split in taken.splits.items()}
         assert len(of_source) == 4, "a source stays in one split"
@@ -335,7 +415,19 @@ def test_what_a_folder_lacks_is_reported(tmp_path: Path, monkeypatch, capsys):
         np.savez(f"mine/{number}.npz", joints=WALK[:20], fps=20)
 
     def prepared(*words: str) -> str:
-        assert main(["prepare", "data=folder", "data.name=mine", "data_root=data", "source=mine", *words]) == 0
+        assert (
+            main(
+                [
+                    "prepare",
+                    "data=folder",
+                    "data.name=mine",
+                    "data_root=data",
+                    "source=mine",
+                    *words,
+                ]
+            )
+            == 0
+        )
         return capsys.readouterr().out
 
     output = prepared()
@@ -351,7 +443,9 @@ def test_what_a_folder_lacks_is_reported(tmp_path: Path, monkeypatch, capsys):
 
 
 def test_the_skeleton_file_in_the_documentation_is_legal(tmp_path: Path):
-    blocks = re.findall(r"```yaml\n(.*?)```", (ROOT / "docs" / "own-data.md").read_text(), re.DOTALL)
+    blocks = re.findall(
+        r"```yaml\n(.*?)```", (ROOT / "docs" / "own-data.md").read_text(), re.DOTALL
+    )
     (block,) = (block for block in blocks if "skeleton.yaml" in block.splitlines()[0])
     (tmp_path / "skeleton.yaml").write_text(block)
     assert set(read_skeleton(tmp_path / "skeleton.yaml")["map"]) == set(SMPL22.joints)
@@ -371,20 +465,35 @@ def test_an_empty_folder_and_a_missing_one_are_told_apart(tmp_path):
         *[("kit_legacy", "joints", 251), ("rifke", "joints", 64), ("humanml_clean", "joints", 263)],
     ],
 )
-def test_every_representation_is_prepared_from_every_kind_of_file(name, motion, features, tmp_path, capsys):
+def test_every_representation_is_prepared_from_every_kind_of_file(
+    name, motion, features, tmp_path, capsys
+):
     folder = tmp_path / "in"
     folder.mkdir()
     for ending in ("npz", "bvh", "json", "glb", "fbx"):
         synthetic("walk").save(folder / f"{ending}.{ending}")
     np.savez(folder / "amass.npz", **amass(synthetic("walk")))
-    words = ["folder", f"source={folder}", f"data_root={tmp_path}", f"representation={name}", "data.source.workers=1"]
+    words = [
+        "folder",
+        f"source={folder}",
+        f"data_root={tmp_path}",
+        f"representation={name}",
+        "data.source.workers=1",
+    ]
     assert main(["prepare", *words, f"data.source.motion={motion}"]) == 0, capsys.readouterr().err
     (path,) = tmp_path.glob("folder-*/store.json")
     store = Store(path.parent)
     assert store.info["shape"][1] == features
-    assert ("rotations were fitted to joints, with a mean error" in capsys.readouterr().out) == (motion == "smpl")
-    representation = instantiate(compose_data("folder", [f"representation={name}"])["representation"])
-    clips = {clip.id: representation.decode(torch.from_numpy(np.array(store.motion(clip)))) for clip in store.clips}
+    assert ("rotations were fitted to joints, with a mean error" in capsys.readouterr().out) == (
+        motion == "smpl"
+    )
+    representation = instantiate(
+        compose_data("folder", [f"representation={name}"])["representation"]
+    )
+    clips = {
+        clip.id: representation.decode(torch.from_numpy(np.array(store.motion(clip))))
+        for clip in store.clips
+    }
     for joints in clips.values():
         head, pelvis = joints[:, representation.skeleton.joints.index("head")], joints[:, 0]
         assert (head - pelvis)[:, 1].mean() > 0.3, "it stands"
@@ -392,5 +501,8 @@ def test_every_representation_is_prepared_from_every_kind_of_file(name, motion, 
     other = "joints" if motion == "smpl" else "smpl"
     for check in ("check=true", "check=false"):
         root = f"data_root={tmp_path / 'other'}"
-        assert main(["prepare", *words[:2], root, *words[3:], check, f"data.source.motion={other}"]) == 1
+        assert (
+            main(["prepare", *words[:2], root, *words[3:], check, f"data.source.motion={other}"])
+            == 1
+        )
         assert "data.source.motion=smpl" in one_error(capsys)

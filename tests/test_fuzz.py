@@ -48,14 +48,24 @@ def fill(bad, trained, tmp_path) -> Callable[[str], str]:
     os.mkfifo(bad / "pipe.npz")
     for name in ("folder.npz", "folder.yaml", "folder.txt", "empty"):
         (bad / name).mkdir()
-    texts = {"list.yaml": b"- 1\n", "broken.yaml": b"a: [\n", "bare.yaml": b"name: x\n", "empty.txt": b"\n \n"}
+    texts = {
+        "list.yaml": b"- 1\n",
+        "broken.yaml": b"a: [\n",
+        "bare.yaml": b"name: x\n",
+        "empty.txt": b"\n \n",
+    }
     texts |= {"foreign.yaml": b"_target_: os.system\ncommand: ls\n", "file.zip": b"x"}
-    texts |= {"part.yaml": b"version: 1\ncondition: text\n", **dict.fromkeys(("latin.yaml", "latin.txt"), b"a: \xe9\n")}
+    texts |= {
+        "part.yaml": b"version: 1\ncondition: text\n",
+        **dict.fromkeys(("latin.yaml", "latin.txt"), b"a: \xe9\n"),
+    }
     for name, text in texts.items():
         (bad / name).write_bytes(text)
     words = {"trained": trained, "bad": bad, "walk": tmp_path / "walk.npz", "long": "x" * 5000}
     words |= {"run": run, "both": f"runs={run} {other}"}
-    return lambda word: reduce(lambda text, name: text.replace(f"{{{name}}}", str(words[name])), words, word)
+    return lambda word: reduce(
+        lambda text, name: text.replace(f"{{{name}}}", str(words[name])), words, word
+    )
 
 
 def test_words(refused, fill):
@@ -80,7 +90,13 @@ def test_values(refused, fill):
 def test_values_of_training(refused, tmp_path, data_root):
     refused.every = 18
     refused.watched = [data_root]  # a run that has begun to log leaves its folder
-    tiny = [*TINY, f"data_root={data_root}", "callbacks.best=null", "trainer.max_steps=1", "logger=csv"]
+    tiny = [
+        *TINY,
+        f"data_root={data_root}",
+        "callbacks.best=null",
+        "trainer.max_steps=1",
+        "logger=csv",
+    ]
     for key, values in CASES["training"].items():
         for value in values:
             words = [word for word in tiny if not word.startswith(f"{key}=")]
@@ -139,7 +155,14 @@ def test_damaged_checkpoints(refused, trained, bad):
 
 def broken_bvh() -> Iterator[str]:
     whole = bvh_text()
-    yield from ("", "HIERARCHY", "HIERARCHY\nMOTION\nFrames: 0\nFrame Time: 0.05\n", "x", "\0", whole.replace("}", ""))
+    yield from (
+        "",
+        "HIERARCHY",
+        "HIERARCHY\nMOTION\nFrames: 0\nFrame Time: 0.05\n",
+        "x",
+        "\0",
+        whole.replace("}", ""),
+    )
     for old, *changes in CASES["bvh"]:
         assert old in whole
         yield from (whole.replace(old, new.replace("{long}", "9" * 5000), 1) for new in changes)
@@ -148,22 +171,32 @@ def broken_bvh() -> Iterator[str]:
     for _ in range(8):
         at = int(draw.integers(len(whole.partition("MOTION")[0])))
         yield whole[:at] + str(draw.choice(["{", "}", " x{ ", "\x1b"])) + whole[at:]
-    yield "HIERARCHY\n" + "".join(f"{'JOINT' if n else 'ROOT'} j{n}\n{{\nOFFSET 0 0 0\n" for n in range(5000))
+    yield "HIERARCHY\n" + "".join(
+        f"{'JOINT' if n else 'ROOT'} j{n}\n{{\nOFFSET 0 0 0\n" for n in range(5000)
+    )
 
 
 def broken_arrays() -> Iterator[dict[str, Any]]:
     joints: dict[str, Any] = {"joints": FOUR, "fps": np.float32(20)}
     shapes = ((), (0,), (4,), (4, 22), (4, 20, 3), (4, 22, 2), (0, 22, 3), (4, 0, 3), (2, 4, 22, 3))
     yield from (joints | {"joints": np.ones(shape)} for shape in shapes)
-    yield from (joints | {"joints": np.full((4, 22, 3), value)} for value in (np.nan, np.inf, "x", 1e300, 1j))
+    yield from (
+        joints | {"joints": np.full((4, 22, 3), value)}
+        for value in (np.nan, np.inf, "x", 1e300, 1j)
+    )
     odd = (np.array({"a": 1}, object), np.array("text"), np.zeros((4, 22, 3), "datetime64[s]"))
     yield from (joints | {"joints": value} for value in odd)
-    yield from (joints | {"fps": np.array(value)} for value in (0, -1, np.nan, np.inf, "x", [20, 20], [], 1j))
+    yield from (
+        joints | {"fps": np.array(value)}
+        for value in (0, -1, np.nan, np.inf, "x", [20, 20], [], 1j)
+    )
     yield from ({"fps": joints["fps"]}, {"joints": FOUR}, {})
     amass = {"poses": np.zeros((4, 156)), "trans": np.zeros((4, 3)), "mocap_framerate": 60.0}
     yield from (amass | {"poses": np.ones(shape)} for shape in ((), (4,), (4, 5), (3, 156), (4, 2)))
     yield from (amass | {"trans": np.ones(shape)} for shape in ((), (3,), (4, 2)))
-    yield from (amass | {"mocap_framerate": np.array(rate)} for rate in (0, -1, np.nan, "x", [1, 2]))
+    yield from (
+        amass | {"mocap_framerate": np.array(rate)} for rate in (0, -1, np.nan, "x", [1, 2])
+    )
     yield from (amass | {"poses": np.full((4, 156), value)} for value in (np.nan, "x"))
     yield amass | {"poses": np.zeros((0, 156)), "trans": np.zeros((0, 3))}
 
@@ -180,22 +213,41 @@ def written(content: dict[str, Any] | np.ndarray) -> bytes:
 def test_damaged_motions(refused, bad):
     refused.every = 12
     cases = [("bvh", text.encode()) for text in broken_bvh()] + [("bvh", b"HIERARCHY\n\xff\xfe")]
-    cases += [("npz", written(content)) for content in broken_arrays()] + [("json", text.encode()) for text in NO_JSON]
+    cases += [("npz", written(content)) for content in broken_arrays()] + [
+        ("json", text.encode()) for text in NO_JSON
+    ]
     for suffix, whole in (("npz", {"joints": FOUR, "fps": 20.0}), ("npy", FOUR)):
         damaged = list(mangled(written(whole), 24, 5))
-        cases += [(suffix, data) for data in (*damaged[:5], *damaged[6::3])]  # cut: zip files may begin anywhere
+        # Cut: zip files may begin anywhere
+        cases += [(suffix, data) for data in (*damaged[:5], *damaged[6::3])]
     for suffix, data in cases:
         (bad / f"bad.{suffix}").write_bytes(data)
         out = "out=out.bvh" if suffix == "json" else "out=out.json"
-        refused("convert", str(bad / f"bad.{suffix}"), out, *(["fps=20"] if suffix == "npy" else []))
+        refused(
+            "convert", str(bad / f"bad.{suffix}"), out, *(["fps=20"] if suffix == "npy" else [])
+        )
 
 
 def test_strange_texts_are_legal(trained, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    strange = "walk\x07b\x1b[31m c\x7f {a: [b \u202e '; $(rm) `x` \\<script>alert(1)</script> & </style>"
+    strange = (
+        "walk\x07b\x1b[31m c\x7f {a: [b \u202e '; $(rm) `x` \\<script>alert(1)</script> & </style>"
+    )
     for text in ("walk " * 390, strange):
         out = tmp_path / str(len(text))
-        assert main(["sample", f"ckpt={trained}", f"text={text}", "samples=1", "seconds=0.5", f"out={out}"]) == 0
+        assert (
+            main(
+                [
+                    "sample",
+                    f"ckpt={trained}",
+                    f"text={text}",
+                    "samples=1",
+                    "seconds=0.5",
+                    f"out={out}",
+                ]
+            )
+            == 0
+        )
         assert "<script>alert(1)" not in (out / "player.html").read_text(encoding="utf-8")
         with np.load(out / "motion_000.npz") as file:
             assert str(file["text"]) == text
@@ -230,7 +282,13 @@ ABSENT = object()
 def values(content: Any, keys: str = "") -> Iterator[tuple[str, Any]]:
     """All values with their dotted keys, those that hold others before these."""
     yield keys, content
-    items = content.items() if isinstance(content, dict) else enumerate(content) if isinstance(content, list) else ()
+    items = (
+        content.items()
+        if isinstance(content, dict)
+        else enumerate(content)
+        if isinstance(content, list)
+        else ()
+    )
     for key, value in items:
         yield from values(value, f"{keys}.{key}" if keys else str(key))
 
@@ -253,16 +311,25 @@ def malformed(name: str, content: Any) -> list[str]:
     case, draw, texts = CASES["files"][name], np.random.default_rng(9), list(NO_JSON)
     for keys, value in values(content):
         wrong = WRONG[type(value)] if keys not in case.get("any", ()) else []
-        texts += [replaced(content, keys, wrong[index]) for index in draw.permutation(len(wrong))[:2]]
+        texts += [
+            replaced(content, keys, wrong[index]) for index in draw.permutation(len(wrong))[:2]
+        ]
     texts += [replaced(content, keys, ABSENT) for keys in case.get("required", ())]
-    texts += [replaced(content, keys, value) for keys, wrong in case.get("wrong", {}).items() for value in wrong]
+    texts += [
+        replaced(content, keys, value)
+        for keys, wrong in case.get("wrong", {}).items()
+        for value in wrong
+    ]
     text = json.dumps(content)
     return [*texts, *(text[: int(at)] for at in draw.integers(1, len(text) - 1, 8))]
 
 
 def reader(name: str, folder: Path) -> tuple[Path, Callable[[], object]]:
     """The path of a file of results or runs, and what reads it."""
-    run, path = a_run(folder / "run"), folder / f"{name}{'.yaml' if name in ('spec', 'config') else '.json'}"
+    run, path = (
+        a_run(folder / "run"),
+        folder / f"{name}{'.yaml' if name in ('spec', 'config') else '.json'}",
+    )
     if name in ("provenance", "bad_batch", "config"):
         return run / path.name, lambda: write_report(run)
     if name in ("pairs", "lengths"):

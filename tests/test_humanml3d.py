@@ -10,7 +10,15 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 from support.fixtures import golden, golden_case, groups, load
-from support.stores import HUMANACT12, RECORDINGS, line, published, write_downloads, write_folder, written
+from support.stores import (
+    HUMANACT12,
+    RECORDINGS,
+    line,
+    published,
+    write_downloads,
+    write_folder,
+    written,
+)
 
 from flame_mdm.__main__ import main
 from flame_mdm.data import amass, humanml3d, t2m
@@ -22,7 +30,11 @@ from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.representations.smpl import SMPL
 
-FIXTURE_SUBSETS = (*sorted([*amass.SUBSETS][:18]), "humanact12")  # in the order of the fixture's numbers
+# In the order of the fixture's numbers
+FIXTURE_SUBSETS = (
+    *sorted([*amass.SUBSETS][:18]),
+    "humanact12",
+)
 SHORTEST = {"t2m": HumanML3D.shortest, "kit": 24}
 
 
@@ -33,10 +45,14 @@ def published_items(group):
     items = []
     for number, frames in enumerate(rules[f"{group}/file_len"]):
         mine = [
-            t2m.Description(f"{number} {row}", [f"word{i}/NOUN" for i in range(int(tokens))], begin, end)
+            t2m.Description(
+                f"{number} {row}", [f"word{i}/NOUN" for i in range(int(tokens))], begin, end
+            )
             for _, row, begin, end, tokens in np.nan_to_num(rows[rows[:, 0] == number])
         ]
-        items += [(number, cut) for cut in t2m.cuts(str(number), int(frames), mine, SHORTEST[group])]
+        items += [
+            (number, cut) for cut in t2m.cuts(str(number), int(frames), mine, SHORTEST[group])
+        ]
     return sorted(items, key=lambda item: item[1].length)
 
 
@@ -56,13 +72,27 @@ def test_items_and_their_crops_and_words_are_the_published_ones(stem):
     rules = golden(stem)
     for group in groups(rules, "entries"):
         items = published_items(group)
-        entries = [(n, cut.start, cut.length, len(cut.descriptions), int(cut.id != str(n))) for n, cut in items]
+        entries = [
+            (n, cut.start, cut.length, len(cut.descriptions), int(cut.id != str(n)))
+            for n, cut in items
+        ]
         np.testing.assert_array_equal(entries, rules[f"{group}/entries"])
         assert len({cut.id for _, cut in items}) == len(items) == rules[f"{group}/n_items"]
         crop = Units(SHORTEST[group], 196, 4)
-        for item, file, caption, double, bound, drawn, length, first, padded, spoken, kept, slots in rules[
-            f"{group}/items"
-        ]:
+        for (
+            item,
+            file,
+            caption,
+            double,
+            bound,
+            drawn,
+            length,
+            first,
+            padded,
+            spoken,
+            kept,
+            slots,
+        ) in rules[f"{group}/items"]:
             number, cut = items[item]
             assert number == file
             generator = Scripted(0 if double else 1, drawn)
@@ -71,7 +101,11 @@ def test_items_and_their_crops_and_words_are_the_published_ones(stem):
             assert (len(frames), cut.start + frames[0], crop.longest()) == (length, first, padded)
             [description] = [d for d in cut.descriptions if float(d.caption.split()[1]) == caption]
             tokens, count = t2m.frame_tokens(description.tokens)
-            assert (count, sum(t.startswith("word") for t in tokens), len(tokens)) == (spoken, kept, slots)
+            assert (count, sum(t.startswith("word") for t in tokens), len(tokens)) == (
+                spoken,
+                kept,
+                slots,
+            )
             assert (tokens[0], tokens[count - 1]) == ("sos/OTHER", "eos/OTHER")
             assert set(tokens[count:]) <= {"unk/OTHER"}
 
@@ -80,27 +114,42 @@ def test_items_and_their_crops_and_words_are_the_published_ones(stem):
 def test_clips_lose_the_published_frames_and_mirrored_joints_are_the_published_ones(stem):
     for subset, count, start, end, first, kept, sign in golden(stem)["crop_table"]:
         name = FIXTURE_SUBSETS[subset]
-        row = IndexedClip("000000", "P01" if name == "humanact12" else f"{name}/a_poses", start, end)
+        row = IndexedClip(
+            "000000", "P01" if name == "humanact12" else f"{name}/a_poses", start, end
+        )
         frames = range(int(count))[row.frames(int(count))]
         assert (frames[0], len(frames), frames.step) == (first, kept, 1)
         assert row.humanact12 == (sign == 1)
-    cases = [key.removesuffix("in") for key in golden(stem) if key.startswith("crop_mirror") and key.endswith("in")]
+    cases = [
+        key.removesuffix("in")
+        for key in golden(stem)
+        if key.startswith("crop_mirror") and key.endswith("in")
+    ]
     for key in cases:
-        joints, mirrored = (torch.from_numpy(golden(stem)[key + end][:, :22]) for end in ("in", "out"))
+        joints, mirrored = (
+            torch.from_numpy(golden(stem)[key + end][:, :22]) for end in ("in", "out")
+        )
         assert torch.equal(SMPL22.mirror(joints), mirrored)
     assert cases
 
 
 @golden_case("smpl147")
 def test_parameters_of_a_clip_make_flames_features(stem):
-    poses, translation, expected = (golden(stem)[f"prep/{key}"] for key in ("poses156", "trans", "feats147"))
-    recording = Recording(np.repeat(poses, 5, 0), np.repeat(translation, 5, 0), np.zeros(16), "female", 100.0)
+    poses, translation, expected = (
+        golden(stem)[f"prep/{key}"] for key in ("poses156", "trans", "feats147")
+    )
+    recording = Recording(
+        np.repeat(poses, 5, 0), np.repeat(translation, 5, 0), np.zeros(16), "female", 100.0
+    )
     [motion] = humanml3d._parameters([IndexedClip("a", "CMU/a", 0, len(poses))], recording)
     np.testing.assert_allclose(SMPL().encode(torch.from_numpy(motion)), expected, atol=2e-6)
 
 
 MOTIONS = {
-    "000000": (120, [line("a person walks"), line("he waves his hand", 1.0, 3.5), line("he waves", 1.0, 3.5)]),
+    "000000": (
+        120,
+        [line("a person walks"), line("he waves his hand", 1.0, 3.5), line("he waves", 1.0, 3.5)],
+    ),
     "000001": (60, [line("a man jumps", "nan", "nan"), line("he lands", 0.0, 1.0)]),
     "000002": (39, [line("too short")]),
     "000003": (200, [line("too long"), line("a part that would fit", 0.0, 4.0)]),
@@ -129,10 +178,18 @@ def test_a_processed_folder_becomes_a_store_and_says_what_was_left_out(folder, t
     assert source.count() == len(clips)
     np.testing.assert_array_equal(store.motion(clips["000000@1-3.5"])[:, 0], np.arange(20, 70))
     np.testing.assert_array_equal(store.motion(clips["M000000"])[:, 5], -np.arange(120.0))
-    np.testing.assert_array_equal(store.motion(clips["000006@0.5-9"])[:, 262], 6000 + np.arange(10, 80))
+    np.testing.assert_array_equal(
+        store.motion(clips["000006@0.5-9"])[:, 262], 6000 + np.arange(10, 80)
+    )
     assert len(store.features) == 2 * (120 + 60 + 44 + 80), "cuts share the frames of their motion"
-    captions = {"000000@1-3.5#2": "he waves", "000001": "a man jumps", "000005": "#3 is a caption with a hash"}
-    assert {name: clips[name].captions for name in captions} == {name: [text] for name, text in captions.items()}
+    captions = {
+        "000000@1-3.5#2": "he waves",
+        "000001": "a man jumps",
+        "000005": "#3 is a caption with a hash",
+    }
+    assert {name: clips[name].captions for name in captions} == {
+        name: [text] for name, text in captions.items()
+    }
     assert clips["000001"].attributes == {"tokens": [["a/NOUN", "man/NOUN", "jumps/NOUN"]]}
     splits = {"000000": "train", "000001": "val", "000005": "test", "000006": "train"}
     assert {(clip.source, clip.split) for clip in store.clips} == {*splits.items()}
@@ -147,8 +204,20 @@ def test_a_processed_folder_becomes_a_store_and_says_what_was_left_out(folder, t
         "names of train without a caption": 2,
         "names of train with captions of unfit parts only": 2,
     }
-    counts = {"motions": 8, "texts": 12, "vocabulary": 27, "words per caption": 3.5, "train": 12, "val": 2, "test": 2}
-    assert source.counts() == counts | {"train share, %": 75, "val share, %": 12.5, "test share, %": 12.5}
+    counts = {
+        "motions": 8,
+        "texts": 12,
+        "vocabulary": 27,
+        "words per caption": 3.5,
+        "train": 12,
+        "val": 2,
+        "test": 2,
+    }
+    assert source.counts() == counts | {
+        "train share, %": 75,
+        "val share, %": 12.5,
+        "test share, %": 12.5,
+    }
     assert source.counts().keys() == published("humanml3d").keys()
     with pytest.raises(ValueError, match=r"humanml3d has 20 frames per second, not 12\.5"):
         next(iter(source.clips(12.5)))
@@ -163,7 +232,9 @@ def test_texts_may_stay_packed(folder):
     shutil.rmtree(folder / "texts")
     assert [(c.id, c.captions) for c in HumanML3D(str(folder)).clips(20.0)] == unpacked
     (folder / "texts.zip").unlink()
-    with pytest.raises(FileNotFoundError, match=r"texts\.zip: not found; nor is the folder texts there; clone"):
+    with pytest.raises(
+        FileNotFoundError, match=r"texts\.zip: not found; nor is the folder texts there; clone"
+    ):
         HumanML3D(str(folder)).count()
 
 
@@ -174,13 +245,25 @@ def motion(folder, name="000001"):
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda f: motion(f).unlink(), r"new_joint_vecs/\*\.npy lacks 1 of the names .* 000001; .*exclude=\[000001\]"),
-        (lambda f: np.save(motion(f), np.full((60, 263), math.nan)), "clip 000001: .* frame 0 are not finite. Exclude"),
+        (
+            lambda f: motion(f).unlink(),
+            r"new_joint_vecs/\*\.npy lacks 1 of the names .* 000001; .*exclude=\[000001\]",
+        ),
+        (
+            lambda f: np.save(motion(f), np.full((60, 263), math.nan)),
+            "clip 000001: .* frame 0 are not finite. Exclude",
+        ),
         (lambda f: motion(f).write_bytes(motion(f).read_bytes()[:-999]), r"000001\.npy: damaged"),
         (lambda f: np.save(motion(f), np.zeros((3, 4, 5))), r"000001\.npy: shape \(3, 4, 5\)"),
         (lambda f: np.save(f / "Std.npy", np.zeros(263)), "is not a mean or positive std"),
-        (lambda f: (f / "test.txt").write_text("000000\n"), r"test\.txt: 000000 is also in train\.txt"),
-        (lambda f: (f / "texts/000001.txt").write_text("ok#a/DET#0#0\nno tags\n"), r"000001\.txt, line 2: not caption"),
+        (
+            lambda f: (f / "test.txt").write_text("000000\n"),
+            r"test\.txt: 000000 is also in train\.txt",
+        ),
+        (
+            lambda f: (f / "texts/000001.txt").write_text("ok#a/DET#0#0\nno tags\n"),
+            r"000001\.txt, line 2: not caption",
+        ),
         (shutil.rmtree, r"HumanML3D: not found; clone"),
     ],
 )
@@ -195,7 +278,9 @@ def test_a_damaged_folder_is_named(folder, tmp_path, damage, message):
 def test_damaged_motions_can_be_excluded(folder, tmp_path):
     motion(folder, "000005").unlink()
     (folder / "texts" / "000005.txt").unlink()
-    store = write_store(tmp_path / "store", HumanML3D(str(folder), exclude=["M000000", "000005"]), LEGACY)
+    store = write_store(
+        tmp_path / "store", HumanML3D(str(folder), exclude=["M000000", "000005"]), LEGACY
+    )
     assert not {"M000000", "000005"} & {clip.id for clip in store.clips}
     assert store.info["excluded"]["motions by data.source.exclude"] == 2
     with pytest.raises(ValueError, match=r"data\.source\.exclude: .* has no 7"):
@@ -204,11 +289,19 @@ def test_damaged_motions_can_be_excluded(folder, tmp_path):
 
 def test_keys_do_not_depend_on_how_a_subset_is_called():
     key = "BioMotionLab_NTroje/rub001/0000_treadmill_norm_poses"
-    for path in (f"./pose_data/{key}.npy", f"BMLrub/{key}.npz", "some/BMLrub/rub001/0000 treadmill_norm_poses.npz"):
+    for path in (
+        f"./pose_data/{key}.npy",
+        f"BMLrub/{key}.npz",
+        "some/BMLrub/rub001/0000 treadmill_norm_poses.npz",
+    ):
         assert key_of(path) == key
-    assert key_of("./pose_data/Transitions_mocap/a/b_poses.npy") == key_of("Transitionsmocap/a/b_poses.npz")
+    assert key_of("./pose_data/Transitions_mocap/a/b_poses.npy") == key_of(
+        "Transitionsmocap/a/b_poses.npz"
+    )
     assert key_of("elsewhere/rub001/0000_poses.npz") is None
-    plain = [amass._plain(name) for subset, others in amass.SUBSETS.items() for name in (subset, *others)]
+    plain = [
+        amass._plain(name) for subset, others in amass.SUBSETS.items() for name in (subset, *others)
+    ]
     assert len(set(plain)) == len(plain)
 
 
@@ -236,9 +329,13 @@ def raw(root, **options):
 def slow_joints(root, recording):
     """Joints (F, 22, 3) of SMPL+H, one frame and joint after the other, y up."""
     model = load(root / "bodies" / "smplh" / str(recording["gender"]) / "model.npz")
-    rest = model["J_regressor"] @ (model["v_template"] + model["shapedirs"][..., :10] @ recording["betas"][:10])
+    rest = model["J_regressor"] @ (
+        model["v_template"] + model["shapedirs"][..., :10] @ recording["betas"][:10]
+    )
     out = np.zeros((len(recording["poses"]), 52, 3))
-    for frame, (pose, translation) in enumerate(zip(recording["poses"], recording["trans"], strict=True)):
+    for frame, (pose, translation) in enumerate(
+        zip(recording["poses"], recording["trans"], strict=True)
+    ):
         turned = Rotation.from_rotvec(pose.reshape(52, 3)).as_matrix()
         out[frame, 0] = translation + rest[0]
         for joint, parent in enumerate(model["kintree_table"][0][1:], 1):
@@ -249,11 +346,18 @@ def slow_joints(root, recording):
 
 def expected_features(root):
     """The features of the index, computed apart from the pipeline."""
-    kept = {"000000": (0, 5, 0, 50), "000001": (0, 5, 20, 72), "000003": (1, 6, 5, 60), "000004": (2, 2, 63, 120)}
+    kept = {
+        "000000": (0, 5, 0, 50),
+        "000001": (0, 5, 20, 72),
+        "000003": (1, 6, 5, 60),
+        "000004": (2, 2, 63, 120),
+    }
     motions = {"000002": HUMANACT12[:, :22]}
     for name, (number, step, start, end) in (kept | {"000005": (3, 6, 1, 48)}).items():
         content = [*RECORDINGS.values()][number]
-        motions[name] = slow_joints(root, content | {k: content[k][::step][start:end] for k in ("poses", "trans")})
+        motions[name] = slow_joints(
+            root, content | {k: content[k][::step][start:end] for k in ("poses", "trans")}
+        )
     encoder = HumanML("smpl22", "legacy", bone_lengths=BONES)
     motions = {name: torch.from_numpy(joints) for name, joints in motions.items()}
     motions |= {f"M{name}": SMPL22.mirror(joints) for name, joints in motions.items()}
@@ -261,7 +365,10 @@ def expected_features(root):
 
 
 def made(root):
-    return {path.stem: np.load(path) for path in (root / "HumanML3D" / "HumanML3D" / "new_joint_vecs").iterdir()}
+    return {
+        path.stem: np.load(path)
+        for path in (root / "HumanML3D" / "HumanML3D" / "new_joint_vecs").iterdir()
+    }
 
 
 def test_the_set_is_made_from_amass_and_an_interrupted_run_is_taken_up(mine):
@@ -305,8 +412,13 @@ def test_archives_are_read_in_place_by_several_processes(downloads, mine, tmp_pa
     assert one.keys() == two.keys()
     for name, features in one.items():
         np.testing.assert_array_equal(features, two[name])
-    stores = [write_store(tmp_path / f"{k}", smpl(root), SMPL()) for k, root in enumerate((downloads, packed))]
-    assert stores[0].fingerprint == stores[1].fingerprint, "order depends on how the subsets are packed"
+    stores = [
+        write_store(tmp_path / f"{k}", smpl(root), SMPL())
+        for k, root in enumerate((downloads, packed))
+    ]
+    assert stores[0].fingerprint == stores[1].fingerprint, (
+        "order depends on how the subsets are packed"
+    )
 
 
 def truncate_archive(root):
@@ -321,7 +433,9 @@ def archive_without_recording(root):
 
 
 def set_in_file(root, **values):
-    np.savez(root / "amass/CMU/80/80_63_poses.npz", **{**RECORDINGS["CMU/80/80_63_poses"], **values})
+    np.savez(
+        root / "amass/CMU/80/80_63_poses.npz", **{**RECORDINGS["CMU/80/80_63_poses"], **values}
+    )
 
 
 def body_of_55_joints(root):
@@ -333,14 +447,32 @@ def body_of_55_joints(root):
     ("damage", "message"),
     [
         (truncate_archive, r"KIT\.tar\.bz2: damaged archive, download it again: "),
-        (archive_without_recording, r"BMLrub\.tar\.bz2: 1 recordings are missing in the archive, such as BioMotionLab"),
-        (lambda r: set_in_file(r, trans=np.full((360, 3), np.nan)), r"80_63_poses\.npz: contains non-finite numbers"),
-        (lambda r: set_in_file(r, mocap_framerate=np.array(15.0)), r"80_63_poses\.npz: recorded at 15 frames per"),
-        (lambda r: shutil.rmtree(r / "amass/BMLrub"), r"cannot be created. .* 1 of 1 recordings .* or BMLrub"),
+        (
+            archive_without_recording,
+            r"BMLrub\.tar\.bz2: 1 recordings are missing in the archive, such as BioMotionLab",
+        ),
+        (
+            lambda r: set_in_file(r, trans=np.full((360, 3), np.nan)),
+            r"80_63_poses\.npz: contains non-finite numbers",
+        ),
+        (
+            lambda r: set_in_file(r, mocap_framerate=np.array(15.0)),
+            r"80_63_poses\.npz: recorded at 15 frames per",
+        ),
+        (
+            lambda r: shutil.rmtree(r / "amass/BMLrub"),
+            r"cannot be created. .* 1 of 1 recordings .* or BMLrub",
+        ),
         (lambda r: shutil.rmtree(r / "amass"), r"amass: not found; register at https://amass"),
-        (body_of_55_joints, r"male/model\.npz: not a SMPL\+H model of 52 joints: J_regressor \(55, 80\)"),
+        (
+            body_of_55_joints,
+            r"male/model\.npz: not a SMPL\+H model of 52 joints: J_regressor \(55, 80\)",
+        ),
         (lambda r: (r / "HumanML3D/index.csv").unlink(), r"index\.csv: not found"),
-        (lambda r: shutil.rmtree(r / "HumanML3D/pose_data"), r"1 clips of HumanAct12, such as P11G01R02"),
+        (
+            lambda r: shutil.rmtree(r / "HumanML3D/pose_data"),
+            r"1 clips of HumanAct12, such as P11G01R02",
+        ),
     ],
 )
 def test_damaged_downloads_are_named(mine, damage, message):
@@ -355,14 +487,31 @@ def test_the_dry_run_lists_all_that_is_missing(mine, capsys):
     (mine / "amass" / "CMU" / "80" / "80_63_poses.npz").unlink()
     shutil.rmtree(mine / "bodies")
     words = [f"source={mine / 'HumanML3D/HumanML3D'}", f"data.source.amass={mine / 'amass'}"]
-    assert main(["prepare", "data=humanml3d", "check=true", *words, f"data.source.body_models={mine / 'bodies'}"]) == 0
-    missing = [line.split(": ")[1] for line in capsys.readouterr().out.splitlines() if line.startswith("missing: ")]
+    assert (
+        main(
+            [
+                "prepare",
+                "data=humanml3d",
+                "check=true",
+                *words,
+                f"data.source.body_models={mine / 'bodies'}",
+            ]
+        )
+        == 0
+    )
+    missing = [
+        line.split(": ")[1]
+        for line in capsys.readouterr().out.splitlines()
+        if line.startswith("missing: ")
+    ]
     assert missing == ["BioMotionLab_NTroje", "CMU", f"{mine}/bodies"]
     assert not (mine / "HumanML3D" / "HumanML3D" / "new_joint_vecs").exists()
 
 
 def smpl(root, **options):
-    return HumanML3DSMPL(str(root / "HumanML3D" / "HumanML3D"), str(root / "amass"), workers=1, **options)
+    return HumanML3DSMPL(
+        str(root / "HumanML3D" / "HumanML3D"), str(root / "amass"), workers=1, **options
+    )
 
 
 def test_each_caption_is_a_clip_of_smpl_parameters(mine, tmp_path):
@@ -373,11 +522,19 @@ def test_each_caption_is_a_clip_of_smpl_parameters(mine, tmp_path):
     store = write_store(tmp_path / "store", source, SMPL())
     clips = {clip.id: clip for clip in store.clips}
     assert source.count() == len(clips) == 2 * 6
-    assert [clips[f"000000#{k}"].captions for k in (0, 1)] == [["a person moves."], ["someone moves."]]
-    assert (clips["000000#1"].length, clips["000000#1"].start) == (50, clips["000000#0"].start), "frames are shared"
+    assert [clips[f"000000#{k}"].captions for k in (0, 1)] == [
+        ["a person moves."],
+        ["someone moves."],
+    ]
+    assert (clips["000000#1"].length, clips["000000#1"].start) == (50, clips["000000#0"].start), (
+        "frames are shared"
+    )
     content = RECORDINGS["Eyes_Japan_Dataset/hamada/pose-06 hangon_poses"]
     recorded = np.concatenate([content["trans"], content["poses"]], 1)[::2][63:120]
-    for name, parameters in (("000004#0", recorded), ("000002#1", np.concatenate([HUMANACT12[:, 0], poses], 1))):
+    for name, parameters in (
+        ("000004#0", recorded),
+        ("000002#1", np.concatenate([HUMANACT12[:, 0], poses], 1)),
+    ):
         expected = SMPL().encode(torch.from_numpy(parameters)).numpy()
         np.testing.assert_allclose(store.motion(clips[name]), expected, atol=1e-6)
     assert store.info["excluded"] == {}
@@ -390,7 +547,9 @@ def test_splits_and_motions_left_out_of_the_smpl_form(mine, tmp_path):
     left_out = {"motions of HumanAct12, as data.source.humanact12 is not given": 1}
     assert info["excluded"] == left_out
     index = mine / "HumanML3D" / "index.csv"
-    index.write_text("".join(row for row in index.read_text().splitlines(True) if "000003" not in row))
+    index.write_text(
+        "".join(row for row in index.read_text().splitlines(True) if "000003" not in row)
+    )
     store = write_store(tmp_path / "store", smpl(mine, exclude=["000001", "M000004"]), SMPL())
     assert {clip.source for clip in store.clips} == {"000000", "000004", "000005"}
     left_out |= {"motions by data.source.exclude": 1, "motions that index.csv lacks": 1}

@@ -23,8 +23,13 @@ Change = Callable[[np.ndarray], None]
 def body() -> np.ndarray:
     """Joints (80, 22, 3) of a body that stands on the floor, arms down, and swings its arms."""
     swing = np.degrees(0.5 * np.sin(2 * np.pi * np.arange(FRAMES) / FPS))
-    arms = {side: np.stack([0 * swing, swing, 0 * swing + down], 1) for side, down in (("left", -90), ("right", 90))}
-    joints = posed(FRAMES, left_shoulder=arms["left"], right_shoulder=arms["right"]).joints.astype(float)
+    arms = {
+        side: np.stack([0 * swing, swing, 0 * swing + down], 1)
+        for side, down in (("left", -90), ("right", 90))
+    }
+    joints = posed(FRAMES, left_shoulder=arms["left"], right_shoulder=arms["right"]).joints.astype(
+        float
+    )
     return joints - [0, joints[..., 1].min(), 0]
 
 
@@ -45,7 +50,9 @@ def float_(joints: np.ndarray, frames: int, speed: float) -> None:
     joints[30 : 30 + frames, :, 1] += 0.06
 
 
-def place(joint: str, at: str, away: Sequence[float] = (0, 0, 0), frames: slice = slice(30, 40)) -> Change:
+def place(
+    joint: str, at: str, away: Sequence[float] = (0, 0, 0), frames: slice = slice(30, 40)
+) -> Change:
     """A change that puts a joint where another one is, or away from there."""
 
     def change(joints: np.ndarray) -> None:
@@ -65,8 +72,15 @@ def test_faults_are_found_where_they_are():
         (lambda joints: float_(joints, 7, 0.0), {("floating", "body", 30, 36)}),
         (lambda joints: float_(joints, 6, 0.0), set()),
         (lambda joints: float_(joints, 16, 1.0), {("floating", "body", 30, 46)}),
-        (lambda joints: float_(joints, 15, 1.0), {("skating", k, *span) for k in feet for span in ((0, 29), (45, 79))}),
-        (place("left_hip", "left_hip", (0, 0, 0.3)), {("limit", "left_knee", 30, 40)}),  # in front of the knee
+        (
+            lambda joints: float_(joints, 15, 1.0),
+            {("skating", k, *span) for k in feet for span in ((0, 29), (45, 79))},
+        ),
+        # In front of the knee
+        (
+            place("left_hip", "left_hip", (0, 0, 0.3)),
+            {("limit", "left_knee", 30, 40)},
+        ),
         (place("left_wrist", "left_shoulder"), {("limit", "left_elbow", 30, 40)}),
         (place("left_wrist", "spine1", (0.02, 0, 0.02)), {("inside", "left_wrist", 30, 40)}),
         (lambda joints: np.copyto(joints[30:60], joints[30]), {("frozen", "body", 30, 60)}),
@@ -97,7 +111,9 @@ def test_the_command_prints_faults_marks_them_and_exits_with_3(tmp_path, capsys,
     assert "penetration: left_foot, frames 30 to 39, 0.06 m (limit 0.05)" in printed
     assert "motions: 1 of 2 motions with faults" in printed
     shown = Page(tmp_path / "both.html").motions
-    assert [motion["id"] for motion in shown] == ["walks-after=good.npz/bad", "good"], "the worst first"
+    assert [motion["id"] for motion in shown] == ["walks-after=good.npz/bad", "good"], (
+        "the worst first"
+    )
     assert [30, 40, "penetration"] in [mark[:3] for mark in shown[0]["marks"]]
     assert not shown[1]["marks"]
 
@@ -143,10 +159,14 @@ def test_skating_resizing_wrists_drawn_in_and_pops(walk):
     changed = p.skate(walk, 1.5)
     np.testing.assert_allclose(changed - changed[:, :1], walk - walk[:, :1], atol=1e-12)
     steps = np.diff(changed[:, 0], axis=0)
-    np.testing.assert_allclose(steps[:, [0, 2]], 1.5 * np.diff(walk[:, 0], axis=0)[:, [0, 2]], atol=1e-12)
+    np.testing.assert_allclose(
+        steps[:, [0, 2]], 1.5 * np.diff(walk[:, 0], axis=0)[:, [0, 2]], atol=1e-12
+    )
     np.testing.assert_array_equal(changed[..., 1], walk[..., 1])
     changed, skeleton = p.resize(walk, 10), HumanML().skeleton
-    ours, theirs = (skeleton.bones(torch.from_numpy(x))[:, 1:].norm(dim=-1) for x in (changed, walk))
+    ours, theirs = (
+        skeleton.bones(torch.from_numpy(x))[:, 1:].norm(dim=-1) for x in (changed, walk)
+    )
     torch.testing.assert_close(ours, 1.1 * theirs)
     np.testing.assert_allclose(changed[:, 0, [0, 2]], walk[:, 0, [0, 2]])
     np.testing.assert_allclose(changed[..., 1], 1.1 * walk[..., 1])
@@ -156,7 +176,10 @@ def test_skating_resizing_wrists_drawn_in_and_pops(walk):
     sizes = np.linalg.norm(changed[:, [18, 19, 20, 21]], axis=-1)
     np.testing.assert_allclose(sizes, [[0.05, 0.05, 0.1, 0.1]] * len(walk))
     assert not np.delete(changed, [18, 19, 20, 21], 1).any()
-    kinds = [{fault.kind for fault in find_faults(Motion(p.draw_in(walk, grade), 20.0))} for grade in (0, 40)]
+    kinds = [
+        {fault.kind for fault in find_faults(Motion(p.draw_in(walk, grade), 20.0))}
+        for grade in (0, 40)
+    ]
     assert ["inside" in kind for kind in kinds] == [False, True]
     for last in (False, True):
         offset = p.pop(walk, 5, np.random.default_rng(0), last=last) - walk
@@ -170,7 +193,9 @@ def test_freezing_cropping_speeds_frame_rates_and_another_half(walk):
     for percent, moving in ((10, 18), (50, 10), (100, 1)):
         frozen = p.freeze(walk[:20], percent)
         np.testing.assert_array_equal(frozen[:moving], walk[:moving])
-        np.testing.assert_array_equal(frozen[moving:], np.repeat(walk[moving - 1 : moving], 20 - moving, 0))
+        np.testing.assert_array_equal(
+            frozen[moving:], np.repeat(walk[moving - 1 : moving], 20 - moving, 0)
+        )
     np.testing.assert_array_equal(p.crop(walk[:40], 25), walk[:30])
     assert len(p.crop(walk[:4], 90)) == 3
 

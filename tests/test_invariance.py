@@ -138,7 +138,9 @@ def expected() -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("size", [7, 32])
-def test_values_depend_neither_on_the_batch_size_nor_on_the_order(size: int, expected: dict[str, Any]):
+def test_values_depend_neither_on_the_batch_size_nor_on_the_order(
+    size: int, expected: dict[str, Any]
+):
     order = torch.randperm(COUNT, generator=torch.Generator().manual_seed(1))
     for indices in (torch.arange(COUNT), order):
         assert measure(all_metrics(), batches(evaluation(), indices.split(size))) == expected
@@ -158,7 +160,10 @@ def test_values_do_not_depend_on_the_number_of_processes(pool: GlooPool, expecte
     """Samples dealt in turn, all to one of the two, and none at all."""
     values = evaluation()
     for first in (range(0, COUNT, 2), range(COUNT)):
-        shares = [torch.tensor(list(share), dtype=torch.long) for share in (first, set(range(COUNT)) - set(first))]
+        shares = [
+            torch.tensor(list(share), dtype=torch.long)
+            for share in (first, set(range(COUNT)) - set(first))
+        ]
         inputs = [batches(values, share.split(7)) if len(share) else [] for share in shares]
         results = pool.run(measure, *[(all_metrics(), batch) for batch in inputs])
         assert results == [expected, expected], first
@@ -168,7 +173,10 @@ def test_values_do_not_depend_on_the_number_of_processes(pool: GlooPool, expecte
 
 @pytest.mark.filterwarnings("error")
 def test_without_samples_values_are_none_never_0(expected: dict[str, Any]):
-    none = {name: dict.fromkeys(value) if isinstance(value, dict) else None for name, value in expected.items()}
+    none = {
+        name: dict.fromkeys(value) if isinstance(value, dict) else None
+        for name, value in expected.items()
+    }
     assert measure(all_metrics(), []) == none
 
 
@@ -179,16 +187,36 @@ def test_too_few_samples_and_wrong_inputs_are_errors():
     short = values | {"mask": values["mask"] & (torch.arange(34) < 1)}
     for metric, inputs, message in (
         (distribution.FrechetMotionDistance(), 1, "got 1 generated motions, needs at least 2"),
-        (distribution.KernelMotionDistance(), 45, "got 45 generated motions for subsets of 1000, needs at least 1000"),
+        (
+            distribution.KernelMotionDistance(),
+            45,
+            "got 45 generated motions for subsets of 1000, needs at least 1000",
+        ),
         (distribution.PrecisionRecall(), 3, "got 3 motions in the smaller set, needs at least 4"),
         (alignment.TextsForMotion(), 31, "got 31 different captions, needs at least 32"),
         (alignment.MotionsForText(), 31, "got 31 motions, needs at least 32"),
         (retrieval.MultiPositiveRPrecision(), 31, "got 31 motions, needs at least 32"),
-        (published_physics.MBenchQuality(30.0), 45, "defined at 20 frames per second, but the motions have 30"),
-        (published_physics.PhysicalFootContact(20.0), 45, "defined at 30 frames per second, but the motions have 20"),
+        (
+            published_physics.MBenchQuality(30.0),
+            45,
+            "defined at 20 frames per second, but the motions have 30",
+        ),
+        (
+            published_physics.PhysicalFootContact(20.0),
+            45,
+            "defined at 30 frames per second, but the motions have 20",
+        ),
         (alignment.MutualInformationDivergence(), 12, "got 12 samples, one more than features"),
-        (diversity.Diversity(pairs=300, replace=False), 45, "got 45 motions for 300 pairs, needs at least 300"),
-        (diversity.TextMultimodality(), 45, "9 of 9 prompts do not have 30 motions but 5 to 5. Generate 30 for each"),
+        (
+            diversity.Diversity(pairs=300, replace=False),
+            45,
+            "got 45 motions for 300 pairs, needs at least 300",
+        ),
+        (
+            diversity.TextMultimodality(),
+            45,
+            "9 of 9 prompts do not have 30 motions but 5 to 5. Generate 30 for each",
+        ),
         (diversity.ActionMultimodality(), 5, "got 1 motions of class 1, needs at least 2"),
         (reconstruction.DisplacementErrors(), kept, "a motion has no generated frame"),
         (reconstruction.TemosPositionErrors(), wrong, "20 joints, but defined only"),
@@ -197,9 +225,13 @@ def test_too_few_samples_and_wrong_inputs_are_errors():
         with pytest.raises(UserError, match=f"{type(metric).__name__}: {message}"):
             measure({"metric": metric}, [evaluation(inputs) if isinstance(inputs, int) else inputs])
     with pytest.raises(ValueError, match="MultimodalDistance: got 45 keys, 45 generated, 44 text"):
-        measure({"metric": alignment.MultimodalDistance()}, [values | {"text": values["text"][:-1]}])
+        measure(
+            {"metric": alignment.MultimodalDistance()}, [values | {"text": values["text"][:-1]}]
+        )
     del values["real"]
-    with pytest.raises(UserError, match=r"metric mid \(Mut.*\): missing input: real\. Remove the metric"):
+    with pytest.raises(
+        UserError, match=r"metric mid \(Mut.*\): missing input: real\. Remove the metric"
+    ):
         update_metrics({"mid": alignment.MutualInformationDivergence()}, **values)
 
 
@@ -210,17 +242,29 @@ def test_samples_given_twice_and_features_that_are_not_finite_are_errors():
     for name, metric in all_metrics().items():
         if isinstance(metric, SampleMetric):
             with pytest.raises(UserError, match="1 samples were given twice"):
-                measure({name: metric}, batches(evaluation(), [torch.arange(COUNT), torch.tensor([3])]))
+                measure(
+                    {name: metric}, batches(evaluation(), [torch.arange(COUNT), torch.tensor([3])])
+                )
             metric.reset()
         with pytest.raises(UserError, match="not finite"):
             measure({name: metric}, [bad])
 
 
-def loss_and_gradients(first: int, last: int, hard: bool = False) -> tuple[float, dict[str, torch.Tensor]]:
+def loss_and_gradients(
+    first: int, last: int, hard: bool = False
+) -> tuple[float, dict[str, torch.Tensor]]:
     """Of the pairs first to last of six, with those of the other processes as negatives."""
     torch.manual_seed(0)
     clip = MotionCLIP(
-        7, 10, latent_dim=16, ff_size=24, num_layers=2, num_heads=4, dropout=0.0, max_frames=20, embedding_dim=8
+        7,
+        10,
+        latent_dim=16,
+        ff_size=24,
+        num_layers=2,
+        num_heads=4,
+        dropout=0.0,
+        max_frames=20,
+        embedding_dim=8,
     )
     torch.manual_seed(3)
     meaning = torch.tensor([[1, 10], [2, 20], [3, 30], [1, 40], [4, 50], [5, 20]])
@@ -242,7 +286,9 @@ def test_two_processes_learn_what_one_learns_from_all_pairs(pool: GlooPool):
         (loss_a, a), (loss_b, b) = pool.run(loss_and_gradients, (0, 3, hard), (3, 6, hard))
         assert (loss_a + loss_b) / 2 == pytest.approx(loss, abs=1e-6)
         for name, gradient in gradients.items():
-            torch.testing.assert_close((a[name] + b[name]) / 2, gradient, atol=1e-6, rtol=1e-4, msg=name)
+            torch.testing.assert_close(
+                (a[name] + b[name]) / 2, gradient, atol=1e-6, rtol=1e-4, msg=name
+            )
         alone, _ = loss_and_gradients(0, 3, hard)
         assert abs(alone - loss_a) > 0.05  # without the others' negatives the loss is another one
 

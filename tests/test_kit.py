@@ -19,10 +19,22 @@ from flame_mdm.representations.rifke import Rifke
 
 
 def test_a_processed_folder_becomes_a_store(tmp_path):
-    motions = {name: (frames, [line("a person walks")]) for name, frames in (("1", 24), ("2", 23), ("3", 199))}
-    source = KIT(str(write_folder(tmp_path, motions, {"train": ["1", "2"], "val": ["3"], "test": []}, 251)))
-    store = write_store(tmp_path / "store", source, HumanML("kit21", "legacy", fps=12.5, units_per_metre=640))
-    assert {clip.id: clip.split for clip in store.clips} == {"1": "train", "M1": "train", "3": "val", "M3": "val"}
+    motions = {
+        name: (frames, [line("a person walks")])
+        for name, frames in (("1", 24), ("2", 23), ("3", 199))
+    }
+    source = KIT(
+        str(write_folder(tmp_path, motions, {"train": ["1", "2"], "val": ["3"], "test": []}, 251))
+    )
+    store = write_store(
+        tmp_path / "store", source, HumanML("kit21", "legacy", fps=12.5, units_per_metre=640)
+    )
+    assert {clip.id: clip.split for clip in store.clips} == {
+        "1": "train",
+        "M1": "train",
+        "3": "val",
+        "M3": "val",
+    }
     assert store.info["excluded"] == {"names of train shorter than 24 frames": 2}
     assert source.counts().keys() >= published("kit").keys()
 
@@ -50,14 +62,30 @@ def test_temos_motions_become_a_store(mmm, tmp_path):
     }
     assert store.info["clips"] == {"train": 2, "val": 1, "test": 2}
     assert len(clips["00001"].captions) == 2
-    assert clips["00008"].captions == ["A person walks in a circle."], "the test split has the first caption alone"
-    assert (clips["00007"].attributes, clips["00008"].attributes) == ({"ghosh_test": False}, {"ghosh_test": True})
+    assert clips["00008"].captions == ["A person walks in a circle."], (
+        "the test split has the first caption alone"
+    )
+    assert (clips["00007"].attributes, clips["00008"].attributes) == (
+        {"ghosh_test": False},
+        {"ghosh_test": True},
+    )
     expected = Rifke().encode(torch.from_numpy(kit_walk(801)[::8] / 640))
     np.testing.assert_allclose(store.motion(clips["00001"]), expected, atol=2e-3)
-    training = np.concatenate([store.motion(clip) for clip in store.clips if clip.split == "train"]).astype(float)
+    training = np.concatenate(
+        [store.motion(clip) for clip in store.clips if clip.split == "train"]
+    ).astype(float)
     np.testing.assert_allclose(store.mean, training.mean(0), rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(store.std, np.where(training.std(0) > 0, training.std(0, ddof=1), 1), rtol=1e-6)
-    assert kit.counts() == {"motions": 8, "texts": 14, "train": 5, "val": 1, "test": 2, "ghosh_test": 1}
+    np.testing.assert_allclose(
+        store.std, np.where(training.std(0) > 0, training.std(0, ddof=1), 1), rtol=1e-6
+    )
+    assert kit.counts() == {
+        "motions": 8,
+        "texts": 14,
+        "train": 5,
+        "val": 1,
+        "test": 2,
+        "ghosh_test": 1,
+    }
     assert kit.counts().keys() == published("kit-temos").keys()
 
 
@@ -66,7 +94,17 @@ def evaluated(mmm, out, protocol, *words):
     raw = [f"data.source.splits={mmm.parent / 'kit-splits'}", f"data_root={mmm.parent / 'data'}"]
     if not (mmm.parent / "data").exists():
         assert main(["prepare", "data=kit_temos", f"source={mmm}", *raw]) == 0
-    return main(["evaluate", "baseline=real", "data=kit_temos", *raw, f"protocol={protocol}", f"out={out}", *words])
+    return main(
+        [
+            "evaluate",
+            "baseline=real",
+            "data=kit_temos",
+            *raw,
+            f"protocol={protocol}",
+            f"out={out}",
+            *words,
+        ]
+    )
 
 
 def test_the_protocol_compares_with_the_recordings_of_520_clips_at_100_fps(mmm, tmp_path, capsys):
@@ -74,12 +112,15 @@ def test_the_protocol_compares_with_the_recordings_of_520_clips_at_100_fps(mmm, 
     assert evaluated(mmm, out, "reconstruction_kit") == 0
     result = json.loads(out.read_text())
     assert (result["protocol"]["name"], result["protocol"]["version"]) == ("reconstruction_kit", 2)
-    recording = torch.from_numpy(kit_walk(161)).float().double()  # of 00008, the only clip in ghosh-test
+    # Of 00008, the only clip in ghosh-test
+    recording = torch.from_numpy(kit_walk(161)).float().double()
     motion = Rifke().decode(Rifke().encode(recording[::8] / 640)) * 640
     times = np.arange(161) / 8
     joints = np.stack([np.interp(times, np.arange(21), x) for x in motion.flatten(1).numpy().T], 1)
     parts = [temos_parts(x) for x in (torch.from_numpy(joints.reshape(161, 21, 3)), recording)]
-    apart = {name: (parts[0][name] - parts[1][name]).norm(dim=-1).mean().item() / 1000 for name in PARTS}
+    apart = {
+        name: (parts[0][name] - parts[1][name]).norm(dim=-1).mean().item() / 1000 for name in PARTS
+    }
     assert 1e-4 < apart["root"] < 0.01
     for name, value in apart.items():
         for kind in ("values", "ground_truth"):
@@ -87,7 +128,10 @@ def test_the_protocol_compares_with_the_recordings_of_520_clips_at_100_fps(mmm, 
             assert error["n"] == 1, "all 587 clips, of which 520 are compared"
             assert error["mean"] == pytest.approx(value, rel=0.02, abs=1e-6)
     assert evaluated(mmm, out, "reconstruction_kit", "split=val") == 1
-    assert "the split has no clip with at least 1 frames and ghosh_test=True" in capsys.readouterr().err
+    assert (
+        "the split has no clip with at least 1 frames and ghosh_test=True"
+        in capsys.readouterr().err
+    )
 
 
 @pytest.mark.slow
@@ -119,12 +163,27 @@ def test_every_eighth_frame_is_kept(stem, tmp_path):
     ("damage", "message"),
     [
         (lambda f: (f / "00003_fke.csv").unlink(), r"00003_fke\.csv: no such file"),
-        (lambda f: (f / "00001_annotations.json").write_text("[]"), r"00001_meta\.json does not match"),
-        (lambda f: (f / "00001_fke.csv").write_text("head\n" + "a,b\n" * 99), r"00001_fke\.csv: damaged"),
-        (lambda f: np.savetxt(f / "00001_fke.csv", np.zeros((90, 63)), delimiter=","), r"63\), not a row number"),
-        (lambda f: np.savetxt(f / "00001_fke.csv", np.full((90, 64), math.nan), delimiter=","), "not .* finite"),
+        (
+            lambda f: (f / "00001_annotations.json").write_text("[]"),
+            r"00001_meta\.json does not match",
+        ),
+        (
+            lambda f: (f / "00001_fke.csv").write_text("head\n" + "a,b\n" * 99),
+            r"00001_fke\.csv: damaged",
+        ),
+        (
+            lambda f: np.savetxt(f / "00001_fke.csv", np.zeros((90, 63)), delimiter=","),
+            r"63\), not a row number",
+        ),
+        (
+            lambda f: np.savetxt(f / "00001_fke.csv", np.full((90, 64), math.nan), delimiter=","),
+            "not .* finite",
+        ),
         (lambda f: shutil.rmtree(f.parent / "kit-splits"), r"kit-splits: not found; .*TEMOS"),
-        (lambda f: (f.parent / "kit-splits/val").write_text("00001"), r"kit-splits/val: 00001 is also in train"),
+        (
+            lambda f: (f.parent / "kit-splits/val").write_text("00001"),
+            r"kit-splits/val: 00001 is also in train",
+        ),
     ],
 )
 def test_a_damaged_folder_is_named(mmm, tmp_path, damage, message):

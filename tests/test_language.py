@@ -27,7 +27,11 @@ ATTRIBUTES = ("side", "count", "direction", "speed")
 
 def requests() -> list[dict]:
     """Requests as people type them, written before the tables of the language, with what each asks for."""
-    lines = (ROOT / "tests" / "fixtures" / "typed_requests.jsonl").read_text(encoding="utf-8").splitlines()
+    lines = (
+        (ROOT / "tests" / "fixtures" / "typed_requests.jsonl")
+        .read_text(encoding="utf-8")
+        .splitlines()
+    )
     return [json.loads(line) for line in lines]
 
 
@@ -46,11 +50,17 @@ def checks(request: dict, understood: Understanding) -> list[bool]:
     for number, step in enumerate(expected):
         mentions = steps[number] if number < len(steps) else []
         for action in step:
-            match = next((mention for mention in mentions if mention.action in action["action"]), None)
+            match = next(
+                (mention for mention in mentions if mention.action in action["action"]), None
+            )
             right.append(match is not None)
             stated = match.attributes if match else {}
             right += [stated.get(name) == action[name] for name in ATTRIBUTES if name in action]
-            right += [False for name in ("side", "count", "speed") if name in stated and name not in action]
+            right += [
+                False
+                for name in ("side", "count", "speed")
+                if name in stated and name not in action
+            ]
             if match:
                 mentions.remove(match)
     right += [word in understood.objects for word in request.get("objects", [])]
@@ -108,7 +118,9 @@ def test_captions_say_what_they_are_understood_to_say():
 FACTS = {
     "actions": list(dict.fromkeys(str(attributes["action"]) for _, attributes in prompts())),
     "verbs": ["walks"],
-    "vocabulary": sorted({word for text, _ in prompts() for word in text.lower().split()} | {"crouches", "sits"}),
+    "vocabulary": sorted(
+        {word for text, _ in prompts() for word in text.lower().split()} | {"crouches", "sits"}
+    ),
     "captions": [text for text, _ in prompts()],
 }
 
@@ -119,9 +131,15 @@ FACTS = {
         ("walk left", ["a person walks sideways to the left"]),
         ("crouch", ["a person squats"]),
         ("a person stretches both arms above the head", ["a person raises both arms"]),
-        ("before sitting down, the person turns around", ["a person turns around", "a person sits down"]),
+        (
+            "before sitting down, the person turns around",
+            ["a person turns around", "a person sits down"],
+        ),
         ("after jumping twice, a person bows", ["a person jumps twice", "a person bows"]),
-        ("a person sits down and stands up again", ["a person sits down", "a person stands up from a chair"]),
+        (
+            "a person sits down and stands up again",
+            ["a person sits down", "a person stands up from a chair"],
+        ),
         ("walk until he sits down", ["a person walks forward", "a person sits down"]),
         ("persn wlaks foward", ["a person walks forward"]),
         ("kik with teh left leg", ["a person kicks with the left leg"]),
@@ -137,11 +155,14 @@ def test_a_model_reads_sentences_in_its_own_words(text, captions):
 
 def test_a_reading_says_what_is_different_from_the_sentence():
     reader = Reader(FACTS)
-    assert reader.read("a person walks four steps nervously").warnings() == ["not understood: nervously, 4 steps"]
+    assert reader.read("a person walks four steps nervously").warnings() == [
+        "not understood: nervously, 4 steps"
+    ]
     assert reader.read("wlak").warnings() == ["'wlak' is read as 'walk'"]
     (line,) = reader.read("while walking, a man waves").warnings()
     assert (
-        line == "the model cannot do 'walks forward' and 'waves' at the same time: they are sampled one after the other"
+        line
+        == "the model cannot do 'walks forward' and 'waves' at the same time: they are sampled one after the other"
     )
     (line,) = reader.read("a person limps").warnings()
     assert line == "the model does not know 'limps': it walks forward slowly instead"
@@ -172,13 +193,17 @@ def test_words_that_no_table_lists_are_read_as_they_are_if_the_model_knows_them(
         Reader(FACTS).read("a person yodels loudly")
 
 
-@pytest.mark.parametrize("text", ["ein Mann geht langsam", "un homme marche", "人が歩く", "человек идёт"])
+@pytest.mark.parametrize(
+    "text", ["ein Mann geht langsam", "un homme marche", "人が歩く", "человек идёт"]
+)
 def test_other_languages_are_refused_with_one_line(text):
     with pytest.raises(UserError, match="understood in English only"):
         Reader(FACTS).read(text)
 
 
-@pytest.mark.parametrize("text", ["photosynthesis", "a blue grenade on a shelf", "backflip", "climb a ladder"])
+@pytest.mark.parametrize(
+    "text", ["photosynthesis", "a blue grenade on a shelf", "backflip", "climb a ladder"]
+)
 def test_a_sentence_without_a_known_action_is_refused_with_three_actions(text):
     with pytest.raises(NotUnderstood) as refusal:
         Reader(FACTS).read(text)

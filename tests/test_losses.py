@@ -34,12 +34,17 @@ def test_mdm_losses(case):
     x, noise = motions(FIXTURE[f"{data}/x_start"]), motions(FIXTURE[f"{data}/noise"])
     mask = torch.from_numpy(FIXTURE[f"{data}/mask"]).flatten(1)
     last_row = FIXTURE[f"{data}/x_start"].shape[2]
-    used = [term for term in WEIGHTS if f"{case}/{term}" in FIXTURE]  # some data sets leave terms out
+    # Some data sets leave terms out
+    used = [term for term in WEIGHTS if f"{case}/{term}" in FIXTURE]
     weights: dict[str, Any] = {OURS[term]: lambdas.get(WEIGHTS[term], 0.0) for term in used}
-    kinematics = torch.from_numpy(FIXTURE[f"{data}/fk"]).to(x)  # a stand-in: joints are linear in the features
+    # A stand-in: joints are linear in the features
+    kinematics = torch.from_numpy(FIXTURE[f"{data}/fk"]).to(x)
     to_joints: Callable[[Tensor], Tensor] = lambda x: joints_as_features(x @ kinematics.T)  # noqa: E731
     losses = MotionLosses(to_joints, SMPL_FEET, **weights, velocity_features=x.shape[-1] - last_row)
-    process, t = GaussianDiffusion(meta(FIXTURE)["config"]["T"]), torch.from_numpy(FIXTURE[f"{data}/t"]).float()
+    process, t = (
+        GaussianDiffusion(meta(FIXTURE)["config"]["T"]),
+        torch.from_numpy(FIXTURE[f"{data}/t"]).float(),
+    )
     seen = []
 
     def denoise(x_t, t, mask, cond):
@@ -76,9 +81,13 @@ def test_masked_mse_is_the_mean_over_real_frames():
     torch.manual_seed(0)
     (a, b), lengths = torch.randn(2, 3, 5, 4), [5, 2, 0]
     mask = length_mask(torch.tensor(lengths), 5)
-    expected = [((a[i, :n] - b[i, :n]) ** 2).mean().item() if n else 0.0 for i, n in enumerate(lengths)]
+    expected = [
+        ((a[i, :n] - b[i, :n]) ** 2).mean().item() if n else 0.0 for i, n in enumerate(lengths)
+    ]
     torch.testing.assert_close(masked_mse(a, b, mask), torch.tensor(expected))
-    torch.testing.assert_close(masked_mse(a.unflatten(2, (2, 2)), b.unflatten(2, (2, 2)), mask), torch.tensor(expected))
+    torch.testing.assert_close(
+        masked_mse(a.unflatten(2, (2, 2)), b.unflatten(2, (2, 2)), mask), torch.tensor(expected)
+    )
 
 
 def test_equal_motions_lose_nothing_but_sliding_feet():
@@ -97,7 +106,9 @@ def test_equal_motions_lose_nothing_but_sliding_feet():
     assert losses(2 * x, x, mask)["foot_contact"] == 0
     # 1 cm per frame in the data is standing, 1.5 cm is not.
     for step, stands in ((0.0099, True), (0.015, False)):
-        loss = MotionLosses(joints_as_features, [2], foot_contact=1.0)(step * x, step * x, mask)["foot_contact"]
+        loss = MotionLosses(joints_as_features, [2], foot_contact=1.0)(step * x, step * x, mask)[
+            "foot_contact"
+        ]
         assert (loss > 0) == stands
 
 
@@ -106,10 +117,15 @@ def test_bones_lose_their_change_of_length_and_not_their_turns():
     points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 2, 0]])
     turned = points @ torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]) + 5
     x, x0_hat = (joints.flatten().repeat(1, 4, 1) for joints in (points, turned))
-    losses, mask = MotionLosses(joints_as_features, [], BONES, bone_length=2.0), torch.ones(1, 4, dtype=torch.bool)
+    losses, mask = (
+        MotionLosses(joints_as_features, [], BONES, bone_length=2.0),
+        torch.ones(1, 4, dtype=torch.bool),
+    )
     assert losses(x0_hat, x, mask)["bone_length"].item() == pytest.approx(0, abs=1e-10)
     x0_hat[0, 1, 7] += 0.3
-    assert losses(x0_hat, x, mask)["bone_length"].item() == pytest.approx(2 * 0.3**2 / (4 * 2), rel=1e-5)
+    assert losses(x0_hat, x, mask)["bone_length"].item() == pytest.approx(
+        2 * 0.3**2 / (4 * 2), rel=1e-5
+    )
 
 
 def test_padding_has_no_loss_and_no_gradient_and_single_frames_have_no_velocity():
@@ -139,6 +155,13 @@ def test_only_what_weighs_is_computed():
     x, mask = torch.randn(1, 4, 9), torch.ones(1, 4, dtype=torch.bool)
     assert MotionLosses(unused, [0])(x, x, mask) == {}
     assert set(MotionLosses(unused, [0], velocity=2.0)(x, x, mask)) == {"velocity"}
-    assert MotionLosses(joints_as_features, [0], joints=2.0)(x + 1, x, mask)["joints"].item() == pytest.approx(2)
+    assert MotionLosses(joints_as_features, [0], joints=2.0)(x + 1, x, mask)[
+        "joints"
+    ].item() == pytest.approx(2)
     moved = x + torch.randn(1, 4, 3).repeat(1, 1, 3)
-    assert MotionLosses(joints_as_features, [1], joints=1.0, root_relative=True)(moved, x, mask)["joints"] < 1e-10
+    assert (
+        MotionLosses(joints_as_features, [1], joints=1.0, root_relative=True)(moved, x, mask)[
+            "joints"
+        ]
+        < 1e-10
+    )

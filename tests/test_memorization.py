@@ -27,7 +27,9 @@ def moved(joints: torch.Tensor, yaw: float, shift: tuple[float, float]) -> torch
 
 def training(motions: list[torch.Tensor], features: torch.Tensor | None = None) -> TrainingMotions:
     lengths = torch.tensor([len(motion) for motion in motions])
-    return TrainingMotions(torch.cat([poses(motion, FACING) for motion in motions]), lengths, features, FACING)
+    return TrainingMotions(
+        torch.cat([poses(motion, FACING) for motion in motions]), lengths, features, FACING
+    )
 
 
 def test_poses_face_forward_on_the_spot():
@@ -38,9 +40,16 @@ def test_poses_face_forward_on_the_spot():
     assert local[:, 0, [0, 2]].abs().max() == 0
     torch.testing.assert_close(local[..., 1], motion[..., 1])
     right_hip, left_hip, right_shoulder, left_shoulder = FACING
-    across = local[:, left_hip] - local[:, right_hip] + local[:, left_shoulder] - local[:, right_shoulder]
+    across = (
+        local[:, left_hip]
+        - local[:, right_hip]
+        + local[:, left_shoulder]
+        - local[:, right_shoulder]
+    )
     assert across[:, 0].min() > 0
-    torch.testing.assert_close(across[:, 2], torch.zeros(12, dtype=torch.float64), atol=1e-12, rtol=0)
+    torch.testing.assert_close(
+        across[:, 2], torch.zeros(12, dtype=torch.float64), atol=1e-12, rtol=0
+    )
 
 
 def test_nearest_is_that_of_all_windows_of_which_copies_have_distance_zero():
@@ -62,7 +71,9 @@ def test_nearest_is_that_of_all_windows_of_which_copies_have_distance_zero():
             for motion in motions
             for first in range(len(motion) - len(query) + 1)
         ]
-        best = min(np.sqrt(((compared - window) ** 2).reshape(-1, 3).sum(1).mean()) for window in windows)
+        best = min(
+            np.sqrt(((compared - window) ** 2).reshape(-1, 3).sum(1).mean()) for window in windows
+        )
         assert distance.item() == pytest.approx(best, rel=1e-9)
         assert best > 0.05
 
@@ -70,7 +81,9 @@ def test_nearest_is_that_of_all_windows_of_which_copies_have_distance_zero():
 def test_copies_are_counted():
     metric = NearestTraining()
     real = torch.linspace(0.1, 0.2, 100, dtype=torch.float64)[:, None]
-    nearest = torch.cat([torch.zeros(40, 1, dtype=torch.float64), torch.full((60, 1), 0.3, dtype=torch.float64)])
+    nearest = torch.cat(
+        [torch.zeros(40, 1, dtype=torch.float64), torch.full((60, 1), 0.3, dtype=torch.float64)]
+    )
     metric.update(keys=torch.arange(100), nearest=nearest, real_nearest=real)
     assert metric.compute() == {"joints": pytest.approx(0.3), "features": None, "copies": 0.4}
 
@@ -83,7 +96,12 @@ def raised(side: str, turn: float) -> np.ndarray:
         body[:, joint, 1] = 1.4 if "shoulder" in name else 0.9
     body[10:20, SMPL22.joints.index(f"{side}_wrist"), 1] = 1.8
     angles = np.linspace(0, turn, 40)
-    rotated = np.stack([Rotation.from_euler("y", a, degrees=True).apply(f) for a, f in zip(angles, body, strict=True)])
+    rotated = np.stack(
+        [
+            Rotation.from_euler("y", a, degrees=True).apply(f)
+            for a, f in zip(angles, body, strict=True)
+        ]
+    )
     rotated[..., 0] += np.sign(turn) * np.linspace(0, 0.5, 40)[:, None]
     return rotated
 
@@ -95,7 +113,12 @@ def test_sides_are_read_from_the_motion():
         assert read_side(right, content, 20) == "right"
     metric = SideAccuracy(fps=20)
     joints = torch.from_numpy(np.stack([left, left, right, right]))
-    hands = {"bye": "left", "walk-turn-right": "right", "raise-up-right-hand": "right", "wave-both-hands": "both"}
+    hands = {
+        "bye": "left",
+        "walk-turn-right": "right",
+        "raise-up-right-hand": "right",
+        "wave-both-hands": "both",
+    }
     metric.update(joints, torch.ones(4, 40, dtype=torch.bool), list(hands.items()), torch.arange(4))
     assert metric.compute() == {"hand": 1.0, "path": 0.0, "hand_or_path": pytest.approx(2 / 3)}
     metric = SideAccuracy(fps=20)

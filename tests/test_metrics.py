@@ -14,11 +14,34 @@ from torch import Tensor
 from torch.nn.functional import normalize
 from torchmetrics import Metric
 
-from evaluators.metrics import accuracy, alignment, distribution, diversity, physics, reconstruction, update_metrics
-from evaluators.metrics.alignment import MotionsForText, MultimodalDistance, TextsForMotion, retrieval_ranks
-from evaluators.metrics.distribution import FrechetMotionDistance, PrecisionRecall, frechet_distance, polynomial_mmd2
+from evaluators.metrics import (
+    accuracy,
+    alignment,
+    distribution,
+    diversity,
+    physics,
+    reconstruction,
+    update_metrics,
+)
+from evaluators.metrics.alignment import (
+    MotionsForText,
+    MultimodalDistance,
+    TextsForMotion,
+    retrieval_ranks,
+)
+from evaluators.metrics.distribution import (
+    FrechetMotionDistance,
+    PrecisionRecall,
+    frechet_distance,
+    polynomial_mmd2,
+)
 from evaluators.metrics.diversity import pair_distance
-from evaluators.metrics.reconstruction import FlamePositionErrors, TemosPositionErrors, flame_parts, temos_parts
+from evaluators.metrics.reconstruction import (
+    FlamePositionErrors,
+    TemosPositionErrors,
+    flame_parts,
+    temos_parts,
+)
 from evaluators.metrics.retrieval import TMR_TOP, whole_set_retrieval
 from evaluators.results import mean_ci
 from flame_mdm.batch import length_mask
@@ -46,7 +69,11 @@ def computed(metric: Metric, **inputs: Any) -> Any:
 
 
 def cases(suffix: str, under: str) -> list[Any]:
-    return [pytest.param(case, id=f"metrics-{case}") for case in groups(FIXTURE, suffix) if case.startswith(under)]
+    return [
+        pytest.param(case, id=f"metrics-{case}")
+        for case in groups(FIXTURE, suffix)
+        if case.startswith(under)
+    ]
 
 
 one = golden_case("metrics")
@@ -56,7 +83,9 @@ one = golden_case("metrics")
 @pytest.mark.parametrize("case", cases("exact_f64", "fid/"))
 def test_frechet_distance_equals_the_authors(case: str):
     a, b = torch.from_numpy(array(f"{case}/a")), torch.from_numpy(array(f"{case}/b"))
-    value = computed(FrechetMotionDistance(), generated=a, keys=keys(len(a)), real=b, real_keys=keys(len(b)))
+    value = computed(
+        FrechetMotionDistance(), generated=a, keys=keys(len(a)), real=b, real_keys=keys(len(b))
+    )
     # the square roots of eigenvalues that should be 0 leave 1e-8 in the reference
     assert value == pytest.approx(float(array(f"{case}/exact_f64")), rel=1e-7, abs=1e-9)
     for official in ("official_scipy117", "official_scipy110"):  # takes means in float32
@@ -69,14 +98,20 @@ def test_text_metrics_equal_guos(stem: str):
     for size, name in ((int(array("t2m/batch")), "top123"), (len(text), "one_batch_of_160")):
         ranks = []
         for own in torch.arange(len(text)).split(size):
-            ranks.append(retrieval_ranks(text[own], motion, own.expand(len(own), -1), torch.arange(len(own))))
+            ranks.append(
+                retrieval_ranks(text[own], motion, own.expand(len(own), -1), torch.arange(len(own)))
+            )
         hits = torch.cat(ranks)[:, None] < torch.arange(1, 4)
-        np.testing.assert_allclose(hits.double().mean(0), array(f"t2m/R_precision_{name}"), rtol=1e-12)
+        np.testing.assert_allclose(
+            hits.double().mean(0), array(f"t2m/R_precision_{name}"), rtol=1e-12
+        )
         if name == "top123":
             np.testing.assert_array_equal(hits[:size], array("t2m/topk_batch0"))
     ids, values = keys(len(text)), {}
     values["matching_score"] = computed(MultimodalDistance(), generated=motion, text=text, keys=ids)
-    values["fid"] = computed(FrechetMotionDistance(), generated=motion, keys=ids, real=real, real_keys=keys(len(real)))
+    values["fid"] = computed(
+        FrechetMotionDistance(), generated=motion, keys=ids, real=real, real_keys=keys(len(real))
+    )
     first, second = array("t2m/diversity_first"), array("t2m/diversity_second")
     values["diversity"] = pair_distance(motion[first], motion[second])
     embedded, first, second = tensor("t2m/mm_emb"), array("t2m/mm_first"), array("t2m/mm_second")
@@ -90,30 +125,48 @@ def test_text_metrics_equal_guos(stem: str):
 @pytest.mark.parametrize("case", cases("mm_pairs", "a2m/"))
 def test_action_metrics_equal_the_authors(case: str):
     features = tensor("a2m/features")
-    value = pair_distance(features[tensor(f"{case}/div_first")], features[tensor(f"{case}/div_second")])
+    value = pair_distance(
+        features[tensor(f"{case}/div_first")], features[tensor(f"{case}/div_second")]
+    )
     assert value == pytest.approx(float(array(f"{case}/diversity")), rel=1e-5)
     first, second = tensor(f"{case}/mm_pairs").T
     labels = tensor(f"{case}/labels")
     assert torch.equal(labels[first], labels[second])
-    share = len(labels.unique()) / int(array(f"{case}/num_labels"))  # theirs divides by classes without motions too
+    # Theirs divides by classes without motions too
+    share = len(labels.unique()) / int(array(f"{case}/num_labels"))
     expected = float(array(f"{case}/multimodality"))
-    assert pair_distance(features[first], features[second]) * share == pytest.approx(expected, rel=1e-5)
+    assert pair_distance(features[first], features[second]) * share == pytest.approx(
+        expected, rel=1e-5
+    )
 
 
 @one
-def test_intervals_accuracy_unconstrained_diversity_precision_recall_and_retrieval_equal_the_authors(stem: str):
+def test_intervals_accuracy_unconstrained_diversity_precision_recall_and_retrieval_equal_the_authors(
+    stem: str,
+):
     interval: Any = mean_ci(array("ci/values").tolist())
     np.testing.assert_allclose(interval, array("ci/mean_ci"), rtol=1e-12)
     columns: Any = [mean_ci(column.tolist()) for column in array("ci/values3").T]
     np.testing.assert_allclose(np.transpose(columns), array("ci/mean_ci3"), rtol=1e-12)
     labels = tensor("a2m/logit_labels")
-    value = computed(accuracy.ActionAccuracy(), logits=tensor("a2m/logits"), labels=labels, keys=keys(len(labels)))
+    value = computed(
+        accuracy.ActionAccuracy(),
+        logits=tensor("a2m/logits"),
+        labels=labels,
+        keys=keys(len(labels)),
+    )
     assert value == pytest.approx(float(array("a2m/accuracy")), rel=1e-6)
     features = tensor("a2m/features")
-    value = pair_distance(features[tensor("uncond/div_first")], features[tensor("uncond/div_second")])
+    value = pair_distance(
+        features[tensor("uncond/div_first")], features[tensor("uncond/div_second")]
+    )
     assert value == pytest.approx(float(array("uncond/diversity")), rel=1e-5)
     fake, real = tensor("pr/gen"), tensor("pr/real")
-    order = {"keys": torch.arange(len(fake)), "real_keys": torch.arange(len(real))}  # the larger set is cut
+    # The larger set is cut
+    order = {
+        "keys": torch.arange(len(fake)),
+        "real_keys": torch.arange(len(real)),
+    }
     values = computed(PrecisionRecall(), generated=fake, real=real, **order)
     assert values == pytest.approx({name: float(array(f"pr/{name}")) for name in values}, rel=1e-12)
     values = whole_set_retrieval(tensor("tmr/sims"))
@@ -131,7 +184,9 @@ def test_kernel_distance_equals_the_authors(case: str):
     mmd = torch.stack([polynomial_mmd2(a[i], b[j]) for i, j in subsets]).numpy()
     np.testing.assert_allclose(mmd, array(f"{case}_float64/mmd"), rtol=1e-11)
     np.testing.assert_allclose(mmd, array(f"{case}_float32/mmd"), rtol=1e-4, atol=2e-6)
-    np.testing.assert_allclose([mmd.mean(), mmd.std()], array(f"{case}_float64/mean_std"), rtol=1e-11, atol=1e-12)
+    np.testing.assert_allclose(
+        [mmd.mean(), mmd.std()], array(f"{case}_float64/mean_std"), rtol=1e-11, atol=1e-12
+    )
 
 
 @pytest.mark.slow
@@ -143,14 +198,19 @@ def test_kernel_distance_of_whole_sets_equals_the_authors(stem: str):
     size, replace = 1000, len(real) > 1000
     mmd = []
     for _ in range(100):
-        i, j = generator.choice(len(real), size, replace), generator.choice(len(fake), size, replace)
+        i, j = (
+            generator.choice(len(real), size, replace),
+            generator.choice(len(fake), size, replace),
+        )
         mmd.append(polynomial_mmd2(real[i], fake[j]).item())
     np.testing.assert_allclose([np.mean(mmd), np.std(mmd)], array("kid/full/mean_std"), rtol=1e-5)
 
 
 def mid(real: Tensor, text: Tensor, generated: Tensor, eps: float) -> float:
     requested = text[: len(generated)]
-    return alignment.pointwise_mutual_information(real, text, generated, requested, eps).mean().item()
+    return (
+        alignment.pointwise_mutual_information(real, text, generated, requested, eps).mean().item()
+    )
 
 
 MID_EPS = {"mid": 0.0, "eps0": 0.0, "eps5e-4": 5e-4, "real_as_fake_eps5e-4": 5e-4}
@@ -168,7 +228,9 @@ def test_mid_equals_the_authors(case: str):
         theirs[option] = float(array(f"{case}/{option}"))
     if len(real) > real.shape[1] + text.shape[1]:
         assert ours == pytest.approx(theirs, rel=1e-6)
-    else:  # the log-determinant of the joint covariance is noise, there and here, but the same with other motions
+    # The log-determinant of the joint covariance is noise, there and here, but the same with other
+    # motions
+    else:
         (a, b), (c, d) = (x.values() for x in (ours, theirs))
         assert b - a == pytest.approx(d - c, rel=1e-6)
         assert a == pytest.approx(c, rel=5e-3)
@@ -176,26 +238,45 @@ def test_mid_equals_the_authors(case: str):
 
 @one
 def test_flame_metrics_and_position_errors_equal_the_authors(stem: str):
-    text, fake, real = tensor("flame/text_feat"), tensor("flame/gen_motion_feat"), tensor("flame/gt_motion_feat")
+    text, fake, real = (
+        tensor("flame/text_feat"),
+        tensor("flame/gen_motion_feat"),
+        tensor("flame/gt_motion_feat"),
+    )
     own = torch.arange(len(text))
     pools = torch.cat([own[:, None], tensor("flame/wrong_idx")], 1)
     rank = retrieval_ranks(fake, text, pools, torch.zeros_like(own))
     shares = [(rank < k).double().mean().item() for k in (1, 2, 3)]
     np.testing.assert_allclose(shares, array("flame/r_precision_top123"), rtol=1e-6)
-    metrics = {"mclip": alignment.MotionCLIPScore(), "mm_distance": MultimodalDistance(), "fd": FrechetMotionDistance()}
+    metrics = {
+        "mclip": alignment.MotionCLIPScore(),
+        "mm_distance": MultimodalDistance(),
+        "fd": FrechetMotionDistance(),
+    }
     update_metrics(metrics, generated=fake, text=text, keys=own, real=real, real_keys=own)
     for name, metric in metrics.items():
         assert metric.compute() == pytest.approx(float(array(f"flame/{name}")), rel=2e-6)
 
     metric, pairs = FlamePositionErrors(SMPL22.parents), []
-    for clip in groups({k: v for k, v in FIXTURE.items() if k.startswith("flame_ape/clip")}, "translation"):
+    for clip in groups(
+        {k: v for k, v in FIXTURE.items() if k.startswith("flame_ape/clip")}, "translation"
+    ):
         sides = []
-        for motion, path in (("gen_joints_xyz", "translation"), ("gt_joints_xyz", "gt_translation")):
+        for motion, path in (
+            ("gen_joints_xyz", "translation"),
+            ("gt_joints_xyz", "gt_translation"),
+        ):
             root = tensor(f"{clip}/{path}")[:, [0, 2, 1]]  # z up -> y up
-            sides.append(flame_parts(tensor(f"{clip}/{motion}") + root[:, None], root, SMPL22.parents))
+            sides.append(
+                flame_parts(tensor(f"{clip}/{motion}") + root[:, None], root, SMPL22.parents)
+            )
         pairs.append(sides)
-    names = [f"{part}_error" for part in ("root_joint", "global_traj", "local_joint", "global_joint")]
-    expected = [float(array(f"flame_ape/{error}_{name}")) for error in ("ape", "ave") for name in names]
+    names = [
+        f"{part}_error" for part in ("root_joint", "global_traj", "local_joint", "global_joint")
+    ]
+    expected = [
+        float(array(f"flame_ape/{error}_{name}")) for error in ("ape", "ave") for name in names
+    ]
     np.testing.assert_allclose(averages(metric, pairs), expected, rtol=1e-6)
 
 
@@ -209,8 +290,14 @@ def averages(metric: reconstruction.PositionErrors, pairs: list[Any]) -> list[fl
 @one
 def test_temos_position_errors_equal_the_authors(stem: str):
     """Also of padded batches: their floor sees the padding, which the parts of padded motions reproduce."""
-    names = [f"{error}_{part}" for error in ("APE", "AVE") for part in ("root", "traj", "mean_pose", "mean_joints")]
-    single, padded = ([float(array(f"temos_ape/{case}/{n}")) for n in names] for case in ("single", "padded"))
+    names = [
+        f"{error}_{part}"
+        for error in ("APE", "AVE")
+        for part in ("root", "traj", "mean_pose", "mean_joints")
+    ]
+    single, padded = (
+        [float(array(f"temos_ape/{case}/{n}")) for n in names] for case in ("single", "padded")
+    )
     fake, real = tensor("temos_ape/padded_text"), tensor("temos_ape/padded_ref")
     lengths = tensor("temos_ape/single/len_text_ref")
     metric = TemosPositionErrors()
@@ -227,10 +314,20 @@ def test_temos_position_errors_equal_the_authors(stem: str):
     metric, pairs = TemosPositionErrors(), []
     metric.units_per_meter = 1.0
     for *motions, length in zip(fake, real, array("temos_ape/lengths"), strict=True):
-        pairs.append([{part: x[:length] for part, x in metric.positions(motion).items()} for motion in motions])
+        pairs.append(
+            [
+                {part: x[:length] for part, x in metric.positions(motion).items()}
+                for motion in motions
+            ]
+        )
     np.testing.assert_allclose(averages(metric, pairs), padded, rtol=2e-6)
     parts, length = temos_parts(fake[0]), int(array("temos_ape/lengths")[0])
-    names = {"root": "root", "trajectory": "traj", "mean_local": "pose_local", "mean_global": "joints"}
+    names = {
+        "root": "root",
+        "trajectory": "traj",
+        "mean_local": "pose_local",
+        "mean_global": "joints",
+    }
     for part, name in names.items():
         expected = array(f"temos_ape/transform0/{name}")
         np.testing.assert_allclose(parts[part][:length] / 1000, expected[:length], atol=2e-6)
@@ -249,9 +346,13 @@ def test_frechet_distance_of_normal_distributions():
     deviations, other = np.array([0.5, 1.0, 3.0]), np.array([2.0, 0.1, 3.5])
     a = exactly_normal(np.array([1.0, 2.0, 3.0]), np.diag(deviations**2), 50, 0)
     b = exactly_normal(np.array([0.0, 2.0, 5.0]), np.diag(other**2), 70, 1)
-    assert frechet_distance(a, b).item() == pytest.approx(5 + ((deviations - other) ** 2).sum(), rel=1e-12)
+    assert frechet_distance(a, b).item() == pytest.approx(
+        5 + ((deviations - other) ** 2).sum(), rel=1e-12
+    )
 
-    s, t = (a @ a.T / 20 + 0.1 * np.eye(20) for a in np.random.default_rng(0).normal(size=(2, 20, 20)))
+    s, t = (
+        a @ a.T / 20 + 0.1 * np.eye(20) for a in np.random.default_rng(0).normal(size=(2, 20, 20))
+    )
     a, b = exactly_normal(np.zeros(20), s, 100, 2), exactly_normal(np.ones(20), t, 60, 3)
     expected = 20 + np.trace(s + t) - 2 * np.trace(np.real(np.asarray(sqrtm(s @ t))))
     assert frechet_distance(a, b).item() == pytest.approx(expected, rel=1e-10)
@@ -262,12 +363,19 @@ def test_frechet_distance_of_normal_distributions():
     dead = torch.ones(1, 5, dtype=torch.float64)
     padded = frechet_distance(*(torch.cat([x, dead.expand(len(x), -1)], 1) for x in (a, b)))
     assert padded.item() == pytest.approx(frechet_distance(a, b).item(), rel=1e-13)
-    few = frechet_distance(a[:5], b[:5])  # a rotation of a thin set: only the means and the trace remain
+    # A rotation of a thin set: only the means and the trace remain
+    few = frechet_distance(a[:5], b[:5])
     eigenvalues = np.linalg.eigvals(np.cov(a[:5].T.numpy()) @ np.cov(b[:5].T.numpy())).real.clip(0)
     trace = a[:5].var(0).sum() + b[:5].var(0).sum() - 2 * np.sqrt(eigenvalues).sum()
-    assert few.item() == pytest.approx(((a[:5].mean(0) - b[:5].mean(0)) ** 2).sum().item() + trace.item(), rel=1e-6)
+    assert few.item() == pytest.approx(
+        ((a[:5].mean(0) - b[:5].mean(0)) ** 2).sum().item() + trace.item(), rel=1e-6
+    )
     x, ids = torch.randn(64, 32, generator=torch.Generator().manual_seed(0)), torch.arange(64)
-    assert 0 <= computed(FrechetMotionDistance(), generated=x, keys=ids, real=x.flip(0), real_keys=ids) < 1e-10
+    assert (
+        0
+        <= computed(FrechetMotionDistance(), generated=x, keys=ids, real=x.flip(0), real_keys=ids)
+        < 1e-10
+    )
 
 
 def test_kernel_distance_of_whole_sets_is_one_value():
@@ -277,9 +385,12 @@ def test_kernel_distance_of_whole_sets_is_one_value():
     inputs = {"generated": a, "keys": torch.arange(50), "real": b, "real_keys": torch.arange(50)}
     metric = distribution.KernelMotionDistance
     values = {
-        replace: computed(metric(subsets=20, subset_size=50, replace=replace), **inputs) for replace in (False, True)
+        replace: computed(metric(subsets=20, subset_size=50, replace=replace), **inputs)
+        for replace in (False, True)
     }
-    assert values[False]["mean"] == pytest.approx(polynomial_mmd2(a.double(), b.double()).item(), rel=1e-12)
+    assert values[False]["mean"] == pytest.approx(
+        polynomial_mmd2(a.double(), b.double()).item(), rel=1e-12
+    )
     assert values[False]["std"] < 1e-12 < values[True]["std"]
     assert values[True]["mean"] > values[False]["mean"]
 
@@ -305,7 +416,9 @@ def test_r_precision_of_perfect_random_and_blind_features():
         for motion, seen in ((random, text), (blind, blind)):
             values = computed(metric(), generated=motion, text=seen, text_keys=ids, keys=ids)
             for chance, value in zip((1 / 32, 2 / 32, 3 / 32), values.values(), strict=True):
-                assert value == pytest.approx(chance, abs=4 * (chance * (1 - chance) / count) ** 0.5)
+                assert value == pytest.approx(
+                    chance, abs=4 * (chance * (1 - chance) / count) ** 0.5
+                )
 
 
 def test_texts_for_motion_never_draw_the_own_caption_and_motions_for_text_count_every_text_once():
@@ -319,13 +432,19 @@ def test_texts_for_motion_never_draw_the_own_caption_and_motions_for_text_count_
     motion = text.clone()
     motion[:32] = text[:32] + torch.tensor([1.0, -1.0]).repeat(16)[:, None]
     ids = torch.arange(33)
-    hits = 33 * computed(MotionsForText(), generated=motion, text=text, text_keys=ids, keys=ids)["top1"]
+    hits = (
+        33
+        * computed(MotionsForText(), generated=motion, text=text, text_keys=ids, keys=ids)["top1"]
+    )
     assert hits == pytest.approx(round(hits))
     assert 1 <= round(hits) <= 2  # the one, and one whose partner an incomplete pool may leave out
 
 
 def test_ties_and_directions_in_retrieval():
-    candidates, query = torch.tensor([[0.0], [1.0], [1.0], [2.0]]), torch.tensor([[1.0], [1.0], [0.4]])
+    candidates, query = (
+        torch.tensor([[0.0], [1.0], [1.0], [2.0]]),
+        torch.tensor([[1.0], [1.0], [0.4]]),
+    )
     pools = torch.arange(4).expand(3, -1)
     assert retrieval_ranks(query, candidates, pools, torch.tensor([1, 2, 3])).tolist() == [0, 1, 3]
     assert set(whole_set_retrieval(torch.eye(4)).values()) == {1.0}
@@ -338,19 +457,27 @@ def test_ties_and_directions_in_retrieval():
         top1 = computed(MotionsForText(normalize=alone), text_keys=rows["keys"], **rows)["top1"]
         assert (top1 == 1) if alone else (top1 < 0.9)
         distance = computed(MultimodalDistance(normalize=alone), **rows)
-        assert distance == pytest.approx(0 if alone else float((lengths - 1).mean()), rel=1e-6, abs=1e-6)
+        assert distance == pytest.approx(
+            0 if alone else float((lengths - 1).mean()), rel=1e-6, abs=1e-6
+        )
 
 
 def test_diversity_of_two_points():
     features = torch.tensor([[0.0, 0.0], [3.0, 4.0]]).repeat(500, 1)
     for replace in (False, True):
-        value = computed(diversity.Diversity(pairs=1000, replace=replace), generated=features, keys=keys(1000))
+        value = computed(
+            diversity.Diversity(pairs=1000, replace=replace), generated=features, keys=keys(1000)
+        )
         assert value == pytest.approx(2.5, abs=0.4)  # half of the pairs are 5 apart
     line = {"generated": torch.arange(1000.0)[:, None], "keys": torch.arange(1000)}
-    assert computed(diversity.Diversity(pairs=1000, replace=False), **line) == pytest.approx(1000 / 3, rel=0.1)
+    assert computed(diversity.Diversity(pairs=1000, replace=False), **line) == pytest.approx(
+        1000 / 3, rel=0.1
+    )
 
 
-def multimodality(metric: Metric, distances: Tensor, samples: int, kind: str = "groups") -> float | None:
+def multimodality(
+    metric: Metric, distances: Tensor, samples: int, kind: str = "groups"
+) -> float | None:
     """Of prompts whose motions stand on two points, so many apart."""
     steps = torch.arange(samples) % 2
     features = (distances[:, None] * steps).flatten()[:, None]
@@ -393,7 +520,8 @@ def test_displacement_and_drift_of_shifted_frames_and_joints():
     mask = length_mask(torch.tensor([8]), 10)
     kept = (torch.arange(10) < 4)[None, :, None].expand(1, 10, 22)
     motions = {"joints": fake, "mask": mask, "real_joints": real, "keys": torch.tensor([1])}
-    short = length_mask(torch.tensor([6]), 10)  # motions are compared up to the end of the shorter one
+    # Motions are compared up to the end of the shorter one
+    short = length_mask(torch.tensor([6]), 10)
     for change, ade, fde in (
         ({"kept": kept, "real_mask": mask}, 25 / 4, 10.0),
         ({"real_mask": mask}, 25 / 8, 10.0),
@@ -408,8 +536,12 @@ def test_displacement_and_drift_of_shifted_frames_and_joints():
     fake[:, 4, 5, 1] += 1
     mask, kept = torch.ones(1, 10, dtype=torch.bool), (torch.arange(22) != 3).expand(1, 10, 22)
     motions |= {"joints": fake, "mask": mask, "real_mask": mask, "kept": kept}
-    assert computed(reconstruction.DisplacementErrors(), **motions) == pytest.approx({"ade": 2, "fde": 2}, rel=1e-6)
-    assert computed(reconstruction.KeptDrift(), **motions) == pytest.approx({"mean": 1 / 210, "largest": 1}, rel=1e-6)
+    assert computed(reconstruction.DisplacementErrors(), **motions) == pytest.approx(
+        {"ade": 2, "fde": 2}, rel=1e-6
+    )
+    assert computed(reconstruction.KeptDrift(), **motions) == pytest.approx(
+        {"mean": 1 / 210, "largest": 1}, rel=1e-6
+    )
     values = computed(reconstruction.KeptDrift(), **motions | {"kept": torch.zeros_like(kept)})
     assert values == {"mean": None, "largest": None}
 
@@ -422,7 +554,12 @@ def test_best_and_worst_of_several_are_chosen_by_the_root():
     fake[:, :, 0, 0] += off[:, None]
     fake[:, :, 1:, 0] += (5 - off)[:, None, None]
     mask = torch.ones(6, 12, dtype=torch.bool)
-    motions = {"joints": fake, "mask": mask, "real_joints": real.repeat(6, 1, 1, 1), "real_mask": mask}
+    motions = {
+        "joints": fake,
+        "mask": mask,
+        "real_joints": real.repeat(6, 1, 1, 1),
+        "real_mask": mask,
+    }
     motions |= {"keys": torch.arange(6), "groups": torch.tensor([8, 8, 8, 4, 4, 4])}
     values = {}
     for samples in (3, 1):
@@ -438,7 +575,9 @@ def test_best_and_worst_of_several_are_chosen_by_the_root():
 
 def test_physics_of_simple_motions():
     frames, fps = 30, 20.0
-    still = torch.rand(1, 1, 22, 3, generator=torch.Generator().manual_seed(0)).repeat(1, frames, 1, 1)
+    still = torch.rand(1, 1, 22, 3, generator=torch.Generator().manual_seed(0)).repeat(
+        1, frames, 1, 1
+    )
     still[..., 1] -= still[..., 1].amin()
     mask, ids = torch.ones(1, frames, dtype=torch.bool), torch.tensor([1])
 
@@ -481,9 +620,13 @@ def test_a_bootstrap_of_a_distance_is_at_its_value():
     generator, draws = torch.Generator().manual_seed(0), np.random.default_rng(0)
     real, noise = torch.randn(2, 150, 8, generator=generator, dtype=torch.float64)
     value = frechet_distance(noise, real).item()
-    drawn = [frechet_distance(noise[draws.integers(150, size=150)], real).item() for _ in range(300)]
+    drawn = [
+        frechet_distance(noise[draws.integers(150, size=150)], real).item() for _ in range(300)
+    ]
     low, high = percentiles(drawn, value)
-    assert low < value < high, "sets with repetitions are farther away, which is not the value's error"
+    assert low < value < high, (
+        "sets with repetitions are farther away, which is not the value's error"
+    )
 
 
 def test_an_interval_is_over_replications_or_over_motions_and_a_single_value_has_none():
@@ -500,7 +643,12 @@ def test_an_interval_is_over_replications_or_over_motions_and_a_single_value_has
 def test_multimodality_draws_no_motion_twice_on_the_same_side(seed: int):
     # Both sides are all 5 motions in some order, so that the value is the mean distance of one of 120 pairings.
     features = torch.tensor([0.0, 1.0, 4.3, 13.7, 41.9], dtype=torch.float64)
-    pairings = [(features - features[list(order)]).abs().mean() for order in itertools.permutations(range(5))]
+    pairings = [
+        (features - features[list(order)]).abs().mean()
+        for order in itertools.permutations(range(5))
+    ]
     metric = diversity.TextMultimodality(samples=5, pairs=5, seed=seed)
-    value = computed(metric, generated=features[:, None], groups=torch.zeros(5, dtype=torch.long), keys=keys(5))
+    value = computed(
+        metric, generated=features[:, None], groups=torch.zeros(5, dtype=torch.long), keys=keys(5)
+    )
     assert min(abs(value - float(pairing)) for pairing in pairings) < 1e-9

@@ -34,7 +34,9 @@ def people(tmp_path: Path) -> Path:
 
 
 def mixture(people: Path, **options) -> Mixture:
-    return Mixture({"synthetic": Synthetic(clips=5), "people": Folder(str(people), mirror=True)}, **options)
+    return Mixture(
+        {"synthetic": Synthetic(clips=5), "people": Folder(str(people), mirror=True)}, **options
+    )
 
 
 def test_a_store_of_a_mixture_has_all_clips_with_their_licenses(people: Path, tmp_path: Path):
@@ -48,7 +50,10 @@ def test_a_store_of_a_mixture_has_all_clips_with_their_licenses(people: Path, tm
     assert licenses["Mfour"] == "CMU"
 
     actions = store.info["actions"]
-    assert {actions[clip.action] for clip in store.clips if clip.id in ("one", "four")} == {"walk", "dance"}
+    assert {actions[clip.action] for clip in store.clips if clip.id in ("one", "four")} == {
+        "walk",
+        "dance",
+    }
     assert len(set(actions)) == len(actions)
 
 
@@ -74,8 +79,12 @@ def test_stores_without_licenses_are_written_as_before(tmp_path: Path):
     assert all("license" not in json.loads(line) for line in lines)
 
 
-@pytest.mark.parametrize(("license", "words"), [("CC-BY-NC-4.0", "license CC-BY-NC-4.0"), ("", "an unknown license")])
-def test_a_license_that_forbids_the_use_is_refused_before_motions_are_read(people: Path, license: str, words: str):
+@pytest.mark.parametrize(
+    ("license", "words"), [("CC-BY-NC-4.0", "license CC-BY-NC-4.0"), ("", "an unknown license")]
+)
+def test_a_license_that_forbids_the_use_is_refused_before_motions_are_read(
+    people: Path, license: str, words: str
+):
     (people / "captions.csv").write_text(CAPTIONS.replace("CC0", license))
     with pytest.raises(UserError, match=f"parts.people: has motions of {words}"):
         mixture(people).count()
@@ -86,7 +95,11 @@ def test_few_clips_of_an_action_are_repeated(people: Path):
     source = Folder(str(people), mirror=True, balance=8)
     clips = list(source.clips(20.0))
     assert len(clips) == source.count()
-    actions = [source.actions[clip.action] for clip in clips if clip.split == "train" and clip.action is not None]
+    actions = [
+        source.actions[clip.action]
+        for clip in clips
+        if clip.split == "train" and clip.action is not None
+    ]
     assert (actions.count("walk"), actions.count("dance")) == (8, 8)
     assert len({clip.id for clip in clips}) == len(clips)
     assert sum(clip.split == "test" for clip in clips) == 1

@@ -48,14 +48,28 @@ def model() -> MotionGenerator:
     return untrained(TINY, max_frames=196)
 
 
-@pytest.mark.parametrize("kind", ["sample.npz", "amass.npz", "joints.npz", "walk.bvh", "walk.json", "walk.npy"])
-def test_every_kind_is_converted_edited_and_own_data(folder: Path, walk: Motion, model, tmp_path: Path, kind: str):
+@pytest.mark.parametrize(
+    "kind", ["sample.npz", "amass.npz", "joints.npz", "walk.bvh", "walk.json", "walk.npy"]
+)
+def test_every_kind_is_converted_edited_and_own_data(
+    folder: Path, walk: Motion, model, tmp_path: Path, kind: str
+):
     tolerance = 0.25 if kind == "amass.npz" else 0.02  # AMASS files have the bones of SMPL's body
     rate = 30 if kind.endswith(".npy") else None
     motion = read(folder / kind, rate)
     for ending in (".BVH", ".glb", ".json", ".npy"):
         motion.save(tmp_path / f"new/out{ending}")
-    assert main(["convert", str(folder / kind), f"out={tmp_path / 'out.npz'}", *[f"fps={rate}"] * bool(rate)]) == 0
+    assert (
+        main(
+            [
+                "convert",
+                str(folder / kind),
+                f"out={tmp_path / 'out.npz'}",
+                *[f"fps={rate}"] * bool(rate),
+            ]
+        )
+        == 0
+    )
     again = read(tmp_path / "out.npz")
     assert again.fps == 30
     assert again.poses is not None
@@ -95,7 +109,9 @@ def test_a_motion_is_shown(walk: Motion, monkeypatch):
     assert "<script" not in shown
 
 
-def test_arrays_are_edited_and_what_cannot_be_edited_is_refused_in_one_line(walk: Motion, model: MotionGenerator):
+def test_arrays_are_edited_and_what_cannot_be_edited_is_refused_in_one_line(
+    walk: Motion, model: MotionGenerator
+):
     how: dict[str, Any] = {"region": "prediction", "num_inference_steps": 2}
     expected, joints = edit(model, walk, "a person jumps", **how)[0], walk.joints
     for array in (joints, torch.from_numpy(joints), joints.tolist()):
@@ -105,13 +121,29 @@ def test_arrays_are_edited_and_what_cannot_be_edited_is_refused_in_one_line(walk
     cases: list[tuple[Any, Any, str]] = [
         (joints, None, "an array has no frame rate: set it, for example with fps=20"),
         (joints, "fast", "fps is fast, not a number of frames per second"),
-        (joints[:, :13], 30, r"joints of shape \(79, 13, 3\), not \(frames, joints, 3\) with 22 \(smpl22\)"),
+        (
+            joints[:, :13],
+            30,
+            r"joints of shape \(79, 13, 3\), not \(frames, joints, 3\) with 22 \(smpl22\)",
+        ),
         (joints[0], 30, r"joints of shape \(22, 3\), not \(frames, joints, 3\)"),
         (joints[:0], 30, "have no frames"),
-        (joints[:, :21], 30, r"^motion: shape \(.*, 21, 3\), but humanml-clean-smpl22 takes \(frames, 22, 3\)"),
-        (joints * 100, 30, r"^the legs are 8\d\.\d m long .* The unit may be 0\.01 \(centimeters\)"),
+        (
+            joints[:, :21],
+            30,
+            r"^motion: shape \(.*, 21, 3\), but humanml-clean-smpl22 takes \(frames, 22, 3\)",
+        ),
+        (
+            joints * 100,
+            30,
+            r"^the legs are 8\d\.\d m long .* The unit may be 0\.01 \(centimeters\)",
+        ),
         (joints * np.nan, 30, "joints in frame 0 are not finite"),
-        (np.tile(joints, (9, 1, 1)), 30, "^the motion: .* frames, but the model was trained on at most 196"),
+        (
+            np.tile(joints, (9, 1, 1)),
+            30,
+            "^the motion: .* frames, but the model was trained on at most 196",
+        ),
         (None, 30, r"^NoneType: not a motion\. Give a path, a Motion, or an array of joints"),
         (walk, 20, r"fps=20: this motion has 30 frames per second\. Omit fps"),
         (Motion(joints * 100, 30, id="take"), None, "^take: the legs are"),

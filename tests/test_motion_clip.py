@@ -12,8 +12,18 @@ from support.fixtures import GOLDEN, assert_within, golden, golden_case, meta, w
 from torch.nn import functional
 
 from evaluators.extractors import MotionCLIPExtractor
-from evaluators.extractors.motion_clip import MotionCLIP, MotionCLIPTask, PooledLoss, info_nce, our_names
-from evaluators.extractors.motion_clip_calibrated import CalibratedMotionCLIPTask, calibration_error, noisy_copies
+from evaluators.extractors.motion_clip import (
+    MotionCLIP,
+    MotionCLIPTask,
+    PooledLoss,
+    info_nce,
+    our_names,
+)
+from evaluators.extractors.motion_clip_calibrated import (
+    CalibratedMotionCLIPTask,
+    calibration_error,
+    noisy_copies,
+)
 from flame_mdm.__main__ import main
 from flame_mdm.batch import length_mask
 from flame_mdm.checkpoints.hub import export
@@ -28,7 +38,14 @@ from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.smpl import SMPL
 from flame_mdm.runs import read_history
 
-SMALL = {"latent_dim": 16, "ff_size": 24, "num_layers": 2, "num_heads": 4, "embedding_dim": 8, "max_frames": 20}
+SMALL = {
+    "latent_dim": 16,
+    "ff_size": 24,
+    "num_layers": 2,
+    "num_heads": 4,
+    "embedding_dim": 8,
+    "max_frames": 20,
+}
 
 
 def network(in_features: int = 7, **options) -> MotionCLIP:
@@ -40,17 +57,33 @@ def network(in_features: int = 7, **options) -> MotionCLIP:
 def test_released_weights_give_the_authors_outputs(stem):
     arrays = golden(stem)
     state = our_names(weights(arrays) | {"text_model.encoder.weight": torch.zeros(1)})
-    (embedding, texts), (width, features) = state["text_projection.weight"].shape, state["input.weight"].shape
-    sizes: dict[str, Any] = {"latent_dim": width, "ff_size": len(state["transformer.layers.0.feed_forward.0.weight"])}
-    sizes["num_layers"] = len({name.split(".")[2] for name in state if name.startswith("transformer.layers.")})
-    sizes |= {"num_heads": meta(arrays)["config"]["heads"], "max_frames": len(state["length_embedding.weight"])}
-    clip = MotionCLIP(features, texts, dropout=0.1, embedding_dim=embedding, blind_features=3, **sizes)  # type: ignore[arg-type]
+    (embedding, texts), (width, features) = (
+        state["text_projection.weight"].shape,
+        state["input.weight"].shape,
+    )
+    sizes: dict[str, Any] = {
+        "latent_dim": width,
+        "ff_size": len(state["transformer.layers.0.feed_forward.0.weight"]),
+    }
+    sizes["num_layers"] = len(
+        {name.split(".")[2] for name in state if name.startswith("transformer.layers.")}
+    )
+    sizes |= {
+        "num_heads": meta(arrays)["config"]["heads"],
+        "max_frames": len(state["length_embedding.weight"]),
+    }
+    clip = MotionCLIP(
+        features, texts, dropout=0.1, embedding_dim=embedding, blind_features=3, **sizes
+    )  # type: ignore[arg-type]
     load_strictly(clip, state, stem)
     x = torch.from_numpy(arrays["in/motion"]).transpose(1, 2)
     mask = length_mask(torch.from_numpy(arrays["in/motion_length"]), x.shape[1])
     with torch.no_grad():
         motion, text = clip(x, mask), clip.text(torch.from_numpy(arrays["lm/pooler_output"]))
-        unit_motion, unit_text = functional.normalize(motion, dim=1), functional.normalize(text, dim=1)
+        unit_motion, unit_text = (
+            functional.normalize(motion, dim=1),
+            functional.normalize(text, dim=1),
+        )
         logits = clip.logit_scale.exp() * unit_motion @ unit_text.T
         ours = {
             "motion_feat": motion,
@@ -65,7 +98,9 @@ def test_released_weights_give_the_authors_outputs(stem):
     for name, value in ours.items():
         assert_within(value, arrays, f"out/{name}")
     # The temperature starts where the authors start it.
-    assert network().logit_scale.item() == pytest.approx(float(arrays["state_init/logit_scale"]), abs=1e-6)
+    assert network().logit_scale.item() == pytest.approx(
+        float(arrays["state_init/logit_scale"]), abs=1e-6
+    )
     assert network().logit_scale.item() == pytest.approx(math.log(1 / 0.07))
 
 
@@ -73,7 +108,11 @@ def released() -> dict[str, torch.Tensor]:
     """Random weights by the names and sizes of the released file."""
     manifest = json.loads((GOLDEN / "state_dict_manifest.json").read_text())["flame_mclip_net"]
     torch.manual_seed(0)
-    shapes = {name: shape for name, shape in manifest["keys"].items() if not name.startswith("text_model.")}
+    shapes = {
+        name: shape
+        for name, shape in manifest["keys"].items()
+        if not name.startswith("text_model.")
+    }
     shapes |= {"text_model.pooler.dense.weight": [768, 768], "text_model.pooler.dense.bias": [768]}
     state = {name: 0.05 * torch.randn(shape) for name, shape in shapes.items()}
     return state | {"text_model.embeddings.word_embeddings.weight": torch.randn(5, 768)}
@@ -84,9 +123,17 @@ def test_the_recipe_takes_every_weight_of_the_released_network(stem):
     recipe = compose("motion_clip/humanml3d_smpl")["task"]["network"]
     ours, state = instantiate(recipe, in_features=147, text_features=768), released()
     load_strictly(ours, our_names(state), "released")
-    assert (ours.blind_features, ours.transformer.layers[0].self_attention.num_heads, recipe["dropout"]) == (3, 8, 0.1)
+    assert (
+        ours.blind_features,
+        ours.transformer.layers[0].self_attention.num_heads,
+        recipe["dropout"],
+    ) == (3, 8, 0.1)
     with pytest.raises(UserError, match="released"):
-        load_strictly(ours, our_names({k: v for k, v in state.items() if k != "lm_projection.bias"}), "released")
+        load_strictly(
+            ours,
+            our_names({k: v for k, v in state.items() if k != "lm_projection.bias"}),
+            "released",
+        )
     with pytest.raises(ValueError, match="unknown keys extra"):
         our_names({**state, "extra": torch.zeros(1)})
 
@@ -96,7 +143,9 @@ def test_the_recipe_takes_every_weight_of_the_released_network(stem):
 def test_the_released_file_becomes_an_extractor(stem, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("FLAME_MDM_DATA", str(tmp_path / "own"))
     file, out, state = tmp_path / "mclip.ckpt", tmp_path / "mclip.safetensors", released()
-    torch.save({"state_dict": {f"net.{name}": value for name, value in state.items()}, "epoch": 3}, file)
+    torch.save(
+        {"state_dict": {f"net.{name}": value for name, value in state.items()}, "epoch": 3}, file
+    )
     with pytest.raises(UserError, match=r"mclip\.ckpt: not a checkpoint .* `flame-mdm import`"):
         MotionCLIPExtractor(str(file))
     assert main(["import", "mclip", str(file), f"out={out}"]) == 0, capsys.readouterr().err
@@ -111,52 +160,84 @@ def test_the_released_file_becomes_an_extractor(stem, tmp_path, monkeypatch, cap
     assert isinstance(condition, PretrainedText)
     assert torch.equal(condition.pooler_weight, state["text_model.pooler.dense.weight"])
     assert torch.equal(condition.pooler_bias, state["text_model.pooler.dense.bias"])
-    assert all(torch.equal(value, clip.state_dict()[name]) for name, value in our_names(state).items())
+    assert all(
+        torch.equal(value, clip.state_dict()[name]) for name, value in our_names(state).items()
+    )
 
-    torch.save({"state_dict": {f"net.{k}": v for k, v in state.items() if k != "text_model.pooler.dense.bias"}}, file)
+    torch.save(
+        {
+            "state_dict": {
+                f"net.{k}": v for k, v in state.items() if k != "text_model.pooler.dense.bias"
+            }
+        },
+        file,
+    )
     assert main(["import", "mclip", str(file), f"out={out}"]) == 1
-    assert re.search(r"mclip\.ckpt: .*not the weights of PretrainedText: .*pooler_bias", capsys.readouterr().err)
+    assert re.search(
+        r"mclip\.ckpt: .*not the weights of PretrainedText: .*pooler_bias", capsys.readouterr().err
+    )
 
 
 @pytest.mark.parametrize("roughness", [False, True])
 def test_padding_and_company_do_not_change_features(roughness):
-    clip, x, lengths = network(roughness=roughness), torch.randn(3, 20, 7), torch.tensor([20, 13, 1])
+    clip, x, lengths = (
+        network(roughness=roughness),
+        torch.randn(3, 20, 7),
+        torch.tensor([20, 13, 1]),
+    )
     together = clip(x, length_mask(lengths))
     for row, length in enumerate(lengths.tolist()):
         alone = clip(x[row : row + 1, :length], torch.ones(1, length, dtype=torch.bool))
         torch.testing.assert_close(alone[0], together[row], atol=1e-5, rtol=1e-5)
-    clip(torch.zeros(1, 25, 7), length_mask(torch.tensor([20]), 25))  # padded beyond the table of lengths
+    # Padded beyond the table of lengths
+    clip(torch.zeros(1, 25, 7), length_mask(torch.tensor([20]), 25))
     with pytest.raises(UserError, match=r"21 frames, but this motion-CLIP takes at most 20"):
         clip(torch.zeros(1, 21, 7), length_mask(torch.tensor([21])))
 
 
 def test_the_loss_with_hard_negatives_is_that_of_a_loop():
     generator = torch.Generator().manual_seed(5)
-    motion, text = (functional.normalize(torch.randn(6, 8, generator=generator), dim=1) for _ in range(2))
+    motion, text = (
+        functional.normalize(torch.randn(6, 8, generator=generator), dim=1) for _ in range(2)
+    )
     meaning = torch.tensor([[1, 10], [2, 20], [3, 30], [1, 40], [4, 50], [5, 20]])
     wrong, scale = functional.normalize(torch.randn(6, 2, 8, generator=generator), dim=2), 7.0
     total = 0.0
     for i in range(6):
         others = [j for j in range(6) if not (meaning[i] == meaning[j]).any()]
         own = math.exp(scale * float(motion[i] @ text[i]))
-        texts = [float(motion[i] @ text[j]) for j in others] + [float(motion[i] @ near) for near in wrong[i]]
+        texts = [float(motion[i] @ text[j]) for j in others] + [
+            float(motion[i] @ near) for near in wrong[i]
+        ]
         motions = [float(text[i] @ motion[j]) for j in others]
         for negatives in (texts, motions):
-            total -= math.log(own / (own + sum(math.exp(scale * cosine) for cosine in negatives))) / 12
+            total -= (
+                math.log(own / (own + sum(math.exp(scale * cosine) for cosine in negatives))) / 12
+            )
     # Pairs 0 and 3 share the first number, 1 and 5 the second.
-    loss = info_nce(2 * motion, text, torch.tensor(math.log(scale)), meaning=meaning, wrong_text=3 * wrong)
+    loss = info_nce(
+        2 * motion, text, torch.tensor(math.log(scale)), meaning=meaning, wrong_text=3 * wrong
+    )
     assert loss.item() == pytest.approx(total, rel=1e-5)
 
 
 def test_the_validation_loss_is_that_of_pools():
     """Pairs are given in disorder; the last 6 of 70 are compared with the last 32."""
     torch.manual_seed(0)
-    motion, text, order, metric = torch.randn(70, 8), torch.randn(70, 8), torch.randperm(70), PooledLoss()
+    motion, text, order, metric = (
+        torch.randn(70, 8),
+        torch.randn(70, 8),
+        torch.randperm(70),
+        PooledLoss(),
+    )
     metric.update(motion[order], text[order], order, torch.tensor(5.0))
     terms = []
     for pool, new in ((slice(0, 32), 32), (slice(32, 64), 32), (slice(38, 70), 6)):
         logits, own = (5 * motion[pool] @ text[pool].T).double(), torch.arange(32)
-        ways = [functional.cross_entropy(table, own, reduction="none")[-new:] for table in (logits, logits.T)]
+        ways = [
+            functional.cross_entropy(table, own, reduction="none")[-new:]
+            for table in (logits, logits.T)
+        ]
         terms.append((ways[0] + ways[1]) / 2)
     assert metric.compute() == pytest.approx(torch.cat(terms).mean().item(), rel=1e-6)
 
@@ -168,7 +249,9 @@ def test_roughness_alone_sees_noise_and_no_steady_change():
     steady = torch.linspace(0, 3, 20)[:, None] * torch.randn(2, 1, 7)
     mask = torch.ones(2, 20, dtype=torch.bool)
     torch.testing.assert_close(clip(steady, mask), clip(0 * steady, mask), atol=1e-4, rtol=0)
-    assert not torch.allclose(clip(steady + 0.1 * torch.randn(2, 20, 7), mask), clip(steady, mask), atol=1e-3)
+    assert not torch.allclose(
+        clip(steady + 0.1 * torch.randn(2, 20, 7), mask), clip(steady, mask), atol=1e-3
+    )
 
 
 def test_the_calibration_error_compares_distances_of_unit_vectors():
@@ -179,7 +262,11 @@ def test_the_calibration_error_compares_distances_of_unit_vectors():
 
 
 def walks(count: int) -> list[torch.Tensor]:
-    clips = (clip for clip in Synthetic(clips=60, seed=1).clips(20.0) if clip.attributes["action"] == "walk")
+    clips = (
+        clip
+        for clip in Synthetic(clips=60, seed=1).clips(20.0)
+        if clip.attributes["action"] == "walk"
+    )
     return [torch.from_numpy(clip.motion) for clip in islice(clips, count)]
 
 
@@ -188,14 +275,18 @@ def test_noisy_copies_have_noise_of_the_stated_strength():
     encoded = representation.encode_many(walks(6))
     representation.mean.copy_(encoded[0].mean(0))
     lengths = torch.tensor([len(x) for x in encoded])
-    x = torch.nn.utils.rnn.pad_sequence([representation.normalize(x) for x in encoded], batch_first=True)
+    x = torch.nn.utils.rnn.pad_sequence(
+        [representation.normalize(x) for x in encoded], batch_first=True
+    )
     real = length_mask(lengths)
     copies = noisy_copies(representation, x, lengths, torch.zeros(6))
     assert torch.equal(copies[3:], x[3:])
     assert not copies[~real].any()
     joints = representation.to_joints(x)
     before_last = real & length_mask(lengths - 1, x.shape[1])
-    torch.testing.assert_close(representation.to_joints(copies)[before_last], joints[before_last], atol=1e-4, rtol=0)
+    torch.testing.assert_close(
+        representation.to_joints(copies)[before_last], joints[before_last], atol=1e-4, rtol=0
+    )
 
     torch.manual_seed(4)
     copies = noisy_copies(representation, x, lengths, torch.full((6,), 0.5))
@@ -210,17 +301,34 @@ def test_noisy_copies_have_noise_of_the_stated_strength():
 
 def test_only_representations_of_joints_are_calibrated():
     config = compose("motion_clip/synthetic_calibrated")
-    with pytest.raises(UserError, match=r"representation=smpl147: CalibratedMotionCLIPTask adds noise to joints"):
+    with pytest.raises(
+        UserError, match=r"representation=smpl147: CalibratedMotionCLIPTask adds noise to joints"
+    ):
         CalibratedMotionCLIPTask.build(config, SMPL())
 
 
-RUN = ["data.source.clips=1100", "data.batch_size=32", "condition=learned", "condition.features=32", "logger=csv"]
-RUN += ["trainer.accelerator=cpu", "trainer.enable_progress_bar=false", "trainer.log_every_n_steps=5"]
-RUN += [f"task.network.{size}" for size in ("latent_dim=32", "ff_size=32", "num_layers=1", "embedding_dim=16")]
+RUN = [
+    "data.source.clips=1100",
+    "data.batch_size=32",
+    "condition=learned",
+    "condition.features=32",
+    "logger=csv",
+]
+RUN += [
+    "trainer.accelerator=cpu",
+    "trainer.enable_progress_bar=false",
+    "trainer.log_every_n_steps=5",
+]
+RUN += [
+    f"task.network.{size}"
+    for size in ("latent_dim=32", "ff_size=32", "num_layers=1", "embedding_dim=16")
+]
 
 
 @pytest.mark.slow
-def test_training_by_recipe_learns_to_retrieve_and_its_checkpoint_is_a_feature_extractor(tmp_path, data_root):
+def test_training_by_recipe_learns_to_retrieve_and_its_checkpoint_is_a_feature_extractor(
+    tmp_path, data_root
+):
     options = [f"data_root={data_root}/clip", f"run.dir={tmp_path / 'run'}", "trainer.max_steps=90"]
     options += ["trainer.val_check_interval=30", "optimizer.lr=0.003"]
     assert main(["train", "motion_clip/synthetic", *RUN, *options]) == 0
@@ -239,7 +347,9 @@ def test_training_by_recipe_learns_to_retrieve_and_its_checkpoint_is_a_feature_e
     features = task(task.representation.denormalize(x), mask)
     assert features.shape == (2, task.network.output.out_features)
     torch.testing.assert_close(features, task.network(x, mask), atol=1e-4, rtol=1e-4)
-    texts = task.text(["a person walks forward", "a person waves with the left hand", "a person walks forward"])
+    texts = task.text(
+        ["a person walks forward", "a person waves with the left hand", "a person walks forward"]
+    )
     assert torch.equal(texts[0], texts[2])
     assert not torch.allclose(texts[0], texts[1], atol=1e-3)
     facts = read_checkpoint(trained)["facts"]
@@ -248,7 +358,10 @@ def test_training_by_recipe_learns_to_retrieve_and_its_checkpoint_is_a_feature_e
     with pytest.raises(UserError, match=r"last\.ckpt: holds a motion-CLIP, not a motion generator"):
         load(trained)
 
-    own, exported = MotionCLIPExtractor(str(trained)), MotionCLIPExtractor(str(export(trained, tmp_path)))
+    own, exported = (
+        MotionCLIPExtractor(str(trained)),
+        MotionCLIPExtractor(str(export(trained, tmp_path))),
+    )
     assert exported.sha256 == own.sha256
     halves = MotionCLIPExtractor(str(export(trained, tmp_path / "half.safetensors", half=True)))
     assert halves.sha256 != exported.sha256
@@ -257,16 +370,23 @@ def test_training_by_recipe_learns_to_retrieve_and_its_checkpoint_is_a_feature_e
 @pytest.mark.slow
 def test_a_calibrated_run_resumes_exactly(tmp_path, data_root, capsys):
     """Checkpoints after four steps at once, and after two and two, are equal; 32 captions are too few to retrieve."""
-    options = [f"data_root={data_root}/few", "trainer.val_check_interval=2", "callbacks.checkpoints.every_n_steps=2"]
+    options = [
+        f"data_root={data_root}/few",
+        "trainer.val_check_interval=2",
+        "callbacks.checkpoints.every_n_steps=2",
+    ]
     options += ["data.source.clips=60", "data.batch_size=8"]
     weights = []
     for stops in ((4,), (2, 4)):
         folder = tmp_path / str(len(stops))
         for steps in stops:
-            logger = ["logger=csv"] if stops == (4,) else []  # a resumed run would overwrite its file
+            # A resumed run would overwrite its file
+            logger = ["logger=csv"] if stops == (4,) else []
             words = [word for word in RUN if word != "logger=csv"] + options + logger
             command = ["train", "motion_clip/synthetic_calibrated", *words]
-            assert main([*command, f"run.dir={folder}", f"trainer.max_steps={steps}"]) == 0, capsys.readouterr().err
+            assert main([*command, f"run.dir={folder}", f"trainer.max_steps={steps}"]) == 0, (
+                capsys.readouterr().err
+            )
         weights.append(read_checkpoint(folder / "checkpoints" / "last.ckpt")["state_dict"])
     curves = read_history(tmp_path / "1")
     assert "val/loss" in curves

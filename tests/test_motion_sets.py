@@ -74,7 +74,9 @@ def test_a_motion_on_a_root_is_the_same_motion(walk: GroundedMotion):
     np.testing.assert_allclose(cut.local, walk.local[10:31])
 
 
-def test_a_walk_becomes_a_start_a_loop_and_a_stop_that_fit_together(walk: GroundedMotion, parts: list[GroundedMotion]):
+def test_a_walk_becomes_a_start_a_loop_and_a_stop_that_fit_together(
+    walk: GroundedMotion, parts: list[GroundedMotion]
+):
     start, loop, stop = parts
     np.testing.assert_array_equal(loop.local[-1], loop.local[0])
     np.testing.assert_allclose(start.local[-1], loop.local[0], atol=1e-5)
@@ -139,7 +141,9 @@ def model() -> flame_mdm.MotionGenerator:
 def small(model: flame_mdm.MotionGenerator, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a small set of synthetic motions, so that tests do not depend on what a model has learned."""
 
-    def generate(model: flame_mdm.MotionGenerator, text: str, *, samples: int, **options: Any) -> list[Motion]:
+    def generate(
+        model: flame_mdm.MotionGenerator, text: str, *, samples: int, **options: Any
+    ) -> list[Motion]:
         return [with_features(model.representation, synthetic(text)) for _ in range(samples)]
 
     folder = tmp_path_factory.mktemp("small")
@@ -154,21 +158,27 @@ def small(model: flame_mdm.MotionGenerator, tmp_path_factory: pytest.TempPathFac
 
 def described(folder: Path) -> dict[str, Any]:
     """The entries of `set.json` by name."""
-    return {entry["name"]: entry for entry in json.loads((folder / "set.json").read_text())["clips"]}
+    return {
+        entry["name"]: entry for entry in json.loads((folder / "set.json").read_text())["clips"]
+    }
 
 
 def test_a_set_has_files_with_a_path_and_in_place_and_a_description(small: Path):
     clips = described(small)
     assert list(clips) == ["Idle", "Walk_Start", "Walk_Loop", "Walk_Stop", "Turn"]
     names = [f"Hero_{name}{end}.fbx" for name in clips for end in ("", "_InPlace")]
-    assert sorted(path.name for path in small.iterdir()) == sorted([*names, "player.html", "set.json", "set.png"])
+    assert sorted(path.name for path in small.iterdir()) == sorted(
+        [*names, "player.html", "set.json", "set.png"]
+    )
     content = json.loads((small / "set.json").read_text())
     assert "goes steadily in the direction of 90 degrees" in content["left_out"]["Strafe"]
 
     loop = clips["Walk_Loop"]
     assert loop["closure"]["meters"] < CENTIMETER
     assert loop["closure"]["degrees"] < 2
-    moving, still = (fbx_scene.read(small / loop["files"][key]) for key in ("root_motion", "in_place"))
+    moving, still = (
+        fbx_scene.read(small / loop["files"][key]) for key in ("root_motion", "in_place")
+    )
     assert len(still.positions) == len(moving.positions) == loop["frames"]
     root = moving.names.index("root")
     travel = moving.positions[-1, root] - moving.positions[0, root]
@@ -177,14 +187,20 @@ def test_a_set_has_files_with_a_path_and_in_place_and_a_description(small: Path)
     # in place is the same motion without the path
     bones = [number for number, name in enumerate(still.names) if name != "person"]
     shift = moving.positions[:, root : root + 1] - still.positions[:, root : root + 1]
-    np.testing.assert_allclose((moving.positions - shift)[:, bones], still.positions[:, bones], atol=1e-4)
+    np.testing.assert_allclose(
+        (moving.positions - shift)[:, bones], still.positions[:, bones], atol=1e-4
+    )
 
 
 def test_contacts_are_in_the_description_and_markers_in_the_files(small: Path, tmp_path: Path):
     start = described(small)["Walk_Start"]
     objects = fbx.read(small / start["files"]["root_motion"]).first("Objects")
     assert objects is not None
-    curves = [node for node in objects.all("AnimationCurveNode") if "LeftFootContact" in node.properties[1]]
+    curves = [
+        node
+        for node in objects.all("AnimationCurveNode")
+        if "LeftFootContact" in node.properties[1]
+    ]
     assert len(curves) == 1
     events = start["contacts"]
     assert {event["event"] for event in events} == {"plant", "lift"}
@@ -208,7 +224,10 @@ def test_a_rig_without_a_root_moves_its_hips(tmp_path: Path):
     for name, variant in (("moving", clip.on_path(motion.path, motion.heading)), ("still", clip)):
         motion_sets.WRITERS["glb"](tmp_path / f"{name}.glb", variant)
         read = glb_animation.read(tmp_path / f"{name}.glb")
-        left, right = (read.positions[:, read.names.index(f"mixamorig:{side}UpLeg")] for side in ("Left", "Right"))
+        left, right = (
+            read.positions[:, read.names.index(f"mixamorig:{side}UpLeg")]
+            for side in ("Left", "Right")
+        )
         across.append(left - right)
         if name == "moving":
             middle = (left + right)[:, [0, 2]] / 2
@@ -230,7 +249,9 @@ def test_a_rig_without_a_root_moves_its_hips(tmp_path: Path):
         ({"fps: 30": "rig: unrael"}, "Did you mean unreal"),
     ],
 )
-def test_an_invalid_description_is_refused_in_one_line(change, message, tmp_path, monkeypatch, capsys):
+def test_an_invalid_description_is_refused_in_one_line(
+    change, message, tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
     text = SMALL
     for before, after in change.items():
@@ -245,14 +266,19 @@ def test_an_invalid_description_is_refused_in_one_line(change, message, tmp_path
     ("words", "message"),
     [
         (["set=locomotoin"], "no such set. Did you mean locomotion?"),
-        (["set=locomotion", "text=a person walks"], "text=a person walks: a set says what is sampled"),
+        (
+            ["set=locomotion", "text=a person walks"],
+            "text=a person walks: a set says what is sampled",
+        ),
         (["set=locomotion", "samples=2"], "samples=2: a set says what is sampled"),
         (["set=locomotion", "out=walk.fbx"], "out=walk.fbx: a set is several files. Name a folder"),
         (["set=locomotion", "format=bvh"], 'format is "bvh"'),
         (["text=a person walks", "format=fbx"], "format=fbx is for sets"),
     ],
 )
-def test_keys_that_do_not_fit_a_set_are_refused(words: Sequence[str], message: str, tmp_path, monkeypatch, capsys):
+def test_keys_that_do_not_fit_a_set_are_refused(
+    words: Sequence[str], message: str, tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
     assert message in error_of(capsys, "sample", "quickstart", *words)
     assert list(tmp_path.iterdir()) == []
@@ -273,7 +299,9 @@ def test_the_locomotion_set_of_the_package_closes_its_loops_and_plants_its_feet(
     assert len(clips) == 20
     stand = fbx_scene.read(locomotion / clips["Idle"]["files"]["in_place"])
     for name, entry in clips.items():
-        moving, still = (fbx_scene.read(locomotion / entry["files"][key]) for key in ("root_motion", "in_place"))
+        moving, still = (
+            fbx_scene.read(locomotion / entry["files"][key]) for key in ("root_motion", "in_place")
+        )
         bones = [number for number, bone in enumerate(still.names) if bone != "person"]
         if entry["kind"] == "loop":
             closes = np.abs(still.positions[-1] - still.positions[0])[bones].max()
@@ -319,7 +347,10 @@ def test_in_three_the_clips_blend_without_sliding_feet(locomotion: Path, node_mo
         footprint = None
         for frame in scene["frames"]:
             shown = [(clips[item["name"]], round(item["time"] * fps)) for item in frame["playing"]]
-            stands = all(any(first <= time <= last for first, last in contacts(entry, name)) for entry, time in shown)
+            stands = all(
+                any(first <= time <= last for first, last in contacts(entry, name))
+                for entry, time in shown
+            )
             toe = np.array(frame["toes"][foot])[[0, 2]]
             footprint = (toe if footprint is None else footprint) if stands else None
             if footprint is not None:

@@ -63,7 +63,13 @@ OWN: dict[str, Callable[[Path], object]] = {
     "02_01.amc": _amc,
 }
 BUILDERS = {name: build for name, build in COLLECTED.items() if not name.endswith(".glb")} | OWN
-FEW = [("f01_stageii.npz", 0), ("f05_json_z_up.json", 1), ("f06_tpose_first.bvh", 2), ("ours.npy", 3), ("02_01.amc", 4)]
+FEW = [
+    ("f01_stageii.npz", 0),
+    ("f05_json_z_up.json", 1),
+    ("f06_tpose_first.bvh", 2),
+    ("ours.npy", 3),
+    ("02_01.amc", 4),
+]
 
 
 @cache
@@ -101,7 +107,9 @@ def of_bytes(content: bytes, draw: np.random.Generator) -> bytes:
     for _ in range(int(draw.integers(1, 6))):
         begin = int(draw.integers(len(changed)))
         changed[begin : begin + 8] = draw.bytes(int(draw.integers(12)))
-    return bytes(changed[: int(draw.integers(1, len(changed) + 1))] if draw.integers(4) == 0 else changed)
+    return bytes(
+        changed[: int(draw.integers(1, len(changed) + 1))] if draw.integers(4) == 0 else changed
+    )
 
 
 def of_arrays(content: bytes, draw: np.random.Generator) -> bytes:

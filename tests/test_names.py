@@ -106,7 +106,10 @@ def test_skeletons_of_other_programs_are_recognized(names: str, skeleton: str):
 @pytest.mark.parametrize(
     ("names", "candidates"),
     [
-        ([f"{person}:{name}" for person in ("A", "B") for name in MIXAMO], "Hips may be A:Hips or B:Hips"),
+        (
+            [f"{person}:{name}" for person in ("A", "B") for name in MIXAMO],
+            "Hips may be A:Hips or B:Hips",
+        ),
         ([*map(str.upper, MIXAMO), "Left_Leg"], "LeftLeg may be LEFTLEG or Left_Leg"),
     ],
 )
@@ -131,7 +134,11 @@ def test_the_side_is_marked_in_four_ways():
     assert set(left) == {"claviclel", "clavicleleft", "lclavicle", "leftclavicle"}
     assert set(right) == {"clavicler", "clavicleright", "rclavicle", "rightclavicle"}
     assert spelled({"lowerback": "lowerback"}) == {"lowerback": "lowerback"}
-    assert best_match(["Head"], {"a": {"neck": "neck"}, "b": {"head": "top"}}) == ("b", {"top": [0]}, [])
+    assert best_match(["Head"], {"a": {"neck": "neck"}, "b": {"head": "top"}}) == (
+        "b",
+        {"top": [0]},
+        [],
+    )
 
 
 @pytest.mark.parametrize("text", ["ROOT {name}\n", "ROOT {name} {{ "])
@@ -150,11 +157,16 @@ def test_names_of_bvh_files_are_the_rest_of_the_line(text: str, tmp_path: Path):
 def test_the_unit_and_the_axis_of_a_small_figure_that_lies_are_proposed_together(tmp_path: Path):
     synthetic().save(tmp_path / "a.bvh", rig="mixamo")
     file = bvh.read(tmp_path / "a.bvh")
-    turned = replace(file, joints=("Top", *file.joints), parents=(-1, *(parent + 1 for parent in file.parents)))
+    turned = replace(
+        file, joints=("Top", *file.joints), parents=(-1, *(parent + 1 for parent in file.parents))
+    )
     turned = replace(turned, offsets=np.concatenate([np.zeros((1, 3)), 0.26 * file.offsets]))
     turned = replace(turned, channels=(("Xrotation",), *file.channels))
     body = np.concatenate([0.26 * file.frames[:, :3], file.frames[:, 3:]], 1)
-    bvh.write(replace(turned, frames=np.concatenate([np.full((len(body), 1), 90.0), body], 1)), tmp_path / "b.bvh")
+    bvh.write(
+        replace(turned, frames=np.concatenate([np.full((len(body), 1), 90.0), body], 1)),
+        tmp_path / "b.bvh",
+    )
     with pytest.raises(UserError, match=r"0\.0\d+ gives the usual legs of 0\.83 m.* set up=z"):
         read(tmp_path / "b.bvh")
 
@@ -168,11 +180,15 @@ def test_layouts_that_fit_the_joints_of_another_equally_well_give_the_same_joint
         match = best_match(joints, {key: skeleton})
         if match.missing or len(match.numbers) < len(joints):
             continue
-        other = _variants()[key].model_copy(update={"unit": layout.unit, "mirrored": layout.mirrored})
+        other = _variants()[key].model_copy(
+            update={"unit": layout.unit, "mirrored": layout.mirrored}
+        )
         names = [""] * len(joints)
         for joint, (number,) in match.numbers.items():
             names[number] = joint
-        np.testing.assert_allclose(other.apply(positions, names), layout.apply(positions, joints), atol=1e-6)
+        np.testing.assert_allclose(
+            other.apply(positions, names), layout.apply(positions, joints), atol=1e-6
+        )
 
 
 def test_a_unit_is_proposed_for_figures_that_have_no_usual_one():

@@ -15,7 +15,9 @@ def clip(name: str, captions: list[str], **attributes: str | int | list[str]) ->
 
 def bandai(content: str, style: str, dataset: int = 2) -> Entry:
     side = side_of(content)
-    facts = {"content": content, "style": style, "dataset": dataset} | ({"side": side} if side else {})
+    facts = {"content": content, "style": style, "dataset": dataset} | (
+        {"side": side} if side else {}
+    )
     return clip(f"{content}-{style}-{dataset}", bandai_captions(content, style, side), **facts)
 
 
@@ -29,7 +31,10 @@ def test_attributes_of_one_clip_alone_do_not_matter():
         {"direction": ["walks forward quickly", "walks forward slowly"]},
     ]
     slow = clip("a", ["walks slowly"], action="walk", speed="slow")
-    assert near_misses([slow, clip("b", ["walks"], action="walk", speed="normal")]) == [{}, {"speed": ["walks slowly"]}]
+    assert near_misses([slow, clip("b", ["walks"], action="walk", speed="normal")]) == [
+        {},
+        {"speed": ["walks slowly"]},
+    ]
 
 
 def test_texts_differ_from_all_captions_of_the_same_attributes():
@@ -42,8 +47,16 @@ def test_texts_differ_from_all_captions_of_the_same_attributes():
 
 
 def test_the_action_of_bandai_contains_no_side():
-    clips = [bandai(f"wave-{hands}", style) for hands in ("left-hand", "both-hands") for style in ("angry", "active")]
-    clips += [bandai("raise-up-left-hand", "angry"), bandai("walk-left", "angry"), bandai("walk", "angry", 1)]
+    clips = [
+        bandai(f"wave-{hands}", style)
+        for hands in ("left-hand", "both-hands")
+        for style in ("angry", "active")
+    ]
+    clips += [
+        bandai("raise-up-left-hand", "angry"),
+        bandai("walk-left", "angry"),
+        bandai("walk", "angry", 1),
+    ]
     left = near_misses(clips)[0]
     assert set(left) == {"side", "style"}
     assert left["side"] == sorted(clips[2].captions)
@@ -53,7 +66,9 @@ def test_the_action_of_bandai_contains_no_side():
 
 def test_one_style_in_both_sets_of_bandai_and_clips_without_an_action_have_no_near_misses():
     assert near_misses([bandai("walk", "feminine", 1), bandai("walk", "feminine", 2)]) == [{}, {}]
-    assert near_misses([clip("a", ["x"], side="left"), clip("b", ["y"], side="right", tokens=["y/VERB"])]) == [{}, {}]
+    assert near_misses(
+        [clip("a", ["x"], side="left"), clip("b", ["y"], side="right", tokens=["y/VERB"])]
+    ) == [{}, {}]
 
 
 def test_near_misses_of_synthetic_clips_state_wrong_attributes():
@@ -66,4 +81,7 @@ def test_near_misses_of_synthetic_clips_state_wrong_attributes():
         for name, text in ((name, text) for name, texts in wrong.items() for text in texts):
             shared = own.attributes.keys() & states[text].keys()
             assert [key for key in shared if states[text][key] != own.attributes[key]] == [name]
-    assert near_misses([replace(entry, id=f"other {entry.id}") for entry in reversed(clips)])[::-1] == texts_of
+    assert (
+        near_misses([replace(entry, id=f"other {entry.id}") for entry in reversed(clips)])[::-1]
+        == texts_of
+    )

@@ -37,11 +37,22 @@ from flame_mdm.safe_io import read_yaml
 from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.seeds import key, seeded_noise
 
-SIZES = {"latent_dim": 16, "ff_size": 24, "num_layers": 1, "num_heads": 2, "channels": [8, 16], "num_groups": 4}
+SIZES = {
+    "latent_dim": 16,
+    "ff_size": 24,
+    "num_layers": 1,
+    "num_heads": 2,
+    "channels": [8, 16],
+    "num_groups": 4,
+}
 RECIPES = sorted((ROOT / "experiments" / "denoiser").glob("*.yaml"))
-NETWORKS = {read_yaml(path)["_target_"]: path.stem for path in RECIPES}  # one recipe of each class of denoisers
+# One recipe of each class of denoisers
+NETWORKS = {read_yaml(path)["_target_"]: path.stem for path in RECIPES}
 CONDITIONS = {"MDMEncoder": "action", "MDMUNet": "none"}  # those of other classes are texts
-VARIANTS = [(name, CONDITIONS.get(target.rpartition(".")[2], "learned")) for target, name in NETWORKS.items()]
+VARIANTS = [
+    (name, CONDITIONS.get(target.rpartition(".")[2], "learned"))
+    for target, name in NETWORKS.items()
+]
 VARIANTS += [("mdm_decoder_token", "learned"), ("mfm_encoder_tokens", "learned")]
 TEXT = "a person kicks twice with the left leg"
 NOTHING = Condition(torch.zeros(1, 0), torch.zeros(1, 0, 0), None)
@@ -65,12 +76,30 @@ def followed(plan: list[list[float]], clip: bool, noise: Any) -> Tensor:
     return x
 
 
-DIFFUSION = [("ancestral", {}), ("ddim", {}), ("ddim", {"eta": 0.7}), ("dpm_solver_pp_2m", {}), ("consistency", {})]
+DIFFUSION = [
+    ("ancestral", {}),
+    ("ddim", {}),
+    ("ddim", {"eta": 0.7}),
+    ("dpm_solver_pp_2m", {}),
+    ("consistency", {}),
+]
 FLOW = ("euler", "midpoint", "heun", "consistency")
 CASES = [
-    *((GaussianDiffusion(50, prediction=p), name, options) for p in ("x0", "epsilon") for name, options in DIFFUSION),
-    (GaussianDiffusion(50, prediction="velocity", variance="fixed_large", clip_x0=True), "ancestral", {}),
-    (GaussianDiffusion(50, variance="learned_range"), "ddim", {"spacing": "stride", "num_inference_steps": 10}),
+    *(
+        (GaussianDiffusion(50, prediction=p), name, options)
+        for p in ("x0", "epsilon")
+        for name, options in DIFFUSION
+    ),
+    (
+        GaussianDiffusion(50, prediction="velocity", variance="fixed_large", clip_x0=True),
+        "ancestral",
+        {},
+    ),
+    (
+        GaussianDiffusion(50, variance="learned_range"),
+        "ddim",
+        {"spacing": "stride", "num_inference_steps": 10},
+    ),
     (GaussianDiffusion(50), "ancestral", {"num_inference_steps": [0, 3, 20, 49]}),
     *((FlowMatching(prediction=p), name, {}) for p in ("velocity", "x0") for name in FLOW),
     (FlowMatching(quantize_time=True, odeint_grid=True), "euler", {}),
@@ -87,7 +116,9 @@ def test_a_plan_leads_to_the_motion_of_the_sampler() -> None:
         plan = onnx.sampling_plan(process, requested)
         assert np.shape(plan)[1] == 7
         ours = followed(plan, getattr(process, "clip_x0", False), noise)
-        torch.testing.assert_close(ours, expected, atol=1e-9, rtol=1e-7, msg=f"{process} {requested}")
+        torch.testing.assert_close(
+            ours, expected, atol=1e-9, rtol=1e-7, msg=f"{process} {requested}"
+        )
     for process, sampler, says in (
         (GaussianDiffusion(50, variance="learned_range"), "ancestral", "learned variance"),
         (FlowMatching(), "rk4", "combines more than two"),
@@ -103,10 +134,14 @@ def test_noise_and_words_of_the_runner_are_those_of_the_package() -> None:
     number = runner.key("noise", 3, 0, "a person walks#0")
     assert number == key("noise", 3, 0, "a person walks#0")
     for draw in (0, 1, 49):
-        np.testing.assert_allclose(runner.normal(number + draw, 60, 263), noise(draw)[0].numpy(), atol=2e-6)
+        np.testing.assert_allclose(
+            runner.normal(number + draw, 60, 263), noise(draw)[0].numpy(), atol=2e-6
+        )
     text = "Él kicks, twice: a_b don't"
     assert runner.words(text) == vocabulary.words(text)
-    assert all(runner.hashed(word, 97) == vocabulary.hashed(word, 97) for word in runner.words(text))
+    assert all(
+        runner.hashed(word, 97) == vocabulary.hashed(word, 97) for word in runner.words(text)
+    )
 
 
 def tiny(name: str, condition: str) -> MotionGenerator:
@@ -114,19 +149,31 @@ def tiny(name: str, condition: str) -> MotionGenerator:
     config = dict(recipe("quickstart"))
     denoiser: Any = read_yaml(ROOT / "experiments" / "denoiser" / f"{name}.yaml")
     config["denoiser"] = denoiser | {key: value for key, value in SIZES.items() if key in denoiser}
-    target = {"learned": "tokens.LearnedTokens", "action": "action.ActionLabels", "none": "Unconditional"}[condition]
-    sizes = {"learned": {"features": 16, "buckets": 50, "max_words": 8}, "action": {"features": 16}, "none": {}}
+    target = {
+        "learned": "tokens.LearnedTokens",
+        "action": "action.ActionLabels",
+        "none": "Unconditional",
+    }[condition]
+    sizes = {
+        "learned": {"features": 16, "buckets": 50, "max_words": 8},
+        "action": {"features": 16},
+        "none": {},
+    }
     config["condition"] = {"_target_": f"flame_mdm.conditions.{target}", **sizes[condition]}
     config["representation"] = {"_target_": "flame_mdm.representations.essential.Essential"}
     torch.manual_seed(0)
-    model = MotionGenerator.build(config, instantiate(config["representation"]), actions=["walk", "run", "sit"])
+    model = MotionGenerator.build(
+        config, instantiate(config["representation"]), actions=["walk", "run", "sit"]
+    )
     model.facts |= {"max_frames": 20}
     return model.eval()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "condition"), VARIANTS)
-def test_graphs_of_each_denoiser_compute_what_pytorch_does(name: str, condition: str, tmp_path: Path) -> None:
+def test_graphs_of_each_denoiser_compute_what_pytorch_does(
+    name: str, condition: str, tmp_path: Path
+) -> None:
     import onnxruntime
 
     model = tiny(name, condition)
@@ -137,7 +184,10 @@ def test_graphs_of_each_denoiser_compute_what_pytorch_does(name: str, condition:
         for batch, frames, words in ((1, 4, 3), (3, 17, 9)):
             frames = 20 if isinstance(model.denoiser, onnx.FIXED_LENGTH) else frames
             lengths = torch.randint(2, frames + 1, (batch,))
-            x_t, t = torch.randn(batch, frames, model.representation.features), torch.rand(batch) * 999
+            x_t, t = (
+                torch.randn(batch, frames, model.representation.features),
+                torch.rand(batch) * 999,
+            )
             inputs = {"x_t": x_t, "t": t, "lengths": lengths}
             if condition == "learned":
                 inputs["condition"] = torch.randint(50, (batch, words, 2))
@@ -145,7 +195,9 @@ def test_graphs_of_each_denoiser_compute_what_pytorch_does(name: str, condition:
             elif condition == "action":
                 inputs["condition"] = torch.arange(batch)
             expected = graph.module(*inputs.values())
-            output = torch.from_numpy(session.run(None, {name: x.numpy() for name, x in inputs.items()})[0])
+            output = torch.from_numpy(
+                session.run(None, {name: x.numpy() for name, x in inputs.items()})[0]
+            )
             mask = length_mask(lengths, frames)
             torch.testing.assert_close(output[mask], expected[mask], atol=1e-4, rtol=1e-4)
 
@@ -181,7 +233,11 @@ def test_the_runner_samples_the_motions_of_the_package_without_pytorch_and_refus
     for name, content, says in (
         ("model.json", description[:-9], "not an exported model"),
         ("model.json", description.replace(b'"format": 1', b'"format": 2'), "not of format 1"),
-        ("model.json", description.replace(b'"fps": 20', b'"fps": 0'), "model.json has changed since it was exported"),
+        (
+            "model.json",
+            description.replace(b'"fps": 20', b'"fps": 0'),
+            "model.json has changed since it was exported",
+        ),
         ("joints.onnx", graph[:-9] + b"x" * 9, "joints.onnx has changed since it was exported"),
     ):
         (exported / "model.json").write_bytes(description)
@@ -199,7 +255,9 @@ def test_a_model_beyond_the_limits_of_the_runner_is_not_exported() -> None:
         onnx.description(model)
 
 
-def test_models_with_a_language_model_and_unknown_formats_are_refused(refused: Any, tmp_path: Path) -> None:
+def test_models_with_a_language_model_and_unknown_formats_are_refused(
+    refused: Any, tmp_path: Path
+) -> None:
     refused("export", "quickstart", str(tmp_path / "x"), "format=tflite", says="format=tflite: ")
     model = tiny("mdm_encoder_small", "learned")
     model.condition = torch.nn.Module()  # type: ignore[assignment]
@@ -214,7 +272,9 @@ DONE = "document.body?.dataset.made || document.querySelector('#notes.error')?.t
 
 
 class Handler(http.server.SimpleHTTPRequestHandler):
-    extensions_map = http.server.SimpleHTTPRequestHandler.extensions_map | {".mjs": "text/javascript"}
+    extensions_map = http.server.SimpleHTTPRequestHandler.extensions_map | {
+        ".mjs": "text/javascript"
+    }
 
 
 @pytest.fixture(scope="module")
@@ -245,7 +305,9 @@ def made(tab: Tab) -> dict[str, Any]:
 
 
 @of_page
-def test_the_page_samples_the_motions_of_the_package(served: tuple[Path, str], tmp_path: Path) -> None:
+def test_the_page_samples_the_motions_of_the_package(
+    served: tuple[Path, str], tmp_path: Path
+) -> None:
     folder, url = served
     assert sum(p.stat().st_size for p in folder.iterdir() if p.is_file()) <= 8e6
     model = flame_mdm.load("quickstart")
@@ -257,7 +319,11 @@ def test_the_page_samples_the_motions_of_the_package(served: tuple[Path, str], t
             tab.run("delete document.body.dataset.made")
             tab.type("#seed", str(seed))
             tab.click("#generate")
-            assert made(tab) | {"milliseconds": 0} == {"text": TEXT, "seed": str(seed), "milliseconds": 0}
+            assert made(tab) | {"milliseconds": 0} == {
+                "text": TEXT,
+                "seed": str(seed),
+                "milliseconds": 0,
+            }
             expected = flame_mdm.generate(model, TEXT, seconds=2.2, seed=seed)[0]
             joints = np.array(tab.run("joints()")).reshape(expected.joints.shape)
             assert np.abs(joints - expected.joints).max() < 1e-3
@@ -270,8 +336,11 @@ def test_the_page_samples_the_motions_of_the_package(served: tuple[Path, str], t
         theirs, ours = read(file.with_suffix(".bvh")), read(tmp_path / "python.bvh")
         assert theirs.fps == pytest.approx(ours.fps)
         assert np.abs(theirs.joints - ours.joints).max() < 1e-3
-        theirs, ours = (Glb(path).worlds()[:, :22, :3, 3] for path in (file, tmp_path / "python.glb"))
-        assert np.abs(theirs - ours).max() < 0.01  # the proportions of its body are those of one example
+        theirs, ours = (
+            Glb(path).worlds()[:, :22, :3, 3] for path in (file, tmp_path / "python.glb")
+        )
+        # The proportions of its body are those of one example
+        assert np.abs(theirs - ours).max() < 0.01
         assert "seed=2" in tab.run("location.hash")
         tab.type("#text", "a person kicks backflipping")
         tab.click("#generate")
@@ -281,16 +350,26 @@ def test_the_page_samples_the_motions_of_the_package(served: tuple[Path, str], t
         tab.click("#generate")
         assert "knows no word" in tab.wait("document.querySelector('#notes.error')?.textContent")
         assert tab.errors == []
-        assert [address for address in tab.requested if not address.startswith((url, "blob:", "data:"))] == []
+        assert [
+            address for address in tab.requested if not address.startswith((url, "blob:", "data:"))
+        ] == []
 
 
 @of_page
 @pytest.mark.parametrize(
     ("file", "change", "says"),
     [
-        ("denoiser.onnx", lambda data: data[:-9] + b"x" * 9, "denoiser.onnx has changed since it was exported"),
+        (
+            "denoiser.onnx",
+            lambda data: data[:-9] + b"x" * 9,
+            "denoiser.onnx has changed since it was exported",
+        ),
         ("model.json", lambda data: data[:-9], "model.json is damaged: not JSON"),
-        ("model.json", lambda data: data.replace(b"[[49.0,", b"[[49.0, 1,"), "model.json is damaged: steps"),
+        (
+            "model.json",
+            lambda data: data.replace(b"[[49.0,", b"[[49.0, 1,"),
+            "model.json is damaged: steps",
+        ),
         ("figure.json", lambda data: data[:-9], "figure.json is damaged"),
     ],
 )

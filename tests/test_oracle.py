@@ -15,13 +15,17 @@ from flame_mdm.sampling.motion_request import METHODS
 from flame_mdm.seeds import normal
 
 METERS, FRAMES, MAX_STEPS = 10.0, 60, 50
-GENERATION = [name for name in recipes() if "process" in recipe(name) and "distillation" not in recipe(name)]
+GENERATION = [
+    name for name in recipes() if "process" in recipe(name) and "distillation" not in recipe(name)
+]
 
 
 def family(name: str) -> str:
     """What decides how a recipe's motions are sampled."""
     config, task = recipe(name), recipe(name)["task"]
-    return repr([config["process"], config["representation"], task["sampler"], task["num_inference_steps"]])
+    return repr(
+        [config["process"], config["representation"], task["sampler"], task["num_inference_steps"]]
+    )
 
 
 FAMILIES = {family(name): name for name in reversed(GENERATION)}.values()
@@ -38,9 +42,12 @@ def traveller(representation: Representation) -> Tensor:
         features = representation.encode(raw)
     else:
         skeleton = representation.skeleton
-        bones = 0.3 * torch.tensor(skeleton.raw_offsets, dtype=torch.float32).expand(len(raw), -1, -1)
+        bones = 0.3 * torch.tensor(skeleton.raw_offsets, dtype=torch.float32).expand(
+            len(raw), -1, -1
+        )
         features = representation.encode(skeleton.assemble(bones, raw[:, [0, 2, 1]]))
-        representation.std.fill_(0.05)  # as small as those of real velocities: normalized ones reach beyond 1
+        # As small as those of real velocities: normalized ones reach beyond 1
+        representation.std.fill_(0.05)
     return representation.normalize(features.double())[None]
 
 
@@ -57,7 +64,10 @@ def root_path(name: str, method: str | None = None) -> tuple[Tensor, Tensor]:
         return normal(torch.tensor([draw]), *x.shape[1:]).double()
 
     sampler, steps = config["task"]["sampler"], config["task"]["num_inference_steps"]
-    how = {"sampler": sampler, "num_inference_steps": min(steps, MAX_STEPS) if isinstance(steps, int) else steps}
+    how = {
+        "sampler": sampler,
+        "num_inference_steps": min(steps, MAX_STEPS) if isinstance(steps, int) else steps,
+    }
     sampled = sample(process, oracle(process, x, noise(0)), noise, edit=edit, **how)
     real, ours = (representation.to_joints(motion)[0, :, 0] for motion in (x, sampled))
     return real, ours
@@ -70,7 +80,8 @@ def longest_step(root: Tensor) -> float:
 @pytest.mark.parametrize("name", UNCLAMPED)
 def test_an_oracle_travels_as_far_as_the_motion_and_in_betweening_does_not_teleport(name):
     real, ours = root_path(name)
-    assert (real[-1] - real[0]).norm() > METERS - 0.2  # some features have a frame less, or scale the body
+    # Some features have a frame less, or scale the body
+    assert (real[-1] - real[0]).norm() > METERS - 0.2
     torch.testing.assert_close(ours, real, rtol=0, atol=0.02)
     modes = instantiate(recipe(name)["process"]).edit_modes
     for method in [method for method, how in METHODS.items() if how["mode"] in modes]:

@@ -65,12 +65,18 @@ def test_forms_of_issues_ask_for_something(path):
     ("module", "old", "new"),
     [
         ("flame_mdm.task", "MotionGeneration", GeneratorTask),
-        ("flame_mdm.training.distillation", "ConsistencyDistillation", distillation.DistillationTask),
+        (
+            "flame_mdm.training.distillation",
+            "ConsistencyDistillation",
+            distillation.DistillationTask,
+        ),
     ],
 )
 def test_an_old_name_works_and_says_the_new_one(module, old, new):
     get = renamed_names(module, {old: new.__name__}, since="0.3")
-    with pytest.warns(DeprecationWarning, match=f"{old} is called {new.__name__} since version 0.3"):
+    with pytest.warns(
+        DeprecationWarning, match=f"{old} is called {new.__name__} since version 0.3"
+    ):
         assert get(old) is new
     with pytest.raises(AttributeError, match="has no attribute 'Nothing'"):
         get("Nothing")

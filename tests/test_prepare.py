@@ -37,8 +37,12 @@ SYNTHETIC = ("data=synthetic", "data.source.clips=30")
 def takes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder in the layout of Bandai-Namco's."""
     folder = tmp_path_factory.mktemp("takes")
-    held_out = next(number for number in range(1, 33) if split_of(2, "walk", "active", number) == "val")
-    for seed, (name, frames) in enumerate([*TAKES.items(), (f"dataset-2_walk_active_{held_out:03d}", 45)]):
+    held_out = next(
+        number for number in range(1, 33) if split_of(2, "walk", "active", number) == "val"
+    )
+    for seed, (name, frames) in enumerate(
+        [*TAKES.items(), (f"dataset-2_walk_active_{held_out:03d}", 45)]
+    ):
         bvh.write(synthetic_take(seed, frames), folder / f"{name}.bvh")
     return folder
 
@@ -57,7 +61,10 @@ def verified(root: Path, *words: str) -> dict:
 
 
 def humanml(root: Path, width: int = 263) -> Path:
-    motions = {name: (frames, [line(f"a person walks {name}")]) for name, frames in {"a": 50, "b": 60, "c": 70}.items()}
+    motions = {
+        name: (frames, [line(f"a person walks {name}")])
+        for name, frames in {"a": 50, "b": 60, "c": 70}.items()
+    }
     return write_folder(root, motions, {"train": ["a"], "val": ["b"], "test": ["c"]}, width)
 
 
@@ -67,36 +74,60 @@ def test_verify_reports_what_is_there(tmp_path: Path, capsys: pytest.CaptureFixt
     store = prepared(tmp_path, *SYNTHETIC)
     assert (report["fingerprint"], report["files"]) == (store.fingerprint, store.info["sha256"])
     for split, number in store.info["clips"].items():
-        assert report["figures"][split] == {"found": number, "published": None, "state": "not published"}
+        assert report["figures"][split] == {
+            "found": number,
+            "published": None,
+            "state": "not published",
+        }
     texts = {caption for clip in store.clips for caption in clip.captions}
     assert report["captions"]["different captions"] == len(texts)
     assert 20 < report["captions"]["different words"] < len(" ".join(texts).split())
-    assert sum(sum(splits.values()) for splits in report["actions"].values()) == len(store.clips) == 30
+    assert (
+        sum(sum(splits.values()) for splits in report["actions"].values()) == len(store.clips) == 30
+    )
     assert report["frames"]["shortest clip"] == min(clip.length for clip in store.clips)
     assert report["still"] == report["duplicates"] == []
     assert max(report["statistics"].values()) < 1e-4
     assert verified(tmp_path, *SYNTHETIC) == report, "the report itself is not part of the store"
 
 
-def test_differences_from_published_figures_are_loud_but_not_fatal(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_differences_from_published_figures_are_loud_but_not_fatal(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     folder = humanml(tmp_path / "HumanML3D")
     report = verified(tmp_path / "data", "data=humanml3d", f"source={folder}")
     output = capsys.readouterr().out
-    assert "DIFFERS from the published figures:\n  motions: 3 found, 14,616 published (-14,613, -99.98%)\n" in output
+    assert (
+        "DIFFERS from the published figures:\n  motions: 3 found, 14,616 published (-14,613, -99.98%)\n"
+        in output
+    )
     assert "  words per caption: 4.0 found, 12 published (-8, -66.67%)" in output
     assert report["figures"]["motions"] == {"found": 3, "published": 14616, "state": "differs"}
-    frames = np.concatenate([np.load(folder / "new_joint_vecs" / f"{name}.npy")[:, 0] for name in ("a", "Ma")])
+    frames = np.concatenate(
+        [np.load(folder / "new_joint_vecs" / f"{name}.npy")[:, 0] for name in ("a", "Ma")]
+    )
     off = np.abs(np.load(folder / "Mean.npy") - frames.mean()).max() / frames.std()
-    assert report["statistics"]["largest difference of a mean, in std"] == pytest.approx(off, rel=1e-3)
+    assert report["statistics"]["largest difference of a mean, in std"] == pytest.approx(
+        off, rel=1e-3
+    )
 
 
 def test_still_clips_duplicates_and_short_clips_are_listed(tmp_path: Path):
     folder = tmp_path / "own"
     folder.mkdir()
-    walk = next(clip for clip in Synthetic(clips=30).clips(20.0) if clip.attributes["action"] == "walk").motion
-    for name, motion in {"a": walk, "b": walk, "c": np.tile(walk[:1], (40, 1, 1)), "d": walk[5:20]}.items():
+    walk = next(
+        clip for clip in Synthetic(clips=30).clips(20.0) if clip.attributes["action"] == "walk"
+    ).motion
+    for name, motion in {
+        "a": walk,
+        "b": walk,
+        "c": np.tile(walk[:1], (40, 1, 1)),
+        "d": walk[5:20],
+    }.items():
         np.savez(folder / f"{name}.npz", joints=motion, fps=20)
-    (folder / "captions.csv").write_text("id,text,split\na,walk,train\nb,walk,test\nc,stand,train\nd,walk,val\n")
+    (folder / "captions.csv").write_text(
+        "id,text,split\na,walk,train\nb,walk,test\nc,stand,train\nd,walk,val\n"
+    )
     report = verified(tmp_path / "data", "data=folder", f"source={folder}")
     anomalies = [report[key] for key in ("still", "duplicates", "duplicates_across_splits")]
     assert anomalies == [["c"], [["a", "b"]], 1]
@@ -109,7 +140,8 @@ def test_numbers_that_are_not_finite_are_damage(tmp_path: Path, capsys: pytest.C
     features = np.load(file)
     features[entry.start + 3, 5] = np.nan
     np.save(file, features)
-    store.info["sha256"]["features.npy"] = sha256(file.read_bytes()).hexdigest()  # whoever changed it may do that
+    # Whoever changed it may do that
+    store.info["sha256"]["features.npy"] = sha256(file.read_bytes()).hexdigest()
     (store.folder / "store.json").write_text(json.dumps(store.info))
     assert main(["prepare", *SYNTHETIC, f"data_root={tmp_path}", "verify=true"]) == 1
     assert f"frame 3 of clip {entry.id} is not finite" in capsys.readouterr().err
@@ -137,7 +169,10 @@ def test_frames_are_not_kept_in_memory(tmp_path: Path):
 
 WHERE = {
     **{"babel": "babel.is.tue.mpg.de", "kit_temos": "github.com/Mathux/TEMOS"},
-    **{"bandai": "github.com/BandaiNamcoResearchInc", "cmu": "clone https://github.com/una-dinosauria/cmu-mocap"},
+    **{
+        "bandai": "github.com/BandaiNamcoResearchInc",
+        "cmu": "clone https://github.com/una-dinosauria/cmu-mocap",
+    },
     **dict.fromkeys(("humanact12", "uestc"), "github.com/Mathux/ACTOR"),
     **dict.fromkeys(("humanml3d", "humanml3d_smpl", "kit"), "github.com/EricGuo5513/HumanML3D"),
     "folder": "Give a folder of .npz, .bvh, .fbx, .glb, .vrm, .vrma, .amc, .json, .npy files",
@@ -149,12 +184,24 @@ def test_a_missing_source_or_another_set_is_refused_with_where_to_get_it(
     takes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     sets = {path.stem for path in (EXPERIMENTS / "data").glob("*.yaml")}
-    assert sets == {*WHERE, "synthetic", "package", "humanact12_unconstrained", "bandai_compositional"}
+    assert sets == {
+        *WHERE,
+        "synthetic",
+        "package",
+        "humanact12_unconstrained",
+        "bandai_compositional",
+    }
     cases = [(data, [], where) for data, where in WHERE.items()]
     others = WHERE.keys() - {"folder", "bandai"}
-    cases += [(data, [f"source={takes}"], "" if data == "kit_temos" else str(takes)) for data in sorted(others)]
+    cases += [
+        (data, [f"source={takes}"], "" if data == "kit_temos" else str(takes))
+        for data in sorted(others)
+    ]
     for data, words, expected in cases:
-        assert main(["prepare", f"data={data}", f"data_root={tmp_path / 'data'}", *words]) == 1, (data, words)
+        assert main(["prepare", f"data={data}", f"data_root={tmp_path / 'data'}", *words]) == 1, (
+            data,
+            words,
+        )
         message = capsys.readouterr().err
         assert re.fullmatch(rf"error: .*{re.escape(expected)}.*\n", message), (data, words, message)
     assert not any((tmp_path / "data").glob("*"))
@@ -183,8 +230,21 @@ def words_of(data: str, takes: Path, root: Path) -> list[str]:
 def test_every_set_from_raw_files_to_a_training_step(data: str, takes: Path, tmp_path: Path):
     verified(tmp_path / "data", f"data={data}", *words_of(data, takes, tmp_path))
     condition = "action" if data in ("humanact12", "uestc") else "learned"
-    tiny = [word for word in TINY if not any(part in word for part in ("clips", "samples", "condition"))]
-    few = ["data.batch_size=4", "data.num_workers=0", "trainer.max_steps=1", "callbacks.samples=null"]
-    recipe = [f"data={data}", *tiny, *few, f"condition={condition}", f"data_root={tmp_path / 'data'}"]
+    tiny = [
+        word for word in TINY if not any(part in word for part in ("clips", "samples", "condition"))
+    ]
+    few = [
+        "data.batch_size=4",
+        "data.num_workers=0",
+        "trainer.max_steps=1",
+        "callbacks.samples=null",
+    ]
+    recipe = [
+        f"data={data}",
+        *tiny,
+        *few,
+        f"condition={condition}",
+        f"data_root={tmp_path / 'data'}",
+    ]
     assert main(["train", "quickstart", *recipe, f"run.dir={tmp_path / 'run'}"]) == 0
     assert (tmp_path / "run" / "checkpoints" / "last.ckpt").is_file()

@@ -93,7 +93,9 @@ def test_reverse_step(case, dtype):
     x0_hat = process.to_x0(output, x_t, t)
     if process.clip_x0:
         x0_hat = x0_hat.clamp(-1, 1)
-    log_variance = torch.as_tensor(process.log_variance(output, x_t, t, process.schedule)).expand_as(x_t)
+    log_variance = torch.as_tensor(
+        process.log_variance(output, x_t, t, process.schedule)
+    ).expand_as(x_t)
     assert_golden(GAUSSIAN, f"pw/{case}/pred_xstart", x0_hat)
     assert_golden(GAUSSIAN, f"pw/{case}/log_variance", log_variance)
     if process.variance == "fixed_small":  # not clipped at step 0, unlike its logarithm
@@ -114,12 +116,16 @@ def test_corruption_posterior_and_variational_bound(case, dtype):
     assert_golden(GAUSSIAN, "pw/x_t", x_t)
     assert_golden(GAUSSIAN, "pw/q_posterior_mean", process.schedule.posterior_mean(x, x_t, t))
     key, arrays = f"pw/vb_{case}", GAUSSIAN
-    if "guided" in case:  # guided-diffusion has bits, and at step 0 the likelihood of a pixel: not for motion
+    # Guided-diffusion has bits, and at step 0 the likelihood of a pixel: not for motion
+    if "guided" in case:
         output, later = pointwise_output(x_t, learned=True), t > 0
         bound = masked_mean(process.vlb(output, x, x_t, t), mask)[later] / math.log(2)
         arrays = GAUSSIAN | {name: GAUSSIAN[name][later.numpy()] for name in (key, f"f64/{key}")}
     else:  # FLAME's code has one channel per joint: the bias of channel 0 for all.
-        A, b = GAUSSIAN["lin4/A2"], np.repeat(GAUSSIAN["lin4/b2"][:, :1], GAUSSIAN["lin4/b2"].shape[1], 1)
+        A, b = (
+            GAUSSIAN["lin4/A2"],
+            np.repeat(GAUSSIAN["lin4/b2"][:, :1], GAUSSIAN["lin4/b2"].shape[1], 1),
+        )
         output = linear_denoiser(A, b, float(GAUSSIAN["lin4/g"]))(x_t, t, mask, NO_CONDITION)
         bound = masked_mean(process.vlb(output, x, x_t, t), mask)
     assert_golden(arrays, key, bound)
@@ -130,9 +136,13 @@ PROCESSES: dict[str, Process] = {
     **{path.stem: instantiate(read_yaml(path)) for path in RECIPES},
     "x0": GaussianDiffusion(prediction="x0"),
     "epsilon": GaussianDiffusion(prediction="epsilon"),
-    "skip": GaussianDiffusion(prediction="epsilon", variance="learned_range", skip=True, min_snr=5.0),
+    "skip": GaussianDiffusion(
+        prediction="epsilon", variance="learned_range", skip=True, min_snr=5.0
+    ),
     "velocity": GaussianDiffusion(prediction="velocity", schedule="linear"),
-    "learned": GaussianDiffusion(num_train_timesteps=50, prediction="epsilon", variance="learned_range"),
+    "learned": GaussianDiffusion(
+        num_train_timesteps=50, prediction="epsilon", variance="learned_range"
+    ),
     "flow": FlowMatching(),
     "flow_sigma": FlowMatching(sigma_min=0.1),
     "flow_x0": FlowMatching(prediction="x0"),
@@ -163,12 +173,15 @@ def test_oracle_has_no_loss_and_padding_has_no_say(name):
 
     quiet = torch.where(mask[..., None], noise, 0.0)
     terms, other = (
-        process.loss(oracle, x, mask, NO_CONDITION, t=t, noise=n, auxiliary=auxiliary) for n in (noise, quiet)
+        process.loss(oracle, x, mask, NO_CONDITION, t=t, noise=n, auxiliary=auxiliary)
+        for n in (noise, quiet)
     )
     assert set(terms) == {"mse", "extra", "loss"} | ({"vlb"} if spare else set())
     torch.testing.assert_close(terms["mse"], torch.zeros(3))
     torch.testing.assert_close(terms["extra"], torch.full((3,), 0.25), rtol=0, atol=1e-2)
-    torch.testing.assert_close(terms["loss"], sum(value for key, value in terms.items() if key != "loss"))
+    torch.testing.assert_close(
+        terms["loss"], sum(value for key, value in terms.items() if key != "loss")
+    )
     torch.testing.assert_close(other["loss"], terms["loss"])
 
 
@@ -177,7 +190,11 @@ def test_min_snr_weighs_an_error_of_the_clean_motion_alike_in_every_prediction(p
     """Hang et al. 2023, arXiv:2303.09556: the weight of the squared error of the clean motion is min(SNR, 5)."""
     process = GaussianDiffusion(50, prediction=prediction, min_snr=5.0)
     t = torch.tensor([2, 10, 25, 40, 45])
-    x, noise, mask = torch.randn(5, 4, 3).double(), torch.randn(5, 4, 3).double(), torch.ones(5, 4, dtype=torch.bool)
+    x, noise, mask = (
+        torch.randn(5, 4, 3).double(),
+        torch.randn(5, 4, 3).double(),
+        torch.ones(5, 4, dtype=torch.bool),
+    )
     x_t = process.corrupt(x, noise, t)
     zero, one = torch.zeros_like(x), torch.ones_like(x)
     signal, sigma = process.corrupt(one, zero, t), process.corrupt(zero, one, t)
@@ -198,13 +215,17 @@ def test_weights_of_the_error_and_the_skip_are_those_of_the_noise():
     torch.testing.assert_close(terms["mse"], weight * wrong.square().mean((1, 2)))
     skip = GaussianDiffusion(prediction="epsilon", min_snr=5.0, skip=True)
     output = (noise + wrong - sigma * skip.corrupt(x, noise, t)) / signal
-    for name, term in skip.loss(lambda *_: output, x, real(x), NO_CONDITION, t=t, noise=noise).items():
+    for name, term in skip.loss(
+        lambda *_: output, x, real(x), NO_CONDITION, t=t, noise=noise
+    ).items():
         torch.testing.assert_close(term, terms[name], rtol=1e-4, atol=0)
 
 
 def test_hybrid_loss_trains_the_variance_alone():
     torch.manual_seed(0)
-    process = GaussianDiffusion(400, prediction="epsilon", variance="learned_range", vlb_weight=0.002)
+    process = GaussianDiffusion(
+        400, prediction="epsilon", variance="learned_range", vlb_weight=0.002
+    )
     (x, noise), t, output = (
         torch.randn(2, 2, 6, 3),
         torch.tensor([0.0, 200.0]),
@@ -242,7 +263,9 @@ def test_unknown_options_and_impossible_steps_are_refused():
 def test_tables_keep_their_precision_when_the_model_is_cast():
     process = GaussianDiffusion(prediction="epsilon").to(torch.bfloat16)
     x, t = torch.ones(1, 1, 1), torch.tensor([999.0])
-    assert process.corrupt(x, 0 * x, t).item() == pytest.approx(process.schedule.tables["signal"][-1].item(), rel=1e-6)
+    assert process.corrupt(x, 0 * x, t).item() == pytest.approx(
+        process.schedule.tables["signal"][-1].item(), rel=1e-6
+    )
     assert process.corrupt(x.bfloat16(), 0 * x.bfloat16(), t).dtype == torch.float32
 
 
@@ -259,7 +282,9 @@ def test_flow_path_target_and_loss(dtype):
     assert_golden(MFM, "loss/field/loss", terms["loss"])
 
 
-GRIDS = sorted(key.removesuffix("_row") for key in MFM if key.startswith("times/") and key.endswith("_row"))
+GRIDS = sorted(
+    key.removesuffix("_row") for key in MFM if key.startswith("times/") and key.endswith("_row")
+)
 
 
 @golden_cases("mfm", GRIDS)
@@ -272,15 +297,24 @@ def test_flow_times_and_rows(case):
     assert process.table_time(times[:-1]).long().tolist() == MFM[f"{case}_row"].tolist()
 
 
-@pytest.mark.parametrize(("distribution", "in_the_middle"), [("uniform", 0.5), ("logit_normal", 0.728)])
+@pytest.mark.parametrize(
+    ("distribution", "in_the_middle"), [("uniform", 0.5), ("logit_normal", 0.728)]
+)
 def test_flow_times_are_drawn_as_named(distribution, in_the_middle):
     """The probability of |logit| < ln 3 of a normal variable is 0.728."""
     torch.manual_seed(0)
-    process, x = FlowMatching(time_distribution=distribution, prediction="x0"), torch.zeros(4000, 1, 1)
+    process, x = (
+        FlowMatching(time_distribution=distribution, prediction="x0"),
+        torch.zeros(4000, 1, 1),
+    )
     # Of motions that are 0, the error of a denoiser that returns the square root of the time is the time.
-    times = process.loss(lambda _, t, *__: (t / 1000).sqrt()[:, None, None], x, real(x), NO_CONDITION)["mse"]
+    times = process.loss(
+        lambda _, t, *__: (t / 1000).sqrt()[:, None, None], x, real(x), NO_CONDITION
+    )["mse"]
     assert times.mean() == pytest.approx(0.5, abs=0.03)
-    assert ((times > 0.25) & (times < 0.75)).float().mean() == pytest.approx(in_the_middle, abs=0.03)
+    assert ((times > 0.25) & (times < 0.75)).float().mean() == pytest.approx(
+        in_the_middle, abs=0.03
+    )
 
 
 MASK = length_mask(torch.tensor([4, 2]))
@@ -303,7 +337,9 @@ def test_guidance_is_two_passes_in_one_except_for_a_learned_variance_and_scale_o
     strength = scale[:, None, None] if isinstance(scale, torch.Tensor) else scale
     expected = torch.cat([(null + strength * (with_cond - null))[..., :2], with_cond[..., 2:]], -1)
     for channels in (4, 2):
-        denoise = CountedDenoise(lambda *args, channels=channels: sees_condition(*args)[..., :channels])
+        denoise = CountedDenoise(
+            lambda *args, channels=channels: sees_condition(*args)[..., :channels]
+        )
         guided = classifier_free_guidance(denoise, scale, features=2)(x_t, t, MASK, COND)
         torch.testing.assert_close(guided, expected[..., :channels])
         assert denoise.calls == 1
@@ -325,5 +361,17 @@ def test_doubled_conditions_and_masks_are_made_once_per_run_and_follow_a_change(
     assert masks[0] is masks[1]
     assert conditions[0] is conditions[1]
     pooled = [1, 2, 10, 10]
-    assert [cond.pooled.flatten().tolist() for cond in conditions] == [pooled, pooled, [2, 3, 10, 10], pooled, pooled]
-    assert [torch.equal(mask, torch.cat([MASK, MASK])) for mask in masks] == [True, True, True, False, True]
+    assert [cond.pooled.flatten().tolist() for cond in conditions] == [
+        pooled,
+        pooled,
+        [2, 3, 10, 10],
+        pooled,
+        pooled,
+    ]
+    assert [torch.equal(mask, torch.cat([MASK, MASK])) for mask in masks] == [
+        True,
+        True,
+        True,
+        False,
+        True,
+    ]

@@ -37,12 +37,16 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.slow
 def test_each_prompt_of_a_file_is_sampled_as_if_alone(here, trained, capsys):
-    Path("p.txt").write_bytes(b"\xef\xbb\xbf" + "\r\n\r\n".join(f" {text} " for text in PROMPTS).encode())
+    Path("p.txt").write_bytes(
+        b"\xef\xbb\xbf" + "\r\n\r\n".join(f" {text} " for text in PROMPTS).encode()
+    )
     assert main(["sample", str(trained), "prompts=p.txt", "seconds=[1,1.5,1]", "samples=2"]) == 0
     lines = capsys.readouterr().out.splitlines()
     page = lines[-1].removeprefix("6 motions for 3 prompts, a folder for each: ")
     assert page == "samples/quickstart/p.html"
-    assert all(json.dumps(text, ensure_ascii=True)[1:-1] in Path(page).read_text() for text in PROMPTS)
+    assert all(
+        json.dumps(text, ensure_ascii=True)[1:-1] in Path(page).read_text() for text in PROMPTS
+    )
     assert "warning: '人が歩く, waving': not understood: 人が歩く" in "\n".join(lines)
     together = {read(path).text: path.parent for path in here.rglob("motion_000.npz")}
     assert set(together) == set(PROMPTS)
@@ -55,12 +59,18 @@ def test_each_prompt_of_a_file_is_sampled_as_if_alone(here, trained, capsys):
 
 
 @pytest.mark.slow
-def test_a_chosen_folder_gets_a_folder_per_prompt_without_files_of_an_earlier_request(here, trained):
+def test_a_chosen_folder_gets_a_folder_per_prompt_without_files_of_an_earlier_request(
+    here, trained
+):
     Path("p.txt").write_text("a person walks\na person jumps\na person walks\n")
     words, videos = ["prompts=p.txt", "seconds=1", "samples=1", "out=mine"], bool(find_spec("av"))
     assert main(["sample", str(trained), *words, "trajectory=true", f"mp4={videos}".lower()]) == 0
     jumps, walks, page = sorted(Path("mine").iterdir())
-    assert [jumps.name[:-7], walks.name[:-7], page.name] == ["a-person-jumps", "a-person-walks", "p.html"]
+    assert [jumps.name[:-7], walks.name[:-7], page.name] == [
+        "a-person-jumps",
+        "a-person-walks",
+        "p.html",
+    ]
     first, second = (read(path) for path in sorted(walks.glob("motion_*.npz")))
     assert np.abs(first.joints - second.joints).max() > 0.001
     assert [path.parent for path in Path("mine").rglob("trajectory.png")] == [walks]
@@ -68,7 +78,12 @@ def test_a_chosen_folder_gets_a_folder_per_prompt_without_files_of_an_earlier_re
     (walks / "motion_1_of_mine.npz").touch()
     assert main(["sample", str(trained), *words]) == 0
     numbers = [f"motion_{number}.npz" for number in ("000", "001", "1_of_mine")]
-    assert sorted(path.name for path in walks.iterdir()) == [*numbers, "motions.gif", "motions.png", "player.html"]
+    assert sorted(path.name for path in walks.iterdir()) == [
+        *numbers,
+        "motions.gif",
+        "motions.png",
+        "player.html",
+    ]
 
 
 def test_a_bad_request_is_one_line_and_writes_nothing(here, trained, capsys, monkeypatch):
@@ -78,10 +93,22 @@ def test_a_bad_request_is_one_line_and_writes_nothing(here, trained, capsys, mon
         (b" \n\t\r\n\n", [], "p.txt: no prompts. Write one per line"),
         (b"PK\x03\x04\xff\xfe\x00", [], "p.txt: not a UTF-8 text file"),
         (b"a\n" * 2**20, [], "p.txt: 2 MiB, but such a file may have at most 1 MiB"),
-        (b"walks", ["mp4=true"], 'mp4=true: MP4 needs the package av. Run pip install "flame-mdm[video]"'),
+        (
+            b"walks",
+            ["mp4=true"],
+            'mp4=true: MP4 needs the package av. Run pip install "flame-mdm[video]"',
+        ),
         (b"walks", ["text=jumps"], "text and prompts exclude each other. Give only one of them"),
-        (b"walks\njumps", ["seconds=[1,2,3]"], "seconds=[1, 2, 3]: lengths: 3, prompts: 2. Give one length, or one"),
-        (b"walks | | sits\n\n" + b"a" * 3000, [], "p.txt: 2 of 2 prompts cannot be sampled. Correct the lines above"),
+        (
+            b"walks\njumps",
+            ["seconds=[1,2,3]"],
+            "seconds=[1, 2, 3]: lengths: 3, prompts: 2. Give one length, or one",
+        ),
+        (
+            b"walks | | sits\n\n" + b"a" * 3000,
+            [],
+            "p.txt: 2 of 2 prompts cannot be sampled. Correct the lines above",
+        ),
         (b"\nwalks", ["seconds=30"], "p.txt: 1 of 1 prompts cannot be sampled"),
     ):
         Path("p.txt").unlink(missing_ok=True)
@@ -92,8 +119,18 @@ def test_a_bad_request_is_one_line_and_writes_nothing(here, trained, capsys, mon
 
 
 @pytest.mark.slow
-def test_refused_lines_of_a_file_are_named_at_the_end_and_the_others_are_written(here, trained, capsys):
-    lines = ["a person walks", "", "a" * 3000, "walks | | sits", "a person jumps", "un uomo cammina", "a person waves"]
+def test_refused_lines_of_a_file_are_named_at_the_end_and_the_others_are_written(
+    here, trained, capsys
+):
+    lines = [
+        "a person walks",
+        "",
+        "a" * 3000,
+        "walks | | sits",
+        "a person jumps",
+        "un uomo cammina",
+        "a person waves",
+    ]
     Path("p.txt").write_text("\n".join(lines))
     words = ["prompts=p.txt", "seconds=[1,1,1,30,1,1.5]", "samples=1", "num_inference_steps=2"]
     assert main(["sample", str(trained), *words]) == 1
@@ -104,25 +141,40 @@ def test_refused_lines_of_a_file_are_named_at_the_end_and_the_others_are_written
     for line, number, message in zip(
         errors,
         (3, 4, 5, 6),
-        ("3,000 characters are too many", "part 2 is empty", "30 seconds (600 frames)", "in English only"),
+        (
+            "3,000 characters are too many",
+            "part 2 is empty",
+            "30 seconds (600 frames)",
+            "in English only",
+        ),
         strict=True,
     ):
         assert line.startswith(f"p.txt, line {number}: ")
         assert message in line
     motions = [read(path) for path in sorted(here.rglob("motion_*.npz"))]
-    assert {motion.text: len(motion.joints) for motion in motions} == {"a person walks": 20, "a person waves": 30}
+    assert {motion.text: len(motion.joints) for motion in motions} == {
+        "a person walks": 20,
+        "a person waves": 30,
+    }
 
 
 def test_each_prompt_has_a_length_of_its_own(trained):
     model = flame_mdm.load(trained)
     motions = flame_mdm.generate(model, PROMPTS[:2], seconds=[1, 1.5], samples=2)
-    assert [(m.text, len(m.joints)) for m in motions] == [(PROMPTS[0], 20)] * 2 + [(PROMPTS[1], 30)] * 2
+    assert [(m.text, len(m.joints)) for m in motions] == [(PROMPTS[0], 20)] * 2 + [
+        (PROMPTS[1], 30)
+    ] * 2
     numpy: dict[str, Any] = {"seconds": np.float32(1.5)}
-    np.testing.assert_allclose(motions[2].joints, flame_mdm.generate(model, PROMPTS[1], **numpy)[0].joints, atol=1e-4)
+    np.testing.assert_allclose(
+        motions[2].joints, flame_mdm.generate(model, PROMPTS[1], **numpy)[0].joints, atol=1e-4
+    )
     for seconds, message in (
         ([1, 2], r"seconds=\[1, 2\]: lengths: 2, prompts: 1\. Give one length, or one per prompt"),
         ([], "lengths: 0, prompts: 1"),
-        *((value, "is not a valid length") for value in ([[1]], ["x"], [float("nan")], 10**400, "3")),
+        *(
+            (value, "is not a valid length")
+            for value in ([[1]], ["x"], [float("nan")], 10**400, "3")
+        ),
     ):
         with one_line_error(message):
             flame_mdm.generate(model, PROMPTS[0], seconds=seconds)  # type: ignore[arg-type]
@@ -134,20 +186,51 @@ def folder(experiment: Any, text: str = "a person walks", **options: Any) -> str
 
 
 def test_requests_for_different_motions_share_no_folder():
-    texts = ["a person walks", "A person walks", "a Person walks", "a person-walks", "a person  walks"]
-    texts += ["a person_walks", "a per\u017fon walks", "A PERSON WALKS", "straße", "strasse", "a person walks."]
+    texts = [
+        "a person walks",
+        "A person walks",
+        "a Person walks",
+        "a person-walks",
+        "a person  walks",
+    ]
+    texts += [
+        "a person_walks",
+        "a per\u017fon walks",
+        "A PERSON WALKS",
+        "straße",
+        "strasse",
+        "a person walks.",
+    ]
     texts += ["a person, walks", "🕺💃", "💃🕺", "人が歩く", "a" * 70, "a" * 71]
     options: list[dict[str, Any]] = [{"guidance_scale": scale} for scale in (-1, 1, 1.5)]
     options += [{"frames": [1, 2]}, {"frames": [12]}, {"sampler": "ddim"}, {"seed": 1}]
     names = [folder("a", text).casefold() for text in texts]  # as file systems that ignore case
     names += [folder("a", **changed) for changed in options]
     assert len(set(names)) == len(names)
-    assert re.fullmatch(r"samples/humanml3d/mdm/a-person-walks-[0-9a-f]{6}", folder("humanml3d/mdm"))
-    assert re.fullmatch(r"samples/a/(walks-){6}walk-[0-9a-f]{6}", folder("a", "walks " * 20, seed=1))
+    assert re.fullmatch(
+        r"samples/humanml3d/mdm/a-person-walks-[0-9a-f]{6}", folder("humanml3d/mdm")
+    )
+    assert re.fullmatch(
+        r"samples/a/(walks-){6}walk-[0-9a-f]{6}", folder("a", "walks " * 20, seed=1)
+    )
 
 
 def test_no_checkpoint_leads_out_of_the_folder(here):
-    names = ["../../x", "/etc/x", "..", "a/../../../b", ".x", "a\0b", "~/x", "-/..", None, 3, "", "\\..\\x", ". ."]
+    names = [
+        "../../x",
+        "/etc/x",
+        "..",
+        "a/../../../b",
+        ".x",
+        "a\0b",
+        "~/x",
+        "-/..",
+        None,
+        3,
+        "",
+        "\\..\\x",
+        ". .",
+    ]
     for name in names:
         path = Path(folder(name, "../../../etc passwd\0", sampler="../../x", joints=["/a", ".."]))
         assert ".." not in path.parts
@@ -165,11 +248,16 @@ def test_the_model_understands_sentences_as_people_type_them(every):
     for sentence in SENTENCES[::every]:
         with suppress(UserError):
             check_known(sentence["text"], model.facts)
-            known[sentence["text"]] = {key: value for key, value in sentence.items() if key != "text"}
+            known[sentence["text"]] = {
+                key: value for key, value in sentence.items() if key != "text"
+            }
     right, motions = 0, flame_mdm.generate(model, list(known), cleanup=True, num_inference_steps=10)
     for motion, stated in zip(motions, known.values(), strict=True):
         seen = read_attributes(motion.joints, motion.fps)
-        right += all(seen.get(key) in (value if isinstance(value, list) else [value]) for key, value in stated.items())
+        right += all(
+            seen.get(key) in (value if isinstance(value, list) else [value])
+            for key, value in stated.items()
+        )
     assert right / len(SENTENCES[::every]) >= 0.85
 
 
@@ -177,7 +265,9 @@ def test_the_shipped_file_is_documented_and_its_name_comes_after_paths(here, cap
     assert sha256(find("quickstart")) in (ROOT / "docs" / "checkpoints.md").read_text()
     assert find("quickstart").stat().st_size < 4.6e6
     assert "license: mit" in find("quickstart").with_suffix(".md").read_text()
-    assert "Did you mean quickstart?" in error_of(capsys, "sample", "quikstart", "text=a person walks")
+    assert "Did you mean quickstart?" in error_of(
+        capsys, "sample", "quikstart", "text=a person walks"
+    )
     (here / "quickstart").mkdir()
     (here / "quickstart" / "mine.safetensors").touch()
     assert find("quickstart").name == "mine.safetensors"

@@ -25,10 +25,16 @@ PUBLISHED: dict[str, dict[str, Any]] = yaml.safe_load(PUBLISHED_FILE.read_text()
 del PUBLISHED["hyperparameters"]  # which tests/test_recipes.py checks
 PAPERS = [name for name in spec_names() if name.startswith(("flame_", "mdm_", "mfm_"))]
 SPECS = {name: load_spec(name) for name in spec_names()}
-PARTS = {f"{name}: {label}": part for name, spec in SPECS.items() for label, part in spec["parts"].items()}
+PARTS = {
+    f"{name}: {label}": part
+    for name, spec in SPECS.items()
+    for label, part in spec["parts"].items()
+}
 MEASURED = {name: part for name, part in PARTS.items() if "columns" in part}
 SETTINGS = {name: part for name, part in PARTS.items() if "recipes" in part}
-REPORTED = {f"{name}: {label}": part for name, parts in PUBLISHED.items() for label, part in parts.items()}
+REPORTED = {
+    f"{name}: {label}": part for name, parts in PUBLISHED.items() for label, part in parts.items()
+}
 NUMBER = re.compile(r"(\d{1,3}(,\d{3})*|\d+)(\.\d+)?(M|%)?( ±\d*\.\d+)?")
 UNREAD = "humanml3d/mdm_motion272"
 """Recipe of features that no evaluator reads."""
@@ -39,7 +45,9 @@ pytestmark = pytest.mark.usefixtures("composed_once")
 
 def trained(row: Config) -> str:
     """The recipe of the checkpoint of a row."""
-    match = re.fullmatch(r"runs/(.+)/[^/]+/checkpoints/(?:best|last)\.ckpt|flame_mdm/models/(.+)\.\w+", row["ckpt"])
+    match = re.fullmatch(
+        r"runs/(.+)/[^/]+/checkpoints/(?:best|last)\.ckpt|flame_mdm/models/(.+)\.\w+", row["ckpt"]
+    )
     assert match, row
     return match[1] or match[2]
 
@@ -60,8 +68,14 @@ def _measures(protocol: str, representation: str) -> tuple[Any, set[str]]:
 
 
 def test_there_is_a_table_for_each_of_the_papers(tmp_path):
-    tables = {f"{paper}_{n}" for paper, last in (("flame", 10), ("mdm", 8), ("mfm", 5)) for n in range(1, last + 1)}
-    figures = {"flame_figure_4", "flame_figure_7", "mdm_figure_4"} | {f"mfm_figure_{n}" for n in (1, 4, 5, 7)}
+    tables = {
+        f"{paper}_{n}"
+        for paper, last in (("flame", 10), ("mdm", 8), ("mfm", 5))
+        for n in range(1, last + 1)
+    }
+    figures = {"flame_figure_4", "flame_figure_7", "mdm_figure_4"} | {
+        f"mfm_figure_{n}" for n in (1, 4, 5, 7)
+    }
     assert set(PAPERS) == tables | figures
     for name in PAPERS:
         table = builder.build(name, SPECS[name], tmp_path)
@@ -72,14 +86,21 @@ def test_published_rows_are_whole():
     wrong = []
     for name, part in REPORTED.items():
         cited = re.search(
-            r"arXiv:(2209.00349|2209.14916|2312.08895|2410.03441), (table|figure|section)", part["source"]
+            r"arXiv:(2209.00349|2209.14916|2312.08895|2410.03441), (table|figure|section)",
+            part["source"],
         )
-        if not (part.keys() <= {"evaluator", "source", "notes", "rows"} and part["evaluator"] and cited):
+        if not (
+            part.keys() <= {"evaluator", "source", "notes", "rows"} and part["evaluator"] and cited
+        ):
             wrong.append(name)
         for row in part["rows"]:
             values = row["values"].values()  # a number without quotes loses digits
-            printed = all(isinstance(v, str) and (name in SETTINGS or NUMBER.fullmatch(v)) for v in values)
-            whole = row.keys() <= {"label", "values", "real", "source", "evaluator"} and row["values"]
+            printed = all(
+                isinstance(v, str) and (name in SETTINGS or NUMBER.fullmatch(v)) for v in values
+            )
+            whole = (
+                row.keys() <= {"label", "values", "real", "source", "evaluator"} and row["values"]
+            )
             if not (printed and whole) or part["rows"].count(row) > 1:
                 wrong.append(f"{name}: {row}")
     assert not wrong
@@ -98,7 +119,10 @@ def test_published_settings_are_those_of_the_recipes():
                         assert value == text
                     elif column != "U-net":  # of which no code is public
                         printed_value = float(text.removesuffix(" words").replace(",", ""))
-                        assert round(value, len(text.partition(".")[2])) == printed_value, (row, column)
+                        assert round(value, len(text.partition(".")[2])) == printed_value, (
+                            row,
+                            column,
+                        )
     for name, part in SETTINGS.items():
         for key in part["keys"].values():
             assert all(key in settings(column) for column in part["recipes"].values()), (name, key)
@@ -148,7 +172,9 @@ def test_rows_are_checkpoints_of_recipes_that_fit():
         for row in part["rows"]:
             config = recipe(trained(row))
             chosen = Path(row["ckpt"]).stem == "best"
-            assert chosen == bool(config["callbacks"]["best"]), f"{name}: best.ckpt only where clips are validated"
+            assert chosen == bool(config["callbacks"]["best"]), (
+                f"{name}: best.ckpt only where clips are validated"
+            )
             protocol, _ = measures(part["protocol"], trained(row))
             labels = config["condition"].get("_target_", "").endswith("ActionLabels")
             assert protocol.condition in ("none", "action" if labels else "text"), name
@@ -170,22 +196,45 @@ def test_papers_checkpoints_are_chosen_by_fid():
         assert protocol.metrics["fid"]["_target_"].endswith("FrechetMotionDistance"), name
         assert extracted(evaluate["extractor"]) == needed_extractor(protocol, recipe(name)), name
         assert 512 <= evaluate["samples"] <= 1000, name
-        assert recipe(name)["trainer"]["max_steps"] % evaluate["every_n_steps"] == 0, f"{name}: not the last step"
+        assert recipe(name)["trainer"]["max_steps"] % evaluate["every_n_steps"] == 0, (
+            f"{name}: not the last step"
+        )
 
 
 def test_real_motions_have_what_protocols_expect():
     names = {"mm_dist": "MM-Dist", "diversity": "Diversity", "fid": "FID"}
     names["motions_for_text/top3"] = "R precision (top 3)"
-    values = yaml.safe_load((EXPERIMENTS / "evaluation" / "text_to_motion_t2m.yaml").read_text())["expected"]
+    values = yaml.safe_load((EXPERIMENTS / "evaluation" / "text_to_motion_t2m.yaml").read_text())[
+        "expected"
+    ]
     for table, part, data in (("mdm_1", "HumanML3D", "humanml3d"), ("mdm_2", "KIT-ML", "kit")):
-        real = next(row["values"] for row in PUBLISHED[table][part]["rows"] if row["label"] == "Real")
+        real = next(
+            row["values"] for row in PUBLISHED[table][part]["rows"] if row["label"] == "Real"
+        )
         expected = values[data]
-        assert {n: float(real[c].split()[0]) for n, c in names.items()} == {n: expected[n][0] for n in names}
+        assert {n: float(real[c].split()[0]) for n, c in names.items()} == {
+            n: expected[n][0] for n in names
+        }
 
 
 ROWS: dict[str, list[int]] = {
-    **{"flame_1": [5, 5], "flame_2": [5], "flame_3": [2], "flame_4": [4], "flame_5": [8], "flame_9": [9, 9]},
-    **{"flame_10": [6], "mdm_1": [14], "mdm_2": [5], "mdm_3": [7], "mdm_4": [5], "mdm_5": [3], "mdm_6": [5]},
+    **{
+        "flame_1": [5, 5],
+        "flame_2": [5],
+        "flame_3": [2],
+        "flame_4": [4],
+        "flame_5": [8],
+        "flame_9": [9, 9],
+    },
+    **{
+        "flame_10": [6],
+        "mdm_1": [14],
+        "mdm_2": [5],
+        "mdm_3": [7],
+        "mdm_4": [5],
+        "mdm_5": [3],
+        "mdm_6": [5],
+    },
     **{
         "dip_1": [3],
         "mdm_7": [7],
@@ -200,8 +249,18 @@ ROWS: dict[str, list[int]] = {
 
 
 def test_rows_are_those_of_the_papers():
-    counts = {name: [len(part["rows"]) for part in parts.values()] for name, parts in PUBLISHED.items()}
-    assert {name: n for name, n in counts.items() if not any(key.startswith(f"{name}: ") for key in SETTINGS)} == ROWS
-    assert SPECS["mdm_5"]["parts"]["HumanAct12"]["columns"]["Diversity"]["better"] == "higher", "the paper's arrow"
+    counts = {
+        name: [len(part["rows"]) for part in parts.values()] for name, parts in PUBLISHED.items()
+    }
+    assert {
+        name: n
+        for name, n in counts.items()
+        if not any(key.startswith(f"{name}: ") for key in SETTINGS)
+    } == ROWS
+    assert SPECS["mdm_5"]["parts"]["HumanAct12"]["columns"]["Diversity"]["better"] == "higher", (
+        "the paper's arrow"
+    )
     for name, part in (("mdm_1", "HumanML3D"), ("mdm_2", "KIT-ML")):
-        assert SPECS[name]["parts"][part]["columns"]["Multimodality"]["better"] == "higher", "the paper's arrow"
+        assert SPECS[name]["parts"][part]["columns"]["Multimodality"]["better"] == "higher", (
+            "the paper's arrow"
+        )

@@ -41,14 +41,18 @@ from flame_mdm.representations.humanml import HumanML
 from flame_mdm.seeds import key
 
 MBENCH, PFC, KIMODO, FLOWMDM, TMR = (
-    golden(name) for name in ("mbench_quality", "pfc", "kimodo_metrics", "transition", "tmr_retrieval")
+    golden(name)
+    for name in ("mbench_quality", "pfc", "kimodo_metrics", "transition", "tmr_retrieval")
 )
 one = golden_case("kimodo_metrics")
 
 
 def cases(fixture: dict[str, np.ndarray], under: str, stem: str) -> list:
     names = [name for name in groups(fixture, "joints") if name.startswith(f"in/{under}")]
-    return [pytest.param(name.removeprefix("in/"), id=f"{stem}-{name.removeprefix('in/')}") for name in names]
+    return [
+        pytest.param(name.removeprefix("in/"), id=f"{stem}-{name.removeprefix('in/')}")
+        for name in names
+    ]
 
 
 def y_up(joints: np.ndarray) -> Tensor:
@@ -56,14 +60,22 @@ def y_up(joints: np.ndarray) -> Tensor:
     return torch.from_numpy(joints).double()[..., [0, 2, 1]] * torch.tensor([1.0, 1.0, -1.0])
 
 
-MBENCH_NAMES = dict(zip(MBenchQuality.parts, ("jitter", "dynamic", "penetration", "sliding", "floating"), strict=True))
+MBENCH_NAMES = dict(
+    zip(
+        MBenchQuality.parts,
+        ("jitter", "dynamic", "penetration", "sliding", "floating"),
+        strict=True,
+    )
+)
 
 
 def mean_over(metric: Metric, fixture: dict[str, np.ndarray], names: list[str]) -> dict[str, float]:
     """The value of a metric for motions of a fixture."""
     for name in names:
         joints = y_up(fixture[f"in/{name}/joints"])[None]
-        metric.update(joints, torch.ones(joints.shape[:2], dtype=torch.bool), torch.tensor([key(name)]))
+        metric.update(
+            joints, torch.ones(joints.shape[:2], dtype=torch.bool), torch.tensor([key(name)])
+        )
     return metric.compute()
 
 
@@ -78,7 +90,8 @@ def test_mbench_equals_the_authors(case: str):
         np.testing.assert_array_equal(parts, MBENCH[f"aux/{case}/floating_parts"])
     ours = MBenchQuality(20.0).measure(motion)
     for name, theirs in MBENCH_NAMES.items():
-        expected = float(MBENCH.get(f"f64/{case}/{theirs}", math.nan))  # without a value where the code fails
+        # Without a value where the code fails
+        expected = float(MBENCH.get(f"f64/{case}/{theirs}", math.nan))
         assert float(ours[name]) == pytest.approx(expected, rel=1e-8, abs=1e-8, nan_ok=True), name
 
 
@@ -93,11 +106,16 @@ def test_physical_foot_contact_equals_the_authors(case: str):
 @golden_case("pfc")
 def test_means_of_mbench_and_physical_foot_contact_leave_out_motions_without_a_value(stem: str):
     values = mean_over(MBenchQuality(20.0), MBENCH, meta(MBENCH)["config"]["summary_over"])
-    expected = {name: float(MBENCH[f"out/summary/{theirs}"][0]) for name, theirs in MBENCH_NAMES.items()}
+    expected = {
+        name: float(MBENCH[f"out/summary/{theirs}"][0]) for name, theirs in MBENCH_NAMES.items()
+    }
     assert values == pytest.approx(expected | {"measured": 1}, abs=1e-6)
     averaged = meta(PFC)["config"]["folder_mean_over"]
     values = mean_over(PhysicalFootContact(30.0), PFC, [*averaged, "static", "steady_glide"])
-    expected = {"pfc": float(PFC["f64/folder_mean"]), "measured": len(averaged) / (len(averaged) + 2)}
+    expected = {
+        "pfc": float(PFC["f64/folder_mean"]),
+        "measured": len(averaged) / (len(averaged) + 2),
+    }
     assert values == pytest.approx(expected, rel=1e-9)
 
 
@@ -107,13 +125,20 @@ def test_kimodos_skating_equals_the_authors(stem: str):
         torch.from_numpy(KIMODO[f"in/quality/{n}"]) for n in ("joints", "foot_contacts", "lengths")
     )
     config = meta(KIMODO)["config"]
-    theirs = {name: f"foot_{name}" for name in ("skate_from_height", "skate_ratio", "contact_consistency")}
-    theirs |= {"skate_from_contacts": "foot_skate_from_pred_contacts", "skate_max": "foot_skate_max_vel"}
+    theirs = {
+        name: f"foot_{name}" for name in ("skate_from_height", "skate_ratio", "contact_consistency")
+    }
+    theirs |= {
+        "skate_from_contacts": "foot_skate_from_pred_contacts",
+        "skate_max": "foot_skate_max_vel",
+    }
     metric = KimodoQuality(config["fps"], config["foot_joint_idx"])
     for row, length in enumerate(lengths.tolist()):
         ours = metric.measure(joints[row, :length].double(), contacts[row, :length])
         for name, key_ in theirs.items():
-            assert float(ours[name]) == pytest.approx(float(KIMODO[f"f64/quality/{key_}"][row]), abs=2e-7), (name, row)
+            assert float(ours[name]) == pytest.approx(
+                float(KIMODO[f"f64/quality/{key_}"][row]), abs=2e-7
+            ), (name, row)
     frames = torch.arange(joints.shape[1]) < lengths[:, None]
     metric.update(joints, frames, torch.arange(len(joints)), contacts)
     values = metric.compute()
@@ -132,15 +157,25 @@ def test_kimodos_constraints_equal_the_authors(case: str):
 
 def kimodo_errors(case: str) -> dict[str, Tensor]:
     joints = torch.from_numpy(KIMODO[f"in/{case}/joints"]).double()
-    offsets = {"root2d": [torch.zeros(0, 2)], "full": [torch.zeros(0, 3)], "ee": [torch.zeros(0, 3)]}
+    offsets = {
+        "root2d": [torch.zeros(0, 2)],
+        "full": [torch.zeros(0, 3)],
+        "ee": [torch.zeros(0, 3)],
+    }
     for group in groups(KIMODO, "target"):
         if group.startswith(f"in/{case}/"):
-            frames, target = (torch.from_numpy(KIMODO[f"{group}/{name}"]) for name in ("frames", "target"))
+            frames, target = (
+                torch.from_numpy(KIMODO[f"{group}/{name}"]) for name in ("frames", "target")
+            )
             kind = group.rpartition("_")[2]
             if kind == "root2d":
                 offset = joints[frames, 0][:, [0, 2]] - target
             else:
-                which = torch.from_numpy(KIMODO[f"{group}/joint_idx"]) if kind == "ee" else torch.arange(22)
+                which = (
+                    torch.from_numpy(KIMODO[f"{group}/joint_idx"])
+                    if kind == "ee"
+                    else torch.arange(22)
+                )
                 offset = (joints[frames] - target)[:, which].flatten(0, 1)
             offsets[kind].append(offset)
     return constraint_errors(*(torch.cat(offsets[kind]) for kind in ("root2d", "full", "ee")))
@@ -152,17 +187,37 @@ def test_kimodos_percentile_retrieval_distances_and_angles_equal_the_authors(ste
     metric.add(torch.arange(len(config)), [kimodo_errors(case) for case in config])
     expected = float(KIMODO["out/constraint_root2d_err_p95"])
     assert metric.compute()["root2d_err_p95"] == pytest.approx(expected, abs=1e-7), "over motions"
-    text, motion, real = (torch.from_numpy(KIMODO[f"in/tmr/{n}"]).double() for n in ("text", "motion", "gt_motion"))
+    text, motion, real = (
+        torch.from_numpy(KIMODO[f"in/tmr/{n}"]).double() for n in ("text", "motion", "gt_motion")
+    )
     same = text @ text.T > 0.96  # their threshold 0.99 is converted to 0.98 of (cosine + 1) / 2
-    for group, query, gallery in (("t2m_R", text, motion), ("m2m_R", motion, real), ("t2m_gt_R", text, real)):
-        assert_recall(whole_set_retrieval(query @ gallery.T, same), KIMODO, {"t2m": f"f64/tmr/{group}"})
+    for group, query, gallery in (
+        ("t2m_R", text, motion),
+        ("m2m_R", motion, real),
+        ("t2m_gt_R", text, real),
+    ):
+        assert_recall(
+            whole_set_retrieval(query @ gallery.T, same), KIMODO, {"t2m": f"f64/tmr/{group}"}
+        )
     alone = best_ranks(text @ motion.T, torch.eye(len(text), dtype=torch.bool))
     ranks = torch.from_numpy(KIMODO["out/tmr/rank_per_sample"])
-    assert torch.equal((alone + 1).floor(), ranks.to(alone)) or torch.equal((alone + 1).ceil(), ranks.to(alone))
-    assert (alone < 3).double().mean().item() * 100 == pytest.approx(float(KIMODO["out/tmr/no_groups_R03"]))
-    for name, a, b in (("gen_gt", motion, real), ("gen_text", motion, text), ("gt_text", real, text)):
-        assert float(frechet_distance(a, b)) == pytest.approx(float(KIMODO[f"f64/tmr/FID/{name}"]), abs=1e-6)
-    pred, target = (torch.from_numpy(KIMODO[f"in/geodesic/{name}"]).double() for name in ("pred", "target"))
+    assert torch.equal((alone + 1).floor(), ranks.to(alone)) or torch.equal(
+        (alone + 1).ceil(), ranks.to(alone)
+    )
+    assert (alone < 3).double().mean().item() * 100 == pytest.approx(
+        float(KIMODO["out/tmr/no_groups_R03"])
+    )
+    for name, a, b in (
+        ("gen_gt", motion, real),
+        ("gen_text", motion, text),
+        ("gt_text", real, text),
+    ):
+        assert float(frechet_distance(a, b)) == pytest.approx(
+            float(KIMODO[f"f64/tmr/FID/{name}"]), abs=1e-6
+        )
+    pred, target = (
+        torch.from_numpy(KIMODO[f"in/geodesic/{name}"]).double() for name in ("pred", "target")
+    )
     angles = torch.rad2deg(rotation.matrix_to_axis_angle(pred @ target.mT).norm(dim=-1))
     # its arc cosine rounds near 0 and 180
     np.testing.assert_allclose(angles, KIMODO["f64/geodesic/degrees"], atol=2e-2)
@@ -181,14 +236,20 @@ def test_jerk_of_transitions_equals_the_authors(stem: str, kind: str):
     if kind == "joints":
         np.testing.assert_allclose(curves, FLOWMDM["f64/joints/jerk"], atol=1e-9)
     values = peak_and_area(curves.mean(0), JERK_OF_REAL_MOTIONS[20])
-    assert values == pytest.approx([float(FLOWMDM[f"f64/{kind}/{n}"]) for n in ("peak_jerk", "auj")], rel=1e-7)
+    assert values == pytest.approx(
+        [float(FLOWMDM[f"f64/{kind}/{n}"]) for n in ("peak_jerk", "auj")], rel=1e-7
+    )
 
 
-def assert_recall(ours: dict, fixture: dict[str, np.ndarray], keys: dict[str, str], within: float = 1e-10):
+def assert_recall(
+    ours: dict, fixture: dict[str, np.ndarray], keys: dict[str, str], within: float = 1e-10
+):
     """Recall in percent and median rank are those under the fixture's key for each way."""
     for way, theirs in keys.items():
         for k in TMR_TOP:
-            assert ours[f"{way}_top{k}"] * 100 == pytest.approx(float(fixture[f"{theirs}/R{k:02}"]), abs=within)
+            assert ours[f"{way}_top{k}"] * 100 == pytest.approx(
+                float(fixture[f"{theirs}/R{k:02}"]), abs=within
+            )
         assert ours[f"{way}_median"] == float(fixture[f"{theirs}/MedR"])
 
 
@@ -197,12 +258,16 @@ def tmr(group: str) -> dict[str, str]:
 
 
 @pytest.mark.golden
-@pytest.mark.parametrize("group", [pytest.param(g, id=f"tmr_retrieval-{g}") for g in groups(TMR, "ranks_t2m")])
+@pytest.mark.parametrize(
+    "group", [pytest.param(g, id=f"tmr_retrieval-{g}") for g in groups(TMR, "ranks_t2m")]
+)
 def test_ranks_equal_tmrs(group: str):
     name = group.removeprefix("out/")
     if name == "few_values_optimistic":
         pytest.skip("TMR never uses its option to break ties in favor of the correct answer")
-    similarity = torch.from_numpy(TMR["in/few_values" if name == "few_values" else "in/sims"]).double()
+    similarity = torch.from_numpy(
+        TMR["in/few_values" if name == "few_values" else "in/sims"]
+    ).double()
     if name == "nsim":
         chosen = torch.from_numpy(TMR["in/nsim_idx"])
         similarity = similarity[chosen][:, chosen]
@@ -218,20 +283,33 @@ def test_ranks_equal_tmrs(group: str):
 
 @golden_case("tmr_retrieval")
 def test_retrieval_in_small_batches_and_by_protocol_equals_tmrs(stem: str, tmp_path, monkeypatch):
-    similarity, batches = torch.from_numpy(TMR["in/sims"]).double(), torch.from_numpy(TMR["out/guo/batches"])
+    similarity, batches = (
+        torch.from_numpy(TMR["in/sims"]).double(),
+        torch.from_numpy(TMR["out/guo/batches"]),
+    )
     assert_recall(batched_retrieval(similarity, batches), TMR, tmr("out/guo"))
 
     ids, chosen = TMR["in/keyids"].tolist(), TMR["in/nsim_idx"]
     vectors = dict(zip(ids, torch.from_numpy(TMR["in/sent_emb"]), strict=True))
-    monkeypatch.setattr("evaluators.metrics.retrieval.embedding", lambda encoder, caption: vectors[caption])
+    monkeypatch.setattr(
+        "evaluators.metrics.retrieval.embedding", lambda encoder, caption: vectors[caption]
+    )
     listed = tmp_path / "nsim_test.txt"
     listed.write_text("\n".join([*(ids[i] for i in chosen), "not_evaluated"]) + "\n")
     metric = TMRRetrieval(encoder={"_target_": "stand-in"}, ids=str(listed))
     motion, text = (torch.from_numpy(TMR[f"in/{kind}_latent"]) for kind in ("motion", "text"))
     metric.update(motion, text, ids, torch.tensor([key(name) for name in ids]))
     values = metric.compute()
-    for ours, theirs in (("all", "normal"), ("threshold", "threshold_0.95"), ("dissimilar", "nsim")):
-        part = {name.removeprefix(f"{ours}_"): value for name, value in values.items() if name.startswith(ours)}
+    for ours, theirs in (
+        ("all", "normal"),
+        ("threshold", "threshold_0.95"),
+        ("dissimilar", "nsim"),
+    ):
+        part = {
+            name.removeprefix(f"{ours}_"): value
+            for name, value in values.items()
+            if name.startswith(ours)
+        }
         # Their similarities are float32, which moves single queries whose answers are nearly equal.
         assert_recall(part, TMR, tmr(f"out/driver_bs256/{theirs}"), within=1.01 * 100 / len(ids))
 
@@ -248,7 +326,9 @@ def test_multi_positive_r_precision_of_an_example_and_dissimilar_captions():
     similarity = torch.tensor([[0.9, 0.8, 0.8, 0.1]])
     values = multi_positive(similarity, torch.tensor([[True, False, True, False]]))
     expected = {"top1": 1, "top2": 1, "top3": 1, "proper": 0.75, "positives": 2}
-    assert values == pytest.approx(expected | {"chance_top1": 0.5, "chance_top2": 5 / 6, "chance_top3": 1})
+    assert values == pytest.approx(
+        expected | {"chance_top1": 0.5, "chance_top2": 5 / 6, "chance_top3": 1}
+    )
     values = multi_positive(similarity, torch.tensor([[False, True, True, False]]))
     assert (values["top1"], values["top2"], values["proper"]) == (0, 1, 0.5)
     angles = torch.linspace(0, math.pi / 2, 5)
@@ -260,8 +340,14 @@ def test_equal_captions_count_as_correct_and_the_classic_value_stays():
     count, generator = 96, torch.Generator().manual_seed(0)
     text = torch.randn(count // 2, 4, generator=generator).repeat(2, 1)
     motion = text + 1e-3 * torch.randn(text.shape, generator=generator)
-    captions = [f"A person {i % (count // 2)}" + ("." if i < count // 2 else " ") for i in range(count)]
-    assert plain_caption("A man,  walking. ") == plain_caption("a man walking") != plain_caption("a man walks")
+    captions = [
+        f"A person {i % (count // 2)}" + ("." if i < count // 2 else " ") for i in range(count)
+    ]
+    assert (
+        plain_caption("A man,  walking. ")
+        == plain_caption("a man walking")
+        != plain_caption("a man walks")
+    )
     keys = torch.arange(count)
     metric, classic = MultiPositiveRPrecision(), MotionsForText()
     metric.update(motion, text, captions, keys)
@@ -288,7 +374,9 @@ def test_windows_of_transitions():
 
 
 @pytest.mark.parametrize(("step", "is_inside"), [(15, False), (16, True), (24, True), (25, False)])
-def test_windows_of_transitions_are_centered_at_the_first_frame_after_them(step: int, is_inside: bool):
+def test_windows_of_transitions_are_centered_at_the_first_frame_after_them(
+    step: int, is_inside: bool
+):
     """The window of 10 frames at frame 20 has frames 15 to 24, so that it contains steps into frames 16 to 24."""
     joints = torch.zeros(1, 40, 22, 3)
     joints[:, step:, 3, 0] = 1

@@ -25,8 +25,12 @@ def test_recipes_have_the_values_of_their_papers():
         for name, column in columns.items():
             papers = {key: cell for key, cell in column.items() if cell is not None}
             ours = generate.hyperparameters(name) if papers else {}
-            differing = {key for key, cell in papers.items() if not generate.same(ours.get(key), cell)}
-            assert differing == {key for row, key in generate.DEVIATIONS if row == name and key in papers}, name
+            differing = {
+                key for key, cell in papers.items() if not generate.same(ours.get(key), cell)
+            }
+            assert differing == {
+                key for row, key in generate.DEVIATIONS if row == name and key in papers
+            }, name
 
 
 def test_values_come_from_the_class_where_the_recipe_is_silent_and_agree_to_the_papers_digits():
@@ -39,7 +43,11 @@ def test_values_come_from_the_class_where_the_recipe_is_silent_and_agree_to_the_
 
 
 def test_the_pages_are_those_of_the_recipes():
-    stale = [page for page, write in generate.PAGES.items() if (ROOT / "docs" / page).read_text() != write()]
+    stale = [
+        page
+        for page, write in generate.PAGES.items()
+        if (ROOT / "docs" / page).read_text() != write()
+    ]
     assert stale == [], "python docs/generate.py writes them"
 
 
@@ -47,7 +55,11 @@ def test_recipes_of_the_papers_sets_name_paper_and_deviations():
     for name in recipes():
         what, deviations = generate.head(name)
         if name.split("/")[0] in ("humanml3d", "kit", "babel", "humanact12", "uestc"):
-            whole = "arXiv:" in what and ("table" in what or "not a row of the" in what.lower()) and deviations
+            whole = (
+                "arXiv:" in what
+                and ("table" in what or "not a row of the" in what.lower())
+                and deviations
+            )
             assert whole, name
 
 
@@ -61,15 +73,20 @@ def test_samplers_steps_and_prompts_suit_process_and_condition():
         else:
             assert task["sampler"] in GaussianDiffusion.samplers, name
             assert 2 <= (len(steps) if isinstance(steps, list) else steps) <= total, name
-            assert not isinstance(steps, list) or (steps == sorted(set(steps)) and 0 <= steps[0] <= steps[-1] < total)
+            assert not isinstance(steps, list) or (
+                steps == sorted(set(steps)) and 0 <= steps[0] <= steps[-1] < total
+            )
         frames = instantiate(config["data"]["crop"]).longest()
         assert config["denoiser"].get("max_frames", frames) >= frames, name
         guided = task["guidance_scale"] != 1
-        assert not guided or task["cond_drop_prob"] > 0, f"{name}: guided, but never trained without condition"
+        assert not guided or task["cond_drop_prob"] > 0, (
+            f"{name}: guided, but never trained without condition"
+        )
         prompts = config["callbacks"]["samples"]["prompts"]
         kind = config["condition"]["_target_"].rpartition(".")[2]
         assert (prompts is None) == (kind == "Unconditional"), name
-        if kind == "ActionLabels" and not name.startswith("uestc"):  # UESTC's names are in its files
+        # UESTC's names are in its files
+        if kind == "ActionLabels" and not name.startswith("uestc"):
             assert set(prompts) <= set(instantiate(config["data"]["source"]).actions), name
 
 
@@ -85,7 +102,12 @@ class Drawn(ConditionEncoder):
 
     def _drawn(self, size: int, null: Condition | None = None) -> Condition:
         tokens = torch.randn(size, self.tokens, self.features)
-        return Condition(torch.randn(size, self.features), tokens, torch.ones(tokens.shape[:2], dtype=torch.bool), null)
+        return Condition(
+            torch.randn(size, self.features),
+            tokens,
+            torch.ones(tokens.shape[:2], dtype=torch.bool),
+            null,
+        )
 
 
 def shortened(name: str) -> dict[str, Any]:
@@ -102,7 +124,9 @@ def decisive(name: str) -> str:
     """What decides how a training step is computed."""
     config = shortened(name)
     options = [config["task"]["cond_drop_prob"] > 0, config["losses"], config["optimizer"]]
-    return repr([config[part] for part in ("denoiser", "process", "condition", "representation")] + options)
+    return repr(
+        [config[part] for part in ("denoiser", "process", "condition", "representation")] + options
+    )
 
 
 def built(name: str) -> GeneratorTask:
@@ -122,17 +146,22 @@ def step(name: str) -> None:
     task = built(name)
     mask = length_mask(torch.tensor([24, 16]))
     x = torch.randn(*mask.shape, task.generator.representation.features) * mask[..., None]
-    batch = MotionBatch(x, mask, ["a", "b"], ["a person walks", "a person jumps"], torch.tensor([0, 1]))
+    batch = MotionBatch(
+        x, mask, ["a", "b"], ["a person walks", "a person jumps"], torch.tensor([0, 1])
+    )
     optimizer = task.make_optimizer()
     before = [parameter.detach().clone() for parameter in task.parameters()]
     loss = task.training_step(batch, 0)
     loss.backward()
     assert loss.isfinite()
-    lacking = [key for key, value in task.named_parameters() if value.requires_grad and value.grad is None]
+    lacking = [
+        key for key, value in task.named_parameters() if value.requires_grad and value.grad is None
+    ]
     assert not lacking, "parameters without a gradient, on which DDP would stop"
     optimizer.step()
     moved = [not torch.equal(old, new) for old, new in zip(before, task.parameters(), strict=True)]
-    assert sum(moved) > 0.9 * len(moved)  # zero gradients, as of labels that are not in the batch, move nothing
+    # Zero gradients, as of labels that are not in the batch, move nothing
+    assert sum(moved) > 0.9 * len(moved)
     task.eval()
     with torch.no_grad():
         task.validation_step(batch, 0)

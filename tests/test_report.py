@@ -25,7 +25,12 @@ from flame_mdm.training import callbacks
 
 pytestmark = pytest.mark.slow
 
-RUN = [*TINY, "trainer.log_every_n_steps=2", "trainer.val_check_interval=4", "callbacks.checkpoints.every_n_steps=4"]
+RUN = [
+    *TINY,
+    "trainer.log_every_n_steps=2",
+    "trainer.val_check_interval=4",
+    "callbacks.checkpoints.every_n_steps=4",
+]
 EVALUATE = """# @package _global_
 defaults:
   - /quickstart
@@ -53,12 +58,22 @@ def evaluated(tmp_path_factory, data_root, printed) -> Path:
     folder = tmp_path_factory.mktemp("evaluated")
     (folder / "mine.yaml").write_text(EVALUATE)
     with contextlib.redirect_stdout(printed):
-        return run(folder / "run", data_root, "trainer.max_steps=8", recipe=str(folder / "mine.yaml"))
+        return run(
+            folder / "run", data_root, "trainer.max_steps=8", recipe=str(folder / "mine.yaml")
+        )
 
 
 def test_the_history_holds_what_a_step_does_and_costs(evaluated):
     curves = read_history(evaluated)
-    for name in ("loss", "mse", "grad_norm", "lr", "epochs", "samples_per_second", "seconds_per_step"):
+    for name in (
+        "loss",
+        "mse",
+        "grad_norm",
+        "lr",
+        "epochs",
+        "samples_per_second",
+        "seconds_per_step",
+    ):
         assert list(curves[f"train/{name}"]) == [1, 3, 5, 7], name
     assert list(curves["val/loss"]) == [3, 7]
     clips = 108  # of 120
@@ -73,7 +88,9 @@ def test_the_history_holds_what_a_step_does_and_costs(evaluated):
     assert curves[jitter].keys() == curves[f"{jitter}/real"].keys() == {3, 7}
     assert len({*curves[f"{jitter}/real"].values()}) == 1, "real motions do not change"
     assert 0 < curves[f"{jitter}/real"][3] < curves[jitter][3]
-    assert "val/synthetic/jitter" not in curves, "checkpoints alone are selected by the name without a unit"
+    assert "val/synthetic/jitter" not in curves, (
+        "checkpoints alone are selected by the name without a unit"
+    )
 
 
 def test_tensorboard_shows_the_table_the_configuration_and_the_data(evaluated):
@@ -81,16 +98,26 @@ def test_tensorboard_shows_the_table_the_configuration_and_the_data(evaluated):
     events.Reload()
     names = events.Tags()["tensors"]
     values = [events.Tensors(name)[-1].tensor_proto.string_val[0].decode() for name in names]
-    text = {name.removesuffix("/text_summary"): value for name, value in zip(names, values, strict=True)}
-    evaluation = "| metric | mean | ci | replications | n | unit | real motions |", "| foot_skating |", "| m/s^3 |"
+    text = {
+        name.removesuffix("/text_summary"): value for name, value in zip(names, values, strict=True)
+    }
+    evaluation = (
+        "| metric | mean | ci | replications | n | unit | real motions |",
+        "| foot_skating |",
+        "| m/s^3 |",
+    )
     assert all(words in text["evaluation/synthetic"] for words in evaluation)
     assert "num_train_timesteps: 10" in text["config"]
     assert "fingerprint: " in text["provenance"]
     assert events.Tags()["images"] == ["samples"]
-    assert {event.step for event in events.Images("samples")} <= {3, 7}, "the steps of the validations"
+    assert {event.step for event in events.Images("samples")} <= {3, 7}, (
+        "the steps of the validations"
+    )
 
 
-def test_the_norm_is_that_before_clipping_and_taken_for_the_log_alone(tmp_path, data_root, monkeypatch):
+def test_the_norm_is_that_before_clipping_and_taken_for_the_log_alone(
+    tmp_path, data_root, monkeypatch
+):
     norms = []
 
     def counted(gradients: Any) -> torch.Tensor:
@@ -98,9 +125,15 @@ def test_the_norm_is_that_before_clipping_and_taken_for_the_log_alone(tmp_path, 
         return norms[-1]
 
     monkeypatch.setattr(callbacks, "get_total_norm", counted)
-    words = ["trainer.max_steps=6", "trainer.gradient_clip_val=1e-6", "trainer.accumulate_grad_batches=2"]
+    words = [
+        "trainer.max_steps=6",
+        "trainer.gradient_clip_val=1e-6",
+        "trainer.accumulate_grad_batches=2",
+    ]
     curves = read_history(run(tmp_path / "run", data_root, *words, "callbacks.samples=null"))
-    assert list(curves["train/grad_norm"].values()) == pytest.approx([float(norm) for norm in norms])
+    assert list(curves["train/grad_norm"].values()) == pytest.approx(
+        [float(norm) for norm in norms]
+    )
     assert list(curves["train/grad_norm"]) == [1, 3, 5]
     assert min(curves["train/grad_norm"].values()) > 1e-3
     pace = curves["train/samples_per_second"][5] * curves["train/seconds_per_step"][5]
@@ -127,18 +160,31 @@ def test_wandb_has_one_run_through_resume(tmp_path, data_root, monkeypatch):
     assert len(list(folder.glob(f"wandb/offline-run-*-{first_id}/*.wandb"))) == 2
     assert any("samples" in row for row in rows[first:])
     filled = [row for row in rows if len(row) > 1]
-    assert [row["_step"] for row in filled] == list(range(len(filled))), "else the second part replaces the first"
+    assert [row["_step"] for row in filled] == list(range(len(filled))), (
+        "else the second part replaces the first"
+    )
     steps = [row["trainer/global_step"] for row in filled]
     assert steps == sorted(steps)
-    losses = {row["trainer/global_step"]: row["train/loss"] for row in filled if "train/loss" in row}
+    losses = {
+        row["trainer/global_step"]: row["train/loss"] for row in filled if "train/loss" in row
+    }
     assert losses == pytest.approx(read_history(folder)["train/loss"])
 
 
 def test_training_ends_with_a_report_that_needs_nothing_else(evaluated):
     text = (evaluated / "report.html").read_text()
-    for words in ("Samples at step 8", "Losses", "Validation", "synthetic/foot_skating", "grad_norm", "fingerprint"):
+    for words in (
+        "Samples at step 8",
+        "Losses",
+        "Validation",
+        "synthetic/foot_skating",
+        "grad_norm",
+        "fingerprint",
+    ):
         assert words in text, words
-    assert not re.findall(r"""(?:src|href)=["'](?!data:)|url\(|@import|https?://(?!www\.w3\.org)""", text)
+    assert not re.findall(
+        r"""(?:src|href)=["'](?!data:)|url\(|@import|https?://(?!www\.w3\.org)""", text
+    )
     assert "srcdoc=" in text
     assert main(["report", str(evaluated)]) == 0
     assert (evaluated / "report.html").read_text() == text
@@ -148,11 +194,22 @@ def test_a_report_shows_evaluations_and_why_training_stopped(tmp_path):
     folder = a_run(tmp_path / "run")
     put(folder, invalid_because=["real motions are off"], changed={"samples": 64})
     batches = [{"rank": 0, "batch": 7, "ids": ["<b>walk"], "loss": "nan"}]
-    (folder / "bad_batch.json").write_text(json.dumps({"step": 8, "usual_loss": "0.5", "batches": batches}))
+    (folder / "bad_batch.json").write_text(
+        json.dumps({"step": 8, "usual_loss": "0.5", "batches": batches})
+    )
     text = write_report(folder).read_text()
     for words in (
-        *("4.5 ± 0.25", "0.125 ± 0.25", "not valid: real motions are off", "differs from the protocol: samples 64"),
-        *("not computed: kid: too few &lt;samples&gt;", "ddim, 5 steps, guidance 2.5", "p version 3, synthetic test"),
+        *(
+            "4.5 ± 0.25",
+            "0.125 ± 0.25",
+            "not valid: real motions are off",
+            "differs from the protocol: samples 64",
+        ),
+        *(
+            "not computed: kid: too few &lt;samples&gt;",
+            "ddim, 5 steps, guidance 2.5",
+            "p version 3, synthetic test",
+        ),
         *("Training stopped at step 8", "&lt;b&gt;walk"),
     ):
         assert words in text, words
@@ -161,11 +218,15 @@ def test_a_report_shows_evaluations_and_why_training_stopped(tmp_path):
 
 def test_names_are_text_not_html(tmp_path):
     folder = a_run(tmp_path / "run", name="<script>alert(1)</script>", note="</pre><script>")
-    (folder / "metrics.jsonl").write_text('{"step": 1, "train/<i>x": 2.0}\n{"step": 2, "train/<i>x": 3.0}\n')
+    (folder / "metrics.jsonl").write_text(
+        '{"step": 1, "train/<i>x": 2.0}\n{"step": 2, "train/<i>x": 3.0}\n'
+    )
     text = write_report(folder).read_text()
     assert not re.search("<script|<i>x", text)
     text = page("a & b", chart("<i>", {"<b>": {1: 2.0}}) + "<u>")
-    assert all(escaped in text for escaped in ("<title>a &amp; b</title>", "&lt;i&gt;", "&lt;u&gt;"))
+    assert all(
+        escaped in text for escaped in ("<title>a &amp; b</title>", "&lt;i&gt;", "&lt;u&gt;")
+    )
     assert not re.search("<[ibu]>", text)
 
 
@@ -181,10 +242,15 @@ def test_missing_files_are_named(tmp_path, capsys):
 
 def test_training_ends_with_what_its_numbers_mean(evaluated, printed, tmp_path):
     out, curves = printed.getvalue(), read_history(evaluated)
-    ours, real = re.findall(r"^  foot_skating: (\S+) \(real motions: (\S+)\)$", out, re.MULTILINE)[0]
+    ours, real = re.findall(r"^  foot_skating: (\S+) \(real motions: (\S+)\)$", out, re.MULTILINE)[
+        0
+    ]
     assert ours == number(curves["samples/foot_skating"][7])
     assert 0 <= float(real) < 0.05
-    assert "foot_skating: Foot skating ratio: fraction of frame transitions in which a foot that touches" in out
+    assert (
+        "foot_skating: Foot skating ratio: fraction of frame transitions in which a foot that touches"
+        in out
+    )
     assert re.search(r"^  attributes/action: \S+ \(real motions: 1\)$", out, re.MULTILINE)
     pattern = r"^loss after 8 steps: (\S+) on the last batch, (\S+) on the validation clips"
     ((batch, clips),) = re.findall(pattern, out, re.MULTILINE)
@@ -202,10 +268,17 @@ def points(svg: str) -> list[tuple[float, float]]:
 
 def test_a_chart_draws_what_it_is_given():
     straight = points(chart("x", {"a": {0: 1.0, 5: 2.0, 10: 3.0}}))
-    assert straight[1] == pytest.approx(((straight[0][0] + straight[2][0]) / 2, (straight[0][1] + straight[2][1]) / 2))
+    assert straight[1] == pytest.approx(
+        ((straight[0][0] + straight[2][0]) / 2, (straight[0][1] + straight[2][1]) / 2)
+    )
     assert straight[0][1] > straight[2][1], "up is more"
     logarithmic = points(chart("x", {"a": {0: 1.0, 5: 10.0, 10: 100.0}}))
     assert logarithmic[1][1] == pytest.approx((logarithmic[0][1] + logarithmic[2][1]) / 2, abs=0.1)
-    thin = points(chart("x", {"a": {step: math.sin(step / 500) for step in range(20_000)} | {7777: 9.0}}))
+    thin = points(
+        chart("x", {"a": {step: math.sin(step / 500) for step in range(20_000)} | {7777: 9.0}})
+    )
     assert len(thin) <= 600
-    assert min(y for _, y in thin) == points(chart("x", {"a": {0: 0.0, 7777: 9.0, 19_999: -1.0}}))[1][1], "extremes"
+    assert (
+        min(y for _, y in thin)
+        == points(chart("x", {"a": {0: 0.0, 7777: 9.0, 19_999: -1.0}}))[1][1]
+    ), "extremes"

@@ -30,15 +30,25 @@ from flame_mdm.representations.motion272 import Motion272, face_forward
 from flame_mdm.representations.rifke import Rifke, upsample
 from flame_mdm.representations.rot6d import Rot6D
 from flame_mdm.representations.rotation import is_degenerate
-from flame_mdm.representations.skeleton import SKELETONS, SMPL22, forward_kinematics, global_rotations
+from flame_mdm.representations.skeleton import (
+    SKELETONS,
+    SMPL22,
+    forward_kinematics,
+    global_rotations,
+)
 from flame_mdm.representations.smpl import SMPL
 
 STEMS = ["hml263", "kit251"]
-STEMS += [pytest.param(f"third_party-{stem}", marks=needs_third_party) for stem in ("hml263", "hml263_bandai")]
+STEMS += [
+    pytest.param(f"third_party-{stem}", marks=needs_third_party)
+    for stem in ("hml263", "hml263_bandai")
+]
 
 
 def arrays(stem: str) -> Arrays:
-    return third_party(stem.removeprefix("third_party-")) if stem.startswith("third") else golden(stem)
+    return (
+        third_party(stem.removeprefix("third_party-")) if stem.startswith("third") else golden(stem)
+    )
 
 
 def cases(stem: str, *keys: str) -> list[list[Tensor]]:
@@ -51,7 +61,9 @@ def legacy(stem: str) -> tuple[HumanML, Tensor]:
     """The published features of a fixture, in its own units, and the bone lengths of its target skeleton."""
     lengths = torch.from_numpy(np.linalg.norm(arrays(stem)["tgt_offsets"], axis=-1))
     if stem.startswith("kit"):
-        return HumanML("kit21", "legacy", fps=12.5, bone_lengths=lengths.tolist(), contact_threshold=0.05), lengths
+        return HumanML(
+            "kit21", "legacy", fps=12.5, bone_lengths=lengths.tolist(), contact_threshold=0.05
+        ), lengths
     return HumanML("smpl22", "legacy", bone_lengths=lengths.tolist()), lengths
 
 
@@ -71,7 +83,9 @@ def decode_rotations(representation: HumanML, features: Tensor, bone_lengths: Te
     local = torch.cat([rotation.axis_angle_to_matrix(facing)[..., None, :, :], local], -3)
     turned = global_rotations(local, skeleton.chain_parents if legacy else skeleton.parents)
     offsets = features.new_tensor(skeleton.raw_offsets) * bone_lengths[:, None]
-    return skeleton.assemble((turned @ offsets[..., None])[..., 0], root / representation.units_per_metre)
+    return skeleton.assemble(
+        (turned @ offsets[..., None])[..., 0], root / representation.units_per_metre
+    )
 
 
 def close(actual: Tensor, expected: Tensor, atol: float) -> None:
@@ -93,7 +107,9 @@ def wander(skeleton: str = "smpl22", frames: int = 60, seed: int = 0, turns: flo
     amplitude[0] = 0
     bend = amplitude * torch.sin(2 * math.pi * (2 * time[:, None, None] + phase))
     bend[:, 0, 1] = 2 * math.pi * turns * time
-    across = torch.stack([torch.sin(bend[:, 0, 1]), 0.2 * torch.sin(9 * time), torch.cos(bend[:, 0, 1])], -1)
+    across = torch.stack(
+        [torch.sin(bend[:, 0, 1]), 0.2 * torch.sin(9 * time), torch.cos(bend[:, 0, 1])], -1
+    )
     offsets = torch.tensor(body.raw_offsets, dtype=torch.float64) * size
     return forward_kinematics(body, rotation.axis_angle_to_matrix(bend), offsets, across)
 
@@ -105,7 +121,9 @@ def test_skeleton_constants_and_mirrored_joints(stem: str):
     assert skeleton.parents == tuple(arrays(stem)["parents"])
     assert np.array_equal(skeleton.raw_offsets, arrays(stem)["raw_offsets"])
     if "kinematic_chain_padded" in arrays(stem):
-        assert skeleton.chains == tuple(tuple(c[c >= 0].tolist()) for c in arrays(stem)["kinematic_chain_padded"])
+        assert skeleton.chains == tuple(
+            tuple(c[c >= 0].tolist()) for c in arrays(stem)["kinematic_chain_padded"]
+        )
     for clip in groups(arrays(stem), "joints_in"):
         if clip.endswith("_mirror"):
             joints = torch.from_numpy(arrays(stem)[f"{clip.removesuffix('_mirror')}/joints_in"])
@@ -114,7 +132,12 @@ def test_skeleton_constants_and_mirrored_joints(stem: str):
 
 def test_skeletons_are_trees():
     for name, skeleton in SKELETONS.items():
-        assert len(set(skeleton.joints)) == len(skeleton.parents) == len(skeleton.raw_offsets) == len(skeleton), name
+        assert (
+            len(set(skeleton.joints))
+            == len(skeleton.parents)
+            == len(skeleton.raw_offsets)
+            == len(skeleton)
+        ), name
         assert skeleton.parents[0] == -1
         assert all(0 <= parent < joint for parent, joint in skeleton.edges)
         in_chains = [edge for chain in skeleton.chains for edge in itertools.pairwise(chain)]
@@ -142,7 +165,9 @@ def test_published_features_and_the_steps_to_and_from_them(stem: str):
         close(canonicalize(representation, joints), expected, atol)
     for expected, joints in cases(stem, "uniform", "joints_in"):
         one_clip = torch.zeros(len(joints), dtype=torch.int64)
-        close(representation._retarget(joints.double(), torch.tensor([0]), one_clip), expected, atol)
+        close(
+            representation._retarget(joints.double(), torch.tensor([0]), one_clip), expected, atol
+        )
     for expected, joints in cases(stem, "ik_root", "global_positions"):
         actual = yaw_quaternion(-representation._heading(joints.double()))
         close(actual * (actual * expected).sum(-1, keepdim=True).sign(), expected, 1e-5)
@@ -163,8 +188,12 @@ def test_published_statistics_and_normalization(stem: str):
     representation, _ = legacy(stem)
     ((*normed, features, joints),) = cases(stem, "normed", "normed_eval", "feats", "joints")
     portable = dict(np.load(SHARED / "golden" / "portable" / "hml263.npz"))
-    clips = [portable[f"{clip}/feats"] for clip in groups(portable, "feats") if "mirror" not in clip]
-    statistics = representation.statistics(torch.from_numpy(np.concatenate([features.numpy(), *clips])))
+    clips = [
+        portable[f"{clip}/feats"] for clip in groups(portable, "feats") if "mirror" not in clip
+    ]
+    statistics = representation.statistics(
+        torch.from_numpy(np.concatenate([features.numpy(), *clips]))
+    )
     for ours, theirs in zip(statistics, *cases(stem, "mean", "std"), strict=True):
         close(ours, theirs, 1e-5)  # the published one sums in float32
     for prefix, expected in zip(("", "eval_"), normed, strict=True):
@@ -187,11 +216,15 @@ def test_clean_motions_are_canonical_and_come_back_also_with_bones_opposite_to_t
 
     for skeleton in SKELETONS:
         representation = HumanML(skeleton)
-        joints = rotation.rotate_y(wander(skeleton), torch.tensor(2.0)) + torch.tensor([3.0, -1.0, 5.0])
+        joints = rotation.rotate_y(wander(skeleton), torch.tensor(2.0)) + torch.tensor(
+            [3.0, -1.0, 5.0]
+        )
         canonical = canonicalize(representation, joints)
         assert canonical[..., 1].min() == 0
         close(canonical[0, 0, ::2], torch.zeros(2), 1e-12)
-        right_hip, left_hip, right_shoulder, left_shoulder = canonical[0, list(representation.skeleton.facing)]
+        right_hip, left_hip, right_shoulder, left_shoulder = canonical[
+            0, list(representation.skeleton.facing)
+        ]
         across = right_hip - left_hip + right_shoulder - left_shoulder
         assert across[2].item() == pytest.approx(0, abs=1e-9)
         assert across[0] < 0, "facing +z, the right side is at -x"
@@ -200,7 +233,9 @@ def test_clean_motions_are_canonical_and_come_back_also_with_bones_opposite_to_t
     representation = HumanML()
     for tilt in (0.0, 1e-9, 1e-4):
         joints = wander(turns=0)  # a thigh straight up is opposite to its rest direction
-        joints = rotation.rotate_y(joints, -torch.atan2(*representation._facing(joints).unbind(-1))[:, None])
+        joints = rotation.rotate_y(
+            joints, -torch.atan2(*representation._facing(joints).unbind(-1))[:, None]
+        )
         lengths = representation.skeleton.bones(joints[0]).norm(dim=-1)
         offset = joints[:, 4] - joints[:, 1]
         joints[:, [4, 7, 10]] += torch.tensor([tilt, lengths[4].item(), 0]) - offset[:, None]
@@ -211,14 +246,20 @@ def test_clean_motions_are_canonical_and_come_back_also_with_bones_opposite_to_t
 
 def test_many_motions_at_once_are_encoded_as_one_by_one():
     motions = [wander(frames=frames, seed=frames, turns=frames / 30) for frames in (3, 41, 20)]
-    for representation in (HumanML(bone_lengths=[0.2] * 22), HumanML(variant="legacy"), Essential()):
+    for representation in (
+        HumanML(bone_lengths=[0.2] * 22),
+        HumanML(variant="legacy"),
+        Essential(),
+    ):
         for many, motion in zip(representation.encode_many(motions), motions, strict=True):
             assert torch.equal(many, representation.encode(motion))
 
 
 def test_statistics():
     representation = HumanML()
-    features = torch.randn(500, 263, generator=torch.Generator().manual_seed(0)) * torch.linspace(0.1, 3, 263)
+    features = torch.randn(500, 263, generator=torch.Generator().manual_seed(0)) * torch.linspace(
+        0.1, 3, 263
+    )
     features[:, representation.slices["contacts"]] = 1.0
     features[:, representation.slices["root_height"]] = 0.9
     mean, std = representation.statistics(features)
@@ -234,7 +275,11 @@ def test_bad_motions_and_options():
     for representation, motion, message in (
         (HumanML(), bent[:2], "2 frames"),
         (HumanML(), bent[:, :21], r"\(5, 21, 3\).*\(frames, 22, 3\)"),
-        (HumanML(), bent.index_fill(0, torch.tensor([3]), math.inf), "numbers in frame 3 are not finite"),
+        (
+            HumanML(),
+            bent.index_fill(0, torch.tensor([3]), math.inf),
+            "numbers in frame 3 are not finite",
+        ),
         (SMPL(), raw[:, :69], r"\(4, 69\)"),
         (Rot6D(), raw[:0], r"\(0, 75\)"),
         (Motion272(), raw[:1], "1 frame, but encoding needs at least 2"),
@@ -256,7 +301,9 @@ def test_bad_motions_and_options():
 def test_flame_features_of_published_samples(stem: str):
     file = tensors(third_party(stem))
     for clip in groups(third_party(stem), "feats147"):
-        features = SMPL().encode(torch.cat([file[f"{clip}/translation"], file[f"{clip}/axis_angle"].flatten(1)], 1))
+        features = SMPL().encode(
+            torch.cat([file[f"{clip}/translation"], file[f"{clip}/axis_angle"].flatten(1)], 1)
+        )
         close(features, file[f"{clip}/feats147"], 4e-4)  # as stored by their authors
 
 
@@ -269,7 +316,8 @@ def test_flame_features_and_action_features_of_consecutive_skipped_and_all_frame
     cases = [re.fullmatch(r"a2m/(|rc_|full_)inp_(\w+)", key) for key in file]
     for kind, number in [case.groups() for case in cases if case]:
         motion = torch.cat([file[f"a2m/joints3d_{number}"][:, 0], file[f"a2m/pose72_{number}"]], 1)
-        expected = file[f"a2m/{kind}inp_{number}"].permute(2, 0, 1).flatten(1)  # (25, 6, F) -> (F, 150)
+        # (25, 6, F) -> (F, 150)
+        expected = file[f"a2m/{kind}inp_{number}"].permute(2, 0, 1).flatten(1)
         if kind == "":
             start = max(int(file[f"a2m/shift_draw_{number}"][2]), 0)
             motion = motion[(start + torch.arange(len(expected))).clamp(max=len(motion) - 1)]
@@ -302,7 +350,9 @@ def test_every_recipe_builds_decodes_and_passes_gradients():
 @golden_case("temos64")
 def test_features_floor_heading_and_joints_are_temos(stem: str):
     rifke, file, atol = Rifke(), tensors(golden(stem)), 2e-3  # in KIT's unit, about 1.6 mm
-    clips = {name: file[f"{name}/joints_in"].double() / 640 for name in groups(golden(stem), "joints_in")}
+    clips = {
+        name: file[f"{name}/joints_in"].double() / 640 for name in groups(golden(stem), "joints_in")
+    }
     for name, joints in clips.items():
         close(rifke.encode(joints), file[f"{name}/feats"], atol)
         close(rifke.floor(joints * 640)[None], file[f"{name}/floor"], atol)
@@ -318,8 +368,13 @@ def test_features_floor_heading_and_joints_are_temos(stem: str):
     features = file["batch/feats_padded"]
     for row, length in enumerate(file["batch/lengths"].tolist()):
         same = [clip for clip in clips.values() if len(clip) == length]
-        padded = [functional.pad(clip, (0, 0, 0, 0, 0, features.shape[1] - length)) for clip in same]
-        assert min((rifke.encode(p)[:length] - features[row, :length]).abs().max() for p in padded) < atol
+        padded = [
+            functional.pad(clip, (0, 0, 0, 0, 0, features.shape[1] - length)) for clip in same
+        ]
+        assert (
+            min((rifke.encode(p)[:length] - features[row, :length]).abs().max() for p in padded)
+            < atol
+        )
     close(rifke.decode(features.double()) * 640, file["batch/joints_back_padded"], atol)
     x = file["norm/feats_clip0"]
     rifke.mean.copy_(file["norm/mean"])
@@ -331,14 +386,21 @@ def test_features_floor_heading_and_joints_are_temos(stem: str):
 
 @golden_case("motion272")
 def test_motion272_is_the_authors(stem: str):
-    representation, file = Motion272(), {key: value.double() for key, value in tensors(golden(stem)).items()}
+    representation, file = (
+        Motion272(),
+        {key: value.double() for key, value in tensors(golden(stem)).items()},
+    )
 
     def pose(name: str) -> tuple[Tensor, Tensor]:
         values = file[name]  # 22 axis-angles, 6 zeros and a translation
         return values[:, 72:75], rotation.axis_angle_to_matrix(values[:, :66].unflatten(1, (22, 3)))
 
     def cases(suffix: str) -> list[str]:
-        return [name.partition("/")[2] for name in groups(golden(stem), suffix) if not name.startswith("f64/")]
+        return [
+            name.partition("/")[2]
+            for name in groups(golden(stem), suffix)
+            if not name.startswith("f64/")
+        ]
 
     for case in cases("face_z"):
         translation, rotations = face_forward(*pose(f"in/{case}/smpl_85"))
@@ -354,7 +416,9 @@ def test_motion272_is_the_authors(stem: str):
         theirs, turned = pose(f"f64/{case}/rec_smpl_85")
         close(pelvis, theirs, 1e-5)
         close(rotations, turned, 1e-5)
-    frames = torch.cat([file[f"out/{case}/feats"] for case in meta(golden(stem))["config"]["stats_over"]])
+    frames = torch.cat(
+        [file[f"out/{case}/feats"] for case in meta(golden(stem))["config"]["stats_over"]]
+    )
     for ours, name in zip(representation.statistics(frames.float()), ("mean", "std"), strict=True):
         close(ours, file[f"out/stats/{name}"], 1e-6)
 
@@ -381,9 +445,15 @@ def test_essential_features_are_the_first_of_humanml_and_the_authors(stem: str):
 def test_cuts_of_motion272_start_like_whole_motions():
     """A body of 24 joints, z up, walks in a circle and bends its joints."""
     time = torch.linspace(0, 1, 50, dtype=torch.float64)
-    turns = 0.4 * torch.randn(24, 3, generator=torch.Generator().manual_seed(0)) * torch.sin(6 * time)[:, None, None]
+    turns = (
+        0.4
+        * torch.randn(24, 3, generator=torch.Generator().manual_seed(0))
+        * torch.sin(6 * time)[:, None, None]
+    )
     turns[:, 0] = torch.stack([torch.pi / 2 + 0 * time, 5 * time, 0 * time], 1)
-    way = torch.stack([3 * torch.sin(5 * time), 3 * torch.cos(5 * time), 1 + 0.1 * torch.sin(20 * time)], 1)
+    way = torch.stack(
+        [3 * torch.sin(5 * time), 3 * torch.cos(5 * time), 1 + 0.1 * torch.sin(20 * time)], 1
+    )
     representation = Motion272()
     features = representation.encode(torch.cat([way, turns.flatten(1)], 1))
     cut = representation.rebase(features[20:])
@@ -391,7 +461,12 @@ def test_cuts_of_motion272_start_like_whole_motions():
     for name in ("root_velocity", "turn", "velocities"):
         close(cut[0, representation.slices[name]], features[0, representation.slices[name]], 0)
     assert not is_degenerate(representation.rotations6d(cut)).any()
-    joints, whole = representation.decode(cut.double()), representation.decode(features.double())[20:]
+    joints, whole = (
+        representation.decode(cut.double()),
+        representation.decode(features.double())[20:],
+    )
     assert joints[0, 0, [0, 2]].abs().max() == 0
-    distances, expected = (torch.cdist(points, points) for points in (joints.flatten(0, 1), whole.flatten(0, 1)))
+    distances, expected = (
+        torch.cdist(points, points) for points in (joints.flatten(0, 1), whole.flatten(0, 1))
+    )
     close(distances, expected, 1e-4)

@@ -36,7 +36,9 @@ def model() -> flame_mdm.MotionGenerator:
 
 def hints(kind: type, without: Sequence[str] = ()) -> dict[str, Any]:
     annotations = get_type_hints(kind, {**vars(motion_request), "Motion": Motion})
-    return {entry.name: annotations[entry.name] for entry in fields(kind) if entry.name not in without}
+    return {
+        entry.name: annotations[entry.name] for entry in fields(kind) if entry.name not in without
+    }
 
 
 def test_keywords_of_generate_and_edit_have_the_names_and_types_of_the_fields_of_requests():
@@ -70,7 +72,9 @@ def test_a_request_is_resolved_once_and_reads_its_targets_once(tmp_path, monkeyp
     words = [f"text={TEXT}", "seconds=1.5", "num_inference_steps=2", "samples=1", "targets=t.json"]
     with (
         patch.object(resolution, "read_targets", wraps=read_targets) as read,
-        patch.object(resolution.Reader, "read", autospec=True, side_effect=resolution.Reader.read) as understood,
+        patch.object(
+            resolution.Reader, "read", autospec=True, side_effect=resolution.Reader.read
+        ) as understood,
     ):
         assert main(["sample", "quickstart", *words]) == 0
     assert (read.call_count, understood.call_count) == (1, 1)
@@ -110,7 +114,9 @@ def test_a_path_is_as_long_as_the_motion_whose_sentence_becomes_a_sequence(model
         resolve(SamplingRequest(texts=[TEXT, TEXT], seconds=[1, 2], path="0,1"), model)
 
 
-@pytest.mark.parametrize(("time", "frame"), [(0.99, 20), (1.02, 20), (1.03, 21), (0.29, 6), (1.149, 23)])
+@pytest.mark.parametrize(
+    ("time", "frame"), [(0.99, 20), (1.02, 20), (1.03, 21), (0.29, 6), (1.149, 23)]
+)
 def test_a_target_is_at_the_frame_nearest_to_its_time(model, tmp_path, time, frame):
     """At 20 frames per second, 0.99 s is nearest to frame 20, not to frame 19."""
     flame_mdm.generate(model, TEXT, seconds=1, num_inference_steps=2)[0].save(tmp_path / "walk.npz")
@@ -138,7 +144,9 @@ def test_the_best_of_several_candidates_is_kept(model):
     assert len(chosen) == len(groups) == 2
     for motion, group in zip(chosen, (several[:3], several[3:]), strict=True):
         faultless = [motion for motion in group if not find_faults(motion)] or group
-        np.testing.assert_allclose(motion.joints, faultless[int(np.argmax(score(faultless)))].joints, atol=1e-4)
+        np.testing.assert_allclose(
+            motion.joints, faultless[int(np.argmax(score(faultless)))].joints, atol=1e-4
+        )
 
 
 def test_without_a_score_the_fewest_faulty_frames_decide():
@@ -153,7 +161,10 @@ def test_a_faultless_candidate_is_kept_even_if_a_faulty_one_has_a_higher_score()
     faulty, faultless = synthetic(), synthetic()
     faulty.joints[5, 3, 0] += 5
     assert not find_faults(faultless)
-    assert best([faulty, faultless], lambda motions: [float(motion is faulty) for motion in motions]) is faultless
+    assert (
+        best([faulty, faultless], lambda motions: [float(motion is faulty) for motion in motions])
+        is faultless
+    )
 
 
 @pytest.mark.parametrize(
@@ -161,7 +172,10 @@ def test_a_faultless_candidate_is_kept_even_if_a_faulty_one_has_a_higher_score()
     [
         ({"candidates": 0}, "candidates=0: give 1 to"),
         ({"candidates": 2, "stages": []}, "single motion"),
-        ({"samples": 5_000, "candidates": 3}, "samples times candidates=15000 of each text: at most 10,000 motions"),
+        (
+            {"samples": 5_000, "candidates": 3},
+            "samples times candidates=15000 of each text: at most 10,000 motions",
+        ),
     ],
     ids=str,
 )
@@ -175,13 +189,28 @@ def test_the_command_chooses_by_a_motion_clip(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     words = [f"text={TEXT}", "seconds=1.5", "num_inference_steps=4", "samples=1"]
     assert main(["sample", "quickstart", *words, "samples=4", "out=all"]) == 0
-    assert main(["sample", "quickstart", *words, "candidates=4", "scorer=motion_clip_synthetic", "out=best"]) == 0
+    assert (
+        main(
+            [
+                "sample",
+                "quickstart",
+                *words,
+                "candidates=4",
+                "scorer=motion_clip_synthetic",
+                "out=best",
+            ]
+        )
+        == 0
+    )
     (chosen,) = Path("best").glob("*.npz")
     joints = np.load(chosen)["joints"]
     candidates = [np.load(file)["joints"] for file in sorted(Path("all").glob("*.npz"))]
     assert sum(np.allclose(joints, candidate, atol=1e-4) for candidate in candidates) == 1
     for options, message in (
-        (["scorer=quickstart"], "scorer=quickstart chooses among motions for a text: give text=... and candidates=8"),
+        (
+            ["scorer=quickstart"],
+            "scorer=quickstart chooses among motions for a text: give text=... and candidates=8",
+        ),
         (["scorer=none.ckpt", "candidates=2"], "scorer: none.ckpt: no such checkpoint. Give a run"),
         (["scorer=quickstart", "candidates=2"], "holds a motion generator, not a motion-CLIP"),
     ):
@@ -199,13 +228,17 @@ def test_edit_takes_a_part_of_any_motion(model, tmp_path):
         (tmp_path / "walk.npz", {}),
     ]
     for source, file_options in sources:
-        with pytest.raises(UserError, match=r"at most 60 \(3 seconds\): select a part with cut=\[begin, end\]"):
+        with pytest.raises(
+            UserError, match=r"at most 60 \(3 seconds\): select a part with cut=\[begin, end\]"
+        ):
             flame_mdm.edit(model, source, TEXT, **options, **file_options)
         edited = flame_mdm.edit(model, source, TEXT, cut=[1, 2.5], **options, **file_options)[0]
         assert len(edited.joints) == 30
         np.testing.assert_allclose(edited.original.joints[0, 0, [0, 2]], 0, atol=1e-5)
         pose = motion.joints[20] - motion.joints[20, 0]
-        np.testing.assert_allclose(edited.original.joints[0, :, 1], pose[:, 1] + motion.joints[20, 0, 1], atol=0.02)
+        np.testing.assert_allclose(
+            edited.original.joints[0, :, 1], pose[:, 1] + motion.joints[20, 0, 1], atol=0.02
+        )
     with one_line_error(r"cut=\[3, 9\] is not a range of .*, which lasts 4 seconds"):
         flame_mdm.edit(model, motion, TEXT, cut=[3, 9], **options)
 
@@ -214,25 +247,52 @@ def test_a_sample_is_written_as_a_motion_file(tmp_path, monkeypatch, capsys):
     """One motion by default; further ones have numbers in their names."""
     monkeypatch.chdir(tmp_path)
     words = [f"text={TEXT}", "seconds=1.5", "num_inference_steps=2"]
-    assert main(["sample", "quickstart", "walk.fbx", *words, "rig=unreal", "root_motion=true", "resample=30"]) == 0
+    assert (
+        main(
+            [
+                "sample",
+                "quickstart",
+                "walk.fbx",
+                *words,
+                "rig=unreal",
+                "root_motion=true",
+                "resample=30",
+            ]
+        )
+        == 0
+    )
     assert [path.name for path in tmp_path.iterdir()] == ["walk.fbx"]
     assert "walk.fbx: 44 frames at 30 per second, centimeters" in capsys.readouterr().out
     motion = read("walk.fbx")
-    expected = flame_mdm.generate(flame_mdm.load("quickstart"), TEXT, seconds=1.5, num_inference_steps=2)[0]
+    expected = flame_mdm.generate(
+        flame_mdm.load("quickstart"), TEXT, seconds=1.5, num_inference_steps=2
+    )[0]
     lift = motion.joints[0, 0, 1] - expected.joints[0, 0, 1]
     assert 0.02 < lift < 0.03
     assert np.abs(motion.joints[::3] - [0, lift, 0] - expected.joints[::2]).max() < 0.02
 
     assert main(["sample", "quickstart", "out/walk.vrma", *words, "samples=2"]) == 0
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["walk.vrma", "walk_2.vrma"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        "walk.vrma",
+        "walk_2.vrma",
+    ]
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["rig=unreal"], "rig=unreal: a folder gets motions as they are. Name a file, such as out=walk.fbx"),
-        (["walk.glb", "mp4=true"], "mp4=true: walk.glb is a single motion file. Name a folder, or omit out"),
-        (["walk.fbx", "root_motion=true"], "root_motion is only for .glb, .fbx and USD files with rig=unreal"),
+        (
+            ["rig=unreal"],
+            "rig=unreal: a folder gets motions as they are. Name a file, such as out=walk.fbx",
+        ),
+        (
+            ["walk.glb", "mp4=true"],
+            "mp4=true: walk.glb is a single motion file. Name a folder, or omit out",
+        ),
+        (
+            ["walk.fbx", "root_motion=true"],
+            "root_motion is only for .glb, .fbx and USD files with rig=unreal",
+        ),
     ],
 )
 def test_keys_that_do_not_fit_the_output_are_refused(words, message, tmp_path, monkeypatch, capsys):

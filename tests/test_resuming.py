@@ -45,7 +45,14 @@ def run(tmp_path_factory, data_root) -> Path:
 
 
 def words(folder: Path, data_root: Path) -> list[str]:
-    return ["quickstart", *TINY, *QUICK, "lr_decay=0.5", f"data_root={data_root}", f"run.dir={folder}"]
+    return [
+        "quickstart",
+        *TINY,
+        *QUICK,
+        "lr_decay=0.5",
+        f"data_root={data_root}",
+        f"run.dir={folder}",
+    ]
 
 
 @pytest.fixture
@@ -68,7 +75,9 @@ def resume(run, tmp_path, data_root) -> Callable[..., int]:
 def best(run) -> tuple[dict[str, Any], dict[str, Any]]:
     """The content of the last checkpoint, and in it the state of the callback that keeps the best one."""
     content = read_checkpoint(run / "checkpoints" / LAST)
-    return content, next(state for name, state in content["callbacks"].items() if name.startswith("ModelCheckpoint"))
+    return content, next(
+        state for name, state in content["callbacks"].items() if name.startswith("ModelCheckpoint")
+    )
 
 
 def test_a_foreign_checkpoint_removes_no_other_files(resume, best, tmp_path):
@@ -89,7 +98,12 @@ def test_a_foreign_checkpoint_removes_no_other_files(resume, best, tmp_path):
 HUGE = torch.zeros(1, dtype=torch.float64).expand(2**31, 16)
 JUNK: list[tuple[tuple[Any, ...], Any]] = [
     *((("pytorch-lightning_version",), version) for version in (None, "1.0.0")),
-    *((("global_step",), True), (("callbacks",), 3), (("lr_schedulers",), [3]), (("state_dict",), {})),
+    *(
+        (("global_step",), True),
+        (("callbacks",), 3),
+        (("lr_schedulers",), [3]),
+        (("state_dict",), {}),
+    ),
     (("loops", "fit_loop", "epoch_progress"), None),
     (("optimizer_states",), [3]),
     (("optimizer_states", 0, "param_groups", 0, "params"), []),
@@ -123,7 +137,9 @@ def test_junk_in_the_state_of_training_is_one_line(resume, best, tmp_path, capsy
 def test_files_of_version_0_1_are_one_line(best, tmp_path):
     content, file = best[0], tmp_path / "old.ckpt"
     torch.save({key: value for key, value in content.items() if key != FORMAT_KEY}, file)
-    with pytest.raises(UserError, match=r"old\.ckpt: written by version 0\.1 of flame_mdm, .* Train or import the"):
+    with pytest.raises(
+        UserError, match=r"old\.ckpt: written by version 0\.1 of flame_mdm, .* Train or import the"
+    ):
         load(file)
     torch.save(content | {FORMAT_KEY: 3}, file)
     with pytest.raises(UserError, match="has format 3, but this version reads 2"):
@@ -143,7 +159,12 @@ def prepared(root: Path, clips: int, *more: str) -> list[str]:
 
 
 def tree(*folders: Path) -> dict[Path, bytes]:
-    return {path: path.read_bytes() for folder in folders for path in folder.rglob("*") if path.is_file()}
+    return {
+        path: path.read_bytes()
+        for folder in folders
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
 
 
 def test_a_run_does_not_resume_on_other_data(run, tmp_path, data_root, capsys, monkeypatch):
@@ -207,7 +228,9 @@ def test_a_damaged_checkpoint_gives_way_to_the_one_before(resume, tmp_path, caps
     assert resume() == 0
     assert "resuming with different code: results may differ" in capsys.readouterr().out
     again = read_checkpoint(folder / LAST)
-    assert all(torch.equal(again["state_dict"][k], v) for k, v in before.content["state_dict"].items())
+    assert all(
+        torch.equal(again["state_dict"][k], v) for k, v in before.content["state_dict"].items()
+    )
     for name in (LAST, PREVIOUS):
         (folder / name).write_bytes(b"")
     with pytest.raises(UserError, match="no other checkpoint"):
@@ -215,7 +238,9 @@ def test_a_damaged_checkpoint_gives_way_to_the_one_before(resume, tmp_path, caps
     assert newest(tmp_path / "absent") is None
 
 
-def break_loss(monkeypatch: pytest.MonkeyPatch, step: int, change: Callable[[torch.Tensor], torch.Tensor]) -> None:
+def break_loss(
+    monkeypatch: pytest.MonkeyPatch, step: int, change: Callable[[torch.Tensor], torch.Tensor]
+) -> None:
     """Changes the loss terms of a training step."""
     original, count = GaussianDiffusion.loss, itertools.count(1)
 
@@ -227,16 +252,34 @@ def break_loss(monkeypatch: pytest.MonkeyPatch, step: int, change: Callable[[tor
     monkeypatch.setattr(GaussianDiffusion, "loss", loss)
 
 
-@pytest.mark.parametrize(("factor", "reason"), [(float("nan"), "step 5 is nan"), (1e6, "(typical: ")])
-def test_a_bad_loss_stops_before_a_checkpoint_is_spoiled(tmp_path, data_root, monkeypatch, capsys, factor, reason):
+@pytest.mark.parametrize(
+    ("factor", "reason"), [(float("nan"), "step 5 is nan"), (1e6, "(typical: ")]
+)
+def test_a_bad_loss_stops_before_a_checkpoint_is_spoiled(
+    tmp_path, data_root, monkeypatch, capsys, factor, reason
+):
     break_loss(monkeypatch, 5, lambda value: value * factor)
-    assert main(["train", *words(tmp_path, data_root), "trainer.max_steps=8", "trainer.log_every_n_steps=2"]) == 1
+    assert (
+        main(
+            [
+                "train",
+                *words(tmp_path, data_root),
+                "trainer.max_steps=8",
+                "trainer.log_every_n_steps=2",
+            ]
+        )
+        == 1
+    )
     assert reason in one_error(capsys)
     bad = json.loads((tmp_path / "bad_batch.json").read_text())
     assert (bad["step"], bad["batches"][0]["batch"], len(bad["batches"][0]["ids"])) == (5, 4, 8)
     checkpoint = read_checkpoint(tmp_path / "checkpoints" / LAST)
     assert checkpoint["global_step"] == 4
-    assert all(value.isfinite().all() for value in checkpoint["state_dict"].values() if value.is_floating_point())
+    assert all(
+        value.isfinite().all()
+        for value in checkpoint["state_dict"].values()
+        if value.is_floating_point()
+    )
 
 
 def test_out_of_memory_names_the_step(tmp_path, data_root, monkeypatch, capsys):
@@ -260,11 +303,16 @@ def test_a_second_run_in_the_folder_is_refused_and_a_dead_one_taken_over(tmp_pat
     other = context.Process(target=hold, args=(tmp_path, held))
     other.start()
     assert held.wait(30)
-    with pytest.raises(UserError, match=f"process {other.pid} on .* is training in this dir"), only_run(tmp_path):
+    with (
+        pytest.raises(UserError, match=f"process {other.pid} on .* is training in this dir"),
+        only_run(tmp_path),
+    ):
         pass
     other.kill()
     other.join()
     with only_run(tmp_path):
-        assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == [LAST], "unfinished ones are removed"
+        assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == [LAST], (
+            "unfinished ones are removed"
+        )
     assert f"process {other.pid} on " in capsys.readouterr().out
     assert not (tmp_path / "run.lock").exists()

@@ -34,7 +34,10 @@ def kick() -> Motion:
 
 def joints_of(file: Glb, character: characters.Character) -> dict[str, np.ndarray]:
     worlds = file.worlds()
-    return {joint: worlds[:, character.file.nodes[number], :3, 3] for joint, number in character.map.items()}
+    return {
+        joint: worlds[:, character.file.nodes[number], :3, 3]
+        for joint, number in character.map.items()
+    }
 
 
 ORDERS = {
@@ -49,11 +52,17 @@ def test_each_skeleton_has_the_euler_order_of_its_program(tmp_path):
     for rig, order in ORDERS.items():
         synthetic("kick").save(tmp_path / "a.bvh", rig=rig)
         channels = bvh.read(tmp_path / "a.bvh").channels
-        written = {"".join(name[0] for name in names if name.endswith("rotation")) for names in channels if names}
+        written = {
+            "".join(name[0] for name in names if name.endswith("rotation"))
+            for names in channels
+            if names
+        }
         assert written == {order}, rig
 
 
-def test_a_known_skeleton_brings_the_joints_back_also_as_a_character_and_does_not_change_the_body(kick, tmp_path):
+def test_a_known_skeleton_brings_the_joints_back_also_as_a_character_and_does_not_change_the_body(
+    kick, tmp_path
+):
     kick.save(tmp_path / "b.glb")
     plain = Glb(tmp_path / "b.glb")
     points = [plain.skinned(plain.worlds()[frame]) for frame in (0, 30)]
@@ -61,7 +70,9 @@ def test_a_known_skeleton_brings_the_joints_back_also_as_a_character_and_does_no
         kick.save(tmp_path / "a.bvh", rig=name)
         back = read(tmp_path / "a.bvh").joints
         exact = [number for joint, number in JOINT.items() if joint not in BLENDED.get(name, ())]
-        np.testing.assert_allclose(back[:, exact], kick.joints[:, exact], rtol=0, atol=1e-5, err_msg=name)
+        np.testing.assert_allclose(
+            back[:, exact], kick.joints[:, exact], rtol=0, atol=1e-5, err_msg=name
+        )
         assert np.abs(back - kick.joints).max() < 0.07, name
 
         kick.save(tmp_path / "a.glb", rig=name)
@@ -71,13 +82,21 @@ def test_a_known_skeleton_brings_the_joints_back_also_as_a_character_and_does_no
         lift = np.array(file.document["nodes"][-1]["translation"])  # by the thickness of the soles
         nodes = [node for node, source in enumerate(rig.sources) if source >= 0]
         expected = kick.joints[:, [source for source in rig.sources if source >= 0]]
-        np.testing.assert_allclose(worlds[:, nodes][..., :3, 3] - lift, expected, rtol=0, atol=1e-5, err_msg=name)
+        np.testing.assert_allclose(
+            worlds[:, nodes][..., :3, 3] - lift, expected, rtol=0, atol=1e-5, err_msg=name
+        )
         for frame, moved in zip((0, 30), points, strict=True):
-            np.testing.assert_allclose(file.skinned(worlds[frame]), moved, rtol=0, atol=1e-5, err_msg=name)
+            np.testing.assert_allclose(
+                file.skinned(worlds[frame]), moved, rtol=0, atol=1e-5, err_msg=name
+            )
         if name in ("lafan1", "unreal", "mixamo"):  # as a character, up to the height of the soles
             kick.save(tmp_path / "out.glb", character=tmp_path / "a.glb")
             at = joints_of(Glb(tmp_path / "out.glb"), characters.read_skinned(tmp_path / "a.glb"))
-            for joint in (f"{side}_{part}" for side in SIDES for part in ("hip", "knee", "ankle", "foot", "wrist")):
+            for joint in (
+                f"{side}_{part}"
+                for side in SIDES
+                for part in ("hip", "knee", "ankle", "foot", "wrist")
+            ):
                 off = np.linalg.norm((at[joint] - kick.joints[:, JOINT[joint]])[:, [0, 2]], axis=1)
                 assert np.median(off) < 0.012, (name, joint)
 
@@ -85,7 +104,11 @@ def test_a_known_skeleton_brings_the_joints_back_also_as_a_character_and_does_no
 def test_local_axes_are_those_of_the_skeleton_and_rotations_those_of_the_source(kick: Motion):
     """Each axis points toward a direction, or toward another joint."""
     for name, joint, axis, toward in (
-        *(("lafan1", "Hips", "x", (0, 1, 0)), ("lafan1", "Hips", "y", (0, 0, 1)), ("lafan1", "Hips", "z", (1, 0, 0))),
+        *(
+            ("lafan1", "Hips", "x", (0, 1, 0)),
+            ("lafan1", "Hips", "y", (0, 0, 1)),
+            ("lafan1", "Hips", "z", (1, 0, 0)),
+        ),
         *(("lafan1", "LeftLeg", "x", "LeftFoot"), ("lafan1", "RightLeg", "x", "RightFoot")),
         *(("lafan1", "LeftArm", "x", "LeftForeArm"), ("lafan1", "RightForeArm", "x", "RightHand")),
         *(("soma", "LeftShin", "x", "LeftFoot"), ("100style", "LeftShoulder", "x", (1, 0, 0))),
@@ -96,11 +119,14 @@ def test_local_axes_are_those_of_the_skeleton_and_rotations_those_of_the_source(
         direction = at[toward] - at[joint] if isinstance(toward, str) else np.array(toward, float)
         actual = rig.neutral[number][:, "xyz".index(axis)]
         # limbs of SMPL's T-pose slope a little
-        np.testing.assert_allclose(actual, direction / np.linalg.norm(direction), atol=0.12, err_msg=f"{name} {joint}")
+        np.testing.assert_allclose(
+            actual, direction / np.linalg.norm(direction), atol=0.12, err_msg=f"{name} {joint}"
+        )
         np.testing.assert_allclose(np.linalg.det(rig.neutral), 1)
     rig = preset("soma", kick.posed())
     left, right = (rig.neutral[rig.joints.index(f"{side}Shin")] for side in ("Left", "Right"))
-    np.testing.assert_allclose(right, -np.diag([-1, 1, 1]) @ left, atol=0.1)  # opposite to the mirrored
+    # Opposite to the mirrored
+    np.testing.assert_allclose(right, -np.diag([-1, 1, 1]) @ left, atol=0.1)
     # every joint has the rotation of its counterpart, also where positions do not show it
     poses = kick.posed()
     rig = preset("lafan1", poses)
@@ -109,7 +135,9 @@ def test_local_axes_are_those_of_the_skeleton_and_rotations_those_of_the_source(
         if parent >= 0:
             turned[:, joint] = turned[:, parent] @ turned[:, joint]
     body = world_rotations(poses.rotations.numpy())
-    np.testing.assert_allclose(turned @ rig.neutral.swapaxes(1, 2), body[:, list(rig.sources)], atol=1e-9)
+    np.testing.assert_allclose(
+        turned @ rig.neutral.swapaxes(1, 2), body[:, list(rig.sources)], atol=1e-9
+    )
 
 
 def limbs_off(at: dict[str, np.ndarray], joints: np.ndarray, *limbs: str) -> float:
@@ -118,7 +146,9 @@ def limbs_off(at: dict[str, np.ndarray], joints: np.ndarray, *limbs: str) -> flo
     for side, start in itertools.product(SIDES, limbs):
         ours = joints[:, JOINT[f"{side}_{LIMBS[start]}"]] - joints[:, JOINT[f"{side}_{start}"]]
         theirs = at[f"{side}_{LIMBS[start]}"] - at[f"{side}_{start}"]
-        cosine = (ours * theirs).sum(1) / np.linalg.norm(ours, axis=1) / np.linalg.norm(theirs, axis=1)
+        cosine = (
+            (ours * theirs).sum(1) / np.linalg.norm(ours, axis=1) / np.linalg.norm(theirs, axis=1)
+        )
         angles.append(float(np.median(np.degrees(np.arccos(np.clip(cosine, -1, 1))))))
     return max(angles)
 
@@ -140,9 +170,11 @@ def test_a_character_with_odd_names_scale_and_rest_pose(kick: Motion, tmp_path: 
     before = Glb(hero).document
     assert all(file.document[part] == before[part] for part in ("meshes", "materials", "skins"))
     for side in SIDES:
-        assert np.median((at[f"{side}_foot"] - at[f"{side}_ankle"])[standing, 2]) > 0  # it faces +z, as the motion does
+        # It faces +z, as the motion does
+        assert np.median((at[f"{side}_foot"] - at[f"{side}_ankle"])[standing, 2]) > 0
     world = characters.moved(characters.read(hero), kick)[0]
-    assert largest_step(world) < largest_step(world_rotations(kick.posed().rotations.numpy())) + 10  # no limb flips
+    # No limb flips
+    assert largest_step(world) < largest_step(world_rotations(kick.posed().rotations.numpy())) + 10
 
 
 def own_bvh(path: Path, kick: Motion, changes: str) -> bvh.Bvh:
@@ -155,7 +187,11 @@ def own_bvh(path: Path, kick: Motion, changes: str) -> bvh.Bvh:
     elif changes == "root alone moves":
         hips = file.joints.index("pelvis")
         columns = file.columns()[hips]
-        moving = [columns.start + number for number, name in enumerate(file.channels[hips]) if "position" in name]
+        moving = [
+            columns.start + number
+            for number, name in enumerate(file.channels[hips])
+            if "position" in name
+        ]
         offsets = file.offsets.copy()
         offsets[hips] = file.frames[0, moving]
         channels = list(file.channels)
@@ -173,7 +209,11 @@ def test_a_bvh_character_keeps_its_skeleton(kick: Motion, tmp_path: Path, change
     assert "22 of 23 joints follow the motion, 1 keep their angle" in kick.save(out, character=hero)
 
     file, character = bvh.read(out), characters.read(hero)
-    assert (file.joints, file.parents, file.channels) == (before.joints, before.parents, before.channels)
+    assert (file.joints, file.parents, file.channels) == (
+        before.joints,
+        before.parents,
+        before.channels,
+    )
     assert (len(file.frames), file.fps) == (len(kick.joints), kick.fps)
     np.testing.assert_array_equal(file.offsets, before.offsets)
 
@@ -196,7 +236,12 @@ def test_a_bvh_character_whose_body_cannot_turn_or_move_is_refused(kick: Motion,
     lines = text.splitlines()
     elbow = next(number for number, line in enumerate(lines) if "lowerarm_l" in line) + 3
     numbers = lines.copy()
-    numbers[elbow] = numbers[elbow].replace("3 Zrotation", "2").replace("3 Xrotation", "2").replace("3 Yrotation", "2")
+    numbers[elbow] = (
+        numbers[elbow]
+        .replace("3 Zrotation", "2")
+        .replace("3 Xrotation", "2")
+        .replace("3 Yrotation", "2")
+    )
     rows = next(number for number, line in enumerate(lines) if line.startswith("Frame Time")) + 1
     numbers[rows:] = [row.rsplit(" ", 1)[0] for row in lines[rows:]]
     fixed = [line.replace("6 Xposition Yposition Zposition", "3") for line in lines[:rows]]
@@ -211,7 +256,9 @@ def test_a_bvh_character_whose_body_cannot_turn_or_move_is_refused(kick: Motion,
         assert not (tmp_path / "out.bvh").exists()
 
 
-def test_names_of_joints_are_read_from_a_file(kick: Motion, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_names_of_joints_are_read_from_a_file(
+    kick: Motion, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     hero, names, out = tmp_path / "hero.glb", tmp_path / "hero.yaml", str(tmp_path / "out.glb")
     odd_character(hero, kick)
     kick.save(tmp_path / "a.npz")
@@ -224,8 +271,14 @@ def test_names_of_joints_are_read_from_a_file(kick: Motion, tmp_path: Path, caps
     other: dict[str, Any]
     for other, message in (
         ({"left_nee": "x"}, r"hero\.yaml: left_nee is no joint of SMPL\. Did you mean left_knee"),
-        ({"left_knee": "Rig Bone-l_flak"}, r"left_knee: .*hero\.glb has no joint Rig Bone-l_flak\. Did you mean Rig"),
-        ({"left_knee": "Rig Bone-r_flac"}, r"hero\.yaml: Rig Bone-r_flac is listed for left_knee and for another"),
+        (
+            {"left_knee": "Rig Bone-l_flak"},
+            r"left_knee: .*hero\.glb has no joint Rig Bone-l_flak\. Did you mean Rig",
+        ),
+        (
+            {"left_knee": "Rig Bone-r_flac"},
+            r"hero\.yaml: Rig Bone-r_flac is listed for left_knee and for another",
+        ),
         ({"left_knee": None}, r"no joint found for left_knee\. Write"),
         ({"left_knee": "Rig Bone-l_hgiht", "left_hip": "Rig Bone-l_eflac"}, "upright|has no joint"),
     ):
@@ -243,7 +296,9 @@ def below_another(document: dict[str, Any], **fields: Any) -> None:
 
 def exchanged(document: dict[str, Any]) -> None:
     for node in document["nodes"]:
-        node["name"] = node["name"].replace("Left", "?").replace("Right", "Left").replace("?", "Right")
+        node["name"] = (
+            node["name"].replace("Left", "?").replace("Right", "Left").replace("?", "Right")
+        )
 
 
 def with_joint(document: dict[str, Any], name: str, skin: int) -> None:
@@ -255,7 +310,9 @@ def with_joint(document: dict[str, Any], name: str, skin: int) -> None:
 
 
 def short(document: dict[str, Any]) -> None:
-    next(node for node in document["nodes"] if node["name"] == "mixamorig:LeftForeArm")["translation"] = [0, 0, 0]
+    next(node for node in document["nodes"] if node["name"] == "mixamorig:LeftForeArm")[
+        "translation"
+    ] = [0, 0, 0]
     del document["skins"][0]["inverseBindMatrices"]
 
 
@@ -271,11 +328,23 @@ def test_characters_that_cannot_be_used_are_refused(kick: Motion, tmp_path: Path
     for change, message in (
         (unskinned, "0 skeletons with a skin"),
         (lambda d: with_joint(d, "other", 1), "2 skeletons with a skin"),
-        (lambda d: with_joint(d, "mixamorig:LeftLeg", 0), r"2 joints for left_knee: mixamorig:LeftLeg, mixamorig:L"),
+        (
+            lambda d: with_joint(d, "mixamorig:LeftLeg", 0),
+            r"2 joints for left_knee: mixamorig:LeftLeg, mixamorig:L",
+        ),
         (short, "the bone from left_shoulder to left_elbow has no length"),
-        (lambda d: below_another(d, rotation=[0, 0, 0.5**0.5, 0.5**0.5]), "not upright, it leans by 90 degrees"),
-        (lambda d: below_another(d, scale=[1, 1, 2]), r"mixamorig:Hips \(pelvis\) is mirrored or scaled unevenly"),
-        (lambda d: below_another(d, scale=[-1, 1, 1]), r"mixamorig:Hips \(pelvis\) is mirrored or scaled unevenly"),
+        (
+            lambda d: below_another(d, rotation=[0, 0, 0.5**0.5, 0.5**0.5]),
+            "not upright, it leans by 90 degrees",
+        ),
+        (
+            lambda d: below_another(d, scale=[1, 1, 2]),
+            r"mixamorig:Hips \(pelvis\) is mirrored or scaled unevenly",
+        ),
+        (
+            lambda d: below_another(d, scale=[-1, 1, 1]),
+            r"mixamorig:Hips \(pelvis\) is mirrored or scaled unevenly",
+        ),
         (exchanged, "the toes point backward"),
         (lambda d: d["buffers"][0].update(uri="hero.bin"), r"in one file: buffers\.0\.uri"),
     ):
@@ -294,9 +363,14 @@ def test_a_folder_is_converted(kick: Motion, tmp_path: Path, capsys: pytest.Capt
         short.save(tmp_path / name)
     folder, out = str(tmp_path / "in"), tmp_path / "out"
     assert main(["convert", folder, str(out), "format=bvh", "rig=mixamo"]) == 0
-    assert [str(path.relative_to(out)) for path in sorted(out.rglob("*.bvh"))] == ["a.bvh", "below/b.bvh"]
+    assert [str(path.relative_to(out)) for path in sorted(out.rglob("*.bvh"))] == [
+        "a.bvh",
+        "below/b.bvh",
+    ]
     kick.save(tmp_path / "hero.glb")
-    assert main(["convert", folder, str(tmp_path / "on"), f"character={tmp_path / 'hero.glb'}"]) == 0
+    assert (
+        main(["convert", folder, str(tmp_path / "on"), f"character={tmp_path / 'hero.glb'}"]) == 0
+    )
     assert (tmp_path / "on" / "below" / "b.glb").exists()
     assert main(["convert", folder, str(tmp_path / "tree"), f"character={out / 'a.bvh'}"]) == 0
     assert (tmp_path / "tree" / "below" / "b.bvh").exists()
@@ -313,13 +387,25 @@ def test_blender_shows_the_pose(name: str, ending: str, kick: Motion, tmp_path: 
     kick.save(path, rig=name)
     lift = np.array(Glb(path).document["nodes"][-1]["translation"]) if ending == ".glb" else 0
     script = Path(__file__).parent / "support" / "blender.py"
-    done = subprocess.run([blender(), script, path, "20"], capture_output=True, text=True, check=True)
-    shown = json.loads(next(line for line in done.stdout.splitlines() if line.startswith("FOUND"))[5:])
+    done = subprocess.run(
+        [blender(), script, path, "20"], capture_output=True, text=True, check=True
+    )
+    shown = json.loads(
+        next(line for line in done.stdout.splitlines() if line.startswith("FOUND"))[5:]
+    )
     assert [frame for frame, _ in shown] == [0, (len(kick.joints) - 1) // 2, len(kick.joints) - 1]
     for frame, positions in shown:
-        joints = {rig.joints.index(joint): position for joint, position in positions.items() if joint in rig.joints}
-        followed = {joint: position for joint, position in joints.items() if rig.sources[joint] >= 0}
+        joints = {
+            rig.joints.index(joint): position
+            for joint, position in positions.items()
+            if joint in rig.joints
+        }
+        followed = {
+            joint: position for joint, position in joints.items() if rig.sources[joint] >= 0
+        }
         assert len(followed) >= len(SMPL22)
         for joint, position in followed.items():
             expected = kick.joints[frame, rig.sources[joint]] + lift
-            np.testing.assert_allclose(position, expected, atol=1e-4, err_msg=f"{rig.joints[joint]}, frame {frame}")
+            np.testing.assert_allclose(
+                position, expected, atol=1e-4, err_msg=f"{rig.joints[joint]}, frame {frame}"
+            )

@@ -38,7 +38,12 @@ def test_conversions_are_the_authors(stem: str):
         same(rotation.matrix_to_rot6d(matrix, "rows").float(), file["conv/rot6d_rows"], 2e-6)
         same(rotation.matrix_to_rot6d(matrix, "columns").float(), file["conv/rot6d_cols"], 2e-6)
         actual = rotation.quaternion_to_matrix(rotation.matrix_to_quaternion(matrix))
-        for key, atol in (("p3d072", 2e-6), ("p3dhead", 2e-6), ("copysign", 2e-3)):  # it loses digits near a half turn
+        # It loses digits near a half turn
+        for key, atol in (
+            ("p3d072", 2e-6),
+            ("p3dhead", 2e-6),
+            ("copysign", 2e-3),
+        ):
             expected = rotation.quaternion_to_matrix(file[f"conv/quat_from_matrix_{key}"]).to(dtype)
             same(actual, expected, atol)
         back = rotation.matrix_to_axis_angle(matrix)
@@ -61,13 +66,21 @@ def test_quaternion_algebra_and_euler_angles_are_the_authors(stem: str):
     same(rotation.rotate(a, v), file["hmlq/qrot"], 4e-6)
     same(rotation.between(v, w), file["hmlq/qbetween"], 2e-6)
     same(rotation.quaternion_to_matrix(a), file["hmlq/to_matrix"], 2e-6)
-    same(rotation.matrix_to_rot6d(rotation.quaternion_to_matrix(a), "columns"), file["hmlq/cont6d"], 2e-6)
+    same(
+        rotation.matrix_to_rot6d(rotation.quaternion_to_matrix(a), "columns"),
+        file["hmlq/cont6d"],
+        2e-6,
+    )
     same(rotation.continuous(file["hmlq/qfix_in"], 0), file["hmlq/qfix_out"], 0)
     # Euler angles
     angles = file["hmlq/euler_xyz_rad"].double()
     for order in ("xyz", "yxz"):
         matrix = euler_to_matrix(angles[:, ["xyz".index(axis) for axis in order]], order.upper())
-        same_rotation(rotation.matrix_to_quaternion(matrix).float(), file[f"hmlq/quat_from_euler_{order}"], 2e-6)
+        same_rotation(
+            rotation.matrix_to_quaternion(matrix).float(),
+            file[f"hmlq/quat_from_euler_{order}"],
+            2e-6,
+        )
     for order in ("XYZ", "YXZ", "ZXY", "ZYX"):
         matrix = euler_to_matrix(file["euler/angles"], order)
         same(matrix, file[f"euler/{order}_matrix"], 2e-6)
@@ -76,7 +89,9 @@ def test_quaternion_algebra_and_euler_angles_are_the_authors(stem: str):
 
 def test_euler_angles_in_gimbal_lock_and_of_unknown_orders():
     for order, sign in itertools.product(ORDERS, (1, -1)):
-        matrix = euler_to_matrix(torch.tensor([0.4, sign * torch.pi / 2, -1.1], dtype=torch.float64), order)
+        matrix = euler_to_matrix(
+            torch.tensor([0.4, sign * torch.pi / 2, -1.1], dtype=torch.float64), order
+        )
         back = rotation.matrix_to_euler(matrix, order)
         assert back[2] == 0
         same(euler_to_matrix(back, order), matrix, 1e-7)
@@ -94,10 +109,20 @@ def test_round_trips(axis_angle: Tensor):
     same(rotation.quaternion_to_matrix(rotation.matrix_to_quaternion(matrix)), matrix, 1e-12)
     same(rotation.axis_angle_to_matrix(rotation.matrix_to_axis_angle(matrix)), matrix, 1e-7)
     for convention in ("rows", "columns"):
-        same(rotation.rot6d_to_matrix(rotation.matrix_to_rot6d(matrix, convention), convention), matrix, 1e-12)
-    same(rotation.matrix_to_rot6d(matrix, "rows"), rotation.matrix_to_rot6d(matrix.mT, "columns"), 0)
+        same(
+            rotation.rot6d_to_matrix(rotation.matrix_to_rot6d(matrix, convention), convention),
+            matrix,
+            1e-12,
+        )
+    same(
+        rotation.matrix_to_rot6d(matrix, "rows"), rotation.matrix_to_rot6d(matrix.mT, "columns"), 0
+    )
     if axis_angle.norm() < 3.1:
-        same(rotation.quaternion_to_axis_angle(rotation.axis_angle_to_quaternion(axis_angle)), axis_angle, 1e-12)
+        same(
+            rotation.quaternion_to_axis_angle(rotation.axis_angle_to_quaternion(axis_angle)),
+            axis_angle,
+            1e-12,
+        )
 
 
 def test_opposite_directions_and_small_angles_have_finite_and_right_gradients():
@@ -136,7 +161,13 @@ def degenerate_pairs() -> Tensor:
     vector, other = torch.randn(2, 50, 3, generator=generator)
     signs = vector.sign()
     pairs = [(vector, factor * vector) for factor in (1, -1, 3.3, -0.01)]
-    pairs += [(signs, signs), (signs, -signs), (0 * vector, vector), (vector, 0 * vector), (0 * vector, 0 * vector)]
+    pairs += [
+        (signs, signs),
+        (signs, -signs),
+        (0 * vector, vector),
+        (vector, 0 * vector),
+        (0 * vector, 0 * vector),
+    ]
     pairs += [(1e-13 * vector, other), (vector, 1e-13 * other), (1e-30 * vector, 1e-30 * other)]
     pairs += [(vector, vector + tilt * other) for tilt in (1e-7, 1e-6, 1e-5)]
     return torch.cat([torch.cat(pair, -1) for pair in pairs])
@@ -144,7 +175,9 @@ def degenerate_pairs() -> Tensor:
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("convention", ["rows", "columns"])
-def test_vectors_that_define_no_rotation_are_completed(convention: rotation.SixD, dtype: torch.dtype):
+def test_vectors_that_define_no_rotation_are_completed(
+    convention: rotation.SixD, dtype: torch.dtype
+):
     rot6d = degenerate_pairs().to(dtype).requires_grad_()
     matrix = rotation.rot6d_to_matrix(rot6d, convention)
     atol = 3 * torch.finfo(dtype).eps ** 0.5
@@ -157,8 +190,14 @@ def test_vectors_that_define_no_rotation_are_completed(convention: rotation.SixD
     first = matrix[:, 0] if convention == "rows" else matrix[..., 0]
     has_direction = rot6d[:, :3].norm(dim=-1) > 1e-6
     same(first[has_direction], functional.normalize(rot6d[has_direction, :3], dim=-1), atol)
-    same(rotation.rot6d_to_matrix(torch.zeros(6, dtype=dtype), convention), torch.eye(3, dtype=dtype), 0)
-    assert rotation.rot6d_to_matrix(torch.full((6,), torch.nan, dtype=dtype), convention).isnan().all()
+    same(
+        rotation.rot6d_to_matrix(torch.zeros(6, dtype=dtype), convention),
+        torch.eye(3, dtype=dtype),
+        0,
+    )
+    assert (
+        rotation.rot6d_to_matrix(torch.full((6,), torch.nan, dtype=dtype), convention).isnan().all()
+    )
 
 
 def test_vectors_beside_degenerate_ones_keep_every_bit_of_value_and_gradient():

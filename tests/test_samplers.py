@@ -40,7 +40,9 @@ from flame_mdm.sampler_options import SamplerOptions
 
 GAUSSIAN, MFM = golden("gaussian"), golden("mfm")
 OPTIONS = meta(GAUSSIAN)["options"]
-both_precisions = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["f32", "f64"])
+both_precisions = pytest.mark.parametrize(
+    "dtype", [torch.float32, torch.float64], ids=["f32", "f64"]
+)
 DIFFUSION = list(GaussianDiffusion.samplers)
 CALLS = {"euler": 1, "midpoint": 2, "heun": 2, "rk4": 4}
 KINDS = {"ddpm": "ancestral", "ddim": "ddim"}
@@ -50,24 +52,53 @@ KINDS = {"ddpm": "ancestral", "ddim": "ddim"}
 @golden_cases("gaussian", OPTIONS["mdm_loops"])
 def test_mdm_loop(case, dtype):
     total, section, kind, options = OPTIONS["mdm_loops"][case]
-    supported = {"eta", "inpaint", "skip_timesteps", "skip", "init_image", "init", "const_noise", "const"}
+    supported = {
+        "eta",
+        "inpaint",
+        "skip_timesteps",
+        "skip",
+        "init_image",
+        "init",
+        "const_noise",
+        "const",
+    }
     assert not options.keys() - supported, f"{case}: options that the product does not have"
     x_T, steps = motions(GAUSSIAN["loop/x_T"], dtype), spaced(total, section)
     draws = [motions(noise, dtype) for noise in GAUSSIAN[f"loop/{case}/noise"]]
-    if options.get("const_noise") or options.get("const") or "const_noise" in case:  # of the steps, not of the start
+    # Of the steps, not of the start
+    if options.get("const_noise") or options.get("const") or "const_noise" in case:
         draws = [noise[:1].expand_as(noise) for noise in draws]
     named = re.search(r"skip(\d+)", case)  # how many of the noisiest steps a loop leaves out
-    edit, skip = None, int(options.get("skip_timesteps") or options.get("skip") or (named[1] if named else 0))
+    edit, skip = (
+        None,
+        int(options.get("skip_timesteps") or options.get("skip") or (named[1] if named else 0)),
+    )
     if skip or options.get("inpaint"):
-        start = next((key for key in (f"loop/{case}/init_image", "loop/init_image") if key in GAUSSIAN), "")
+        start = next(
+            (key for key in (f"loop/{case}/init_image", "loop/init_image") if key in GAUSSIAN), ""
+        )
         known = GAUSSIAN["loop/inpainted_motion" if options.get("inpaint") or not start else start]
         strength = (len(steps) - skip) / len(steps) if skip else None
-        edit = Edit(motions(known, dtype), torch.zeros_like(x_T, dtype=torch.bool), strength=strength)
+        edit = Edit(
+            motions(known, dtype), torch.zeros_like(x_T, dtype=torch.bool), strength=strength
+        )
         if options.get("inpaint"):
             edit.keep = motions(GAUSSIAN["loop/inpainting_mask"]) > 0
-    denoise = linear_denoiser(GAUSSIAN["loop/lin4/A"], GAUSSIAN["loop/lin4/b"], float(GAUSSIAN["lin4/g"]))
-    how = {"sampler": KINDS[kind], "num_inference_steps": steps, "eta": options.get("eta") if kind == "ddim" else None}
-    x = sample(GaussianDiffusion(num_train_timesteps=total), denoise, recorded(x_T, draws), edit=edit, **how)
+    denoise = linear_denoiser(
+        GAUSSIAN["loop/lin4/A"], GAUSSIAN["loop/lin4/b"], float(GAUSSIAN["lin4/g"])
+    )
+    how = {
+        "sampler": KINDS[kind],
+        "num_inference_steps": steps,
+        "eta": options.get("eta") if kind == "ddim" else None,
+    }
+    x = sample(
+        GaussianDiffusion(num_train_timesteps=total),
+        denoise,
+        recorded(x_T, draws),
+        edit=edit,
+        **how,
+    )
     assert_golden(GAUSSIAN, f"loop/{case}/out", x)
     if edit is not None:
         torch.testing.assert_close(x[edit.keep], edit.known[edit.keep], rtol=0, atol=1e-12)
@@ -84,18 +115,33 @@ def flame_edit(known: Tensor, joints: list[int], keep_translation: bool) -> Edit
 @golden_cases("gaussian", OPTIONS["flame_loops"])
 def test_flame_loop(case, dtype):
     options = OPTIONS["flame_loops"][case]
-    process = GaussianDiffusion(options["T"], prediction="epsilon", variance="learned_range", clip_x0=True)
+    process = GaussianDiffusion(
+        options["T"], prediction="epsilon", variance="learned_range", clip_x0=True
+    )
     x_T = motions(GAUSSIAN["floop/x_T"], dtype)
     edit = None
     if "edit" in options:
-        edit = flame_edit(motions(GAUSSIAN["floop/ref_motion"], dtype).expand_as(x_T), *options["edit"])
-    denoise = linear_denoiser(GAUSSIAN["floop/A"], GAUSSIAN["floop/b"][:, None], float(GAUSSIAN["lin4/g"]))
+        edit = flame_edit(
+            motions(GAUSSIAN["floop/ref_motion"], dtype).expand_as(x_T), *options["edit"]
+        )
+    denoise = linear_denoiser(
+        GAUSSIAN["floop/A"], GAUSSIAN["floop/b"][:, None], float(GAUSSIAN["lin4/g"])
+    )
     draws = [motions(noise, dtype) for noise in GAUSSIAN[f"floop/{case}/noise"]]
-    how = {"sampler": KINDS[options["kind"]], "num_inference_steps": spaced(options["T"], options["sec"])}
-    assert_golden(GAUSSIAN, f"floop/{case}/out", sample(process, denoise, recorded(x_T, draws), edit=edit, **how))
+    how = {
+        "sampler": KINDS[options["kind"]],
+        "num_inference_steps": spaced(options["T"], options["sec"]),
+    }
+    assert_golden(
+        GAUSSIAN,
+        f"floop/{case}/out",
+        sample(process, denoise, recorded(x_T, draws), edit=edit, **how),
+    )
 
 
-DDIM_STEPS = sorted(key.removeprefix("step/") for key in GAUSSIAN if key.startswith("step/ddim_eta"))
+DDIM_STEPS = sorted(
+    key.removeprefix("step/") for key in GAUSSIAN if key.startswith("step/ddim_eta")
+)
 
 
 @both_precisions
@@ -106,11 +152,17 @@ def test_one_step(case, dtype):
     noise = motions(GAUSSIAN["step/noise"][["p_sample", *DDIM_STEPS].index(case)], dtype)
     denoise = linear_denoiser(GAUSSIAN["lin4/A"], GAUSSIAN["lin4/b"], float(GAUSSIAN["lin4/g"]))
     x0_hat = denoise(x_t, t.float(), real(x_t), NO_CONDITION)
-    name, eta = ("ancestral", None) if case == "p_sample" else ("ddim", float(case.removeprefix("ddim_eta")))
+    name, eta = (
+        ("ancestral", None)
+        if case == "p_sample"
+        else ("ddim", float(case.removeprefix("ddim_eta")))
+    )
     stepped = []
     for x, x0, draw, step in zip(x_t, x0_hat, noise, t.tolist(), strict=True):
         estimate = x0, process.log_variance(x0, x, step, process.schedule)
-        run = Descent(lambda *_, same=estimate: same, process.schedule, iter([draw]), SamplerOptions(eta=eta))
+        run = Descent(
+            lambda *_, same=estimate: same, process.schedule, iter([draw]), SamplerOptions(eta=eta)
+        )
         stepped.append(process.samplers[name].step(x, run, step))
     x = torch.stack(stepped)
     assert_golden(GAUSSIAN, f"step/{case}", x)
@@ -131,13 +183,23 @@ def replay_flow_run(case: str, denoise: Denoise, cond: Condition, **options: Any
     process = FlowMatching(meta(MFM)["sigma_min"], odeint_grid=method not in EULER, **options)
     start = motions(MFM["sample/x_init"])
     if run["on"] == "cfg":
-        denoise = classifier_free_guidance(denoise, torch.from_numpy(MFM["in/scale"]), start.shape[-1])
+        denoise = classifier_free_guidance(
+            denoise, torch.from_numpy(MFM["in/scale"]), start.shape[-1]
+        )
     edit = None
     if "edit" in method:
-        keep, known = motions(MFM["edit/inpainting_mask"]) > 0, motions(MFM["edit/inpainted_motion"])
+        keep, known = (
+            motions(MFM["edit/inpainting_mask"]) > 0,
+            motions(MFM["edit/inpainted_motion"]),
+        )
         edit = Edit(known, keep, mode="trajectory", until=run.get("edit_till", 1.0))
-    how = {"sampler": EULER.get(method, method), "num_inference_steps": round(1 / run.get("step_size", 0.1))}
-    assert_golden(MFM, f"run/{case}", sample(process, denoise, recorded(start), cond=cond, edit=edit, **how))
+    how = {
+        "sampler": EULER.get(method, method),
+        "num_inference_steps": round(1 / run.get("step_size", 0.1)),
+    }
+    assert_golden(
+        MFM, f"run/{case}", sample(process, denoise, recorded(start), cond=cond, edit=edit, **how)
+    )
 
 
 def stages(times: np.ndarray) -> np.ndarray:
@@ -183,7 +245,9 @@ def released_flow() -> tuple[Denoise, Condition]:
     else:
         pooled = torch.from_numpy(MFM["in/text_embed"]).flatten(0, -2)
     tokens = torch.zeros(len(pooled), 0, pooled.shape[1])
-    return built(released), Condition(pooled, tokens, None, Condition(torch.zeros_like(pooled[:1]), tokens[:1], None))
+    return built(released), Condition(
+        pooled, tokens, None, Condition(torch.zeros_like(pooled[:1]), tokens[:1], None)
+    )
 
 
 @golden_case("mfm")
@@ -204,8 +268,12 @@ FLAME_OPTIONS: dict[str, Any] = {"prediction": "epsilon", "variance": "learned_r
 
 def released_flame() -> tuple[Denoise, Condition]:
     """The fixture's network and the conditions of its texts; the last text, "", is their null."""
-    pooled, tokens = torch.from_numpy(FLAME["lm/pooler_output"]), torch.from_numpy(FLAME["lm/last_hidden_state"])
-    seen = torch.ones(tokens.shape[:2], dtype=torch.bool)  # the authors attend to the padding of the text
+    pooled, tokens = (
+        torch.from_numpy(FLAME["lm/pooler_output"]),
+        torch.from_numpy(FLAME["lm/last_hidden_state"]),
+    )
+    # The authors attend to the padding of the text
+    seen = torch.ones(tokens.shape[:2], dtype=torch.bool)
     null = Condition(pooled[-1:], tokens[-1:], seen[-1:])
     denoise = built(import_flame(weights(FLAME), num_heads=meta(FLAME)["config"]["heads"]))
     return denoise, Condition(pooled[:-1], tokens[:-1], seen[:-1], null)
@@ -223,7 +291,9 @@ def test_flame_loop_of_the_network(case):
     draws = [motions(noise[:1]) for noise in FLAME[f"noise/{case}_steps"]]
     edit = None
     if case == "edit":
-        edit = flame_edit(motions(FLAME["edit/ref_motion"][None]), config["edit_joints"], config["keep_trans"])
+        edit = flame_edit(
+            motions(FLAME["edit/ref_motion"][None]), config["edit_joints"], config["keep_trans"]
+        )
     process = GaussianDiffusion(total, clip_x0=True, **FLAME_OPTIONS)
     guided = classifier_free_guidance(denoise, config["scale"], start.shape[-1])
     how = {"sampler": KINDS[kind], "num_inference_steps": spaced(total, section)}
@@ -235,8 +305,13 @@ def test_flame_loop_of_the_network(case):
 def test_flame_loss_of_the_network(stem):
     denoise, cond = released_flame()
     x, noise = motions(FLAME["loss/x_start"]), motions(FLAME["loss/noise"])
-    mask, t = length_mask(torch.from_numpy(FLAME["in/motion_length"]), x.shape[1]), torch.from_numpy(FLAME["loss/t"])
-    process = GaussianDiffusion(meta(FLAME)["config"]["T_loss"], average_padding=True, **FLAME_OPTIONS)
+    mask, t = (
+        length_mask(torch.from_numpy(FLAME["in/motion_length"]), x.shape[1]),
+        torch.from_numpy(FLAME["loss/t"]),
+    )
+    process = GaussianDiffusion(
+        meta(FLAME)["config"]["T_loss"], average_padding=True, **FLAME_OPTIONS
+    )
     terms = process.loss(denoise, x * mask[..., None], mask, cond, t=t.float(), noise=noise)
     for name in ("mse", "vlb", "loss"):
         assert_golden(FLAME, f"out/loss_{name.replace('vlb', 'vb')}", terms[name])
@@ -248,7 +323,10 @@ def test_flame_loss_of_the_network(stem):
 @pytest.mark.parametrize("variance", ["fixed_small", "fixed_large", "learned_range"])
 def test_oracle_diffusion_returns_the_data(variance, prediction, sampler, count):
     torch.manual_seed(0)
-    process, mask = GaussianDiffusion(50, prediction=prediction, variance=variance), length_mask(torch.tensor([6, 3]))
+    process, mask = (
+        GaussianDiffusion(50, prediction=prediction, variance=variance),
+        length_mask(torch.tensor([6, 3])),
+    )
     data = torch.randn(2, 6, 4, dtype=torch.float64) * mask[..., None]
     denoise, estimates = CountedDenoise(oracle(process, data)), list[Tensor]()
     noise, how = drawn((2, 6, 4), torch.float64), {"sampler": sampler, "num_inference_steps": count}
@@ -264,7 +342,10 @@ def test_oracle_diffusion_returns_the_data(variance, prediction, sampler, count)
 @pytest.mark.parametrize("sampler", [*CALLS, "dopri5"])
 def test_oracle_flow_returns_the_data(sampler, count, prediction):
     torch.manual_seed(0)
-    process, mask = FlowMatching(sigma_min=1e-3, prediction=prediction), length_mask(torch.tensor([6, 3]))
+    process, mask = (
+        FlowMatching(sigma_min=1e-3, prediction=prediction),
+        length_mask(torch.tensor([6, 3])),
+    )
     data, noise = torch.randn(2, 2, 6, 4, dtype=torch.float64)
     data = data * mask[..., None]
     output = process.target(data, noise, torch.zeros(2))
@@ -302,8 +383,11 @@ def test_order_of_diffusion_solvers():
 MIXING = linear_denoiser(np.array([[0.3, -0.2], [0.1, 0.4]]), np.array([[0.2], [-0.1]]), 0.3)
 
 
-@pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # theirs, under numpy 2
-@pytest.mark.parametrize(("ours", "name"), [("x0", "sample"), ("epsilon", "epsilon"), ("velocity", "v_prediction")])
+# Theirs, under numpy 2
+@pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")
+@pytest.mark.parametrize(
+    ("ours", "name"), [("x0", "sample"), ("epsilon", "epsilon"), ("velocity", "v_prediction")]
+)
 def test_dpm_solver_agrees_with_diffusers(ours, name):
     process, steps = GaussianDiffusion(1000, prediction=ours), [0, 30, 90, 250, 400, 777, 950]
     options: Any = {
@@ -319,16 +403,24 @@ def test_dpm_solver_agrees_with_diffusers(ours, name):
         output = MIXING(theirs, torch.tensor([float(t)]), real(theirs), NO_CONDITION)
         theirs = scheduler.step(output, t, theirs, return_dict=False)[0]
     ours = sample(process, MIXING, noise, sampler="dpm_solver_pp_2m", num_inference_steps=steps)
-    torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-4)  # theirs computes alpha products in float32
+    # Theirs computes alpha products in float32
+    torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-4)
 
 
 def test_fixed_steps_agree_with_torchdiffeq():
     field = linear_denoiser(np.random.default_rng(0).normal(size=(4, 4)), np.ones((4, 1)), 2.0)
     start, times = drawn((2, 5, 4), torch.float64)(0), torch.linspace(0, 1, 8, dtype=torch.float64)
     for sampler in CALLS:
-        ours = sample(FlowMatching(), field, recorded(start), sampler=sampler, num_inference_steps=7)
+        ours = sample(
+            FlowMatching(), field, recorded(start), sampler=sampler, num_inference_steps=7
+        )
         method = "heun2" if sampler == "heun" else sampler
-        theirs = odeint(lambda t, x: field(x, 1000 * t.expand(2), real(x), NO_CONDITION), start, times, method=method)
+        theirs = odeint(
+            lambda t, x: field(x, 1000 * t.expand(2), real(x), NO_CONDITION),
+            start,
+            times,
+            method=method,
+        )
         torch.testing.assert_close(ours, theirs[-1], rtol=1e-9, atol=1e-9, msg=sampler)
 
 
@@ -358,7 +450,11 @@ def test_kept_parts_are_met_exactly_and_seen_by_the_rest(build, sampler):
         # The denoiser sees the kept part, so the rest follows it downwards.
         assert edited[~keep].mean() < free[~keep].mean() - 0.05
         nothing = sampled(build(), edit=Edit(known, torch.zeros_like(keep), mode, blend="before"))
-        if mode == "x0" or sampler not in ("ancestral", "consistency"):  # blending uses up their draws
+        # Blending uses up their draws
+        if mode == "x0" or sampler not in (
+            "ancestral",
+            "consistency",
+        ):
             torch.testing.assert_close(nothing, free)
     if build is GaussianDiffusion:  # clipping does not move kept parts
         clipped = sampled(GaussianDiffusion(clip_x0=True), edit=Edit(known, keep))
@@ -367,8 +463,12 @@ def test_kept_parts_are_met_exactly_and_seen_by_the_rest(build, sampler):
 
 
 @pytest.mark.parametrize("sampler", ["ancestral", "ddim"])
-@pytest.mark.parametrize(("blend", "resample"), [("after", 1), ("before", 1), ("after", 2), ("before", 2)])
-def test_blended_parts_are_as_noisy_as_the_rest_and_each_noisy_step_is_resampled(blend, resample, sampler):
+@pytest.mark.parametrize(
+    ("blend", "resample"), [("after", 1), ("before", 1), ("after", 2), ("before", 2)]
+)
+def test_blended_parts_are_as_noisy_as_the_rest_and_each_noisy_step_is_resampled(
+    blend, resample, sampler
+):
     """What the denoiser sees of a kept part is the known motion, corrupted to exactly the step it is told.
 
     So is what it sees of the rest at the second visit of a step, if it knows the motion.
@@ -380,9 +480,13 @@ def test_blended_parts_are_as_noisy_as_the_rest_and_each_noisy_step_is_resampled
         seen.append((int(t[0]), x_t))
         return known
 
-    edit = Edit(known, torch.arange(4000).expand(1, 1, -1) < 2000, "x_t", blend=blend, resample=resample)
+    edit = Edit(
+        known, torch.arange(4000).expand(1, 1, -1) < 2000, "x_t", blend=blend, resample=resample
+    )
     steps = [0, 5, 15, 30, 60, 99]
-    x = sample(process, denoise, drawn((1, 1, 4000)), edit=edit, sampler=sampler, num_inference_steps=steps)
+    x = sample(
+        process, denoise, drawn((1, 1, 4000)), edit=edit, sampler=sampler, num_inference_steps=steps
+    )
     torch.testing.assert_close(x, known, rtol=0, atol=1e-4)
     assert len(seen) == 5 * resample + 1
     for number, (step, x_t) in enumerate(seen):
@@ -401,13 +505,17 @@ def test_rewriting_ends_at_its_threshold(sampler):
         seen.append((t[0].item() / 1000, x_t))
         return torch.zeros_like(x_t)
 
-    sample(FlowMatching(), still, recorded(start), sampler=sampler, num_inference_steps=25, edit=edit)
+    sample(
+        FlowMatching(), still, recorded(start), sampler=sampler, num_inference_steps=25, edit=edit
+    )
     calls = seen[:: CALLS[sampler]]
     assert len(calls) == 25
     for i, (time, x) in enumerate(calls):
         share = min(i, 5) / 25
         assert time == pytest.approx(i / 25)
-        torch.testing.assert_close(x, torch.where(edit.keep, (1 - share) * start + share * known, start))
+        torch.testing.assert_close(
+            x, torch.where(edit.keep, (1 - share) * start + share * known, start)
+        )
 
 
 REFUSED: dict[type[Process], list[tuple[dict[str, Any], str]]] = {
@@ -418,21 +526,36 @@ REFUSED: dict[type[Process], list[tuple[dict[str, Any], str]]] = {
         ({"num_inference_steps": [5, 3]}, "increasing"),
         ({"num_inference_steps": [5, 1000]}, "999"),
         ({"num_inference_steps": [0, 1.5]}, "give a number of steps, or a list"),
-        ({"eta": 1.0}, "eta=1.0: the sampler ancestral has no such option. Omit it, or give guidance_scale"),
+        (
+            {"eta": 1.0},
+            "eta=1.0: the sampler ancestral has no such option. Omit it, or give guidance_scale",
+        ),
         ({"sampler": "ddim", "eta": 1.5}, "0 to 1"),
         ({"sampler": 3}, "sampler=3: give the name"),
         ({"spacing": "even"}, "spacing=even is unknown: choose from linspace, stride"),
         ({"guidance_scale": math.nan}, "guidance_scale=nan is not a finite number"),
         ({"edit": {"mode": "trajectory"}}, "x0, x_t"),
-        ({"edit": {"mode": "x_t", "known": torch.zeros(1, 5, 2)}}, "^edit does not match the shape"),
-        ({"sampler": "dpm_solver_pp_2m", "edit": {"mode": "x_t", "resample": 2}}, "with resample and x_t: choose"),
+        (
+            {"edit": {"mode": "x_t", "known": torch.zeros(1, 5, 2)}},
+            "^edit does not match the shape",
+        ),
+        (
+            {"sampler": "dpm_solver_pp_2m", "edit": {"mode": "x_t", "resample": 2}},
+            "with resample and x_t: choose",
+        ),
     ],
     FlowMatching: [
         ({"sampler": "ddim"}, "has euler, midpoint, heun, rk4, dopri5"),
         ({"sampler": "euler", "num_inference_steps": [0, 2]}, "a number of equal steps"),
-        ({"sampler": "euler", "spacing": "stride"}, "spacing=stride: the sampler euler has no such"),
+        (
+            {"sampler": "euler", "spacing": "stride"},
+            "spacing=stride: the sampler euler has no such",
+        ),
         ({"sampler": "euler", "edit": {"mode": "x_t"}}, "trajectory, x0"),
-        ({"sampler": "dopri5", "edit": {"mode": "x0"}}, "dopri5 cannot edit with x0: choose the sampler from euler"),
+        (
+            {"sampler": "dopri5", "edit": {"mode": "x0"}},
+            "dopri5 cannot edit with x0: choose the sampler from euler",
+        ),
     ],
 }
 
@@ -473,12 +596,21 @@ def test_no_loop_waits_for_the_device(build, sampler):
     known = torch.zeros(2, 6, 3, device="meta")
     for edit in (None, *(Edit(known, known > 0, mode) for mode in build.edit_modes)):
         how = {"sampler": sampler, "num_inference_steps": 5, "edit": edit, "trajectory": []}
-        assert sample(build(), pulled, lambda draw: torch.zeros_like(known), **how).shape == (2, 6, 3)
+        assert sample(build(), pulled, lambda draw: torch.zeros_like(known), **how).shape == (
+            2,
+            6,
+            3,
+        )
 
 
 def test_half_precision_denoisers_are_sampled_in_float32():
-    denoisers: list[Denoise] = [lambda x_t, *_: x_t.bfloat16(), lambda x_t, *_: x_t.bfloat16().float()]
+    denoisers: list[Denoise] = [
+        lambda x_t, *_: x_t.bfloat16(),
+        lambda x_t, *_: x_t.bfloat16().float(),
+    ]
     for sampler in DIFFUSION:
         how = {"sampler": sampler, "num_inference_steps": 5}
-        half, single = (sample(GaussianDiffusion(), denoise, drawn((1, 4, 2)), **how) for denoise in denoisers)
+        half, single = (
+            sample(GaussianDiffusion(), denoise, drawn((1, 4, 2)), **how) for denoise in denoisers
+        )
         torch.testing.assert_close(half, single, rtol=0, atol=0)

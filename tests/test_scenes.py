@@ -21,11 +21,17 @@ FILES = SHARED / "data" / "files"
 MILLIMETER = 1e-3
 
 
-CASES = [(ending, rig) for ending in (".fbx", ".glb") for rig in (None, "mixamo", "unreal", "unity", "lafan1", "soma")]
+CASES = [
+    (ending, rig)
+    for ending in (".fbx", ".glb")
+    for rig in (None, "mixamo", "unreal", "unity", "lafan1", "soma")
+]
 
 
 @pytest.mark.parametrize(("ending", "rig"), [*CASES, (".vrma", None)])
-def test_a_motion_comes_back_from_each_kind_of_file_and_rig(ending: str, rig: str | None, tmp_path: Path):
+def test_a_motion_comes_back_from_each_kind_of_file_and_rig(
+    ending: str, rig: str | None, tmp_path: Path
+):
     motion = synthetic("kick")
     motion.save(tmp_path / f"kick{ending}", rig=rig)
     again = read(tmp_path / f"kick{ending}")
@@ -44,7 +50,11 @@ def test_splines_of_a_glb_file_have_a_slope_before_and_another_one_after_each_ke
     keys = np.zeros((3, 3, 3), "f4")  # slope before, value and slope after of each key
     keys[..., 0] = np.transpose([slopes_before, values, slopes_after])
     times = binary.add(np.array([0, 1, 1.5], "f4"), bounds=True)
-    sampler = {"input": times, "output": binary.add(keys.reshape(9, 3)), "interpolation": "CUBICSPLINE"}
+    sampler = {
+        "input": times,
+        "output": binary.add(keys.reshape(9, 3)),
+        "interpolation": "CUBICSPLINE",
+    }
     channel = {"sampler": 0, "target": {"node": 0, "path": "translation"}}
     document = {
         "asset": {"version": "2.0", "extras": {"fps": 20}},
@@ -61,13 +71,20 @@ def test_splines_of_a_glb_file_have_a_slope_before_and_another_one_after_each_ke
 
 
 @needs_third_party
-@pytest.mark.parametrize("name", ["mixamo_prerotation.fbx", "mixamo_not_tpose.fbx", "mixamo_not_tpose.glb"])
+@pytest.mark.parametrize(
+    "name", ["mixamo_prerotation.fbx", "mixamo_not_tpose.fbx", "mixamo_not_tpose.glb"]
+)
 def test_joints_of_other_writers_are_those_of_the_file(name: str):
     motion = read(FILES / name)
     with np.load(FILES / "mixamo_not_tpose_expected.npz") as expected:
         names = [str(joint).removeprefix("mixamorig:") for joint in expected["names"]]
         walk = expected["walk"][: len(motion.joints)]
-    for joint, bone in (("left_knee", "LeftLeg"), ("head", "Head"), ("right_wrist", "RightHand"), ("spine2", "Spine1")):
+    for joint, bone in (
+        ("left_knee", "LeftLeg"),
+        ("head", "Head"),
+        ("right_wrist", "RightHand"),
+        ("spine2", "Spine1"),
+    ):
         ours = motion.joints[:, SMPL22.joints.index(joint)]
         assert np.abs(ours - walk[:, names.index(bone)]).max() < 0.01 * MILLIMETER
 

@@ -51,7 +51,11 @@ def test_windows_cover_every_frame_and_share_the_overlap(lengths, loop):
 
 
 def test_one_window_changes_nothing_and_two_are_averaged():
-    x, t, mask = torch.randn(2, 20, 3), torch.tensor([5.0, 7.0]), torch.ones(2, 20, dtype=torch.bool)
+    x, t, mask = (
+        torch.randn(2, 20, 3),
+        torch.tensor([5.0, 7.0]),
+        torch.ones(2, 20, dtype=torch.bool),
+    )
     cond = Condition(torch.zeros(3, 1), torch.zeros(3, 0, 1), None)
 
     def denoise(x_t, t, mask, cond):
@@ -59,9 +63,16 @@ def test_one_window_changes_nothing_and_two_are_averaged():
 
     whole = blended(denoise, cover([(0, 0, 20), (1, 0, 20)], [20, 20], 4, 20, CPU))
     assert torch.equal(whole(x, t, mask, cond), denoise(x, t, mask, cond))
-    number, three = torch.tensor([1.0, 2.0, 3.0]), cover([(0, 0, 12), (0, 8, 12), (1, 0, 20)], [20, 20], 4, 20, CPU)
-    several = blended(lambda x_t, *_: number[:, None, None].expand_as(x_t), three)(x, t, mask, cond)[..., 0]
-    expected = torch.tensor([1.0] * 8 + [1 + np.sin(np.pi / 16 * n) ** 2 for n in (1, 3, 5, 7)] + [2.0] * 8).float()
+    number, three = (
+        torch.tensor([1.0, 2.0, 3.0]),
+        cover([(0, 0, 12), (0, 8, 12), (1, 0, 20)], [20, 20], 4, 20, CPU),
+    )
+    several = blended(lambda x_t, *_: number[:, None, None].expand_as(x_t), three)(
+        x, t, mask, cond
+    )[..., 0]
+    expected = torch.tensor(
+        [1.0] * 8 + [1 + np.sin(np.pi / 16 * n) ** 2 for n in (1, 3, 5, 7)] + [2.0] * 8
+    ).float()
     torch.testing.assert_close(several[0], expected)
     torch.testing.assert_close(several[1], torch.full((20,), 3.0))
 
@@ -88,7 +99,11 @@ def test_a_part_longer_than_training_and_one_as_long_as_training(model):
 
 
 def test_a_continued_motion_begins_with_it_and_knows_its_parts(model, tmp_path):
-    assert read_parts("walks @3 | turns left| sits @ 2.5s") == [("walks", 3.0), ("turns left", None), ("sits", 2.5)]
+    assert read_parts("walks @3 | turns left| sits @ 2.5s") == [
+        ("walks", 3.0),
+        ("turns left", None),
+        ("sits", 2.5),
+    ]
     begin = flame_mdm.generate(model, TEXT, seconds=2, **FAST)[0]
     begin.save(tmp_path / "walk.npz")
     text, after = "a person bows @1 | a person jumps", tmp_path / "walk.npz"
@@ -108,8 +123,12 @@ def test_a_loop_has_no_seam(model):
     assert (first, size) == (-shared // 2, 40 + shared)
 
     def seam(loop: bool) -> float:
-        features = flame_mdm.generate(model, "a person raises both arms", seconds=2, loop=loop)[0].features[:, 4:67]
-        return float(np.abs(features[0] - features[-1]).max() / np.abs(np.diff(features, axis=0)).max())
+        features = flame_mdm.generate(model, "a person raises both arms", seconds=2, loop=loop)[
+            0
+        ].features[:, 4:67]
+        return float(
+            np.abs(features[0] - features[-1]).max() / np.abs(np.diff(features, axis=0)).max()
+        )
 
     assert seam(loop=True) < 1 < seam(loop=False)
 
@@ -120,8 +139,16 @@ def test_bad_requests_give_one_clear_line(model):
         ("walks @fast", {}, "seconds of a part are a number"),
         ("walks @0.2 | sits", {}, "'walks': a part of 0.2 seconds is too short"),
         ("walks @9999", {}, "too long"),
-        ("walks", {"after": "walk.npz", "loop": True}, r"^after=walk\.npz: a motion .* cannot have loop\."),
-        ("walks", {"after": "walk.npz", "targets": "path.json"}, r"^after=walk\.npz: .* cannot have targets\."),
+        (
+            "walks",
+            {"after": "walk.npz", "loop": True},
+            r"^after=walk\.npz: a motion .* cannot have loop\.",
+        ),
+        (
+            "walks",
+            {"after": "walk.npz", "targets": "path.json"},
+            r"^after=walk\.npz: .* cannot have targets\.",
+        ),
         ("walks", {"after": "notes.txt"}, r"^notes\.txt: not a motion\. Give a \.npz"),
         ("walks", {"seed": 0.5}, "seed=0.5: give a whole number"),
         ("walks", {"actions": "walk"}, "texts or actions, not both"),
@@ -138,7 +165,9 @@ def test_bad_requests_give_one_clear_line(model):
 
 def bones(motion: flame_mdm.Motion) -> np.ndarray:
     """Lengths (F, N) of all bones but those of the root."""
-    return np.linalg.norm(motion.skeleton.bones(torch.from_numpy(motion.joints)).numpy()[:, 1:], axis=-1)
+    return np.linalg.norm(
+        motion.skeleton.bones(torch.from_numpy(motion.joints)).numpy()[:, 1:], axis=-1
+    )
 
 
 def test_a_linear_decoder_is_solved_exactly_and_changes_least():
@@ -173,17 +202,27 @@ def test_way_points_joints_and_poses_are_reached(model, tmp_path):
     targets = read_targets(model.representation, file)
     assert len(targets.positions.values) == 2 + 1 + 1 + 1
     options: dict[str, Any] = {"seconds": 2.5, "num_inference_steps": 10}
-    motion, plain = (flame_mdm.generate(model, TEXT, targets=source, **options)[0] for source in (file, None))
+    motion, plain = (
+        flame_mdm.generate(model, TEXT, targets=source, **options)[0] for source in (file, None)
+    )
     assert errors(motion, targets).max() < 0.03 < errors(plain, targets).max()
     local = slice(4, 4 + 21 * 3)
     np.testing.assert_allclose(motion.features[48, local], bow.features[20, local], atol=1e-5)
     arms = np.linalg.norm(motion.joints[:, 18:22] - motion.joints[:, 16:20], axis=-1)
     np.testing.assert_allclose(arms[30], np.median(arms, 0), rtol=0.05)
     targets = {"root": [{"time": t, "position": [0.1 * t, 0.3 * t]} for t in (1, 2, 3, 4)]}
-    sequence = flame_mdm.generate(model, f"{TEXT} @2.4 | {TEXT} @2.4", targets=targets, num_inference_steps=10)[0]
+    sequence = flame_mdm.generate(
+        model, f"{TEXT} @2.4 | {TEXT} @2.4", targets=targets, num_inference_steps=10
+    )[0]
     assert errors(sequence, read_targets(model.representation, targets)).max() < 0.05
     # a pose at a position faces its heading
-    entry = {"time": 1.0, "file": str(tmp_path / "bow.npz"), "frame": 5, "position": [0.2, 0.5], "heading": 90}
+    entry = {
+        "time": 1.0,
+        "file": str(tmp_path / "bow.npz"),
+        "frame": 5,
+        "position": [0.2, 0.5],
+        "heading": 90,
+    }
     pose = read_targets(model.representation, {"poses": [entry]}).positions.values.reshape(22, 3)
     assert pose[0, [0, 2]].tolist() == pytest.approx([0.2, 0.5])
     left = (pose[1] - pose[2] + pose[16] - pose[17]).numpy()
@@ -196,10 +235,22 @@ def test_bad_targets_give_one_clear_line(model, tmp_path):
         ({"roots": []}, "unknown key: roots. Did you mean root, joints"),
         ({"root": [{"time": "1", "position": [0, 1]}]}, 'root.0.time is "1", not a number'),
         ({"root": [{"time": 1, "position": [1]}]}, r"root.0.position is \[1\], not a longer list"),
-        ({"root": [{"time": 1, "position": [0, 30]}]}, "30.0 m from the start in 1 seconds is impossible"),
-        ({"root": [{"time": 9, "position": [0, 1]}]}, "9 seconds is after .* last frame is at 1.95 seconds"),
-        ({"joints": [{"time": 1, "joint": "left_rist", "position": [0, 1, 0]}]}, "no joint 'left_rist'.*left_wrist"),
-        ({"joints": [{"time": 1, "joint": "head", "position": [0, 9, 0]}]}, "height 9 m is impossible"),
+        (
+            {"root": [{"time": 1, "position": [0, 30]}]},
+            "30.0 m from the start in 1 seconds is impossible",
+        ),
+        (
+            {"root": [{"time": 9, "position": [0, 1]}]},
+            "9 seconds is after .* last frame is at 1.95 seconds",
+        ),
+        (
+            {"joints": [{"time": 1, "joint": "left_rist", "position": [0, 1, 0]}]},
+            "no joint 'left_rist'.*left_wrist",
+        ),
+        (
+            {"joints": [{"time": 1, "joint": "head", "position": [0, 9, 0]}]},
+            "height 9 m is impossible",
+        ),
         ({"poses": [{"time": 1, "file": "no.npz"}]}, "no.npz"),
         ("{", r"t.json: .*; see docs/targets.md"),
     ):
@@ -228,12 +279,16 @@ def test_targets_that_the_text_does_not_suggest_do_not_stretch_bones(model):
     """Steering may not leave what the denoiser was trained on, and bones keep their lengths around a target."""
     target = {"joints": [{"time": 1.5, "joint": "right_wrist", "position": [-0.5, 1.5, 0.2]}]}
     options: dict[str, Any] = {"seconds": 3, "num_inference_steps": 20}
-    motions = [flame_mdm.generate(model, "a person stands still", targets=t, seed=1, **options) for t in (None, target)]
+    motions = [
+        flame_mdm.generate(model, "a person stands still", targets=t, seed=1, **options)
+        for t in (None, target)
+    ]
     before, after = (np.median(bones(motion), 0) for (motion,) in motions)
     assert np.abs(after / before - 1).max() < 0.05
     target = {"joints": [{"time": 1.5, "joint": "right_wrist", "position": [None, 1.4, None]}]}
     lengths = bones(flame_mdm.generate(model, TEXT, targets=target, **options)[0])
-    assert np.abs(lengths / np.median(lengths, 0) - 1).max() < 0.15  # 0.6, if kept in the frame of the target alone
+    # 0.6, if kept in the frame of the target alone
+    assert np.abs(lengths / np.median(lengths, 0) - 1).max() < 0.15
 
 
 CAPTIONS = ["A person walks forward.", "a person waves with the left hand", "someone jumps"]
@@ -241,7 +296,9 @@ CAPTIONS = ["A person walks forward.", "a person waves with the left hand", "som
 
 def test_a_vocabulary_holds_every_word_once_and_captions_only_if_they_may_be_shared(trained):
     facts = read_checkpoint(trained)["facts"]
-    assert facts["vocabulary"] == sorted({word for caption in facts["captions"] for word in vocabulary.words(caption)})
+    assert facts["vocabulary"] == sorted(
+        {word for caption in facts["captions"] for word in vocabulary.words(caption)}
+    )
     assert "walks" in facts["vocabulary"]
     kept = vocabulary.vocabulary([*CAPTIONS, *CAPTIONS], share=False)
     assert kept == {"vocabulary": sorted(set(" ".join(CAPTIONS).lower().replace(".", "").split()))}
@@ -253,7 +310,8 @@ def test_a_vocabulary_holds_every_word_once_and_captions_only_if_they_may_be_sha
 
 def test_unseen_and_unread_words_are_named_once_with_one_suggestion():
     facts = vocabulary.vocabulary(CAPTIONS, share=True)
-    assert vocabulary.advice("A person WAVES, with the hand! They were walking", facts) == []  # walks; function words
+    # Walks; function words
+    assert vocabulary.advice("A person WAVES, with the hand! They were walking", facts) == []
     (line,) = vocabulary.advice("a person dances the flamenco and dances with the left foot", facts)
     assert line == f"never seen in training: dances, flamenco, foot. Did you mean '{CAPTIONS[1]}'?"
     (line,) = vocabulary.advice("A person wakls forwrad.", facts)
@@ -261,7 +319,9 @@ def test_unseen_and_unread_words_are_named_once_with_one_suggestion():
     (line,) = vocabulary.advice("a person walks happily", {"vocabulary": ["walks"]})
     assert line == "never seen in training: happily."
     text = "a person walks forward and then jumps"
-    assert vocabulary.advice(text, {}, max_words=5) == ["only the first 5 words are read, not 'then jumps'"]
+    assert vocabulary.advice(text, {}, max_words=5) == [
+        "only the first 5 words are read, not 'then jumps'"
+    ]
     assert vocabulary.advice(text, {}, max_words=7) == []
     for text, first in (("walks", 0), ("jumps", 2), ("the left hand of a person", 1)):
         assert vocabulary.nearest(text, CAPTIONS)[0] == CAPTIONS[first]
@@ -288,7 +348,9 @@ def test_a_text_without_a_known_word_is_refused(model, tmp_path, monkeypatch, ca
 def test_words_are_read_in_a_known_form_and_unknown_ones_are_dropped():
     forms = {"walks": "walked", "wave": "waving", "hop": "hopping", "ball": "balls", "sits": "sit"}
     assert {vocabulary.known_form(word, forms) for word in forms.values()} == set(forms)
-    assert [vocabulary.known_form(word, forms) for word in ("string", "hip", "s", "walkie")] == [None] * 4
+    assert [vocabulary.known_form(word, forms) for word in ("string", "hip", "s", "walkie")] == [
+        None
+    ] * 4
     tokens = LearnedTokens(features=8, heads=1, buckets=64)
     every = tokens.rows("he walked moonily to the ball")
     tokens.seen = {*forms, "the", "he"}
@@ -313,5 +375,11 @@ SENTENCES = {
 def test_sentences_of_several_actions_are_split_at_their_verbs():
     for text, parts in SENTENCES.items():
         assert vocabulary.in_parts(text, Synthetic.verbs) == (parts or [text])
-    assert vocabulary.in_parts("walks forward, turns left. Then waves", ()) == ["walks forward, turns left", "waves"]
-    assert vocabulary.in_parts("walks, then turns in limp style.", ()) == ["walks in limp style", "turns in limp style"]
+    assert vocabulary.in_parts("walks forward, turns left. Then waves", ()) == [
+        "walks forward, turns left",
+        "waves",
+    ]
+    assert vocabulary.in_parts("walks, then turns in limp style.", ()) == [
+        "walks in limp style",
+        "turns in limp style",
+    ]

@@ -70,7 +70,11 @@ def test_attention_by_matrix_products_is_the_fused_one():
 
 def test_a_simplified_network_computes_the_same_without_dropout():
     network = Transformer(16, 32, 2, 4, 0.1, cross_attention=True)
-    x, memory, mask = torch.randn(3, 7, 16), torch.randn(3, 5, 16), torch.arange(7) < torch.tensor([[7], [3], [1]])
+    x, memory, mask = (
+        torch.randn(3, 7, 16),
+        torch.randn(3, 5, 16),
+        torch.arange(7) < torch.tensor([[7], [3], [1]]),
+    )
     names, expected = list(network.state_dict()), network.eval()(x, mask, memory)
     speed._simplify(network)
     torch.testing.assert_close(network(x, mask, memory), expected)
@@ -128,7 +132,9 @@ def test_the_moving_average_of_flame_is_that_of_its_code():
         if step % 10 == 0:
             expected = weight.clone() if step <= 100 else 0.99 * expected + 0.01 * weight
         if step >= 10:
-            torch.testing.assert_close(saved(average, model)["state_dict"]["layer.weight"], expected)
+            torch.testing.assert_close(
+                saved(average, model)["state_dict"]["layer.weight"], expected
+            )
 
 
 @pytest.mark.parametrize("recipe", ["mdm_50_steps", "mdm_decoder_distilbert"])
@@ -156,10 +162,20 @@ def test_a_resumed_average_keeps_the_initial_weights_before_its_first_update():
 @pytest.mark.slow
 def test_fast_is_reproducible_resumes_exactly_and_is_recorded(tiny, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": True})
-    options = [*tiny, "callbacks.samples=null", "denoiser.dropout=0.2", "callbacks.checkpoints.every_n_steps=2"]
+    options = [
+        *tiny,
+        "callbacks.samples=null",
+        "denoiser.dropout=0.2",
+        "callbacks.checkpoints.every_n_steps=2",
+    ]
 
     def train(name: str, steps: int, speed: str = "fast") -> dict[str, Any]:
-        words = [*options, f"speed={speed}", f"run.dir={tmp_path / name}", f"trainer.max_steps={steps}"]
+        words = [
+            *options,
+            f"speed={speed}",
+            f"run.dir={tmp_path / name}",
+            f"trainer.max_steps={steps}",
+        ]
         assert main(["train", "quickstart", *words]) == 0
         return read_checkpoint(tmp_path / name / "checkpoints" / "last.ckpt")
 
@@ -167,27 +183,47 @@ def test_fast_is_reproducible_resumes_exactly_and_is_recorded(tiny, tmp_path, mo
     assert "bf16-mixed, speed=fast" in capsys.readouterr().out
     train("parts", 2)
     parts = train("parts", 4)
-    assert all(torch.equal(value, parts["state_dict"][name]) for name, value in whole["state_dict"].items())
-    facts = [checkpoint["facts"]["training"] for checkpoint in (whole, train("reference", 1, "reference"))]
-    assert [(f["speed"], f["precision"]) for f in facts] == [("fast", "bf16-mixed"), ("reference", "32-true")]
+    assert all(
+        torch.equal(value, parts["state_dict"][name]) for name, value in whole["state_dict"].items()
+    )
+    facts = [
+        checkpoint["facts"]["training"]
+        for checkpoint in (whole, train("reference", 1, "reference"))
+    ]
+    assert [(f["speed"], f["precision"]) for f in facts] == [
+        ("fast", "bf16-mixed"),
+        ("reference", "32-true"),
+    ]
 
 
 def test_bfloat16_is_chosen_where_the_processor_computes_with_it(monkeypatch):
-    cases = ("amx_bf16", "32-true", "bf16-mixed"), ("avx2", "32-true", "32-true"), ("amx_bf16", *["16-mixed"] * 2)
+    cases = (
+        ("amx_bf16", "32-true", "bf16-mixed"),
+        ("avx2", "32-true", "32-true"),
+        ("amx_bf16", *["16-mixed"] * 2),
+    )
     for has, precision, chosen in cases:
         monkeypatch.setattr(torch.cpu, "get_capabilities", lambda has=has: {has: True})
-        config = compose("quickstart", ["trainer.accelerator=cpu", f"trainer.precision={precision}"])
+        config = compose(
+            "quickstart", ["trainer.accelerator=cpu", f"trainer.precision={precision}"]
+        )
         assert speed.accelerate(*parts(config), config) == chosen
 
 
 def parts(config: Config) -> tuple[GeneratorTask, MotionDataModule]:
     representation = instantiate(config["representation"])
-    return GeneratorTask.build(config, representation), instantiate(config["data"], representation=representation)
+    return GeneratorTask.build(config, representation), instantiate(
+        config["data"], representation=representation
+    )
 
 
 @pytest.mark.parametrize(
     ("words", "multiple"),
-    [("trainer.max_steps=5000", 32), ("trainer.max_steps=4999", 0), ("+denoiser.mask_padding=false", 1)],
+    [
+        ("trainer.max_steps=5000", 32),
+        ("trainer.max_steps=4999", 0),
+        ("+denoiser.mask_padding=false", 1),
+    ],
 )
 def test_long_runs_on_cuda_are_compiled_for_few_lengths(words, multiple, monkeypatch, capsys):
     for name in ("is_available", "is_bf16_supported"):

@@ -61,7 +61,9 @@ class Recalling(Denoiser):
     def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
         assert cond.prefix is not None
         windows = self.motion.unfold(0, CONTEXT, 1).transpose(1, 2)
-        starts = [(windows - prefix).square().sum((1, 2)).argmin() + CONTEXT for prefix in cond.prefix]
+        starts = [
+            (windows - prefix).square().sum((1, 2)).argmin() + CONTEXT for prefix in cond.prefix
+        ]
         longer = torch.cat([self.motion, self.motion[-1:].expand(x_t.shape[1], -1)])
         return torch.stack([longer[start : start + x_t.shape[1]] for start in starts])
 
@@ -72,7 +74,10 @@ def walk(model) -> Motion:
     source = Synthetic(clips=1)
     for index in range(200):
         clip = source.clip(index, FPS)
-        if clip.attributes["action"] == "walk" and clip.attributes.get("direction") in ("left", "right"):
+        if clip.attributes["action"] == "walk" and clip.attributes.get("direction") in (
+            "left",
+            "right",
+        ):
             break
     motion = Motion(np.asarray(clip.motion), FPS)
     return with_features(model.representation, motion)
@@ -95,10 +100,13 @@ def test_blocks_continue_in_the_world_where_the_frames_before_them_end(model, wa
 def test_a_motion_may_stand_anywhere_when_a_stream_continues_it(model, walk):
     moved = decoded(model.representation, torch.from_numpy(walk.features[:20]), "", "moved")
     placement = Placement(
-        torch.tensor([0.7], dtype=torch.float64), torch.tensor([[3.0, 0.0, -2.0]], dtype=torch.float64)
+        torch.tensor([0.7], dtype=torch.float64),
+        torch.tensor([[3.0, 0.0, -2.0]], dtype=torch.float64),
     )
     here = next(stream(model, "a person walks", moved)).joints
-    moved.joints = placement.apply(torch.from_numpy(moved.joints)[None])[0].numpy().astype(np.float32)
+    moved.joints = (
+        placement.apply(torch.from_numpy(moved.joints)[None])[0].numpy().astype(np.float32)
+    )
     there = next(stream(model, "a person walks", moved)).joints
     assert_same(there, placement.apply(torch.from_numpy(here)[None])[0].numpy())
 
@@ -107,7 +115,8 @@ def test_places_are_found_and_undone():
     generator = torch.Generator().manual_seed(0)
     pose = torch.randn(4, 22, 3, generator=generator)
     placement = Placement(
-        torch.tensor([0.0, 1.0, -2.0, 3.1], dtype=torch.float64), torch.randn(4, 3, generator=generator)
+        torch.tensor([0.0, 1.0, -2.0, 3.1], dtype=torch.float64),
+        torch.randn(4, 3, generator=generator),
     )
     placement.shift[:, 1] = 0
     moved = placement.apply(pose)
@@ -118,7 +127,10 @@ def test_places_are_found_and_undone():
 
 
 def test_a_text_changes_later_blocks_only(model):
-    plain, changed = stream(model, "a person walks", seed=3), stream(model, "a person walks", seed=3)
+    plain, changed = (
+        stream(model, "a person walks", seed=3),
+        stream(model, "a person walks", seed=3),
+    )
     before = [next(plain), next(plain)], [next(changed), next(changed)]
     changed.change("a person sits down")
     after = next(plain), next(changed)
@@ -129,19 +141,25 @@ def test_a_text_changes_later_blocks_only(model):
         "a person sits down",
         "a person sits down",
     )
-    assert not np.allclose(next(stream(model, "a person walks", seed=4)).joints, before[0][0].joints, atol=1e-3)
+    assert not np.allclose(
+        next(stream(model, "a person walks", seed=4)).joints, before[0][0].joints, atol=1e-3
+    )
 
 
 def test_a_text_is_read_in_the_words_of_the_captions_as_in_generate():
     reading = built()
     words = ["a", "person", "walks", "waves", "forward", "with", "the", "left", "hand"]
-    reading.add_facts({"verbs": ["walks", "waves"], "actions": ["walk", "wave"], "vocabulary": words})
+    reading.add_facts(
+        {"verbs": ["walks", "waves"], "actions": ["walk", "wave"], "vocabulary": words}
+    )
     running = stream(reading, "somebody is strolling forwards")
     first = next(running)
     running.change("he waved his left hand")
     second = next(running)
     assert (first.text, second.text) == ("somebody is strolling forwards", "he waved his left hand")
-    motion = generate(reading, "somebody is strolling forwards @1.5 | he waved his left hand @1.5")[0]
+    motion = generate(reading, "somebody is strolling forwards @1.5 | he waved his left hand @1.5")[
+        0
+    ]
     assert_same(motion.joints, joints([first, second]))
     with pytest.raises(UserError):
         running.change("xyzzy plugh")
@@ -151,7 +169,9 @@ def test_each_block_has_its_own_noise_which_no_text_changes(model):
     def starts(text: str) -> list[Tensor]:
         """The noise that each of three blocks starts from."""
         inputs: list[Tensor] = []
-        hook = model.denoiser.register_forward_hook(lambda _, arguments, __: inputs.append(arguments[0]))
+        hook = model.denoiser.register_forward_hook(
+            lambda _, arguments, __: inputs.append(arguments[0])
+        )
         running = stream(model, "a person walks", guidance_scale=1.0)
         next(running)
         running.change(text)
@@ -175,7 +195,9 @@ def test_texts_at_times_give_the_same_motion_whenever_they_are_typed(model):
     blocks += [next(late), next(late)]
     assert [len(block.joints) for block in blocks] == [30, 15, 25, 30]
     assert np.array_equal(joints(islice(early, 4)), joints(blocks))
-    with pytest.raises(UserError, match=r"at=1: the stream is at 5 seconds already\. Give a later time"):
+    with pytest.raises(
+        UserError, match=r"at=1: the stream is at 5 seconds already\. Give a later time"
+    ):
         late.change("a person jumps", at=1)
 
 
@@ -204,7 +226,9 @@ def test_a_motion_is_continued(model, walk):
 
 
 def test_samples_and_lengths_in_a_batch_are_those_alone(model):
-    together = generate(model, ["a person walks", "a person waves | sits"], samples=2, seconds=[1.0, 2.0])
+    together = generate(
+        model, ["a person walks", "a person waves | sits"], samples=2, seconds=[1.0, 2.0]
+    )
     assert [len(motion.joints) for motion in together] == [20, 20, 80, 80]
     assert not np.allclose(together[0].joints, together[1].joints, atol=1e-3)
     assert_same(generate(model, "a person walks", frames=20)[0].joints, together[0].joints)
@@ -226,9 +250,15 @@ def test_a_batch_of_streams_gives_what_single_ones_give(model):
 
 def test_options_of_the_sampler_reach_the_stream(model):
     first = next(stream(model, "a person walks")).joints
-    changes: list[SamplerKeywords] = [{"guidance_scale": 1.0}, {"sampler": "ddim"}, {"num_inference_steps": 2}]
+    changes: list[SamplerKeywords] = [
+        {"guidance_scale": 1.0},
+        {"sampler": "ddim"},
+        {"num_inference_steps": 2},
+    ]
     for options in changes:
-        assert not np.allclose(next(stream(model, "a person walks", **options)).joints, first, atol=1e-4)
+        assert not np.allclose(
+            next(stream(model, "a person walks", **options)).joints, first, atol=1e-4
+        )
     with pytest.raises(UserError, match="unknown sampler 'dddim'"):
         stream(model, "a person walks", sampler="dddim")
 
@@ -253,7 +283,9 @@ def test_a_model_trained_with_targets_also_reads_them():
     target = seen[0]
     assert target is not None
     # A straight way at an even speed: the first block ends after 30 of the 57 frames to the goal.
-    torch.testing.assert_close(target[0, 6], torch.tensor([0.5 * 30 / 57, 0.0, 30 / 57, 1.0]), rtol=0, atol=1e-4)
+    torch.testing.assert_close(
+        target[0, 6], torch.tensor([0.5 * 30 / 57, 0.0, 30 / 57, 1.0]), rtol=0, atol=1e-4
+    )
     assert not target[0, [0, 1, 2, 3, 4, 5, 7]].any()
     seen.clear()
     next(stream(aiming, "a person walks"))
@@ -280,13 +312,20 @@ def test_cleanup_is_applied_to_generated_motions(model):
 def test_online_cleanup_waits_for_one_block_and_has_no_jump_between_blocks(walk):
     knowing = built()
     features = torch.from_numpy(walk.features)
-    noisy = features + 0.02 * torch.randn(features.shape, generator=torch.Generator().manual_seed(1))
+    noisy = features + 0.02 * torch.randn(
+        features.shape, generator=torch.Generator().manual_seed(1)
+    )
     knowing.denoiser = Recalling(knowing.representation.normalize(noisy))
     begun = decoded(knowing.representation, noisy[:CONTEXT], "", "begun")
     running = stream(knowing, "a person walks", begun, block=10, cleanup=True)
     raw = joints(islice(stream(knowing, "a person walks", begun, block=10), 4))
     first = next(running)
-    assert (running.frames, len(first.joints), first.cleanup, len(first.features)) == (20, 10, True, 0)
+    assert (running.frames, len(first.joints), first.cleanup, len(first.features)) == (
+        20,
+        10,
+        True,
+        0,
+    )
     clean = np.concatenate([first.joints, *(next(running).joints for _ in range(3))])
     assert np.linalg.norm(clean - raw, axis=-1).mean() < 0.1
 
@@ -304,17 +343,44 @@ def test_what_such_a_model_cannot_do_is_said_in_one_line(model, walk):
     short = decoded(model.representation, torch.from_numpy(walk.features[:4]), "", "short")
     ordinary = untrained(["denoiser.latent_dim=16", "denoiser.num_layers=1"], 60)
     for call, message in (
-        (lambda: stream(ordinary, "a person walks"), "does not continue frames, so it has no streams"),
-        (lambda: stream(model, "a person walks", short), "start=short: 4 frames are too short. Give at least 10"),
+        (
+            lambda: stream(ordinary, "a person walks"),
+            "does not continue frames, so it has no streams",
+        ),
+        (
+            lambda: stream(model, "a person walks", short),
+            "start=short: 4 frames are too short. Give at least 10",
+        ),
         (lambda: stream(model, "a person walks", "nowhere.bvh"), "nowhere.bvh"),
-        (lambda: stream(model, "a person walks", block=31), "block=31: this model predicts 30 frames at once"),
+        (
+            lambda: stream(model, "a person walks", block=31),
+            "block=31: this model predicts 30 frames at once",
+        ),
         (lambda: stream(model, " "), "give a text that says what happens"),
-        (lambda: generate(model, "a person walks", loop=True), "loop=true: this model continues frames"),
-        (lambda: generate(model, "a person walks", stages=[]), "trajectory: this model continues frames"),
-        (lambda: generate(model, "a person walks", after=short), "after=short: 4 frames are too short"),
-        (lambda: edit(model, walk, region="in_between"), "this model continues frames and cannot edit"),
-        (lambda: description(model), "this model continues frames, which the exported runner does not"),
-        (lambda: generate(model, "a person walks", seconds=601), "601 seconds are too long. Give at most 600"),
+        (
+            lambda: generate(model, "a person walks", loop=True),
+            "loop=true: this model continues frames",
+        ),
+        (
+            lambda: generate(model, "a person walks", stages=[]),
+            "trajectory: this model continues frames",
+        ),
+        (
+            lambda: generate(model, "a person walks", after=short),
+            "after=short: 4 frames are too short",
+        ),
+        (
+            lambda: edit(model, walk, region="in_between"),
+            "this model continues frames and cannot edit",
+        ),
+        (
+            lambda: description(model),
+            "this model continues frames, which the exported runner does not",
+        ),
+        (
+            lambda: generate(model, "a person walks", seconds=601),
+            "601 seconds are too long. Give at most 600",
+        ),
         (lambda: generate(model, "a person walks", seconds=0), "0 seconds are too short"),
     ):
         with pytest.raises((UserError, FileNotFoundError), match=message) as error:

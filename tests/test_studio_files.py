@@ -46,7 +46,9 @@ def autodesk(folder: Path, file: Path) -> Path:
     return out.with_suffix(".glb")
 
 
-def largest_difference(names: list[str], first: np.ndarray, other: AnimatedNodes, frames: list[int]) -> float:
+def largest_difference(
+    names: list[str], first: np.ndarray, other: AnimatedNodes, frames: list[int]
+) -> float:
     """The largest distance in meters between positions (F, N, 3) of named joints and nodes of the same name."""
     nodes = [other.names.index(name) for name in names]
     return float(np.abs(first - other.positions[frames][:, nodes]).max())
@@ -89,7 +91,9 @@ class Written:
 
 
 @pytest.fixture(scope="module", params=RIGS)
-def on_rig(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> list[Written]:
+def on_rig(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> list[Written]:
     """The twenty motions as FBX files of a rig; tests of all readers share them."""
     folder = tmp_path_factory.mktemp(request.param or "smpl")
     files = []
@@ -186,7 +190,9 @@ def check_blender(file: Written, joints: list[str], scene: dict[str, Any]) -> No
     """Checks positions, mesh and materials of a file in Blender, whose z is up."""
     expected = file.read.positions[FRAMES][:, [file.read.names.index(name) for name in joints]]
     for frame, positions in zip(expected, scene["frames"], strict=True):
-        found = np.array([positions.get(name) or positions[name.replace(":", "_")] for name in joints])
+        found = np.array(
+            [positions.get(name) or positions[name.replace(":", "_")] for name in joints]
+        )
         assert np.abs(found[:, [0, 2, 1]] * [1, 1, -1] - frame).max() < 0.01 * MILLIMETER, file.path
     assert scene["vertices"] >= 2302
     assert len(set(scene["materials"])) >= 5
@@ -201,7 +207,10 @@ def test_the_surface_in_autodesk_is_that_of_pictures(node_modules: Path, tmp_pat
     motion.save(tmp_path / "kick.fbx", rig="mixamo")
     motion.save(tmp_path / "kick.glb", rig="mixamo")
     surfaces = []
-    for path, frame in ((tmp_path / "kick.glb", 20), (autodesk(node_modules, tmp_path / "kick.fbx"), 30)):
+    for path, frame in (
+        (tmp_path / "kick.glb", 20),
+        (autodesk(node_modules, tmp_path / "kick.fbx"), 30),
+    ):
         surfaces.append(skinned(path, frame))
     # the SDK's file has a vertex once per material that meets there, in another order
     for first, second in (surfaces, surfaces[::-1]):
@@ -246,13 +255,18 @@ def test_a_character_becomes_fbx_with_its_own_skin(node_modules: Path, tmp_path:
         joints = [joint for joint in expected.names if joint in ours.names]
         numbers = [expected.names.index(joint) for joint in joints]
         frames = list(range(len(expected.positions)))
-        assert largest_difference(joints, expected.positions[:, numbers], ours, frames) < 0.01 * MILLIMETER
+        assert (
+            largest_difference(joints, expected.positions[:, numbers], ours, frames)
+            < 0.01 * MILLIMETER
+        )
         theirs = glb_animation.read(autodesk(node_modules, tmp_path / "wave.fbx"))
         shared = [joint for joint in joints if joint in theirs.names]
         assert len(shared) >= 22
         numbers = [expected.names.index(joint) for joint in shared]
         whole = [0, 20, 40]
-        difference = largest_difference(shared, expected.positions[whole][:, numbers], theirs, [0, 30, 60])
+        difference = largest_difference(
+            shared, expected.positions[whole][:, numbers], theirs, [0, 30, 60]
+        )
         assert difference < 0.01 * MILLIMETER
 
 
@@ -269,7 +283,9 @@ def test_blender_reads_usd_files(rig: str, tmp_path: Path):
     # only FBX files have the root 0.1 mm behind the origin
     check_blender(expected, [name for name in expected.joints if name != "root"], scene)
     if rig == "unreal":
-        assert all(abs(max(frame["root"], key=abs)) < 0.01 * MILLIMETER for frame in scene["frames"])
+        assert all(
+            abs(max(frame["root"], key=abs)) < 0.01 * MILLIMETER for frame in scene["frames"]
+        )
 
 
 def test_a_vrm_animation_has_the_positions_of_the_motion_and_the_rest_pose_of_vrm(tmp_path: Path):
@@ -302,9 +318,13 @@ def test_a_vrm_animation_has_the_positions_of_the_motion_and_the_rest_pose_of_vr
     assert all("rotation" not in item and "scale" not in item for item in document["nodes"])
     (animation,) = document["animations"]
     moved = [
-        channel["target"]["node"] for channel in animation["channels"] if channel["target"]["path"] == "translation"
+        channel["target"]["node"]
+        for channel in animation["channels"]
+        if channel["target"]["path"] == "translation"
     ]
-    assert moved == [document["extensions"]["VRMC_vrm_animation"]["humanoid"]["humanBones"]["hips"]["node"]]
+    assert moved == [
+        document["extensions"]["VRMC_vrm_animation"]["humanoid"]["humanBones"]["hips"]["node"]
+    ]
     assert len(set(vrma.LIMBS)) == 4
 
 
@@ -323,7 +343,9 @@ def test_three_vrm_animation_reads_the_motion(node_modules: Path, tmp_path: Path
         positions = np.zeros((frames, len(file.names), 3))
         turned = np.tile(np.eye(3), (frames, len(file.names), 1, 1))
         for number, (name, parent) in enumerate(zip(file.names, file.parents, strict=True)):
-            turn = Rotation.from_quat(np.array(tracks["rotation"][name]).reshape(frames, 4)).as_matrix()
+            turn = Rotation.from_quat(
+                np.array(tracks["rotation"][name]).reshape(frames, 4)
+            ).as_matrix()
             if parent < 0:
                 positions[:, number] = np.array(tracks["translation"]["hips"]).reshape(frames, 3)
                 turned[:, number] = turn
@@ -338,7 +360,9 @@ def test_three_vrm_animation_reads_the_motion(node_modules: Path, tmp_path: Path
 def test_usd_files_are_valid_and_have_the_positions_of_the_motion(ending: str, tmp_path: Path):
     pytest.importorskip("pxr", reason="usd-core is not installed: pip install .[usd]")
     names = ("Usd", "UsdGeom", "UsdSkel", "UsdValidation")
-    Usd, UsdGeom, UsdSkel, UsdValidation = (cast(Any, import_module(f"pxr.{name}")) for name in names)
+    Usd, UsdGeom, UsdSkel, UsdValidation = (
+        cast(Any, import_module(f"pxr.{name}")) for name in names
+    )
 
     motion = synthetic("kick")
     motion.save(tmp_path / f"kick{ending}", rig="mixamo")
@@ -355,7 +379,10 @@ def test_usd_files_are_valid_and_have_the_positions_of_the_motion(ending: str, t
     cache, root = UsdSkel.Cache(), UsdSkel.Root(stage.GetDefaultPrim())
     cache.Populate(root, Usd.PrimDefaultPredicate)
     query = cache.GetSkelQuery(UsdSkel.Skeleton(stage.GetPrimAtPath("/person/skeleton")))
-    names = [joint.rpartition("/")[2].replace("mixamorig_", "mixamorig:") for joint in query.GetJointOrder()]
+    names = [
+        joint.rpartition("/")[2].replace("mixamorig_", "mixamorig:")
+        for joint in query.GetJointOrder()
+    ]
     nodes = [expected.names.index(name) for name in names]
     for frame in FRAMES:
         matrices = query.ComputeJointSkelTransforms(frame)
@@ -363,9 +390,13 @@ def test_usd_files_are_valid_and_have_the_positions_of_the_motion(ending: str, t
         assert np.abs(positions - expected.positions[frame, nodes]).max() < 0.01 * MILLIMETER
 
 
-def test_without_usd_core_the_error_says_how_to_install_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_without_usd_core_the_error_says_how_to_install_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.setitem(sys.modules, "pxr", None)
-    with pytest.raises(UserError, match=r"need the package usd-core: install it with pip install .flame-mdm\[usd\]"):
+    with pytest.raises(
+        UserError, match=r"need the package usd-core: install it with pip install .flame-mdm\[usd\]"
+    ):
         synthetic("kick").save(tmp_path / "kick.usdz")
     assert list(tmp_path.iterdir()) == []
 

@@ -40,10 +40,14 @@ def clips() -> list[Clip]:
 
 def test_the_clips_of_the_core_do_not_change():
     few = list(Synthetic(12, seed=3, workers=1).clips(FPS))
-    said = json.dumps([[clip.id, clip.captions, clip.split, clip.action, clip.attributes] for clip in few])
+    said = json.dumps(
+        [[clip.id, clip.captions, clip.split, clip.action, clip.attributes] for clip in few]
+    )
     assert hashlib.sha256(said.encode()).hexdigest()[:16] == "4e369d3d06ae3afc"
     sums = [float(np.abs(clip.motion.astype(np.float64)).sum()) for clip in few[:6]]
-    np.testing.assert_allclose(sums, [1945.7566, 1129.1888, 2575.2707, 2527.4028, 1032.7145, 2779.1908], rtol=1e-6)
+    np.testing.assert_allclose(
+        sums, [1945.7566, 1129.1888, 2575.2707, 2527.4028, 1032.7145, 2779.1908], rtol=1e-6
+    )
     assert Synthetic.actions == tuple(CORE)
     assert Synthetic(1).options == {"clips": 1, "seed": 0}
     assert len(Synthetic.verbs) < len(Synthetic(1, actions="all").verbs)
@@ -65,7 +69,8 @@ def test_bones_are_constant_and_feet_on_the_floor_do_not_move(attributes: Attrib
     across = motion[0, 16] - motion[0, 17]
     assert across[0] > 0.9 * np.linalg.norm(across), "it does not face +z"
 
-    toes = motion[:, [10, 11]]  # of which those that neither rise nor sink for three frames stand on something
+    # Of which those that neither rise nor sink for three frames stand on something
+    toes = motion[:, [10, 11]]
     level = np.abs(np.diff(toes[..., 1], axis=0)) < 1e-5
     stance = level[1:-1] & level[2:] & level[:-2]
     moved = np.linalg.norm(np.diff(toes[..., [0, 2]], axis=0), axis=-1)[1:-1]
@@ -75,7 +80,9 @@ def test_bones_are_constant_and_feet_on_the_floor_do_not_move(attributes: Attrib
     ahead = motion[:, 1] - motion[:, 2]
     for side in (0, 1):
         hip, knee, ankle = (motion[:, joint + side] for joint in (1, 4, 7))
-        assert (((knee - (hip + ankle) / 2) * np.cross(ankle - hip, ahead)).sum(-1) > 0).all(), "a knee bends backward"
+        assert (((knee - (hip + ankle) / 2) * np.cross(ankle - hip, ahead)).sum(-1) > 0).all(), (
+            "a knee bends backward"
+        )
     assert np.linalg.norm(np.diff(motion, axis=0), axis=-1).max() * FPS < 13
 
 
@@ -92,7 +99,16 @@ def test_a_cycle_begins_and_ends_in_motion(attributes: Attributes):
 
 
 def test_two_actions_at_once_move_legs_like_one_and_an_arm_like_the_other():
-    both = example({"action": "walk", "direction": "forward", "speed": "slow", "while": "wave", "side": "left"}, FPS)
+    both = example(
+        {
+            "action": "walk",
+            "direction": "forward",
+            "speed": "slow",
+            "while": "wave",
+            "side": "left",
+        },
+        FPS,
+    )
     assert (both[:, 20, 1] > both[:, 16, 1] + 0.1).sum() > FPS
     assert (both[:, 21, 1] < both[:, 17, 1]).all()
     assert both[-1, 0, 2] > 0.8
@@ -121,7 +137,11 @@ def test_captions_state_the_attributes_and_contradict_none():
     rng, source = np.random.default_rng(0), Synthetic(1, actions="all")
     requested = [MORE[name].draw(rng, name) for name in MORE for _ in range(6)]
     requested += [source.attributes(rng) for _ in range(40)]
-    requested = [attributes for number, attributes in enumerate(requested) if attributes not in requested[:number]]
+    requested = [
+        attributes
+        for number, attributes in enumerate(requested)
+        if attributes not in requested[:number]
+    ]
     meaning: dict[str, Attributes] = {}
     for attributes in requested:
         captions, stated = draw_captions(rng, attributes, 14)
@@ -140,13 +160,21 @@ def test_captions_state_the_attributes_and_contradict_none():
 def test_every_action_has_six_captions_and_known_verbs():
     grammar = content()
     for name in MORE:
-        templates = next(grammar["captions"][key] for key in (name, f"{name} left") if key in grammar["captions"])
+        templates = next(
+            grammar["captions"][key] for key in (name, f"{name} left") if key in grammar["captions"]
+        )
         assert len(templates) >= 6, name
-    assert {key for key in grammar["captions"] if key.endswith(" cycle")} == {f"{name} cycle" for name in CYCLES}
+    assert {key for key in grammar["captions"] if key.endswith(" cycle")} == {
+        f"{name} cycle" for name in CYCLES
+    }
     assert grammar["gestures"].keys() == GESTURES.keys()
     assert {key.split()[0] for key in grammar["mains"]} == BASES.keys()
-    text = json.dumps([grammar[name] for name in ("captions", "mains", "gestures", "simultaneous", "phrases")])
-    used = {verb for group in text.split("<")[1:] for verb in group.split(">")[0].lstrip("-").split("/")}
+    text = json.dumps(
+        [grammar[name] for name in ("captions", "mains", "gestures", "simultaneous", "phrases")]
+    )
+    used = {
+        verb for group in text.split("<")[1:] for verb in group.split(">")[0].lstrip("-").split("/")
+    }
     assert used <= grammar["verbs"].keys()
 
 
@@ -156,7 +184,9 @@ def test_all_has_both_groups_two_actions_at_once_and_cycles(clips: list[Clip]):
     assert len(ACTIONS) >= 70
     assert source.options["actions"] == "all"
     assert all(source.actions[clip.action or 0] == clip.attributes["action"] for clip in clips)
-    shares = {name: np.mean([name in clip.attributes for clip in clips]) for name in ("while", "ends")}
+    shares = {
+        name: np.mean([name in clip.attributes for clip in clips]) for name in ("while", "ends")
+    }
     assert 0.03 < shares["while"] < 0.14
     assert 0.005 < shares["ends"] < 0.09
     assert len({clip.attributes["action"] for clip in clips}) > 45
@@ -166,7 +196,9 @@ def test_all_has_both_groups_two_actions_at_once_and_cycles(clips: list[Clip]):
 
 def drawn(name: str, number: int) -> tuple[np.ndarray, Attributes]:
     attributes = MORE[name].draw(np.random.default_rng((number, len(name))), name)
-    return gaussian_filter1d(example(attributes, FPS).astype(np.float64), 1.0, axis=0, mode="nearest"), attributes
+    return gaussian_filter1d(
+        example(attributes, FPS).astype(np.float64), 1.0, axis=0, mode="nearest"
+    ), attributes
 
 
 @pytest.mark.parametrize("name", CHECKED)

@@ -20,10 +20,24 @@ from flame_mdm.runs import read_history
 VERBS = ["walks", "runs", "hops", "bows", "waves", "kicks"]
 MANNERS = ["slowly", "quickly", "left", "right", "happily", "sadly"]
 MOVEMENT = 40
-SIZES = {"movement_hidden": 32, "movement_latent": 32, "text_hidden": 32, "motion_hidden": 32, "embedding": 16}
-RUN = ["data.num_workers=0", "data.batch_size=16", "trainer.accelerator=cpu", "trainer.enable_progress_bar=false"]
+SIZES = {
+    "movement_hidden": 32,
+    "movement_latent": 32,
+    "text_hidden": 32,
+    "motion_hidden": 32,
+    "embedding": 16,
+}
+RUN = [
+    "data.num_workers=0",
+    "data.batch_size=16",
+    "trainer.accelerator=cpu",
+    "trainer.enable_progress_bar=false",
+]
 RUN += ["trainer.log_every_n_steps=10", "optimizer.lr=0.003", f"task.movement_steps={MOVEMENT}"]
-RUN += [*(f"task.network.{name}={size}" for name, size in SIZES.items()), "task.network.max_frames=40"]
+RUN += [
+    *(f"task.network.{name}={size}" for name, size in SIZES.items()),
+    "task.network.max_frames=40",
+]
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +59,9 @@ def words(tmp_path_factory) -> list[str]:
         x = patterns[verb] + patterns[manner] + generator.normal(size=(32, 251)) / 3
         np.save(folder / "new_joint_vecs" / f"{name}.npy", (2 + 3 * x).astype(np.float32))
     known = ["unk", "sos", "eos", *VERBS, *MANNERS]
-    glove = write_words(root / "glove", known, np.random.default_rng(0).normal(size=(len(known), 300)))
+    glove = write_words(
+        root / "glove", known, np.random.default_rng(0).normal(size=(len(known), 300))
+    )
     return [*RUN, f"data.source.path={folder}", f"data_root={root}", f"task.words={glove}"]
 
 
@@ -85,14 +101,19 @@ def weights(path: Path) -> dict[str, torch.Tensor]:
 
 def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor], *parts: str) -> set[bool]:
     """Whether the weights whose names begin so agree, all or none."""
-    return {torch.equal(a[name], b[name]) for name in a if name.startswith(parts) and "bias" not in name}
+    return {
+        torch.equal(a[name], b[name]) for name in a if name.startswith(parts) and "bias" not in name
+    }
 
 
 @pytest.mark.slow
 def test_a_resumed_run_is_the_uninterrupted_one_and_changes_parts_at_its_step(words, tmp_path):
     options = [*words, "task.movement_steps=3", "trainer.val_check_interval=2"]
     whole = weights(fit(tmp_path / "whole", options, "trainer.max_steps=6"))
-    at = {most: weights(fit(tmp_path / "run", options, f"trainer.max_steps={most}")) for most in (2, 3, 6)}
+    at = {
+        most: weights(fit(tmp_path / "run", options, f"trainer.max_steps={most}"))
+        for most in (2, 3, 6)
+    }
     assert whole.keys() == at[6].keys()
     assert same(whole, at[6], "") == {True}
     movement, matching = ("decoder", "network.movement"), ("network.text", "network.motion")
@@ -105,8 +126,19 @@ def test_it_measures_text_to_motion(trained, words, tmp_path, monkeypatch):
     where = [word for word in words if word.startswith(("data.source", "data_root"))]
     out = tmp_path / "result.json"
     monkeypatch.chdir(tmp_path)
-    options = ["baseline=shuffled", "data=kit", "protocol=text_to_motion_t2m_own", f"extractor={trained}"]
-    options += [f"out={out}", "device=cpu", "replications=1", "data.crop.max_frames=40", "multimodality=false"]
+    options = [
+        "baseline=shuffled",
+        "data=kit",
+        "protocol=text_to_motion_t2m_own",
+        f"extractor={trained}",
+    ]
+    options += [
+        f"out={out}",
+        "device=cpu",
+        "replications=1",
+        "data.crop.max_frames=40",
+        "multimodality=false",
+    ]
     assert main(["evaluate", *options, *where]) == 0
     result = json.loads(out.read_text())
     assert result["invalid_because"] == []
@@ -125,9 +157,13 @@ def test_the_checkpoint_needs_no_word_vectors_beside_it(trained):
     assert torch.allclose(extractor.texts([""], tokens[:1]), features[:1], atol=1e-5)
     with pytest.raises(UserError, match="these are not the word vectors that this run began with"):
         extractor.task.set_extra_state(torch.zeros(15, 300))
-    with pytest.raises(UserError, match="needs tagged words, but the data set has captions without them"):
+    with pytest.raises(
+        UserError, match="needs tagged words, but the data set has captions without them"
+    ):
         extractor.texts(["walks"], [None])
-    with pytest.raises(UserError, match=r"trained on .* of kit at .*, but the motions are .* of humanml3d"):
+    with pytest.raises(
+        UserError, match=r"trained on .* of kit at .*, but the motions are .* of humanml3d"
+    ):
         extractor.check(extractor.task.representation, "humanml3d")
 
 
@@ -140,8 +176,12 @@ def test_what_is_missing_is_one_line(words, tmp_path, monkeypatch, capsys):
     assert "nowhere/our_vab_idx.pkl: no such file" in refusal("task.words=nowhere")
     assert "data.batch_size=1: matching needs at least two motions" in refusal("data.batch_size=1")
     whole = T2MFolder.clips
-    monkeypatch.setattr(T2MFolder, "clips", lambda *args: (replace(clip, attributes={}) for clip in whole(*args)))
-    assert "72 clips have no captions with tagged words, such as 00train" in refusal(f"data_root={tmp_path}")
+    monkeypatch.setattr(
+        T2MFolder, "clips", lambda *args: (replace(clip, attributes={}) for clip in whole(*args))
+    )
+    assert "72 clips have no captions with tagged words, such as 00train" in refusal(
+        f"data_root={tmp_path}"
+    )
 
 
 def test_the_loss_is_the_published_one_and_a_motion_that_a_text_describes_is_no_wrong_one():
@@ -156,7 +196,9 @@ def test_the_loss_is_the_published_one_and_a_motion_that_a_text_describes_is_no_
     fits[2, 1] = fits[0, 4] = fits[0, 3] = True
     near = (motion - text).norm(dim=1).square()
     wrong = [(motion[other] - text[i]).norm() for i, other in enumerate((2, 0, 0, 2, 3))]
-    expected = torch.stack([n + (3 - far).clamp(min=0) ** 2 for n, far in zip(near, wrong, strict=True)]).mean()
+    expected = torch.stack(
+        [n + (3 - far).clamp(min=0) ** 2 for n, far in zip(near, wrong, strict=True)]
+    ).mean()
     torch.testing.assert_close(matching_loss(motion, text, 3.0, fits), expected)
     nothing_wrong = torch.ones(5, 5, dtype=torch.bool)
     torch.testing.assert_close(matching_loss(motion, text, 3.0, nothing_wrong), near.mean())
@@ -164,11 +206,19 @@ def test_the_loss_is_the_published_one_and_a_motion_that_a_text_describes_is_no_
 
 @pytest.mark.slow
 def test_words_are_learned_from_captions_without_tags(words, tmp_path):
-    learned = fit(tmp_path, words, "task.words=learned", "trainer.max_steps=120", "trainer.val_check_interval=120")
+    learned = fit(
+        tmp_path,
+        words,
+        "task.words=learned",
+        "trainer.max_steps=120",
+        "trainer.val_check_interval=120",
+    )
     assert logged(learned, "val/motions_for_text_top3")[119] > 0.5  # by chance 3 in 32
     extractor = OwnT2MExtractor(str(learned))
     features = extractor.texts(["Walks slowly.", "runs left"], [None, None])
-    assert torch.allclose(extractor.texts(["walks slowly"], [["another/VERB"]]), features[:1], atol=1e-5)
+    assert torch.allclose(
+        extractor.texts(["walks slowly"], [["another/VERB"]]), features[:1], atol=1e-5
+    )
     assert not torch.allclose(features[0], features[1], atol=0.1)
     assert isinstance(extractor.task.words, LearnedWords)
     text = extractor.task.words([["walks", "slowly"], ["word"] * 30])

@@ -62,13 +62,32 @@ def entry(mean: float) -> dict[str, Any]:
 def measured(fid: float, top3: float, diversity: float, **other: Any) -> dict[str, Any]:
     """A result with these values of generated motions."""
     names = ("fid", "texts_for_motion/top3", "diversity")
-    values, real = (dict(zip(names, map(entry, means), strict=True)) for means in ((fid, top3, diversity), REAL))
-    checkpoint = {"path": "mdm.ckpt", "sha256": "c" * 64, "experiment": "synthetic/mdm", "selected_by": "none: last"}
-    checkpoint |= {"averaged_weights": True, "guidance_scale": 2.5, "sampler": "ddpm", "num_inference_steps": 50}
+    values, real = (
+        dict(zip(names, map(entry, means), strict=True)) for means in ((fid, top3, diversity), REAL)
+    )
+    checkpoint = {
+        "path": "mdm.ckpt",
+        "sha256": "c" * 64,
+        "experiment": "synthetic/mdm",
+        "selected_by": "none: last",
+    }
+    checkpoint |= {
+        "averaged_weights": True,
+        "guidance_scale": 2.5,
+        "sampler": "ddpm",
+        "num_inference_steps": 50,
+    }
     checkpoint["parameters"] = 12_345_678
     data = {"dataset": "synthetic", "fingerprint": "f" * 16}
-    shared = {"protocol": {"name": "synthetic", "version": 1}, "extractor": {"sha256": "e" * 64}, "data": data}
-    shared |= {"cost": {"nfe": 50.0, "seconds_per_sample": 0.11, "batch_size": 64.0}, "checkpoint": checkpoint}
+    shared = {
+        "protocol": {"name": "synthetic", "version": 1},
+        "extractor": {"sha256": "e" * 64},
+        "data": data,
+    }
+    shared |= {
+        "cost": {"nfe": 50.0, "seconds_per_sample": 0.11, "batch_size": 64.0},
+        "checkpoint": checkpoint,
+    }
     return result(values=values, ground_truth=real, **shared | other)
 
 
@@ -85,7 +104,9 @@ def folder(tmp_path: Path) -> Path:
             put(needed[0], tmp_path, results[row["label"]])
     for row, needed in evaluations(parts["Steps"]):
         fid = 1 / row["num_inference_steps"] + row["guidance_scale"] / 10
-        checkpoint = results["MDM"]["checkpoint"] | {n: row[n] for n in ("num_inference_steps", "guidance_scale")}
+        checkpoint = results["MDM"]["checkpoint"] | {
+            n: row[n] for n in ("num_inference_steps", "guidance_scale")
+        }
         put(needed[0], tmp_path, measured(fid, 0.6, 9.0, checkpoint=checkpoint))
     return tmp_path
 
@@ -124,17 +145,30 @@ def files(folder: Path) -> dict[str, bytes]:
 
 
 def command(folder: Path, out: Path) -> int:
-    words = [f"table={folder / 'spec.yaml'}", "evaluate=false", f"results={folder / 'results'}", f"out={out}"]
+    words = [
+        f"table={folder / 'spec.yaml'}",
+        "evaluate=false",
+        f"results={folder / 'results'}",
+        f"out={out}",
+    ]
     return main(["tables", *words])
 
 
 def test_the_same_results_give_the_same_bytes(folder, capsys):
     assert command(folder, folder / "a") == command(folder, folder / "b") == 0
     assert files(folder / "a") == files(folder / "b")
-    names = {"spec.md", "spec.tex", "spec.csv", "spec.html", "spec-steps-figure1.svg", "spec-steps-figure2.svg"}
+    names = {
+        "spec.md",
+        "spec.tex",
+        "spec.csv",
+        "spec.html",
+        "spec-steps-figure1.svg",
+        "spec-steps-figure2.svg",
+    }
     assert names == files(folder / "a").keys()
     assert "![Steps](spec-steps-figure1.svg)" in (folder / "a" / "spec.md").read_text()
-    assert "spec: 7 of 8 rows measured" in capsys.readouterr().out  # the sweep's four rows count, too
+    # The sweep's four rows count, too
+    assert "spec: 7 of 8 rows measured" in capsys.readouterr().out
 
 
 def test_cells_ranks_and_real_motions(folder):
@@ -142,13 +176,23 @@ def test_cells_ranks_and_real_motions(folder):
     real = [c.text if c else None for c in lines["real: Real motions"].cells]
     assert real == ["0.002 ±0.012", "0.797 ±0.012", "9.503 ±0.012", None]
     ranks_of = {name: [c.rank if c else None for c in line.cells] for name, line in lines.items()}
-    assert ranks_of["measured: MDM"] == [2, 0, 2, 1]  # 9.559 is 0.056 from real motions, 9.5 only 0.003
+    # 9.559 is 0.056 from real motions, 9.5 only 0.003
+    assert ranks_of["measured: MDM"] == [
+        2,
+        0,
+        2,
+        1,
+    ]
     assert ranks_of["measured: MFM"] == [1, 1, 0, 1]
     assert ranks_of["measured: FLAME <b>"] == [0, 2, 1, 1]
     assert lines["measured: missing"].state == "no checkpoint"
     assert "missing: " in rendered(made(folder), "md")
     sources = lines["measured: MDM"].facts
-    assert (sources["checkpoint sha256"], sources["guidance"], sources["steps"]) == ("c" * 16, "2.5", "50")
+    assert (sources["checkpoint sha256"], sources["guidance"], sources["steps"]) == (
+        "c" * 16,
+        "2.5",
+        "50",
+    )
 
 
 def test_rows_of_another_evaluator_are_marked_and_not_compared(folder):
@@ -172,36 +216,57 @@ def test_rows_of_another_evaluator_are_marked_and_not_compared(folder):
 
 
 def test_a_recipe_changed_in_place_is_not_ranked_beside_the_recipe(folder):
-    checkpoint = measured(0, 0, 0)["checkpoint"] | {"recipe_changes": ["denoiser._target_=my_package.MyDenoiser"]}
+    checkpoint = measured(0, 0, 0)["checkpoint"] | {
+        "recipe_changes": ["denoiser._target_=my_package.MyDenoiser"]
+    }
     put(request_of(folder, "MFM"), folder, measured(0.410, 0.7, 9.4, checkpoint=checkpoint))
     part = made(folder).parts[0]
     lines = {line.label: line for line in part.lines if line.kind == "measured"}
     assert [lines[name].marks for name in ("MDM", "MFM", "FLAME <b>")] == ["a", "b", "a"]
     assert all(cell is None or cell.rank == 0 for cell in lines["MFM"].cells)
-    changes = "the model differs from the recipe synthetic/mdm: denoiser._target_=my_package.MyDenoiser"
+    changes = (
+        "the model differs from the recipe synthetic/mdm: denoiser._target_=my_package.MyDenoiser"
+    )
     assert ("b", f"as a, but {changes}") in part.notes
 
 
 def test_changes_of_a_recipe_are_found_in_the_configuration_of_a_model():
-    for same in ([], ["seed=3", "run.name=mine", "data_root=/x", "trainer.max_steps=5", "selection=loss"]):
+    for same in (
+        [],
+        ["seed=3", "run.name=mine", "data_root=/x", "trainer.max_steps=5", "selection=loss"],
+    ):
         assert recipe_changes(compose("quickstart", same)) == [], same
     config = compose("quickstart", ["denoiser=mdm_unet", "optimizer.lr=0.1", "+process.min_snr=5"])
     network = "denoiser._target_=flame_mdm.denoisers.unet.MDMUNet"
     assert recipe_changes(config) == [network, "optimizer.lr=0.1", "process.min_snr=5"]
-    assert recipe_changes({"experiment": "mine"}) == recipe_changes({"experiment": "quickstart"}) == []
+    assert (
+        recipe_changes({"experiment": "mine"}) == recipe_changes({"experiment": "quickstart"}) == []
+    )
 
 
 def test_footnotes_tell_what_was_left_out_the_skeleton_and_how_checkpoints_were_chosen(folder):
     left_out = {"motions of HumanAct12, as data.source.humanact12 is not given": 1191}
     for label in ("MDM", "MFM", "FLAME <b>"):
-        change(folder, label, ground_truth={"fid": {"mean": 0.0, "ci": 0.0, "replications": 5, "n": 400}})
+        change(
+            folder,
+            label,
+            ground_truth={"fid": {"mean": 0.0, "ci": 0.0, "replications": 5, "n": 400}},
+        )
     change(folder, "MFM", checkpoint={"selected_by": "best val/text_to_motion_t2m/fid"})
     notes = [note for _, note in made(folder).parts[0].notes]
     assert "MFM: best checkpoint by val/text_to_motion_t2m/fid" in notes
     assert "MDM; FLAME <b>: last checkpoint, not chosen by validation" in notes
-    assert "FID of real motions is 0 by construction: clips are taken whole" in rendered(made(folder), "md")
+    assert "FID of real motions is 0 by construction: clips are taken whole" in rendered(
+        made(folder), "md"
+    )
     sampled = {"sampler": "ddim", "eta": 0.5, "num_inference_steps": [0, 5, 9]}
-    change(folder, "MDM", data={"excluded": left_out}, changed={"samples": 4, "seed": 2}, checkpoint=sampled)
+    change(
+        folder,
+        "MDM",
+        data={"excluded": left_out},
+        changed={"samples": 4, "seed": 2},
+        checkpoint=sampled,
+    )
     text = rendered(made(folder), "md")
     assert "differs from the protocol: samples = 4, seed = 2" in text
     assert "sampler ddim, eta 0.5, steps 0, 5, 9" in text
@@ -210,11 +275,19 @@ def test_footnotes_tell_what_was_left_out_the_skeleton_and_how_checkpoints_were_
     lengths = {"fingerprint": "f" * 16, "fps": 20.0, "lengths": [50, 60], "excluded": left_out}
     (folder / "results" / "lengths").mkdir()
     (folder / "results" / "lengths" / "mine.json").write_text(json.dumps(lengths))
-    table = build("x", {"title": "Lengths", "parts": {"All": {"lengths": ["mine"]}}}, folder / "results")
+    table = build(
+        "x", {"title": "Lengths", "parts": {"All": {"lengths": ["mine"]}}}, folder / "results"
+    )
     assert table.parts[0].notes[1] == ("", f"mine{words}")
     for skeleton, note in (
-        ({"stand_in": True, "smpl_sha256": None}, "joints of a stand-in skeleton, whose bones are not SMPL's"),
-        ({"stand_in": False, "smpl_sha256": "5" * 64}, "joints of SMPL's model file, sha256 555555555555"),
+        (
+            {"stand_in": True, "smpl_sha256": None},
+            "joints of a stand-in skeleton, whose bones are not SMPL's",
+        ),
+        (
+            {"stand_in": False, "smpl_sha256": "5" * 64},
+            "joints of SMPL's model file, sha256 555555555555",
+        ),
         ({"stand_in": False, "smpl_sha256": None}, ""),
     ):
         change(folder, "MDM", skeleton=skeleton)
@@ -224,7 +297,9 @@ def test_footnotes_tell_what_was_left_out_the_skeleton_and_how_checkpoints_were_
 
 def test_a_missing_extractor_is_noted_beside_a_missing_checkpoint(folder):
     text = (folder / "spec.yaml").read_text().replace(f"{folder}/clip.ckpt", "assets/t2m/kit")
-    (folder / "spec.yaml").write_text(text.replace(f"{folder}/missing", "runs/synthetic/mdm/default/checkpoints/last"))
+    (folder / "spec.yaml").write_text(
+        text.replace(f"{folder}/missing", "runs/synthetic/mdm/default/checkpoints/last")
+    )
     part = made(folder).parts[0]
     notes = [note for mark, note in part.notes if not mark]
     assert next(line.state for line in part.lines if line.label == "missing") == "no checkpoint"
@@ -234,7 +309,9 @@ def test_a_missing_extractor_is_noted_beside_a_missing_checkpoint(folder):
 
 
 def test_footnotes_list_what_differs_and_group_rows(folder):
-    for number, (_, needed) in enumerate(evaluations(load_spec(str(folder / "spec.yaml"))["parts"]["Steps"])):
+    for number, (_, needed) in enumerate(
+        evaluations(load_spec(str(folder / "spec.yaml"))["parts"]["Steps"])
+    ):
         path = needed[0].path(folder / "results")
         reasons = {"invalid_because": ["real motions have fid 3, expected 0.002 +- 0.02"]}
         path.write_text(json.dumps(json.loads(path.read_text()) | reasons | {"seed": number // 2}))
@@ -286,7 +363,9 @@ def test_times_are_compared_in_batches_of_the_same_size_alone(folder):
     spec = load_spec(str(folder / "timed.yaml"))
     for row, needed in evaluations(spec["parts"]["all"]):
         size = row.get("batch_size", 1)
-        content = measured(0, 0, 0, cost={"nfe": 10.0, "seconds_per_sample": 1 / size, "batch_size": float(size)})
+        content = measured(
+            0, 0, 0, cost={"nfe": 10.0, "seconds_per_sample": 1 / size, "batch_size": float(size)}
+        )
         trained = {"prediction": "velocity", "training_hours": 12.25, "training_memory_gib": 7.5}
         content["checkpoint"] |= trained if row["label"] == "MFM" else {}
         put(needed[0], folder, content)
@@ -295,21 +374,29 @@ def test_times_are_compared_in_batches_of_the_same_size_alone(folder):
     lines = [line for line in part.lines if line.kind == "measured"]
     texts = [[cell and cell.text for cell in line.cells] for line in lines]
     unknown = [None, None, None]  # of a checkpoint without these facts
-    assert texts == [["1", "1.000", *unknown], ["64", "0.016", *unknown], ["1", "1.000", "velocity", "12.2", "7.5"]]
+    assert texts == [
+        ["1", "1.000", *unknown],
+        ["64", "0.016", *unknown],
+        ["1", "1.000", "velocity", "12.2", "7.5"],
+    ]
     assert [line.marks for line in lines] == ["a", "b", "a"]
     assert "as a, but timed in batches of 64 on cpu" in [note for _, note in part.notes]
     assert [cell.rank for line in lines if (cell := line.cells[1])] == [1, 0, 1]
     assert "predicts – / – / velocity" in rendered(Table("timed", "", [part]), "md")
 
 
-def test_what_is_missing_or_changed_is_evaluated_once_and_timed_rows_have_their_own_batch_size(folder, monkeypatch):
+def test_what_is_missing_or_changed_is_evaluated_once_and_timed_rows_have_their_own_batch_size(
+    folder, monkeypatch
+):
     (folder / "timed.yaml").write_text(TIMED.format(folder=folder))
     needed = []
 
     def evaluate(request: EvaluationRequest) -> None:
         needed.append(request)
         content = measured(0, 0, 0)
-        content["checkpoint"]["sha256"] = hashlib.sha256(Path(str(request.ckpt)).read_bytes()).hexdigest()
+        content["checkpoint"]["sha256"] = hashlib.sha256(
+            Path(str(request.ckpt)).read_bytes()
+        ).hexdigest()
         write_json(str(request.out), content)
 
     monkeypatch.setattr(evaluators.evaluation, "evaluate", evaluate)
@@ -323,7 +410,9 @@ def test_what_is_missing_or_changed_is_evaluated_once_and_timed_rows_have_their_
     assert needed[-1].ckpt == f"{folder}/mfm.ckpt"
     needed.clear()
     assert main(["tables", f"table={folder / 'spec.yaml'}", *words]) == 0
-    assert {(request.batch_size, request.extractor) for request in needed} == {(256, f"{folder}/clip.ckpt")}
+    assert {(request.batch_size, request.extractor) for request in needed} == {
+        (256, f"{folder}/clip.ckpt")
+    }
     assert [request.options.num_inference_steps for request in needed[3:]] == [5, 5, 10, 10]
 
 
@@ -363,12 +452,20 @@ def test_rows_are_measured_from_their_checkpoint(trained, data_root, tmp_path, m
 def test_published_numbers_are_marked_and_ranked_among_themselves(folder, monkeypatch):
     published = folder / "published.yaml"
     printed = [
-        {"label": "Real", "real": True, "values": {"FID": "0.002 ±.000", "Diversity": "9.503 ±.065"}},
+        {
+            "label": "Real",
+            "real": True,
+            "values": {"FID": "0.002 ±.000", "Diversity": "9.503 ±.065"},
+        },
         {"label": "T2M", "values": {"FID": "1.067 ±.002", "NFE": "1,000"}},
         {"label": "MDM", "values": {"FID": "0.544 ±.044"}},
         {"label": "MDM, corrected", "source": "elsewhere", "values": {"FID": "0.489"}},
     ]
-    part = {"evaluator": "an evaluator of theirs", "source": "Someone, table 1", "notes": ["They print percent."]}
+    part = {
+        "evaluator": "an evaluator of theirs",
+        "source": "Someone, table 1",
+        "notes": ["They print percent."],
+    }
     published.write_text(json.dumps({"spec": {"Text-to-motion": part | {"rows": printed}}}))
     monkeypatch.setattr(builder, "PUBLISHED", published)
     lines = rows(folder)
@@ -384,7 +481,10 @@ def test_published_numbers_are_marked_and_ranked_among_themselves(folder, monkey
     assert "†: as reported: Someone, table 1; measured with an evaluator of theirs" in text
     assert "They print percent." in text
     for wrong, message in (
-        ("Text-to-motion: {evaluator: e, source: s, rows: [{label: x, values: {FDI: 1}}]}", "no column is called FDI"),
+        (
+            "Text-to-motion: {evaluator: e, source: s, rows: [{label: x, values: {FDI: 1}}]}",
+            "no column is called FDI",
+        ),
         ("Txt: {evaluator: e, source: s, rows: []}", "parts that are not in its spec: Txt"),
     ):
         published.write_text(f"spec: {{{wrong}}}")
@@ -394,7 +494,12 @@ def test_published_numbers_are_marked_and_ranked_among_themselves(folder, monkey
 
 @pytest.mark.usefixtures("composed_once")
 def test_an_index_lists_the_tables_with_their_measured_rows(tmp_path, capsys):
-    needed = ["table=flame_9 flame_10", "evaluate=false", f"results={tmp_path / 'none'}", f"out={tmp_path}"]
+    needed = [
+        "table=flame_9 flame_10",
+        "evaluate=false",
+        f"results={tmp_path / 'none'}",
+        f"out={tmp_path}",
+    ]
     assert main(["tables", *needed]) == 0
     assert f"all tables: {tmp_path / 'index.html'}" in capsys.readouterr().out
     text = (tmp_path / "index.html").read_text()
@@ -405,7 +510,9 @@ def test_an_index_lists_the_tables_with_their_measured_rows(tmp_path, capsys):
     assert names.index("flame_9") + 1 == names.index("flame_10")
 
 
-def test_a_corrected_table_is_ranked_by_its_own_real_row_and_names_its_own_evaluator(folder, monkeypatch):
+def test_a_corrected_table_is_ranked_by_its_own_real_row_and_names_its_own_evaluator(
+    folder, monkeypatch
+):
     published = folder / "published.yaml"
     theirs = {"source": "their repository", "evaluator": "a corrected evaluator"}
     printed = [
@@ -422,7 +529,9 @@ def test_a_corrected_table_is_ranked_by_its_own_real_row_and_names_its_own_evalu
     lines = rows(folder)
     index = 2  # of the column Diversity
     ranked = {
-        line.label: cell.rank for line in lines.values() if line.kind == "reported" and (cell := line.cells[index])
+        line.label: cell.rank
+        for line in lines.values()
+        if line.kind == "reported" and (cell := line.cells[index])
     }
     assert ranked == {"near": 1, "far": 2, "near, corrected": 1, "far, corrected": 2}
     text = rendered(made(folder), "md")
@@ -445,7 +554,9 @@ def test_a_legend_names_the_rows_that_are_not_ranked(folder):
 def test_notes_of_a_latex_table_are_in_its_threeparttable(folder):
     text = rendered(made(folder), "tex")
     lines = text.splitlines()
-    assert [line for line in lines if line.startswith("%")] == [r"% \usepackage{booktabs,threeparttable}"]
+    assert [line for line in lines if line.startswith("%")] == [
+        r"% \usepackage{booktabs,threeparttable}"
+    ]
     notes = text.split(r"\begin{tablenotes}")[1].split(r"\end{tablenotes}")[0]
     assert r"\item[] A note." in notes
     assert r"\item[] $\uparrow$ higher is better" in notes
@@ -460,10 +571,14 @@ def test_footnotes_of_rows_with_several_protocols_name_their_columns(tmp_path):
             write_json(evaluation.path(tmp_path), result(protocol={"name": protocol, "version": 1}))
     (part,) = build("mfm_figure_4", spec, tmp_path).parts
     notes = dict(note for note in part.notes if note[0])
-    assert notes["a"].startswith("NFE, FID, Training hours, Peak memory of training, GiB: protocol text_to_motion_t2m")
+    assert notes["a"].startswith(
+        "NFE, FID, Training hours, Peak memory of training, GiB: protocol text_to_motion_t2m"
+    )
     assert notes["b"].startswith("Seconds per motion: ")
     assert notes["†"].endswith("as run by Hu et al. on an unnamed device")
-    assert notes["††"].endswith("as run by Chen et al. on one V100"), "the value that Hu et al. quote"
+    assert notes["††"].endswith("as run by Chen et al. on one V100"), (
+        "the value that Hu et al. quote"
+    )
 
 
 def test_multimodality_is_measured_for_tables_that_show_it_alone(folder):
@@ -474,8 +589,12 @@ def test_multimodality_is_measured_for_tables_that_show_it_alone(folder):
     write_json(path, measured(0.5, 0.7, 9.0, changed={"multimodality": False}, checkpoint=None))
     (folder / "mdm.ckpt").unlink()
     assert not outdated(path, evaluation, {"fid"})
-    assert outdated(path, evaluation, {"fid", "multimodality"}), "was not measured for a table without it"
-    assert not outdated(path, Evaluation("MDM", keys | {"multimodality": False}), {"multimodality"}), "as the spec says"
+    assert outdated(path, evaluation, {"fid", "multimodality"}), (
+        "was not measured for a table without it"
+    )
+    assert not outdated(
+        path, Evaluation("MDM", keys | {"multimodality": False}), {"multimodality"}
+    ), "as the spec says"
 
     change(folder, "MFM", changed={"multimodality": False})
     assert "differs from the protocol" not in rendered(made(folder), "md"), "no column shows it"
@@ -500,7 +619,11 @@ def test_ranks():
 def test_numbers_have_the_decimals_of_their_column_and_are_never_all_zeros():
     lines = [Line("", "measured", [Cell("", value, 0.0021)]) for value in (103.6, 0.016, 0.0)]
     builder._print_cells(lines, 1)
-    assert [cell.text for line in lines if (cell := line.cells[0])] == ["103.6 ±0.0", "0.016 ±0.002", "0.0 ±0.0"]
+    assert [cell.text for line in lines if (cell := line.cells[0])] == [
+        "103.6 ±0.0",
+        "0.016 ±0.002",
+        "0.0 ±0.0",
+    ]
 
 
 PARTS = {part: {"_target_": "any.Class"} for part in ("task", "representation")}
@@ -508,8 +631,15 @@ PARTS = {part: {"_target_": "any.Class"} for part in ("task", "representation")}
 
 def clip_file(folder: Path, weight: float, steps: int) -> str:
     """Writes an extractor and returns the sha256 of its weights."""
-    content = {"config": {"experiment": "motion_clip/synthetic"} | PARTS, "facts": {"actions": [], "max_frames": 60}}
-    content |= {"global_step": steps, FORMAT_KEY: FORMAT, "state_dict": {"w": torch.tensor([weight])}}
+    content = {
+        "config": {"experiment": "motion_clip/synthetic"} | PARTS,
+        "facts": {"actions": [], "max_frames": 60},
+    }
+    content |= {
+        "global_step": steps,
+        FORMAT_KEY: FORMAT,
+        "state_dict": {"w": torch.tensor([weight])},
+    }
     torch.save(content, folder / "clip.ckpt")
     return weights_sha256(folder / "clip.ckpt")
 
@@ -540,7 +670,9 @@ def test_a_result_is_outdated_when_the_motion_files_are_others_now(tmp_path):
     (tmp_path / "theirs").mkdir()
     for number in range(2):
         np.savez(tmp_path / "theirs" / f"{number}.npz", ids=["a"])
-    request = Evaluation("theirs", {"from_samples": str(tmp_path / "theirs"), "protocol": "synthetic"})
+    request = Evaluation(
+        "theirs", {"from_samples": str(tmp_path / "theirs"), "protocol": "synthetic"}
+    )
     sha256 = SampleFolder(tmp_path / "theirs", HumanML()).sha256
     path = put(request, tmp_path, measured(0, 0, 0, checkpoint=None, samples_sha256=sha256))
     assert not outdated(path, request)
@@ -565,8 +697,12 @@ def test_multimodality_is_computed_if_a_column_shows_it(folder, monkeypatch):
 
     def evaluate(request: EvaluationRequest) -> None:
         requests.append(request.multimodality)
-        content = measured(0, 0, 0, changed={} if request.multimodality else {"multimodality": False})
-        content["checkpoint"]["sha256"] = hashlib.sha256(Path(str(request.ckpt)).read_bytes()).hexdigest()
+        content = measured(
+            0, 0, 0, changed={} if request.multimodality else {"multimodality": False}
+        )
+        content["checkpoint"]["sha256"] = hashlib.sha256(
+            Path(str(request.ckpt)).read_bytes()
+        ).hexdigest()
         content["extractor"] = None
         content["values"] |= {"multimodality": entry(1.0)} if request.multimodality else {}
         write_json(str(request.out), content)
@@ -574,7 +710,12 @@ def test_multimodality_is_computed_if_a_column_shows_it(folder, monkeypatch):
     monkeypatch.setattr(evaluators.evaluation, "evaluate", evaluate)
     spec, more = folder / "several.yaml", ", Multimodality: {value: multimodality}"
     words = ["tables", f"table={spec}", f"results={folder / 'several'}", f"out={folder / 'out'}"]
-    for text, expected in (("", [False]), (more, [False, True]), (more, [False, True]), ("", [False, True])):
+    for text, expected in (
+        ("", [False]),
+        (more, [False, True]),
+        (more, [False, True]),
+        ("", [False, True]),
+    ):
         spec.write_text(SEVERAL.format(folder=folder, more=text))
         assert main(words) == 0
         assert requests == expected
@@ -589,14 +730,17 @@ def test_a_footnote_states_the_numbers_of_generated_and_of_real_motions(folder):
     put(request_of(folder, "MDM"), folder, content)
     notes = dict(made(folder).parts[0].notes)
     assert any(
-        "N = 64, 5 replications (real motions: N = 378), compared with sets of 378 real motions" in text
+        "N = 64, 5 replications (real motions: N = 378), compared with sets of 378 real motions"
+        in text
         for text in notes.values()
     )
     origins = {line.facts["computed from"] for line in rows(folder).values() if line.facts}
     assert {len(origin) for origin in origins} == {16}
 
 
-def test_figure_4_of_mdm_shows_the_ratings_of_a_user_study_beside_the_reported_ones(tmp_path, monkeypatch):
+def test_figure_4_of_mdm_shows_the_ratings_of_a_user_study_beside_the_reported_ones(
+    tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     spec = load_spec("mdm_figure_4")
     missing, _ = build("mdm_figure_4", spec, tmp_path / "results").parts
@@ -605,10 +749,15 @@ def test_figure_4_of_mdm_shows_the_ratings_of_a_user_study_beside_the_reported_o
 
     pair = {"a": "kit/mdm", "b": "kit_real", "wins_a": 4, "wins_b": 2, "raters": 2}
     (tmp_path / "runs" / "ratings").mkdir(parents=True)
-    (tmp_path / "runs" / "ratings" / "mdm_kit.json").write_text(json.dumps({"format": 1, "pairs": [pair]}))
+    (tmp_path / "runs" / "ratings" / "mdm_kit.json").write_text(
+        json.dumps({"format": 1, "pairs": [pair]})
+    )
     table = build("mdm_figure_4", spec, tmp_path / "results")
     measured, reported = table.parts[0].lines
     assert [cell.text for cell in measured.cells if cell] == ["66.7% [30.0%, 90.3%]", "6", "2"]
     assert measured.label == "kit/mdm over kit_real"
-    assert (reported.label, reported.cells[0] and reported.cells[0].text) == ("MDM over Real", "42.3%")
+    assert (reported.label, reported.cells[0] and reported.cells[0].text) == (
+        "MDM over Real",
+        "42.3%",
+    )
     assert '<td class="number">66.7% [30.0%, 90.3%]</td>' in rendered(table, "html")

@@ -28,11 +28,18 @@ from flame_mdm.sampling.editing import edit
 from flame_mdm.sampling.generation import generate
 from flame_mdm.task import GeneratorTask
 
-STEPS = ["trainer.val_check_interval=4", "callbacks.checkpoints.every_n_steps=4", "callbacks.samples=null"]
+STEPS = [
+    "trainer.val_check_interval=4",
+    "callbacks.checkpoints.every_n_steps=4",
+    "callbacks.samples=null",
+]
 
 
 def run(overrides: list[str], steps: int, folder: Path) -> Path:
-    assert main(["train", "quickstart", *overrides, f"run.dir={folder}", f"trainer.max_steps={steps}"]) == 0
+    assert (
+        main(["train", "quickstart", *overrides, f"run.dir={folder}", f"trainer.max_steps={steps}"])
+        == 0
+    )
     return folder / "checkpoints" / "last.ckpt"
 
 
@@ -40,23 +47,38 @@ def same_weights(first: Path, second: Path) -> bool:
     """Whether two checkpoints hold the same weights, averaged and not, bit for bit."""
     a, b = read_checkpoint(first), read_checkpoint(second)
     pairs = [(a.get(key, {}), b.get(key, {})) for key in ("state_dict", "current_model_state")]
-    return all(x.keys() == y.keys() and all(torch.equal(x[name], y[name]) for name in x) for x, y in pairs)
+    return all(
+        x.keys() == y.keys() and all(torch.equal(x[name], y[name]) for name in x) for x, y in pairs
+    )
 
 
 @pytest.mark.slow
 def test_training_learns_and_leaves_what_a_user_looks_for(tiny, tmp_path):
-    words = [*tiny, "trainer.val_check_interval=30", "optimizer.lr=0.01", "trainer.log_every_n_steps=1"]
+    words = [
+        *tiny,
+        "trainer.val_check_interval=30",
+        "optimizer.lr=0.01",
+        "trainer.log_every_n_steps=1",
+    ]
     folder = tmp_path / "run"
     checkpoint = read_checkpoint(run(words, 60, folder))
     losses = list(read_history(folder)["train/loss"].values())
     assert len(losses) == checkpoint["global_step"] == 60
     assert np.mean(losses[-10:]) < 0.7 * np.mean(losses[:5])
-    files = ("config.yaml", "provenance.json", "metrics.jsonl", "report.html", "checkpoints/best.ckpt")
+    files = (
+        "config.yaml",
+        "provenance.json",
+        "metrics.jsonl",
+        "report.html",
+        "checkpoints/best.ckpt",
+    )
     for name in (*files, "samples/step_0000060/player.html"):
         assert (folder / name).is_file(), name
     events = EventAccumulator(str(folder / "tensorboard"))
     events.Reload()
-    assert {"val/loss", "epoch"} & set(events.Tags()["scalars"]) == {"val/loss"}, "the epoch is always 0"
+    assert {"val/loss", "epoch"} & set(events.Tags()["scalars"]) == {"val/loss"}, (
+        "the epoch is always 0"
+    )
     assert checkpoint["config"]["experiment"] == "quickstart"
     training = checkpoint["facts"].pop("training")
     assert training.keys() == {"hours", "memory_gib", "processes", "speed", "precision", "device"}
@@ -77,13 +99,16 @@ def test_a_resumed_run_is_the_uninterrupted_one_and_adds_up_what_it_cost(tiny, t
     assert 0.01 < training["memory_gib"] < 1000
     training |= {"hours": 100.0, "memory_gib": 2000.0}
     torch.save(first, parts)
-    with (tmp_path / "parts" / "metrics.jsonl").open("a") as file:  # what a killed run leaves behind
+    # What a killed run leaves behind
+    with (tmp_path / "parts" / "metrics.jsonl").open("a") as file:
         file.write('{"step": 6, "train/loss": 77.0}\n{"step": 7, "train/lo')
     run(overrides, 11, tmp_path / "parts")
     assert same_weights(parts, run(overrides, 11, tmp_path / "whole"))
     a, b = (read_history(tmp_path / name) for name in ("parts", "whole"))
     assert a.keys() == b.keys()
-    assert all(a[name] == b[name] for name in ("train/loss", "train/grad_norm", "val/loss", "train/epochs"))
+    assert all(
+        a[name] == b[name] for name in ("train/loss", "train/grad_norm", "val/loss", "train/epochs")
+    )
     resumed = read_checkpoint(parts)["facts"]["training"]
     assert 100 < resumed["hours"] < 101
     assert resumed["memory_gib"] == 2000
@@ -92,7 +117,14 @@ def test_a_resumed_run_is_the_uninterrupted_one_and_adds_up_what_it_cost(tiny, t
 @pytest.mark.slow
 def test_a_decaying_learning_rate_resumes_where_it_was(tiny, tmp_path):
     """Also with accumulated gradients, a loading process, and without averaged weights."""
-    overrides = [*tiny, *STEPS, "lr_decay=0.5", "optimizer.lr=0.008", "callbacks.best=null", "data.resident=false"]
+    overrides = [
+        *tiny,
+        *STEPS,
+        "lr_decay=0.5",
+        "optimizer.lr=0.008",
+        "callbacks.best=null",
+        "data.resident=false",
+    ]
     overrides += ["callbacks.checkpoints.keep_every_n_steps=6", "trainer.log_every_n_steps=1"]
     overrides += ["trainer.accumulate_grad_batches=2", "data.num_workers=1", "ema=null"]
     whole = run(overrides, 8, tmp_path / "whole")
@@ -115,31 +147,51 @@ def test_progress_counts_all_steps_and_shows_losses(tiny, tmp_path, capfd, monke
     lines = [line for line in capfd.readouterr().err.splitlines() if line.startswith("training:")]
     steps = [*(f"{step}/6" for step in range(7)), "6/8", "7/8", "8/8"]
     assert list(dict.fromkeys(re.findall(r" (\d+/\d+) \[", "\n".join(lines)))) == steps
-    assert ("train/loss=" in lines[3], "val/loss=" in lines[6], "\r" in "".join(lines)) == (True, True, False)
+    assert ("train/loss=" in lines[3], "val/loss=" in lines[6], "\r" in "".join(lines)) == (
+        True,
+        True,
+        False,
+    )
 
 
 def test_waiting_threads_soon_sleep():
     """Importing the package says so to OpenMP before torch is loaded, unless the user has said otherwise."""
     code = "import os, sys, flame_mdm; assert 'torch' not in sys.modules; print(os.environ.get('GOMP_SPINCOUNT'))"
-    environment = {name: os.environ[name] for name in os.environ.keys() - {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT"}}
-    for own, expected in (({}, "2000"), ({"GOMP_SPINCOUNT": "7"}, "7"), ({"OMP_WAIT_POLICY": "ACTIVE"}, "None")):
-        printed = subprocess.check_output([sys.executable, "-c", code], text=True, env=environment | own)
+    environment = {
+        name: os.environ[name] for name in os.environ.keys() - {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT"}
+    }
+    for own, expected in (
+        ({}, "2000"),
+        ({"GOMP_SPINCOUNT": "7"}, "7"),
+        ({"OMP_WAIT_POLICY": "ACTIVE"}, "None"),
+    ):
+        printed = subprocess.check_output(
+            [sys.executable, "-c", code], text=True, env=environment | own
+        )
         assert printed.strip() == expected
 
 
 @pytest.mark.slow
-def test_a_finished_run_says_so_another_configuration_is_refused_and_a_saved_one_repeats_it(tiny, tmp_path, capsys):
+def test_a_finished_run_says_so_another_configuration_is_refused_and_a_saved_one_repeats_it(
+    tiny, tmp_path, capsys
+):
     for _ in range(2):
         first = run([*tiny, *STEPS], 2, tmp_path / "run")
     assert "already trained for 2 steps" in capsys.readouterr().out
-    assert main(["train", "quickstart", *tiny, *STEPS, "optimizer.lr=0.5", "trainer.max_steps=4"]) == 1
+    assert (
+        main(["train", "quickstart", *tiny, *STEPS, "optimizer.lr=0.5", "trainer.max_steps=4"]) == 1
+    )
     assert "optimizer.lr (0.002 there, 0.5 here)" in capsys.readouterr().err
-    assert main(["train", str(tmp_path / "run" / "config.yaml"), f"run.dir={tmp_path / 'again'}"]) == 0
+    assert (
+        main(["train", str(tmp_path / "run" / "config.yaml"), f"run.dir={tmp_path / 'again'}"]) == 0
+    )
     assert same_weights(tmp_path / "again" / "checkpoints" / "last.ckpt", first)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("signum", [pytest.param(signal.SIGINT, marks=pytest.mark.robustness), signal.SIGTERM])
+@pytest.mark.parametrize(
+    "signum", [pytest.param(signal.SIGINT, marks=pytest.mark.robustness), signal.SIGTERM]
+)
 def test_a_signal_stops_at_the_end_of_a_step_and_the_run_goes_on(tiny, signum, tmp_path):
     process = spawn(["flame_mdm", "train", "quickstart", *tiny, *STEPS, "trainer.max_steps=100000"])
     checkpoint = tmp_path / "run" / "checkpoints" / "last.ckpt"
@@ -157,7 +209,9 @@ def test_a_signal_stops_at_the_end_of_a_step_and_the_run_goes_on(tiny, signum, t
 
 def test_averaged_weights_are_what_is_loaded(trained):
     checkpoint = read_checkpoint(trained)
-    name = next(n for n in checkpoint["state_dict"] if n.startswith("denoiser.") and n.endswith("weight"))
+    name = next(
+        n for n in checkpoint["state_dict"] if n.startswith("denoiser.") and n.endswith("weight")
+    )
     assert not torch.equal(checkpoint["state_dict"][name], checkpoint["current_model_state"][name])
     assert torch.equal(load(trained).state_dict()[name], checkpoint["state_dict"][name])
 
@@ -167,7 +221,9 @@ def test_validation_does_not_depend_on_the_batch_size(trained, data_root):
     for size in (3, 8):
         overrides = [TINY[0], f"data_root={data_root}", f"data.batch_size={size}"]
         task = load_task(trained, GeneratorTask)
-        data = instantiate(compose("quickstart", overrides)["data"], representation=task.generator.representation)
+        data = instantiate(
+            compose("quickstart", overrides)["data"], representation=task.generator.representation
+        )
         data.setup("fit")
         with torch.no_grad():
             for index, batch in enumerate(data.val_dataloader()):
@@ -177,14 +233,22 @@ def test_validation_does_not_depend_on_the_batch_size(trained, data_root):
 
 
 def test_unconditioned_samples_ignore_guidance(trained):
-    a, b = (generate(load(trained), frames=24, guidance_scale=scale)[0].features for scale in (1.0, 7.0))
+    a, b = (
+        generate(load(trained), frames=24, guidance_scale=scale)[0].features for scale in (1.0, 7.0)
+    )
     np.testing.assert_allclose(a, b, atol=1e-5)
 
 
 @pytest.mark.slow
 def test_sampling_writes_motions_and_a_player_and_takes_every_option(trained, tmp_path, capsys):
     out, text = tmp_path / "samples", "a person's walk (slow), 100%"
-    how: dict[str, Any] = {"frames": 24, "sampler": "ddim", "eta": 0.5, "num_inference_steps": [0, 2, 5, 9], "seed": 9}
+    how: dict[str, Any] = {
+        "frames": 24,
+        "sampler": "ddim",
+        "eta": 0.5,
+        "num_inference_steps": [0, 2, 5, 9],
+        "seed": 9,
+    }
     words = [f"{key}={value}".replace(" ", "") for key, value in how.items()]
     words += ["samples=2", "shared_noise=true", "trajectory=true"]
     assert main(["sample", f"ckpt={trained}", f"text={text}", f"out={out}", *words]) == 0
@@ -200,18 +264,37 @@ def test_sampling_writes_motions_and_a_player_and_takes_every_option(trained, tm
         with np.load(out / name) as motion:
             np.testing.assert_allclose(motion["features"], features(), atol=1e-5)
             facts = [motion[key].item() for key in ("text", "seed", "fps")]
-            assert (*facts, motion["joints"].shape, len(str(motion["checkpoint"]))) == (text, 9, 20.0, (24, 22, 3), 64)
+            assert (*facts, motion["joints"].shape, len(str(motion["checkpoint"]))) == (
+                text,
+                9,
+                20.0,
+                (24, 22, 3),
+                64,
+            )
     five = features(num_inference_steps=5)
     np.testing.assert_array_equal(features(num_inference_steps=[0, 2, 4, 7, 9]), five)
     for change in ({"spacing": "stride"}, {"eta": 0.0}, {"shared_noise": False}):
         assert not np.allclose(features(num_inference_steps=5, **change), five)
     with Image.open(out / "trajectory.png") as sheet, Image.open(out / "motions.png") as motions:
-        assert sheet.height / 5 == pytest.approx(motions.height / 2, rel=0.2)  # four estimates and the result
+        # Four estimates and the result
+        assert sheet.height / 5 == pytest.approx(motions.height / 2, rel=0.2)
 
 
 def test_cleanup_is_noted_in_the_results(trained, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert main(["sample", f"ckpt={trained}", "text=a person walks", "samples=1", "seconds=1.5", "cleanup=true"]) == 0
+    assert (
+        main(
+            [
+                "sample",
+                f"ckpt={trained}",
+                "text=a person walks",
+                "samples=1",
+                "seconds=1.5",
+                "cleanup=true",
+            ]
+        )
+        == 0
+    )
     (path,) = Path("samples").rglob("motion_000.npz")
     model, raw = load(trained), generate(load(trained), "a person walks", seconds=1.5)[0]
     with np.load(path) as motion:
@@ -225,7 +308,13 @@ def test_cleanup_is_noted_in_the_results(trained, tmp_path, monkeypatch):
 def test_shared_noise_is_that_of_no_text(trained):
     model, seen = load(trained), []
     model.denoiser.register_forward_hook(lambda module, inputs, output: seen.append(inputs[0]))
-    generate(model, ["a person walks", "a person jumps"], frames=20, shared_noise=True, guidance_scale=1.0)
+    generate(
+        model,
+        ["a person walks", "a person jumps"],
+        frames=20,
+        shared_noise=True,
+        guidance_scale=1.0,
+    )
     assert torch.equal(seen[0][0], seen[0][1])
 
 

@@ -83,13 +83,21 @@ def model_file(path: Path, trained: Path, text: str | None = None, **recipe: Any
 
 def test_interpolations_in_models_are_refused(attacked, trained, changed, bad, tmp_path):
     marker, says = tmp_path / "owned", "holds an interpolation"
-    for value in (exploit(marker), [{"a": exploit(marker)}], {exploit(marker): 1}, "x${oc.env:HOME}"):
+    for value in (
+        exploit(marker),
+        [{"a": exploit(marker)}],
+        {exploit(marker): 1},
+        "x${oc.env:HOME}",
+    ):
         refuses(changed(config__data__batch_size=value), says)
     refuses(changed(facts__dataset=exploit(marker)), says)
     path = changed(config__denoiser__latent_dim=exploit(marker))
     attacked("evaluate", f"ckpt={trained}", f"extractor={path}", "quick=true", says="interpolation")
     attacked("export", str(path), "out=out", says=says)
-    refuses(model_file(bad / "x.safetensors", trained, config__denoiser__latent_dim=exploit(marker)), says)
+    refuses(
+        model_file(bad / "x.safetensors", trained, config__denoiser__latent_dim=exploit(marker)),
+        says,
+    )
     assert not marker.exists()
 
 
@@ -101,8 +109,15 @@ def test_interpolations_in_saved_runs_and_protocols_are_refused(attacked, traine
     representation = load(trained).representation
     own.write_text(protocol)
     metrics = load_protocol(str(own), representation).metrics
-    assert metrics["jitter"]["fps"] == representation.fps, "a protocol knows the representation alone"
-    for value in (json.dumps(exploit(marker)), "${oc.env:HOME}", "x${representation.fps}", "${run.dir}${seed}"):
+    assert metrics["jitter"]["fps"] == representation.fps, (
+        "a protocol knows the representation alone"
+    )
+    for value in (
+        json.dumps(exploit(marker)),
+        "${oc.env:HOME}",
+        "x${representation.fps}",
+        "${run.dir}${seed}",
+    ):
         (bad / "config.yaml").write_text(f"{saved}\nx: {value}\n")
         own.write_text(f"{protocol}\nsmoothing: {value}\n")
         with pytest.raises(UserError, match=f"config.yaml: x {says}"):
@@ -111,17 +126,23 @@ def test_interpolations_in_saved_runs_and_protocols_are_refused(attacked, traine
             load_protocol(str(own), representation)
     for words in (["train", "quickstart", *TINY, f"run.dir={bad}"], ["report", str(bad)]):
         attacked(*words, says=f"config.yaml: x {says}")
-    attacked("train", "quickstart", r"run.dir='x\${a}'", says=says)  # its checkpoints would be refused
+    # Its checkpoints would be refused
+    attacked("train", "quickstart", r"run.dir='x\${a}'", says=says)
     assert not marker.exists()
 
 
 def test_parts_are_built_as_hydra_builds_them_without_resolving_anything(tmp_path):
     node = {"_target_": "builtins.dict", "a": exploit(tmp_path / "owned"), "b": ["${oc.env:HOME}"]}
-    assert instantiate({"_target_": "collections.OrderedDict", "x": {"y": "${z}"}}) == {"x": {"y": "${z}"}}
+    assert instantiate({"_target_": "collections.OrderedDict", "x": {"y": "${z}"}}) == {
+        "x": {"y": "${z}"}
+    }
     assert instantiate(node) == {"a": node["a"], "b": node["b"]}
     assert not (tmp_path / "owned").exists()
     inner = {"_target_": "fractions.Fraction", "numerator": 3}
-    assert instantiate({"_target_": "builtins.dict", "a": [inner], "b": {"c": inner}}) == {"a": [3], "b": {"c": 3}}
+    assert instantiate({"_target_": "builtins.dict", "a": [inner], "b": {"c": inner}}) == {
+        "a": [3],
+        "b": {"c": 3},
+    }
     kept = instantiate({"_target_": "builtins.dict", "_recursive_": False, "a": inner})
     assert (kept, kept["a"] is inner) == ({"a": inner}, False)
     for key in ("_args_", "_partial_", "_convert_"):
@@ -138,13 +159,25 @@ def test_text_encoders_of_models_run_no_code(attacked, bad, trained, monkeypatch
     Path("lm").mkdir()
     for path in ("evil_package.py", "lm/evil.py"):
         Path(path).write_text("import pathlib\npathlib.Path('RAN').touch()\nclass Cfg: pass\n")
-    Path("lm/config.json").write_text('{"auto_map": {"AutoConfig": "evil.Cfg"}, "model_type": "zzz"}')
+    Path("lm/config.json").write_text(
+        '{"auto_map": {"AutoConfig": "evil.Cfg"}, "model_type": "zzz"}'
+    )
     monkeypatch.syspath_prepend(str(Path.cwd()))
     monkeypatch.setattr("sys.stdin", io.StringIO("y\ny\ny\n"))
     whole, path = read_checkpoint(trained), bad / "model.ckpt"
-    text = {"_target_": "flame_mdm.conditions.text.PretrainedText", "model": "lm", "features": 16, "max_tokens": 8}
+    text = {
+        "_target_": "flame_mdm.conditions.text.PretrainedText",
+        "model": "lm",
+        "features": 16,
+        "max_tokens": 8,
+    }
     package = {"package": "evil_package.x", "sha256": "0"}
-    for options in ({"freeze": True} | package, {"freeze": True}, {"freeze": False} | package, {"freeze": False}):
+    for options in (
+        {"freeze": True} | package,
+        {"freeze": True},
+        {"freeze": False} | package,
+        {"freeze": False},
+    ):
         condition = text | {"pooling": "mean"} | options
         torch.save(whole | {"config": whole["config"] | {"condition": condition}}, path)
         attacked("sample", f"ckpt={path}", TEXT)
@@ -158,7 +191,14 @@ def test_plain_values():
         deep = [deep]
     itself: list[Any] = [1]
     itself.extend([itself, itself])
-    for value in ({"a": {"b": "x${c}"}}, {"${a}": 1}, {"a": [b"x"]}, {"a": {(1,): 2}}, {"a": deep}, {"a": itself}):
+    for value in (
+        {"a": {"b": "x${c}"}},
+        {"${a}": 1},
+        {"a": [b"x"]},
+        {"a": {(1,): 2}},
+        {"a": deep},
+        {"a": itself},
+    ):
         with pytest.raises(UserError, match="the file"):
             plain(value, "the file")
     with pytest.raises(UserError, match=r"\$\{oc"):
@@ -167,11 +207,23 @@ def test_plain_values():
 
 
 def test_absurd_sizes(attacked, changed):
-    text = {"_target_": "flame_mdm.conditions.text.PretrainedText", "model": "a/b", "features": 60_000}
+    text = {
+        "_target_": "flame_mdm.conditions.text.PretrainedText",
+        "model": "a/b",
+        "features": 60_000,
+    }
     for key, value in (
         *(("process__num_train_timesteps", 10**9), ("task__num_inference_steps", 10**9)),
-        *(("denoiser__num_layers", 10**7), ("denoiser__num_layers", 90_000), ("denoiser__ff_size", 10**12)),
-        *(("denoiser__latent_dim", 10**7), ("denoiser__latent_dim", 60_000), ("condition__features", 60_000)),
+        *(
+            ("denoiser__num_layers", 10**7),
+            ("denoiser__num_layers", 90_000),
+            ("denoiser__ff_size", 10**12),
+        ),
+        *(
+            ("denoiser__latent_dim", 10**7),
+            ("denoiser__latent_dim", 60_000),
+            ("condition__features", 60_000),
+        ),
         ("condition", text | {"max_tokens": 5, "pooling": "pooler"}),
     ):
         path = changed(**{f"config__{key}": value})
@@ -186,7 +238,13 @@ def test_files_that_are_no_files(attacked, trained, bad):
     for name in ("zero.safetensors", "pipe.ckpt"):
         refuses(bad / name, "not a file")
         attacked("import", "flame", str(bad / name), "out=x", says="not a file")
-    attacked("evaluate", f"ckpt={trained}", "extractor=none", f"protocol={bad / 'pipe.yaml'}", says="not a file")
+    attacked(
+        "evaluate",
+        f"ckpt={trained}",
+        "extractor=none",
+        f"protocol={bad / 'pipe.yaml'}",
+        says="not a file",
+    )
     attacked("train", str(bad / "pipe.yaml"), says="pipe.yaml")
 
 
@@ -211,8 +269,14 @@ def test_absurd_facts_and_weights(attacked, trained, changed):
     state = read_checkpoint(trained)["state_dict"]
     name = max(state, key=lambda name: state[name].numel())
     weights = state[name].float()
-    for value in (torch.zeros(1).expand(10**9, 10**9), torch.zeros(5, device="meta"), torch.zeros(3).to_sparse()):
-        attacked("export", str(changed(state_dict=state | {name: value})), "out=x", says="its weights")
+    for value in (
+        torch.zeros(1).expand(10**9, 10**9),
+        torch.zeros(5, device="meta"),
+        torch.zeros(3).to_sparse(),
+    ):
+        attacked(
+            "export", str(changed(state_dict=state | {name: value})), "out=x", says="its weights"
+        )
     odd = [weights.to(torch.complex64), weights.to(torch.float8_e4m3fn)]
     for value in (*odd, torch.quantize_per_tensor(weights, 0.1, 0, torch.qint8)):
         path = changed(state_dict=state | {name: value})
@@ -222,7 +286,10 @@ def test_absurd_facts_and_weights(attacked, trained, changed):
 
 def test_packed_checkpoints(attacked, trained, bad):
     path = bad / "bomb.ckpt"
-    with zipfile.ZipFile(trained) as source, zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as target:
+    with (
+        zipfile.ZipFile(trained) as source,
+        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as target,
+    ):
         for member in source.namelist():
             target.writestr(member, source.read(member))
         with target.open("archive/data/bomb", "w") as file:
@@ -235,9 +302,17 @@ def test_packed_checkpoints(attacked, trained, bad):
 def test_values_of_wrong_kinds_are_refused_when_a_model_is_loaded(attacked, trained, changed, bad):
     steps = (None, 0, 1.5, True, ["x"], [0, 10**9], [0, True])
     for key, name, values in (
-        ("config__representation__fps", "fps", (0, float("nan"), "x", 1e-300, -5, None, [], True, "20")),
+        (
+            "config__representation__fps",
+            "fps",
+            (0, float("nan"), "x", 1e-300, -5, None, [], True, "20"),
+        ),
         ("config__task__num_inference_steps", "num_inference_steps", steps),
-        ("config__denoiser__num_heads", "num_heads", (True, [2], {"_target_": "flame_mdm.denoisers.mdm.MDMEncoder"})),
+        (
+            "config__denoiser__num_heads",
+            "num_heads",
+            (True, [2], {"_target_": "flame_mdm.denoisers.mdm.MDMEncoder"}),
+        ),
         ("config__experiment", "damaged", (3,)),
         ("facts__dataset", "damaged", (3,)),
         ("facts__actions", "damaged", ([1],)),
@@ -249,7 +324,9 @@ def test_values_of_wrong_kinds_are_refused_when_a_model_is_loaded(attacked, trai
         path = changed(config__task__num_inference_steps=value)
         attacked("sample", f"ckpt={path}", TEXT, says="sampling steps must be")
     attacked("evaluate", f"ckpt={changed(config__data=3)}", "extractor=none", "quick=true")
-    refuses(model_file(bad / "x.safetensors", trained, text='{"a":' * 100_000), "x.safetensors: damaged")
+    refuses(
+        model_file(bad / "x.safetensors", trained, text='{"a":' * 100_000), "x.safetensors: damaged"
+    )
 
 
 def test_incomplete_checkpoints(attacked, trained, changed, bad):
@@ -264,11 +341,23 @@ def test_incomplete_checkpoints(attacked, trained, changed, bad):
     refuses(changed(config__denoiser__latent_dim=32), says)
     attacked("export", str(changed(config__denoiser={})), "out=x", says="damaged: config.denoiser")
     best = changed("best.ckpt", config__callbacks={"best": 5})
-    attacked("evaluate", f"ckpt={best}", "extractor=none", "quick=true", says="damaged: config.callbacks.best is 5")
+    attacked(
+        "evaluate",
+        f"ckpt={best}",
+        "extractor=none",
+        "quick=true",
+        says="damaged: config.callbacks.best is 5",
+    )
     path = model_file(bad / "x.safetensors", trained, origin=None)
     attacked("push", str(path), "a/b", "dry_run=true", says="x.safetensors: damaged")
-    facts = {name: value for name, value in whole["facts"].items() if name not in ("dataset", "fingerprint")}
-    assert "| data | unknown |" in card(read_model_file(export(changed(facts=facts), bad)), "a/b", "")
+    facts = {
+        name: value
+        for name, value in whole["facts"].items()
+        if name not in ("dataset", "fingerprint")
+    }
+    assert "| data | unknown |" in card(
+        read_model_file(export(changed(facts=facts), bad)), "a/b", ""
+    )
 
 
 def test_bombs_of_yaml(bad):
@@ -292,16 +381,30 @@ def test_options_and_weights_of_released_models(attacked, bad):
     options.write_text("[" * 100_000)
     for kind in ("mdm", "mfm"):
         attacked("import", kind, *words)
-    wrong = {"dataset": [1], "num_heads": "4", "cond_mask_prob": {}, "lambda_rcxyz": [1], "num_frames": 1e300}
+    wrong = {
+        "dataset": [1],
+        "num_heads": "4",
+        "cond_mask_prob": {},
+        "lambda_rcxyz": [1],
+        "num_frames": 1e300,
+    }
     for name, value in (*wrong.items(), ("noise_schedule", 5), ("num_heads", 0)):
         options.write_text(json.dumps({name: value}))
         attacked("import", "mdm", *words, says=f"{name} is")
     options.write_text("{}")
-    name, rest, one = "input_process.poseEmbedding.weight", "output_process.poseFinal.weight", torch.zeros(8, 8)
+    name, rest, one = (
+        "input_process.poseEmbedding.weight",
+        "output_process.poseFinal.weight",
+        torch.zeros(8, 8),
+    )
     cases: list[dict] = [{5: one}, {"state_dict": [1]}, {"state_dict": {"net.a": 5}}]
     cases += [{"model_avg": {name: 5, rest: [1]}}, {"model_avg": {name: one}, "model": "x"}]
     cases += [{name: torch.zeros(1).expand(2**31, 263), rest: one}]
-    cases += [{name: one[0], rest: one[0]}, {name: one.to(torch.complex64), rest: one}, {name: one, rest: one}]
+    cases += [
+        {name: one[0], rest: one[0]},
+        {name: one.to(torch.complex64), rest: one},
+        {name: one, rest: one},
+    ]
     for content in cases:
         torch.save(content, path)
         for kind, *more in (("mdm", str(options)), ("flame",), ("mclip",)):
@@ -314,8 +417,13 @@ def test_little_memory_is_one_line(trained, tmp_path):
         f"import resource; resource.setrlimit(resource.RLIMIT_AS, ({300 << 20},) * 2)\n"
         f"import sys; from flame_mdm.__main__ import main\nsys.exit(main(['sample', 'ckpt={trained}', {TEXT!r}]))"
     )
-    line, threads = [sys.executable, "-c", program], {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    ended = subprocess.run(line, capture_output=True, text=True, cwd=tmp_path, check=False, env=os.environ | threads)
+    line, threads = (
+        [sys.executable, "-c", program],
+        {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+    )
+    ended = subprocess.run(
+        line, capture_output=True, text=True, cwd=tmp_path, check=False, env=os.environ | threads
+    )
     assert (ended.returncode, one_line(ended.stderr)) == (1, True), ended.stderr
 
 
@@ -336,7 +444,9 @@ SAME_HASH: dict[str, list[Any]] = {
 
 @pytest.mark.parametrize("kind", SAME_HASH)
 @pytest.mark.parametrize("legacy", [False, True])
-def test_keys_that_may_share_a_hash_are_refused_before_a_dictionary_is_made(kind, legacy, bad, monkeypatch):
+def test_keys_that_may_share_a_hash_are_refused_before_a_dictionary_is_made(
+    kind, legacy, bad, monkeypatch
+):
     path = with_keys(SAME_HASH[kind], bad / "keys.ckpt", legacy=legacy)
     monkeypatch.setattr(torch, "load", lambda *_, **__: pytest.fail("PyTorch read the file"))
     refuses(path, "not text or a small whole number")
@@ -363,8 +473,14 @@ def test_containers_are_made_of_checked_keys_only(kind, bad):
 
 
 def test_ten_thousand_states_of_an_optimizer_are_read(bad):
-    weights = {number: {"step": torch.tensor(1.0), "exp_avg": torch.zeros(2)} for number in range(10_000)}
-    content = {"state_dict": OrderedDict(weight=torch.zeros(2)), "optimizer": {"state": weights}, "seed": 2**63}
+    weights = {
+        number: {"step": torch.tensor(1.0), "exp_avg": torch.zeros(2)} for number in range(10_000)
+    }
+    content = {
+        "state_dict": OrderedDict(weight=torch.zeros(2)),
+        "optimizer": {"state": weights},
+        "seed": 2**63,
+    }
     for legacy in (False, True):
         torch.save(content, bad / "large.ckpt", _use_new_zipfile_serialization=not legacy)
         assert len(read_torch(bad / "large.ckpt")["optimizer"]["state"]) == 10_000

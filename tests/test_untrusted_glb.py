@@ -62,7 +62,9 @@ node = partial(item, "nodes")
 
 
 def bind(**values: Any) -> Change:
-    return lambda document: document["accessors"][document["skins"][0]["inverseBindMatrices"]].update(values)
+    return lambda document: document["accessors"][
+        document["skins"][0]["inverseBindMatrices"]
+    ].update(values)
 
 
 def unbuffered(document: dict[str, Any]) -> None:
@@ -74,11 +76,15 @@ def unbuffered(document: dict[str, Any]) -> None:
 
 def deep(document: dict[str, Any]) -> None:
     first = len(document["nodes"])
-    document["nodes"] += [{"children": [number + 1]} for number in range(first, glb.MAX_NODES - 1)] + [{}]
+    document["nodes"] += [
+        {"children": [number + 1]} for number in range(first, glb.MAX_NODES - 1)
+    ] + [{}]
 
 
 def many(document: dict[str, Any]) -> None:
-    document["nodes"] += [{"name": f"bone {k}"} for k in range(len(document["nodes"]), glb.MAX_NODES)]
+    document["nodes"] += [
+        {"name": f"bone {k}"} for k in range(len(document["nodes"]), glb.MAX_NODES)
+    ]
     document["skins"][0] = {"joints": list(range(glb.MAX_NODES))}
 
 
@@ -89,7 +95,10 @@ def drawn(document: dict[str, Any]) -> None:
 
 FAULTS: dict[str, tuple[Change, str]] = {
     "child that does not exist": (node(children=[999]), "child: there is no number 999"),
-    "two parents": (lambda d: d["nodes"][0]["children"].append(d["nodes"][1]["children"][0]), "two parents"),
+    "two parents": (
+        lambda d: d["nodes"][0]["children"].append(d["nodes"][1]["children"][0]),
+        "two parents",
+    ),
     "own ancestor": (lambda document: document["nodes"][21].update(children=[0]), "damaged"),
     "many nodes": (lambda document: document["nodes"].extend([{}] * 100_000), "at most 4096"),
     "chain of all nodes": (deep, ""),
@@ -102,12 +111,18 @@ FAULTS: dict[str, tuple[Change, str]] = {
     "negative offset": (item("accessors", byteOffset=-4), "greater than or equal to 0"),
     "wrong matrices": (bind(componentType=5125), "inverse bind matrices"),
     "nan": (lambda document: document["nodes"][0].update(translation=[float("nan"), 0, 0]), "NaN"),
-    "overflow of products": (lambda d: [n.update(scale=[1e8] * 3) for n in d["nodes"]], "not finite, or too large"),
+    "overflow of products": (
+        lambda d: [n.update(scale=[1e8] * 3) for n in d["nodes"]],
+        "not finite, or too large",
+    ),
     "vanishing": (lambda d: [n.update(scale=[1e-8] * 3) for n in d["nodes"]], ""),
     "flat": (node(scale=[0, 0, 0]), ""),
     "rotation of length 0": (node(rotation=[0, 0, 0, 0]), "zero norm"),
     "matrix of 15 numbers": (node(matrix=[1] * 15), "at least 16 items"),
-    "no bounds": (lambda document: [a.pop("min", None) for a in document["accessors"]], "without bounds"),
+    "no bounds": (
+        lambda document: [a.pop("min", None) for a in document["accessors"]],
+        "without bounds",
+    ),
     "no document": (lambda document: document.clear(), "asset: Field required"),
 }
 
@@ -147,7 +162,29 @@ def test_faults_of_the_parts_of_a_file_are_named(heroes: list[Path], tmp_path: P
         assert message in outcome(path, tmp_path / "out.glb"), content[:40]
 
 
-VALUES = [None, True, -1, 0, 1, 7, 99, 2**31, 2**70, HUGE, 0.5, -1e-300, 1e30, 1e308, "", "x", "0", [], [0], [-1], [[]]]
+VALUES = [
+    None,
+    True,
+    -1,
+    0,
+    1,
+    7,
+    99,
+    2**31,
+    2**70,
+    HUGE,
+    0.5,
+    -1e-300,
+    1e30,
+    1e308,
+    "",
+    "x",
+    "0",
+    [],
+    [0],
+    [-1],
+    [[]],
+]
 VALUES += [{}, {"a": 1}, [1e9] * 3, [0] * 4, [0] * 16, [1] * 16, list(range(50)), [{}], [None]]
 
 
@@ -165,7 +202,9 @@ def mutated(value: Any, draw: random.Random) -> Any:
     elif kind == 1 and isinstance(container, list):
         container.insert(key, copy.deepcopy(draw.choice([value, draw.choice(VALUES)])))
     elif kind == 2 and isinstance(value, int | float):
-        container[key] = draw.choice([-value, value * 10, value + 1, value - 1, value * 1e9, float(value)])
+        container[key] = draw.choice(
+            [-value, value * 10, value + 1, value - 1, value * 1e9, float(value)]
+        )
     else:
         container[key] = copy.deepcopy(draw.choice(VALUES))
     return steps[0][0]

@@ -53,7 +53,9 @@ MOTION = Motion(np.zeros((2, 22, 3), np.float32), 20.0, SMPL22, text="a person w
 
 def save_checkpoint(run: Path) -> None:
     for step in (1, 2):  # the second one moves the first to previous.ckpt
-        AtomicCheckpoints(run / "checkpoints").save_checkpoint({"global_step": step}, run / "checkpoints" / "last.ckpt")
+        AtomicCheckpoints(run / "checkpoints").save_checkpoint(
+            {"global_step": step}, run / "checkpoints" / "last.ckpt"
+        )
 
 
 def train_in(run: Path) -> None:
@@ -69,7 +71,9 @@ def prepare(root: Path) -> None:
 
 def encode_captions(root: Path) -> None:
     encoder: Any = object.__new__(PretrainedText)
-    encoded = EncodedCaptions(["a"], torch.zeros(1, 2), torch.zeros(1, 2).half(), torch.tensor([0, 1]))
+    encoded = EncodedCaptions(
+        ["a"], torch.zeros(1, 2), torch.zeros(1, 2).half(), torch.tensor([0, 1])
+    )
     vars(encoder).update(
         freeze=True,
         _cache_path=lambda captions, folder: folder / "model-0123.safetensors",
@@ -109,7 +113,9 @@ def audit(out: Path) -> None:
 
 def audit_cache(out: Path) -> None:
     evaluator: Any = SimpleNamespace(
-        extract=lambda _: {"generated": torch.zeros(1, 2)}, metrics={}, protocol=SimpleNamespace(metrics={})
+        extract=lambda _: {"generated": torch.zeros(1, 2)},
+        metrics={},
+        protocol=SimpleNamespace(metrics={}),
     )
     audited_inputs(evaluator, out / "real.npz", ["a"], lambda: [np.zeros((2, 3))])
 
@@ -143,7 +149,10 @@ def report(out: Path) -> None:
 def store() -> Store:
     folder = TemporaryDirectory()
     finalize(
-        opened := write_store(Path(folder.name, "s"), OwnClips(clip("a")), HumanML("smpl22", "clean")), folder.cleanup
+        opened := write_store(
+            Path(folder.name, "s"), OwnClips(clip("a")), HumanML("smpl22", "clean")
+        ),
+        folder.cleanup,
     )
     return opened
 
@@ -158,7 +167,9 @@ def verify(out: Path) -> None:
     opened.verify()
     opened.verify, opened.folder, statistics = (lambda: None), out, opened.folder
     (out / "features.npy").write_bytes((statistics / "features.npy").read_bytes())
-    data: Any = SimpleNamespace(open=lambda: opened, crop=SimpleNamespace(min_frames=1), representation=representation)
+    data: Any = SimpleNamespace(
+        open=lambda: opened, crop=SimpleNamespace(min_frames=1), representation=representation
+    )
     verify_data(data)
 
 
@@ -177,7 +188,9 @@ def adapter(out: Path) -> None:
         trained = Path(folder, "last.ckpt")
         torch.save({"config": {"adapter": {}}, "state_dict": {}}, trained)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(adapters, "read_checkpoint", lambda path: torch.load(path, weights_only=True))
+            patch.setattr(
+                adapters, "read_checkpoint", lambda path: torch.load(path, weights_only=True)
+            )
             adapters.write_adapter(out / "mine.safetensors", trained)
 
 
@@ -196,16 +209,28 @@ def succeed(words: list[str]) -> None:
             raise UserError(errors[-1].removeprefix("error: "))
 
 
-CONVERTED = [ending for ending in WRITTEN if ending not in (".mp4", *USD)]  # others need packages of extras
+# Others need packages of extras
+CONVERTED = [ending for ending in WRITTEN if ending not in (".mp4", *USD)]
 CARD = ROOT / "docs" / "benchmarks" / "audit" / "synthetic-none.json"
-SAMPLES = [f"walk/{name}" for name in ("motion_000.npz", "motions.gif", "motions.png", "player.html")]
+SAMPLES = [
+    f"walk/{name}" for name in ("motion_000.npz", "motions.gif", "motions.png", "player.html")
+]
 WRITERS: dict[str, tuple[Callable[[Path], None], list[str]]] = {
     "train": (
         train_in,
-        ["run.lock", "metrics.jsonl", "bad_batch.json", "checkpoints/last.ckpt", "checkpoints/previous.ckpt"],
+        [
+            "run.lock",
+            "metrics.jsonl",
+            "bad_batch.json",
+            "checkpoints/last.ckpt",
+            "checkpoints/previous.ckpt",
+        ],
     ),
     "checkpoint": (save_checkpoint, ["checkpoints/last.ckpt", "checkpoints/previous.ckpt"]),
-    "prepare": (prepare, ["mine-humanml.lock", "mine-humanml/store.json", "mine-humanml/features.npy"]),
+    "prepare": (
+        prepare,
+        ["mine-humanml.lock", "mine-humanml/store.json", "mine-humanml/features.npy"],
+    ),
     "text cache": (encode_captions, ["text/model-0123.safetensors"]),
     "sample": (sample, SAMPLES),
     "page": (page, ["player.html"]),
@@ -269,14 +294,18 @@ def test_each_writer_writes_its_files_into_a_folder_without_links(tmp_path, writ
 
 @pytest.mark.parametrize("kind", ["link", "hard link", "pipe"])
 @pytest.mark.parametrize(("writer", "name"), CASES)
-def test_a_link_at_the_name_of_a_file_does_not_lead_to_the_file_of_somebody_else(tmp_path, writer, name, kind):
+def test_a_link_at_the_name_of_a_file_does_not_lead_to_the_file_of_somebody_else(
+    tmp_path, writer, name, kind
+):
     victim, folder = tmp_path / "victim", tmp_path / "folder"
     victim.write_bytes(VICTIM)
     plant(kind, folder / name, victim)
     attempt(WRITERS[writer][0], folder)
     assert victim.read_bytes() == VICTIM
     assert sorted(tmp_path.iterdir()) == [folder, victim]
-    assert not [path for path in folder.rglob(".*") if path.name.startswith(".")], "nothing half-written stays"
+    assert not [path for path in folder.rglob(".*") if path.name.startswith(".")], (
+        "nothing half-written stays"
+    )
 
 
 @pytest.mark.parametrize("writer", ["audit cache", "text cache", "evaluate", "prepare", "train"])
@@ -291,7 +320,9 @@ def test_a_link_to_a_file_that_does_not_exist_does_not_create_it(tmp_path, write
 
 
 @pytest.mark.parametrize(("writer", "name"), FOLDERS)
-def test_a_link_at_the_name_of_a_folder_does_not_lead_to_the_files_of_somebody_else(tmp_path, writer, name):
+def test_a_link_at_the_name_of_a_folder_does_not_lead_to_the_files_of_somebody_else(
+    tmp_path, writer, name
+):
     victim, folder = tmp_path / "victim", tmp_path / "folder"
     write, names = WRITERS[writer]
     contents = {Path(file).name for file in names} | {"thesis.doc", "motion_007.npz"}
@@ -302,7 +333,9 @@ def test_a_link_at_the_name_of_a_folder_does_not_lead_to_the_files_of_somebody_e
     (folder / name).symlink_to(victim)
     with one_line_error("a link leads out of|is not a prepared data set"):
         write(folder)
-    assert {path.name: path.read_bytes() for path in victim.iterdir()} == dict.fromkeys(contents, VICTIM)
+    assert {path.name: path.read_bytes() for path in victim.iterdir()} == dict.fromkeys(
+        contents, VICTIM
+    )
 
 
 @pytest.mark.parametrize("kind", ["link", "hard link", "pipe"])
@@ -337,8 +370,12 @@ def test_an_export_to_onnx_replaces_links_in_its_folder(tmp_path, monkeypatch, n
 
 
 @pytest.mark.parametrize("kind", ["link", "hard link", "pipe"])
-@pytest.mark.parametrize("name", ["multirun.yaml", ".submitit/1_submitted.pkl", "seed=1/config.yaml"])
-def test_hydra_starts_no_sweep_in_a_folder_that_leads_elsewhere(tmp_path, monkeypatch, capsys, name, kind):
+@pytest.mark.parametrize(
+    "name", ["multirun.yaml", ".submitit/1_submitted.pkl", "seed=1/config.yaml"]
+)
+def test_hydra_starts_no_sweep_in_a_folder_that_leads_elsewhere(
+    tmp_path, monkeypatch, capsys, name, kind
+):
     monkeypatch.setattr(sweeps, "hydra_main", lambda **_: pytest.fail("the sweep has begun"))
     victim, folder = tmp_path / "victim", tmp_path / "folder"
     victim.write_bytes(VICTIM)
@@ -367,7 +404,9 @@ def test_prepare_replaces_an_intact_store_only_and_keeps_the_files_of_others(tmp
     prepare(tmp_path)
     (folder / "notes.txt").write_bytes(VICTIM)
     before = (folder / "features.npy").read_bytes()
-    write_store(folder, OwnClips(clip("b", motion=clip("a").motion[:30])), HumanML("smpl22", "clean"))
+    write_store(
+        folder, OwnClips(clip("b", motion=clip("a").motion[:30])), HumanML("smpl22", "clean")
+    )
     assert (folder / "notes.txt").read_bytes() == VICTIM
     assert (folder / "features.npy").read_bytes() != before
     features = (folder / "features.npy").read_bytes()
@@ -378,7 +417,9 @@ def test_prepare_replaces_an_intact_store_only_and_keeps_the_files_of_others(tmp
 
 
 @pytest.mark.parametrize("name", ["*", "../x", "/tmp/x", "..", ".hidden", "a/b", "", "-x"])
-def test_the_name_of_a_data_set_names_a_folder_in_the_data_root(tmp_path, monkeypatch, capsys, name):
+def test_the_name_of_a_data_set_names_a_folder_in_the_data_root(
+    tmp_path, monkeypatch, capsys, name
+):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "data").mkdir()
     (tmp_path / "data" / ".mine.keep").mkdir()
@@ -397,7 +438,8 @@ def test_temporary_files_of_living_processes_stay_and_abandoned_ones_go(tmp_path
         "alive": f".a.{machine}-{os.getppid()}-{token}.npz",
         "dead": f".a.{machine}-{dead}-{token}.npz",
         "elsewhere": f".a.00000000-{dead}-{token}.npz",
-        "former": f".b.{machine}-{os.getpid()}-{token}.npz",  # in a container, each process may have the same number
+        # In a container, each process may have the same number
+        "former": f".b.{machine}-{os.getpid()}-{token}.npz",
         "not ours": ".a.backup-7-old.npz",
     }
     for name in names.values():
@@ -408,7 +450,9 @@ def test_temporary_files_of_living_processes_stay_and_abandoned_ones_go(tmp_path
         own.touch()
         paths.remove_abandoned(tmp_path)
         assert own.exists()
-    assert {path.name for path in tmp_path.iterdir()} == {names[key] for key in ("alive", "elsewhere", "not ours")}
+    assert {path.name for path in tmp_path.iterdir()} == {
+        names[key] for key in ("alive", "elsewhere", "not ours")
+    }
     paths.remove_abandoned(tmp_path, is_locked=True)
     assert {path.name for path in tmp_path.iterdir()} == {names["not ours"]}
 
@@ -451,7 +495,13 @@ def test_an_evaluation_stays_in_the_run(tmp_path, trained, data_root, name, caps
     (run / "checkpoints" / "last.ckpt").write_bytes(trained.read_bytes())
     (run / name).parent.mkdir(parents=True, exist_ok=True)
     (run / name).symlink_to(victim)
-    words = [f"ckpt={run}", "protocol=synthetic", "extractor=none", "quick=true", f"data_root={data_root}"]
+    words = [
+        f"ckpt={run}",
+        "protocol=synthetic",
+        "extractor=none",
+        "quick=true",
+        f"data_root={data_root}",
+    ]
     assert main(["evaluate", *words]) == 1
     assert "a link leads out of" in capsys.readouterr().err
     assert not list(victim.iterdir())

@@ -48,7 +48,9 @@ pytestmark = pytest.mark.slow
 def header(shape: tuple[int, ...], dtype: str = "<f8") -> bytes:
     """The header of an .npy file that declares any shape."""
     stream = io.BytesIO()
-    np.lib.format.write_array_header_1_0(stream, {"descr": dtype, "fortran_order": False, "shape": shape})
+    np.lib.format.write_array_header_1_0(
+        stream, {"descr": dtype, "fortran_order": False, "shape": shape}
+    )
     return stream.getvalue()
 
 
@@ -64,7 +66,9 @@ def encrypted(data: bytes) -> bytes:
     """A zip archive whose headers say that its members are encrypted."""
     for magic, at in ((b"PK\3\4", 6), (b"PK\1\2", 8)):
         head, *members = data.split(magic)
-        data = head + b"".join(magic + part[: at - 4] + b"\1\0" + part[at - 2 :] for part in members)
+        data = head + b"".join(
+            magic + part[: at - 4] + b"\1\0" + part[at - 2 :] for part in members
+        )
     return data
 
 
@@ -82,12 +86,24 @@ MOTIONS: list[tuple[str, bytes, str]] = [
     ("a.bvh", bvh_text().replace("Frames: 3", "Frames: 1000000000").encode(), "1000000000"),
     ("a.bvh", bvh_at("1" * 40_000 + "x"), "Frame Time"),
     ("a.npz", b"PK\x03\x04 cut", "damaged"),
-    ("a.npz", npz(poses=LONG, trans=np.zeros((4, 3)), mocap_framerate=20), "poses are not an array of real numbers"),
-    ("a.npz", npz(joints=JOINTS, fps=20, representation="smpl147", features=FIELDS), "features are not an array"),
+    (
+        "a.npz",
+        npz(poses=LONG, trans=np.zeros((4, 3)), mocap_framerate=20),
+        "poses are not an array of real numbers",
+    ),
+    (
+        "a.npz",
+        npz(joints=JOINTS, fps=20, representation="smpl147", features=FIELDS),
+        "features are not an array",
+    ),
     ("a.npz", zipped({"joints.npy": header((10**12, 22, 3)), "fps.npy": b"x"}), "declares"),
     ("a.npz", BOMB, "expand to"),
     ("a.npz", encrypted(npz(joints=JOINTS, fps=20)), "encrypted"),
-    ("a.npz", zipped({"joints.npy": header((4, 22, 3))}, zipfile.ZIP_LZMA), "another method than deflate"),
+    (
+        "a.npz",
+        zipped({"joints.npy": header((4, 22, 3))}, zipfile.ZIP_LZMA),
+        "another method than deflate",
+    ),
     ("a.npz", npz(joints=np.array([{}]), fps=20), "Python objects"),
     ("a.npy", header((10**12, 22, 3)), "declares"),
     ("a.npy", header((2**62, 2**62)), "declares"),
@@ -155,13 +171,26 @@ def test_commands_refuse_in_one_line_and_leave_nothing(attacked: Refused, bad: P
     attacked.watched.append(root)
     (bad / "a.npz").write_bytes(BOMB)
     attacked("convert", str(bad / "a.npz"), "out=out.json", says="expand to")
-    attacked("edit", f"ckpt={trained}", f"motion={bad / 'a.npz'}", "region=in_between", "text=a", says="expand to")
+    attacked(
+        "edit",
+        f"ckpt={trained}",
+        f"motion={bad / 'a.npz'}",
+        "region=in_between",
+        "text=a",
+        says="expand to",
+    )
     attacked("prepare", "data=folder", f"source={bad}", f"data_root={root}", says="expand to")
     (bad / "set").write_bytes(sparse(TAKE, 40 * 10**9))
     words = (f"source={bad / 'set'}", f"data_root={root}", "data.source.workers=1")
     attacked("prepare", "data=bandai", *words, says="sparse")
     (bad / "humanact12poses.pkl").write_bytes(PICKLES["doubled"][0])
-    attacked("prepare", "data=humanact12", f"source={bad / 'humanact12poses.pkl'}", f"data_root={root}", says="expand")
+    attacked(
+        "prepare",
+        "data=humanact12",
+        f"source={bad / 'humanact12poses.pkl'}",
+        f"data_root={root}",
+        says="expand",
+    )
 
 
 def test_links_pipes_and_folders(tmp_path: Path, folder: Callable):
@@ -172,11 +201,21 @@ def test_links_pipes_and_folders(tmp_path: Path, folder: Callable):
             path.symlink_to(path if target == "loop" else target)
             refuses(str(path), read, path, fps=20)
     for name in ("b.npz", "a.txt", "captions.csv", "skeleton.yaml"):
-        refuses(f"{name}: a pipe", of_folder, folder(lambda path, name=name: os.mkfifo(path / name)))
+        refuses(
+            f"{name}: a pipe", of_folder, folder(lambda path, name=name: os.mkfifo(path / name))
+        )
     of_folder(folder(lambda path: (path / "b.npz").mkdir()))  # is no motion
-    refuses("b.npz: cannot be read", of_folder, folder(lambda path: (path / "b.npz").symlink_to(path / "b.npz")))
+    refuses(
+        "b.npz: cannot be read",
+        of_folder,
+        folder(lambda path: (path / "b.npz").symlink_to(path / "b.npz")),
+    )
     for name, shown in ((b"\x1b[31m", r"\x1b[31m"), (b"\xff", r"\udcff"), (b"x\ny", r"x\ny")):
-        path = folder(lambda path, name=name: Path(os.fsdecode(os.fsencode(path) + b"/" + name + b".npz")).touch())
+        path = folder(
+            lambda path, name=name: Path(
+                os.fsdecode(os.fsencode(path) + b"/" + name + b".npz")
+            ).touch()
+        )
         refuses(shown, of_folder, path)
 
 
@@ -221,8 +260,13 @@ def archive_cases() -> Iterator[tuple[bytes, str]]:
     yield member(TAKE, 0, tarfile.FIFOTYPE) + bytes(1024), "special file"
     yield member("@LongLink", 10**10, tarfile.GNUTYPE_LONGNAME) + bytes(1024), "a header of"
     yield member("x", 10**10, tarfile.XHDTYPE) + bytes(1024), "a header of"
-    for kind, values, says in ((tarfile.XGLTYPE, 200, "not a BVH file"), (tarfile.XHDTYPE, 10_000, "a header of")):
-        records = b"".join(b"%d k%d=v\n" % (len(f"k{n}=v\n") + 3, n) for n in range(10_000, 10_000 + values))
+    for kind, values, says in (
+        (tarfile.XGLTYPE, 200, "not a BVH file"),
+        (tarfile.XHDTYPE, 10_000, "a header of"),
+    ):
+        records = b"".join(
+            b"%d k%d=v\n" % (len(f"k{n}=v\n") + 3, n) for n in range(10_000, 10_000 + values)
+        )
         padding = bytes(-len(records) % tarfile.BLOCKSIZE)
         yield member("x", len(records), kind) + records + padding + member(TAKE) + bytes(1024), says
     for compress, name in product((gzip.compress, bz2.compress, lzma.compress), (TAKE, "junk")):
@@ -233,7 +277,10 @@ def archive_cases() -> Iterator[tuple[bytes, str]]:
     yield zipped({TAKE: whole}, zipfile.ZIP_LZMA), "another method than deflate"
     yield zipped({TAKE: whole})[:-30], "damaged archive"
     yield b"PK\3\4", "damaged archive"
-    yield zipped({"-" + TAKE: whole}).replace(b"-" + TAKE.encode(), b"\0" + TAKE.encode()), "a file without a name"
+    yield (
+        zipped({"-" + TAKE: whole}).replace(b"-" + TAKE.encode(), b"\0" + TAKE.encode()),
+        "a file without a name",
+    )
     yield b"", "neither a folder nor"
     yield bytes(10240), "no file dataset-1"
 
@@ -255,7 +302,9 @@ def test_archives_are_refused_and_many_members_take_little_memory(tmp_path: Path
         tracemalloc.stop()
 
 
-def test_archives_of_too_many_members_are_refused_before_they_are_listed(tmp_path: Path, monkeypatch):
+def test_archives_of_too_many_members_are_refused_before_they_are_listed(
+    tmp_path: Path, monkeypatch
+):
     names = [f"{number}.txt" for number in range(1000)]
     cases = {"a.zip": zipped(dict.fromkeys(names, b"")), "a.tar": member("x") * 1000 + bytes(1024)}
     cases["a.npz"] = npz(**{f"a{number}": np.zeros(0) for number in range(1000)})
@@ -288,16 +337,22 @@ def test_archives_of_too_many_members_are_refused_before_they_are_listed(tmp_pat
 
 def wide_bvh(joints: int, frames: int) -> bytes:
     """A motion of joints without channels below a root with one channel: two bytes per frame."""
-    below = "JOINT j\n{\nOFFSET 0 1 0\nCHANNELS 0\nEnd Site\n{\nOFFSET 0 1 0\n}\n}\n" * (joints // 2)
+    below = "JOINT j\n{\nOFFSET 0 1 0\nCHANNELS 0\nEnd Site\n{\nOFFSET 0 1 0\n}\n}\n" * (
+        joints // 2
+    )
     head = f"HIERARCHY\nROOT r\n{{\nOFFSET 0 0 0\nCHANNELS 1 Yposition\n{below}}}\n"
     return f"{head}MOTION\nFrames: {frames}\nFrame Time: 0.05\n".encode() + b"0\n" * frames
 
 
 def wide_amc(folder: Path, bones: int, frames: int) -> Path:
     """A motion of bones without degrees of freedom, each the child of the root."""
-    data = "".join(f"begin\nname b{n}\ndirection 0 1 0\nlength 1\naxis 0 0 0 XYZ\nend\n" for n in range(bones))
+    data = "".join(
+        f"begin\nname b{n}\ndirection 0 1 0\nlength 1\naxis 0 0 0 XYZ\nend\n" for n in range(bones)
+    )
     tree = "".join(f"root b{n}\n" for n in range(bones))
-    (folder / "1.asf").write_text(f":root\norder TY\naxis XYZ\n:bonedata\n{data}:hierarchy\nbegin\n{tree}end\n")
+    (folder / "1.asf").write_text(
+        f":root\norder TY\naxis XYZ\n:bonedata\n{data}:hierarchy\nbegin\n{tree}end\n"
+    )
     path = folder / "1_1.amc"
     path.write_text("".join(f"{frame}\nroot 0\n" for frame in range(1, frames + 1)))
     return path
@@ -307,16 +362,25 @@ def test_frames_times_joints_are_bounded_before_memory_is_taken(tmp_path: Path, 
     path = tmp_path / "wide.bvh"
     path.write_bytes(wide_bvh(4000, 10_000))
     assert path.stat().st_size < 200_000
-    with bounded(20, 200 * MEBIBYTE), pytest.raises(UserError, match="a file of this size may have at most 249 frames"):
+    with (
+        bounded(20, 200 * MEBIBYTE),
+        pytest.raises(UserError, match="a file of this size may have at most 249 frames"),
+    ):
         bvh_files.read(path)
     amc = wide_amc(tmp_path, 2000, 4000)
-    with bounded(20, 200 * MEBIBYTE), pytest.raises(UserError, match=r"1_1\.amc: 4,001 frames of 4,001 joints"):
+    with (
+        bounded(20, 200 * MEBIBYTE),
+        pytest.raises(UserError, match=r"1_1\.amc: 4,001 frames of 4,001 joints"),
+    ):
         asf.read(amc, 120)
 
 
 def test_long_motions_of_many_moving_joints_are_read(tmp_path: Path):
     """A minute of 300 joints: 2 million positions are more than a small file may have, but its numbers are there."""
-    body = "".join(f"JOINT j{n}\n{{\nOFFSET 0 1 0\nCHANNELS 3 Zrotation Xrotation Yrotation\n" for n in range(300))
+    body = "".join(
+        f"JOINT j{n}\n{{\nOFFSET 0 1 0\nCHANNELS 3 Zrotation Xrotation Yrotation\n"
+        for n in range(300)
+    )
     text = f"HIERARCHY\nROOT r\n{{\nOFFSET 0 0 0\nCHANNELS 3 Xposition Yposition Zposition\n{body}{'}' * 301}\n"
     text = text.replace("}", "}\n") + "MOTION\nFrames: 7200\nFrame Time: 0.00833333\n"
     path = tmp_path / "long.bvh"
@@ -331,11 +395,17 @@ def test_the_bones_of_an_asf_file_are_bounded(tmp_path: Path):
     refuses("more than 4096 bones", asf.read, wide_amc(tmp_path, 50_000, 3), 120)
 
 
-@pytest.mark.parametrize(("case", "says"), [("killed", "a worker process was killed"), ("bomb", "frame time")])
+@pytest.mark.parametrize(
+    ("case", "says"), [("killed", "a worker process was killed"), ("bomb", "frame time")]
+)
 def test_one_bad_task_ends_all_workers(case: str, says: str, tmp_path: Path):
     (tmp_path / "bomb").write_bytes(bvh_at("999999"))
     tasks: dict[str, list[tuple]] = {"killed": [(abs, 1), (signal.raise_signal, 9)]}
-    tasks["bomb"] = [(signal.raise_signal, signal.SIGSTOP), (bvh_files.read, tmp_path / "bomb")]  # the first has no end
+    # The first has no end
+    tasks["bomb"] = [
+        (signal.raise_signal, signal.SIGSTOP),
+        (bvh_files.read, tmp_path / "bomb"),
+    ]
     before, start = active_children(), time.monotonic()
     with pytest.raises((UserError, ValueError), match=says):
         list(in_order(carry_out, [*tasks[case], *[(abs, -2)] * 9], workers=2))
@@ -349,10 +419,17 @@ PICKLES = {
     "memo": (b"\x80\x04Nr\xff\xff\xff\x7f.", "must contain"),
     "tuples": (b"\x80\x04})" + b"\x85" * (2 * 10**5) + b"Ns.", "is not text"),
     "lists": (b"\x80\x04" + b"](" * 10**5 + b"e" * 10**5 + b".", "nested too deeply"),
-    "doubled": (b"\x80\x04]" + b"q\x00](h\x00h\x00e" * 60 + b".", "expand to"),  # a list that holds a list twice, ...
+    # A list that holds a list twice, ...
+    "doubled": (
+        b"\x80\x04]" + b"q\x00](h\x00h\x00e" * 60 + b".",
+        "expand to",
+    ),
     "cycle": (b"\x80\x04]\x94h\x00a.", "nested too deeply"),
     "integers": (pickle.dumps({n * (2**61 - 1): 0 for n in range(2**10)}, 4), "is not text"),
-    "complex": (pickle.dumps({complex(-1_000_003 * n, n): 0 for n in range(1, 2**10)}, 4), "it names builtins.complex"),
+    "complex": (
+        pickle.dumps({complex(-1_000_003 * n, n): 0 for n in range(1, 2**10)}, 4),
+        "it names builtins.complex",
+    ),
     "frozen": (pickle.dumps(frozenset([(1, 2), (3, 4)]), 4), "a set"),
     "old dictionary": (b"((I1\nI2\ntI3\nd.", "is not text"),
     "digits": (b"L" + b"9" * 30 + b"L\n.", "must contain"),
@@ -362,9 +439,16 @@ PICKLES = {
 
 def test_pickles_are_refused_or_bounded(tmp_path: Path):
     path = tmp_path / "humanact12poses.pkl"
-    wrong: list[list[Any]] = [[3, 3, 3], [["x"], ["x"], [1]], [[np.zeros((2, 72))], [np.zeros((2, 24, 3))], ["x"]]]
+    wrong: list[list[Any]] = [
+        [3, 3, 3],
+        [["x"], ["x"], [1]],
+        [[np.zeros((2, 72))], [np.zeros((2, 24, 3))], ["x"]],
+    ]
     dictionaries = [dict(zip(("poses", "joints3D", "y"), values, strict=True)) for values in wrong]
-    for content, says in (*PICKLES.values(), *((pickle.dumps(content), str(path)) for content in dictionaries)):
+    for content, says in (
+        *PICKLES.values(),
+        *((pickle.dumps(content), str(path)) for content in dictionaries),
+    ):
         path.write_bytes(content)
         refuses(says, lambda: list(HumanAct12(str(path)).clips(20)))
     array = np.zeros(10**6, np.uint8)  # repeated arrays count each time
@@ -377,24 +461,56 @@ def test_pickles_are_refused_or_bounded(tmp_path: Path):
 
 def small_store(folder: Path, clip: dict[str, Any], info: dict[str, Any]) -> None:
     """Writes a store of one clip with changed fields; its hashes and its fingerprint are right."""
-    entry: dict[str, Any] = {"id": "a", "start": 0, "length": 4, "split": "train", "source": "a", "captions": []}
+    entry: dict[str, Any] = {
+        "id": "a",
+        "start": 0,
+        "length": 4,
+        "split": "train",
+        "source": "a",
+        "captions": [],
+    }
     entry |= {"action": None, "attributes": {}} | clip
     folder.mkdir(parents=True, exist_ok=True)
     np.save(folder / "features.npy", np.zeros((4, 2), np.float32))
     (folder / "clips.jsonl").write_text(json.dumps(entry) + "\n")
     np.savez(folder / "statistics.npz", mean=np.zeros(2, np.float32), std=np.ones(2, np.float32))
     hashes = {path.name: sha256(path) for path in folder.iterdir() if path.suffix != ".json"}
-    digest = hashlib.sha256((folder / "clips.jsonl").read_bytes() + b'["r", 20, [0.0, 0.0, 1.0, 1.0]]')
-    content: dict[str, Any] = {"format": 1, "dataset": "d", "representation": "r", "fps": 20, "hours": 0.1}
-    content |= {"actions": ["x"], "excluded": {}, "published_split": False, "shape": [4, 2], "sha256": hashes}
+    digest = hashlib.sha256(
+        (folder / "clips.jsonl").read_bytes() + b'["r", 20, [0.0, 0.0, 1.0, 1.0]]'
+    )
+    content: dict[str, Any] = {
+        "format": 1,
+        "dataset": "d",
+        "representation": "r",
+        "fps": 20,
+        "hours": 0.1,
+    }
+    content |= {
+        "actions": ["x"],
+        "excluded": {},
+        "published_split": False,
+        "shape": [4, 2],
+        "sha256": hashes,
+    }
     content |= {"clips": {"train": 1, "val": 0, "test": 0}, "fingerprint": digest.hexdigest()[:16]}
     (folder / "store.json").write_text(json.dumps(content | info))
 
 
-CLIPS = {"action": [99, -1, "a", {}], "id": [5, ""], "captions": [None, [5]], "start": [3.5, -1], "length": [0, 5]}
+CLIPS = {
+    "action": [99, -1, "a", {}],
+    "id": [5, ""],
+    "captions": [None, [5]],
+    "start": [3.5, -1],
+    "length": [0, 5],
+}
 CLIPS |= {"source": [1], "split": [[]], "attributes": [[]]}
 COUNTS = {"train": 1, "val": 0, "test": 0}
-INFOS = [("hours", 10**400), ("fps", 10**400), ("clips", COUNTS | {"<b>x": 1}), ("clips", COUNTS | {"val": "x"})]
+INFOS = [
+    ("hours", 10**400),
+    ("fps", 10**400),
+    ("clips", COUNTS | {"<b>x": 1}),
+    ("clips", COUNTS | {"val": "x"}),
+]
 INFOS += [("clips", {"train": 1}), ("actions", [1])]
 
 
@@ -422,16 +538,37 @@ def test_every_field_of_a_store_is_checked(tmp_path: Path):
 
 def test_samples_of_other_kinds_and_recordings_of_amass_are_bounded(tmp_path: Path):
     path = tmp_path / "a.npz"
-    whole: dict[str, Any] = {"ids": np.array(["a"]), "lengths": np.array([4]), "features": np.zeros((4, 2))}
+    whole: dict[str, Any] = {
+        "ids": np.array(["a"]),
+        "lengths": np.array([4]),
+        "features": np.zeros((4, 2)),
+    }
     path.write_bytes(npz(**whole, captions=np.array(["x"])))
     assert read_samples(path)["lengths"].tolist() == [4]
-    arrays = [np.zeros((4, 2, 3)), np.zeros(()), np.zeros((4, 2), np.longdouble), np.zeros((4, 66)), np.array([1])]
+    arrays = [
+        np.zeros((4, 2, 3)),
+        np.zeros(()),
+        np.zeros((4, 2), np.longdouble),
+        np.zeros((4, 66)),
+        np.array([1]),
+    ]
     for name, array in zip(["features"] * 3 + ["joints", "captions"], arrays, strict=True):
         path.write_bytes(npz(**whole | {name: array}))
         refuses("a.npz: ", read_samples, path)
-    whole = {"poses": np.zeros((4, 156)), "trans": np.zeros((4, 3)), "betas": np.zeros(16), "gender": "male"}
-    wrong: dict[str, list[Any]] = {"mocap_framerate": [np.inf, 1e-7, [1, 2]], "gender": [np.array(["a", "b"])]}
-    wrong |= {"betas": [np.array(["x"]), np.zeros(())], "poses": [np.zeros((4, 156), "S1"), np.zeros(())]}
+    whole = {
+        "poses": np.zeros((4, 156)),
+        "trans": np.zeros((4, 3)),
+        "betas": np.zeros(16),
+        "gender": "male",
+    }
+    wrong: dict[str, list[Any]] = {
+        "mocap_framerate": [np.inf, 1e-7, [1, 2]],
+        "gender": [np.array(["a", "b"])],
+    }
+    wrong |= {
+        "betas": [np.array(["x"]), np.zeros(())],
+        "poses": [np.zeros((4, 156), "S1"), np.zeros(())],
+    }
     for name, value in [(name, value) for name, values in wrong.items() for value in values]:
         with pytest.raises(UserError, match="here: "):
             read_amass(npz(**{**whole, "mocap_framerate": 120.0, name: value}), "here")

@@ -32,10 +32,17 @@ def tensor(name: str, *shape: int | str, kind: int = FLOAT) -> Any:
 
 def graph(inputs: list[Any], outputs: list[Any], *nodes: tuple[Any, ...], **constants: Any) -> Any:
     """A model of nodes (operator, inputs, outputs, attributes)."""
-    made = [onnx.helper.make_node(kind, read, written, **options) for kind, read, written, options in nodes]
-    initializers = [onnx.numpy_helper.from_array(np.array(value), name) for name, value in constants.items()]
+    made = [
+        onnx.helper.make_node(kind, read, written, **options)
+        for kind, read, written, options in nodes
+    ]
+    initializers = [
+        onnx.numpy_helper.from_array(np.array(value), name) for name, value in constants.items()
+    ]
     content = onnx.helper.make_graph(made, "graph", inputs, outputs, initializers)
-    return onnx.helper.make_model(content, opset_imports=[onnx.helper.make_opsetid("", 17)], ir_version=8)
+    return onnx.helper.make_model(
+        content, opset_imports=[onnx.helper.make_opsetid("", 17)], ir_version=8
+    )
 
 
 def graphs() -> dict[str, bytes]:
@@ -81,7 +88,11 @@ CONTENT: dict[str, Any] = {
     "fps": 20,
     "max_frames": 60,
     "padded_frames": 0,
-    "skeleton": {"joints": ["pelvis"] * JOINTS, "parents": [-1, *[0] * 21], "feet": [[1, 2], [3, 4]]},
+    "skeleton": {
+        "joints": ["pelvis"] * JOINTS,
+        "parents": [-1, *[0] * 21],
+        "feet": [[1, 2], [3, 4]],
+    },
     "clip_x0": False,
     "steps": [[9.0, 0.0, 1.0, 0.5, 0.5, 0.0, 0.1], [0.0, 0.0, 1.0, 0.0, 1.0, 0.0, 0.0]],
     "sha256": {name: hashlib.sha256(content).hexdigest() for name, content in GRAPHS.items()},
@@ -108,7 +119,19 @@ INVALID: dict[str, list[Any]] = {
     "skeleton.parents": [MISSING, None, [], ["a"], [NAN], [-2], [10**9], [0.5]],
     "skeleton.feet": [MISSING, None, 5, {}],
     "clip_x0": [MISSING, None, 0, 1, "false", []],
-    "steps": [MISSING, None, {}, [], [[]], [[1] * 6], [[1] * 8], [["1"] * 7], [[True] * 7], [[NAN] * 7], [[1e300] * 7]],
+    "steps": [
+        MISSING,
+        None,
+        {},
+        [],
+        [[]],
+        [[1] * 6],
+        [[1] * 8],
+        [["1"] * 7],
+        [[True] * 7],
+        [[NAN] * 7],
+        [[1e300] * 7],
+    ],
     "sha256": [MISSING, None, [], "denoiser.onnx"],
     "sha256.denoiser.onnx": HASH,
     "sha256.joints.onnx": HASH,
@@ -155,7 +178,9 @@ def test_a_folder_within_the_limits_is_sampled_from(folder: Path) -> None:
     assert (joints.shape, offsets.shape, quaternions.shape) == ((60, 22, 3), (22, 3), (60, 22, 4))
 
 
-@pytest.mark.parametrize(("name", "value"), CASES, ids=[f"{name}={str(value)[:12]!r}" for name, value in CASES])
+@pytest.mark.parametrize(
+    ("name", "value"), CASES, ids=[f"{name}={str(value)[:12]!r}" for name, value in CASES]
+)
 def test_an_invalid_value_of_model_json_is_named(folder: Path, name: str, value: Any) -> None:
     write(folder, mutated(name, value))
     with pytest.raises(ValueError, match="not an exported model") as error:
@@ -207,7 +232,9 @@ def with_external_data(key: bytes) -> bytes:
     return content.replace(b"\x08location", key) if len(key) == 9 else content
 
 
-def test_a_graph_that_reads_other_files_is_refused(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_graph_that_reads_other_files_is_refused(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(folder)
     (folder / "weights.bin").write_bytes(np.float32(0.5).tobytes())
     replaced(folder, "denoiser.onnx", with_external_data(b"\x08location"))
@@ -225,7 +252,9 @@ def other_graph(kind: str) -> bytes:
         return graph(inputs, [tensor("output", 1, FEATURES, "frames")], node).SerializeToString()
     if kind == "inputs":
         node = ("Identity", ["x_t"], ["output"], {})
-        return graph(inputs[:1], [tensor("output", 1, "frames", FEATURES)], node).SerializeToString()
+        return graph(
+            inputs[:1], [tensor("output", 1, "frames", FEATURES)], node
+        ).SerializeToString()
     node = ("Log", ["x_t"], ["output"], {})
     return graph(inputs, [tensor("output", 1, "frames", FEATURES)], node).SerializeToString()
 
@@ -293,14 +322,22 @@ def javascript(tmp_path: Path) -> Callable[[str, Any], Any]:
             f"console.log(JSON.stringify({expression}));",
         ]
         (tmp_path / "run.js").write_text("\n".join(lines))
-        done = subprocess.run(["node", "run.js"], cwd=tmp_path, capture_output=True, text=True, check=True)
+        done = subprocess.run(
+            ["node", "run.js"], cwd=tmp_path, capture_output=True, text=True, check=True
+        )
         return json.loads(done.stdout)
 
     return run
 
 
-def test_the_web_page_refuses_what_the_runner_refuses(javascript: Callable[[str, Any], Any]) -> None:
-    contents = [mutated(name, value) for name, value in CASES if "NaN" not in json.dumps(mutated(name, value))]
+def test_the_web_page_refuses_what_the_runner_refuses(
+    javascript: Callable[[str, Any], Any],
+) -> None:
+    contents = [
+        mutated(name, value)
+        for name, value in CASES
+        if "NaN" not in json.dumps(mutated(name, value))
+    ]
     contents = [content for content in contents if "Infinity" not in json.dumps(content)]
     assert len(contents) > 120
     complete = [content | {"digest": "0" * 64} for content in (CONTENT, *contents)]
@@ -312,7 +349,9 @@ def test_the_web_page_refuses_what_the_runner_refuses(javascript: Callable[[str,
 
 
 def test_the_web_page_checks_the_seconds_of_a_link(javascript: Callable[[str, Any], Any]) -> None:
-    counts = "data.map((text) => message(() => frameCount(Number(text), { fps: 20, max_frames: 60 })))"
+    counts = (
+        "data.map((text) => message(() => frameCount(Number(text), { fps: 20, max_frames: 60 })))"
+    )
     answers = javascript(counts, ["3", "0.1", "3.1", "0", "-2", "1e9", "1e400", "abc"])
     assert answers[:2] == [60, 2]
     assert all(answer.endswith(": give 0.1 to 3 seconds") for answer in answers[2:])

@@ -34,7 +34,16 @@ from flame_mdm.formats.readers import read
 from flame_mdm.records import Cost
 from flame_mdm.reporting.plots import Panel, Series, svg
 from flame_mdm.reporting.report import write_report
-from flame_mdm.reporting.tables.format import Cell, Line, Part, Table, comma_separated, draw, rendered, write
+from flame_mdm.reporting.tables.format import (
+    Cell,
+    Line,
+    Part,
+    Table,
+    comma_separated,
+    draw,
+    rendered,
+    write,
+)
 from flame_mdm.reporting.tables.specs import Figure
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.skeleton import SMPL22
@@ -54,7 +63,8 @@ parts:
 MANY = list(range(1, 41))
 COST = Cost(nfe=1.0, seconds_per_sample=1.0, batch_size=1.0)
 BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
-    f"{name}: &{name} [{', '.join([f'*{before}'] * 9)}]\n" for before, name in zip("abcdefgh", "bcdefghi", strict=True)
+    f"{name}: &{name} [{', '.join([f'*{before}'] * 9)}]\n"
+    for before, name in zip("abcdefgh", "bcdefghi", strict=True)
 )
 COLUMNS = ", ".join(f"c{k}: {{value: fid}}" for k in range(500))
 OPTIONS = f"num_inference_steps: {MANY}, guidance_scale: {MANY}, until: {MANY}"
@@ -67,7 +77,8 @@ SPECS = {
     ROWS.format(keys="data.source._target_: os.system"): "data.source._target_",
     ROWS.format(keys="hydra.searchpath: x"): "only keys of the data",
     f"title: t\nparts: {{P: {{protocol: x, rows: [], columns: {{{COLUMNS}}}}}}}\n": "not a shorter list",
-    ROWS.format(keys="note: n") + f"figures: [{{part: P, x: nfe, y: {['FID'] * 300}}}]\n": "300 exceed the limit",
+    ROWS.format(keys="note: n")
+    + f"figures: [{{part: P, x: nfe, y: {['FID'] * 300}}}]\n": "300 exceed the limit",
     "title: caf\udce9\n": "not a UTF-8 text file",
     "title: t\nparts: {P: {recipes: {a: quickstart}, keys: {}}}\n": "keys is {}, not a longer",
     f"title: t\nnotes: [0x{'f' * 20_000}]\n": NUMBER,
@@ -92,7 +103,10 @@ def huge(path: Path) -> None:
 
 UNREADABLE: dict[str, tuple[Callable[[Path], object], str]] = {
     "pipe": (os.mkfifo, "a pipe, a socket or a device, not a file"),
-    "endless": (lambda path: path.symlink_to("/dev/zero"), "a pipe, a socket or a device, not a file"),
+    "endless": (
+        lambda path: path.symlink_to("/dev/zero"),
+        "a pipe, a socket or a device, not a file",
+    ),
     "folder": (Path.mkdir, "a folder, not a file"),
     "huge": (huge, "1 TiB, but such a file may have at most"),
     "latin": (lambda path: path.write_bytes(b'{"a": "\xe9"}\n'), "not a UTF-8 text file"),
@@ -124,7 +138,18 @@ def test_unreadable_files(attacked, bad, trained):
 
 def test_numbers_at_the_ends_of_the_range_are_drawn(bad):
     folder = a_run(bad / "run")
-    lines = [{"step": 0}, {"step": 1, "foo": 1, "": 1, "a/": 1, "train/loss": 5e-324, "train/a": 1e-299, "a/b": 1e299}]
+    lines = [
+        {"step": 0},
+        {
+            "step": 1,
+            "foo": 1,
+            "": 1,
+            "a/": 1,
+            "train/loss": 5e-324,
+            "train/a": 1e-299,
+            "a/b": 1e299,
+        },
+    ]
     (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     assert main(["report", str(folder)]) == 0
     for low, high in ((0, 5e-324), (5e-324, 5e-324), (1e299, 1e299), (-5e-324, 0), (5e-324, 1)):
@@ -137,11 +162,21 @@ def test_long_names_and_many_texts(attacked, bad, tmp_path, trained, capfd):
     attacked("tables", f"table={bad / 'spec.yaml'}", "evaluate=false", says="aaa … ")
     say("b" * 5_000, error=True)
     assert len(capfd.readouterr().err) < 2_010
-    attacked("sample", f"ckpt={trained}", f"text={'a person walks ' * 66_667}", says=" characters are too many")
+    attacked(
+        "sample",
+        f"ckpt={trained}",
+        f"text={'a person walks ' * 66_667}",
+        says=" characters are too many",
+    )
     with pytest.raises(UserError, match=r"samples=2 of each text: at most 10,000 motions"):
-        flame_mdm.generate(flame_mdm.load(trained), [f"text {number}" for number in range(5001)], samples=2)
+        flame_mdm.generate(
+            flame_mdm.load(trained), [f"text {number}" for number in range(5001)], samples=2
+        )
     caption = "x" * 1_000_000
-    short, shown = (Motion(np.zeros((frames, 22, 3)), 20.0, SMPL22, text=caption, id=caption) for frames in (2, 20))
+    short, shown = (
+        Motion(np.zeros((frames, 22, 3)), 20.0, SMPL22, text=caption, id=caption)
+        for frames in (2, 20)
+    )
     with bounded():
         write_gif(tmp_path / "a.gif", [shown])
         contact_sheet(tmp_path / "a.png", [shown])
@@ -154,23 +189,39 @@ def test_a_text_given_twice_has_two_motions(trained):
     model = flame_mdm.load(trained)
 
     def sampled(texts: Any, **options: Any) -> np.ndarray:
-        return np.stack([made.features for made in flame_mdm.generate(model, texts, seconds=1, **options)])
+        return np.stack(
+            [made.features for made in flame_mdm.generate(model, texts, seconds=1, **options)]
+        )
 
     pair, twice = sampled("walk", samples=2), sampled(["walk", "jump", "walk"])
     np.testing.assert_allclose(twice, np.stack([pair[0], sampled("jump")[0], pair[1]]), atol=1e-5)
     assert np.abs(twice[0] - twice[2]).max() > 1e-3
-    ids = [made.id for made in flame_mdm.generate(model, ["walk", "jump", "walk"], seconds=1, samples=2)]
+    ids = [
+        made.id
+        for made in flame_mdm.generate(model, ["walk", "jump", "walk"], seconds=1, samples=2)
+    ]
     assert ids == ["walk#0", "walk#1", "jump#0", "jump#1", "walk#2", "walk#3"]
 
 
 def _made(text: str = "a person walks") -> list[Motion]:
-    return [Motion(np.zeros((4, 22, 3)), 20.0, SMPL22, text, f"{text}#0", features=np.zeros((4, 263), np.float32))]
+    return [
+        Motion(
+            np.zeros((4, 22, 3)),
+            20.0,
+            SMPL22,
+            text,
+            f"{text}#0",
+            features=np.zeros((4, 263), np.float32),
+        )
+    ]
 
 
 def _write_all(folder: Path, table: Table) -> None:
     row: Any = SimpleNamespace(id="000001", text="a person walks")
     for _ in range(30):
-        write_json(folder / "results" / "lengths" / "kit.json", {"lengths": list(range(1000))}, indent=None)
+        write_json(
+            folder / "results" / "lengths" / "kit.json", {"lengths": list(range(1000))}, indent=None
+        )
         _write(folder / "rep_0.npz", [row], [np.zeros((40, 263), np.float32)], COST, "text")
     for _ in range(2):
         write(table, folder / "tables")
@@ -178,7 +229,9 @@ def _write_all(folder: Path, table: Table) -> None:
 
 
 def test_four_processes_write_the_same_files(tmp_path):
-    table = Table("t", "T", [Part("P", {"FID": "lower"}, [Line("a", "measured", [Cell("1", 1.0)])])])
+    table = Table(
+        "t", "T", [Part("P", {"FID": "lower"}, [Line("a", "measured", [Cell("1", 1.0)])])]
+    )
     table.parts[0].figures.append(Figure(part="P", x="nfe", y=["FID"]))
     table.parts[0].lines[0].options["nfe"] = 3.0
     fork = multiprocessing.get_context("fork")
@@ -212,7 +265,10 @@ def test_a_failed_write_keeps_what_was_there(tmp_path):
     write_motions(tmp_path / "a", _made(), {})
     (tmp_path / "a" / "notes.txt").write_text("mine")
     before = {path.name: path.read_bytes() for path in (tmp_path / "a").iterdir()}
-    with pytest.raises(UserError, match="a: cannot be written"), atomic_folder(tmp_path / "a") as made:
+    with (
+        pytest.raises(UserError, match="a: cannot be written"),
+        atomic_folder(tmp_path / "a") as made,
+    ):
         (made / "no folder" / "player.html").write_text("half")
     assert {path.name: path.read_bytes() for path in (tmp_path / "a").iterdir()} == before
     write_motions(tmp_path / "a", _made("another"), {})
@@ -234,7 +290,12 @@ def _report(folder: Path) -> Path:
 
 
 def _check_of_data(folder: Path) -> Path:
-    options: dict[str, Any] = {"root": str(folder), "name": "s", "batch_size": 4, "crop": Whole(1, 45)}
+    options: dict[str, Any] = {
+        "root": str(folder),
+        "name": "s",
+        "batch_size": 4,
+        "crop": Whole(1, 45),
+    }
     data = MotionDataModule(Synthetic(clips=12), HumanML(), **options)
     data.prepare_data()
     verify.report(data)
@@ -242,7 +303,9 @@ def _check_of_data(folder: Path) -> Path:
 
 
 @pytest.mark.parametrize("writer", [_table, _report, _check_of_data])
-def test_a_file_that_is_half_written_when_the_disk_is_full_leaves_the_old_one(tmp_path, capsys, writer):
+def test_a_file_that_is_half_written_when_the_disk_is_full_leaves_the_old_one(
+    tmp_path, capsys, writer
+):
     """With `capsys`, because pytest otherwise captures what is printed in files, which are limited as well."""
     path = writer(tmp_path)
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
@@ -256,7 +319,13 @@ HOSTILE = "x\n# Heading\n\n<b>|`[a](http://b)\r\x1b[31m\u202e\t~~_*"
 
 
 def test_tables_hold_text_not_markup_and_no_formulas():
-    facts = {"device": "=HYPERLINK(1)", "seed": "-5", "recipe": "@SUM(1)", "result": "\t=1+1", "baseline": "-2+3+cmd"}
+    facts = {
+        "device": "=HYPERLINK(1)",
+        "seed": "-5",
+        "recipe": "@SUM(1)",
+        "result": "\t=1+1",
+        "baseline": "-2+3+cmd",
+    }
     line = Line(HOSTILE, "measured", [Cell("-0.5 ±0.1", -0.5, 0.1), Cell("+cmd")], "a", facts=facts)
     line.options["nfe"] = 1.0
     part = Part(HOSTILE, {"=A": "none", HOSTILE: "none"}, [line], [("a", HOSTILE), ("", HOSTILE)])
@@ -274,7 +343,11 @@ def test_tables_hold_text_not_markup_and_no_formulas():
         assert not re.search("[\x00-\x09\x0b-\x1f\u202e]", form)
     assert not [line for line in tex.splitlines() if line.lstrip().startswith(("#", "<b>", "["))]
     cells = [cell for row in csv.reader(io.StringIO(comma_separated(table))) for cell in row]
-    formulas = [cell for cell in cells if cell.lstrip().startswith(tuple("=+-@")) and not re.match(r"-[\d.]+", cell)]
+    formulas = [
+        cell
+        for cell in cells
+        if cell.lstrip().startswith(tuple("=+-@")) and not re.match(r"-[\d.]+", cell)
+    ]
     assert not formulas
     assert {"-5", "-0.5 ±0.1", "'-2+3+cmd", "'=HYPERLINK(1)"} <= set(cells)
     line.label = r"$\frac{$"
@@ -294,26 +367,45 @@ def test_commands_print_no_control_characters(tmp_path, capsys):
 def test_all_that_is_printed_is_printable():
     pattern = r"(?<![\w.])print\(|sys\.std(?:out|err)\.write"
     alone = ("errors.py", "runner.py")  # the runner needs nothing of the package
-    wrong = [path for path in FILES if path.name not in alone and re.search(pattern, path.read_text())]
+    wrong = [
+        path for path in FILES if path.name not in alone and re.search(pattern, path.read_text())
+    ]
     assert wrong == [], "use errors.say"
 
 
 def test_pages_use_no_network_and_play_the_motions_not_the_pages_of_others(tmp_path):
     assert "Content-Security-Policy" in player_page([Motion(np.zeros((2, 22, 3)), 20.0, SMPL22)])
-    runs = [motions(a_run(tmp_path / name, name=name) / "samples" / "step_0000009").parent.parent for name in "ab"]
+    runs = [
+        motions(a_run(tmp_path / name, name=name) / "samples" / "step_0000009").parent.parent
+        for name in "ab"
+    ]
     assert main(["compare", f"runs={runs[0]} {runs[1]}", f"out={tmp_path / 'out.html'}"]) == 0
-    (runs[0] / "samples" / "step_0000009" / "player.html").write_text("<script>fetch('https://example.com')</script>")
+    (runs[0] / "samples" / "step_0000009" / "player.html").write_text(
+        "<script>fetch('https://example.com')</script>"
+    )
     report = write_report(runs[0])
-    assert main(["compare", f"runs={runs[0]} {runs[1]}", f"out={tmp_path / 'rate.html'}", "rate=true"]) == 0
+    assert (
+        main(["compare", f"runs={runs[0]} {runs[1]}", f"out={tmp_path / 'rate.html'}", "rate=true"])
+        == 0
+    )
     for path in (tmp_path / "out.html", tmp_path / "rate.html", report, _table(tmp_path)):
-        assert """<meta http-equiv="Content-Security-Policy" content="default-src 'none'; """ in path.read_text()
+        assert (
+            """<meta http-equiv="Content-Security-Policy" content="default-src 'none'; """
+            in path.read_text()
+        )
     assert "example.com" not in report.read_text()
     assert "a person jumps" in report.read_text()
 
 
 def test_push_takes_names_not_paths_and_overwrites_only_its_own_files(attacked, bad, trained):
     for name in ("a/..", "./a", "a/.git", "a/-x", "/"):
-        attacked("push", str(trained), name, "dry_run=true", says="not a repository name. Write user/name")
+        attacked(
+            "push",
+            str(trained),
+            name,
+            "dry_run=true",
+            says="not a repository name. Write user/name",
+        )
     (bad / "config.yaml").write_text("mine")
     attacked("push", str(trained), "a/b", f"out={bad}", "dry_run=true", says="not written by push")
     assert [path.read_text() for path in bad.iterdir()] == ["mine"]

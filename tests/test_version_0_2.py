@@ -54,8 +54,12 @@ def test_a_checkpoint_loads_with_its_averaged_weights_under_the_same_names(check
         state = model.state_dict()
         assert list(state) == list(saved["state_dict"])
         assert all(torch.equal(value, saved["state_dict"][name]) for name, value in state.items())
-        assert model.config["task"] == saved["config"]["task"] | {"_target_": "flame_mdm.task.GeneratorTask"}
-    (motion,) = flame_mdm.generate(flame_mdm.load(checkpoint), saved["facts"]["captions"][0], frames=20)
+        assert model.config["task"] == saved["config"]["task"] | {
+            "_target_": "flame_mdm.task.GeneratorTask"
+        }
+    (motion,) = flame_mdm.generate(
+        flame_mdm.load(checkpoint), saved["facts"]["captions"][0], frames=20
+    )
     assert motion.joints.shape == (20, 22, 3)
 
 
@@ -66,7 +70,9 @@ def test_a_run_resumes_exactly(checkpoint, data_root, tmp_path):
     config = (FILES / "config.yaml").read_text()
     (run / "config.yaml").write_text(config.replace("  dir: run\n", f"  dir: {run}\n"))
     saved = torch.load(checkpoint, weights_only=True)
-    saved["facts"]["fingerprint"] = None  # of the same clips, which a later version may store in another format
+    saved["facts"]["fingerprint"] = (
+        None  # of the same clips, which a later version may store in another format
+    )
     torch.save(saved, run / "checkpoints" / "last.ckpt")
     words = [f"run.dir={run}", f"data_root={data_root}", f"data.root={data_root}"]
     assert main(["train", str(run / "config.yaml"), *words]) == 0
@@ -74,7 +80,8 @@ def test_a_run_resumes_exactly(checkpoint, data_root, tmp_path):
     assert resumed["global_step"] == 4
     for name, part in (("weights", "current_model_state"), ("average", "state_dict")):
         weights = {key: resumed[part][key] for key in expected[name]}
-        torch.testing.assert_close(weights, expected[name], rtol=0, atol=1e-5)  # the learning rate is 2e-3
+        # The learning rate is 2e-3
+        torch.testing.assert_close(weights, expected[name], rtol=0, atol=1e-5)
 
 
 def test_a_student_loads_without_its_teacher_and_is_written_again(tmp_path):
@@ -93,9 +100,13 @@ def test_a_student_loads_without_its_teacher_and_is_written_again(tmp_path):
 
 def test_the_task_of_a_configuration_gets_its_name_of_today(tmp_path):
     (tmp_path / "config.yaml").write_bytes((FILES / "config.yaml").read_bytes())
-    assert read_saved(tmp_path / "config.yaml")["task"]["_target_"] == "flame_mdm.task.GeneratorTask"
+    assert (
+        read_saved(tmp_path / "config.yaml")["task"]["_target_"] == "flame_mdm.task.GeneratorTask"
+    )
     adaptation = renamed({"task": {"_target_": OLD_TASK}, "base": "runs/base"})
-    assert adaptation["task"]["_target_"] == f"{AdaptationTask.__module__}.{AdaptationTask.__name__}"
+    assert (
+        adaptation["task"]["_target_"] == f"{AdaptationTask.__module__}.{AdaptationTask.__name__}"
+    )
     other: dict[str, Any] = {"task": {"_target_": "my.Task"}, "base": "runs/base"}
     assert renamed(other) == other
     assert renamed({"data": {}}) == {"data": {}}

@@ -26,39 +26,70 @@ MP4 = pytest.mark.skipif(av is None, reason="av is not installed: pip install fl
 
 
 def test_player_holds_the_joints_to_half_a_millimetre_and_huge_ones_coarser(tmp_path):
-    motions = [sway(contacts=True), sway(7, 12.5, SKELETONS["kit21"])]  # lengths, rates and skeletons may differ
+    # Lengths, rates and skeletons may differ
+    motions = [
+        sway(contacts=True),
+        sway(7, 12.5, SKELETONS["kit21"]),
+    ]
     write_player(tmp_path / "p.html", motions, "t")
     for packed, motion in zip(Page(tmp_path / "p.html").motions, motions, strict=True):
         np.testing.assert_allclose(unpacked(packed), motion.joints, rtol=0, atol=0.0005 + 1e-6)
         assert (packed["fps"], packed["parents"]) == (motion.fps, list(motion.skeleton.parents))
-    contacts = np.frombuffer(base64.b64decode(Page(tmp_path / "p.html").motions[0]["contacts"]), "u1")
+    contacts = np.frombuffer(
+        base64.b64decode(Page(tmp_path / "p.html").motions[0]["contacts"]), "u1"
+    )
     np.testing.assert_array_equal(contacts.reshape(30, -1), motions[0].contacts)
     motions[0].joints *= 1000
     write_player(tmp_path / "p.html", motions[:1])
-    (packed,), span = Page(tmp_path / "p.html").motions, np.ptp(motions[0].joints, axis=(0, 1)).max()
-    np.testing.assert_allclose(unpacked(packed), motions[0].joints, rtol=0, atol=span / 65534 / 2 + 1e-3)
+    (packed,), span = (
+        Page(tmp_path / "p.html").motions,
+        np.ptp(motions[0].joints, axis=(0, 1)).max(),
+    )
+    np.testing.assert_allclose(
+        unpacked(packed), motions[0].joints, rtol=0, atol=span / 65534 / 2 + 1e-3
+    )
 
 
 def test_player_is_one_file_that_escapes_all_texts(tmp_path):
     write_player(tmp_path / "p.html", [sway(text=HOSTILE, id="a\u2066b")], HOSTILE)
     page = Page(tmp_path / "p.html")
     assert not {"link", "img", "iframe"} & set(page.tags)
-    for reference in ("http:", "https:", 'src="', "href=", "url(", "@import", "import(", "fetch(", "XMLHttpRequest"):
+    for reference in (
+        "http:",
+        "https:",
+        'src="',
+        "href=",
+        "url(",
+        "@import",
+        "import(",
+        "fetch(",
+        "XMLHttpRequest",
+    ):
         assert reference not in page.source, reference
     assert page.tags.count("script") == 3
     assert page.texts["title"] == page.texts["h1"] == HOSTILE
-    assert (page.motions[0]["caption"], page.motions[0]["id"]) == (HOSTILE, r"a\u2066b")  # it rearranges no text
+    # It rearranges no text
+    assert (page.motions[0]["caption"], page.motions[0]["id"]) == (
+        HOSTILE,
+        r"a\u2066b",
+    )
 
 
 @pytest.mark.parametrize("kind", ["known rotations", "joints of people", "other skeleton"])
-@pytest.mark.parametrize("ending", [*WRITTEN, ".html", ".png", "rigged.bvh", "rigged.glb", "character.glb"])
+@pytest.mark.parametrize(
+    "ending", [*WRITTEN, ".html", ".png", "rigged.bvh", "rigged.glb", "character.glb"]
+)
 def test_nothing_warns_while_a_motion_is_written_or_drawn(tmp_path, ending, kind):
     if ending == ".mp4":
         pytest.importorskip("av", reason="av is not installed: pip install flame-mdm[video]")
     if ending.startswith(".usd"):
         pytest.importorskip("pxr", reason="usd-core is not installed: pip install flame-mdm[usd]")
     solved = Motion(posed(2, left_knee=(60, 0, 0)).joints, 20)
-    motions = {"known rotations": posed(2), "joints of people": solved, "other skeleton": sway(2, skeleton=KIT21)}
+    motions = {
+        "known rotations": posed(2),
+        "joints of people": solved,
+        "other skeleton": sway(2, skeleton=KIT21),
+    }
     posed(2).save(tmp_path / "rig.glb", rig="mixamo")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -104,7 +135,9 @@ PIXELS = """(() => {
 @pytest.mark.tools
 @pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
 def test_player_runs_in_a_browser(tmp_path):
-    write_player(tmp_path / "p.html", [sway(contacts=True, text=HOSTILE, id=f"m{k}") for k in range(13)], "t")
+    write_player(
+        tmp_path / "p.html", [sway(contacts=True, text=HOSTILE, id=f"m{k}") for k in range(13)], "t"
+    )
     with browser(tmp_path / "profile", 900, 700) as tab:
         tab.open((tmp_path / "p.html").as_uri())
         tab.wait("typeof motions === 'object' && motions.length === 13 && !!motions[12].figure")
@@ -144,7 +177,9 @@ def test_gif_keeps_frames_and_time_and_holds_a_motion_that_ended(tmp_path):
     assert (frames[8][:, 64:] != frames[15][:, 64:]).any()
 
 
-@pytest.mark.parametrize("write", [write_player, write_gif, pytest.param(write_mp4, marks=MP4), contact_sheet])
+@pytest.mark.parametrize(
+    "write", [write_player, write_gif, pytest.param(write_mp4, marks=MP4), contact_sheet]
+)
 def test_writers_give_the_same_bytes_and_leave_nothing_where_they_fail(tmp_path, write):
     with pytest.raises(UserError, match=r"out\.x: no motions to show"):
         write(tmp_path / "out.x", [])
@@ -161,7 +196,9 @@ def test_frames_show_both_sides_and_height_of_a_skeleton():
     motion.joints[:, :, 1] += 0.3
     images = [frames[0].astype(int), frames_array(motion, size=128)[0].astype(int)]
     for side in (-1, 1):
-        rows, lifted = (np.nonzero((np.abs(image - SIDE_COLORS[side]) < 12).all(-1))[0] for image in images)
+        rows, lifted = (
+            np.nonzero((np.abs(image - SIDE_COLORS[side]) < 12).all(-1))[0] for image in images
+        )
         assert len(rows) > 30
         assert rows.mean() - lifted.mean() == pytest.approx(0.3 * 2.05 * 128 / 5, rel=0.2)
 
@@ -173,7 +210,9 @@ def test_contact_sheet_shows_first_to_last_pose_of_each_motion(tmp_path):
     assert sheet.shape[1:] == (3 * 96, 3)
     last = frames_array(motions[0], size=96)[-1]
     np.testing.assert_array_equal(sheet[24:96, -96:], last[24:])  # the time stands above
-    np.testing.assert_array_equal(sheet[sheet.shape[0] // 2 + 24 :][:60, :96], frames_array(motions[1], 96)[0][24:84])
+    np.testing.assert_array_equal(
+        sheet[sheet.shape[0] // 2 + 24 :][:60, :96], frames_array(motions[1], 96)[0][24:84]
+    )
 
 
 @pytest.mark.slow
@@ -191,12 +230,18 @@ def test_mp4_has_the_frames_of_the_motion_and_the_colors_of_the_gif(tmp_path):
 
     # it shows what a GIF shows, in its colors
     motions = [sway(8, text="walks"), sway(16)]
-    assert motions[0].save(tmp_path / "m.MP4").endswith("m.MP4: 8 frames at 20 per second, H.264 video")
+    assert (
+        motions[0]
+        .save(tmp_path / "m.MP4")
+        .endswith("m.MP4: 8 frames at 20 per second, H.264 video")
+    )
     assert (tmp_path / "m.MP4").read_bytes().startswith(b"\0\0\0\x20ftyp")
     write_gif(tmp_path / "m.gif", motions, size=128)
     write_mp4(tmp_path / "m.mp4", motions, size=128)
     with Image.open(tmp_path / "m.gif") as image:
-        shown = np.stack([np.asarray(frame.convert("RGB"), int) for frame in ImageSequence.Iterator(image)])
+        shown = np.stack(
+            [np.asarray(frame.convert("RGB"), int) for frame in ImageSequence.Iterator(image)]
+        )
     with av.open(str(tmp_path / "m.mp4")) as file:
         video = np.stack([frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)])
     assert len(video) == len(shown) == 16
@@ -208,7 +253,10 @@ def test_mp4_has_the_frames_of_the_motion_and_the_colors_of_the_gif(tmp_path):
 
 def test_mp4_without_its_package_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(UserError, match=r'm\.mp4: MP4 needs the package av\. Run pip install "flame-mdm\[video\]", or'):
+    with pytest.raises(
+        UserError,
+        match=r'm\.mp4: MP4 needs the package av\. Run pip install "flame-mdm\[video\]", or',
+    ):
         write_mp4(tmp_path / "m.mp4", [sway(2)])
     assert list(tmp_path.iterdir()) == []
 
@@ -220,7 +268,10 @@ def test_bad_motions_are_refused_by_name():
     for change, message in (
         ({"joints": joints}, "'m': joint 5 in frame 2 is not finite"),
         ({"joints": np.zeros((0, 22, 3))}, r"'m': joints have shape \(0, 22, 3\)"),
-        ({"joints": np.zeros((4, 24, 3))}, r"'m': joints have shape \(4, 24, 3\), smpl22 needs \(frames, 22, 3\)"),
+        (
+            {"joints": np.zeros((4, 24, 3))},
+            r"'m': joints have shape \(4, 24, 3\), smpl22 needs \(frames, 22, 3\)",
+        ),
         ({"fps": 0}, "'m': fps is 0"),
         ({"fps": float("nan")}, "'m': fps is nan"),
         ({"contacts": np.zeros((3, 4))}, r"contacts have shape \(3, 4\), expected \(4, 4\)"),

@@ -32,7 +32,10 @@ PLATFORMS = {
 """Names of Blender -> tags of wheels."""
 MODULES = (
     RUNNER,
-    *(Path(str(module.__file__)) for module in (skeleton, names, posture, rig, sys.modules[UserError.__module__])),
+    *(
+        Path(str(module.__file__))
+        for module in (skeleton, names, posture, rig, sys.modules[UserError.__module__])
+    ),
 )
 """Modules that the extension contains as they are here; they need numpy alone."""
 
@@ -50,7 +53,9 @@ def build(model: str, out: Path, target: str) -> None:
         UserError: If the platform is unknown, or pip finds no wheels for it.
     """
     if target not in PLATFORMS:
-        raise UserError(f"PLATFORM={target}: unknown.{did_you_mean(target, PLATFORMS)} Use {', '.join(PLATFORMS)}")
+        raise UserError(
+            f"PLATFORM={target}: unknown.{did_you_mean(target, PLATFORMS)} Use {', '.join(PLATFORMS)}"
+        )
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         fetch_wheels(folder / "wheels", target)
@@ -58,12 +63,20 @@ def build(model: str, out: Path, target: str) -> None:
         (folder / "model" / RUNNER.name).unlink()
         for path in (*MODULES, SOURCE / "__init__.py"):
             # inside Blender, the extension is not a package of its own name
-            code = re.sub(r"from flame_mdm\.(\w+\.)*(\w+) import", r"from .\2 import", path.read_text(encoding="utf-8"))
+            code = re.sub(
+                r"from flame_mdm\.(\w+\.)*(\w+) import",
+                r"from .\2 import",
+                path.read_text(encoding="utf-8"),
+            )
             write_text(folder / path.name, code)
         write_json(folder / "skeletons.json", known_skeletons(), indent=None)
-        wheels = ", ".join(f'"./wheels/{path.name}"' for path in sorted((folder / "wheels").iterdir()))
+        wheels = ", ".join(
+            f'"./wheels/{path.name}"' for path in sorted((folder / "wheels").iterdir())
+        )
         manifest = (SOURCE / "blender_manifest.toml").read_text(encoding="utf-8")
-        manifest += f'version = "{version("flame-mdm")}"\nplatforms = ["{target}"]\nwheels = [{wheels}]\n'
+        manifest += (
+            f'version = "{version("flame-mdm")}"\nplatforms = ["{target}"]\nwheels = [{wheels}]\n'
+        )
         write_text(folder / "blender_manifest.toml", manifest)
         with atomic_write(out) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as packed:
             for path in sorted(path for path in folder.rglob("*") if path.is_file()):
@@ -72,10 +85,28 @@ def build(model: str, out: Path, target: str) -> None:
 
 def fetch_wheels(folder: Path, target: str) -> None:
     """Downloads the wheels of onnxruntime, in the version that exported the model, and of what it requires."""
-    names = [re.split(r"[^\w-]", line)[0] for line in requires("onnxruntime") or [] if "extra ==" not in line]
-    pinned = [f"{name}=={version(name)}" for name in ("onnxruntime", *names) if name != "numpy"]  # Blender has numpy
-    command = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--only-binary=:all:", *pinned]
-    command += [f"--python-version={PYTHON}", f"--dest={folder}", *(f"--platform={tag}" for tag in PLATFORMS[target])]
+    names = [
+        re.split(r"[^\w-]", line)[0]
+        for line in requires("onnxruntime") or []
+        if "extra ==" not in line
+    ]
+    # Blender has numpy
+    pinned = [f"{name}=={version(name)}" for name in ("onnxruntime", *names) if name != "numpy"]
+    command = [
+        sys.executable,
+        "-m",
+        "pip",
+        "download",
+        "--quiet",
+        "--no-deps",
+        "--only-binary=:all:",
+        *pinned,
+    ]
+    command += [
+        f"--python-version={PYTHON}",
+        f"--dest={folder}",
+        *(f"--platform={tag}" for tag in PLATFORMS[target]),
+    ]
     done = subprocess.run(command, check=False, capture_output=True, text=True)
     if done.returncode:
         reason = (done.stderr.strip().splitlines() or ["no message"])[-1]

@@ -223,7 +223,8 @@ def curled(points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndar
     joints, turned = pose()
     wrist, axes = joints[JOINT["left_wrist"]], axes_of_hand(turned[JOINT["left_wrist"]])
     local = (points - wrist) @ axes.T
-    fingers = (np.linalg.norm(local, axis=1) < 0.25) & (local[:, 2] < 0.06)  # the thumb stays straight
+    # The thumb stays straight
+    fingers = (np.linalg.norm(local, axis=1) < 0.25) & (local[:, 2] < 0.06)
     beyond = np.where(fingers, np.maximum(local[:, 0] - KNUCKLES, 0), 0)
     angle = beyond / CURL
     bend = Rotation.from_rotvec(-angle[:, None] * [0, 0, 1]).as_matrix()
@@ -264,7 +265,9 @@ def head() -> Field:
         distance = union(skull(points), face(points), 0.03)
         distance = union(union(distance, brow(points), 0.014), cheek(points), 0.03)
         distance = -union(-distance, eye(points), 0.014)
-        distance = union(union(union(distance, nose(points), 0.014), lips(points), 0.010), chin(points), 0.025)
+        distance = union(
+            union(union(distance, nose(points), 0.014), lips(points), 0.010), chin(points), 0.025
+        )
         return union(distance, ear(points), 0.006)
 
     def haired(points: np.ndarray) -> np.ndarray:
@@ -276,7 +279,9 @@ def head() -> Field:
 def surface(parts: dict[str, Field], points: np.ndarray) -> np.ndarray:
     """Returns the signed distance of the whole body; points have x >= 0."""
     mirrored = points * [-1, 1, 1]
-    leg = union(union(parts["thigh"](points), parts["calf"](points), 0.02), parts["foot"](points), 0.03)
+    leg = union(
+        union(parts["thigh"](points), parts["calf"](points), 0.02), parts["foot"](points), 0.03
+    )
     seat = union(parts["torso"](points), parts["buttock"](points), 0.05)
     body = union(seat, parts["breast"](points), 0.04)
     body = union(union(body, parts["blade"](points), 0.05), parts["trapezius"](points), 0.05)
@@ -289,7 +294,9 @@ def surface(parts: dict[str, Field], points: np.ndarray) -> np.ndarray:
 def gradient(distance: Field, points: np.ndarray) -> np.ndarray:
     """Returns the gradient (N, 3) of a distance by central differences."""
     steps = 1e-4 * np.eye(3)
-    return np.stack([distance(points + step) - distance(points - step) for step in steps], -1) / 2e-4
+    return (
+        np.stack([distance(points + step) - distance(points - step) for step in steps], -1) / 2e-4
+    )
 
 
 def magnified(points: np.ndarray, inverse: bool = False) -> np.ndarray:
@@ -297,13 +304,17 @@ def magnified(points: np.ndarray, inverse: bool = False) -> np.ndarray:
     joints, turned = pose()
     hand = joints[JOINT["left_wrist"]] + turned[JOINT["left_wrist"]] @ np.array([0.09, 0, 0])
     radii = np.linspace(0, 3, 6001)
-    for center, reach, growth in (((0, 0.67, 0.07), 0.13, 1.6), (hand, 0.12, 0.9))[:: -1 if inverse else 1]:
+    for center, reach, growth in (((0, 0.67, 0.07), 0.13, 1.6), (hand, 0.12, 0.9))[
+        :: -1 if inverse else 1
+    ]:
         slope = np.where(radii < reach, growth, np.where(radii < reach * (1 + 2 * growth), -0.5, 0))
         grown = radii + np.cumsum(slope) * radii[1]
         offset = points - np.array(center)
         distance = np.linalg.norm(offset, axis=1, keepdims=True)
         before, after = (grown, radii) if inverse else (radii, grown)
-        points = np.array(center) + offset * np.interp(distance, before, after) / np.maximum(distance, 1e-9)
+        points = np.array(center) + offset * np.interp(distance, before, after) / np.maximum(
+            distance, 1e-9
+        )
     return points
 
 
@@ -311,13 +322,19 @@ def triangulate(distance: Field) -> tuple[np.ndarray, np.ndarray]:
     """Returns vertices (V, 3) and outward-facing triangles (T, 3) of the left half; its border is at x = 0."""
     axes = [np.arange(low, high, CELL) for low, high in ((0, 0.76), (-1.01, 0.84), (-0.18, 0.22))]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
-    values = np.concatenate([distance(part.reshape(-1, 3)).reshape(part.shape[:3]) for part in np.split(grid, 8)])
+    values = np.concatenate(
+        [distance(part.reshape(-1, 3)).reshape(part.shape[:3]) for part in np.split(grid, 8)]
+    )
     points, triangles, _, _ = measure.marching_cubes(values, 0.0, spacing=(CELL,) * 3)
     points = points + [axis[0] for axis in axes]
     share = 1 - 2 * VERTICES / len(triangles)
-    order = np.array([1, 2, 0])  # the result depends on the order of axes; this one keeps the border closed
+    # The result depends on the order of axes; this one keeps the border closed
+    order = np.array([1, 2, 0])
     points, triangles = fast_simplification.simplify(
-        np.ascontiguousarray(magnified(points)[:, order], np.float32), triangles.astype(np.int32), share, agg=3
+        np.ascontiguousarray(magnified(points)[:, order], np.float32),
+        triangles.astype(np.int32),
+        share,
+        agg=3,
     )
     points = magnified(points[:, np.argsort(order)].astype(float), inverse=True)
     edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), 1)
@@ -334,7 +351,11 @@ def triangulate(distance: Field) -> tuple[np.ndarray, np.ndarray]:
         slope = gradient(distance, points)
         slope[border, 0] = 0
         points = points - (distance(points) / np.maximum((slope**2).sum(1), 0.2))[:, None] * slope
-    volume = np.einsum("ij,ij->i", points[triangles[:, 0]], np.cross(points[triangles[:, 1]], points[triangles[:, 2]]))
+    volume = np.einsum(
+        "ij,ij->i",
+        points[triangles[:, 0]],
+        np.cross(points[triangles[:, 1]], points[triangles[:, 2]]),
+    )
     return points, triangles if volume.sum() > 0 else triangles[:, ::-1]
 
 
@@ -351,7 +372,9 @@ def skin(points: np.ndarray, parts: dict[str, Field]) -> np.ndarray:
         return turned[JOINT[name]] @ np.array(local, float)
 
     x, y = points[:, 0], points[:, 1]
-    arm = np.minimum(np.minimum(parts["arm"](points), parts["forearm"](points)), parts["hand"](points))
+    arm = np.minimum(
+        np.minimum(parts["arm"](points), parts["forearm"](points)), parts["hand"](points)
+    )
     on_arm = smooth(-0.045, 0.015, parts["torso"](points) - arm) * (x > 0.08)
     bend = along("left_shoulder", (1, 0, 0)) + along("left_collar", (0.8, 0.3, 0))
     half_elbow = along("left_elbow", (1, 0, 0)) + along("left_shoulder", (1, 0, 0))
@@ -359,13 +382,17 @@ def skin(points: np.ndarray, parts: dict[str, Field]) -> np.ndarray:
     throat = smooth(0.52, 0.57, y)
     share = {
         "left_hip": leg * beyond("left_hip", (0.42, -0.9, 0), 0.075),
-        "right_hip": (y < 0.1) * smooth(-0.05, 0.05, -x) * beyond("right_hip", (-0.42, -0.9, 0), 0.075),
+        "right_hip": (y < 0.1)
+        * smooth(-0.05, 0.05, -x)
+        * beyond("right_hip", (-0.42, -0.9, 0), 0.075),
         "spine1": beyond("spine1", (0, 1, 0), 0.08),
         "spine2": beyond("spine2", (0, 1, 0), 0.08),
         "spine3": beyond("spine3", (0, 1, 0), 0.06),
         "neck": beyond("neck", (0, 1, 0.3), 0.05) * (1 - smooth(0.06, 0.11, x) * (1 - throat)),
         "head": beyond("head", (0, 0.8, 0.6), 0.035),
-        "left_collar": beyond("left_collar", (1, 0.15, 0), 0.07) * smooth(0.30, 0.44, y - on_arm) * (1 - throat),
+        "left_collar": beyond("left_collar", (1, 0.15, 0), 0.07)
+        * smooth(0.30, 0.44, y - on_arm)
+        * (1 - throat),
         "left_shoulder": beyond("left_shoulder", bend, 0.07) * on_arm,
         "left_elbow": beyond("left_elbow", half_elbow, 0.05),
         "left_wrist": beyond("left_wrist", along("left_wrist", (1, 0, 0)), 0.03),
@@ -394,7 +421,9 @@ def skin(points: np.ndarray, parts: dict[str, Field]) -> np.ndarray:
 
 def descendants(joint: int) -> list[int]:
     """Returns a joint and all joints below it."""
-    return [joint] + [j for child, p in enumerate(SMPL22.parents) if p == joint for j in descendants(child)]
+    return [joint] + [
+        j for child, p in enumerate(SMPL22.parents) if p == joint for j in descendants(child)
+    ]
 
 
 def paint(points: np.ndarray) -> np.ndarray:
@@ -404,7 +433,11 @@ def paint(points: np.ndarray) -> np.ndarray:
     def mixed(below: np.ndarray, above: tuple[int, int, int], share: np.ndarray) -> np.ndarray:
         return below + share[:, None] * (np.array(above) - below)
 
-    elbow = (points - joints[JOINT["left_elbow"]]) @ turned[JOINT["left_shoulder"]] @ np.array([1.0, 0, 0])
+    elbow = (
+        (points - joints[JOINT["left_elbow"]])
+        @ turned[JOINT["left_shoulder"]]
+        @ np.array([1.0, 0, 0])
+    )
     hand = smooth(-0.115, -0.07, elbow) * (points[:, 0] > 0.2)
     color = mixed(np.tile(np.array(SHIRT, float), (len(points), 1)), SKIN, hand)
     neck = points[:, 1] - 0.535 + 0.28 * points[:, 2]
@@ -444,7 +477,8 @@ def make() -> dict[str, np.ndarray]:
     points, normals = curled(points, normals)
     normals = np.concatenate([normals, normals[beside] * flip])
     near = normals[triangles].sum(1)
-    np.add.at(normals, triangles.ravel(), np.repeat(near, 3, axis=0))  # folds are softer than the surface's gradient
+    # Folds are softer than the surface's gradient
+    np.add.at(normals, triangles.ravel(), np.repeat(near, 3, axis=0))
     return packed(
         np.concatenate([points, points[beside] * flip]),
         normals,

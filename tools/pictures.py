@@ -17,7 +17,11 @@ from flame_mdm.formats.readers import read
 from flame_mdm.visualize.render import contact_sheet
 
 ASSETS = Path(__file__).parent.parent / "docs" / "assets" / "options"
-WALK, STAND, WAVE = "a person walks forward", "a person stands still", "a person waves with the left hand"
+WALK, STAND, WAVE = (
+    "a person walks forward",
+    "a person stands still",
+    "a person waves with the left hand",
+)
 PATH = {"root": [{"time": 1, "position": [0.2, 0.6]}, {"time": 2.3, "position": [0.8, 1.4]}]}
 WRIST = {"joints": [{"time": 1.25, "joint": "right_wrist", "position": [None, 1.8, None]}]}
 SHOTS = {"page": "#stage", "examples": "#examples", "change": "#edit"}
@@ -34,16 +38,30 @@ def draw_motions() -> None:
         "root": WALK,
         "joints": STAND,
     }
-    keys = {"seed": {"seed": 1}, "seconds": {"seconds": 1.2}, "root": {"targets": PATH}, "joints": {"targets": WRIST}}
-    drawn = {n: flame_mdm.generate(model, text, **{"seconds": 2.5} | keys.get(n, {}))[0] for n, text in texts.items()}
+    keys = {
+        "seed": {"seed": 1},
+        "seconds": {"seconds": 1.2},
+        "root": {"targets": PATH},
+        "joints": {"targets": WRIST},
+    }
+    drawn = {
+        n: flame_mdm.generate(model, text, **{"seconds": 2.5} | keys.get(n, {}))[0]
+        for n, text in texts.items()
+    }
     for region in ("in_between", "prediction", "suffix", "interpolate"):
-        drawn[region] = flame_mdm.edit(model, drawn["text"], "a person jumps once", region=region)[0]
+        drawn[region] = flame_mdm.edit(model, drawn["text"], "a person jumps once", region=region)[
+            0
+        ]
     drawn["upper_body"] = flame_mdm.edit(model, drawn["text"], WAVE, joints="upper_body")[0]
-    drawn["strength"] = flame_mdm.edit(model, drawn["text"], "a person runs forward", strength=0.6)[0]
+    drawn["strength"] = flame_mdm.edit(model, drawn["text"], "a person runs forward", strength=0.6)[
+        0
+    ]
     with tempfile.TemporaryDirectory() as folder:
         for rig in ("mixamo", "unreal"):
             drawn["text"].save(f"{folder}/{rig}.bvh", rig=rig, rest_pose=True)
-            drawn[rig] = replace(read(f"{folder}/{rig}.bvh"), text=f"the rest pose of rig={rig}, and the motion")
+            drawn[rig] = replace(
+                read(f"{folder}/{rig}.bvh"), text=f"the rest pose of rig={rig}, and the motion"
+            )
     for name, motion in drawn.items():
         contact_sheet(ASSETS / f"{name}.png", [replace(motion, id="")], size=80)
 
@@ -53,16 +71,25 @@ def draw_demo() -> None:
     sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
     from support.browser import browser
 
-    threading.Thread(target=serve, args=(["quickstart"],), kwargs={"port": 7999}, daemon=True).start()
-    with tempfile.TemporaryDirectory() as folder, browser(Path(folder) / "profile", 1280, 1500) as tab:
-        tab.wait("fetch('http://127.0.0.1:7999', { mode: 'no-cors' }).then(() => true, () => false)", 60)
+    threading.Thread(
+        target=serve, args=(["quickstart"],), kwargs={"port": 7999}, daemon=True
+    ).start()
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        browser(Path(folder) / "profile", 1280, 1500) as tab,
+    ):
+        tab.wait(
+            "fetch('http://127.0.0.1:7999', { mode: 'no-cors' }).then(() => true, () => false)", 60
+        )
         tab.open(f"http://127.0.0.1:7999/?text={WALK}&path=0,1+0.5,2")
         tab.wait("!!document.querySelector('#files a')", 60)
         time.sleep(3)  # the player draws
         for name, part in SHOTS.items():
             box = tab.run(f"document.querySelector('{part}').getBoundingClientRect().toJSON()")
             clip = {key: box[key] for key in ("x", "y", "width", "height")} | {"scale": 0.6}
-            picture = io.BytesIO(base64.b64decode(tab.send("Page.captureScreenshot", clip=clip)["data"]))
+            picture = io.BytesIO(
+                base64.b64decode(tab.send("Page.captureScreenshot", clip=clip)["data"])
+            )
             Image.open(picture).quantize(128).save(ASSETS / f"demo-{name}.png", optimize=True)
 
 

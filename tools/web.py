@@ -39,7 +39,9 @@ RUNTIME, INTEGRITY = (
 )
 """Package of npm and the SHA-512 of its archive."""
 RUNTIME_FILES = ("ort.wasm.min.mjs", "ort-wasm-simd-threaded.mjs", "ort-wasm-simd-threaded.wasm")
-POLICY = "default-src 'none'; script-src 'self'; style-src 'self'; base-uri 'none'; form-action 'none'"
+POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; base-uri 'none'; form-action 'none'"
+)
 
 
 def build(model: str, out: Path) -> None:
@@ -54,7 +56,9 @@ def build(model: str, out: Path) -> None:
     example = flame_mdm.generate(loaded, loaded.facts["captions"][0])[0]
     example.save(out / "template.glb")
     page = player_page([example], "")
-    style, code = (re.findall(rf"<{tag}>\n(.*?)</{tag}>", page, re.DOTALL)[0] for tag in ("style", "script"))
+    style, code = (
+        re.findall(rf"<{tag}>\n(.*?)</{tag}>", page, re.DOTALL)[0] for tag in ("style", "script")
+    )
     data = re.findall(r'<script type="application/json" id="data">(.*?)</script>', page)[0]
     page = page.replace(style, "").replace(code, "").replace(data, "__DATA__")
     page = page.replace("<style>\n</style>", '<link rel="stylesheet" href="player.css">')
@@ -76,7 +80,9 @@ def figure(example: Motion) -> dict[str, Any]:
         above, below = (joint, child) if of_wrist else (SMPL22.parents[joint], joint)
         axis = (offsets[child] / np.linalg.norm(offsets[child])).tolist()
         share = share if of_wrist else share - 1
-        helpers.append({"joint": joint, "above": above, "below": below, "share": share, "axis": axis})
+        helpers.append(
+            {"joint": joint, "above": above, "below": below, "share": share, "axis": axis}
+        )
     return {
         **{"names": names, "parents": SMPL22.parents, "helpers": helpers, "toes": TOES},
         "feet": [JOINT["left_foot"], JOINT["right_foot"]],
@@ -104,14 +110,18 @@ def fetch_runtime(folder: Path) -> None:
             raise UserError(f"npm cannot fetch {RUNTIME}. Is the registry reachable?")
         (archive,) = Path(temporary).iterdir()
         if base64.b64encode(hashlib.sha512(archive.read_bytes()).digest()).decode() != INTEGRITY:
-            raise UserError(f"{RUNTIME}: the archive of npm is not the pinned one (its SHA-512 differs)")
+            raise UserError(
+                f"{RUNTIME}: the archive of npm is not the pinned one (its SHA-512 differs)"
+            )
         folder.mkdir(exist_ok=True)
         with tarfile.open(archive) as packed:
             for name in RUNTIME_FILES:
                 member = packed.extractfile(f"package/dist/{name}")
                 assert member is not None
                 (folder / name).write_bytes(member.read())
-    write_text(folder / "LICENSE.txt", f"{RUNTIME}, Copyright (c) Microsoft Corporation, MIT license\n")
+    write_text(
+        folder / "LICENSE.txt", f"{RUNTIME}, Copyright (c) Microsoft Corporation, MIT license\n"
+    )
 
 
 if __name__ == "__main__":

@@ -59,23 +59,37 @@ def main(out: Path) -> None:
     words = listed(model)
     vectors = reduced(encoded(model, words))
     quantized = np.rint(127 * vectors / np.abs(vectors).max(1, keepdims=True)).astype(np.int8)
-    with atomic_write(out) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as file:
+    with (
+        atomic_write(out) as temporary,
+        zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as file,
+    ):
         text = np.frombuffer("\n".join(words).encode(), np.uint8)
         for name, array in {"words": text, "vectors": quantized}.items():
             buffer = io.BytesIO()
             np.save(buffer, array)
             # a fixed time, so that the same words and model give the same bytes
             file.writestr(
-                zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0)), buffer.getvalue(), zipfile.ZIP_DEFLATED
+                zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0)),
+                buffer.getvalue(),
+                zipfile.ZIP_DEFLATED,
             )
-    print(f"{out}: {len(words)} words, {vectors.shape[1]} numbers each, {out.stat().st_size / 1e6:.2f} MB")
+    print(
+        f"{out}: {len(words)} words, {vectors.shape[1]} numbers each, {out.stat().st_size / 1e6:.2f} MB"
+    )
 
 
 def listed(model: Pretrained) -> list[str]:
     """Returns the words of the table: frequent ones by frequency, then words for motion and things."""
     ranks = model.tokenizer.get_vocab()
-    frequent = sorted((word for word in ranks if WORD.fullmatch(word)), key=ranks.__getitem__)[:FREQUENT]
-    tables = words_of("objects") | words_of("people") | words_of("body") | frozenset(phrases()["numbers"])
+    frequent = sorted((word for word in ranks if WORD.fullmatch(word)), key=ranks.__getitem__)[
+        :FREQUENT
+    ]
+    tables = (
+        words_of("objects")
+        | words_of("people")
+        | words_of("body")
+        | frozenset(phrases()["numbers"])
+    )
     added = {word for word in (*MOTION.split(), *tables, *action_words()) if WORD.fullmatch(word)}
     return [*frequent, *sorted(added - set(frequent))]
 

@@ -34,7 +34,8 @@ from flame_mdm.seeds import key
 class Extractor(ABC):
     """A network that computes features of motions, and of texts if it supports them."""
 
-    sha256: str  # of its weights or files. Values of extractors with different hashes are not comparable.
+    # Of its weights or files. Values of extractors with different hashes are not comparable.
+    sha256: str
     fingerprint: str | None = None  # of the data it was trained on, if known
 
     @abstractmethod
@@ -48,7 +49,9 @@ class Extractor(ABC):
         Motions are `features` (B, F, D) in the data's units, and joints (B, F, J, 3) in meters, y up, with mask (B, F).
         """
 
-    def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor | None:
+    def texts(
+        self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]
+    ) -> Tensor | None:
         """Returns features (B, E) of captions with "word/PART" tokens, if known; None if it does not read text."""
         return None
 
@@ -132,11 +135,16 @@ class OwnT2MExtractor(OwnExtractor[T2MTask]):
     def reads(self, other: Representation) -> bool:
         """Returns whether the network reads motions in a representation, also if it sees only their common part."""
         own = self.task.representation
-        part = (other.part_of, other.fps) == (own.name, own.fps) and self.task.network.used <= other.features
+        part = (other.part_of, other.fps) == (
+            own.name,
+            own.fps,
+        ) and self.task.network.used <= other.features
         return part or super().reads(other)
 
     def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
-        return self.task.text(list(map(words, captions)) if self.task.learns_words else _tagged(self.path, tokens))
+        return self.task.text(
+            list(map(words, captions)) if self.task.learns_words else _tagged(self.path, tokens)
+        )
 
 
 class OwnClassifierExtractor(OwnExtractor[ClassifierTask]):
@@ -145,13 +153,18 @@ class OwnClassifierExtractor(OwnExtractor[ClassifierTask]):
     trained, recipes = ClassifierTask, "classifier"
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
-        return {"features": self.task(joints, mask), "logits": self.task.network.logits(joints, mask)}
+        return {
+            "features": self.task(joints, mask),
+            "logits": self.task.network.logits(joints, mask),
+        }
 
 
 def _tagged(path: Path, tokens: Sequence[Sequence[str] | None]) -> list[Sequence[str]]:
     tagged = [words for words in tokens if words is not None]
     if len(tagged) < len(tokens):
-        raise UserError(f"extractor {path}: needs tagged words, but the data set has captions without them")
+        raise UserError(
+            f"extractor {path}: needs tagged words, but the data set has captions without them"
+        )
     return tagged
 
 
@@ -168,12 +181,18 @@ class ReleasedExtractor(Extractor, Generic[Network]):
         files = [self.path / name for name in self.FILES] or [self.path]
         missing = [str(file) for file in files if not file.is_file()]
         if missing:
-            raise FileNotFoundError(f"{', '.join(missing)}: no such file. Give the path of what the authors released")
+            raise FileNotFoundError(
+                f"{', '.join(missing)}: no such file. Give the path of what the authors released"
+            )
         hashes = [sha256(file) for file in files]
-        self.sha256 = hashes[0] if len(hashes) == 1 else hashlib.sha256("".join(hashes).encode()).hexdigest()
+        self.sha256 = (
+            hashes[0] if len(hashes) == 1 else hashlib.sha256("".join(hashes).encode()).hexdigest()
+        )
 
     def check(self, representation: Representation, dataset: str) -> None:
-        names = {representation.name} | ({representation.part_of} if self.used <= representation.features else set())
+        names = {representation.name} | (
+            {representation.part_of} if self.used <= representation.features else set()
+        )
         if self.made_for[0] not in names or dataset != self.made_for[1]:
             raise UserError(
                 f"extractor {self.path}: made for {' of '.join(self.made_for)}, but the motions are "
@@ -196,13 +215,21 @@ class T2MExtractor(ReleasedExtractor[T2MEvaluator]):
     def __init__(self, path: str, device: str | torch.device = "cpu", *, full_length: bool = False):
         super().__init__(path)
         self.network = load_t2m(self.path).to(device)
-        self.words, self.full_length, self.used = WordVectors.read(self.path), full_length, self.network.used
+        self.words, self.full_length, self.used = (
+            WordVectors.read(self.path),
+            full_length,
+            self.network.used,
+        )
         human, kit = ("humanml-legacy-smpl22", "humanml3d"), ("humanml-legacy-kit21", "kit")
         made_for = {263: human, 67: human, 251: kit, 64: kit}
-        self.made_for = made_for.get(len(self.network.mean), ("unknown features", "an unknown data set"))
+        self.made_for = made_for.get(
+            len(self.network.mean), ("unknown features", "an unknown data set")
+        )
 
     def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
-        return self.network.text(self.words(_tagged(self.path, tokens), full_length=self.full_length))
+        return self.network.text(
+            self.words(_tagged(self.path, tokens), full_length=self.full_length)
+        )
 
 
 class MARDMClipExtractor(ReleasedExtractor[MARDMClip]):
@@ -217,7 +244,9 @@ class MARDMClipExtractor(ReleasedExtractor[MARDMClip]):
     def __init__(self, path: str, device: str | torch.device = "cpu"):
         super().__init__(path)
         network, weights = MARDMClip(*read_statistics(self.path)), self.path / self.FILES[0]
-        self.network = load_strictly(network, read_weights(weights, "contrast_model"), weights).to(device)
+        self.network = load_strictly(network, read_weights(weights, "contrast_model"), weights).to(
+            device
+        )
 
     def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
         return self.network.text(clip_tokens(captions).to(self.network.mean.device))
@@ -240,11 +269,20 @@ class ClassifierExtractor(ReleasedExtractor[ActionGRU | UESTC | Unconstrained]):
     drawn from a normal distribution, separately for features and scores; here, as a function of the motion.
     """
 
-    def __init__(self, kind: str, path: str, device: str | torch.device = "cpu", *, random_start: bool = False):
+    def __init__(
+        self,
+        kind: str,
+        path: str,
+        device: str | torch.device = "cpu",
+        *,
+        random_start: bool = False,
+    ):
         super().__init__(path)
         network, weights_key, dataset = CLASSIFIERS[kind]
         weights = self.path / self.FILES[0] if self.FILES else self.path
-        self.network = load_strictly(network(), read_weights(weights, weights_key), weights).to(device)
+        self.network = load_strictly(network(), read_weights(weights, weights_key), weights).to(
+            device
+        )
         self.made_for, self.random_start = ("rot6d-25", dataset), random_start
         if random_start and network is not ActionGRU:
             raise UserError(f"random_start: the classifier {kind} is not recurrent")
@@ -255,9 +293,18 @@ class ClassifierExtractor(ReleasedExtractor[ActionGRU | UESTC | Unconstrained]):
         if not (self.random_start and isinstance(network, ActionGRU)):
             return {"features": network(x, mask), "logits": network.logits(x, mask)}
         pairs = zip(x, mask, strict=True)
-        names = [hashlib.sha256(motion[real].cpu().numpy().tobytes()).hexdigest() for motion, real in pairs]
-        start = {use: network.random_state([key(use, name) for name in names]) for use in ("features", "logits")}
-        return {"features": network(x, mask, start["features"]), "logits": network.logits(x, mask, start["logits"])}
+        names = [
+            hashlib.sha256(motion[real].cpu().numpy().tobytes()).hexdigest()
+            for motion, real in pairs
+        ]
+        start = {
+            use: network.random_state([key(use, name) for name in names])
+            for use in ("features", "logits")
+        }
+        return {
+            "features": network(x, mask, start["features"]),
+            "logits": network.logits(x, mask, start["logits"]),
+        }
 
 
 class UnconstrainedExtractor(ClassifierExtractor):

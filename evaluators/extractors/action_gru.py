@@ -18,7 +18,14 @@ class ActionGRU(nn.Module):
 
     features = 30
 
-    def __init__(self, num_joints: int = 24, hidden: int = 128, num_layers: int = 2, *, num_actions: int = NUM_ACTIONS):
+    def __init__(
+        self,
+        num_joints: int = 24,
+        hidden: int = 128,
+        num_layers: int = 2,
+        *,
+        num_actions: int = NUM_ACTIONS,
+    ):
         super().__init__()
         self.recurrent = nn.GRU(3 * num_joints, hidden, num_layers, batch_first=True)
         self.linear1 = nn.Linear(hidden, self.features)
@@ -42,5 +49,7 @@ class ActionGRU(nn.Module):
     def random_state(self, seeds: Sequence[int]) -> Tensor:
         """Draws initial states (layers, B, hidden) from a standard normal distribution, as the authors do."""
         shape = (self.recurrent.num_layers, 1, self.recurrent.hidden_size)
-        states = [torch.randn(shape, generator=torch.Generator().manual_seed(seed)) for seed in seeds]
+        states = [
+            torch.randn(shape, generator=torch.Generator().manual_seed(seed)) for seed in seeds
+        ]
         return torch.cat(states, 1).to(self.linear1.weight)

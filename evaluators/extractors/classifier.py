@@ -28,14 +28,20 @@ class ClassifierTask(ExtractorTask[ActionGRU | JointSTGCN]):
     noun = "an action classifier"
 
     @classmethod
-    def parts(cls, config: Config, representation: Representation, actions: Sequence[str]) -> dict[str, Any]:
+    def parts(
+        cls, config: Config, representation: Representation, actions: Sequence[str]
+    ) -> dict[str, Any]:
         if len(actions) < 2:
-            raise UserError(f"a classifier needs a data set with at least two actions, but this one has {len(actions)}")
+            raise UserError(
+                f"a classifier needs a data set with at least two actions, but this one has {len(actions)}"
+            )
         parents = representation.skeleton.parents
         sizes = {"num_joints": len(parents), "parents": parents, "num_actions": len(actions)}
         settings = config["task"]["network"]
         legal = parameters(settings["_target_"])
-        network = instantiate(settings, **{name: value for name, value in sizes.items() if name in legal})
+        network = instantiate(
+            settings, **{name: value for name, value in sizes.items() if name in legal}
+        )
         return {"network": network, "condition": Unconditional()}
 
     def metrics(self) -> dict[str, Metric]:

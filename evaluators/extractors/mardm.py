@@ -60,7 +60,9 @@ class MARDMClip(nn.Module):
         super().__init__()
         self.register_buffer("mean", mean.float(), persistent=False)
         self.register_buffer("std", std.float(), persistent=False)
-        self.motion_encoder = _MotionEncoder(len(mean), width, _transformer(width, heads, hidden, layers))
+        self.motion_encoder = _MotionEncoder(
+            len(mean), width, _transformer(width, heads, hidden, layers)
+        )
         self.token_embedding = nn.Embedding(words, width)
         self.positional_embedding = nn.Parameter(torch.zeros(slots, width))
         self.textTransEncoder = _transformer(width, heads, hidden, layers)
@@ -74,12 +76,16 @@ class MARDMClip(nn.Module):
 
     def text(self, tokens: Tensor) -> Tensor:
         """Returns vectors (B, 512) of captions, given as CLIP's tokens (B, S), 0 after the end."""
-        hidden = self.text_ln(self.textTransEncoder(self.token_embedding(tokens) + self.positional_embedding))
+        hidden = self.text_ln(
+            self.textTransEncoder(self.token_embedding(tokens) + self.positional_embedding)
+        )
         return F.normalize(self.out(hidden[torch.arange(len(tokens)), tokens.argmax(1)]), dim=-1)
 
 
 def clip_tokens(captions: Sequence[str]) -> Tensor:
     """Returns CLIP's tokens (B, 77) of captions, 0 after the end; longer captions are cut."""
     tokenizer = Pretrained(*CLIP, None, None).tokenizer
-    encoded = tokenizer(list(captions), padding="max_length", truncation=True, max_length=77, return_tensors="pt")
+    encoded = tokenizer(
+        list(captions), padding="max_length", truncation=True, max_length=77, return_tensors="pt"
+    )
     return encoded["input_ids"] * encoded["attention_mask"]

@@ -17,7 +17,13 @@ from evaluators.extractors.training import ExtractorTask
 from evaluators.metrics.alignment import MotionsForText, TextsForMotion
 from evaluators.metrics.samples import SampleMetric
 from flame_mdm.batch import MotionBatch
-from flame_mdm.checkpoints.released_weights import ENCODER_LAYER, layer_names, load_strictly, renamed, shape_of
+from flame_mdm.checkpoints.released_weights import (
+    ENCODER_LAYER,
+    layer_names,
+    load_strictly,
+    renamed,
+    shape_of,
+)
 from flame_mdm.conditions import ConditionEncoder
 from flame_mdm.config import Config, instantiate
 from flame_mdm.denoisers.flame import cosine_first_sinusoid
@@ -72,14 +78,18 @@ class MotionCLIP(nn.Module):
         lengths = mask.sum(1)
         if x.shape[1] > self.max_frames and lengths.max() > self.max_frames:
             longest = int(lengths.max())
-            raise UserError(f"a motion has {longest} frames, but this motion-CLIP takes at most {self.max_frames}")
+            raise UserError(
+                f"a motion has {longest} frames, but this motion-CLIP takes at most {self.max_frames}"
+            )
         x = F.pad(x[..., self.blind_features :], (self.blind_features, 0))
         if self.roughness:
             x = torch.cat([x, F.pad(x.diff(n=2, dim=1).abs(), (0, 0, 2, 0))[:, : x.shape[1]]], -1)
         x = self.input(x)
         length = self.length_embedding(lengths % self.max_frames)
         x = torch.cat([self.cls.expand(len(x), 1, -1), length[:, None], x], 1)
-        x = x + cosine_first_sinusoid(torch.arange(x.shape[1], device=x.device), x.shape[-1]).to(x.dtype)
+        x = x + cosine_first_sinusoid(torch.arange(x.shape[1], device=x.device), x.shape[-1]).to(
+            x.dtype
+        )
         return self.output(self.transformer(x, with_prefix(mask, 2))[:, 0])
 
     def text(self, pooled: Tensor) -> Tensor:
@@ -88,7 +98,11 @@ class MotionCLIP(nn.Module):
 
 
 def info_nce(
-    motion: Tensor, text: Tensor, logit_scale: Tensor, meaning: Tensor | None = None, wrong_text: Tensor | None = None
+    motion: Tensor,
+    text: Tensor,
+    logit_scale: Tensor,
+    meaning: Tensor | None = None,
+    wrong_text: Tensor | None = None,
 ) -> Tensor:
     """Contrastive loss over the pairs of all processes: the mean of both cross-entropies.
 
@@ -111,9 +125,14 @@ def info_nce(
     if meaning is not None:
         same = (meaning[:, None] == _of_all_processes(meaning)).any(-1)
         same[torch.arange(len(own)), own] = False
-        of_motion, of_text = of_motion.masked_fill(same, -torch.inf), of_text.masked_fill(same, -torch.inf)
+        of_motion, of_text = (
+            of_motion.masked_fill(same, -torch.inf),
+            of_text.masked_fill(same, -torch.inf),
+        )
     if wrong_text is not None:
-        of_motion = torch.cat([of_motion, scale * (F.normalize(wrong_text, dim=-1) @ motion[..., None])[..., 0]], 1)
+        of_motion = torch.cat(
+            [of_motion, scale * (F.normalize(wrong_text, dim=-1) @ motion[..., None])[..., 0]], 1
+        )
     return (F.cross_entropy(of_motion, own) + F.cross_entropy(of_text, own)) / 2
 
 
@@ -147,13 +166,19 @@ class MotionCLIPTask(ExtractorTask[MotionCLIP]):
     noun = "a motion-CLIP"
 
     @classmethod
-    def parts(cls, config: Config, representation: Representation, actions: Sequence[str]) -> dict[str, Any]:
+    def parts(
+        cls, config: Config, representation: Representation, actions: Sequence[str]
+    ) -> dict[str, Any]:
         condition: ConditionEncoder = instantiate(config["condition"])
         widths = {"in_features": representation.features, "text_features": condition.features}
         return {"condition": condition, "network": instantiate(config["task"]["network"], **widths)}
 
     def metrics(self) -> dict[str, Metric]:
-        return {"loss": PooledLoss(), "texts_for_motion": TextsForMotion(), "motions_for_text": MotionsForText()}
+        return {
+            "loss": PooledLoss(),
+            "texts_for_motion": TextsForMotion(),
+            "motions_for_text": MotionsForText(),
+        }
 
     @classmethod
     def import_released(cls, state: Mapping[str, Tensor], config: Config) -> Self:
@@ -165,7 +190,11 @@ class MotionCLIPTask(ExtractorTask[MotionCLIP]):
         representation: Representation = instantiate(config["representation"])
         task = cls.build(config, representation)
         theirs = "text_model.pooler.dense."
-        pooler = {f"pooler_{name.removeprefix(theirs)}": state[name] for name in state if name.startswith(theirs)}
+        pooler = {
+            f"pooler_{name.removeprefix(theirs)}": state[name]
+            for name in state
+            if name.startswith(theirs)
+        }
         load_strictly(task.condition, pooler, "released motion-CLIP")
         load_strictly(task.network, our_names(state), "released motion-CLIP")
         task.facts |= {"fingerprint": None, "max_frames": task.network.max_frames}
@@ -181,7 +210,8 @@ class MotionCLIPTask(ExtractorTask[MotionCLIP]):
 
     def text_features(self, batch: MotionBatch) -> Tensor:
         cond = self.condition(batch)
-        if cond.null is not None:  # gives a learned null, which is not used here, a gradient, as DDP requires
+        # Gives a learned null, which is not used here, a gradient, as DDP requires
+        if cond.null is not None:
             cond = cond.drop(torch.zeros(len(cond.pooled), dtype=torch.bool, device=self.device))
         return self.network.text(cond.pooled)
 
@@ -196,7 +226,9 @@ class MotionCLIPTask(ExtractorTask[MotionCLIP]):
     def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:
         motion = F.normalize(self.network(batch.x, batch.mask), dim=-1)
         text = F.normalize(self.text_features(batch), dim=-1)
-        self.update_samples(batch, generated=motion, text=text, scale=self.network.logit_scale.exp())
+        self.update_samples(
+            batch, generated=motion, text=text, scale=self.network.logit_scale.exp()
+        )
 
 
 _MCLIP = {

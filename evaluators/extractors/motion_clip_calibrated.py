@@ -22,10 +22,14 @@ from flame_mdm.representations.humanml import HumanML
 from flame_mdm.seeds import key
 
 NEAR_MISSES = 2  # Near-miss captions per motion and step, of different attributes if possible
-JITTER = 0.02  # standard deviation of joint positions, in meters, at which the strength of noise is 1
-FEATURE_NOISE = 0.3  # standard deviation of normalized features at which it is 1: joints err by about 20 mm, too
+JITTER = (
+    0.02  # standard deviation of joint positions, in meters, at which the strength of noise is 1
+)
+# Standard deviation of normalized features at which it is 1: joints err by about 20 mm, too
+FEATURE_NOISE = 0.3
 WEIGHT = 5.0  # weight of `calibration_error`, compared with `info_nce`
-LENGTH = 10.0  # of all features: the FID of noise of strength s, which moves all motions alike, is about (10 s)^2
+# Of all features: the FID of noise of strength s, which moves all motions alike, is about (10 s)^2
+LENGTH = 10.0
 
 
 class CalibratedMotionCLIPTask(MotionCLIPTask):
@@ -45,7 +49,9 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
     near_misses: dict[str, list[list[str]]]
 
     @classmethod
-    def parts(cls, config: Config, representation: Representation, actions: Sequence[str]) -> dict[str, Any]:
+    def parts(
+        cls, config: Config, representation: Representation, actions: Sequence[str]
+    ) -> dict[str, Any]:
         if not isinstance(representation, HumanML):
             raise UserError(
                 f"representation={representation.name}: {cls.__name__} adds noise to joints and encodes them again. "
@@ -65,13 +71,20 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
         self.meanings, self.near_misses = {}, {}
         for clip, texts in zip(clips, near_misses(clips), strict=True):
             attributes = json.dumps(clip.attributes if "action" in clip.attributes else clip.id)
-            self.meanings[clip.id] = [key("captions", *sorted(clip.captions)), key("attributes", attributes)]
+            self.meanings[clip.id] = [
+                key("captions", *sorted(clip.captions)),
+                key("attributes", attributes),
+            ]
             self.near_misses[clip.id] = list(texts.values())
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
         self.seed_step(batch_idx)
         assert batch.text is not None
-        wrong = [self.near_miss(name, number, batch_idx) for name in batch.ids for number in range(NEAR_MISSES)]
+        wrong = [
+            self.near_miss(name, number, batch_idx)
+            for name in batch.ids
+            for number in range(NEAR_MISSES)
+        ]
         texts = self.text_features(replace(batch, text=batch.text + wrong))
         text, wrong_text = texts.tensor_split([len(batch)])
         pairs = zip(batch.ids, batch.text, strict=True)
@@ -80,14 +93,26 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
         chosen = torch.randperm(len(batch))[: (len(batch) + 1) // 2].to(self.device)
         strength = torch.rand(len(chosen)) ** 2
         copies = noisy_copies(self.representation, batch.x[chosen], batch.lengths[chosen], strength)
-        motion = self.network(torch.cat([batch.x, copies]), torch.cat([batch.mask, batch.mask[chosen]]))
+        motion = self.network(
+            torch.cat([batch.x, copies]), torch.cat([batch.mask, batch.mask[chosen]])
+        )
         motion, copy = motion.tensor_split([len(batch)])
-        alike, wrong_text = torch.tensor(meaning, device=self.device), wrong_text.unflatten(0, (-1, NEAR_MISSES))
+        alike, wrong_text = (
+            torch.tensor(meaning, device=self.device),
+            wrong_text.unflatten(0, (-1, NEAR_MISSES)),
+        )
         contrast = info_nce(motion, text, self.network.logit_scale, alike, wrong_text)
         error = calibration_error(motion[chosen], copy, strength.to(self.device))
         loss, temperature = contrast + WEIGHT * error, (-self.network.logit_scale).exp()
-        values = {"loss": loss, "contrast": contrast, "calibration_error": error, "temperature": temperature}
-        self.log_dict({f"train/{name}": value for name, value in values.items()}, batch_size=len(batch))
+        values = {
+            "loss": loss,
+            "contrast": contrast,
+            "calibration_error": error,
+            "temperature": temperature,
+        }
+        self.log_dict(
+            {f"train/{name}": value for name, value in values.items()}, batch_size=len(batch)
+        )
         return loss
 
     def near_miss(self, name: str, number: int, step: int) -> str:
@@ -100,7 +125,9 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
 
 def calibration_error(motion: Tensor, copy: Tensor, strength: Tensor) -> Tensor:
     """Returns the mean absolute error of the distances of features (B, E), scaled to length 1, from `strength` (B,)."""
-    distance = torch.linalg.vector_norm(F.normalize(motion, dim=-1) - F.normalize(copy, dim=-1), dim=-1)
+    distance = torch.linalg.vector_norm(
+        F.normalize(motion, dim=-1) - F.normalize(copy, dim=-1), dim=-1
+    )
     return (distance - strength).abs().mean()
 
 
@@ -115,7 +142,9 @@ def noisy_copies(representation: HumanML, x: Tensor, lengths: Tensor, strength: 
         (motion[:length] + JITTER * amount * torch.randn(length, *motion.shape[1:])).numpy()
         for motion, length, amount in zip(joints, frames, strength, strict=False)
     ]
-    encoded = (torch.from_numpy(features).to(x.device) for features in encode(representation, noisy))
+    encoded = (
+        torch.from_numpy(features).to(x.device) for features in encode(representation, noisy)
+    )
     copies = [representation.normalize(features) for features in encoded]
     for motion, length, amount in zip(x[half:], frames[half:], strength[half:], strict=True):
         noise = FEATURE_NOISE * amount * torch.randn(length, x.shape[2])

@@ -43,7 +43,12 @@ class STGCN(nn.Module):
     """
 
     def __init__(
-        self, parents: Sequence[int], num_actions: int, widths: Sequence[int], strides: Sequence[int], channels: int = 3
+        self,
+        parents: Sequence[int],
+        num_actions: int,
+        widths: Sequence[int],
+        strides: Sequence[int],
+        channels: int = 3,
     ):
         super().__init__()
         self.register_buffer("A", adjacency(parents))
@@ -51,8 +56,12 @@ class STGCN(nn.Module):
         self.data_bn = nn.BatchNorm1d(channels * len(parents))
         self.st_gcn_networks = nn.ModuleList()
         for before, width, stride in zip([channels, *widths[:-1]], widths, strides, strict=True):
-            self.st_gcn_networks.append(_Block(before, width, len(self.A), stride, len(self.st_gcn_networks) > 0))
-        self.edge_importance = nn.ParameterList([nn.Parameter(torch.ones_like(self.A)) for _ in widths])
+            self.st_gcn_networks.append(
+                _Block(before, width, len(self.A), stride, len(self.st_gcn_networks) > 0)
+            )
+        self.edge_importance = nn.ParameterList(
+            [nn.Parameter(torch.ones_like(self.A)) for _ in widths]
+        )
         self.fcn = nn.Conv2d(widths[-1], num_actions, 1)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
@@ -75,7 +84,9 @@ class _Block(nn.Module):
         super().__init__()
         self.stride = stride
         self.gcn = nn.ModuleDict({"conv": nn.Conv2d(in_channels, width * partitions, 1)})
-        over_time = nn.Conv2d(width, width, (TEMPORAL_KERNEL, 1), (stride, 1), (TEMPORAL_KERNEL // 2, 0))
+        over_time = nn.Conv2d(
+            width, width, (TEMPORAL_KERNEL, 1), (stride, 1), (TEMPORAL_KERNEL // 2, 0)
+        )
         self.tcn = nn.Sequential(nn.BatchNorm2d(width), nn.ReLU(), over_time, nn.BatchNorm2d(width))
         self.residual: nn.Module | None = None
         if residual:
@@ -111,7 +122,9 @@ class Unconstrained(STGCN):
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
         """Returns features (B, 256) of joints (B, F, 24, 3) in meters, y up; the network sees them with y down."""
-        return self.published(x[:, :, list(UNCONSTRAINED_JOINTS)] * x.new_tensor([1.0, -1.0, -1.0]), mask)
+        return self.published(
+            x[:, :, list(UNCONSTRAINED_JOINTS)] * x.new_tensor([1.0, -1.0, -1.0]), mask
+        )
 
     def published(self, x: Tensor, mask: Tensor) -> Tensor:
         """Returns features (B, 256) of joints (B, F, 15, 3) as in the reference motions, y down; 8 is the pelvis."""

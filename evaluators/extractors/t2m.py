@@ -61,9 +61,15 @@ class WordVectors:
         """Reads our_vab_data.npy and our_vab_idx.pkl; raises `FileNotFoundError`, or `UserError` for other content."""
         rows = restricted_pickle.read(folder / "our_vab_idx.pkl")
         vectors = _read_numbers(folder / "our_vab_data.npy").astype(np.float32)
-        named = isinstance(rows, dict) and vectors.ndim == 2 and {"sos", "eos", "unk"} <= rows.keys()
-        if not named or not all(isinstance(row, int | np.integer) and 0 <= row < len(vectors) for row in rows.values()):
-            raise UserError(f"{folder}: not the released GloVe vectors: sos, eos, unk and other words, each with a row")
+        named = (
+            isinstance(rows, dict) and vectors.ndim == 2 and {"sos", "eos", "unk"} <= rows.keys()
+        )
+        if not named or not all(
+            isinstance(row, int | np.integer) and 0 <= row < len(vectors) for row in rows.values()
+        ):
+            raise UserError(
+                f"{folder}: not the released GloVe vectors: sos, eos, unk and other words, each with a row"
+            )
         return cls(rows, torch.from_numpy(vectors))
 
     def __call__(self, captions: Sequence[Sequence[str]], *, full_length: bool = False) -> Words:
@@ -96,9 +102,16 @@ class LearnedWords(nn.Module):
     def forward(self, captions: Sequence[Sequence[str]]) -> Words:
         """Returns the text encoder's input for the words of captions; those after the 20th are dropped."""
         framed, lengths = zip(*map(frame_tokens, captions), strict=True)
-        rows = [[hashed(token.partition("/")[0], self.table.num_embeddings) for token in tokens] for tokens in framed]
+        rows = [
+            [hashed(token.partition("/")[0], self.table.num_embeddings) for token in tokens]
+            for tokens in framed
+        ]
         vectors = self.table(torch.tensor(rows, device=self.table.weight.device)).sum(2)
-        return Words(vectors, vectors.new_zeros(*vectors.shape[:2], len(PARTS_OF_SPEECH)), torch.tensor(lengths))
+        return Words(
+            vectors,
+            vectors.new_zeros(*vectors.shape[:2], len(PARTS_OF_SPEECH)),
+            torch.tensor(lengths),
+        )
 
 
 class T2MEvaluator(nn.Module):
@@ -179,13 +192,18 @@ class _Recurrent(nn.Module):
         self.input_emb = nn.Linear(in_features, hidden)
         self.gru = nn.GRU(hidden, hidden, batch_first=True, bidirectional=True)
         self.output_net = nn.Sequential(
-            nn.Linear(2 * hidden, hidden), nn.LayerNorm(hidden), nn.LeakyReLU(0.2), nn.Linear(hidden, embedding)
+            nn.Linear(2 * hidden, hidden),
+            nn.LayerNorm(hidden),
+            nn.LeakyReLU(0.2),
+            nn.Linear(hidden, embedding),
         )
         self.hidden = nn.Parameter(torch.randn(2, 1, hidden))
 
     def encode(self, x: Tensor, lengths: Tensor) -> Tensor:
         """(B, N, in_features) of which the first `lengths` (B,) are real -> (B, embedding)."""
-        packed = pack_padded_sequence(self.input_emb(x), lengths.cpu(), batch_first=True, enforce_sorted=False)
+        packed = pack_padded_sequence(
+            self.input_emb(x), lengths.cpu(), batch_first=True, enforce_sorted=False
+        )
         _, last = self.gru(packed, self.hidden.expand(-1, len(x), -1).contiguous())
         return self.output_net(torch.cat([last[0], last[1]], -1))
 

@@ -39,7 +39,9 @@ class _MovementDecoder(nn.Module):
         return self.out_net(self.main(self.in_net(latents).transpose(1, 2)).transpose(1, 2))
 
 
-def reconstruction_terms(network: T2MEvaluator, decoder: nn.Module, batch: MotionBatch) -> dict[str, Tensor]:
+def reconstruction_terms(
+    network: T2MEvaluator, decoder: nn.Module, batch: MotionBatch
+) -> dict[str, Tensor]:
     """Returns loss terms (B,) of the movement autoencoder, over the real frames and vectors of each motion."""
     frames = batch.x.shape[1] // UNIT * UNIT
     x, mask = batch.x[:, :frames, : network.used], batch.mask[:, :frames]
@@ -55,7 +57,9 @@ def reconstruction_terms(network: T2MEvaluator, decoder: nn.Module, batch: Motio
     }
 
 
-def matching_loss(motion: Tensor, text: Tensor, margin: float, fits: Tensor | None = None) -> Tensor:
+def matching_loss(
+    motion: Tensor, text: Tensor, margin: float, fits: Tensor | None = None
+) -> Tensor:
     """Contrastive loss () of Guo et al. 2022 (Hadsell et al. 2006, eq. 4, without its factor 1/2), of B pairs (B, E).
 
     Each text is compared with its own motion, and with that of the nearest previous pair that it does not fit, which
@@ -66,7 +70,9 @@ def matching_loss(motion: Tensor, text: Tensor, margin: float, fits: Tensor | No
     count = len(motion)
     own = torch.arange(count, device=motion.device)
     previous = (own[:, None] - 1 - own[: count - 1]) % count
-    wrong = torch.ones_like(previous, dtype=torch.bool) if fits is None else ~fits.gather(1, previous)
+    wrong = (
+        torch.ones_like(previous, dtype=torch.bool) if fits is None else ~fits.gather(1, previous)
+    )
     other = previous.gather(1, wrong.int().argmax(1, keepdim=True))[:, 0]
     near = torch.linalg.vector_norm(motion - text, dim=-1)
     far = torch.linalg.vector_norm(motion[other] - text, dim=-1)
@@ -122,13 +128,20 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
         self.decoder = _MovementDecoder(linear.out_features, first.out_channels, first.in_channels)
         self.word_folder, self.movement_steps = words, movement_steps
         self.sparsity, self.smoothness, self.margin = sparsity, smoothness, margin
-        self.words: WordVectors | LearnedWords | None = LearnedWords() if words == "learned" else None
+        self.words: WordVectors | LearnedWords | None = (
+            LearnedWords() if words == "learned" else None
+        )
         self.tokens: dict[str, dict[str, list[str]]] = {}  # of the captions of each clip
 
     @classmethod
-    def parts(cls, config: Config, representation: Representation, actions: Sequence[str]) -> dict[str, Any]:
+    def parts(
+        cls, config: Config, representation: Representation, actions: Sequence[str]
+    ) -> dict[str, Any]:
         statistics = {"mean": representation.mean.clone(), "std": representation.std.clone()}
-        return {"network": instantiate(config["task"]["network"], **statistics), "condition": Unconditional()}
+        return {
+            "network": instantiate(config["task"]["network"], **statistics),
+            "condition": Unconditional(),
+        }
 
     def metrics(self) -> dict[str, Metric]:
         of_pairs = {"mm_dist": MultimodalDistance(), "motions_for_text": MotionsForText()}
@@ -139,14 +152,20 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
         super().setup(stage)
         data: MotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
         if data.batch_size < 2:
-            raise UserError(f"data.batch_size={data.batch_size}: matching needs at least two motions per batch")
+            raise UserError(
+                f"data.batch_size={data.batch_size}: matching needs at least two motions per batch"
+            )
         if not self.learns_words:
             self.words = WordVectors.read(Path(self.word_folder))
             self.facts["words"] = {str(word): int(row) for word, row in self.words.rows.items()}
         self.network.mean.copy_(self.representation.mean)
         self.network.std.copy_(self.representation.std)
         for clip in (*data.train.clips, *data.val.clips):
-            tagged = map(words_of, clip.captions) if self.learns_words else clip.attributes.get("tokens", ())
+            tagged = (
+                map(words_of, clip.captions)
+                if self.learns_words
+                else clip.attributes.get("tokens", ())
+            )
             # The first of equal captions counts.
             self.tokens[clip.id] = dict(reversed(list(zip(clip.captions, tagged, strict=False))))
         bare = [name for name, tokens in self.tokens.items() if not tokens]
@@ -170,7 +189,9 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
         if self.learns_words:
             return
         if isinstance(self.words, WordVectors) and not torch.equal(self.words.vectors, state.cpu()):
-            raise UserError(f"task.words={self.word_folder}: these are not the word vectors that this run began with")
+            raise UserError(
+                f"task.words={self.word_folder}: these are not the word vectors that this run began with"
+            )
         self.words = WordVectors(self.facts["words"], state.cpu())
 
     def text(self, tokens: Sequence[Sequence[str]]) -> Tensor:
@@ -184,12 +205,19 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
         if self._learns_movement:
             values = reconstruction_terms(self.network, self.decoder, batch)
             terms = {name: value.mean() for name, value in values.items()}
-            loss = terms["reconstruction"] + self.sparsity * terms["sparsity"] + self.smoothness * terms["smoothness"]
+            loss = (
+                terms["reconstruction"]
+                + self.sparsity * terms["sparsity"]
+                + self.smoothness * terms["smoothness"]
+            )
         else:
             fits = [[text in self.tokens[name] for name in batch.ids] for text in batch.text or ()]
-            loss = matching_loss(*self._embed(batch), self.margin, torch.tensor(fits, device=self.device))
+            loss = matching_loss(
+                *self._embed(batch), self.margin, torch.tensor(fits, device=self.device)
+            )
         self.log("train/loss", loss, batch_size=len(batch))
-        return loss + 0 * sum(parameter.sum() for parameter in self._idle())  # gives all a gradient, as DDP requires
+        # Gives all a gradient, as DDP requires
+        return loss + 0 * sum(parameter.sum() for parameter in self._idle())
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
         """Removes the gradients of idle parameters: with a gradient of 0, momentum would still change them."""
@@ -202,7 +230,10 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
 
     def _idle(self) -> list[nn.Parameter]:
         movement = [*self.network.movement_encoder.parameters(), *self.decoder.parameters()]
-        matching = [*self.network.text_encoder.parameters(), *self.network.motion_encoder.parameters()]
+        matching = [
+            *self.network.text_encoder.parameters(),
+            *self.network.motion_encoder.parameters(),
+        ]
         matching += self.words.parameters() if isinstance(self.words, LearnedWords) else []
         return matching if self._learns_movement else movement
 

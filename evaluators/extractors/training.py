@@ -41,9 +41,15 @@ class ExtractorTask(Task, Generic[Network]):
         self.network, self.val_metrics = network, nn.ModuleDict()
 
     @classmethod
-    def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:
+    def build(
+        cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()
+    ) -> Self:
         options = {name: value for name, value in config["task"].items() if name != "_target_"}
-        options |= {"representation": representation, "optimizer": config["optimizer"], "seed": config["seed"]}
+        options |= {
+            "representation": representation,
+            "optimizer": config["optimizer"],
+            "seed": config["seed"],
+        }
         task = cls(**options | cls.parts(config, representation, actions))
         task.config, task.facts = config, {"actions": list(actions)}
         return task
@@ -53,7 +59,9 @@ class ExtractorTask(Task, Generic[Network]):
         return self.condition
 
     @classmethod
-    def parts(cls, config: Config, representation: Representation, actions: Sequence[str]) -> dict[str, Any]:
+    def parts(
+        cls, config: Config, representation: Representation, actions: Sequence[str]
+    ) -> dict[str, Any]:
         """Builds `network` and `condition` of a recipe."""
         raise NotImplementedError
 
@@ -77,9 +85,16 @@ class ExtractorTask(Task, Generic[Network]):
         """Updates the metrics of samples; with fewer clips than processes, each has all and only the first counts."""
         if self.global_rank and len(self.trainer.datamodule.val) < self.trainer.world_size:  # type: ignore[attr-defined]
             return
-        for name, kind, names in (("keys", "motion", batch.ids), ("text_keys", "caption", batch.text or ())):
+        for name, kind, names in (
+            ("keys", "motion", batch.ids),
+            ("text_keys", "caption", batch.text or ()),
+        ):
             inputs[name] = torch.tensor([key(kind, value) for value in names], device=self.device)
-        of_samples = {name: metric for name, metric in self.val_metrics.items() if isinstance(metric, SampleMetric)}
+        of_samples = {
+            name: metric
+            for name, metric in self.val_metrics.items()
+            if isinstance(metric, SampleMetric)
+        }
         update_metrics(of_samples, **inputs)
 
     def on_validation_epoch_end(self) -> None:
@@ -92,7 +107,11 @@ class ExtractorTask(Task, Generic[Network]):
                 if name == "loss":
                     raise
                 value = None
-            parts = {f"{name}_{part}": x for part, x in value.items()} if isinstance(value, dict) else {name: value}
+            parts = (
+                {f"{name}_{part}": x for part, x in value.items()}
+                if isinstance(value, dict)
+                else {name: value}
+            )
             for part, x in parts.items():
                 if x is not None:
                     self.log(f"val/{part}", x, prog_bar=part == "loss")

@@ -51,7 +51,9 @@ def make_metrics(configs: Mapping[str, Config], **options: Any) -> dict[str, Sam
     metrics: dict[str, SampleMetric] = {}
     for name, config in configs.items():
         legal = parameters(config["_target_"]) if "_target_" in config else ()
-        metrics[name] = instantiate(config, **{option: value for option, value in options.items() if option in legal})
+        metrics[name] = instantiate(
+            config, **{option: value for option, value in options.items() if option in legal}
+        )
     return metrics
 
 
@@ -73,7 +75,9 @@ def update_metrics(metrics: Mapping[str, Metric], **inputs: Any) -> None:
         for needed in required_inputs(metric):
             if needed not in inputs:
                 raise missing_input(name, metric, needed)
-        metric.update(**{needed: inputs[needed] for needed in inputs_of(metric) if needed in inputs})
+        metric.update(
+            **{needed: inputs[needed] for needed in inputs_of(metric) if needed in inputs}
+        )
 
 
 def missing_input(name: str, metric: Metric, needed: str) -> UserError:

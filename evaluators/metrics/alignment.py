@@ -68,8 +68,12 @@ class RPrecision(SampleMetric):
             raise UserError(f"{others + 1} candidates are fewer than a pool of {self.pool}")
         at = distance.gather(1, own[:, None])
         closer = (distance < at).sum(1) + ((distance == at).sum(1) - 1) // 2
-        probable = {f"top{k}": hypergeom.cdf(k - 1, others, closer.numpy(), self.pool - 1) for k in TOP}
-        return {name: equally_weighted(torch.from_numpy(values)) for name, values in probable.items()}
+        probable = {
+            f"top{k}": hypergeom.cdf(k - 1, others, closer.numpy(), self.pool - 1) for k in TOP
+        }
+        return {
+            name: equally_weighted(torch.from_numpy(values)) for name, values in probable.items()
+        }
 
 
 class TextsForMotion(RPrecision):
@@ -91,12 +95,16 @@ class TextsForMotion(RPrecision):
         position = generator.integers(self.pool, size=len(own))
         rows = np.arange(len(own))
         pools[rows, others], pools[rows, position] = pools[rows, position], own
-        return retrieval_ranks(generated, text[first], torch.from_numpy(pools), torch.from_numpy(position))
+        return retrieval_ranks(
+            generated, text[first], torch.from_numpy(pools), torch.from_numpy(position)
+        )
 
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
         keys = rows["text_keys"].numpy()
         _, first, own = np.unique(keys, return_index=True, return_inverse=True)
-        return self.in_random_pools(distances(rows["generated"], rows["text"][first]), torch.from_numpy(own))
+        return self.in_random_pools(
+            distances(rows["generated"], rows["text"][first]), torch.from_numpy(own)
+        )
 
 
 class MotionsForText(RPrecision):
@@ -218,12 +226,18 @@ class MutualInformationDivergence(SampleMetric):
         self.eps = eps
 
     def value(self, generated: Tensor, text: Tensor, real: Tensor) -> float:
-        self.need(len(text), real.shape[1] + text.shape[1] + 1, "samples, one more than features of motion and text")
+        self.need(
+            len(text),
+            real.shape[1] + text.shape[1] + 1,
+            "samples, one more than features of motion and text",
+        )
         return pointwise_mutual_information(real, text, generated, text, self.eps).mean().item()
 
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
         real, real_text = rows["paired"], rows["paired_text"]
         if len(real) <= real.shape[1] + real_text.shape[1]:
             raise UserError(f"{len(real)} motions are too few for its covariances")
-        terms = pointwise_mutual_information(real, real_text, rows["generated"], rows["text"], self.eps)
+        terms = pointwise_mutual_information(
+            real, real_text, rows["generated"], rows["text"], self.eps
+        )
         return {"": equally_weighted(terms)}

@@ -35,9 +35,23 @@ from evaluators.metrics.checks import (
 from evaluators.metrics.samples import MotionMean, Rows, Timed
 from flame_mdm.data.synthetic_actions import MORE
 
-BONES = [(1, 4), (2, 5), (4, 7), (5, 8), (16, 18), (17, 19), (18, 20), (19, 21)]  # thighs, shins, arms
+# Thighs, shins, arms
+BONES = [
+    (1, 4),
+    (2, 5),
+    (4, 7),
+    (5, 8),
+    (16, 18),
+    (17, 19),
+    (18, 20),
+    (19, 21),
+]
 ATTRIBUTES = ("action", "side", "count", "direction", "speed", "amount")
-UNREAD = ("while", "ends")  # attributes of synthetic clips that no rule reads; such clips are not scored
+# Attributes of synthetic clips that no rule reads; such clips are not scored
+UNREAD = (
+    "while",
+    "ends",
+)
 UNDECIDED = MORE.keys() - CHECKED.keys()  # actions without a rule, which are not scored either
 
 
@@ -58,7 +72,10 @@ def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
 
     # Standing, the neck is 25 cm above the pelvis and the pelvis 50 cm above the toes, half of the time.
     pelvis = smooth[:, PELVIS, 1]
-    stands = np.median(smooth[:, NECK, 1] - pelvis) > 0.25 and np.median(pelvis - smooth[:, TOES, 1].min(1)) > 0.5
+    stands = (
+        np.median(smooth[:, NECK, 1] - pelvis) > 0.25
+        and np.median(pelvis - smooth[:, TOES, 1].min(1)) > 0.5
+    )
     lowered = _lowered(smooth, floor, forward, fps)
     if lowered or not stands:
         return lowered
@@ -66,7 +83,11 @@ def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
     # A leap goes more than 45 cm with both feet side by side, a dance sways at least three times by more than 3.5 cm to
     # one side and the other, and a hand that picks something up comes within 42 cm of the floor.
     stride = ((smooth[:, TOES[0]] - smooth[:, TOES[1]])[:, [0, 2]] * forward).sum(-1)
-    if jumps and np.abs(stride).max() < 0.25 and np.linalg.norm((smooth[-1] - smooth[0])[PELVIS, [0, 2]]) > 0.45:
+    if (
+        jumps
+        and np.abs(stride).max() < 0.25
+        and np.linalg.norm((smooth[-1] - smooth[0])[PELVIS, [0, 2]]) > 0.45
+    ):
         return {"action": "leap"}
     if walked := _locomotion(smooth, forward, left, turned, fps):
         return walked
@@ -116,7 +137,9 @@ def _is_a_body(joints: np.ndarray, smooth: np.ndarray) -> bool:
     return bool(steady and calm and length.min() > 0.15 and length.max() < 0.6)
 
 
-def _lowered(smooth: np.ndarray, floor: float, forward: np.ndarray, fps: float) -> dict[str, str | int]:
+def _lowered(
+    smooth: np.ndarray, floor: float, forward: np.ndarray, fps: float
+) -> dict[str, str | int]:
     """Reads crawling, lying down, sitting down and standing up from the height of the pelvis and the tilt of the trunk.
 
     A standing pelvis is higher than 78 cm, a seated one at 35 to 72 cm, a lying one below 35 cm. The trunk of who lies
@@ -130,7 +153,11 @@ def _lowered(smooth: np.ndarray, floor: float, forward: np.ndarray, fps: float) 
         return {"action": "crawl", "direction": "forward" if moved > 0 else "backward"}
     if ends[1] < 0.35 and tilt[last].mean() > 55 and ends[0] > 0.78:
         return {"action": "lie"}
-    if max(tilt[first].mean(), tilt[last].mean()) < 35 and 0.35 < min(ends) < 0.72 and max(ends) > 0.78:
+    if (
+        max(tilt[first].mean(), tilt[last].mean()) < 35
+        and 0.35 < min(ends) < 0.72
+        and max(ends) > 0.78
+    ):
         return {"action": "sit" if ends[1] < ends[0] else "rise"}
     return {}
 
@@ -145,7 +172,8 @@ def _locomotion(
     if np.ptp(np.percentile(smooth[:, ANKLES, 1], (5, 95), axis=0), axis=0).min() < 0.04:
         return {}
     velocity = np.gradient(ground, 1 / fps, axis=0)
-    speed = np.percentile(np.linalg.norm(velocity, axis=-1), 90)  # of the middle: walks begin and end in standing
+    # Of the middle: walks begin and end in standing
+    speed = np.percentile(np.linalg.norm(velocity, axis=-1), 90)
     ahead, aside = (velocity * forward).sum(-1).mean(), (velocity * left).sum(-1).mean()
     if abs(turned) > 90:
         direction = "counterclockwise" if turned > 0 else "clockwise"
@@ -167,7 +195,11 @@ def _kick(smooth: np.ndarray, floor: float, forward: np.ndarray) -> dict[str, st
     reach = np.where(high > 0.25, ahead, 0).max(0)
     side = int(reach.argmax())
     kicks = count_rises(np.where(high[:, side] > 0.15, ahead[:, side], 0), 0.35, 0.2)
-    return {"action": "kick", "side": SIDES[side], "count": kicks} if kicks and reach[side] > 0.35 else {}
+    return (
+        {"action": "kick", "side": SIDES[side], "count": kicks}
+        if kicks and reach[side] > 0.35
+        else {}
+    )
 
 
 def _arms(smooth: np.ndarray, forward: np.ndarray, fps: float) -> dict[str, str | int]:
@@ -195,7 +227,9 @@ def _arms(smooth: np.ndarray, forward: np.ndarray, fps: float) -> dict[str, str 
         if up.sum() < 0.35 * fps:
             continue
         # A wave swings the forearm about the elbow; a raised arm holds still.
-        swing = straight[up, side] - gaussian_filter1d(straight[up, side], 0.25 * fps, mode="nearest")
+        swing = straight[up, side] - gaussian_filter1d(
+            straight[up, side], 0.25 * fps, mode="nearest"
+        )
         height = np.percentile(above[up, side], 70)
         if np.percentile(straight[up, side], 20) < 0.85 and swing.std() > 0.04 and height > 0.25:
             waving.append(name)
@@ -242,7 +276,10 @@ def right_attributes(seen: Mapping[str, Any], requested: Mapping[str, Any]) -> d
     if requested["action"] in CHECKED:
         seen = seen.get("checks", {}).get(requested["action"], {})
     right = {name: seen.get(name) == value for name, value in requested.items()}
-    return right | {"action_and_side": right["action"] and right.get("side", True), "all": all(right.values())}
+    return right | {
+        "action_and_side": right["action"] and right.get("side", True),
+        "all": all(right.values()),
+    }
 
 
 class AttributeAccuracy(Timed, MotionMean):
@@ -268,9 +305,13 @@ class AttributeAccuracy(Timed, MotionMean):
                 weighted[name] = torch.tensor(values, dtype=torch.float64)
         return weighted
 
-    def update(self, joints: Tensor, mask: Tensor, requested: Sequence[Mapping[str, Any]], keys: Tensor) -> None:
+    def update(
+        self, joints: Tensor, mask: Tensor, requested: Sequence[Mapping[str, Any]], keys: Tensor
+    ) -> None:
         rows = []
-        for motion, real, attributes in zip(joints.detach().cpu(), mask.cpu(), requested, strict=True):
+        for motion, real, attributes in zip(
+            joints.detach().cpu(), mask.cpu(), requested, strict=True
+        ):
             rows.append(right_attributes(read_all(motion[real].numpy(), self.fps), attributes))
         self.add(keys, rows)
 
@@ -302,10 +343,14 @@ class SideAccuracy(Timed, MotionMean):
     summary = "hand_or_path"
     names = ("hand", "path", "hand_or_path")
 
-    def update(self, joints: Tensor, mask: Tensor, sides: Sequence[tuple[str, str]], keys: Tensor) -> None:
+    def update(
+        self, joints: Tensor, mask: Tensor, sides: Sequence[tuple[str, str]], keys: Tensor
+    ) -> None:
         """Adds motions; those requested with another side than left and right do not count."""
         rows = []
-        for motion, real, (content, side) in zip(joints.detach().cpu(), mask.cpu(), sides, strict=True):
+        for motion, real, (content, side) in zip(
+            joints.detach().cpu(), mask.cpu(), sides, strict=True
+        ):
             right = read_side(motion[real].numpy(), content, self.fps) == side
             kind = "path" if content.startswith("walk") else "hand"
             rows.append({kind: right, "hand_or_path": right} if side in SIDES else {})

@@ -18,7 +18,9 @@ SIDES = ("left", "right")
 
 def heading_of(smooth: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     """Returns the directions (F, 2) forward and left on the ground, and the turn to the left in degrees."""
-    across = (smooth[:, HIPS[0]] - smooth[:, HIPS[1]] + smooth[:, SHOULDERS[0]] - smooth[:, SHOULDERS[1]])[:, [0, 2]]
+    across = (
+        smooth[:, HIPS[0]] - smooth[:, HIPS[1]] + smooth[:, SHOULDERS[0]] - smooth[:, SHOULDERS[1]]
+    )[:, [0, 2]]
     left = across / np.linalg.norm(across, axis=-1, keepdims=True)
     forward = np.stack([-left[:, 1], left[:, 0]], -1)
     yaw = np.unwrap(np.arctan2(forward[:, 0], forward[:, 1]))
@@ -108,7 +110,9 @@ def _point(view: View) -> Shown:
     """Reads an arm of 90 % of its length that is less than 35 degrees from level for 0.4 seconds."""
     side = _raised_hand(view)
     shoulder, elbow, wrist = (view.smooth[:, joint[side]] for joint in (SHOULDERS, ELBOWS, WRISTS))
-    length = np.median(np.linalg.norm(elbow - shoulder, axis=-1) + np.linalg.norm(wrist - elbow, axis=-1))
+    length = np.median(
+        np.linalg.norm(elbow - shoulder, axis=-1) + np.linalg.norm(wrist - elbow, axis=-1)
+    )
     arm = wrist - shoulder
     straight = np.linalg.norm(arm, axis=-1) / length > 0.9
     level = np.abs(arm[:, 1]) / length < 0.57
@@ -151,7 +155,9 @@ def _hop(view: View) -> Shown:
 
 def _jumping_jacks(view: View) -> Shown:
     """Counts how often the feet are more than 45 cm apart, if the hands get above the shoulders."""
-    apart = np.linalg.norm((view.smooth[:, ANKLES[0]] - view.smooth[:, ANKLES[1]])[:, [0, 2]], axis=-1)
+    apart = np.linalg.norm(
+        (view.smooth[:, ANKLES[0]] - view.smooth[:, ANKLES[1]])[:, [0, 2]], axis=-1
+    )
     if (view.smooth[:, WRISTS, 1] - view.smooth[:, SHOULDERS, 1]).max(0).min() < 0.1:
         return {}
     jumps = count_rises(apart, 0.45, 0.35)

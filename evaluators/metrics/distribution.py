@@ -37,7 +37,8 @@ class FrechetMotionDistance(TwoSets):
     def value(self, generated: Tensor, real: Tensor) -> float:
         self.need(len(generated), 2, "generated motions")
         self.need(len(real), 2, "real motions")
-        return max(frechet_distance(generated, real).item(), 0.0)  # rounding may give a value slightly below 0
+        # Rounding may give a value slightly below 0
+        return max(frechet_distance(generated, real).item(), 0.0)
 
     def weighted(self, rows: Rows, weights: np.ndarray) -> dict[str, np.ndarray]:
         """Computes the distance of sets in which each motion is repeated as often as it was drawn."""
@@ -72,16 +73,27 @@ class KernelMotionDistance(TwoSets):
     summary = "mean"
     names = ("mean", "std")
 
-    def __init__(self, subsets: int = 100, subset_size: int = 1000, replace: bool = False, seed: int = 0):
+    def __init__(
+        self, subsets: int = 100, subset_size: int = 1000, replace: bool = False, seed: int = 0
+    ):
         super().__init__()
-        self.subsets, self.subset_size, self.replace, self.seed = subsets, subset_size, replace, seed
+        self.subsets, self.subset_size, self.replace, self.seed = (
+            subsets,
+            subset_size,
+            replace,
+            seed,
+        )
 
     def value(self, generated: Tensor, real: Tensor) -> dict[str, float | None]:
         for name, features in (("generated", generated), ("real", real)):
-            self.need(len(features), self.subset_size, f"{name} motions for subsets of {self.subset_size}")
+            self.need(
+                len(features), self.subset_size, f"{name} motions for subsets of {self.subset_size}"
+            )
         draw, values = np.random.default_rng(self.seed).choice, []
         for _ in range(self.subsets):
-            subsets = (x[draw(len(x), self.subset_size, replace=self.replace)] for x in (generated, real))
+            subsets = (
+                x[draw(len(x), self.subset_size, replace=self.replace)] for x in (generated, real)
+            )
             values.append(polynomial_mmd2(*subsets))
         mmd2 = torch.stack(values)
         return {"mean": mmd2.mean().item(), "std": mmd2.std(unbiased=False).item()}

@@ -21,7 +21,9 @@ def distances(a: Tensor, b: Tensor) -> Tensor:
 def _random_pairs(count: int, pairs: int, replace: bool, seed: int) -> tuple[Tensor, Tensor]:
     """Draws both sides (pairs,) of pairs of `count` motions, each with or without replacement."""
     draw = np.random.default_rng(seed).choice
-    return torch.from_numpy(draw(count, pairs, replace)), torch.from_numpy(draw(count, pairs, replace))
+    return torch.from_numpy(draw(count, pairs, replace)), torch.from_numpy(
+        draw(count, pairs, replace)
+    )
 
 
 class Diversity(SampleMetric):
@@ -39,7 +41,9 @@ class Diversity(SampleMetric):
         self.pairs, self.replace, self.seed = pairs, replace, seed
 
     def value(self, features: Tensor) -> float:
-        self.need(len(features), 2 if self.replace else self.pairs, f"motions for {self.pairs} pairs")
+        self.need(
+            len(features), 2 if self.replace else self.pairs, f"motions for {self.pairs} pairs"
+        )
         first, second = _random_pairs(len(features), self.pairs, self.replace, self.seed)
         return pair_distance(features[first], features[second])
 
@@ -144,6 +148,8 @@ class JointVariance(SampleMetric):
             motions = [self.motions[index].double() for index in order[members].tolist()]
             lengths = {len(motion) for motion in motions}
             if len(lengths) > 1:
-                raise self.error(f"motions of one text have {sorted(lengths)} frames. Generate them at one length")
+                raise self.error(
+                    f"motions of one text have {sorted(lengths)} frames. Generate them at one length"
+                )
             values.append(torch.stack(motions).var(0).sum(-1).mean())
         return torch.stack(values).mean().item()

@@ -9,14 +9,22 @@ from torch import Tensor
 
 from evaluators.metrics.samples import SampleMetric
 
-STEP = 4  # Every fourth frame of a motion is compared, which takes a quarter of the time. A copy still has distance 0.
-CLOSE = 0.01  # share of the held-out real motions that are closer to a training motion than the limit of a copy
+# Every fourth frame of a motion is compared, which takes a quarter of the time. A copy still has
+# distance 0.
+STEP = 4
+# Share of the held-out real motions that are closer to a training motion than the limit of a copy
+CLOSE = 0.01
 
 
 def poses(joints: Tensor, facing: Sequence[int]) -> Tensor:
     """Returns joints (F, J, 3) relative to the pelvis on the ground, turned to face z in every frame, as (F, 3J)."""
     right_hip, left_hip, right_shoulder, left_shoulder = facing
-    left = joints[:, left_hip] - joints[:, right_hip] + joints[:, left_shoulder] - joints[:, right_shoulder]
+    left = (
+        joints[:, left_hip]
+        - joints[:, right_hip]
+        + joints[:, left_shoulder]
+        - joints[:, right_shoulder]
+    )
     left = torch.nn.functional.normalize(left[:, [0, 2]], dim=-1)[:, None]
     local = joints - joints[:, :1] * joints.new_tensor([1.0, 0.0, 1.0])
     across = (local[..., [0, 2]] * left).sum(-1)
@@ -40,12 +48,17 @@ class TrainingMotions:
         same length; infinite if no training motion is as long. Second, the distance of the features (B, E).
         """
         squares = self.poses.square().sum(-1)
-        left = torch.cat([torch.arange(int(length), 0, -1) for length in self.lengths])  # frames to the motion's end
-        of_joints = torch.stack([self._closest(poses(motion, self.facing), squares, left) for motion in joints])
+        # Frames to the motion's end
+        left = torch.cat([torch.arange(int(length), 0, -1) for length in self.lengths])
+        of_joints = torch.stack(
+            [self._closest(poses(motion, self.facing), squares, left) for motion in joints]
+        )
         if features is None or self.features is None:
             return of_joints[:, None]
         exact = "donot_use_mm_for_euclid_dist"  # matrix products would cancel in a copy
-        return torch.stack([of_joints, torch.cdist(features, self.features, compute_mode=exact).min(1).values], 1)
+        return torch.stack(
+            [of_joints, torch.cdist(features, self.features, compute_mode=exact).min(1).values], 1
+        )
 
     def _closest(self, motion: Tensor, squares: Tensor, left: Tensor) -> Tensor:
         compared = motion[::STEP]

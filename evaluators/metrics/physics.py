@@ -80,4 +80,5 @@ class StaticShare(Timed, JointMean):
 
     def measure(self, motion: Tensor) -> Tensor:
         moved = motion.double().diff(dim=0).norm(dim=-1)
-        return (moved.mean() * self.fps < STANDING)[None][: len(moved)]  # undefined for a single frame
+        # Undefined for a single frame
+        return (moved.mean() * self.fps < STANDING)[None][: len(moved)]

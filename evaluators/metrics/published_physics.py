@@ -14,7 +14,13 @@ from torch import Tensor
 
 from evaluators.metrics.samples import JointMean, MotionMean, Rows, SampleMetric, Timed
 
-FEET = (7, 10, 8, 11)  # left ankle or heel, left toe, right ankle or heel and right toe of the 22 SMPL joints
+# Left ankle or heel, left toe, right ankle or heel and right toe of the 22 SMPL joints
+FEET = (
+    7,
+    10,
+    8,
+    11,
+)
 JERK_OF_REAL_MOTIONS: dict[float, float] = {20: 0.033031363, 30: 0.016383045}
 """Mean jerk of FlowMDM by frame rate: of HumanML3D at 20 frames per second, and of BABEL at 30."""
 Values = dict[str, Tensor | float]
@@ -25,7 +31,9 @@ class PublishedPhysics(Timed, JointMean):
 
     higher_is_better = False
     summary = None
-    required_fps: float | None = None  # the only frame rate at which the values are defined; None = any
+    required_fps: float | None = (
+        None  # the only frame rate at which the values are defined; None = any
+    )
 
     def __init__(self, fps: float, feet: Sequence[int] = FEET):
         super().__init__(fps)
@@ -33,7 +41,9 @@ class PublishedPhysics(Timed, JointMean):
 
     def value(self, sums: Tensor, counts: Tensor) -> dict[str, float | None]:
         if not self.defined:
-            raise self.error(f"defined at {self.required_fps:g} frames per second, but the motions have {self.fps:g}")
+            raise self.error(
+                f"defined at {self.required_fps:g} frames per second, but the motions have {self.fps:g}"
+            )
         return self.means(sums, counts) | {"measured": (counts > 0).all(1).double().mean().item()}
 
     @property
@@ -58,7 +68,13 @@ class MBenchQuality(PublishedPhysics):
     `toes` are the indices of the left and the right toe.
     """
 
-    parts = ("jitter_degree", "dynamic_degree", "ground_penetration", "foot_sliding", "foot_floating")
+    parts = (
+        "jitter_degree",
+        "dynamic_degree",
+        "ground_penetration",
+        "foot_sliding",
+        "foot_floating",
+    )
     names = (*parts, "measured")
     unit = "m/frame"
     units: Mapping[str, str] = {"ground_penetration": "m", "foot_floating": "", "measured": ""}
@@ -80,7 +96,9 @@ class MBenchQuality(PublishedPhysics):
             "dynamic_degree": sum(x.diff(dim=0).norm(dim=-1).mean() for x in (motion, local)),
             "ground_penetration": -deep.mean() if len(deep) else 0.0,
             "foot_sliding": sliding.mean(),
-            "foot_floating": (carried + 0.5 * lagging + swinging) / len(motion) if len(motion) > 1 else math.nan,
+            "foot_floating": (carried + 0.5 * lagging + swinging) / len(motion)
+            if len(motion) > 1
+            else math.nan,
         }
 
 
@@ -138,15 +156,33 @@ class KimodoQuality(PublishedPhysics):
     Speeds are in three dimensions; a motion of one frame has none. `feet` are left heel and toe, right heel and toe.
     """
 
-    parts = ("skate_from_height", "skate_ratio", "low", "skate_from_contacts", "skate_max", "contact_consistency")
+    parts = (
+        "skate_from_height",
+        "skate_ratio",
+        "low",
+        "skate_from_contacts",
+        "skate_max",
+        "contact_consistency",
+    )
     names = (*parts, "measured")
     unit = "m/s"
-    units: Mapping[str, str] = {"skate_ratio": "", "low": "", "contact_consistency": "", "measured": ""}
+    units: Mapping[str, str] = {
+        "skate_ratio": "",
+        "low": "",
+        "contact_consistency": "",
+        "measured": "",
+    }
     directions: Mapping[str, bool | None] = {"low": None, "contact_consistency": True}
 
-    def update(self, joints: Tensor, mask: Tensor, keys: Tensor, contacts: Tensor | None = None) -> None:
+    def update(
+        self, joints: Tensor, mask: Tensor, keys: Tensor, contacts: Tensor | None = None
+    ) -> None:
         motions = self.real_frames(joints, mask)
-        labels = [None] * len(motions) if contacts is None else contacts[mask].split(mask.sum(1).tolist())
+        labels = (
+            [None] * len(motions)
+            if contacts is None
+            else contacts[mask].split(mask.sum(1).tolist())
+        )
         self.add(keys, [self.measure(*pair) for pair in zip(motions, labels, strict=True)])
 
     def extras(self, motions: Rows, i: int) -> dict[str, Tensor]:
@@ -191,18 +227,26 @@ class KimodoConstraints(MotionMean):
     parts = ("root2d_err", "root2d_acc", "fullbody_keyframe", "end_effector")
     names = (*parts, "root2d_err_p95")
 
-    def update(self, joints: Tensor, real_joints: Tensor, mask: Tensor, kept: Tensor, keys: Tensor) -> None:
+    def update(
+        self, joints: Tensor, real_joints: Tensor, mask: Tensor, kept: Tensor, keys: Tensor
+    ) -> None:
         motions = self.real_frames(joints, mask)
         parts = kept[mask].split(mask.sum(1).tolist())
         errors = []
         for motion, real, part in zip(motions, real_joints, parts, strict=True):
             off, full = motion.double() - real[: len(motion)], part.all(1)
-            errors.append(constraint_errors(off[part[:, 0], 0][:, [0, 2]], off[full], off[part & ~full[:, None]]))
+            errors.append(
+                constraint_errors(
+                    off[part[:, 0], 0][:, [0, 2]], off[full], off[part & ~full[:, None]]
+                )
+            )
         self.add(keys, errors)
 
     def value(self, sums: Tensor, counts: Tensor) -> dict[str, float | None]:
         roots = sums[counts[:, 0] > 0, 0]
-        return self.means(sums, counts) | {"root2d_err_p95": roots.quantile(0.95).item() if len(roots) else None}
+        return self.means(sums, counts) | {
+            "root2d_err_p95": roots.quantile(0.95).item() if len(roots) else None
+        }
 
 
 def constraint_errors(root: Tensor, full: Tensor, parts: Tensor) -> dict[str, Tensor]:
@@ -266,7 +310,9 @@ class TransitionJerk(SampleMetric):
         parts = kept[mask].split(mask.sum(1).tolist())
         total = torch.zeros(len(keys), self.window - 3, dtype=torch.float64)
         count = torch.zeros(len(keys), 1, dtype=torch.long)
-        for row, (motion, part) in enumerate(zip(self.real_frames(joints, mask), parts, strict=True)):
+        for row, (motion, part) in enumerate(
+            zip(self.real_frames(joints, mask), parts, strict=True)
+        ):
             seams = (part[1:] != part[:-1]).any(1).nonzero()[:, 0] + 1
             for start in (seams - self.window // 2).tolist():
                 if 0 <= start <= len(motion) - self.window:

@@ -69,21 +69,35 @@ class PositionErrors(MotionMean):
         references: Sequence[Tensor] | None = None,
     ) -> None:
         """Compares pairs of motions up to the end of the shorter one, of at least two frames."""
-        motions, real_motions = self.real_frames(joints, mask), self.real_frames(real_joints, real_mask)
+        motions, real_motions = (
+            self.real_frames(joints, mask),
+            self.real_frames(real_joints, real_mask),
+        )
         if self.upsampling > 1:
             if references is None:
-                raise self.error("the store has no recordings. Prepare the data set again with force=true")
-            motions, real_motions = [upsample(motion, self.upsampling) for motion in motions], list(references)
+                raise self.error(
+                    "the store has no recordings. Prepare the data set again with force=true"
+                )
+            motions, real_motions = (
+                [upsample(motion, self.upsampling) for motion in motions],
+                list(references),
+            )
         errors = []
         for motion, real in zip(motions, real_motions, strict=True):
             a, b = self.positions(motion.double()), self.positions(real.double())
             length = min(len(a["root"]), len(b["root"]))
             self.need(length, 2, "frames of a motion")
-            errors.append(self.errors(*({part: x[:length] for part, x in side.items()} for side in (a, b))))
+            errors.append(
+                self.errors(*({part: x[:length] for part, x in side.items()} for side in (a, b)))
+            )
         self.add(keys, errors, groups=keys if groups is None or self.samples == 1 else groups)
 
     def value(self, sums: Tensor, counts: Tensor, groups: Tensor) -> dict[str, float | None]:
-        texts = self.by_group(groups, self.samples) if self.samples > 1 else torch.arange(len(groups))[:, None]
+        texts = (
+            self.by_group(groups, self.samples)
+            if self.samples > 1
+            else torch.arange(len(groups))[:, None]
+        )
         root, values = (sums[:, 0] / counts[:, 0])[texts], []
         for descending in self.ranked.values():
             first = root.argsort(dim=1, descending=descending, stable=True)[:, :1]
@@ -120,7 +134,9 @@ class TemosPositionErrors(PositionErrors):
     def errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> dict[str, Tensor]:
         distances = {part: (a[part] - b[part]).norm(dim=-1) for part in PARTS}
         position = {f"ape_{part}": x if x.ndim == 1 else x.mean(1) for part, x in distances.items()}
-        return position | {f"ave_{part}": (a[part].var(0) - b[part].var(0)).norm(dim=-1).mean() for part in PARTS}
+        return position | {
+            f"ave_{part}": (a[part].var(0) - b[part].var(0)).norm(dim=-1).mean() for part in PARTS
+        }
 
 
 class FlamePositionErrors(PositionErrors):
@@ -142,7 +158,12 @@ class FlamePositionErrors(PositionErrors):
 
     def errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> dict[str, Tensor]:
         root, path, local, joints = (a[part] - b[part] for part in PARTS)
-        distances = [root.norm(dim=-1), path.abs().sum(-1), local.norm(dim=-1).mean(1), joints.norm(dim=-1).mean(1)]
+        distances = [
+            root.norm(dim=-1),
+            path.abs().sum(-1),
+            local.norm(dim=-1).mean(1),
+            joints.norm(dim=-1).mean(1),
+        ]
         root, path, local, joints = (a[part].var(0) - b[part].var(0) for part in PARTS)
         variances = [root.norm(), path.norm(), local.norm(dim=-1).mean(), joints.mean(0).norm()]
         return dict(zip(self.parts, [*(x.mean() for x in distances), *variances], strict=True))
@@ -165,12 +186,18 @@ class EditErrors(MotionMean):
         kept: Tensor | None,
     ) -> None:
         """Adds the errors of pairs of motions (B, F, J, 3) with masks (B, F), up to the end of the shorter one."""
-        motions = zip(self.real_frames(joints, mask), self.real_frames(real_joints, real_mask), strict=True)
+        motions = zip(
+            self.real_frames(joints, mask), self.real_frames(real_joints, real_mask), strict=True
+        )
         errors = []
         for row, (motion, real) in enumerate(motions):
             length = min(len(motion), len(real))
             distance = (motion[:length].double() - real[:length].double()).norm(dim=-1)
-            old = torch.zeros_like(distance, dtype=torch.bool) if kept is None else kept[row][mask[row]][:length]
+            old = (
+                torch.zeros_like(distance, dtype=torch.bool)
+                if kept is None
+                else kept[row][mask[row]][:length]
+            )
             errors.append(self.errors_of(distance, old))
         self.add(keys, errors)
 
@@ -218,14 +245,24 @@ class KeptDrift(EditErrors):
     names = ("mean", "largest")
 
     def update(
-        self, joints: Tensor, mask: Tensor, real_joints: Tensor, real_mask: Tensor, keys: Tensor, kept: Tensor
+        self,
+        joints: Tensor,
+        mask: Tensor,
+        real_joints: Tensor,
+        real_mask: Tensor,
+        keys: Tensor,
+        kept: Tensor,
     ) -> None:
         self.compare(joints, mask, real_joints, real_mask, keys, kept)
 
     def errors_of(self, distance: Tensor, kept: Tensor) -> dict[str, Tensor]:
-        return {"mean": distance[kept].mean(), "largest": distance[kept].max()} if kept.any() else {}
+        return (
+            {"mean": distance[kept].mean(), "largest": distance[kept].max()} if kept.any() else {}
+        )
 
     def value(self, sums: Tensor, counts: Tensor) -> dict[str, float | None]:
         drift = sums[counts[:, 0] > 0]
-        values = (drift[:, 0].mean().item(), drift[:, 1].max().item()) if len(drift) else (None, None)
+        values = (
+            (drift[:, 0].mean().item(), drift[:, 1].max().item()) if len(drift) else (None, None)
+        )
         return dict(zip(self.names, values, strict=True))

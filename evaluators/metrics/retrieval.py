@@ -20,7 +20,8 @@ from flame_mdm.errors import UserError
 from flame_mdm.safe_io import MEBIBYTE, read_text
 from flame_mdm.seeds import key
 
-SAME = 0.9  # cosine above which TMR considers captions the same: its threshold 0.95 is of (cosine + 1) / 2
+# Cosine above which TMR considers captions the same: its threshold 0.95 is of (cosine + 1) / 2
+SAME = 0.9
 TMR_TOP = (1, 2, 3, 5, 10)  # k of recall
 BATCH, DISSIMILAR = 32, 100  # motions in a batch, and most dissimilar motions, of TMR
 
@@ -35,7 +36,9 @@ def embedding(config: str, caption: str) -> Tensor:
     """Returns the vector (C,) of length 1 of a caption, encoded alone; `config` is the JSON of an encoder's mapping."""
     empty = torch.zeros(1, 1, 1)
     with torch.no_grad():
-        vector = _encoder(config)(MotionBatch(empty, empty[..., 0].bool(), [""], text=[caption])).pooled[0]
+        vector = _encoder(config)(
+            MotionBatch(empty, empty[..., 0].bool(), [""], text=[caption])
+        ).pooled[0]
     return F.normalize(vector, dim=0)
 
 
@@ -51,7 +54,9 @@ def whole_set_retrieval(similarity: Tensor, correct: Tensor | None = None) -> di
     """
     values: dict[str, float] = {}
     for way, table in (("t2m", similarity), ("m2t", similarity.T)):
-        rank = best_ranks(table, torch.eye(len(table), dtype=torch.bool) if correct is None else correct)
+        rank = best_ranks(
+            table, torch.eye(len(table), dtype=torch.bool) if correct is None else correct
+        )
         values |= {f"{way}_top{k}": (rank < k).double().mean().item() for k in TMR_TOP}
         values[f"{way}_median"] = rank.double().quantile(0.5).item() + 1
     return values
@@ -74,16 +79,23 @@ class CaptionMetric(SampleMetric):
 
     def __init__(self, encoder: Config | None = None, seed: int = 0):
         super().__init__()
-        self.encoder, self.seed = None if encoder is None else json.dumps(encoder, sort_keys=True), seed
+        self.encoder, self.seed = (
+            None if encoder is None else json.dumps(encoder, sort_keys=True),
+            seed,
+        )
 
-    def update(self, generated: Tensor, text: Tensor, captions: Sequence[str], keys: Tensor) -> None:
+    def update(
+        self, generated: Tensor, text: Tensor, captions: Sequence[str], keys: Tensor
+    ) -> None:
         if not len(captions):
             return
         caption_keys = torch.tensor([key(plain_caption(caption)) for caption in captions])
         meaning = torch.zeros(len(captions), 0)
         if self.encoder is not None:
             meaning = torch.stack([embedding(self.encoder, caption) for caption in captions])
-        super().update(keys=keys, generated=generated, text=text, caption_keys=caption_keys, meaning=meaning)
+        super().update(
+            keys=keys, generated=generated, text=text, caption_keys=caption_keys, meaning=meaning
+        )
 
 
 class MultiPositiveRPrecision(CaptionMetric):
@@ -95,15 +107,25 @@ class MultiPositiveRPrecision(CaptionMetric):
     similar captions raise all values, `chance_top1`, ... are those of a random order, and `positives` is the mean of R.
     """
 
-    names = (*(f"{kind}top{k}" for kind in ("", "single_", "chance_") for k in TOP), "proper", "positives")
+    names = (
+        *(f"{kind}top{k}" for kind in ("", "single_", "chance_") for k in TOP),
+        "proper",
+        "positives",
+    )
     summary = "top3"
-    directions: Mapping[str, bool | None] = {"positives": None} | {f"chance_top{k}": None for k in TOP}
+    directions: Mapping[str, bool | None] = {"positives": None} | {
+        f"chance_top{k}": None for k in TOP
+    }
 
-    def __init__(self, encoder: Config | None = None, pool: int = 32, seed: int = 0, normalize: bool = False):
+    def __init__(
+        self, encoder: Config | None = None, pool: int = 32, seed: int = 0, normalize: bool = False
+    ):
         super().__init__(encoder, seed)
         self.pool, self.normalize = pool, normalize
 
-    def value(self, motion: Tensor, text: Tensor, caption_keys: Tensor, meaning: Tensor) -> dict[str, float | None]:
+    def value(
+        self, motion: Tensor, text: Tensor, caption_keys: Tensor, meaning: Tensor
+    ) -> dict[str, float | None]:
         self.need(len(motion), self.pool, "motions")
         if self.normalize:
             motion, text = F.normalize(motion, dim=-1), F.normalize(text, dim=-1)
@@ -112,7 +134,11 @@ class MultiPositiveRPrecision(CaptionMetric):
         for query, pool in zip(order.split(16), pools.split(16), strict=True):
             similarity.append(-torch.linalg.vector_norm(text[query, None] - motion[pool], dim=-1))
             similar = (meaning[query, None] * meaning[pool]).sum(-1) > SAME
-            correct.append((caption_keys[query, None] == caption_keys[pool]) | similar | (query[:, None] == pool))
+            correct.append(
+                (caption_keys[query, None] == caption_keys[pool])
+                | similar
+                | (query[:, None] == pool)
+            )
         single = best_ranks(torch.cat(similarity), F.one_hot(position, self.pool).bool())
         singles = {f"single_top{k}": (single < k).double().mean().item() for k in TOP}
         return multi_positive(torch.cat(similarity), torch.cat(correct)) | singles
@@ -130,7 +156,10 @@ def multi_positive(similarity: Tensor, correct: Tensor) -> dict[str, float | Non
     above, tied = similarity > last, similarity == last
     share = (count - above.sum(1)) / tied.sum(1).double()
     hits = (above & correct).sum(1) + (tied & correct).sum(1) * share
-    return values | {"proper": (hits / count).mean().item(), "positives": count.double().mean().item()}
+    return values | {
+        "proper": (hits / count).mean().item(),
+        "positives": count.double().mean().item(),
+    }
 
 
 class TMRRetrieval(CaptionMetric):
@@ -159,7 +188,9 @@ class TMRRetrieval(CaptionMetric):
         for value in (*(f"top{k}" for k in TMR_TOP), "median")
     )
     summary = None
-    directions: Mapping[str, bool | None] = {name: False for name in names if name.endswith("median")}
+    directions: Mapping[str, bool | None] = {
+        name: False for name in names if name.endswith("median")
+    }
 
     def __init__(self, encoder: Config | None = None, seed: int = 0, ids: str | None = None):
         super().__init__(encoder, seed)
@@ -168,10 +199,15 @@ class TMRRetrieval(CaptionMetric):
             raise UserError(f"{ids}: contains no ids. Write one per line")
         self.ids = torch.tensor([key(name) for name in listed], dtype=torch.long)
 
-    def value(self, motion: Tensor, text: Tensor, caption_keys: Tensor, meaning: Tensor) -> dict[str, float | None]:
+    def value(
+        self, motion: Tensor, text: Tensor, caption_keys: Tensor, meaning: Tensor
+    ) -> dict[str, float | None]:
         similarity = F.normalize(text, dim=-1) @ F.normalize(motion, dim=-1).T
         same = (caption_keys[None] == caption_keys[:, None]) | (meaning @ meaning.T > SAME)
-        values = {"all": whole_set_retrieval(similarity), "threshold": whole_set_retrieval(similarity, same)}
+        values = {
+            "all": whole_set_retrieval(similarity),
+            "threshold": whole_set_retrieval(similarity, same),
+        }
         if len(self.ids):
             (keys,) = self.rows("keys", "keys")
             chosen = torch.isin(keys, self.ids.to(keys.device)).nonzero()[:, 0].tolist()
@@ -183,7 +219,11 @@ class TMRRetrieval(CaptionMetric):
         batches = torch.from_numpy(order[: len(order) // BATCH * BATCH]).view(-1, BATCH)
         if len(batches):
             values["batches"] = batched_retrieval(similarity, batches)
-        computed = {f"{protocol}_{name}": x for protocol, result in values.items() for name, x in result.items()}
+        computed = {
+            f"{protocol}_{name}": x
+            for protocol, result in values.items()
+            for name, x in result.items()
+        }
         return dict.fromkeys(self.names) | computed
 
 

@@ -153,7 +153,9 @@ class SampleMetric(Declared, Metric):
             if values.is_floating_point():
                 values = values.double()
                 if bad := int((~values.isfinite().reshape(len(values), -1).all(1)).sum()):
-                    raise self.error(f"{bad} of {len(values)} rows of {name!r} are not finite. Did the model diverge?")
+                    raise self.error(
+                        f"{bad} of {len(values)} rows of {name!r} are not finite. Did the model diverge?"
+                    )
             sorted_rows.append(values)
         return sorted_rows if len(order) else []
 
@@ -161,7 +163,9 @@ class SampleMetric(Declared, Metric):
         """Returns the indices that sort samples by their keys. Raises `UserError` if two samples have the same key."""
         values, order = dim_zero_cat(getattr(self, keys)).sort()
         if twice := int((values[1:] == values[:-1]).sum()):
-            raise self.error(f"{twice} samples were given twice ({keys}). Evaluate each once, with a key of its own")
+            raise self.error(
+                f"{twice} samples were given twice ({keys}). Evaluate each once, with a key of its own"
+            )
         return order
 
     def by_group(self, groups: Tensor, samples: int) -> Tensor:
@@ -169,7 +173,9 @@ class SampleMetric(Declared, Metric):
         names, sizes = groups.unique(return_counts=True)
         if wrong := int((sizes != samples).sum()):
             have = f"{wrong} of {len(names)} prompts do not have {samples} motions"
-            raise self.error(f"{have} but {int(sizes.min())} to {int(sizes.max())}. Generate {samples} for each")
+            raise self.error(
+                f"{have} but {int(sizes.min())} to {int(sizes.max())}. Generate {samples} for each"
+            )
         return groups.argsort(stable=True).unflatten(0, (len(names), samples))
 
     def error(self, message: str) -> UserError:
@@ -190,7 +196,9 @@ class SampleMetric(Declared, Metric):
         # A sum is finite only if all numbers are, and is faster to compute.
         if not frames.sum().isfinite():
             bad = sum(not bool(motion.isfinite().all()) for motion in motions)
-            raise self.error(f"{bad} of {len(motions)} motions are not finite. Did the model diverge?")
+            raise self.error(
+                f"{bad} of {len(motions)} motions are not finite. Did the model diverge?"
+            )
         return motions
 
     def _sync_dist(self, dist_sync_fn: Any = None, process_group: Any | None = None) -> None:
@@ -265,7 +273,9 @@ class JointMean(MotionMean):
         for i, joints in enumerate(motions["joints"]):
             mask = torch.ones(1, len(joints), dtype=torch.bool)
             self.update(joints[None], mask, motions["keys"][i : i + 1], **self.extras(motions, i))
-        pairs = torch.stack([torch.cat(getattr(self, state)) for state in ("sums", "counts")], 1).numpy()
+        pairs = torch.stack(
+            [torch.cat(getattr(self, state)) for state in ("sums", "counts")], 1
+        ).numpy()
         names = self.parts or self.names or [""]
         return {name: pairs[..., k] for k, name in enumerate(names) if pairs[:, 1, k].any()}
 

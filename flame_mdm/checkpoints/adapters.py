@@ -25,7 +25,13 @@ from torch.nn.utils.parametrize import register_parametrization
 from typing_extensions import TypedDict
 
 from flame_mdm.checkpoints.locating import find
-from flame_mdm.checkpoints.model_files import ADAPTER, check_weights, read_checkpoint, read_safetensors, state_sha256
+from flame_mdm.checkpoints.model_files import (
+    ADAPTER,
+    check_weights,
+    read_checkpoint,
+    read_safetensors,
+    state_sha256,
+)
 from flame_mdm.conditions.tokens import START, LearnedTokens
 from flame_mdm.conditions.vocabulary import hashed
 from flame_mdm.denoisers.layers import TransformerLayer
@@ -37,7 +43,8 @@ if TYPE_CHECKING:
     from flame_mdm.generator import MotionGenerator
 
 ORIGINAL, CHANGE = ".parametrizations.weight.original", ".parametrizations.weight.0."
-FARTHER = 10.0  # factor of the vectors of words, which have farther to go than weights: the rows are from N(0, 1)
+# Factor of the vectors of words, which have farther to go than weights: the rows are from N(0, 1)
+FARTHER = 10.0
 Paths = str | Path | Sequence[str | Path]  # one file, or several
 
 
@@ -65,10 +72,14 @@ class Change(nn.Module):
         return changed(weight, dict((*self.kept.items(), *self.dropped.items())), self.rows)
 
 
-def changed(weight: Tensor, parts: Mapping[str, Tensor], rows: Sequence[int], strength: float = 1.0) -> Tensor:
+def changed(
+    weight: Tensor, parts: Mapping[str, Tensor], rows: Sequence[int], strength: float = 1.0
+) -> Tensor:
     """Returns a weight with a low-rank change, or with vectors added to some of its rows."""
     if "vectors" in parts:
-        return weight.index_add(0, torch.tensor(rows, device=weight.device), strength * FARTHER * parts["vectors"])
+        return weight.index_add(
+            0, torch.tensor(rows, device=weight.device), strength * FARTHER * parts["vectors"]
+        )
     return weight + strength * (parts["up"] @ parts["down"])
 
 
@@ -84,7 +95,9 @@ def attach(model: MotionGenerator, about: About) -> None:
     model.requires_grad_(False)
     layers = [layer for layer in model.denoiser.modules() if isinstance(layer, TransformerLayer)]
     if not layers:
-        raise UserError(f"{model.describe()} has no attention, which adapters change. Train all weights: full=true")
+        raise UserError(
+            f"{model.describe()} has no attention, which adapters change. Train all weights: full=true"
+        )
     for number, layer in enumerate(layers):
         is_kept = about["action"] or number >= len(layers) // 2
         for module in [module for module in layer.modules() if isinstance(module, nn.Linear)]:
@@ -104,7 +117,9 @@ def copy_weights(model: MotionGenerator, base: str | Path) -> None:
     try:
         model.load_state_dict(own)
     except RuntimeError as error:
-        raise UserError(f"base={base}: its weights do not fit the recipe: {first_line(error)}") from error
+        raise UserError(
+            f"base={base}: its weights do not fit the recipe: {first_line(error)}"
+        ) from error
 
 
 def write_adapter(path: Path, trained: Path) -> None:
@@ -117,22 +132,36 @@ def write_adapter(path: Path, trained: Path) -> None:
         temporary.write_bytes(save(_changes(checkpoint["state_dict"]), metadata))
 
 
-def read_merged(path: Path, adapter: Paths = (), strength: float | Sequence[float] = 1.0) -> dict[str, Any]:
+def read_merged(
+    path: Path, adapter: Paths = (), strength: float | Sequence[float] = 1.0
+) -> dict[str, Any]:
     """Reads a checkpoint or model file, with adapters merged into its weights; see `flame_mdm.load`."""
     paths = [adapter] if isinstance(adapter, str | Path) else list(adapter)
     strengths = [strength] * len(paths) if isinstance(strength, int | float) else list(strength)
     if len(strengths) != len(paths) or not all(math.isfinite(value) for value in strengths):
-        raise UserError(f"adapter strength {strength}: give one number, or one for each of {len(paths)} adapters")
+        raise UserError(
+            f"adapter strength {strength}: give one number, or one for each of {len(paths)} adapters"
+        )
     checkpoint = read_checkpoint(path)
-    state, config, facts = checkpoint["state_dict"], dict(checkpoint["config"]), dict(checkpoint["facts"])
-    plain = {name.replace(ORIGINAL, ".weight"): value for name, value in state.items() if CHANGE not in name}
+    state, config, facts = (
+        checkpoint["state_dict"],
+        dict(checkpoint["config"]),
+        dict(checkpoint["facts"]),
+    )
+    plain = {
+        name.replace(ORIGINAL, ".weight"): value
+        for name, value in state.items()
+        if CHANGE not in name
+    }
     if (trained := config.pop("adapter", None)) and (changes := _changes(state)):
         _merge(plain, changes, check_shape(trained, About)["rows"], 1.0, path)
     own = state_sha256(plain) if paths else ""
     for file, weight in zip(paths, strengths, strict=True):
         about, changes = _read(Path(file))
         if about["base"] != own:
-            raise UserError(f"adapter={file}: made for the weights {about['base'][:12]}, not {own[:12]}. Give its base")
+            raise UserError(
+                f"adapter={file}: made for the weights {about['base'][:12]}, not {own[:12]}. Give its base"
+            )
         _merge(plain, changes, about["rows"], weight, file)
         for key, more in (("vocabulary", about["words"]), ("captions", about["captions"])):
             if key in facts and weight:  # the base leaves out words that it does not know
@@ -146,14 +175,24 @@ def _changes(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def _merge(
-    state: dict[str, Tensor], changes: Mapping[str, Tensor], rows: Sequence[int], strength: float, path: str | Path
+    state: dict[str, Tensor],
+    changes: Mapping[str, Tensor],
+    rows: Sequence[int],
+    strength: float,
+    path: str | Path,
 ) -> None:
     try:
         for name in {name.rpartition(".")[0] for name in changes}:
-            parts = {key.rpartition(".")[2]: part for key, part in changes.items() if key.rpartition(".")[0] == name}
+            parts = {
+                key.rpartition(".")[2]: part
+                for key, part in changes.items()
+                if key.rpartition(".")[0] == name
+            }
             state[name] = changed(state[name].float(), parts, rows, strength)
     except (KeyError, RuntimeError, IndexError) as error:
-        raise UserError(f"{path}: damaged: the adapter does not fit the weights: {first_line(error)}") from error
+        raise UserError(
+            f"{path}: damaged: the adapter does not fit the weights: {first_line(error)}"
+        ) from error
 
 
 def _read(path: Path) -> tuple[About, dict[str, Tensor]]:

@@ -7,7 +7,12 @@ from typing import Any
 
 from flame_mdm.checkpoints.adapters import read_merged
 from flame_mdm.checkpoints.locating import find
-from flame_mdm.checkpoints.model_files import FILE, read_model_file, without_own_paths, write_model_file
+from flame_mdm.checkpoints.model_files import (
+    FILE,
+    read_model_file,
+    without_own_paths,
+    write_model_file,
+)
 from flame_mdm.config import save
 from flame_mdm.errors import UserError, first_line, markdown_text
 from flame_mdm.safe_io import atomic_folder, read_text, read_yaml, regular_file, sha256, write_text
@@ -45,7 +50,9 @@ def export(source: str | Path, out: str | Path, *, half: bool = False, **adapted
     return write_model_file(out, state, config=config, facts=checkpoint["facts"], origin=origin)
 
 
-def push(source: str | Path, repository: str, folder: str | Path, *, upload: bool, private: bool) -> Path:
+def push(
+    source: str | Path, repository: str, folder: str | Path, *, upload: bool, private: bool
+) -> Path:
     """Writes a folder with model file, recipe and card, and uploads it to the hub as "user/name"; see `export`."""
     if not re.fullmatch(r"\w[\w.-]*/\w[\w.-]*", repository):
         raise UserError(f"{repository}: not a repository name. Write user/name")
@@ -61,8 +68,11 @@ def push(source: str | Path, repository: str, folder: str | Path, *, upload: boo
 
         try:
             HfApi().create_repo(repository, private=private, exist_ok=True)
-            HfApi().upload_folder(repo_id=repository, folder_path=folder, allow_patterns=[FILE, *WRITTEN])
-        except Exception as error:  # the client raises many kinds: no network, no token, no permission ...
+            HfApi().upload_folder(
+                repo_id=repository, folder_path=folder, allow_patterns=[FILE, *WRITTEN]
+            )
+        # The client raises many kinds: no network, no token, no permission ...
+        except Exception as error:
             message = f"{repository}: upload failed: {first_line(error)}. The files are in {folder}"
             raise UserError(message) from error
     return folder
@@ -87,7 +97,9 @@ def card(model: Mapping[str, Any], repository: str, file_sha256: str) -> str:
 
     config, facts = model["config"], model["facts"]
     licenses = read_yaml(Path(__file__).with_name("licenses.yaml"))
-    names = [name for name in ("denoiser", "process", "condition", "representation") if name in config]
+    names = [
+        name for name in ("denoiser", "process", "condition", "representation") if name in config
+    ]
     parts = {name: config[name]["_target_"].rpartition(".")[2] for name in names}
     other = {"ActionLabels": f"actions={facts['actions'][:1]}, ", "Unconditional": ""}
     request = other.get(parts.get("condition", ""), '"a person walks forward", ')
@@ -106,5 +118,8 @@ def card(model: Mapping[str, Any], repository: str, file_sha256: str) -> str:
     sources = [motions | terms.get(motions["license"], {}) for motions in facts.get("licenses", ())]
     template = Template(CARD.read_text(encoding="utf-8"), keep_trailing_newline=True)
     dataset = "mixture" if sources else facts.get("dataset")
-    words = licenses.get(dataset, licenses["other"]) | {"repository": repository, "request": request}
+    words = licenses.get(dataset, licenses["other"]) | {
+        "repository": repository,
+        "request": request,
+    }
     return template.render(words, rows=rows, sources=sources, markdown=markdown_text)

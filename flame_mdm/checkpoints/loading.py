@@ -22,7 +22,14 @@ from flame_mdm.generator import DistilledGenerator, MotionGenerator
 if TYPE_CHECKING:
     from flame_mdm.task import Task
 
-PARTS = ("task", "representation", "process", "condition", "denoiser")  # parts of a recipe from which a model is built
+# Parts of a recipe from which a model is built
+PARTS = (
+    "task",
+    "representation",
+    "process",
+    "condition",
+    "denoiser",
+)
 GENERATORS = {
     "flame_mdm.task.GeneratorTask": MotionGenerator,
     "flame_mdm.training.adaptation.AdaptationTask": MotionGenerator,
@@ -30,7 +37,11 @@ GENERATORS = {
 }
 """Classes of the task in recipes, and the generators that they train, which are loaded without Lightning."""
 Trained = TypeVar("Trained", bound="Task | MotionGenerator")
-NO_GPU = "PyTorch finds no GPU" if torch.version.cuda or torch.version.hip else "this PyTorch was built without CUDA"
+NO_GPU = (
+    "PyTorch finds no GPU"
+    if torch.version.cuda or torch.version.hip
+    else "this PyTorch was built without CUDA"
+)
 """Why no GPU can be used, if PyTorch has none."""
 
 
@@ -47,10 +58,14 @@ def load(
     `adapter` are files that `flame_mdm.adapt` wrote for this model, `strength` that of each, or of all: 0 = the model
     without them, 1 = as trained.
     """
-    return load_task(find(source, which), MotionGenerator, device, adapter=adapter, strength=strength)
+    return load_task(
+        find(source, which), MotionGenerator, device, adapter=adapter, strength=strength
+    )
 
 
-def load_task(path: Path, kind: type[Trained], device: str | torch.device = "cpu", **adapted: Any) -> Trained:
+def load_task(
+    path: Path, kind: type[Trained], device: str | torch.device = "cpu", **adapted: Any
+) -> Trained:
     """Loads the task of a .ckpt or .safetensors file in evaluation mode, with averaged weights if its recipe has them.
 
     `kind` is the expected class of the task, `adapted` adapter and strength, as for `load`. Raises `UserError` if the
@@ -63,7 +78,11 @@ def load_task(path: Path, kind: type[Trained], device: str | torch.device = "cpu
     except Exception as error:  # a nonsensical recipe may fail anywhere
         if isinstance(error, FileNotFoundError):  # of a text encoder
             raise
-        kind_of_error = "" if isinstance(error, UserError) else f"cannot build the model: {type(error).__name__}: "
+        kind_of_error = (
+            ""
+            if isinstance(error, UserError)
+            else f"cannot build the model: {type(error).__name__}: "
+        )
         raise UserError(f"{path}: {kind_of_error}{error}") from error
 
 
@@ -76,7 +95,9 @@ def check_device(device: str | torch.device) -> None:
     except (RuntimeError, AssertionError) as error:  # torch reports an absent device as either
         gpus = [f"cuda:{number}" for number in range(torch.cuda.device_count())]
         names = ", ".join(["cpu", *gpus]) + f" ({NO_GPU})" * (not gpus)
-        raise UserError(f"device={device}: this machine has only {names}. Drop device=, or change it") from error
+        raise UserError(
+            f"device={device}: this machine has only {names}. Drop device=, or change it"
+        ) from error
 
 
 def _build(checkpoint: dict[str, Any], kind: type[Trained]) -> Trained:

@@ -10,7 +10,9 @@ from flame_mdm.safe_io import regular_file
 
 Which = Literal["last", "best"]
 
-SHIPPED = {path.stem: path for path in sorted((Path(__file__).parents[1] / "models").glob("*.safetensors"))}
+SHIPPED = {
+    path.stem: path for path in sorted((Path(__file__).parents[1] / "models").glob("*.safetensors"))
+}
 """Models in this package, by name; `docs/checkpoints.md` says how they were trained."""
 
 
@@ -32,30 +34,42 @@ def find(source: str | Path, which: Which = "last") -> Path:
     if match is None or path.suffix in (".ckpt", ".safetensors", ".pt") or path.parent.is_dir():
         neighbors = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
         near = did_you_mean(path.name, [*neighbors, *SHIPPED])
-        raise FileNotFoundError(f"{path}: no such checkpoint.{near or ' Give a run, or a .ckpt or .safetensors file'}")
+        raise FileNotFoundError(
+            f"{path}: no such checkpoint.{near or ' Give a run, or a .ckpt or .safetensors file'}"
+        )
     from huggingface_hub import hf_hub_download, logging
 
     logging.set_verbosity_error()  # otherwise it reports every attempt to reach the hub
     try:
         return Path(hf_hub_download(match[1], FILE, revision=match[2]))
-    except Exception as error:  # the client raises many kinds: no network, no such repository, no permission ...
+    # The client raises many kinds: no network, no such repository, no permission ...
+    except Exception as error:
         what = f"no such file or folder, and {FILE} of a model with this name cannot be downloaded from the hub"
         raise UserError(f"{source}: {what}: {first_line(error)}") from error
 
 
 def _find_in_folder(folder: Path, which: Which) -> Path:
-    weights = [file for file in sorted(folder.glob("*.safetensors")) if not file.name.startswith(".")]  # half-written
+    # Half-written
+    weights = [
+        file for file in sorted(folder.glob("*.safetensors")) if not file.name.startswith(".")
+    ]
     is_run = (folder / "config.yaml").is_file() and not weights
     if is_run or (folder / "checkpoints").is_dir():
         file = folder / "checkpoints" / f"{which}.ckpt"
         if not file.exists():
-            names = ", ".join(sorted(path.name for path in file.parent.glob("*.ckpt"))) or "none yet"
+            names = (
+                ", ".join(sorted(path.name for path in file.parent.glob("*.ckpt"))) or "none yet"
+            )
             raise FileNotFoundError(f"{file}: no such checkpoint. The run has {names}")
         return file
     if len(weights) != 1:
         if runs := [run for run in sorted(folder.iterdir()) if (run / "checkpoints").is_dir()]:
-            raise UserError(f"{folder}: no run, but there are runs below it. Give one: {', '.join(map(str, runs))}")
+            raise UserError(
+                f"{folder}: no run, but there are runs below it. Give one: {', '.join(map(str, runs))}"
+            )
         names = ", ".join(file.name for file in weights) or "no .safetensors file"
-        raise UserError(f"{folder}: this folder holds {names}. Name the file of the model, or a run directory")
+        raise UserError(
+            f"{folder}: this folder holds {names}. Name the file of the model, or a run directory"
+        )
     regular_file(weights[0])
     return weights[0]

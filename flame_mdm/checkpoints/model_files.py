@@ -27,9 +27,14 @@ if TYPE_CHECKING:
 
 FORMAT = 2  # format of checkpoints and model files: 2 since version 0.2.0
 FORMAT_KEY = "flame_mdm_format"  # key of the format in a checkpoint
-KEY, ADAPTER = "flame_mdm", "flame_mdm_adapter"  # keys of the metadata of model files and of adapters
+# Keys of the metadata of model files and of adapters
+KEY, ADAPTER = (
+    "flame_mdm",
+    "flame_mdm_adapter",
+)
 FILE = "model.safetensors"
-MOST_FRAMES = 100_000  # maximum number of frames that a model file may declare: more than an hour at 20 per second
+# Maximum number of frames that a model file may declare: more than an hour at 20 per second
+MOST_FRAMES = 100_000
 
 
 def read_model_file(path: Path) -> dict[str, Any]:
@@ -37,17 +42,26 @@ def read_model_file(path: Path) -> dict[str, Any]:
     metadata, state = read_safetensors(path)
     text = metadata.get(KEY)
     if ADAPTER in metadata:
-        raise UserError(f"{path}: an adapter, which changes a model. Name its base first: BASE adapter={path}")
+        raise UserError(
+            f"{path}: an adapter, which changes a model. Name its base first: BASE adapter={path}"
+        )
     if text is None:
-        raise UserError(f"{path}: weights without a recipe. Import released weights with `flame-mdm import`")
+        raise UserError(
+            f"{path}: weights without a recipe. Import released weights with `flame-mdm import`"
+        )
     try:
         content = parse_json(text)
-        number, model = content["format"], {name: content[name] for name in ("config", "facts", "origin")}
+        number, model = (
+            content["format"],
+            {name: content[name] for name in ("config", "facts", "origin")},
+        )
     except (ValueError, TypeError, KeyError) as error:
         raise UserError(f"{path}: damaged: its recipe cannot be read") from error
     check_format(path, number)
     if metadata.get("sha256") != content_sha256(text, state):
-        raise UserError(f"{path}: damaged: it has changed since it was written. Download or export it again")
+        raise UserError(
+            f"{path}: damaged: it has changed since it was written. Download or export it again"
+        )
     return checked(path, model | {"state_dict": state})
 
 
@@ -67,9 +81,13 @@ def check_format(path: Path, number: Any) -> None:
     """Raises `UserError` for a format other than `FORMAT`; version 0.1 wrote 1 or, in checkpoints, None."""
     if number in (1, None):
         what = "written by version 0.1 of flame_mdm, whose files this version does not read"
-        raise UserError(f"{path}: {what}. Train or import the model again, or use it with version 0.1")
+        raise UserError(
+            f"{path}: {what}. Train or import the model again, or use it with version 0.1"
+        )
     if number != FORMAT:
-        raise UserError(f"{path}: has format {str(number)[:40]}, but this version reads {FORMAT}. Update flame_mdm")
+        raise UserError(
+            f"{path}: has format {str(number)[:40]}, but this version reads {FORMAT}. Update flame_mdm"
+        )
 
 
 class _Run(TypedDict, total=False):
@@ -135,7 +153,11 @@ def checked(path: Path, content: Any) -> dict[str, Any]:
     if not isinstance(content, dict) or not {"config", "facts", "state_dict"} <= content.keys():
         what = "not a checkpoint of this framework: it holds no recipe"
         raise UserError(f"{path}: {what}. Import released checkpoints with `flame-mdm import`")
-    metadata = {name: content[name] for name in ("config", "facts", "origin", "global_step") if name in content}
+    metadata = {
+        name: content[name]
+        for name in ("config", "facts", "origin", "global_step")
+        if name in content
+    }
     for name, value in metadata.items():
         plain(value, f"{path}: {name}")
     try:
@@ -155,16 +177,31 @@ def check_weights(weights: Mapping[Any, Any], path: Path) -> None:
     kinds = (torch.float64, torch.float32, torch.float16, torch.bfloat16)
     kinds += (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8, torch.bool)
     for name, value in weights.items():
-        is_dense = isinstance(name, str) and isinstance(value, torch.Tensor) and value.layout == torch.strided
+        is_dense = (
+            isinstance(name, str)
+            and isinstance(value, torch.Tensor)
+            and value.layout == torch.strided
+        )
         if not is_dense or value.device.type != "cpu" or value.dtype not in kinds or value.is_neg():
             shown = f"{str(name)[:80]} is {getattr(value, 'dtype', type(value).__name__)}"
-            raise UserError(f"{path}: damaged: its weights are not dense tensors of real numbers by name: {shown}")
-    if sum(value.numel() * value.element_size() for value in weights.values()) > 2 * path.stat().st_size:  # 2: shared
+            raise UserError(
+                f"{path}: damaged: its weights are not dense tensors of real numbers by name: {shown}"
+            )
+    # 2: shared
+    if (
+        sum(value.numel() * value.element_size() for value in weights.values())
+        > 2 * path.stat().st_size
+    ):
         raise UserError(f"{path}: damaged: its weights are declared to be larger than the file")
 
 
 def write_model_file(
-    out: str | Path, state: Mapping[str, Tensor], *, config: Mapping[str, Any], facts: Mapping[str, Any], origin: Any
+    out: str | Path,
+    state: Mapping[str, Tensor],
+    *,
+    config: Mapping[str, Any],
+    facts: Mapping[str, Any],
+    origin: Any,
 ) -> Path:
     """Writes a model file atomically, to a .safetensors file or to `FILE` in a folder, and returns its path."""
     from safetensors.torch import save
@@ -208,6 +245,11 @@ def weights_sha256(path: Path) -> str:
 
 def without_own_paths(config: Mapping[str, Any]) -> dict[str, Any]:
     """Returns a recipe with default paths of data and run instead of absolute paths on this machine."""
-    own = {config.get("data_root"): "data", config.get("run", {}).get("dir"): f"runs/{config['experiment']}/default"}
-    moves = {folder: other for folder, other in own.items() if folder and Path(folder).is_absolute()}
+    own = {
+        config.get("data_root"): "data",
+        config.get("run", {}).get("dir"): f"runs/{config['experiment']}/default",
+    }
+    moves = {
+        folder: other for folder, other in own.items() if folder and Path(folder).is_absolute()
+    }
     return moved(dict(config), moves)

@@ -32,8 +32,13 @@ from flame_mdm.safe_io import atomic_folder, sha256, write_json
 from flame_mdm.sampler_options import SamplerOptions
 
 RUNNER = Path(__file__).with_name("runner.py")
-TOLERANCE = 1e-4  # maximum difference between the outputs of a graph and of PyTorch, relative to the largest output
-FIXED_LENGTH = (MDMGRU, MDMUNet)  # their graphs have as many frames as the longest motion: shorter ones are padded
+# Maximum difference between the outputs of a graph and of PyTorch, relative to the largest output
+TOLERANCE = 1e-4
+# Their graphs have as many frames as the longest motion: shorter ones are padded
+FIXED_LENGTH = (
+    MDMGRU,
+    MDMUNet,
+)
 TINY = 1e-6  # probe of `to_x0` that no clipping of the clean estimate changes
 
 
@@ -48,7 +53,9 @@ def export_onnx(source: str | Path, out: str | Path, *, half: bool = False, **ad
         import onnxruntime  # noqa: F401
         import onnxscript  # noqa: F401
     except ImportError as error:
-        raise UserError(f"format=onnx needs the package {error.name}: pip install flame-mdm[onnx]") from error
+        raise UserError(
+            f"format=onnx needs the package {error.name}: pip install flame-mdm[onnx]"
+        ) from error
     model = load(source, **adapted)
     content = description(model)
     with atomic_folder(out) as folder, torch.no_grad():
@@ -67,25 +74,50 @@ def description(model: MotionGenerator) -> dict[str, Any]:
     Raises:
         UserError: If a value is not within the limits of the runner, or the sampler cannot be exported.
     """
-    representation, skeleton, facts = model.representation, model.representation.skeleton, model.facts
+    representation, skeleton, facts = (
+        model.representation,
+        model.representation.skeleton,
+        model.facts,
+    )
     encoder, denoiser = model.condition, model.denoiser
     if denoiser.context_frames:
-        raise UserError("this model continues frames, which the exported runner does not. Export another model")
+        raise UserError(
+            "this model continues frames, which the exported runner does not. Export another model"
+        )
     padded = isinstance(denoiser, FIXED_LENGTH) or not denoiser.mask_padding
-    words = {"buckets": encoder.buckets, "max_words": encoder.max_words} if isinstance(encoder, LearnedTokens) else {}
+    words = (
+        {"buckets": encoder.buckets, "max_words": encoder.max_words}
+        if isinstance(encoder, LearnedTokens)
+        else {}
+    )
     content = {
-        **{"format": FORMAT, "experiment": model.config["experiment"], "reads": model.conditioned_on, **words},
+        **{
+            "format": FORMAT,
+            "experiment": model.config["experiment"],
+            "reads": model.conditioned_on,
+            **words,
+        },
         **{key: list(facts.get(key, ())) for key in ("actions", "vocabulary", "captions")},
         "function_words": sorted(FUNCTION_WORDS),
-        **{"features": representation.features, "fps": representation.fps, "max_frames": facts["max_frames"]},
+        **{
+            "features": representation.features,
+            "fps": representation.fps,
+            "max_frames": facts["max_frames"],
+        },
         "padded_frames": facts["max_frames"] if padded else 0,
         "skeleton": {"joints": skeleton.joints, "parents": skeleton.parents, "feet": skeleton.feet},
         "clip_x0": bool(getattr(model.process, "clip_x0", False)),
         "steps": sampling_plan(model.process, model.sampler_options),
     }
-    wrong = [name for name in faults(json.loads(json.dumps(content)), SCHEMA) if name not in ("sha256", "digest")]
+    wrong = [
+        name
+        for name in faults(json.loads(json.dumps(content)), SCHEMA)
+        if name not in ("sha256", "digest")
+    ]
     if wrong:
-        raise UserError(f"{wrong[0]}: not within the limits of an exported model, which docs/export.md lists")
+        raise UserError(
+            f"{wrong[0]}: not within the limits of an exported model, which docs/export.md lists"
+        )
     return content | {"sha256": {}}
 
 
@@ -99,7 +131,8 @@ class Probe:
     def __init__(self, process: Process, calls: int, variance: float):
         self.process, self.calls, self.variance, self.output = process, calls, variance, variance
         self.time, self.draws = 0.0, 0
-        self.records: list[tuple[Tensor, int, list[float]]] = []  # x_t, draws before, (t, p, q) of each call
+        # x_t, draws before, (t, p, q) of each call
+        self.records: list[tuple[Tensor, int, list[float]]] = []
 
     def unit(self, number: int) -> Tensor:
         return functional.one_hot(torch.tensor(number), 2 * self.calls + 1).double()[None, None]
@@ -135,7 +168,9 @@ def sampling_plan(process: Process, options: SamplerOptions) -> list[list[float]
     plans = [np.array(_plan(process, options, variance)) for variance in (0.0, 1.0)]
     if not np.array_equal(plans[0], plans[1]):
         what = "draws noise with the learned variance of this model, which the graph does not have"
-        raise UserError(f"sampler={options.sampler} {what}. Set task.sampler to ddim or dpm_solver_pp_2m")
+        raise UserError(
+            f"sampler={options.sampler} {what}. Set task.sampler to ddim or dpm_solver_pp_2m"
+        )
     return plans[0].tolist()
 
 
@@ -145,18 +180,29 @@ def _plan(process: Process, options: SamplerOptions, variance: float) -> list[li
     like, mask = probe.unit(0), torch.ones(1, 1, dtype=torch.bool)
     edit = Edit(like * 0, torch.zeros_like(like, dtype=torch.bool), guide=probe)
     try:
-        end = process.sample(probe.denoise, probe.noise, mask, Condition(like[0], like, mask), options, edit=edit)
+        end = process.sample(
+            probe.denoise, probe.noise, mask, Condition(like[0], like, mask), options, edit=edit
+        )
     except UserError as error:
         raise UserError(f"sampler={options.sampler} cannot be exported: {error}") from error
     rows = []
     for number, (x_t, draws, row) in enumerate(probe.records):
         after, drawn, _ = (*probe.records, (end, probe.draws, []))[number + 1]
         last = probe.unit(probe.calls + number) * (number > 0)
-        columns = [x_t, probe.unit(probe.calls + 1 + number), last, probe.unit(draws) * (drawn > draws)]
+        columns = [
+            x_t,
+            probe.unit(probe.calls + 1 + number),
+            last,
+            probe.unit(draws) * (drawn > draws),
+        ]
         matrix = torch.cat(columns, 1)[0].T.numpy()
         solution = np.linalg.lstsq(matrix, after.numpy().ravel())[0]
-        if np.abs(matrix @ solution - after.numpy().ravel()).max() > 1e-9 * float(after.abs().max()):
-            raise UserError(f"sampler={options.sampler} combines more than two clean estimates, and is not exported")
+        if np.abs(matrix @ solution - after.numpy().ravel()).max() > 1e-9 * float(
+            after.abs().max()
+        ):
+            raise UserError(
+                f"sampler={options.sampler} combines more than two clean estimates, and is not exported"
+            )
         rows.append([*row, *np.where(np.abs(solution) > 1e-12, solution, 0.0).tolist()])
     return rows
 
@@ -188,10 +234,19 @@ class Call(nn.Module):
         self.scale = model.sampler_options.guidance_scale if model.condition.features else None
 
     def forward(
-        self, x_t: Tensor, t: Tensor, lengths: Tensor, condition: Tensor | None = None, counts: Tensor | None = None
+        self,
+        x_t: Tensor,
+        t: Tensor,
+        lengths: Tensor,
+        condition: Tensor | None = None,
+        counts: Tensor | None = None,
     ) -> Tensor:
         mask = length_mask(lengths, x_t.shape[1])
-        if isinstance(self.condition, LearnedTokens) and condition is not None and counts is not None:
+        if (
+            isinstance(self.condition, LearnedTokens)
+            and condition is not None
+            and counts is not None
+        ):
             cond = self.condition.encode(condition, counts)
         else:
             cond = self.condition(MotionBatch(x_t, mask, [], action=condition))
@@ -211,8 +266,15 @@ class Function(nn.Module):
 
 def graphs(model: MotionGenerator) -> list[Graph]:
     """Returns the graphs of a model: the guided denoiser, decoding to joints and, for SMPL's skeleton, to rotations."""
-    representation, encoder, longest = model.representation, model.condition, model.facts["max_frames"]
-    batch, frames = torch.export.Dim("batch", max=1024), torch.export.Dim("frames", min=4, max=max(longest, 5))
+    representation, encoder, longest = (
+        model.representation,
+        model.condition,
+        model.facts["max_frames"],
+    )
+    batch, frames = (
+        torch.export.Dim("batch", max=1024),
+        torch.export.Dim("frames", min=4, max=max(longest, 5)),
+    )
     x = torch.randn(2, min(longest, 9), representation.features)
     fixed = isinstance(model.denoiser, FIXED_LENGTH)
     inputs = {"x_t": torch.randn(2, longest, representation.features) if fixed else x}
@@ -223,7 +285,10 @@ def graphs(model: MotionGenerator) -> list[Graph]:
     if isinstance(encoder, LearnedTokens):
         most = encoder.positions.shape[0]
         most = min(most, getattr(model.denoiser, "max_tokens", 0) or most)
-        inputs |= {"condition": torch.randint(encoder.buckets, (2, 5, 2)), "counts": torch.tensor([5, 3])}
+        inputs |= {
+            "condition": torch.randint(encoder.buckets, (2, 5, 2)),
+            "counts": torch.tensor([5, 3]),
+        }
         words = torch.export.Dim("words", min=MIN_WORDS, max=most)
         dimensions |= {"condition": {0: batch, 1: words}, "counts": {0: batch}}
     elif encoder.features:
@@ -234,8 +299,12 @@ def graphs(model: MotionGenerator) -> list[Graph]:
     made += [Graph("joints", to_joints, {"x": x}, {"x": {0: batch, 1: frames}}, ["joints"])]
     if representation.skeleton.name == SMPL22.name:
         solver = Function(partial(solve_checked, fps=representation.fps))
-        joints = {"joints": representation.to_joints(x[0]) + torch.randn(x.shape[1], len(SMPL22), 3)}
-        made.append(Graph("poses", solver, joints, {"joints": {0: frames}}, ["offsets", "quaternions"]))
+        joints = {
+            "joints": representation.to_joints(x[0]) + torch.randn(x.shape[1], len(SMPL22), 3)
+        }
+        made.append(
+            Graph("poses", solver, joints, {"joints": {0: frames}}, ["offsets", "quaternions"])
+        )
     return made
 
 
@@ -251,9 +320,13 @@ def write_graph(graph: Graph, path: Path, half: bool) -> None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             module = graph.module.eval()
-            exported = torch.export.export(module, tuple(examples), dynamic_shapes=dimensions, strict=False)
+            exported = torch.export.export(
+                module, tuple(examples), dynamic_shapes=dimensions, strict=False
+            )
             names = {"input_names": list(graph.examples), "output_names": graph.outputs}
-            program = torch.onnx.export(exported, dynamo=True, verbose=False, optimize=False, **names)
+            program = torch.onnx.export(
+                exported, dynamo=True, verbose=False, optimize=False, **names
+            )
             assert program is not None
             program.save(raw)
         # onnxruntime optimizes in a second what takes PyTorch's exporter a minute.
@@ -263,18 +336,28 @@ def write_graph(graph: Graph, path: Path, half: bool) -> None:
         options.optimized_model_filepath = str(path)
         onnxruntime.InferenceSession(raw, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # the exporter raises many kinds
-        raise UserError(f"the {graph.name} cannot be exported to ONNX: {first_line(error)}") from error
+        raise UserError(
+            f"the {graph.name} cannot be exported to ONNX: {first_line(error)}"
+        ) from error
     raw.unlink()
     _shrink(path, half)
     session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
     single = examples if graph.name == "poses" else [example[:1] for example in examples]
     for values in (examples, single):
-        outputs = session.run(None, {name: value.numpy() for name, value in zip(graph.examples, values, strict=True)})
+        outputs = session.run(
+            None, {name: value.numpy() for name, value in zip(graph.examples, values, strict=True)}
+        )
         expected = graph.module(*values)
-        for ours, theirs in zip(outputs, [expected] if isinstance(expected, Tensor) else expected, strict=True):
-            difference = float((torch.from_numpy(ours) - theirs).abs().max() / theirs.abs().max().clamp(min=1))
+        for ours, theirs in zip(
+            outputs, [expected] if isinstance(expected, Tensor) else expected, strict=True
+        ):
+            difference = float(
+                (torch.from_numpy(ours) - theirs).abs().max() / theirs.abs().max().clamp(min=1)
+            )
             if not difference <= (100 * TOLERANCE if half else TOLERANCE):
-                raise UserError(f"the {graph.name} of onnxruntime and PyTorch differ by {difference:.2g}")
+                raise UserError(
+                    f"the {graph.name} of onnxruntime and PyTorch differ by {difference:.2g}"
+                )
 
 
 def _shrink(path: Path, half: bool) -> None:
@@ -290,5 +373,7 @@ def _shrink(path: Path, half: bool) -> None:
         if half and tensor.data_type == onnx.TensorProto.FLOAT and len(tensor.dims) > 1:
             name, values = tensor.name, numpy_helper.to_array(tensor).astype(np.float16)
             tensor.CopyFrom(numpy_helper.from_array(values, f"{name}.half"))
-            model.graph.node.insert(0, onnx.helper.make_node("Cast", [tensor.name], [name], to=onnx.TensorProto.FLOAT))
+            model.graph.node.insert(
+                0, onnx.helper.make_node("Cast", [tensor.name], [name], to=onnx.TensorProto.FLOAT)
+            )
     onnx.save(model, path)

@@ -82,16 +82,28 @@ def import_mdm(state: Mapping[str, Tensor], args: Options, *, time_token: bool =
         options |= {"num_layers": num_layers, "recur_over_batch": True}
     else:
         ff_size = theirs.shape_of(ours, "transformer.layers.0.feed_forward.0.weight")[0]
-        options |= {"ff_size": ff_size, "num_heads": args.num_heads, "mask_padding": args.mask_frames}
+        options |= {
+            "ff_size": ff_size,
+            "num_heads": args.num_heads,
+            "mask_padding": args.mask_frames,
+        }
     if args.arch == "trans_dec":
         distilbert = args.text_encoder_type == "bert"
         options["token_memory"] = distilbert
-        options |= {"memory": args.emb_policy, "context_frames": args.context_len, **_target_options(ours)}
+        options |= {
+            "memory": args.emb_policy,
+            "context_frames": args.context_len,
+            **_target_options(ours),
+        }
         if args.emb_trans_dec:  # the code that introduced DistilBERT has a token of the time alone
             options["input_token"] = "time" if time_token or distilbert else "condition"
     if (args.lambda_target_loc or args.multi_target_cond) and "target_encoder" not in options:
-        raise ValueError("released weights: embed_target_cond is missing, the encoder of targets that the options name")
-    return Released(network, (in_features, out_features, cond_features), options, ours, embedding).checked()
+        raise ValueError(
+            "released weights: embed_target_cond is missing, the encoder of targets that the options name"
+        )
+    return Released(
+        network, (in_features, out_features, cond_features), options, ours, embedding
+    ).checked()
 
 
 def _target_options(ours: Mapping[str, Tensor]) -> dict[str, Any]:
@@ -101,7 +113,9 @@ def _target_options(ours: Mapping[str, Tensor]) -> dict[str, Any]:
         return {"target_encoder": "single", "target_layers": layers}
     if "target.weights" in ours:
         return {"target_encoder": "multi"}
-    layers = sum(key.startswith("target.networks.0.") and key.endswith(".weight") for key in ours) - 1
+    layers = (
+        sum(key.startswith("target.networks.0.") and key.endswith(".weight") for key in ours) - 1
+    )
     return {"target_encoder": "split", "target_layers": layers} if layers >= 0 else {}
 
 
@@ -111,18 +125,30 @@ def import_flame(state: Mapping[str, Tensor], *, num_heads: int = 8) -> Released
     names, num_layers = theirs.layer_names(learned, "tf_decoder", theirs.DECODER_LAYER)
     ours = theirs.renamed(learned, theirs.NAMES["flame"] | names)
     latent_dim, in_features = theirs.shape_of(ours, "input.weight")
-    output, pooled = (theirs.shape_of(ours, name) for name in ("output.weight", "pooled_projection.weight"))
+    output, pooled = (
+        theirs.shape_of(ours, name) for name in ("output.weight", "pooled_projection.weight")
+    )
     ff_size, _ = theirs.shape_of(ours, "transformer.layers.0.feed_forward.0.weight")
-    options = {"latent_dim": latent_dim, "ff_size": ff_size, "num_layers": num_layers, "num_heads": num_heads}
+    options = {
+        "latent_dim": latent_dim,
+        "ff_size": ff_size,
+        "num_layers": num_layers,
+        "num_heads": num_heads,
+    }
     options |= {"dropout": 0.1, "max_frames": theirs.shape_of(ours, "length_embedding.weight")[0]}
     return Released(FLAME, (in_features, output[0], pooled[1]), options, ours).checked()
 
 
-def _recipe(name: str, released: Released, representation: str, condition: Config, process: Config) -> Config:
+def _recipe(
+    name: str, released: Released, representation: str, condition: Config, process: Config
+) -> Config:
     return {
         "experiment": name,
         "seed": 0,
-        "denoiser": {"_target_": f"{released.network.__module__}.{released.network.__name__}", **released.options},
+        "denoiser": {
+            "_target_": f"{released.network.__module__}.{released.network.__name__}",
+            **released.options,
+        },
         "condition": condition,
         "process": process,
         "representation": _option("representation", representation),
@@ -139,11 +165,19 @@ def _option(group: str, name: str) -> Config:
 
 def _flame_recipe(released: Released) -> tuple[Config, dict[str, Any]]:
     condition = _option("condition", "roberta") | {"features": released.features[2]}
-    config = _recipe("released/flame", released, "smpl", condition, _option("process", "flame_code"))
+    config = _recipe(
+        "released/flame", released, "smpl", condition, _option("process", "flame_code")
+    )
     config["task"] |= {"cond_drop_prob": 0.25, "guidance_scale": 8.0}
     config["optimizer"] |= {"weight_decay": 0.0}
-    longest = released.options["max_frames"] - 1  # the authors' table has one row more than the number of lengths
-    return config, {"actions": [], "dataset": "humanml3d-smpl", "fingerprint": None, "max_frames": longest}
+    # The authors' table has one row more than the number of lengths
+    longest = released.options["max_frames"] - 1
+    return config, {
+        "actions": [],
+        "dataset": "humanml3d-smpl",
+        "fingerprint": None,
+        "max_frames": longest,
+    }
 
 
 def _mdm_recipe(kind: str, released: Released, args: Options) -> tuple[Config, dict[str, Any]]:
@@ -153,13 +187,20 @@ def _mdm_recipe(kind: str, released: Released, args: Options) -> tuple[Config, d
     if released.action_embedding is not None:
         count, width = released.action_embedding.shape
         names = HumanAct12.actions if dataset == "humanact12" else ()
-        actions = [*names] if len(names) == count else [f"action {number}" for number in range(count)]
+        actions = (
+            [*names] if len(names) == count else [f"action {number}" for number in range(count)]
+        )
         condition = _option("condition", "action") | {"features": width}
     elif released.features[2]:
-        condition = _option("condition", ENCODERS[args.text_encoder_type]) | {"features": released.features[2]}
+        condition = _option("condition", ENCODERS[args.text_encoder_type]) | {
+            "features": released.features[2]
+        }
     process = _option("process", "flow_matching" if kind == "mfm" else "diffusion")
     config = _recipe(f"released/{kind}", released, representation, condition, process)
-    config["task"] |= {"cond_drop_prob": args.cond_mask_prob, "guidance_scale": 2.5 if args.cond_mask_prob else 1.0}
+    config["task"] |= {
+        "cond_drop_prob": args.cond_mask_prob,
+        "guidance_scale": 2.5 if args.cond_mask_prob else 1.0,
+    }
     if kind == "mfm":
         solver = args.ode_kwargs
         # All methods other than dopri5 are Euler; "euler" uses torchdiffeq's float32 times, the others i / N.
@@ -167,17 +208,28 @@ def _mdm_recipe(kind: str, released: Released, args: Options) -> tuple[Config, d
         config["task"]["sampler"] = "dopri5" if solver.method == "dopri5" else "euler"
         config["task"]["num_inference_steps"] = int(1 / solver.step_size)
     else:
-        process["num_train_timesteps"] = config["task"]["num_inference_steps"] = args.diffusion_steps
+        process["num_train_timesteps"] = config["task"]["num_inference_steps"] = (
+            args.diffusion_steps
+        )
         process["schedule"] = args.noise_schedule
         process["variance"] = "fixed_small" if args.sigma_small else "fixed_large"
-    config["losses"] = {"joints": args.lambda_rcxyz, "velocity": args.lambda_vel, "foot_contact": args.lambda_fc}
+    config["losses"] = {
+        "joints": args.lambda_rcxyz,
+        "velocity": args.lambda_vel,
+        "foot_contact": args.lambda_fc,
+    }
     longest = PADDED_FRAMES if dataset in NORMALIZED else args.num_frames or ACTION_FRAMES
     if args.context_len:
         longest = args.context_len + args.pred_len
         config["task"]["guidance_scale"] = PREFIX_GUIDANCE
     if released.options.get("target_encoder"):
         config["task"]["targets"] = _option("task", "generation_targets")["targets"]
-    return config, {"actions": actions, "dataset": dataset, "fingerprint": None, "max_frames": longest}
+    return config, {
+        "actions": actions,
+        "dataset": dataset,
+        "fingerprint": None,
+        "max_frames": longest,
+    }
 
 
 def import_released(
@@ -196,7 +248,9 @@ def import_released(
     file = Path(file)
     if (args is None) != (kind in ("flame", "mclip")):
         needs = "takes no" if args else "needs a"
-        raise UserError(f"{kind} {needs} file of options: MDM's args.json, or MFM's .hydra/config.yaml")
+        raise UserError(
+            f"{kind} {needs} file of options: MDM's args.json, or MFM's .hydra/config.yaml"
+        )
     options = read_options(args, {} if num_heads is None else {"num_heads": num_heads})
     advice = "Add run_code=true if you trust the authors of the file"
     checkpoint = theirs.read_released(file, run_code=run_code, advice=advice)
@@ -213,40 +267,68 @@ def import_released(
             )
         elif kind == "flame":
             released = import_flame(state, num_heads=num_heads or 8)
-            pooler = {f"condition.pooler_{name}": state.get(POOLER + name) for name in ("weight", "bias")}
+            pooler = {
+                f"condition.pooler_{name}": state.get(POOLER + name) for name in ("weight", "bias")
+            }
             if None in pooler.values():
-                raise ValueError(f"released weights: {POOLER}weight is missing: FLAME uses RoBERTa's pooler")
+                raise ValueError(
+                    f"released weights: {POOLER}weight is missing: FLAME uses RoBERTa's pooler"
+                )
             model = _model(released, *_flame_recipe(released), stats, pooler)
         else:
             released = import_mdm(state, options, time_token=time_token)
-            table = {} if released.action_embedding is None else {"condition.table": released.action_embedding}
+            table = (
+                {}
+                if released.action_embedding is None
+                else {"condition.table": released.action_embedding}
+            )
             model = _model(released, *_mdm_recipe(kind, released, options), stats, table)
     except (OSError, MemoryError):
         raise
     except Exception as error:  # nonsensical weights and options may fail anywhere
-        kind_of_error = "" if isinstance(error, ValueError) else f"cannot build the model: {type(error).__name__}: "
+        kind_of_error = (
+            ""
+            if isinstance(error, ValueError)
+            else f"cannot build the model: {type(error).__name__}: "
+        )
         raise UserError(f"{file}: {kind_of_error}{first_line(error)}") from error
     made = f"released by the authors of {kind.upper()}"
     origin = {"made": made, "file": file.name, "sha256": sha256(file), "averaged": averaged}
-    return write_model_file(out, model.state_dict(), config=model.config, facts=model.facts, origin=origin)
+    return write_model_file(
+        out, model.state_dict(), config=model.config, facts=model.facts, origin=origin
+    )
 
 
 def _model(
-    released: Released, config: Config, facts: dict[str, Any], stats: str | Path | None, extra: dict[str, Any]
+    released: Released,
+    config: Config,
+    facts: dict[str, Any],
+    stats: str | Path | None,
+    extra: dict[str, Any],
 ) -> MotionGenerator:
     """Builds a model of a recipe with its weights, `extra` besides the network's, and the statistics in a folder."""
     plain(config, "the options of the released model")
-    representation, width, dataset = instantiate(config["representation"]), released.features[0], facts["dataset"]
+    representation, width, dataset = (
+        instantiate(config["representation"]),
+        released.features[0],
+        facts["dataset"],
+    )
     if representation.features != width:
         expected = f"{representation.features} of {representation.name}, the representation of data set {dataset}"
         raise ValueError(f"released weights: have {width} features, but not the {expected}")
     if (stats is not None) != (dataset in NORMALIZED):
         what, advice = ("normalized", "Give") if stats is None else ("not normalized", "Leave out")
-        raise ValueError(f"features of {dataset} are {what}. {advice} stats=FOLDER with Mean.npy and Std.npy")
+        raise ValueError(
+            f"features of {dataset} are {what}. {advice} stats=FOLDER with Mean.npy and Std.npy"
+        )
     for name in ("mean", "std") if stats is not None else ():
         file = f"{name.capitalize()}.npy"
         value = read_npy(Path(stats or "") / file)
-        numbers = value.dtype.kind in "fiu" and value.shape == (width,) and bool((abs(value) < float("inf")).all())
+        numbers = (
+            value.dtype.kind in "fiu"
+            and value.shape == (width,)
+            and bool((abs(value) < float("inf")).all())
+        )
         if not numbers or (name == "std" and (value <= 0).any()):
             what = f"shape {tuple(value.shape)}, expected ({width},) finite numbers, positive in Std.npy"
             raise ValueError(f"{file}: {what}")

@@ -18,7 +18,8 @@ from flame_mdm.schemas import Number, Schema, check_shape
 # JSON is read as YAML 1.1, in which 2e-2 is a text
 YamlNumber = Annotated[float, BeforeValidator(lambda x: float(x) if isinstance(x, str) else x)]
 
-LowerCase = BeforeValidator(lambda x: x.lower() if isinstance(x, str) else x)  # the name of an enumeration's value
+# The name of an enumeration's value
+LowerCase = BeforeValidator(lambda x: x.lower() if isinstance(x, str) else x)
 
 
 class Solver(Schema):
@@ -63,7 +64,12 @@ def read_options(path: str | Path | None, changes: dict[str, Any]) -> Options:
     # In a composed configuration of MFM, options of network and training are one level down.
     groups = [name for name in ("model", "training") if isinstance(options.get(name), dict)]
     top = {name: value for name, value in options.items() if name not in groups}
-    flat = {k: v for part in (*(options[name] for name in groups), top) for k, v in part.items() if v is not None}
+    flat = {
+        k: v
+        for part in (*(options[name] for name in groups), top)
+        for k, v in part.items()
+        if v is not None
+    }
     solver = flat.get("ode_kwargs")
     try:
         _check_known(flat, Options.model_fields, NAMES["options"]["mdm"])
@@ -87,7 +93,9 @@ def _check_prefix(options: Options) -> None:
             )
     if bool(options.context_len) != bool(options.pred_len):
         lengths = f"context_len={options.context_len}, pred_len={options.pred_len}"
-        raise ValueError(f"{lengths}: both are positive in a model that continues frames, or both 0. Correct the file")
+        raise ValueError(
+            f"{lengths}: both are positive in a model that continues frames, or both 0. Correct the file"
+        )
 
 
 def check_hyperparameters(checkpoint: Mapping[str, Any], kind: str) -> None:
@@ -107,7 +115,9 @@ def _check_known(options: Mapping[Any, Any], read: Any, table: Config, prefix: s
                 what = f"changes the model in a way that is not imported; known is {neutral}"
                 raise ValueError(f"{shown}: {what}. Import a model without it")
         elif value is not None and name not in read and name not in table["unused"]:
-            raise ValueError(f"{shown}: an unknown option, which may change the network. Import a model without it")
+            raise ValueError(
+                f"{shown}: an unknown option, which may change the network. Import a model without it"
+            )
 
 
 def _equal(value: Any, neutral: Any) -> bool:

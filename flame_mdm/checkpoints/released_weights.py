@@ -19,7 +19,9 @@ NAMES: dict[str, Any] = read_yaml(Path(__file__).with_name("released.yaml"))
 ENCODER_LAYER, DECODER_LAYER = NAMES["encoder_layer"], NAMES["decoder_layer"]
 
 
-def read_released(path: Path, *, run_code: bool = False, advice: str = "Save only its state dict") -> Mapping[str, Any]:
+def read_released(
+    path: Path, *, run_code: bool = False, advice: str = "Save only its state dict"
+) -> Mapping[str, Any]:
     """Reads a released file; with `run_code` also pickles of other objects, which runs any code in them.
 
     Raises `UserError` if it is damaged, or holds such objects, with `advice` what to do about them.
@@ -32,7 +34,9 @@ def read_released(path: Path, *, run_code: bool = False, advice: str = "Save onl
     except (FileNotFoundError, UserError):
         raise
     except ImportError as error:
-        raise UserError(f"{path}: {error}. The objects in this file need this package: install it") from error
+        raise UserError(
+            f"{path}: {error}. The objects in this file need this package: install it"
+        ) from error
     except Exception as error:  # torch raises many kinds for damaged files
         unsafe = re.search(r"Unsupported global: GLOBAL (\S+)", str(error))
         if unsafe is None:
@@ -40,7 +44,9 @@ def read_released(path: Path, *, run_code: bool = False, advice: str = "Save onl
         what = f"holds Python objects ({unsafe[1]}) besides the weights, and reading them can run any code"
         raise UserError(f"{path}: {what}. {advice}") from error
     if not isinstance(content, Mapping):
-        raise UserError(f"{path}: holds a {type(content).__name__}, not the weights of a released model")
+        raise UserError(
+            f"{path}: holds a {type(content).__name__}, not the weights of a released model"
+        )
     return content
 
 
@@ -48,8 +54,12 @@ def read_weights(path: Path, key: str | None = None) -> dict[str, Tensor]:
     """Returns the state dict in a released file, or under a key of it; raises `UserError` if there is none."""
     content = read_released(path)
     state = content if key is None else content.get(key)
-    if not isinstance(state, Mapping) or not all(isinstance(value, Tensor) for value in state.values()):
-        raise UserError(f"{path}: contains no weights{f' under {key!r}' if key else ''}, but {_listed(content)}")
+    if not isinstance(state, Mapping) or not all(
+        isinstance(value, Tensor) for value in state.values()
+    ):
+        raise UserError(
+            f"{path}: contains no weights{f' under {key!r}' if key else ''}, but {_listed(content)}"
+        )
     return dict(state)
 
 
@@ -70,13 +80,19 @@ def released_state(checkpoint: Mapping[str, Any], *, ema: bool = True) -> dict[s
     state = next(filter(None, inner), state)
     if not state or not all(isinstance(value, Tensor) for value in state.values()):
         expected = "expected a state dict, 'model' and 'model_avg', or 'state_dict'"
-        raise ValueError(f"not a released checkpoint: {expected}, but it has {_listed(checkpoint) or 'nothing'}")
+        raise ValueError(
+            f"not a released checkpoint: {expected}, but it has {_listed(checkpoint) or 'nothing'}"
+        )
     return dict(state)
 
 
-def layer_names(state: Mapping[str, Tensor], stack: str, layer: Mapping[str, str]) -> tuple[dict[str, str], int]:
+def layer_names(
+    state: Mapping[str, Tensor], stack: str, layer: Mapping[str, str]
+) -> tuple[dict[str, str], int]:
     """Returns the prefixes of all layers of a torch transformer -> those of ours, and the number of layers."""
-    count = sum(key.startswith(f"{stack}.layers.") and key.endswith(".norm1.weight") for key in state)
+    count = sum(
+        key.startswith(f"{stack}.layers.") and key.endswith(".norm1.weight") for key in state
+    )
     prefixes = ((f"{stack}.layers.{i}.", f"transformer.layers.{i}.") for i in range(count))
     return {theirs + a: ours + b for theirs, ours in prefixes for a, b in layer.items()}, count
 
@@ -91,16 +107,22 @@ def renamed(state: Mapping[str, Tensor], prefixes: Mapping[str, str]) -> dict[st
         else:
             result[prefixes[theirs] + key.removeprefix(theirs)] = value
     if unknown:
-        raise ValueError(f"released weights: unknown keys {_listed(unknown)}: not a network of this kind")
+        raise ValueError(
+            f"released weights: unknown keys {_listed(unknown)}: not a network of this kind"
+        )
     return result
 
 
 def shape_of(state: Mapping[str, Tensor], key: str, ndim: int = 2) -> torch.Size:
     """Returns the shape of a weight; raises `ValueError` if it is missing, or has another number of dimensions."""
     if key not in state:
-        raise ValueError(f"released weights: {key} is missing: not a network of this kind, or a damaged file")
+        raise ValueError(
+            f"released weights: {key} is missing: not a network of this kind, or a damaged file"
+        )
     if state[key].ndim != ndim:
-        raise ValueError(f"released weights: {key} has shape {tuple(state[key].shape)}, not {ndim} dimensions")
+        raise ValueError(
+            f"released weights: {key} has shape {tuple(state[key].shape)}, not {ndim} dimensions"
+        )
     return state[key].shape
 
 

@@ -24,7 +24,21 @@ FORMAT = 1
 MIN_WORDS = 3  # least number of tokens of a graph, with padding
 WORD = re.compile(r"[^\W_]+")
 NUMBERS = frozenset(
-    ["zero", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve"]
+    [
+        "zero",
+        "one",
+        "two",
+        "three",
+        "four",
+        "five",
+        "six",
+        "seven",
+        "eight",
+        "nine",
+        "ten",
+        "eleven",
+        "twelve",
+    ]
 )
 MASK = (1 << 64) - 1
 GRAPHS = ("denoiser.onnx", "joints.onnx", "poses.onnx")  # the last one only for SMPL's joints
@@ -172,10 +186,16 @@ class Sampler:
         self.folder = Path(folder)
         try:
             self.content = self._description()
-            sessions = {name: self._session(name, threads) for name in GRAPHS if name in self.content["sha256"]}
+            sessions = {
+                name: self._session(name, threads)
+                for name in GRAPHS
+                if name in self.content["sha256"]
+            }
         except (OSError, ValueError) as error:
             reason = first_line(error)
-            raise ValueError(f"{self.folder}: not an exported model ({reason}). Export the model again") from error
+            raise ValueError(
+                f"{self.folder}: not an exported model ({reason}). Export the model again"
+            ) from error
         self.denoiser, self.joints = sessions["denoiser.onnx"], sessions["joints.onnx"]
         self.poses = sessions.get("poses.onnx")
 
@@ -216,7 +236,9 @@ class Sampler:
             raise ValueError(f"'{text}': the model knows no word of it that says what happens")
         return unknown
 
-    def generate(self, prompt: str = "", seconds: float | None = None, seed: int = 0, sample: int = 0) -> np.ndarray:
+    def generate(
+        self, prompt: str = "", seconds: float | None = None, seed: int = 0, sample: int = 0
+    ) -> np.ndarray:
         """Returns normalized features (F, D) of one motion, for a text or an action; "" for an unconditional model.
 
         `sample` numbers the motions of one text; `seconds` is by default up to 3. Raises `ValueError` for an unknown
@@ -243,10 +265,15 @@ class Sampler:
                 x0_hat = x0_hat.clip(-1, 1)
             x = np.float32(keep) * x + np.float32(clean) * x0_hat + np.float32(last) * before
             if noise:
-                x, draw = x + np.float32(noise) * normal(number + draw, padded, content["features"]), draw + 1
+                x, draw = (
+                    x + np.float32(noise) * normal(number + draw, padded, content["features"]),
+                    draw + 1,
+                )
             before = x0_hat
         if not np.isfinite(x).all():
-            raise ValueError(f"the model returned non-finite numbers for '{prompt}'. Export it again")
+            raise ValueError(
+                f"the model returned non-finite numbers for '{prompt}'. Export it again"
+            )
         return x[:frames]
 
     def decode(self, x: np.ndarray) -> np.ndarray:
@@ -261,16 +288,22 @@ class Sampler:
         """
         if self.poses is None:
             raise ValueError("rotations are computed only for SMPL's 22 joints")
-        offsets, quaternions = self._run("poses", {"joints": joints}, [(22, 3), (len(joints), 22, 4)])
+        offsets, quaternions = self._run(
+            "poses", {"joints": joints}, [(22, 3), (len(joints), 22, 4)]
+        )
         return offsets, quaternions
 
-    def _run(self, name: str, inputs: dict[str, np.ndarray], shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray]:
+    def _run(
+        self, name: str, inputs: dict[str, np.ndarray], shapes: Sequence[tuple[int, ...]]
+    ) -> list[np.ndarray]:
         """Returns the outputs of a graph; raises `ValueError` if it cannot run, or has outputs of other shapes."""
         session = getattr(self, name)
         try:
             outputs = session.run(None, inputs)
         except Exception as error:  # onnxruntime raises its own kinds
-            raise ValueError(f"{name}.onnx cannot run: {first_line(error)}. Export the model again") from error
+            raise ValueError(
+                f"{name}.onnx cannot run: {first_line(error)}. Export the model again"
+            ) from error
         if [np.shape(output) for output in outputs] != list(shapes):
             raise ValueError(f"{name}.onnx does not fit model.json. Export the model again")
         return outputs
@@ -281,12 +314,16 @@ class Sampler:
             return {}
         if content["reads"] == "action":
             if prompt not in content["actions"]:
-                raise ValueError(f"unknown action '{prompt}'; this model knows: {', '.join(content['actions'])}")
+                raise ValueError(
+                    f"unknown action '{prompt}'; this model knows: {', '.join(content['actions'])}"
+                )
             return {"condition": np.array([content["actions"].index(prompt)])}
         read = words(prompt)
         if seen := set(content["vocabulary"]):
             read = [form for word in read if (form := known_form(word, seen))]
-        rows = [hashed(word, content["buckets"]) for word in ["<start>", *read[: content["max_words"]]]]
+        rows = [
+            hashed(word, content["buckets"]) for word in ["<start>", *read[: content["max_words"]]]
+        ]
         padding = [(0, 0)] * max(0, MIN_WORDS - len(rows))
         return {"condition": np.array([[*rows, *padding]]), "counts": np.array([len(rows)])}
 
@@ -306,9 +343,18 @@ def known_form(word: str, seen: set[str]) -> str | None:
     """See `flame_mdm.conditions.vocabulary.known_form`."""
     if word in NUMBERS and word not in seen:
         return None
-    stems = [word.removesuffix(suffix) for suffix in ("ing", "ed", "es", "s", "d", "") if word.endswith(suffix)]
+    stems = [
+        word.removesuffix(suffix)
+        for suffix in ("ing", "ed", "es", "s", "d", "")
+        if word.endswith(suffix)
+    ]
     stems += [stem[:-1] for stem in stems if len(stem) > 3 and stem[-1] in f"e{stem[-2]}"]
-    forms = [stem + ending for stem in stems if len(stem) > 2 for ending in ("", "e", "s", "es", "ing", "ed")]
+    forms = [
+        stem + ending
+        for stem in stems
+        if len(stem) > 2
+        for ending in ("", "e", "s", "es", "ing", "ed")
+    ]
     return next((form for form in [word, *forms] if form in seen), None)
 
 
@@ -338,9 +384,14 @@ def normal(number: int, frames: int, features: int) -> np.ndarray:
     first = mixed(mixed(np.array([number & MASK], np.uint64)))
     positions = np.arange(frames * pairs, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
     bits = mixed(first + positions)
-    low, high = ((part & np.uint64(0xFFFFFF)).astype(np.float32) for part in (bits, bits >> np.uint64(40)))
+    low, high = (
+        (part & np.uint64(0xFFFFFF)).astype(np.float32) for part in (bits, bits >> np.uint64(40))
+    )
     half, scale = np.float32(0.5), np.float32(2.0**-24)
-    radius, angle = np.sqrt(-2 * np.log((low + half) * scale)), np.float32(2 * np.pi) * ((high + half) * scale)
+    radius, angle = (
+        np.sqrt(-2 * np.log((low + half) * scale)),
+        np.float32(2 * np.pi) * ((high + half) * scale),
+    )
     both = np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1)
     return both.reshape(frames, 2 * pairs)[:, :features]
 
@@ -374,7 +425,9 @@ def _number_of(options: Mapping[str, str], key: str, kind: type[Any]) -> Any:
     try:
         return kind(options[key])
     except ValueError as error:
-        raise ValueError(f"{key}={options[key][:40]}: give a {'whole ' if kind is int else ''}number") from error
+        raise ValueError(
+            f"{key}={options[key][:40]}: give a {'whole ' if kind is int else ''}number"
+        ) from error
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -382,7 +435,10 @@ def main(arguments: Sequence[str]) -> int:
     positional = [word for word in arguments if not re.match(r"(seconds|seed)=", word)]
     options = dict(word.split("=", 1) for word in arguments if word not in positional)
     if len(positional) != 3:
-        print('usage: python runner.py FOLDER "TEXT OR ACTION" motion.npz [seconds=3] [seed=0]', file=sys.stderr)
+        print(
+            'usage: python runner.py FOLDER "TEXT OR ACTION" motion.npz [seconds=3] [seed=0]',
+            file=sys.stderr,
+        )
         return 2
     folder, prompt, out = positional
     try:
@@ -396,7 +452,9 @@ def main(arguments: Sequence[str]) -> int:
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
-    print(f"{out}: {len(joints)} frames at {sampler.content['fps']:g} per second, joints in meters, y up")
+    print(
+        f"{out}: {len(joints)} frames at {sampler.content['fps']:g} per second, joints in meters, y up"
+    )
     return 0
 
 

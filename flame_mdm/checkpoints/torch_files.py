@@ -31,11 +31,18 @@ def check_torch(path: Path) -> None:
     size = regular_file(path)
     if not _is_archive(path):
         return
-    damage = naming(path, *ZIP_ERRORS, OSError, ValueError, what="damaged, or not a file of torch.save: ")
+    damage = naming(
+        path, *ZIP_ERRORS, OSError, ValueError, what="damaged, or not a file of torch.save: "
+    )
     with damage, path.open("rb") as file, opened_zip(file) as archive:
         members = archive.infolist()
-        if any(member.compress_type for member in members) or sum(m.file_size for m in members) > size:
-            raise UserError("damaged: its parts are compressed or overlap, and torch.save compresses none")
+        if (
+            any(member.compress_type for member in members)
+            or sum(m.file_size for m in members) > size
+        ):
+            raise UserError(
+                "damaged: its parts are compressed or overlap, and torch.save compresses none"
+            )
         if (spoiled := archive.testzip()) is not None:
             raise UserError(f"damaged: the checksum of {spoiled} is wrong")
 
@@ -129,7 +136,9 @@ class _KeyCheck(pickle._Unpickler):
         self.append(_Named(name))
         if name in CONTAINERS:
             _check_container(name, arguments)
-        elif name == "builtins.bytearray" and not all(isinstance(value, bytes | _Named) for value in arguments):
+        elif name == "builtins.bytearray" and not all(
+            isinstance(value, bytes | _Named) for value in arguments
+        ):
             raise pickle.UnpicklingError("an array of bytes without its bytes")
         elif name == "_codecs.encode" and _text(arguments[1]) not in CODECS:
             raise pickle.UnpicklingError("bytes in an unknown encoding")
@@ -137,7 +146,9 @@ class _KeyCheck(pickle._Unpickler):
     def _load_object(self) -> None:
         arguments = self.stack.pop()
         if arguments != ():
-            raise pickle.UnpicklingError("an object with arguments, which torch.save does not write")
+            raise pickle.UnpicklingError(
+                "an object with arguments, which torch.save does not write"
+            )
 
     def _load_build(self) -> None:
         del self.stack[-1]
@@ -149,10 +160,38 @@ class _KeyCheck(pickle._Unpickler):
     dispatch = {  # pyright: ignore[reportAssignmentType]
         code[0]: pickle._Unpickler.dispatch[code[0]]
         for code in (
-            *(pickle.GLOBAL, pickle.MARK, pickle.TUPLE, pickle.TUPLE1, pickle.TUPLE2, pickle.TUPLE3, pickle.NONE),
-            *(pickle.NEWFALSE, pickle.NEWTRUE, pickle.EMPTY_TUPLE, pickle.EMPTY_LIST, pickle.BININT, pickle.BININT1),
-            *(pickle.BININT2, pickle.BINFLOAT, pickle.BINUNICODE, pickle.SHORT_BINSTRING, pickle.BINPERSID),
-            *(pickle.BINGET, pickle.LONG_BINGET, pickle.BINPUT, pickle.LONG_BINPUT, pickle.LONG1, pickle.PROTO),
+            *(
+                pickle.GLOBAL,
+                pickle.MARK,
+                pickle.TUPLE,
+                pickle.TUPLE1,
+                pickle.TUPLE2,
+                pickle.TUPLE3,
+                pickle.NONE,
+            ),
+            *(
+                pickle.NEWFALSE,
+                pickle.NEWTRUE,
+                pickle.EMPTY_TUPLE,
+                pickle.EMPTY_LIST,
+                pickle.BININT,
+                pickle.BININT1,
+            ),
+            *(
+                pickle.BININT2,
+                pickle.BINFLOAT,
+                pickle.BINUNICODE,
+                pickle.SHORT_BINSTRING,
+                pickle.BINPERSID,
+            ),
+            *(
+                pickle.BINGET,
+                pickle.LONG_BINGET,
+                pickle.BINPUT,
+                pickle.LONG_BINPUT,
+                pickle.LONG1,
+                pickle.PROTO,
+            ),
             *(pickle.APPEND, pickle.APPENDS, pickle.EMPTY_DICT, pickle.STOP),
         )
     } | {

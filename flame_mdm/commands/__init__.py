@@ -46,7 +46,9 @@ def motion_file(key: str, source: str) -> None:
     elif Path(source).suffix.lower() in ADVICE:
         raise unread(Path(source))
     elif ":" not in source:
-        raise UserError(f"{key}={source}: neither a motion file ({', '.join(ENDINGS)}) nor dataset:id")
+        raise UserError(
+            f"{key}={source}: neither a motion file ({', '.join(ENDINGS)}) nor dataset:id"
+        )
 
 
 def finish(failures: Sequence[str], total: int, done: str) -> None:
@@ -68,7 +70,9 @@ def model_source(key: str, source: str) -> None:
 
 def body_name(key: str, body: str) -> None:
     if body.split()[:1] not in (["mannequin"], ["anny"]) and not Path(body).is_file():
-        raise UserError(f'{key}={body}: no such file. Use mannequin, a file, or Anny: {key}="anny age=0.9"')
+        raise UserError(
+            f'{key}={body}: no such file. Use mannequin, a file, or Anny: {key}="anny age=0.9"'
+        )
 
 
 def device_name(key: str, device: str) -> None:
@@ -80,7 +84,9 @@ def device_name(key: str, device: str) -> None:
 def video(key: str, requested: bool) -> None:
     """Checks that MP4 files can be written."""
     if requested and find_spec("av") is None:
-        raise UserError(f'{key}=true: MP4 needs the package av. Run pip install "flame-mdm[video]", or write a GIF')
+        raise UserError(
+            f'{key}=true: MP4 needs the package av. Run pip install "flame-mdm[video]", or write a GIF'
+        )
 
 
 def above_zero(key: str, number: int) -> None:
@@ -92,7 +98,9 @@ def above_zero(key: str, number: int) -> None:
 class ModelSettings:
     """Keys that name a model."""
 
-    ckpt: str = required("a checkpoint, run directory, model file, shipped model (quickstart), or hub id")
+    ckpt: str = required(
+        "a checkpoint, run directory, model file, shipped model (quickstart), or hub id"
+    )
     which: Which = option("last", "or best: the checkpoint of a run directory")
 
     def model_file(self) -> Path:
@@ -104,8 +112,12 @@ class ModelSettings:
 class AdaptedSettings(ModelSettings):
     """Keys that name a model and its adapters."""
 
-    adapter: list[str] | None = option(None, "files of `flame-mdm adapt` for this model, separated by spaces")
-    adapter_strength: float | Sequence[float] = option(1.0, "for all adapters, or a list; 0 = the model without them")
+    adapter: list[str] | None = option(
+        None, "files of `flame-mdm adapt` for this model, separated by spaces"
+    )
+    adapter_strength: float | Sequence[float] = option(
+        1.0, "for all adapters, or a list; 0 = the model without them"
+    )
 
     def adapters(self) -> dict[str, Any]:
         return {"adapter": self.adapter or (), "strength": self.adapter_strength}
@@ -115,10 +127,18 @@ class AdaptedSettings(ModelSettings):
 class FileSettings:
     """Keys that describe a motion file."""
 
-    fps: float | None = option(None, "frames per second; overrides the value in the file; required for .npy, .amc")
-    unit: float | None = option(None, "meters per length unit of the file; default 0.01 for most .bvh, 1 for .npy")
-    up: str | None = option(None, "axis of the file that points up: y, z or -y; default that of skeleton.yaml, or y")
-    animation: str | None = option(None, "name or number of an animation in an .fbx or .glb file; default: the first")
+    fps: float | None = option(
+        None, "frames per second; overrides the value in the file; required for .npy, .amc"
+    )
+    unit: float | None = option(
+        None, "meters per length unit of the file; default 0.01 for most .bvh, 1 for .npy"
+    )
+    up: str | None = option(
+        None, "axis of the file that points up: y, z or -y; default that of skeleton.yaml, or y"
+    )
+    animation: str | None = option(
+        None, "name or number of an animation in an .fbx or .glb file; default: the first"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,7 +146,9 @@ class BodySettings:
     """The body in pictures, pages and files."""
 
     body: str = option(
-        "mannequin", 'or a file, or Anny with a shape, such as "anny gender=1 age=0.9": docs/formats.md', body_name
+        "mannequin",
+        'or a file, or Anny with a shape, such as "anny gender=1 age=0.9": docs/formats.md',
+        body_name,
     )
 
 
@@ -134,10 +156,16 @@ class BodySettings:
 class WritingSettings:
     """Keys of the motion files that are written."""
 
-    rig: str | None = option(None, "skeleton: mixamo, unreal, unity, rigify, lafan1, soma, cmu or 100style")
-    root_motion: bool = option(False, "true = the root of rig=unreal or soma follows the hips on the floor")
+    rig: str | None = option(
+        None, "skeleton: mixamo, unreal, unity, rigify, lafan1, soma, cmu or 100style"
+    )
+    root_motion: bool = option(
+        False, "true = the root of rig=unreal or soma follows the hips on the floor"
+    )
     resample: float | None = option(None, "frames per second of OUT; default: those of the motion")
-    character: str | None = option(None, "your own .glb with a skin, or .bvh, to move: docs/characters.md", existing)
+    character: str | None = option(
+        None, "your own .glb with a skin, or .bvh, to move: docs/characters.md", existing
+    )
 
     def read_character(self) -> Character | BvhCharacter | None:
         """Reads `character`; prints the lines of a file to complete if names of its joints are unknown."""
@@ -153,7 +181,11 @@ class WritingSettings:
         """Returns a motion at the frame rate of `resample`."""
         from flame_mdm.formats.resampling import frame_rate
 
-        return motion if self.resample is None else motion.resampled(frame_rate(self.resample, "resample"))
+        return (
+            motion
+            if self.resample is None
+            else motion.resampled(frame_rate(self.resample, "resample"))
+        )
 
 
 @dataclass(frozen=True)
@@ -175,7 +207,9 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
     seed: int = same_option(SamplingRequest, "seed")
     cleanup: bool = same_option(SamplingRequest, "cleanup")
     targets: str | None = same_option(SamplingRequest, "targets", existing)
-    trajectory: bool = option(False, "draw the clean estimates along the sampling of the first motion: trajectory.png")
+    trajectory: bool = option(
+        False, "draw the clean estimates along the sampling of the first motion: trajectory.png"
+    )
     mp4: bool = option(False, 'also write motions.mp4; needs pip install "flame-mdm[video]"', video)
     device: str | None = option(None, "default: cuda if available", device_name)
 
@@ -200,12 +234,18 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
         return SamplingRequest(
             **keywords,
             options=SamplerOptions(**self._fields(SamplerOptions)),
-            editing=EditRequest(**self._fields(EditRequest)) if isinstance(self, EditRequest) else None,
+            editing=EditRequest(**self._fields(EditRequest))
+            if isinstance(self, EditRequest)
+            else None,
         )
 
     def _fields(self, kind: type[Any]) -> dict[str, Any]:
         """Returns the values of the keys that are fields of a dataclass."""
-        return {entry.name: getattr(self, entry.name) for entry in fields(kind) if hasattr(self, entry.name)}
+        return {
+            entry.name: getattr(self, entry.name)
+            for entry in fields(kind)
+            if hasattr(self, entry.name)
+        }
 
     def load(self, request: SamplingRequest) -> LoadedModel:
         """Loads the model and the body; raises `UserError` with examples if the request names no condition."""
@@ -229,9 +269,15 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
 class DataSettings:
     """Keys of commands that open a data set."""
 
-    data: str | None = option(None, "data set: a file in experiments/data; data.KEY=... overrides its keys")
-    representation: str | None = option(None, "a file in experiments/representation; default: the data set's")
-    data_root: str = option(usual_data_root, "folder of the prepared data sets; default: FLAME_MDM_DATA, or data")
+    data: str | None = option(
+        None, "data set: a file in experiments/data; data.KEY=... overrides its keys"
+    )
+    representation: str | None = option(
+        None, "a file in experiments/representation; default: the data set's"
+    )
+    data_root: str = option(
+        usual_data_root, "folder of the prepared data sets; default: FLAME_MDM_DATA, or data"
+    )
     seed: int = option(0, "seed of generated data")
     composed: tuple[str, ...] = ()
 
@@ -239,22 +285,30 @@ class DataSettings:
         if self.data is not None:
             _ = self.nodes  # composed now, to report errors before any work
         elif self.composed:
-            raise UserError(f"{self.composed[0]} belongs to a data set, and none is named. Add data=NAME")
+            raise UserError(
+                f"{self.composed[0]} belongs to a data set, and none is named. Add data=NAME"
+            )
 
     @cached_property
     def nodes(self) -> Config:
         """The composed configuration of the data set and its representation: `data` and `representation`."""
         if self.data is None:
             names = ", ".join(sorted(path.stem for path in (EXPERIMENTS / "data").glob("*.yaml")))
-            raise UserError(f"no data set named. Add data=NAME, one of: {names}; folder is for your own motions")
+            raise UserError(
+                f"no data set named. Add data=NAME, one of: {names}; folder is for your own motions"
+            )
         chosen = [f"representation={self.representation}"] if self.representation else []
-        return compose_data(self.data, [*chosen, *self.composed], data_root=self.data_root or "data", seed=self.seed)
+        return compose_data(
+            self.data, [*chosen, *self.composed], data_root=self.data_root or "data", seed=self.seed
+        )
 
     def data_node(self, source: str | None = None) -> Config:
         """Returns the configuration of the data set, with the path given as `source`."""
         node = self.nodes["data"]
         if source is not None:
             if "path" not in node["source"]:
-                raise UserError(f"source={source}: {node['name']} is generated and has no source. Drop source=")
+                raise UserError(
+                    f"source={source}: {node['name']} is generated and has no source. Drop source="
+                )
             node["source"]["path"] = source
         return node

@@ -21,10 +21,18 @@ class AdaptSettings(ModelSettings):
     source: str = required("folder of motions with captions: docs/own-data.md")
     name: str = required("one word for prompts: 'a person walks in NAME style'")
     out: str | None = option(None, "run directory; default runs/adapt/NAME")
-    action: bool = option(False, "true = the clips show an action that the model does not know, instead of a style")
-    full: bool = option(False, "true = train all weights; the result is a model instead of an adapter")
+    action: bool = option(
+        False, "true = the clips show an action that the model does not know, instead of a style"
+    )
+    full: bool = option(
+        False, "true = train all weights; the result is a model instead of an adapter"
+    )
     force: bool = option(False, "true = accept clips that drift upward or float")
-    rank: int = option(8, "of the changes of the weights; more for motions far from what the model knows", above_zero)
+    rank: int = option(
+        8,
+        "of the changes of the weights; more for motions far from what the model knows",
+        above_zero,
+    )
     data_root: str = option(usual_data_root, "folder of the prepared data sets")
     composed: tuple[str, ...] = ()
 
@@ -34,5 +42,9 @@ def main(settings: AdaptSettings) -> None:
 
     from flame_mdm.training.adaptation import adapt
 
-    own = {name: value for name, value in vars(settings).items() if name not in ("ckpt", "which", "composed")}
+    own = {
+        name: value
+        for name, value in vars(settings).items()
+        if name not in ("ckpt", "which", "composed")
+    }
     adapt(file, overrides=settings.composed, **own)

@@ -26,14 +26,18 @@ class AuditSettings(DataSettings):
     extractor: str | None = option(
         None, "a motion-CLIP, or as the protocol requires; none = metrics of joints", model_source
     )
-    protocol: str | None = option(None, "whose metrics are audited; default: synthetic or text_to_motion")
+    protocol: str | None = option(
+        None, "whose metrics are audited; default: synthetic or text_to_motion"
+    )
     split: Literal["train", "val", "test"] = option("test", "train, val or test")
     samples: int | None = option(None, "number of motions; default: all of the split")
     resamples: int = option(100, "bootstrap resamples of motions, for the intervals")
     cards: list[str] | None = option(None, "one card (.json) to render again, or two, side by side")
     batch_size: int = option(64, "motions at once")
     device: str | None = option(None, "default: cpu", device_name)
-    data_root: str = option("", "folder of the prepared data sets; default: FLAME_MDM_DATA, or data")
+    data_root: str = option(
+        "", "folder of the prepared data sets; default: FLAME_MDM_DATA, or data"
+    )
     out: str = option("runs/audit", "folder of the cards")
 
 
@@ -41,20 +45,30 @@ def main(settings: AuditSettings) -> None:
     out = Path(settings.out)
     if settings.cards is not None:
         if len(settings.cards) > 2:
-            raise UserError(f"cards={' '.join(settings.cards)}: {len(settings.cards)} cards. Give one or two")
+            raise UserError(
+                f"cards={' '.join(settings.cards)}: {len(settings.cards)} cards. Give one or two"
+            )
         paths = [Path(card) for card in settings.cards]
         name = "-and-".join(path.stem for path in paths)
         say(*write_card([read_card(path) for path in paths], out, name))
         return
     if settings.data is None or settings.extractor is None:
-        raise UserError("give a data set and an extractor: data=NAME extractor=FILE, or extractor=none")
+        raise UserError(
+            "give a data set and an extractor: data=NAME extractor=FILE, or extractor=none"
+        )
     if settings.resamples < 100 or (settings.samples or 64) < 8:
-        raise UserError(f"resamples={settings.resamples}, samples={settings.samples}: give 100, and 8, or more")
+        raise UserError(
+            f"resamples={settings.resamples}, samples={settings.samples}: give 100, and 8, or more"
+        )
     from evaluators.audit import audit as measure
     from evaluators.evaluation_request import EvaluationRequest
 
-    protocol = settings.protocol or ("synthetic" if settings.nodes["data"]["name"] == "synthetic" else "text_to_motion")
-    request = EvaluationRequest.of(vars(settings) | settings.nodes | {"baseline": "real", "protocol": protocol})
+    protocol = settings.protocol or (
+        "synthetic" if settings.nodes["data"]["name"] == "synthetic" else "text_to_motion"
+    )
+    request = EvaluationRequest.of(
+        vars(settings) | settings.nodes | {"baseline": "real", "protocol": protocol}
+    )
     card = measure(request, out / "cache", settings.resamples)
     write_json(out / f"{card_name(card)}.json", card.model_dump(), indent=None)
     say(*write_card([card], out))

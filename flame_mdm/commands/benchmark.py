@@ -32,7 +32,9 @@ class BenchmarkSettings:
     out: str | None = option(None, "folder; default runs/benchmark/<exp>")
     device: str | None = option(None, "device and batch_size: as for make evaluate")
     batch_size: int = option(64, "motions at once")
-    data_root: str = option("", "folder of the prepared data sets; default: the checkpoint's, or FLAME_MDM_DATA")
+    data_root: str = option(
+        "", "folder of the prepared data sets; default: the checkpoint's, or FLAME_MDM_DATA"
+    )
 
 
 def main(settings: BenchmarkSettings) -> None:
@@ -45,7 +47,9 @@ def main(settings: BenchmarkSettings) -> None:
     for words in plan["train"]:
         train(words, settings.data_root)
     name, spec = plan["table"], load_spec(plan["table"])
-    options = TablesSettings(device=settings.device, batch_size=settings.batch_size, data_root=settings.data_root)
+    options = TablesSettings(
+        device=settings.device, batch_size=settings.batch_size, data_root=settings.data_root
+    )
     faults = evaluate_missing({name: spec}, Path(options.results), options)
     table = build(name, spec, Path(options.results))
     write(table, out)
@@ -61,21 +65,35 @@ def train(words: Sequence[str], data_root: str) -> None:
     """Runs `flame-mdm train` in a separate process; raises `SystemExit` if it is interrupted."""
     root = [f"data_root={data_root}"] if data_root else []
     say(f"== training {' '.join(words)}")
-    code = subprocess.run([sys.executable, "-m", "flame_mdm", "train", *words, *root], check=False).returncode
+    code = subprocess.run(
+        [sys.executable, "-m", "flame_mdm", "train", *words, *root], check=False
+    ).returncode
     if code >= 128 or code < 0:
         raise SystemExit(code if code > 0 else 128 - code)
     if code:
-        raise UserError(f"training {' '.join(words)} failed (see above). Run the benchmark again to continue")
+        raise UserError(
+            f"training {' '.join(words)} failed (see above). Run the benchmark again to continue"
+        )
 
 
-def check(table: Table, expected: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]]) -> list[tuple[str, bool]]:
+def check(
+    table: Table, expected: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]]
+) -> list[tuple[str, bool]]:
     """Returns a line for each expected range of a value of a table, and whether the value is within it."""
     parts = {part.name: part for part in table.parts}
     checks = []
     for part, rows in expected.items():
-        lines = {line.label: line for line in parts[part].lines if line.kind == "measured" and not line.state}
+        lines = {
+            line.label: line
+            for line in parts[part].lines
+            if line.kind == "measured" and not line.state
+        }
         for row, columns in rows.items():
-            cells = dict(zip(parts[part].columns, lines[row].cells, strict=True)) if row in lines else {}
+            cells = (
+                dict(zip(parts[part].columns, lines[row].cells, strict=True))
+                if row in lines
+                else {}
+            )
             for column, (low, high) in columns.items():
                 value = cell.value if (cell := cells.get(column)) else None
                 measured = "not measured" if value is None else f"{value:.3g}"

@@ -24,10 +24,14 @@ class BrowseSettings(BodySettings, DataSettings):
 
     OBJECTS: ClassVar = ("data", "out")
     out: str | None = option(None, "HTML file; default runs/browse/<store>.html")
-    source: str | None = option(None, "folder or archive, if the data set is not prepared yet and needs one")
+    source: str | None = option(
+        None, "folder or archive, if the data set is not prepared yet and needs one"
+    )
     split: Split | None = option(None, "train, val or test; default: all")
     search: str | None = option(None, "words that must occur in the id or the captions of a clip")
-    clips: int = option(200, "maximum number, evenly spaced; mirrored copies come with their originals", above_zero)
+    clips: int = option(
+        200, "maximum number, evenly spaced; mirrored copies come with their originals", above_zero
+    )
     motions: str | None = option(None, "folder: also write the shown clips as motion files")
 
 
@@ -45,17 +49,23 @@ def main(settings: BrowseSettings) -> None:
         info = Store(data.folder).info  # own data are shown as they were prepared
         data.source.options, data.source.version = info.get("source", {}), info.get("version", 1)
         if settings.source is not None:
-            say(f"{data.folder}: already prepared; source={settings.source} is not read (prepare it with force=true)")
+            say(
+                f"{data.folder}: already prepared; source={settings.source} is not read (prepare it with force=true)"
+            )
     data.prepare_data()
     store = data.open()
     search = settings.search or ""
     families = find(store.clips, settings.split, search)
     if not families:
-        raise UserError(f"no clip of {data.folder} has '{search}' in its id or captions. Search for other words")
+        raise UserError(
+            f"no clip of {data.folder} has '{search}' in its id or captions. Search for other words"
+        )
     matching = sum(map(len, families))
     clips = [clip for family in choose(families, settings.clips) for clip in family]
     title = f"{store.info['dataset']}: {len(clips)} of {matching} clips"
-    title += f" in {settings.split}" * (settings.split is not None) + f" with '{search}'" * bool(search)
+    title += f" in {settings.split}" * (settings.split is not None) + f" with '{search}'" * bool(
+        search
+    )
     out = Path(settings.out or Path("runs") / "browse" / f"{data.folder.name}.html")
     write_page(out, store, representation, clips, title, body)
     say(f"{out}: {len(clips)} of {matching} clips, {out.stat().st_size / 1e6:.1f} MB")

@@ -47,24 +47,31 @@ class CompareSettings(BodySettings):
     """
 
     OBJECTS: ClassVar = ("runs",)
-    runs: list[str] | None = option(None, "run directories or folders of motion files, separated by spaces")
+    runs: list[str] | None = option(
+        None, "run directories or folders of motion files, separated by spaces"
+    )
     prompts: str | None = option(
         None,
         "a file with one prompt per line, sampled by each last.ckpt; default: the captions of the first folder of "
         "motion files; without such a folder, the newest samples of each run",
     )
     seconds: float | None = option(
-        None, "length of the sampled motions; default 3, or the lengths of the motions in the folder"
+        None,
+        "length of the sampled motions; default 3, or the lengths of the motions in the folder",
     )
     seed: int = option(0, "seed of sampling, and of the order in which motions are rated")
-    rate: bool = option(False, "write a rating page: motions of the first run against those of each other run")
+    rate: bool = option(
+        False, "write a rating page: motions of the first run against those of each other run"
+    )
     ratings: list[str] | None = option(None, "files saved by the rating page, to be counted")
     out: str | None = option(None, "default runs/compare.html, runs/rate.html or runs/ratings.json")
 
 
 def main(settings: CompareSettings) -> None:
     if (settings.runs is None) == (settings.ratings is None):
-        raise UserError('give either runs="A B" to compare runs, or ratings="x.json y.json" to count ratings')
+        raise UserError(
+            'give either runs="A B" to compare runs, or ratings="x.json y.json" to count ratings'
+        )
     if settings.ratings is not None:
         _count([Path(file) for file in settings.ratings], settings.out or "runs/ratings.json")
     else:
@@ -78,7 +85,9 @@ def _count(files: Sequence[Path], out: str) -> None:
     for pair in pairs:
         share, low, high = pair.share
         interval = f"{share:.1%} ({low:.1%} to {high:.1%})"
-        say(f"{pair.a} over {pair.b}: {pair.wins_a} of {pair.votes} answers, {interval}, {pair.raters} raters")
+        say(
+            f"{pair.a} over {pair.b}: {pair.wins_a} of {pair.votes} answers, {interval}, {pair.raters} raters"
+        )
     say(f"written: {out}")
 
 
@@ -109,17 +118,23 @@ def _tested(runs: Mapping[str, Run]) -> list[str]:
     return lines
 
 
-def _motions(compared: Sequence[ComparedRun], settings: CompareSettings) -> list[dict[Prompt, Motion]]:
+def _motions(
+    compared: Sequence[ComparedRun], settings: CompareSettings
+) -> list[dict[Prompt, Motion]]:
     """Returns the motions of each run and folder, by prompt.
 
     The last checkpoint of each run is sampled for the requested prompts or else for the captions of the first folder of
     motions, at the lengths of its motions. Without either, a run shows its newest samples.
     """
-    from_files = {entry.label: read_motions(entry.folder) for entry in compared if entry.run is None}
+    from_files = {
+        entry.label: read_motions(entry.folder) for entry in compared if entry.run is None
+    }
 
     prompts: dict[Prompt, float | None] = {}
     if settings.prompts is not None:
-        prompts = {(text, 0): settings.seconds for text in _texts(PromptFile.read(settings.prompts))}
+        prompts = {
+            (text, 0): settings.seconds for text in _texts(PromptFile.read(settings.prompts))
+        }
     elif from_files:
         reference = next(iter(from_files.values()))
         for prompt, motion in reference.items():
@@ -144,7 +159,9 @@ def _texts(prompts: PromptFile) -> list[str]:
     return list(prompts.lines.values())
 
 
-def _sampled(entry: ComparedRun, prompts: Mapping[Prompt, float | None], seed: int) -> dict[Prompt, Motion]:
+def _sampled(
+    entry: ComparedRun, prompts: Mapping[Prompt, float | None], seed: int
+) -> dict[Prompt, Motion]:
     """Samples the last checkpoint of a run for texts or action labels.
 
     Args:

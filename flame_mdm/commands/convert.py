@@ -33,9 +33,15 @@ class ConvertSettings(BodySettings, WritingSettings, FileSettings):
     """
 
     OBJECTS: ClassVar = ("motion", "out")
-    motion: str = required("a file, or a folder of files; .npy holds joint positions (frames, joints, 3)")
-    out: str = required(".fbx, .glb, .bvh, .usdz, .vrma, .npz (AMASS), .json or .npy; .mp4 or .gif to look at")
-    format: str | None = option(None, "if MOTION is a folder: ending of the files that are written to the folder OUT")
+    motion: str = required(
+        "a file, or a folder of files; .npy holds joint positions (frames, joints, 3)"
+    )
+    out: str = required(
+        ".fbx, .glb, .bvh, .usdz, .vrma, .npz (AMASS), .json or .npy; .mp4 or .gif to look at"
+    )
+    format: str | None = option(
+        None, "if MOTION is a folder: ending of the files that are written to the folder OUT"
+    )
     rest_pose: bool = option(False, "true = .bvh begins with a frame of the rest pose, arms out")
 
 
@@ -62,17 +68,25 @@ def main(settings: ConvertSettings) -> None:
 
 
 def _targets(settings: ConvertSettings, folder: Path, out: Path) -> dict[Path, Path]:
-    ending = settings.format or (Path(settings.character).suffix[1:].lower() if settings.character else None)
+    ending = settings.format or (
+        Path(settings.character).suffix[1:].lower() if settings.character else None
+    )
     if ending is None:
-        raise UserError(f"{folder} is a folder: name the format of the files too, such as format=glb")
+        raise UserError(
+            f"{folder} is a folder: name the format of the files too, such as format=glb"
+        )
     files = motion_files(folder)
     targets = {out / file.relative_to(folder).with_suffix(f".{ending}"): file for file in files}
     if double := [file for file in files if file not in targets.values()]:
-        raise UserError(f"{double[0]}: another motion has the same name, so both would become one file. Rename one")
+        raise UserError(
+            f"{double[0]}: another motion has the same name, so both would become one file. Rename one"
+        )
     return targets
 
 
-def _convert(settings: ConvertSettings, path: Path, out: Path, character: Character | BvhCharacter | None) -> None:
+def _convert(
+    settings: ConvertSettings, path: Path, out: Path, character: Character | BvhCharacter | None
+) -> None:
     from flame_mdm.formats.layouts import head_height, leg_length
     from flame_mdm.formats.people import load_body
     from flame_mdm.formats.readers import read
@@ -81,16 +95,24 @@ def _convert(settings: ConvertSettings, path: Path, out: Path, character: Charac
     body = load_body(settings.body)
     motion = read(path, settings.fps, settings.unit, settings.up, animation=settings.animation)
     if out.exists() and out.samefile(path):
-        raise UserError(f"{out}: the same file as the input, which stays as it is. Choose another name for the output")
+        raise UserError(
+            f"{out}: the same file as the input, which stays as it is. Choose another name for the output"
+        )
     motion = settings.at_rate(motion)
     if out.suffix.lower() == ".npz":
         motion.poses = motion.posed()  # other programs expect AMASS's keys
     try:
-        say(motion.save(out, settings.rest_pose, settings.rig, character, body, settings.root_motion))
+        say(
+            motion.save(
+                out, settings.rest_pose, settings.rig, character, body, settings.root_motion
+            )
+        )
     except UserError as error:  # of the motion, if not of the output
         if str(out) in str(error):
             raise
         raise UserError(f"{path}: {error}") from error
     say(*(f"{path}: {note}" for note in motion.notes))
     if motion.skeleton.joints[: len(SMPL22)] == SMPL22.joints:
-        say(f"legs {leg_length(motion.joints):.2f} m, head joint at {head_height(motion.joints):.2f} m")
+        say(
+            f"legs {leg_length(motion.joints):.2f} m, head joint at {head_height(motion.joints):.2f} m"
+        )

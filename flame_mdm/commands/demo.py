@@ -17,11 +17,19 @@ class DemoSettings:
     """
 
     OBJECTS: ClassVar = ("ckpt",)
-    ckpt: list[str] = option(lambda: ["quickstart"], "one or more models, separated by spaces, as for sample")
-    adapter: list[str] = option(list, "adapters of the first model to choose from, separated by spaces")
-    host: str = option("127.0.0.1", "address to listen on: this computer alone; 0.0.0.0 = all networks")
+    ckpt: list[str] = option(
+        lambda: ["quickstart"], "one or more models, separated by spaces, as for sample"
+    )
+    adapter: list[str] = option(
+        list, "adapters of the first model to choose from, separated by spaces"
+    )
+    host: str = option(
+        "127.0.0.1", "address to listen on: this computer alone; 0.0.0.0 = all networks"
+    )
     port: int = option(7860, "0 = any free port")
-    hosts: list[str] = option(list, "names of this server, such as motion.example.org; localhost and addresses work")
+    hosts: list[str] = option(
+        list, "names of this server, such as motion.example.org; localhost and addresses work"
+    )
     device: str | None = option(None, "default: cuda if available")
 
 

@@ -60,8 +60,13 @@ def student_recipe(settings: DistillSettings) -> Config:
     teacher = read_teacher(file)
     recipe: Any = teacher.config
     if not teacher.steps or not isinstance(recipe.get("data"), dict) or "trainer" not in recipe:
-        raise UserError(f"{settings.ckpt}: was not trained by this framework, so that its data and steps are unknown")
-    name, root = f"{recipe['experiment']}_distilled", os.environ.get("FLAME_MDM_DATA", recipe["data_root"])
+        raise UserError(
+            f"{settings.ckpt}: was not trained by this framework, so that its data and steps are unknown"
+        )
+    name, root = (
+        f"{recipe['experiment']}_distilled",
+        os.environ.get("FLAME_MDM_DATA", recipe["data_root"]),
+    )
     steps = max(1, round(SHARE_OF_STEPS * teacher.steps))
     own: Config = {
         "experiment": name,
@@ -69,7 +74,10 @@ def student_recipe(settings: DistillSettings) -> Config:
         "data": {"root": root},
         "run": {"name": "default", "dir": settings.out or f"runs/{name}/default"},
         "optimizer": {"lr": SHARE_OF_RATE * recipe["optimizer"]["lr"]},
-        "trainer": {"max_steps": steps, "val_check_interval": min(steps, recipe["trainer"]["val_check_interval"])},
+        "trainer": {
+            "max_steps": steps,
+            "val_check_interval": min(steps, recipe["trainer"]["val_check_interval"]),
+        },
         "distillation": {"teacher": str(file)},
     }
     if samples := recipe["callbacks"].get("samples"):

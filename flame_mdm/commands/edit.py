@@ -25,16 +25,26 @@ class EditSettings(OutputSettings, EditRequest, FileSettings):
     OBJECTS: ClassVar = ("ckpt", "motion", "out")
     motion: str = required("FILE (.npz, .bvh, .fbx, .glb, .json, .npy) or dataset:id", motion_file)
     samples: int = same_option(SamplingRequest, "samples", default=3)
-    cut: Sequence[float] | None = option(None, "[begin, end] in seconds: use only this part of the motion")
+    cut: Sequence[float] | None = option(
+        None, "[begin, end] in seconds: use only this part of the motion"
+    )
     data_root: str = option(usual_data_root, "folder of the prepared data sets")
-    out: str | None = option(None, "folder; default samples/<experiment>/edit-<motion>-<text>-<hash>")
+    out: str | None = option(
+        None, "folder; default samples/<experiment>/edit-<motion>-<text>-<hash>"
+    )
 
 
 def main(settings: EditSettings) -> None:
     request = settings.request()
 
     from flame_mdm.sampling.editing import resolve_edit, sample_edit
-    from flame_mdm.sampling.output import SAMPLES, default_folder, degenerate_notes, summary, write_motions
+    from flame_mdm.sampling.output import (
+        SAMPLES,
+        default_folder,
+        degenerate_notes,
+        summary,
+        write_motions,
+    )
     from flame_mdm.sampling.reading import read_motion
 
     loaded = settings.load(request)
@@ -58,15 +68,24 @@ def main(settings: EditSettings) -> None:
 
     title = f"edit {Path(original.id).stem} {edits[0].text}"
     general = (settings.motion, settings.cut, settings.adapter, settings.adapter_strength)
-    folder = Path(settings.out or default_folder(model, title, digest, replace(request, samples=1), *general))
+    folder = Path(
+        settings.out or default_folder(model, title, digest, replace(request, samples=1), *general)
+    )
     shown = replace(original, text=f"original: {original.text or original.id}")
     facts = {"seed": settings.seed, "checkpoint": digest, "keep": edits[0].keep}
     check_within(folder, settings.out or SAMPLES)
     write_motions(folder, [shown, *edits], facts, stages, settings.mp4, loaded.body)
     say(summary(folder, edits, mp4=settings.mp4))
 
-    changed, moved = max(edit.feature_error for edit in edits), max(edit.joint_error for edit in edits)
+    changed, moved = (
+        max(edit.feature_error for edit in edits),
+        max(edit.joint_error for edit in edits),
+    )
     largest = f"{changed:.3g} in normalized features, {moved:.3g} m in world joint positions"
-    say(f"{edits[0].keep.mean():.0%} of the features are kept. Largest change in the kept part: {largest}")
+    say(
+        f"{edits[0].keep.mean():.0%} of the features are kept. Largest change in the kept part: {largest}"
+    )
     if moved > 0.01:
-        say("a kept part that follows a generated one begins where that one ends, so its place in the world may differ")
+        say(
+            "a kept part that follows a generated one begins where that one ends, so its place in the world may differ"
+        )

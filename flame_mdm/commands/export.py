@@ -18,7 +18,9 @@ class ExportSettings(AdaptedSettings):
 
     OBJECTS: ClassVar = ("ckpt", "out")
     out: str = required("a .safetensors file, or a folder; for format=onnx, a folder")
-    format: Literal["safetensors", "onnx"] = option("safetensors", "or onnx: for onnxruntime, with a script")
+    format: Literal["safetensors", "onnx"] = option(
+        "safetensors", "or onnx: for onnxruntime, with a script"
+    )
     half: bool = option(False, "true = weight matrices in half precision")
 
 

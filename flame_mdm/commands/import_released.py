@@ -19,15 +19,25 @@ class ImportSettings:
     """
 
     OBJECTS: ClassVar = ("kind", "file", "args")
-    kind: Literal["mdm", "mfm", "flame", "mclip"] = required("mdm, mfm, flame, or mclip (FLAME's motion-CLIP)")
+    kind: Literal["mdm", "mfm", "flame", "mclip"] = required(
+        "mdm, mfm, flame, or mclip (FLAME's motion-CLIP)"
+    )
     file: str = required("the released file: model000475000.pt, or FLAME's .ckpt", existing)
     args: str | None = option(None, "MDM's args.json, or MFM's .hydra/config.yaml", existing)
     out: str = required("a .safetensors file, or a folder for model.safetensors")
-    stats: str | None = option(None, "folder with Mean.npy and Std.npy of HumanML3D or KIT-ML", existing)
+    stats: str | None = option(
+        None, "folder with Mean.npy and Std.npy of HumanML3D or KIT-ML", existing
+    )
     averaged: bool = option(True, "false = the raw weights, if the file also has averaged ones")
-    num_heads: int | None = option(None, "number of attention heads, if it differs from the released models")
-    time_token: bool = option(False, "decoder whose input token is the time alone, as in MDM's code since 2025")
-    run_code: bool = option(False, "load pickles that hold more than weights: THIS RUNS ANY CODE IN THE FILE")
+    num_heads: int | None = option(
+        None, "number of attention heads, if it differs from the released models"
+    )
+    time_token: bool = option(
+        False, "decoder whose input token is the time alone, as in MDM's code since 2025"
+    )
+    run_code: bool = option(
+        False, "load pickles that hold more than weights: THIS RUNS ANY CODE IN THE FILE"
+    )
 
 
 def main(settings: ImportSettings) -> None:

@@ -9,7 +9,15 @@ from glob import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from flame_mdm.commands import STORE, BodySettings, DataSettings, FileSettings, above_zero, existing, finish
+from flame_mdm.commands import (
+    STORE,
+    BodySettings,
+    DataSettings,
+    FileSettings,
+    above_zero,
+    existing,
+    finish,
+)
 from flame_mdm.config import EXPERIMENTS, instantiate
 from flame_mdm.config.options import option, required
 from flame_mdm.errors import UserError, first_line, say
@@ -33,7 +41,9 @@ class InspectSettings(BodySettings, FileSettings, DataSettings):
     """
 
     OBJECTS: ClassVar = ("motion", "out")
-    motion: str = required("a motion file, a folder of them, or the name of a data set, also of your own (data.name)")
+    motion: str = required(
+        "a motion file, a folder of them, or the name of a data set, also of your own (data.name)"
+    )
     out: str | None = option(None, "HTML file; default runs/inspect/<name>.html")
     clips: int = option(24, "maximum number of motions in the player, the worst ones", above_zero)
     split: str | None = option(None, "train, val or test of a data set; default: all")
@@ -42,7 +52,8 @@ class InspectSettings(BodySettings, FileSettings, DataSettings):
         name = self.motion
         if not (Path(name).suffix or Path(name).exists() or "/" in name):  # not a file: a data set
             is_prepared = any(Path(self.data_root).glob(f"{escape(name)}-*/{STORE}"))
-            if is_prepared and not (EXPERIMENTS / "data" / f"{name}.yaml").exists():  # own motions under their name
+            # Own motions under their name
+            if is_prepared and not (EXPERIMENTS / "data" / f"{name}.yaml").exists():
                 object.__setattr__(self, "data", "folder")
                 object.__setattr__(self, "composed", (*self.composed, f"data.name={name}"))
             else:
@@ -61,26 +72,44 @@ def main(settings: InspectSettings) -> None:
     failures: list[str] = []
     name, total, motions = _read(settings, failures) if settings.data is None else _clips(settings)
     worst, kinds, faulty, count = [], Counter(), 0, 0
-    for motion in ProgressBar(motions, "inspecting", total, unit=" motions", disable=None if total > 1 else True):
+    for motion in ProgressBar(
+        motions, "inspecting", total, unit=" motions", disable=None if total > 1 else True
+    ):
         count += 1
         faults = find_faults(motion)
         kinds.update({fault.kind for fault in faults})
         faulty += bool(faults)
         frames = {frame for fault in faults for frame in range(fault.start, fault.end)}
         score = (len({fault.kind for fault in faults}), len(frames) / len(motion.joints))
-        worst = sorted([*worst, (score, motion, faults)], key=lambda row: row[0], reverse=True)[: settings.clips]
+        worst = sorted([*worst, (score, motion, faults)], key=lambda row: row[0], reverse=True)[
+            : settings.clips
+        ]
     if not count:
         finish(failures, total, "read")
     for _, motion, faults in worst if count <= settings.clips else []:
         say(*(f"{motion.id}: {note}" for note in motion.notes))
         if faults:
-            say(f"{motion.id}: {len(faults)} faults", *(f"  {fault}" for fault in faults[:MOST_LINES]))
+            say(
+                f"{motion.id}: {len(faults)} faults",
+                *(f"  {fault}" for fault in faults[:MOST_LINES]),
+            )
     say(f"{name}: {faulty} of {count} motions with faults")
-    say(*(f"  {kind:12} {kinds[kind]:6} ({kinds[kind] / count:.1%}): {LIMITS[kind][2]}" for kind in LIMITS))
+    say(
+        *(
+            f"  {kind:12} {kinds[kind]:6} ({kinds[kind] / count:.1%}): {LIMITS[kind][2]}"
+            for kind in LIMITS
+        )
+    )
     out = Path(settings.out or Path("runs") / "inspect" / f"{name}.html")
     marks = [[(f.start, f.end, f.kind, str(f)) for f in faults] for _, _, faults in worst]
-    write_player(out, [motion for _, motion, _ in worst], f"Faults of {name}", marks=marks, body=body)
-    say(f"{out}: the {len(worst)} worst motions (open in any browser)" if count > len(worst) else f"player: {out}")
+    write_player(
+        out, [motion for _, motion, _ in worst], f"Faults of {name}", marks=marks, body=body
+    )
+    say(
+        f"{out}: the {len(worst)} worst motions (open in any browser)"
+        if count > len(worst)
+        else f"player: {out}"
+    )
     finish(failures, total, "read")
     if faulty:
         raise SystemExit(3)
@@ -95,14 +124,18 @@ def _read(settings: InspectSettings, failures: list[str]) -> tuple[str, int, Ite
         return (
             path.resolve().stem,
             1,
-            iter([read(path, settings.fps, settings.unit, settings.up, animation=settings.animation)]),
+            iter(
+                [read(path, settings.fps, settings.unit, settings.up, animation=settings.animation)]
+            ),
         )
     files = motion_files(path)
 
     def motions() -> Iterator[Motion]:
         for file in files:
             try:
-                motion = read(file, settings.fps, settings.unit, settings.up, animation=settings.animation)
+                motion = read(
+                    file, settings.fps, settings.unit, settings.up, animation=settings.animation
+                )
             except (UserError, OSError) as error:
                 failures.append(first_line(error))
                 continue
@@ -117,11 +150,14 @@ def _clips(settings: InspectSettings) -> tuple[str, int, Iterator[Motion]]:
 
     representation = instantiate(settings.nodes["representation"])
     data = instantiate(settings.nodes["data"], representation=representation)
-    if (data.folder / STORE).exists() and data.source.named_by_recipe:  # own data are inspected as they were prepared
+    # Own data are inspected as they were prepared
+    if (data.folder / STORE).exists() and data.source.named_by_recipe:
         info = Store(data.folder).info
         data.source.options, data.source.version = info.get("source", {}), info.get("version", 1)
     store = data.open()
     if settings.split not in (None, *store.info["clips"]):
-        raise UserError(f"no split is called {settings.split}. Available: {', '.join(store.info['clips'])}")
+        raise UserError(
+            f"no split is called {settings.split}. Available: {', '.join(store.info['clips'])}"
+        )
     clips = [clip for clip in store.clips if settings.split in (None, clip.split)]
     return data.folder.name, len(clips), (motion(store, representation, clip) for clip in clips)

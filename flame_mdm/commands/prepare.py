@@ -19,7 +19,9 @@ class PrepareSettings(DataSettings):
 
     OBJECTS: ClassVar = ("data",)
     source: str | None = option(None, "folder or archive, if the data set needs one")
-    check: bool = option(False, "list the files that exist and those that are missing, prepare nothing")
+    check: bool = option(
+        False, "list the files that exist and those that are missing, prepare nothing"
+    )
     verify: bool = option(False, "check and report on an existing store, write nothing")
     force: bool = option(False, "rewrite an existing store")
 
@@ -53,10 +55,15 @@ def main(settings: PrepareSettings) -> None:
         store = write_store(data.folder, data.source, representation)
         say(*data.source.findings())
     info = store.info
-    say(f"{info['dataset']} as {info['representation']} at {info['fps']:g} fps; {info['hours']} hours")
+    say(
+        f"{info['dataset']} as {info['representation']} at {info['fps']:g} fps; {info['hours']} hours"
+    )
     say(*data.counts(store))
     if info["excluded"]:
-        say("excluded: " + ", ".join(f"{count} {reason}" for reason, count in info["excluded"].items()))
+        say(
+            "excluded: "
+            + ", ".join(f"{count} {reason}" for reason, count in info["excluded"].items())
+        )
     size = f"{info['shape'][0]} frames with {info['shape'][1]} features"
     say(f"{size}, fingerprint {store.fingerprint}: {data.folder}", *data.source.failure_lines())
     if data.source.failures:

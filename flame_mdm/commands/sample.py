@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from flame_mdm.sampling.targets import Targets
     from flame_mdm.visualize.body import Mesh
 
-GALLERY = 200  # maximum number of motions on the page of a file of prompts, which has about 20 kB for each
+# Maximum number of motions on the page of a file of prompts, which has about 20 kB for each
+GALLERY = 200
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +50,9 @@ class SampleSettings(OutputSettings, WritingSettings):
     """
 
     OBJECTS: ClassVar = ("ckpt", "out")
-    prompts: str | None = option(None, "instead of text: a file with one prompt per line; each gets its own folder")
+    prompts: str | None = option(
+        None, "instead of text: a file with one prompt per line; each gets its own folder"
+    )
     seconds: float | Sequence[float] | None = same_option(SamplingRequest, "seconds")
     frames: int | Sequence[int] | None = same_option(SamplingRequest, "frames")
     after: str | None = same_option(SamplingRequest, "after", motion_file)
@@ -61,10 +64,16 @@ class SampleSettings(OutputSettings, WritingSettings):
         None, "instead of text: locomotion, or a .yaml file: docs/sampling.md#sets-for-game-engines"
     )
     format: str | None = option(None, "format of the files of a set: fbx, glb, usda, usdc or usdz")
-    scorer: str | None = option(None, "a motion-CLIP that chooses the candidate that fits the text best", model_source)
+    scorer: str | None = option(
+        None, "a motion-CLIP that chooses the candidate that fits the text best", model_source
+    )
     shared_noise: bool = same_option(SamplingRequest, "shared_noise")
-    samples: int | None = option(None, "motions per text or action; default 3, or 1 if OUT is a file")
-    out: str | None = option(None, "a folder, default samples/<experiment>/<text>-<hash>; or a motion file")
+    samples: int | None = option(
+        None, "motions per text or action; default 3, or 1 if OUT is a file"
+    )
+    out: str | None = option(
+        None, "a folder, default samples/<experiment>/<text>-<hash>; or a motion file"
+    )
 
     @property
     def file(self) -> Path | None:
@@ -75,35 +84,60 @@ class SampleSettings(OutputSettings, WritingSettings):
     def check_output(self) -> None:
         """Raises `UserError` for keys that do not fit the kind of output."""
         if self.set is not None:
-            of_sets = {"out", "set", "format", "rig", "resample", "seed", "body", "device", "ckpt", "which"}
-            of_sets |= {"adapter", "adapter_strength", *(entry.name for entry in fields(SamplerOptions))}
+            of_sets = {
+                "out",
+                "set",
+                "format",
+                "rig",
+                "resample",
+                "seed",
+                "body",
+                "device",
+                "ckpt",
+                "which",
+            }
+            of_sets |= {
+                "adapter",
+                "adapter_strength",
+                *(entry.name for entry in fields(SamplerOptions)),
+            }
             for entry in fields(self):
                 value = getattr(self, entry.name)
                 if entry.name not in of_sets and value != entry.default:
                     shown = f"{entry.name}={shortened(str(value), 60)}"
-                    raise UserError(f"{shown}: a set says what is sampled, and how it is cut. Omit {entry.name}")
+                    raise UserError(
+                        f"{shown}: a set says what is sampled, and how it is cut. Omit {entry.name}"
+                    )
             if self.file is not None:
                 raise UserError(f"out={self.out}: a set is several files. Name a folder")
             return
         if self.format is not None:
-            raise UserError(f"format={self.format} is for sets; the ending of OUT is the format of one file")
+            raise UserError(
+                f"format={self.format} is for sets; the ending of OUT is the format of one file"
+            )
         if self.file is None:
             for key in ("rig", "root_motion", "resample", "character"):
                 if value := getattr(self, key):
                     advice = "Name a file, such as out=walk.fbx"
-                    raise UserError(f"{key}={str(value).lower()}: a folder gets motions as they are. {advice}")
+                    raise UserError(
+                        f"{key}={str(value).lower()}: a folder gets motions as they are. {advice}"
+                    )
             return
         for key in ("prompts", "mp4", "trajectory"):
             if value := getattr(self, key):
                 advice = "Name a folder, or omit out"
-                raise UserError(f"{key}={str(value).lower()}: {self.out} is a single motion file. {advice}")
+                raise UserError(
+                    f"{key}={str(value).lower()}: {self.out} is a single motion file. {advice}"
+                )
 
     def set_content(self, source: str) -> MotionSet:
         """Returns the description of a set, changed by the keys that say how it is written."""
         from flame_mdm.sampling.motion_sets import changed, read_set
 
         keys = {"rig": self.rig, "format": self.format, "fps": self.resample}
-        return changed(read_set(source), **{key: value for key, value in keys.items() if value is not None})
+        return changed(
+            read_set(source), **{key: value for key, value in keys.items() if value is not None}
+        )
 
     def conditions(self) -> list[str]:
         return [*super().conditions(), *(["prompts"] if self.prompts is not None else [])]
@@ -116,7 +150,9 @@ class SampleSettings(OutputSettings, WritingSettings):
             request = self.request(samples=samples)
         else:
             if self.path is not None:
-                raise UserError(f"path={self.path}: prompts cannot be given with a path. Give text and seconds")
+                raise UserError(
+                    f"path={self.path}: prompts cannot be given with a path. Give text and seconds"
+                )
             request = self.request(
                 samples=samples,
                 texts=list(prompts.accepted.values()),
@@ -124,7 +160,9 @@ class SampleSettings(OutputSettings, WritingSettings):
                 frames=prompts.lengths("frames", self.frames),
             )
         if self.scorer is not None and (request.kind != "text" or self.candidates == 1):
-            raise UserError(f"scorer={self.scorer} chooses among motions for a text: give text=... and candidates=8")
+            raise UserError(
+                f"scorer={self.scorer} chooses among motions for a text: give text=... and candidates=8"
+            )
         return request
 
 
@@ -191,7 +229,9 @@ def _sample(settings: SampleSettings, request: SamplingRequest, prompts: PromptF
 def _sample_set(settings: SampleSettings, source: str) -> None:
     """Samples and writes a set of clips."""
     content = settings.set_content(source)
-    request = settings.request(texts=[motion.text for motion in content.motions.values()], samples=1)
+    request = settings.request(
+        texts=[motion.text for motion in content.motions.values()], samples=1
+    )
     loaded = settings.load(request)
     from flame_mdm.sampling.motion_sets import make_set, write_set
     from flame_mdm.sampling.output import SAMPLES, default_folder
@@ -200,14 +240,22 @@ def _sample_set(settings: SampleSettings, source: str) -> None:
     made = make_set(loaded.model, content, settings.seed, **options)
     say(*(f"left out: {name}: {reason}" for name, reason in made.left_out.items()))
     if settings.out is None:
-        general = (content.model_dump(), options, settings.seed, settings.adapter, settings.adapter_strength)
+        general = (
+            content.model_dump(),
+            options,
+            settings.seed,
+            settings.adapter,
+            settings.adapter_strength,
+        )
         folder = default_folder(loaded.model, Path(source).stem, loaded.sha256, *general)
     else:
         folder = Path(settings.out)
     check_within(folder, settings.out or SAMPLES)
     facts = {"set": Path(source).stem, "seed": settings.seed, "checkpoint": loaded.sha256}
     write_set(folder, made, content, facts, loaded.body)
-    say(f"{len(made.clips)} clips, each with its path and in place: {folder / 'player.html'}, set.png, set.json")
+    say(
+        f"{len(made.clips)} clips, each with its path and in place: {folder / 'player.html'}, set.png, set.json"
+    )
 
 
 def _write_files(
@@ -249,7 +297,14 @@ def _folders(
 
     request = resolved.request
     shared = replace(request, texts=None, actions=None, seconds=None, frames=None, samples=1)
-    general = (digest, request.kind, shared, settings.scorer, settings.adapter, settings.adapter_strength)
+    general = (
+        digest,
+        request.kind,
+        shared,
+        settings.scorer,
+        settings.adapter,
+        settings.adapter_strength,
+    )
     folders: dict[Path, list[Motion]] = {}
     for number, prompt in enumerate(resolved.prompts):
         folder = default_folder(model, prompt.text or "unconditioned", prompt.frames, *general)
@@ -263,7 +318,9 @@ def _folders(
 def _distance(targets: Targets, motions: Sequence[Motion]) -> str:
     from flame_mdm.sampling.targets import errors
 
-    distances = [100 * distance for motion in motions for distance in errors(motion, targets).tolist()]
+    distances = [
+        100 * distance for motion in motions for distance in errors(motion, targets).tolist()
+    ]
     return f"distance from the targets: mean {mean(distances):.1f} cm, max {max(distances):.1f} cm"
 
 

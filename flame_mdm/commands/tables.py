@@ -31,14 +31,20 @@ class TablesSettings:
     """
 
     OBJECTS: ClassVar = ("table",)
-    table: list[str] | None = option(None, "names in experiments/tables, or paths of specs; default: all")
+    table: list[str] | None = option(
+        None, "names in experiments/tables, or paths of specs; default: all"
+    )
     evaluate: bool = option(True, "evaluate what is missing; false = render existing results only")
     out: str = option("runs/tables", "folder of the tables")
     results: str = option("runs/results", "folder of the results")
     device: str | None = option(None, "this and the next two: as for make evaluate")
     batch_size: int = option(64, "motions at once")
-    force: bool = option(False, "generate even if real motions miss the values that the protocol expects")
-    data_root: str = option("", "folder of the prepared data sets; default: the checkpoint's, or FLAME_MDM_DATA")
+    force: bool = option(
+        False, "generate even if real motions miss the values that the protocol expects"
+    )
+    data_root: str = option(
+        "", "folder of the prepared data sets; default: the checkpoint's, or FLAME_MDM_DATA"
+    )
 
 
 def main(settings: TablesSettings) -> None:
@@ -51,14 +57,21 @@ def main(settings: TablesSettings) -> None:
     counts, invalid = {}, []
     for name, table in built.items():
         write(table, out)
-        lines = [(part, line) for part in table.parts for line in part.lines if line.kind == "measured"]
+        lines = [
+            (part, line) for part in table.parts for line in part.lines if line.kind == "measured"
+        ]
         counts[name] = f"{sum(not line.state for _, line in lines)} of {len(lines)}"
         say(f"{name}: {counts[name]} rows measured: {out / name}.html, .md, .tex, .csv")
         invalid += [(name, part, line) for part, line in lines if line.state == NOT_VALID]
     for name, part, line in invalid:
-        say(f"NOT VALID: {name}, {part.name}, {line.label}: {line.facts['not valid because']}", error=True)
+        say(
+            f"NOT VALID: {name}, {part.name}, {line.label}: {line.facts['not valid because']}",
+            error=True,
+        )
     if len(specs) > 1:
-        write_text(out / "index.html", page("Tables", render("index.html", tables=built, measured=counts)))
+        write_text(
+            out / "index.html", page("Tables", render("index.html", tables=built, measured=counts))
+        )
         say(f"all tables: {out / 'index.html'}")
     if failed:
         raise UserError(f"{len(failed)} evaluations failed: {'; '.join(failed)}")
@@ -66,7 +79,9 @@ def main(settings: TablesSettings) -> None:
         raise SystemExit(INVALID)
 
 
-def evaluate_missing(specs: Mapping[str, Config], results: Path, settings: TablesSettings) -> list[str]:
+def evaluate_missing(
+    specs: Mapping[str, Config], results: Path, settings: TablesSettings
+) -> list[str]:
     """Runs evaluations whose results are missing or outdated, and counts lengths; returns one line per failure."""
     from evaluators.evaluation import evaluate
     from evaluators.evaluation_request import EvaluationRequest
@@ -98,7 +113,9 @@ def evaluate_missing(specs: Mapping[str, Config], results: Path, settings: Table
             dotted = [f"{name}={keys.pop(name)}" for name in list(keys) if "." in name]
             nodes = compose_data(keys.pop("data"), dotted) if "data" in keys else {}
             names = ("device", "batch_size", "force", "data_root")
-            general = {name: value for name in names if (value := getattr(settings, name)) is not None}
+            general = {
+                name: value for name in names if (value := getattr(settings, name)) is not None
+            }
             if "batch_size" in protocol_config(keys["protocol"]):
                 general.pop("batch_size", None)  # protocols that measure time set the batch size
             evaluate(EvaluationRequest.of(nodes | general | keys | {"out": str(path)}))
@@ -141,7 +158,11 @@ def outdated(path: Path, evaluation: Evaluation, values: Set[str] = frozenset())
         return True
     for used, key in ((result.checkpoint, "ckpt"), (result.extractor, "extractor")):
         file = Path(str(evaluation.keys.get(key)))
-        hashed = weights_sha256 if key == "extractor" and file.suffix in (".ckpt", ".safetensors") else sha256
+        hashed = (
+            weights_sha256
+            if key == "extractor" and file.suffix in (".ckpt", ".safetensors")
+            else sha256
+        )
         if file.is_file() and (used is None or used.sha256 != hashed(file)):
             return True
     return False
@@ -149,12 +170,18 @@ def outdated(path: Path, evaluation: Evaluation, values: Set[str] = frozenset())
 
 def count_lengths(dataset: str, results: Path, settings: TablesSettings) -> None:
     """Writes the motion lengths of a data set to `results`; prints a message if the data set is not prepared."""
-    nodes = compose_data(dataset, data_root=settings.data_root or os.environ.get("FLAME_MDM_DATA", "data"))
+    nodes = compose_data(
+        dataset, data_root=settings.data_root or os.environ.get("FLAME_MDM_DATA", "data")
+    )
     data = instantiate(nodes["data"], representation=instantiate(nodes["representation"]))
     if not (data.folder / "store.json").exists():
-        say(f"{dataset}: not prepared, so its lengths are omitted. To prepare it: make prepare DATA={dataset}")
+        say(
+            f"{dataset}: not prepared, so its lengths are omitted. To prepare it: make prepare DATA={dataset}"
+        )
         return
     store = data.open()
     facts = {name: store.info[name] for name in ("fingerprint", "fps", "excluded")}
     counted = Lengths(lengths=sorted(clip.length for clip in store.clips), **facts)
-    write_json(results / "lengths" / f"{dataset}.json", counted.model_dump(), indent=None, within=results)
+    write_json(
+        results / "lengths" / f"{dataset}.json", counted.model_dump(), indent=None, within=results
+    )

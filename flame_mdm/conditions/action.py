@@ -20,14 +20,21 @@ class ActionLabels(ConditionEncoder):
         """`features` (C) is the width of the vectors; `num_actions` is the number of labels in the data set."""
         super().__init__()
         if num_actions < 1:
-            raise UserError("condition=action needs a data set with action labels; this one has none")
+            raise UserError(
+                "condition=action needs a data set with action labels; this one has none"
+            )
         self.features = features
         self.table = nn.Parameter(torch.randn(num_actions, features))
 
     def forward(self, batch: MotionBatch) -> Condition:
         if batch.action is None:
-            raise UserError("condition=action needs action labels, and this batch has none: choose data with labels")
-        pooled, nothing = self.table[batch.action.to(self.table.device)], torch.zeros_like(self.table[:1])
+            raise UserError(
+                "condition=action needs action labels, and this batch has none: choose data with labels"
+            )
+        pooled, nothing = (
+            self.table[batch.action.to(self.table.device)],
+            torch.zeros_like(self.table[:1]),
+        )
         token_mask = torch.ones(pooled.shape[0], 1, dtype=torch.bool, device=pooled.device)
         null = Condition(nothing, nothing[:, None], token_mask.new_ones(1, 1))
         return Condition(pooled, pooled[:, None], token_mask, null)

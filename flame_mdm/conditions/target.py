@@ -20,7 +20,9 @@ HEADING = SLOTS.index("heading")
 COORDINATES = torch.tensor([[1.0, 1.0, 1.0]] * len(JOINTS) + [[1.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
 """Coordinates (8, 3) of the slots that are lengths; x of the heading is an angle."""
 
-EPSILON = 1e-8  # added to the numbers of requested values, as in the authors' code, so that none of them costs nothing
+# Added to the numbers of requested values, as in the authors' code, so that none of them costs
+# nothing
+EPSILON = 1e-8
 
 
 class TargetConditions:
@@ -50,11 +52,15 @@ class TargetConditions:
         heading_modulo_pi: bool = False,
     ):
         if lacking := [name for name in JOINTS if name not in joints]:
-            raise UserError(f"task.targets: the skeleton has no {', '.join(lacking)}. Choose another data set, or null")
+            raise UserError(
+                f"task.targets: the skeleton has no {', '.join(lacking)}. Choose another data set, or null"
+            )
         unknown = [name for choice in choices for name in choice if name not in SLOTS]
         if unknown or not choices:
             advice = did_you_mean(unknown[0], SLOTS) if unknown else ""
-            raise UserError(f"task.targets.choices={list(choices)}:{advice} Give sets of {', '.join(SLOTS)}")
+            raise UserError(
+                f"task.targets.choices={list(choices)}:{advice} Give sets of {', '.join(SLOTS)}"
+            )
         if not 0 <= drop_prob <= 1:
             raise UserError(f"task.targets.drop_prob={drop_prob}: give a probability from 0 to 1")
         self.columns = [joints.index(name) for name in JOINTS]
@@ -65,7 +71,9 @@ class TargetConditions:
     def locations(self, joints: Tensor, lengths: Tensor | None = None) -> Tensor:
         """Returns the values (B, 8, 3) of all slots at the last of `lengths` (B,) frames of motions (B, F, J, 3)."""
         last = (
-            joints[:, -1] if lengths is None else joints[torch.arange(len(joints), device=joints.device), lengths - 1]
+            joints[:, -1]
+            if lengths is None
+            else joints[torch.arange(len(joints), device=joints.device), lengths - 1]
         )
         pelvis = last[:, :1] * last.new_tensor([1.0, 0.0, 1.0])
         angle = heading(last[:, self.facing])
@@ -85,7 +93,9 @@ class TargetConditions:
         """
         predicted, values, valid = self.locations(joints, lengths), target[..., :3], target[..., 3:]
         counted = valid * COORDINATES.to(target)
-        squares = ((predicted - values).square() * counted).sum((1, 2)) / (counted.sum((1, 2)) + EPSILON)
+        squares = ((predicted - values).square() * counted).sum((1, 2)) / (
+            counted.sum((1, 2)) + EPSILON
+        )
         difference = predicted[:, HEADING, 0] - values[:, HEADING, 0]
         if self.heading_modulo_pi:
             turn = torch.remainder(difference + math.pi / 2, math.pi) - math.pi / 2

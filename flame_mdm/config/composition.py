@@ -48,9 +48,14 @@ def compose(name: str, overrides: Sequence[str] = ()) -> Config:
     return resolve(source, *prepare_overrides(source, overrides))
 
 
-def compose_data(name: str, overrides: Sequence[str] = (), *, data_root: str = "data", seed: int = 0) -> Config:
+def compose_data(
+    name: str, overrides: Sequence[str] = (), *, data_root: str = "data", seed: int = 0
+) -> Config:
     """Composes a file in experiments/data with its representation; returns the keys `data` and `representation`."""
-    source, first = ConfigSource(EXPERIMENTS, None), [f"+seed={seed}", quoted(f"+data_root={data_root}")]
+    source, first = (
+        ConfigSource(EXPERIMENTS, None),
+        [f"+seed={seed}", quoted(f"+data_root={data_root}")],
+    )
     config = resolve(source, *prepare_overrides(source, [f"+data={name}", *overrides], first))
     return {key: config[key] for key in ("data", "representation")}
 
@@ -59,7 +64,8 @@ class ConfigSource(NamedTuple):
     """Location and kind of a configuration."""
 
     folder: Path
-    stem: str | None  # name of the file in `folder` without its suffix; None = an empty configuration
+    # Name of the file in `folder` without its suffix; None = an empty configuration
+    stem: str | None
     saved: bool = False  # whether it is a resolved configuration, whose parts cannot be replaced
 
 
@@ -73,8 +79,13 @@ def prepare_overrides(
     parsed = parse(overrides)
     _check_groups(parsed, recipe)
     if recipe.saved:  # its parts are fixed, so that the launcher is an addition
-        parsed = parse([f"+{word}" if word.startswith(f"{LAUNCH}=") else word for word in overrides])
-    first = [*first, *([f"hydra.searchpath=[file://{EXPERIMENTS}]"] if recipe.folder != EXPERIMENTS else [])]
+        parsed = parse(
+            [f"+{word}" if word.startswith(f"{LAUNCH}=") else word for word in overrides]
+        )
+    first = [
+        *first,
+        *([f"hydra.searchpath=[file://{EXPERIMENTS}]"] if recipe.folder != EXPERIMENTS else []),
+    ]
     if recipe.stem and not recipe.saved:
         first.append(f"experiment={recipe.stem}")
     if not parsed:
@@ -108,10 +119,14 @@ def find_recipe(name: str) -> ConfigSource:
     if name.endswith((".yaml", ".yml")):
         path = Path(name).resolve()
         if not path.is_file():
-            raise UserError(f"{name}: no such file. EXP takes an experiment or the path of a config.yaml")
+            raise UserError(
+                f"{name}: no such file. EXP takes an experiment or the path of a config.yaml"
+            )
         content = read_yaml(path)
         if not isinstance(content, dict):
-            raise UserError(f"{name}: not a recipe: it has no keys. Begin with `defaults:` and another recipe")
+            raise UserError(
+                f"{name}: not a recipe: it has no keys. Begin with `defaults:` and another recipe"
+            )
         saved = "defaults" not in content
         if saved:
             plain(content, name, but=RUN_DIR)
@@ -127,7 +142,9 @@ def quoted(word: str) -> str:
     """Returns a word `key=value` whose value Hydra takes literally."""
     key, _, value = word.partition("=")
     # Hydra takes a backslash literally, except right before a quote, where it has to be doubled.
-    escaped = re.sub(r"(\\*)('|$)", lambda m: m[1] * 2 + ("\\'" if m[2] else ""), value).replace("${", "\\${")
+    escaped = re.sub(r"(\\*)('|$)", lambda m: m[1] * 2 + ("\\'" if m[2] else ""), value).replace(
+        "${", "\\${"
+    )
     return f"{key}='{escaped}'"
 
 
@@ -160,7 +177,9 @@ def _check_groups(overrides: Sequence[Override], recipe: ConfigSource) -> None:
                     f"no {group} is called '{option}'.{did_you_mean(option, options)} Available: {', '.join(options)}"
                 )
         if group == LAUNCH and source_file("submitit") is None:
-            raise UserError(f"{override.input_line} needs hydra-submitit-launcher: pip install flame-mdm[slurm]")
+            raise UserError(
+                f"{override.input_line} needs hydra-submitit-launcher: pip install flame-mdm[slurm]"
+            )
 
 
 def resolve(source: ConfigSource, overrides: list[str], base: Config | None = None) -> Config:
@@ -183,14 +202,23 @@ def resolve(source: ConfigSource, overrides: list[str], base: Config | None = No
 def _legal(config: Config, override: Override) -> str:
     """Returns the override as text for Hydra; raises `UserError` if neither recipe nor `_target_` has its key."""
     line = str(override.input_line)
-    if override.is_delete() or override.is_force_add() or override.is_add() or line.startswith("hydra."):
+    if (
+        override.is_delete()
+        or override.is_force_add()
+        or override.is_add()
+        or line.startswith("hydra.")
+    ):
         return line
     node: Any = config
     parts = override.key_or_group.split(".")
     for depth, part in enumerate(parts):
         if isinstance(node, Mapping) and part in node:
             node = node[part]
-        elif isinstance(node, Mapping) and "_target_" in node and part in parameters(node["_target_"]):
+        elif (
+            isinstance(node, Mapping)
+            and "_target_" in node
+            and part in parameters(node["_target_"])
+        ):
             return "++" + line
         elif isinstance(node, list) and part.isdigit() and int(part) < len(node):
             node = node[int(part)]

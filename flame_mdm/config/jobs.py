@@ -6,7 +6,15 @@ from itertools import product
 from pathlib import Path
 from typing import Any, TypeVar
 
-from flame_mdm.config.command_line import STOP, checked_settings, guarded, is_text, make_variables, run, with_keys
+from flame_mdm.config.command_line import (
+    STOP,
+    checked_settings,
+    guarded,
+    is_text,
+    make_variables,
+    run,
+    with_keys,
+)
 from flame_mdm.config.composition import EXPERIMENTS, LAUNCH, choices, compose, parse, quoted
 from flame_mdm.config.sweeps import SWEEP, check_launcher, hydra_sweep
 from flame_mdm.errors import UserError, say
@@ -33,7 +41,12 @@ def run_jobs(command: Callable[[Settings], None], kind: type[Settings], argv: Se
     return guarded(lambda: _serve(command, kind, words, codes), STOP) or max(codes)
 
 
-def _serve(command: Callable[[Settings], None], kind: type[Settings], words: Sequence[str], codes: list[int]) -> None:
+def _serve(
+    command: Callable[[Settings], None],
+    kind: type[Settings],
+    words: Sequence[str],
+    codes: list[int],
+) -> None:
     launcher = [word for word in words if _is_of_launcher(word)]
     keyed = with_keys(kind, [word for word in words if word not in launcher and word not in SWEEP])
     combinations = list(product(*(_alternatives(kind, word) for word in keyed)))

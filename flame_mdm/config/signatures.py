@@ -62,7 +62,10 @@ TOP_LEVEL = {
 }
 """The kinds of values of the keys of a recipe that are no argument of a `_target_`."""
 
-ARGUMENTS = {"losses": "flame_mdm.losses.MotionLosses", "ema": "flame_mdm.training.averaging.MovingAverage"}
+ARGUMENTS = {
+    "losses": "flame_mdm.losses.MotionLosses",
+    "ema": "flame_mdm.training.averaging.MovingAverage",
+}
 """Keys of a recipe whose mapping has arguments of a class: the class."""
 
 DERIVED = ("to_joints", "feet", "edges")  # arguments of these classes that no recipe has
@@ -84,7 +87,8 @@ def check_top_level(config: Config) -> None:
             if name not in legal:
                 raise UserError(f"unknown config key '{key}.{name}'. Available: {', '.join(legal)}")
             check_kind(f"{key}.{name}", value, legal[name])
-    for key in config.keys() - TOP_LEVEL.keys():  # a recipe may have keys of its own, to which others refer
+    # A recipe may have keys of its own, to which others refer
+    for key in config.keys() - TOP_LEVEL.keys():
         if near := difflib.get_close_matches(str(key), TOP_LEVEL, 1, 0.75):
             raise UserError(f"unknown config key '{key}'. Did you mean {near[0]}?")
 
@@ -93,7 +97,8 @@ def check_kind(key: str, value: Any, annotation: str) -> None:
     """Raises `UserError` if the annotation of a parameter rules out a value. Unknown annotations allow any value."""
     required = []
     kinds = _alternatives(ast.parse(annotation or "Any", mode="eval").body)
-    for kind in [kind for kind in kinds if _name(kind) != "Tensor"]:  # no configuration holds a tensor
+    # No configuration holds a tensor
+    for kind in [kind for kind in kinds if _name(kind) != "Tensor"]:
         description = _mismatch(value, kind)
         if not description:
             return
@@ -105,7 +110,8 @@ def check_kind(key: str, value: Any, annotation: str) -> None:
 def _alternatives(annotation: ast.expr) -> list[ast.expr]:
     if isinstance(annotation, ast.BinOp):
         return [*_alternatives(annotation.left), *_alternatives(annotation.right)]
-    if isinstance(annotation, ast.Constant) and isinstance(annotation.value, str):  # a forward reference
+    # A forward reference
+    if isinstance(annotation, ast.Constant) and isinstance(annotation.value, str):
         return _alternatives(ast.parse(annotation.value, mode="eval").body)
     if isinstance(annotation, ast.Subscript):
         name, members = _name(annotation.value), annotation.slice
@@ -122,7 +128,11 @@ def _mismatch(value: Any, kind: ast.expr) -> str:
     if name in KINDS:
         types, description = KINDS[name]
         legal = isinstance(value, types) and isinstance(value, bool) == (name == "bool")
-        return "" if legal and not (isinstance(value, float) and not math.isfinite(value)) else description
+        return (
+            ""
+            if legal and not (isinstance(value, float) and not math.isfinite(value))
+            else description
+        )
     if isinstance(kind, ast.Subscript):
         outer = _name(kind.value)
         if outer == "Literal":
@@ -131,16 +141,24 @@ def _mismatch(value: Any, kind: ast.expr) -> str:
             return "" if value in choices else f"one of {', '.join(map(str, choices))}"
         if outer in ("dict", "Dict", "Mapping"):
             return "" if isinstance(value, Mapping) else "a mapping of keys"
-        if outer not in (*SEQUENCES, *TUPLES) or (isinstance(value, Mapping) and "_target_" in value):
+        if outer not in (*SEQUENCES, *TUPLES) or (
+            isinstance(value, Mapping) and "_target_" in value
+        ):
             return ""
         if not isinstance(value, list | tuple):
             return "a list"
         if outer in TUPLES and isinstance(kind.slice, ast.Tuple):
             return _mismatch_of_items(value, kind.slice.elts)
-        required = [[_mismatch(item, member) for member in _alternatives(kind.slice)] for item in value]
+        required = [
+            [_mismatch(item, member) for member in _alternatives(kind.slice)] for item in value
+        ]
         wrong = [descriptions for descriptions in required if all(descriptions)]
         return f"a list, each item {' or '.join(dict.fromkeys(wrong[0]))}" if wrong else ""
-    if re.fullmatch(r"[A-Z]\w+", name) and name != "Any" and (value is None or isinstance(value, int | float)):
+    if (
+        re.fullmatch(r"[A-Z]\w+", name)
+        and name != "Any"
+        and (value is None or isinstance(value, int | float))
+    ):
         return "a part"  # a class
     return ""
 
@@ -152,7 +170,9 @@ def _mismatch_of_items(items: Sequence[Any], kinds: Sequence[ast.expr]) -> str:
     if len(items) != len(kinds):
         return f"a list of {len(kinds)}"
     for item, kind in zip(items, kinds, strict=True):
-        required = [_mismatch(item, member) for member in _alternatives(kind) if _name(member) != "Tensor"]
+        required = [
+            _mismatch(item, member) for member in _alternatives(kind) if _name(member) != "Tensor"
+        ]
         if required and all(required):
             return f"a list of {len(kinds)}, each item {' or '.join(dict.fromkeys(required))}"
     return ""
@@ -160,7 +180,11 @@ def _mismatch_of_items(items: Sequence[Any], kinds: Sequence[ast.expr]) -> str:
 
 def _name(node: ast.expr) -> str:
     """Returns the last part of a dotted name."""
-    return ast.unparse(node).rpartition(".")[2] if isinstance(node, ast.Name | ast.Attribute | ast.Constant) else ""
+    return (
+        ast.unparse(node).rpartition(".")[2]
+        if isinstance(node, ast.Name | ast.Attribute | ast.Constant)
+        else ""
+    )
 
 
 def check_same_kinds(base: Config, config: Config, path: str = "") -> None:
@@ -172,7 +196,11 @@ def check_same_kinds(base: Config, config: Config, path: str = "") -> None:
                 raise UserError(f"{key} cannot be removed. Give it another value")
         elif isinstance(value, Mapping):
             if isinstance(config[name], Mapping):
-                check_same_kinds({k: v for k, v in value.items() if "_target_" not in value}, config[name], f"{key}.")
+                check_same_kinds(
+                    {k: v for k, v in value.items() if "_target_" not in value},
+                    config[name],
+                    f"{key}.",
+                )
             elif config[name] is not None or key in ("run", "callbacks", "losses"):
                 raise UserError(f"{key}={config[name]}: must be a mapping of keys")
         elif value is not None and not isinstance(value, list):
@@ -180,7 +208,9 @@ def check_same_kinds(base: Config, config: Config, path: str = "") -> None:
             check_kind(key, config[name], "str | int | float" if kind == "str" else kind)
 
 
-def walk(node: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Mapping[str, Any]]]:
+def walk(
+    node: Any, path: tuple[str, ...] = ()
+) -> Iterator[tuple[tuple[str, ...], Mapping[str, Any]]]:
     if isinstance(node, Mapping):
         yield path, node
         for name, child in node.items():
@@ -200,7 +230,9 @@ def unknown_key(config: Config, parts: Sequence[str], depth: int, node: Any) -> 
     near = difflib.get_close_matches(parts[depth], siblings - {parts[depth]}, 3, 0.6)
     names = [".".join([*parts[:depth], name]) for name in near]
     if not names:
-        legal = {".".join([*path, str(name)]) for path, mapping in walk(config) for name in mapping} - {key}
+        legal = {
+            ".".join([*path, str(name)]) for path, mapping in walk(config) for name in mapping
+        } - {key}
         names = difflib.get_close_matches(key, legal, 3, 0.6)
         names = names or [name for name in sorted(legal) if name.endswith(f".{parts[-1]}")][:3]
     return f"unknown config key '{key}'." + (f" Did you mean {', '.join(names)}?" if names else "")
@@ -219,12 +251,18 @@ def _signature(target: str) -> dict[str, str]:
     if node is None:
         package = module.partition(".")[0]
         missing = package and find_spec(package) is None
-        hint = f". Python finds no {package}: set PYTHONPATH to the folder that contains it" if missing else ""
+        hint = (
+            f". Python finds no {package}: set PYTHONPATH to the folder that contains it"
+            if missing
+            else ""
+        )
         raise UserError(f"_target_={target}: no such class or function{hint}")
     return _arguments(*node)
 
 
-def definition(module: str, name: str, seen: frozenset[str] = frozenset()) -> tuple[str, ast.AST] | None:
+def definition(
+    module: str, name: str, seen: frozenset[str] = frozenset()
+) -> tuple[str, ast.AST] | None:
     """Returns the module and syntax tree of the definition of `module.name`, following re-exports."""
     tree = _tree(module)
     if tree is None or module in seen:
@@ -237,9 +275,13 @@ def definition(module: str, name: str, seen: frozenset[str] = frozenset()) -> tu
             for alias in node.names:
                 if alias.name == "*" or (alias.asname or alias.name) == name:
                     path = source_file(module)
-                    package = module if path and path.name == "__init__.py" else module.rpartition(".")[0]
+                    package = (
+                        module if path and path.name == "__init__.py" else module.rpartition(".")[0]
+                    )
                     source = resolve_name(f"{'.' * node.level}{node.module or ''}", package)
-                    original = definition(source, name if alias.name == "*" else alias.name, seen | {module})
+                    original = definition(
+                        source, name if alias.name == "*" else alias.name, seen | {module}
+                    )
                     if original:
                         return original
     return None
@@ -259,7 +301,10 @@ def source_file(module: str) -> Path | None:
         return None
     relative = Path(*module.split("."))
     for entry in [str(Path(__file__).parent.parent.parent), *sys.path]:
-        for candidate in (Path(entry) / relative / "__init__.py", (Path(entry) / relative).with_suffix(".py")):
+        for candidate in (
+            Path(entry) / relative / "__init__.py",
+            (Path(entry) / relative).with_suffix(".py"),
+        ):
             if candidate.is_file():
                 return candidate
     return None
@@ -277,7 +322,11 @@ def _tree(module: str) -> ast.Module | None:
 def _arguments(module: str, node: ast.AST) -> dict[str, str]:
     if isinstance(node, ast.FunctionDef):
         listed = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
-        names = {a.arg: ast.unparse(a.annotation) if a.annotation else "" for a in listed if a.arg != "self"}
+        names = {
+            a.arg: ast.unparse(a.annotation) if a.annotation else ""
+            for a in listed
+            if a.arg != "self"
+        }
         return names | ({"**": ""} if node.args.kwarg else {})
     assert isinstance(node, ast.ClassDef)
     for item in node.body:

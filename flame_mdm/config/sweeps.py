@@ -22,7 +22,8 @@ from flame_mdm.safe_io.paths import check_tree
 SWEEP = ("-m", "--multirun")  # options that make values separated by commas a sweep
 QUIET = ["hydra/job_logging=disabled", "hydra/hydra_logging=disabled", "hydra.output_subdir=null"]
 
-INTERRUPT = STOP[:1]  # signals that end training before the first step; then training handles them itself
+# Signals that end training before the first step; then training handles them itself
+INTERRUPT = STOP[:1]
 
 
 def run_recipe(command: Callable[[Config], None], usage: str, argv: Sequence[str]) -> int:
@@ -33,7 +34,9 @@ def run_recipe(command: Callable[[Config], None], usage: str, argv: Sequence[str
     words = make_variables() if "--from-make" in argv else list(argv)
     if not words or any(word in ("-h", "--help") for word in words):
         say(*usage.strip().splitlines(), "", "experiments:")
-        for folder, names in groupby(composition.recipes(), lambda recipe: recipe.rpartition("/")[0]):
+        for folder, names in groupby(
+            composition.recipes(), lambda recipe: recipe.rpartition("/")[0]
+        ):
             listed = ", ".join(name.rpartition("/")[2] for name in names)
             say(f"  {f'{folder}/' if folder else '':13}{listed}")
         say("parts: " + ", ".join(f"{group}=..." for group in composition.groups()))
@@ -49,18 +52,28 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
     recipe = composition.find_recipe(name)
     flags = [word for word in words if word.startswith("-")]
     if unknown := [flag for flag in flags if flag not in SWEEP]:
-        raise UserError(f"unknown option {unknown[0]}. Available: --help, --multirun, and keys as key=value")
-    overrides, base = composition.prepare_overrides(recipe, [word for word in words if word not in flags])
+        raise UserError(
+            f"unknown option {unknown[0]}. Available: --help, --multirun, and keys as key=value"
+        )
+    overrides, base = composition.prepare_overrides(
+        recipe, [word for word in words if word not in flags]
+    )
     parsed = composition.parse(overrides)
     launcher = [str(o.value()) for o in parsed if o.key_or_group == LAUNCH]
     sweep = bool(launcher or flags)
     lists = [str(o.input_line) for o in parsed if o.is_sweep_override()]
     if lists and not sweep:
-        raise UserError(f"{lists[0]}: several values make a sweep, one run for each. Add --multirun, or give one value")
-    config = composition.resolve(recipe, [composition.first_choice(o) for o in parsed] if sweep else overrides, base)
+        raise UserError(
+            f"{lists[0]}: several values make a sweep, one run for each. Add --multirun, or give one value"
+        )
+    config = composition.resolve(
+        recipe, [composition.first_choice(o) for o in parsed] if sweep else overrides, base
+    )
     _check_whole(config, name)
     if "local" in launcher and config["trainer"].get("devices", 1) != 1:
-        raise UserError("launch=local runs each job in one process. Remove launch, or trainer.devices")
+        raise UserError(
+            "launch=local runs each job in one process. Remove launch, or trainer.devices"
+        )
 
     def start(config: Config, task: Sequence[str]) -> int:
         # Lightning starts further processes with these words.
@@ -75,9 +88,16 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
     def job(_: object) -> None:
         hydra = HydraConfig.get()
         HydraConfig.instance().cfg = None  # otherwise Lightning adds words for Hydra's command line
-        task = [str(word) for word in hydra.overrides.task if not str(word).lstrip("+").startswith(f"{LAUNCH}=")]
-        code = start(composition.compose(name, [*task, quoted(f"run.dir={hydra.runtime.output_dir}")]), task)
-        if code > 128 or (launcher and code):  # a signal ends the whole sweep; a launched job counts as failed
+        task = [
+            str(word)
+            for word in hydra.overrides.task
+            if not str(word).lstrip("+").startswith(f"{LAUNCH}=")
+        ]
+        code = start(
+            composition.compose(name, [*task, quoted(f"run.dir={hydra.runtime.output_dir}")]), task
+        )
+        # A signal ends the whole sweep; a launched job counts as failed
+        if code > 128 or (launcher and code):
             raise SystemExit(code)
 
     fixed = [repr(o.key_or_group) for o in parsed if not o.is_sweep_override()]
@@ -101,7 +121,9 @@ def check_launcher(launchers: Sequence[str]) -> None:
         )
 
 
-def hydra_sweep(job: Callable[[Any], None], folder: Path, stem: str | None, words: Sequence[str]) -> None:
+def hydra_sweep(
+    job: Callable[[Any], None], folder: Path, stem: str | None, words: Sequence[str]
+) -> None:
     """Runs the jobs of a sweep with Hydra.
 
     Args:
@@ -125,13 +147,17 @@ def _check_whole(config: Config, name: str) -> None:
     parts = ["trainer", "data", "representation", "task", "optimizer"]
     parts += [key for key in ("denoiser", "process", "condition") if key in config]
     lacking = [key for key in ("experiment", "seed", "ema", "logger") if key not in config]
-    lacking += [key for key in ("run", "callbacks", *parts) if not isinstance(config.get(key), Mapping)]
+    lacking += [
+        key for key in ("run", "callbacks", *parts) if not isinstance(config.get(key), Mapping)
+    ]
     if not lacking:
         lacking = [f"{key}._target_" for key in parts if "_target_" not in config[key]]
         lacking += ["run.dir"] * (not config["run"].get("dir"))
         lacking += ["trainer.max_steps"] * ("max_steps" not in config["trainer"])
     if lacking:
-        raise UserError(f"{name}: no {lacking[0]}. Set it, or begin with the defaults of another recipe, or with /base")
+        raise UserError(
+            f"{name}: no {lacking[0]}. Set it, or begin with the defaults of another recipe, or with /base"
+        )
     for key, value in config.get("denoiser", {}).items():
         if isinstance(value, int) and value < 0:
             raise UserError(f"denoiser.{key}={value}: must not be negative")

@@ -30,7 +30,8 @@ class Clip:
     # input of the representation, at its frame rate; for joint-based representations the joint positions (F, J, 3) in
     # meters, y up, in the joint order of its skeleton
     motion: np.ndarray
-    captions: list[str]  # descriptions of the motion, each complete; empty for data sets with action labels only
+    # Descriptions of the motion, each complete; empty for data sets with action labels only
+    captions: list[str]
     split: Split  # mirrored copies and cuts of a take belong to the split of that take
     source: str  # the take the clip comes from; clips of one source are never in two splits
     action: int | None = None  # index into the data set's `actions`, or None
@@ -44,22 +45,28 @@ class Clip:
     window: tuple[int, int] | None = None
     # (F', J, 3) joints in meters at the frame rate of the recording, for protocols that compare at it
     reference: np.ndarray | None = None
-    license: str = ""  # of this motion, an identifier such as "MIT"; empty if the data set has one license for all
+    # Of this motion, an identifier such as "MIT"; empty if the data set has one license for all
+    license: str = ""
 
 
 class MotionSource(ABC):
     """A data set in the form in which it is published."""
 
     name: str
-    named_by_recipe: bool = False  # whether its name is `data.name` of the recipe: the files are the user's own
+    named_by_recipe: bool = (
+        False  # whether its name is `data.name` of the recipe: the files are the user's own
+    )
     options: Mapping[str, Any] = {}
     """Arguments of the constructor that define the data, as JSON values; not those that say where files are and how to
     read them. They are saved in the store, and commands compare them with the recipe's."""
     actions: tuple[str, ...] = ()  # names of the action labels, in the order of their numbers
-    verbs: tuple[str, ...] = ()  # all forms of the verbs in the captions, at which sentences are split, or none
+    # All forms of the verbs in the captions, at which sentences are split, or none
+    verbs: tuple[str, ...] = ()
     license: str = ""
     """License of all motions, a key of `licenses.yaml` such as "MIT"; empty if unknown, or if clips have their own."""
-    captions_may_be_shared: bool = False  # whether the license allows checkpoints to contain captions
+    captions_may_be_shared: bool = (
+        False  # whether the license allows checkpoints to contain captions
+    )
     published_split: bool = False
     """Whether the split is the one used in papers although it tests on clips seen in training or leaves no validation
     clips. Saved in the store and in every result."""
@@ -134,7 +141,9 @@ class MotionSource(ABC):
     def check_fps(self, fps: float, published: float) -> None:
         """Raises `UserError` if a set that is not resampled is requested at another frame rate."""
         if fps != published:
-            raise UserError(f"{self.name} has {published:g} frames per second, not {fps:g}: set representation.fps")
+            raise UserError(
+                f"{self.name} has {published:g} frames per second, not {fps:g}: set representation.fps"
+            )
 
 
 def required(path: Path, get_it: str) -> Path:
@@ -169,7 +178,9 @@ def split_blocks(name: str, clips: int, size: int, *, val: float, test: float) -
     blocks = sorted(range(-(-clips // size)), key=lambda block: name_hash(f"{name}_{block}"))
     tested, validated = (max(1, round(share * len(blocks))) for share in (test, val))
     counts: dict[Split, int] = {"test": tested, "val": validated, "train": len(blocks)}
-    return dict(zip(blocks, (split for split, count in counts.items() for _ in range(count)), strict=False))
+    return dict(
+        zip(blocks, (split for split, count in counts.items() for _ in range(count)), strict=False)
+    )
 
 
 def swap_sides(text: str) -> str:
@@ -193,5 +204,8 @@ def mirrored(clip: Clip, motion: np.ndarray, actions: Sequence[str]) -> Clip:
         motion=motion,
         captions=[swap_sides(caption) for caption in clip.captions],
         action=actions.index(action) if action in actions else clip.action,
-        attributes={k: swap_sides(value) if isinstance(value, str) else value for k, value in clip.attributes.items()},
+        attributes={
+            k: swap_sides(value) if isinstance(value, str) else value
+            for k, value in clip.attributes.items()
+        },
     )

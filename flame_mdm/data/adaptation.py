@@ -20,7 +20,11 @@ from flame_mdm.representations import Representation
 
 DRIFT, FLOAT = 0.05, 0.1
 """Limits in meters of a clip: rise of its floor from the first to the last second, and median height above it."""
-PRIOR = {"train": 2000, "val": 64}  # maximum number of kept clips of what the model knows, evenly spaced in its data
+# Maximum number of kept clips of what the model knows, evenly spaced in its data
+PRIOR = {
+    "train": 2000,
+    "val": 64,
+}
 KEPT = "prior/"  # beginning of the names of these clips
 
 
@@ -41,11 +45,17 @@ class Lesson(MotionSource):
         return Store(self.prior)
 
     def kept(self) -> list[Entry]:
-        clips = {split: [clip for clip in self.store.clips if clip.split == split] for split in PRIOR}
-        return [clip for split, of in clips.items() for clip in of[:: -(-len(of) // PRIOR[split]) or 1]]
+        clips = {
+            split: [clip for clip in self.store.clips if clip.split == split] for split in PRIOR
+        }
+        return [
+            clip for split, of in clips.items() for clip in of[:: -(-len(of) // PRIOR[split]) or 1]
+        ]
 
     def count(self) -> int:
-        self.folder.splits = {name: note.split or "train" for name, note in self.folder.notes.items()}
+        self.folder.splits = {
+            name: note.split or "train" for name, note in self.folder.notes.items()
+        }
         return self.folder.count() + len(self.kept())
 
     def suit(self, representation: Representation) -> None:
@@ -59,7 +69,11 @@ class Lesson(MotionSource):
             yield replace(clip, captions=[styled(caption, self.name) for caption in clip.captions])
         self.folder.require_all()  # of a few clips, none is left out
         for entry in self.kept():
-            features, name, encoded = self.store.motion(entry), KEPT + entry.id, self.store.info["representation"]
+            features, name, encoded = (
+                self.store.motion(entry),
+                KEPT + entry.id,
+                self.store.info["representation"],
+            )
             yield Clip(name, features, entry.captions, entry.split, name, encoded=encoded)
 
 
@@ -73,11 +87,15 @@ def check_clips(path: str | Path, fps: float) -> None:
     Prints the skeletons of the motions, and what was left out of them.
     """
     folder = Folder(str(path))
-    faults = [f"{clip.id} {fault}" for clip in folder.clips(fps) if (fault := fault_of(clip.motion, fps))]
+    faults = [
+        f"{clip.id} {fault}" for clip in folder.clips(fps) if (fault := fault_of(clip.motion, fps))
+    ]
     folder.require_all()
     say(*folder.findings())
     if listed := some(faults):
-        raise UserError(f"{path}: {listed}. The model would learn that: correct these clips, or add force=true")
+        raise UserError(
+            f"{path}: {listed}. The model would learn that: correct these clips, or add force=true"
+        )
 
 
 def fault_of(joints: np.ndarray, fps: float) -> str:
@@ -90,7 +108,11 @@ def fault_of(joints: np.ndarray, fps: float) -> str:
     rise, height = floor[-1] - floor[0], np.median(floor) - floor.min()
     if rise > DRIFT:
         return f"drifts upward by {100 * rise:.0f} cm (limit {100 * DRIFT:.0f})"
-    return f"floats {100 * height:.0f} cm above the floor (limit {100 * FLOAT:.0f})" if height > FLOAT else ""
+    return (
+        f"floats {100 * height:.0f} cm above the floor (limit {100 * FLOAT:.0f})"
+        if height > FLOAT
+        else ""
+    )
 
 
 class LessonBatches(Sampler[list[Draw]]):
@@ -101,7 +123,11 @@ class LessonBatches(Sampler[list[Draw]]):
 
     def __iter__(self) -> Iterator[list[Draw]]:
         for parts in zip(*self.streams, strict=True):
-            yield [(int(r[index]), n) for r, part in zip(self.rows, parts, strict=True) for index, n in part]
+            yield [
+                (int(r[index]), n)
+                for r, part in zip(self.rows, parts, strict=True)
+                for index, n in part
+            ]
 
 
 class LessonData(MotionDataModule):
@@ -111,14 +137,20 @@ class LessonData(MotionDataModule):
         """Returns the indices of the user's training clips, and of the others."""
         is_kept = np.array([clip.id.startswith(KEPT) for clip in self.train.clips])
         if is_kept.all():
-            raise UserError(f"{self.source.name}: all clips are shorter than {self.crop.min_frames} frames")
+            raise UserError(
+                f"{self.source.name}: all clips are shorter than {self.crop.min_frames} frames"
+            )
         return [np.flatnonzero(~is_kept), np.flatnonzero(is_kept)]
 
     def counts(self, store: Store) -> list[str]:
         own, kept = map(len, self.halves())
-        return [f"clips: {own} of {self.source.name}, mirrored copies included; {kept} of what the model knows"]
+        return [
+            f"clips: {own} of {self.source.name}, mirrored copies included; {kept} of what the model knows"
+        ]
 
     def training_batches(self, **of_process: int) -> Sampler[list[Draw]]:
         rows, few = self.halves(), self.batch_size // 2
         sizes = zip(rows, (self.batch_size - few, few), strict=True)
-        return LessonBatches(rows, [TrainingBatches(self.train.lengths[r], size, **of_process) for r, size in sizes])
+        return LessonBatches(
+            rows, [TrainingBatches(self.train.lengths[r], size, **of_process) for r, size in sizes]
+        )

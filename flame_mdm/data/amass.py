@@ -28,7 +28,9 @@ Argument = TypeVar("Argument")
 Result = TypeVar("Result")
 ARCHIVE = re.compile(r"(.+)\.tar(\.bz2|\.xz|\.gz)?")
 RELEASE = "not a motion of AMASS's SMPL+H G release, which is the one to download"
-GET_IT = "register at https://amass.is.tue.mpg.de, download the SMPL+H G archives and put them there"
+GET_IT = (
+    "register at https://amass.is.tue.mpg.de, download the SMPL+H G archives and put them there"
+)
 
 
 def _plain(name: str) -> str:
@@ -51,7 +53,9 @@ class Recording(NamedTuple):
         """Returns every int(self.fps / fps)-th frame, as HumanML3D and FLAME do: at 59.94 or 250 Hz, about `fps`."""
         step = int(self.fps / fps)
         if step < 1:
-            raise UserError(f"recorded at {self.fps:g} frames per second, fewer than the requested {fps:g}")
+            raise UserError(
+                f"recorded at {self.fps:g} frames per second, fewer than the requested {fps:g}"
+            )
         return self.cut(slice(None, None, step))
 
     def cut(self, frames: slice) -> Recording:
@@ -82,9 +86,19 @@ def read(file: Path | bytes, name: str) -> Recording:
     with naming(name, ValueError), naming(name, KeyError, what=f"{RELEASE}: it lacks "):
         data = read_npz(io.BytesIO(file) if isinstance(file, bytes) else file, only=names)
         poses, translation, betas, gender, rate = (data[key] for key in names)
-        if poses.shape[1:] != (156,) or translation.shape != (len(poses), 3) or betas.ndim != 1 or gender.size != 1:
-            raise UserError(f"{RELEASE}: poses {poses.shape} and trans {translation.shape}, not (F, 156) and (F, 3)")
-        if any(array.dtype.kind not in "fiu" or not np.isfinite(array).all() for array in (poses, translation, betas)):
+        if (
+            poses.shape[1:] != (156,)
+            or translation.shape != (len(poses), 3)
+            or betas.ndim != 1
+            or gender.size != 1
+        ):
+            raise UserError(
+                f"{RELEASE}: poses {poses.shape} and trans {translation.shape}, not (F, 156) and (F, 3)"
+            )
+        if any(
+            array.dtype.kind not in "fiu" or not np.isfinite(array).all()
+            for array in (poses, translation, betas)
+        ):
             raise UserError("contains non-finite numbers")
         check_frames(len(poses))
         word = gender.item()
@@ -108,7 +122,11 @@ class Amass:
     def archives(self) -> dict[str, Path]:
         """Subset -> its archive, recognized by file name."""
         paths = ((path, ARCHIVE.fullmatch(path.name)) for path in sorted(self.root.rglob("*.tar*")))
-        return {subset: path for path, match in paths if match and (subset := _BY_NAME.get(_plain(match[1])))}
+        return {
+            subset: path
+            for path, match in paths
+            if match and (subset := _BY_NAME.get(_plain(match[1])))
+        }
 
     def missing(self, keys: Collection[str]) -> list[str]:
         """Returns one line per subset with missing recordings; archives are not opened, so not checked."""
@@ -127,11 +145,15 @@ class Amass:
             raise FileNotFoundError(f"{self.root}: {'; '.join(absent)}")
 
     def map(
-        self, arguments: Mapping[str, Argument], function: Callable[[Argument, Recording], Result], workers: int = 0
+        self,
+        arguments: Mapping[str, Argument],
+        function: Callable[[Argument, Recording], Result],
+        workers: int = 0,
     ) -> Iterator[tuple[str, Result]]:
         """Yields (key, `function(arguments[key], recording)`), sorted; both are picklable, for worker processes."""
         self.check(arguments)
-        tasks: list[tuple[Path, dict[str, Argument]]] = []  # a recording or an archive, and arguments
+        # A recording or an archive, and arguments
+        tasks: list[tuple[Path, dict[str, Argument]]] = []
         for subset, keys in groupby(sorted(arguments), _subset_of):
             of_subset = {key: arguments[key] for key in keys}
             if of_subset.keys() <= self.files.keys():
@@ -139,7 +161,9 @@ class Amass:
             else:
                 tasks.append((self.archives[subset], of_subset))
         # An archive takes minutes: this process must not begin with one alone.
-        for results in in_order(partial(_run, function), tasks, min(workers or cores(), len(tasks))):
+        for results in in_order(
+            partial(_run, function), tasks, min(workers or cores(), len(tasks))
+        ):
             yield from results
 
 
@@ -153,7 +177,11 @@ def _run(
     path, arguments = task
     results = {}
     is_archive = ARCHIVE.fullmatch(path.name)
-    contents = _members(path, arguments) if is_archive else zip(arguments, [str(path)], [path], strict=True)
+    contents = (
+        _members(path, arguments)
+        if is_archive
+        else zip(arguments, [str(path)], [path], strict=True)
+    )
     for key, name, content in contents:
         with naming(name):
             results[key] = function(arguments[key], read(content, name))
@@ -163,10 +191,14 @@ def _run(
 def _members(archive: Path, keys: Collection[str]) -> Iterator[tuple[str, str, bytes]]:
     """Yields key, name and content of recordings in an archive."""
     left = set(keys)
-    for name, content in archives.members(archive, lambda name: name.endswith(".npz") and key_of(name) in left):
+    for name, content in archives.members(
+        archive, lambda name: name.endswith(".npz") and key_of(name) in left
+    ):
         key = str(key_of(name))
         left.remove(key)
         yield key, f"{archive}/{name}", content
         if not left:
             return
-    raise UserError(f"{archive}: {len(left)} recordings are missing in the archive, such as {min(left)}")
+    raise UserError(
+        f"{archive}: {len(left)} recordings are missing in the archive, such as {min(left)}"
+    )

@@ -43,7 +43,9 @@ def members(path: Path, is_wanted: Callable[[str], bool]) -> Iterator[tuple[str,
     with path.open("rb") as file:
         head = file.read(6)
         file.seek(0)
-        unpack: Any = next((opener for magic, opener in _UNPACKERS.items() if head.startswith(magic)), None)
+        unpack: Any = next(
+            (opener for magic, opener in _UNPACKERS.items() if head.startswith(magic)), None
+        )
         with naming(path, *_DAMAGE, what="damaged archive, download it again: "):
             if head.startswith(b"PK") or zipfile.is_zipfile(path):
                 yield from _zip_members(file, size, is_wanted)
@@ -75,22 +77,29 @@ def as_folder(path: Path, owner: object, is_wanted: Callable[[str], bool]) -> Pa
     return folder
 
 
-def _zip_members(file: IO[bytes], size: int, is_wanted: Callable[[str], bool]) -> Iterator[tuple[str, bytes]]:
+def _zip_members(
+    file: IO[bytes], size: int, is_wanted: Callable[[str], bool]
+) -> Iterator[tuple[str, bytes]]:
     with opened_zip(file) as archive:
         check_expansion(sum(info.file_size for info in archive.infolist()), size)
         for info in archive.infolist():
             name = info.filename
             if not name:  # `zipfile` cuts names at a null character
                 raise UserError("a file without a name")
-            if not info.is_dir() and "__MACOSX" not in name and is_wanted(name):  # macOS keeps attributes there
+            # MacOS keeps attributes there
+            if not info.is_dir() and "__MACOSX" not in name and is_wanted(name):
                 check_member(info)
                 _check_size(name, info.file_size)
                 yield name, archive.read(info)
 
 
-def _tar_members(path: Path, stream: Any, is_wanted: Callable[[str], bool]) -> Iterator[tuple[str, bytes]]:
+def _tar_members(
+    path: Path, stream: Any, is_wanted: Callable[[str], bool]
+) -> Iterator[tuple[str, bytes]]:
     try:
-        archive: Any = tarfile.open(mode="r|", fileobj=stream, bufsize=MEBIBYTE // 4, tarinfo=_Member)  # noqa: SIM115
+        archive: Any = tarfile.open(  # noqa: SIM115
+            mode="r|", fileobj=stream, bufsize=MEBIBYTE // 4, tarinfo=_Member
+        )
     except tarfile.ReadError as error:
         raise UserError(f"{path}: neither a folder nor a zip or tar archive: {error}") from error
     count = 0
@@ -100,7 +109,9 @@ def _tar_members(path: Path, stream: Any, is_wanted: Callable[[str], bool]) -> I
             check_members(count)
             if not member.isdir() and is_wanted(member.name):
                 if not member.isreg() or member.issparse():
-                    raise UserError(f"{member.name}: a link or another special file, not a regular file")
+                    raise UserError(
+                        f"{member.name}: a link or another special file, not a regular file"
+                    )
                 _check_size(member.name, member.size)
                 yield member.name, archive.extractfile(member).read()
             archive.members = []  # a million empty members take a gigabyte

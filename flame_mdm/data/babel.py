@@ -24,7 +24,11 @@ LENGTH, STRIDE = 128, 10  # frames of a clip, and between the windows of a label
 Segment = tuple[str, list[str] | None, float | None, float | None]  # words, categories, start, end
 GET_IT = "BABEL v1.0 is published at https://babel.is.tue.mpg.de: unpack it, then run `make prepare SOURCE=/path/to/it`"
 
-PARTS = {"train": ("train", "extra_train"), "val": ("val", "extra_val")}  # extra: only the first annotator's labels
+# Extra: only the first annotator's labels
+PARTS = {
+    "train": ("train", "extra_train"),
+    "val": ("val", "extra_val"),
+}
 
 
 class Label(NamedTuple):
@@ -60,7 +64,11 @@ class Babel(MotionSource):
     name = "babel"
 
     def __init__(self, path: str, amass: str, published_split: bool = False, workers: int = 0):
-        self.path, self.amass, self.published_split = Path(path), Amass(Path(amass)), published_split
+        self.path, self.amass, self.published_split = (
+            Path(path),
+            Amass(Path(amass)),
+            published_split,
+        )
         self.workers = workers
         self.options = {"published_split": published_split}
 
@@ -80,7 +88,16 @@ class Babel(MotionSource):
             for id_, split, start, label in windows[key]:
                 source = id_ if self.published_split else key
                 attributes = {"motion": key, "start": start, "label": label.kind}
-                yield Clip(id_, motion, [label.text], split, source, None, attributes, window=(start, LENGTH))
+                yield Clip(
+                    id_,
+                    motion,
+                    [label.text],
+                    split,
+                    source,
+                    None,
+                    attributes,
+                    window=(start, LENGTH),
+                )
 
     @cached_property
     def windows(self) -> list[Window]:
@@ -88,19 +105,30 @@ class Babel(MotionSource):
         labels = {part: self.labels(part) for part in PARTS}
         keys = dict.fromkeys(label.motion for part in PARTS for label in labels[part])
         measured = self.amass.map(keys, _measure, self.workers)
-        lengths = dict(ProgressBar(measured, "measuring the motions of AMASS", len(keys), unit=" motions"))
+        lengths = dict(
+            ProgressBar(measured, "measuring the motions of AMASS", len(keys), unit=" motions")
+        )
         windows, trained = [], {label.motion for label in labels["train"]}
         for part in PARTS:
             number = 0
             for label in labels[part]:
                 starts, reason = _starts(label, lengths[label.motion])
-                if starts and part == "val" and label.motion in trained and not self.published_split:
+                if (
+                    starts
+                    and part == "val"
+                    and label.motion in trained
+                    and not self.published_split
+                ):
                     reason = "labels of the val part on motions of the train part"
                 if reason:
                     self.leave_out(reason)
                 else:
                     for n, start in enumerate(starts, number):
-                        windows.append(Window(f"{part}_{n:06d}", self._split(part, n, label.motion), start, label))
+                        windows.append(
+                            Window(
+                                f"{part}_{n:06d}", self._split(part, n, label.motion), start, label
+                            )
+                        )
                 number += len(starts)
         return windows
 
@@ -113,7 +141,8 @@ class Babel(MotionSource):
         for name in PARTS[part]:
             words, categories = [], []
             for motion, (text, kinds, start, end) in self._annotations(self.path / f"{name}.json"):
-                if kinds is None or kinds:  # FLAME's code drops the words if the list of categories is empty
+                # FLAME's code drops the words if the list of categories is empty
+                if kinds is None or kinds:
                     words.append(Label(motion, text, start, end, "words"))
                 categories += [Label(motion, kind, start, end, "category") for kind in kinds or ()]
             once = {}
@@ -128,11 +157,15 @@ class Babel(MotionSource):
         errors = (AttributeError, KeyError, TypeError, IndexError, ValueError)
         with naming(path, *errors, what="not in the layout of BABEL v1.0: "):
             for sequence in data.values():
-                annotation = sequence[key][0] if key == "frame_anns" and sequence[key] else sequence[key]
+                annotation = (
+                    sequence[key][0] if key == "frame_anns" and sequence[key] else sequence[key]
+                )
                 for label in annotation["labels"] if annotation else ():
                     motion = key_of(str(sequence["feat_p"]))
                     if motion is None:
-                        raise UserError(f"the labels refer to {sequence['feat_p']}, which is in no subset of AMASS")
+                        raise UserError(
+                            f"the labels refer to {sequence['feat_p']}, which is in no subset of AMASS"
+                        )
                     yield motion, _segment(label)
 
     def _split(self, part: str, number: int, motion: str) -> Split:

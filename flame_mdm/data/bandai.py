@@ -13,7 +13,17 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from flame_mdm.data import Clip, MotionSource, Split, archives, mirrored, name_hash, required, split_blocks, swap_sides
+from flame_mdm.data import (
+    Clip,
+    MotionSource,
+    Split,
+    archives,
+    mirrored,
+    name_hash,
+    required,
+    split_blocks,
+    swap_sides,
+)
 from flame_mdm.data.parallel import in_order
 from flame_mdm.errors import UserError
 from flame_mdm.formats import bvh
@@ -23,7 +33,9 @@ from flame_mdm.representations.skeleton import SMPL22, SMPL24
 from flame_mdm.safe_io import read_yaml
 
 _MAP = LAYOUTS["Bandai-Namco"].map
-JOINTS = {name: own if isinstance(own := _MAP[name], str) else next(iter(own)) for name in SMPL22.joints}
+JOINTS = {
+    name: own if isinstance(own := _MAP[name], str) else next(iter(own)) for name in SMPL22.joints
+}
 """The joint of the files for each joint of SMPL, in the order of SMPL; spine1 lies between Hips and Spine."""
 
 _LEFT, _UP, _FORWARD = np.eye(3)
@@ -73,7 +85,10 @@ TAKES_2: dict[str, list[int]] = WORDS["dataset_2"]["takes"]
 
 WRONG_SIDE, SIDES = WORDS["wrong_side"], WORDS["sides"]
 HELD_OUT = frozenset(
-    (content, style) for group in WORDS["held_out"] for content in group["contents"] for style in group["styles"]
+    (content, style)
+    for group in WORDS["held_out"]
+    for content in group["contents"]
+    for style in group["styles"]
 )
 """Combinations of content and style that training never sees with the compositional split."""
 GET_IT = (
@@ -120,7 +135,12 @@ class Bandai(MotionSource):
     ):
         self.path, self.workers, self.exclude = Path(path), workers, tuple(exclude)
         self.motion, self.mirror, self.split = motion, mirror, split
-        self.options = {"motion": motion, "mirror": mirror, "exclude": list(exclude), "split": split}
+        self.options = {
+            "motion": motion,
+            "mirror": mirror,
+            "exclude": list(exclude),
+            "split": split,
+        }
 
     def count(self) -> int:
         return sum(1 + (self.mirror and take.split == "train") for take in self.takes)
@@ -136,7 +156,10 @@ class Bandai(MotionSource):
             side, name = side_of(take.content), take.file.stem
             attributes = {"content": take.content, "style": take.style, "dataset": take.dataset}
             attributes |= {"side": side} if side else {}
-            texts, action = captions(take.content, take.style, side), self.actions.index(take.content)
+            texts, action = (
+                captions(take.content, take.style, side),
+                self.actions.index(take.content),
+            )
             clip = Clip(name, motion, texts, take.split, name, action, attributes)
             yield clip
             if self.mirror and take.split == "train":
@@ -146,13 +169,22 @@ class Bandai(MotionSource):
     def takes(self) -> list[Take]:
         """The takes that are present and not excluded, sorted by name."""
         files: dict[str, Path] = {}
-        folder = archives.as_folder(required(self.path, GET_IT), self, lambda name: name.endswith(".bvh"))
+        folder = archives.as_folder(
+            required(self.path, GET_IT), self, lambda name: name.endswith(".bvh")
+        )
         for file in sorted(folder.rglob("dataset-*.bvh")):
             if FILE.fullmatch(file.name) and files.setdefault(file.stem, file) != file:
-                raise UserError(f"{self.path}: {file.stem} exists twice, as {files[file.stem]} and {file}; delete one")
+                raise UserError(
+                    f"{self.path}: {file.stem} exists twice, as {files[file.stem]} and {file}; delete one"
+                )
         if not files:
-            raise FileNotFoundError(f"{self.path}: no file dataset-1_*.bvh or dataset-2_*.bvh in it; {GET_IT}")
-        return [_take(file, self.split) for _, file in sorted(self.not_excluded(files, self.path).items())]
+            raise FileNotFoundError(
+                f"{self.path}: no file dataset-1_*.bvh or dataset-2_*.bvh in it; {GET_IT}"
+            )
+        return [
+            _take(file, self.split)
+            for _, file in sorted(self.not_excluded(files, self.path).items())
+        ]
 
 
 def convert(file: Path, fps: float, kind: str = "joints") -> np.ndarray:
@@ -167,7 +199,9 @@ def convert(file: Path, fps: float, kind: str = "joints") -> np.ndarray:
 
 def _standard(tree: bvh.Bvh) -> tuple[bvh.Bvh, dict[str, Any]]:
     if missing := set(JOINTS.values()) - set(tree.joints):
-        raise UserError(f"not the skeleton of this data set: joint {', '.join(sorted(missing))} missing")
+        raise UserError(
+            f"not the skeleton of this data set: joint {', '.join(sorted(missing))} missing"
+        )
     return tree, {"map": _MAP, "unit": LAYOUTS["Bandai-Namco"].unit}
 
 
@@ -196,7 +230,9 @@ def mirror(motion: np.ndarray) -> np.ndarray:
     """Returns the mirror image of joints (F, 22, 3) or of an SMPL motion (F, 75)."""
     if motion.ndim == 3:
         return SMPL22.mirror(torch.from_numpy(motion)).numpy()
-    vectors = motion[:, 3:].reshape(len(motion), 24, 3)[:, list(SMPL24.mirrored)] * np.array([1, -1, -1], motion.dtype)
+    vectors = motion[:, 3:].reshape(len(motion), 24, 3)[:, list(SMPL24.mirrored)] * np.array(
+        [1, -1, -1], motion.dtype
+    )
     translation = motion[:, :3] * np.array([-1, 1, 1], motion.dtype)
     return np.concatenate([translation, vectors.reshape(len(motion), -1)], 1)
 
@@ -233,7 +269,9 @@ def split_of(dataset: int, content: str, style: str, number: int, rule: str = "t
     if style == "normal" and content.startswith("walk-turn-"):
         return "train"
     takes = TAKES_2[content][STYLES_2.index(style)]
-    return split_blocks(f"dataset-2_{content}_{style}", takes, 5, val=0.05, test=0.1)[(number - 1) // 5]
+    return split_blocks(f"dataset-2_{content}_{style}", takes, 5, val=0.05, test=0.1)[
+        (number - 1) // 5
+    ]
 
 
 def _take(file: Path, rule: str) -> Take:
@@ -241,9 +279,13 @@ def _take(file: Path, rule: str) -> Take:
     dataset = int(name[-1])
     contents, styles = (CONTENTS_1, STYLES_1) if dataset == 1 else (TAKES_2, STYLES_2)
     if content not in contents or style not in styles:
-        raise UserError(f"{file.name}: data set {dataset} has no content {content} with style {style}")
+        raise UserError(
+            f"{file.name}: data set {dataset} has no content {content} with style {style}"
+        )
     split = split_of(dataset, content, style, int(number), rule)
-    return Take(file, dataset, swap_sides(content) if file.stem in WRONG_SIDE else content, style, split)
+    return Take(
+        file, dataset, swap_sides(content) if file.stem in WRONG_SIDE else content, style, split
+    )
 
 
 def prompts() -> list[str]:

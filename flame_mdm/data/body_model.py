@@ -21,7 +21,9 @@ def load_offsets(path: Path) -> tuple[tuple[float, float, float], ...]:
 
     `path` is SMPL's .pkl from https://smpl.is.tue.mpg.de, of which no code runs, or an .npz with the same arrays.
     """
-    with naming(path, KeyError, TypeError, IndexError, ValueError, what="not a SMPL model of 24 joints: "):
+    with naming(
+        path, KeyError, TypeError, IndexError, ValueError, what="not a SMPL model of 24 joints: "
+    ):
         if path.suffix == ".npz":
             model: Any = read_npz(path, only=ARRAYS)
         else:
@@ -37,12 +39,20 @@ def load_offsets(path: Path) -> tuple[tuple[float, float, float], ...]:
     return tuple(tuple(offset) for offset in offsets.tolist())
 
 
-def _rest_joints(regressor: Any, vertices: Any, tree: Any, joints: int, parents: tuple[int, ...]) -> np.ndarray:
+def _rest_joints(
+    regressor: Any, vertices: Any, tree: Any, joints: int, parents: tuple[int, ...]
+) -> np.ndarray:
     """Returns rest joints (J, 3) of a model of `joints` joints, of which the first ones have these parents."""
     regressor, vertices = np.asarray(regressor, np.float64), np.asarray(vertices, np.float64)
     numbers = np.asarray(tree)[0, 1 : len(parents)].tolist()
-    if regressor.shape != (joints, len(vertices)) or vertices.shape[1:] != (3,) or numbers != list(parents[1:]):
-        raise ValueError(f"J_regressor {regressor.shape}, v_template {vertices.shape}, or another tree of joints")
+    if (
+        regressor.shape != (joints, len(vertices))
+        or vertices.shape[1:] != (3,)
+        or numbers != list(parents[1:])
+    ):
+        raise ValueError(
+            f"J_regressor {regressor.shape}, v_template {vertices.shape}, or another tree of joints"
+        )
     rest = regressor @ vertices
     if not np.isfinite(rest).all():
         raise ValueError("non-finite numbers")
@@ -74,8 +84,16 @@ def load_body(folder: Path, gender: str) -> Body:
     if path is None:
         get_it = "download the extended SMPL+H model from https://mano.is.tue.mpg.de"
         raise FileNotFoundError(f"{folder}: contains neither {' nor '.join(names)}; {get_it}")
-    with naming(path, KeyError, TypeError, IndexError, ValueError, what="not a SMPL+H model of 52 joints: "):
-        regressor, template, tree, directions = (read_npz(path, only=ARRAYS)[name] for name in ARRAYS)
+    with naming(
+        path, KeyError, TypeError, IndexError, ValueError, what="not a SMPL+H model of 52 joints: "
+    ):
+        regressor, template, tree, directions = (
+            read_npz(path, only=ARRAYS)[name] for name in ARRAYS
+        )
         rest = _rest_joints(regressor, template, tree, 52, SMPL22.parents)[:22]
-        shape = np.einsum("jv,vck->jck", regressor[:22].astype(np.float64), directions[..., :10].astype(np.float64))
+        shape = np.einsum(
+            "jv,vck->jck",
+            regressor[:22].astype(np.float64),
+            directions[..., :10].astype(np.float64),
+        )
     return Body(torch.from_numpy(rest), torch.from_numpy(shape))

@@ -15,20 +15,28 @@ COLUMNS = ("id", "text", "action", "split", "source", "license")
 SPLITTABLE = 10  # number of motions from which on each split has at least one
 
 
-def table_rows(path: Path, columns: Collection[str] = COLUMNS) -> Iterator[tuple[str, dict[str, str]]]:
+def table_rows(
+    path: Path, columns: Collection[str] = COLUMNS
+) -> Iterator[tuple[str, dict[str, str]]]:
     """Yields file and line, for errors, and the cells by column of each row of a table of captions.
 
     Raises `UserError` if the table is damaged, or has other `columns` than these, of which only `id` is required.
     """
-    rows = csv.DictReader(io.StringIO(read_text(path).removeprefix("\ufeff"), newline=""), strict=True)
+    rows = csv.DictReader(
+        io.StringIO(read_text(path).removeprefix("\ufeff"), newline=""), strict=True
+    )
     with naming(path, csv.Error, what="damaged: "):
         names = list(rows.fieldnames or ())
         if "id" not in names or len(names) > len(set(names) & set(columns)):
-            raise UserError(f"its columns are {str(names)[:200]}; use {', '.join(columns)} (only id is required)")
+            raise UserError(
+                f"its columns are {str(names)[:200]}; use {', '.join(columns)} (only id is required)"
+            )
         for row in rows:
             where = f"{path}, line {rows.line_num}"
             if None in row or None in row.values():
-                raise UserError(f"{where}: not one cell per column; put texts that contain a comma in quotes")
+                raise UserError(
+                    f"{where}: not one cell per column; put texts that contain a comma in quotes"
+                )
             yield where, {name: cell.strip() for name, cell in row.items()}
 
 
@@ -40,7 +48,9 @@ def known_split(split: str) -> Split:
     raise UserError(f"unknown split {split!r}; use {', '.join(SPLITS)}")
 
 
-def drawn_splits(sources: Mapping[str, str], stated: Mapping[str, Split | None]) -> dict[str, Split]:
+def drawn_splits(
+    sources: Mapping[str, str], stated: Mapping[str, Split | None]
+) -> dict[str, Split]:
     """Returns the split of each motion: the stated one, else one drawn by a hash of the source.
 
     An empty training split, and in a set of `SPLITTABLE` or more motions any empty split, gets the source with the
@@ -57,7 +67,9 @@ def drawn_splits(sources: Mapping[str, str], stated: Mapping[str, Split | None])
         if split not in {*of_sources.values(), *drawn.values()}:
             sizes = Counter(drawn.values())
             most = max(sizes.values(), default=0)
-            if movable := [source for source in drawn if sizes[drawn[source]] == most > (split != "train")]:
+            if movable := [
+                source for source in drawn if sizes[drawn[source]] == most > (split != "train")
+            ]:
                 drawn[max(movable, key=name_hash)] = split
     of_sources |= drawn
     return {name: stated[name] or of_sources[source] for name, source in sources.items()}

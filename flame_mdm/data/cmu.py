@@ -33,16 +33,40 @@ from flame_mdm.safe_io import naming, read_json, read_yaml
 
 FACTS: dict[str, Any] = read_yaml(Path(__file__).with_suffix(".yaml"))
 FILE = re.compile(r"(\d{2,3}_\d{2,3})\.(amc|bvh)", re.IGNORECASE)
-SUFFIXES = (".amc", ".asf", ".bvh", ".csv", ".json", ".txt", ".yaml", ".zip")  # files that are read of an archive
+# Files that are read of an archive
+SUFFIXES = (
+    ".amc",
+    ".asf",
+    ".bvh",
+    ".csv",
+    ".json",
+    ".txt",
+    ".yaml",
+    ".zip",
+)
 RATES = (120.0, 60.0)  # frame rates of the recordings, the usual one first
 SLACK = 0.05  # seconds, one frame at 20 fps, by which durations may differ
 SHORTEST = 40  # rows of features of a clip, as in HumanML3D
 BLENDED = 3  # frames after the T-pose of a Daz-friendly file that are blended with it
-COLUMNS = ("id", "begin", "end", "text", "action", "split", "source")  # of a table of captions of one's own
-UNKNOWN = 1000  # frames of a recording whose length is not known before it is read: more than `SHORTEST`
-Evidence = tuple[float | None, int | None, bool]  # arguments of `decide_rate` that the captions give
+# Of a table of captions of one's own
+COLUMNS = (
+    "id",
+    "begin",
+    "end",
+    "text",
+    "action",
+    "split",
+    "source",
+)
+UNKNOWN = (
+    1000  # frames of a recording whose length is not known before it is read: more than `SHORTEST`
+)
+# Arguments of `decide_rate` that the captions give
+Evidence = tuple[float | None, int | None, bool]
 MAP = {**LAYOUTS["CMU ASF"].map, "pelvis": "pelvis", "neck": "upperneck", "head": "face"}
-_HIP, _KNEE, _ANKLE, _HEAD = (ADULT[SMPL22.joints.index(n)] for n in ("left_hip", "left_knee", "left_ankle", "head"))
+_HIP, _KNEE, _ANKLE, _HEAD = (
+    ADULT[SMPL22.joints.index(n)] for n in ("left_hip", "left_knee", "left_ankle", "head")
+)
 ADULT_LEG = float(np.linalg.norm(_KNEE) + np.linalg.norm(_ANKLE))
 GET_IT = (
     "clone https://github.com/una-dinosauria/cmu-mocap or unpack ASF/AMC files of http://mocap.cs.cmu.edu, clone "
@@ -122,9 +146,13 @@ class CMU(MotionSource):
             if match := FILE.fullmatch(path.name):
                 files[match[1]].append(path)
         if not files:
-            raise FileNotFoundError(f"{self.path}: no recording such as 02_01.bvh or 02_01.amc in it; {GET_IT}")
+            raise FileNotFoundError(
+                f"{self.path}: no recording such as 02_01.bvh or 02_01.amc in it; {GET_IT}"
+            )
         kept = self.not_excluded(files, self.path)
-        good = {name: sorted(kept[name], key=_rank) for name in sorted(kept) if not _is_in("bad", name)}
+        good = {
+            name: sorted(kept[name], key=_rank) for name in sorted(kept) if not _is_in("bad", name)
+        }
         self.leave_out("recordings known to be bad", len(kept) - len(good))
         return good
 
@@ -136,32 +164,57 @@ class CMU(MotionSource):
         return path if path.exists() else None
 
     @cached_property
-    def humanml3d(self) -> tuple[list[IndexedClip], dict[str, list[Description]], Mapping[str, Split]]:
+    def humanml3d(
+        self,
+    ) -> tuple[list[IndexedClip], dict[str, list[Description]], Mapping[str, Split]]:
         """HumanML3D's clips of CMU recordings, captions by name, and splits; empty with captions of one's own."""
         if self.table:
             return [], {}, {}
         required(self.captions, f"it is the folder of the captions: {GET_IT}")
         if files := sorted(self.captions.glob("humanml3d_test_captions*.json")):
-            rows, texts = read_index(self.captions / "humanml3d_index_cmu.csv"), _test_captions(files[0])
+            rows, texts = (
+                read_index(self.captions / "humanml3d_index_cmu.csv"),
+                _test_captions(files[0]),
+            )
             splits: Mapping[str, Split] = dict.fromkeys(texts, SPLITS[2])
         else:
             inner = self.captions / "HumanML3D"
             source = HumanML3D(str(inner if inner.is_dir() else self.captions))
             rows, texts, splits = source.rows, source.texts, source.names
         wrong = FACTS["wrong_captions"]
-        return [row for row in rows if row.key.startswith("CMU/") and row.name not in wrong], texts, splits
+        return (
+            [row for row in rows if row.key.startswith("CMU/") and row.name not in wrong],
+            texts,
+            splits,
+        )
 
     @cached_property
     def kit(self) -> list[tuple[str, str, str, float]]:
         """Id, recording, text and seconds of KIT-ML's captions of CMU recordings; empty if there is no file of them."""
         if self.table:
             return []
-        files = [file for folder in (self.captions, self.path) for file in sorted(folder.glob("kitml*.json"))]
+        files = [
+            file
+            for folder in (self.captions, self.path)
+            for file in sorted(folder.glob("kitml*.json"))
+        ]
         if not files:
             return []
-        with naming(files[0], AttributeError, KeyError, TypeError, ValueError, what="not KIT-ML's captions of AMASS: "):
+        with naming(
+            files[0],
+            AttributeError,
+            KeyError,
+            TypeError,
+            ValueError,
+            what="not KIT-ML's captions of AMASS: ",
+        ):
             return [
-                (f"kit{number}", _recording(entry["path"]), str(text["text"]), float(entry["duration"]))
+                (
+                    f"kit{number}",
+                    _recording(entry["path"]),
+                    str(text["text"]),
+                    float(entry["duration"]),
+                )
                 for number, entry in read_json(files[0]).items()
                 if entry["path"].startswith("CMU/")
                 for text in entry["annotations"]
@@ -176,18 +229,27 @@ class CMU(MotionSource):
         for row in rows:
             trial = _recording(row.key)
             cut_from[trial].add(splits.get(row.name, "train"))
-            names = [name for name in (row.name, f"M{row.name}") if name in splits and texts.get(name)]
+            names = [
+                name for name in (row.name, f"M{row.name}") if name in splits and texts.get(name)
+            ]
             if trial not in files:
                 self.leave_out("clips of HumanML3D without their recording")
             elif not names:
                 self.leave_out("clips of HumanML3D without captions")
             else:
-                items[trial] += [Item(n, splits[n], row.name, texts[n], row.start, row.end, n[0] == "M") for n in names]
+                items[trial] += [
+                    Item(n, splits[n], row.name, texts[n], row.start, row.end, n[0] == "M")
+                    for n in names
+                ]
         for id_, trial, text, _ in self.kit:
             if trial in files:
                 by_subject = hashed_split(f"CMU subject {trial.partition('_')[0]}", val=5, test=10)
-                of_clips: list[Split] = [split for split in SPLITS if split in cut_from[trial]] or [by_subject]
-                items[trial].append(Item(id_, of_clips[-1], f"recording {trial}", [Description(text, [])]))
+                of_clips: list[Split] = [split for split in SPLITS if split in cut_from[trial]] or [
+                    by_subject
+                ]
+                items[trial].append(
+                    Item(id_, of_clips[-1], f"recording {trial}", [Description(text, [])])
+                )
         if self.table:
             parts = _parts(self.table)
             present = {name: part for name, part in parts.items() if part.trial in files}
@@ -196,7 +258,9 @@ class CMU(MotionSource):
         captioned = {trial: items[trial] for trial in files if items[trial]}
         self.leave_out("recordings without a caption", len(files) - len(captioned))
         if not captioned:
-            raise UserError(f"{self.captions}: no captions of the recordings in {self.path}; {GET_IT}")
+            raise UserError(
+                f"{self.captions}: no captions of the recordings in {self.path}; {GET_IT}"
+            )
         return captioned
 
     def count(self) -> int:
@@ -210,11 +274,18 @@ class CMU(MotionSource):
         self.check_fps(fps, FPS)
         labels = {item.action for items in self.items.values() for item in items}
         self.actions = tuple(sorted(label for label in labels if label is not None))
-        last = {_recording(row.key): row.end for row in sorted(self.humanml3d[0], key=lambda row: row.end)}
+        last = {
+            _recording(row.key): row.end
+            for row in sorted(self.humanml3d[0], key=lambda row: row.end)
+        }
         seconds = {trial: length for _, trial, _, length in self.kit}
-        evidence = {trial: (seconds.get(trial), last.get(trial), is_at_60(trial)) for trial in self.items}
+        evidence = {
+            trial: (seconds.get(trial), last.get(trial), is_at_60(trial)) for trial in self.items
+        }
         tasks = [(self.files[trial], evidence[trial], items) for trial, items in self.items.items()]
-        for trial, motions in zip(self.items, in_order(partial(_read, self.motion), tasks, self.workers), strict=True):
+        for trial, motions in zip(
+            self.items, in_order(partial(_read, self.motion), tasks, self.workers), strict=True
+        ):
             if isinstance(motions, str):
                 self._errors.append(motions)
                 self.leave_out("recordings that cannot be read")
@@ -276,13 +347,28 @@ def _parts(table: Path) -> dict[str, _Part]:
 
 def _own_items(parts: Mapping[str, _Part]) -> dict[str, list[Item]]:
     """Returns recording -> its parts. Their splits are stated, or drawn by their source or else by their subject."""
-    sources = {name: part.source or f"CMU subject {part.trial.partition('_')[0]}" for name, part in parts.items()}
+    sources = {
+        name: part.source or f"CMU subject {part.trial.partition('_')[0]}"
+        for name, part in parts.items()
+    }
     splits = drawn_splits(sources, {name: part.split for name, part in parts.items()})
 
     items: defaultdict[str, list[Item]] = defaultdict(list)
     for name, part in parts.items():
-        source, descriptions = part.source or f"recording {part.trial}", [Description(text, []) for text in part.texts]
-        item = Item(name, splits[name], source, descriptions, part.start, part.end, action=part.action, is_own=True)
+        source, descriptions = (
+            part.source or f"recording {part.trial}",
+            [Description(text, []) for text in part.texts],
+        )
+        item = Item(
+            name,
+            splits[name],
+            source,
+            descriptions,
+            part.start,
+            part.end,
+            action=part.action,
+            is_own=True,
+        )
         items[part.trial].append(item)
     return items
 
@@ -293,14 +379,18 @@ def _part_in_table(cells: Mapping[str, str]) -> _Part:
     if not re.fullmatch(r"\d{2,3}_\d{2,3}", trial):
         raise UserError(f"id {trial!r} is not the name of a recording, such as 02_01")
     first, last = 0, None
-    with naming(f"begin {begin!r}, end {end!r}", ValueError, OverflowError, what="not numbers of seconds: "):
+    with naming(
+        f"begin {begin!r}, end {end!r}", ValueError, OverflowError, what="not numbers of seconds: "
+    ):
         first = round(float(begin) * FPS) if begin else 0
         last = round(float(end) * FPS) if end else None
     if first < 0 or (last is not None and last <= first):
         raise UserError(f"begin {begin!r}, end {end!r}: not a part of a recording, in seconds")
     name = f"{trial}@{begin or 0}-{end or 'end'}" if begin or end else trial
     split = known_split(cells["split"]) if cells.get("split") else None
-    return _Part(name, trial, first, last, split, cells.get("source") or None, cells.get("action") or None)
+    return _Part(
+        name, trial, first, last, split, cells.get("source") or None, cells.get("action") or None
+    )
 
 
 def _is_in(fact: str, trial: str) -> bool:  # or its subject is
@@ -319,15 +409,21 @@ def _recording(key: str) -> str:
 def _test_captions(path: Path) -> dict[str, list[Description]]:
     """Returns captions by name of a JSON list of test captions; `segment` is the part described, in seconds."""
     texts: defaultdict[str, list[Description]] = defaultdict(list)
-    with naming(path, KeyError, TypeError, ValueError, what="not a list of captions of HumanML3D: "):
+    with naming(
+        path, KeyError, TypeError, ValueError, what="not a list of captions of HumanML3D: "
+    ):
         for entry in read_json(path):
             begin, end = map(float, entry["segment"] or (0, 0))
             name = "M" * bool(entry["mirrored"]) + entry["base"]
-            texts[name] += [Description(str(caption), [], begin, end) for caption in entry["captions"]]
+            texts[name] += [
+                Description(str(caption), [], begin, end) for caption in entry["captions"]
+            ]
     return texts
 
 
-def decide_rate(frames: int, header: float | None, seconds: float | None, last: int | None, is_sixty: bool) -> float:
+def decide_rate(
+    frames: int, header: float | None, seconds: float | None, last: int | None, is_sixty: bool
+) -> float:
     """Returns the frame rate of a recording of `frames` frames.
 
     Durations are trusted first, KIT-ML's `seconds` and HumanML3D's `last` frame at 20 fps; then CMU's list; then the
@@ -336,7 +432,11 @@ def decide_rate(frames: int, header: float | None, seconds: float | None, last: 
     rates = RATES if header in (None, *RATES) else (*RATES, header)
     if fitting := [rate for rate in rates if seconds and abs(frames / rate - seconds) < SLACK]:
         return fitting[0]
-    if last and header != RATES[1] and frames / RATES[0] + SLACK < last / FPS <= frames / RATES[1] + SLACK:
+    if (
+        last
+        and header != RATES[1]
+        and frames / RATES[0] + SLACK < last / FPS <= frames / RATES[1] + SLACK
+    ):
         return RATES[1]
     return RATES[1] if is_sixty else header or RATES[0]
 
@@ -355,11 +455,22 @@ def standardize(tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
         for child, (share, bone) in FACTS["lost"].items():
             if child in tree.joints and not offsets[at(child)].any():
                 offsets[at(child)] = share * offsets[at(bone)]
-        tree = replace(tree, offsets=offsets, joints=tuple(FACTS["motionbuilder"].get(n, n) for n in tree.joints))
+        tree = replace(
+            tree,
+            offsets=offsets,
+            joints=tuple(FACTS["motionbuilder"].get(n, n) for n in tree.joints),
+        )
     elif "lButtock" in tree.joints:
         tree, unit, blended = _added(tree, upperback=("abdomen", [0, 0, 0])), 0.01, BLENDED
-        rows = [FACTS["daz"].get(name, [name, *offset]) for name, offset in zip(tree.joints, tree.offsets, strict=True)]
-        tree = replace(tree, joints=tuple(row[0] for row in rows), offsets=np.array([row[1:] for row in rows], float))
+        rows = [
+            FACTS["daz"].get(name, [name, *offset])
+            for name, offset in zip(tree.joints, tree.offsets, strict=True)
+        ]
+        tree = replace(
+            tree,
+            joints=tuple(row[0] for row in rows),
+            offsets=np.array([row[1:] for row in rows], float),
+        )
     if "lfemur" not in tree.joints:
         return tree, {}
     if not (is_original or tree.frames[0, 3:6].any()) and len(tree.frames) > 1 + blended:
@@ -373,7 +484,8 @@ def standardize(tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
     above = tree.parents[tree.joints.index("head")]
     face = bone["head"] + [0, 0, scale * _HEAD[2]]
     tree = _added(tree, pelvis=("root", pelvis), face=(tree.joints[above], face))
-    if "upperneck" not in tree.joints:  # the Daz figure has one bone from the lower neck to the head
+    # The Daz figure has one bone from the lower neck to the head
+    if "upperneck" not in tree.joints:
         tree = _added(tree, upperneck=(tree.joints[above], bone["head"] / 2))
     return tree, {"map": MAP, "unit": unit}
 
@@ -397,7 +509,9 @@ def _read(kind: str, task: tuple[list[Path], Evidence, list[Item]]) -> list[np.n
         is_original = _rank(file) == 0
         standard = partial(_standardized, is_original, evidence)
         try:
-            recording = read_recording(file, FPS, fps=RATES[0] if is_original else None, standard=standard)
+            recording = read_recording(
+                file, FPS, fps=RATES[0] if is_original else None, standard=standard
+            )
             if recording.doubts.jump:
                 raise UserError(f"{file}: {recording.doubts.jump}")
         except (UserError, OSError) as error:
@@ -421,5 +535,7 @@ def _part(joints: np.ndarray, mirrored: bool, kind: str) -> np.ndarray:
     if kind == "joints" or len(joints) <= SHORTEST:
         return part.numpy()
     floor = part.new_tensor([0, float(part[..., 1].min()), 0])
-    turns, translation = amass_parameters(solve((part - floor) * (ADULT_LEG / leg_length(joints)), FPS))
+    turns, translation = amass_parameters(
+        solve((part - floor) * (ADULT_LEG / leg_length(joints)), FPS)
+    )
     return np.concatenate([translation, np.pad(turns, ((0, 0), (0, 6)))], 1).astype(np.float32)

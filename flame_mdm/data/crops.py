@@ -17,9 +17,12 @@ from flame_mdm.errors import UserError
 from flame_mdm.representations import Representation
 from flame_mdm.seeds import integers, key
 
-Draw = tuple[int, int]  # (index of a clip, number of the batch that it is drawn for; -1 in evaluation)
-Sample = tuple[str, Tensor, str | None, int | None]  # (id, x (F, D), caption, action), input of `collate`
-Below = Callable[[Any], Any]  # draws integers from 0 up to, and not including, its argument: one, or (B,)
+# (index of a clip, number of the batch that it is drawn for; -1 in evaluation)
+Draw = tuple[int, int]
+# (id, x (F, D), caption, action), input of `collate`
+Sample = tuple[str, Tensor, str | None, int | None]
+# Draws integers from 0 up to, and not including, its argument: one, or (B,)
+Below = Callable[[Any], Any]
 
 
 class Crop(ABC):
@@ -59,7 +62,9 @@ class Units(Crop):
 
     def __post_init__(self) -> None:
         if not 1 <= self.unit <= self.min_frames <= self.max_frames or self.max_frames % self.unit:
-            raise UserError(f"crop: needs 1 <= unit <= min_frames <= max_frames and whole units, not {self}")
+            raise UserError(
+                f"crop: needs 1 <= unit <= min_frames <= max_frames and whole units, not {self}"
+            )
 
     def draw(self, frames: Any, below: Below | None) -> tuple[Any, Any]:
         length = np.minimum(frames, self.max_frames) // self.unit * self.unit
@@ -103,7 +108,9 @@ class Fixed(Crop):
 class Clips(Dataset[Sample]):
     """The clips of a split that are long enough for the crop rule, cropped at every draw, then normalized."""
 
-    def __init__(self, store: Store, split: Split, *, representation: Representation, crop: Crop, seed: int):
+    def __init__(
+        self, store: Store, split: Split, *, representation: Representation, crop: Crop, seed: int
+    ):
         self.store, self.representation, self.crop, self.seed = store, representation, crop, seed
         of_split = [clip for clip in store.clips if clip.split == split]
         self.clips = [clip for clip in of_split if clip.length >= crop.min_frames]
@@ -123,15 +130,21 @@ class Clips(Dataset[Sample]):
         """Returns the samples of a batch; the data loader calls this."""
         samples: list[Sample] = []
         indices = [index for index, _ in draws]
-        for index, first, length, caption in zip(indices, *self.draw(indices, draws[0][1]), strict=True):
+        for index, first, length, caption in zip(
+            indices, *self.draw(indices, draws[0][1]), strict=True
+        ):
             clip = self.clips[index]
             frames = np.minimum(np.arange(length) + first, clip.length - 1)
             features = self.representation.rebase(self.store.motion(clip)[frames])
             x = torch.from_numpy((features - self.mean) / self.std)
-            samples.append((clip.id, x, clip.captions[caption] if clip.captions else None, clip.action))
+            samples.append(
+                (clip.id, x, clip.captions[caption] if clip.captions else None, clip.action)
+            )
         return samples
 
-    def draw(self, indices: Sequence[int] | np.ndarray, batch: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def draw(
+        self, indices: Sequence[int] | np.ndarray, batch: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns first frame, number of frames and number of the caption (B,) of clips in a batch.
 
         They are functions of (seed, batch, index); in evaluation (batch -1), they are always the same.
@@ -145,5 +158,8 @@ class Clips(Dataset[Sample]):
     @cached_property
     def evaluated(self) -> np.ndarray:
         """Number (clips,) of the caption of each clip in evaluation, chosen by the id of the clip."""
-        draws = (key("caption", self.seed, -1, clip.id) % max(1, len(clip.captions)) for clip in self.clips)
+        draws = (
+            key("caption", self.seed, -1, clip.id) % max(1, len(clip.captions))
+            for clip in self.clips
+        )
         return np.fromiter(draws, np.int64, len(self.clips))

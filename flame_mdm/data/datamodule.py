@@ -26,8 +26,11 @@ from flame_mdm.data.store import Store, write_store
 from flame_mdm.errors import UserError, say
 from flame_mdm.representations import Representation
 
-MAX_FRAMES = 100_000  # maximum number of frames of a sample; one hour at 20 frames per second has 72,000
-NAME = r"\w[\w .-]*"  # of a data set: part of the name of its folder, which must not leave `root` or be hidden
+MAX_FRAMES = (
+    100_000  # maximum number of frames of a sample; one hour at 20 frames per second has 72,000
+)
+# Of a data set: part of the name of its folder, which must not leave `root` or be hidden
+NAME = r"\w[\w .-]*"
 Loader = DataLoader[Sample] | ResidentLoader
 
 
@@ -40,7 +43,9 @@ class TrainingBatches(Sampler[list[Draw]]):
 
     BUCKETS = 16
 
-    def __init__(self, lengths: np.ndarray, batch_size: int, *, seed: int, first: int, rank: int, world: int):
+    def __init__(
+        self, lengths: np.ndarray, batch_size: int, *, seed: int, first: int, rank: int, world: int
+    ):
         self.lengths, self.batch_size, self.seed = lengths, batch_size, seed
         self.first, self.rank, self.world = first, rank, world
 
@@ -67,10 +72,14 @@ class TrainingBatches(Sampler[list[Draw]]):
         return [batches[i] for i in generator.permutation(len(batches))]
 
 
-def evaluation_batches(lengths: np.ndarray, batch_size: int, *, rank: int, world: int) -> list[list[Draw]]:
+def evaluation_batches(
+    lengths: np.ndarray, batch_size: int, *, rank: int, world: int
+) -> list[list[Draw]]:
     """Returns batches with every clip once across all processes, longest first, without repeats."""
     mine = np.argsort(-lengths, kind="stable")[rank::world]
-    return [[(int(i), -1) for i in mine[b : b + batch_size]] for b in range(0, len(mine), batch_size)]
+    return [
+        [(int(i), -1) for i in mine[b : b + batch_size]] for b in range(0, len(mine), batch_size)
+    ]
 
 
 class MotionDataModule(LightningDataModule):
@@ -108,10 +117,30 @@ class MotionDataModule(LightningDataModule):
         for key, value, is_valid, remedy in (
             ("batch_size", batch_size, batch_size >= 1, "a batch has at least one clip"),
             ("num_workers", num_workers, num_workers >= 0, "give 0 or more"),
-            ("name", name, re.fullmatch(NAME, name), "give a name of letters, digits, _, - and ., such as my_motions"),
-            ("resident", resident, isinstance(resident, bool) or resident == "auto", "give true, false or auto"),
-            ("pad_multiple", pad_multiple, 1 <= pad_multiple <= MAX_FRAMES, f"give 1 to {MAX_FRAMES:,}"),
-            ("crop", crop, is_crop, f"give a rule of flame_mdm.data.crops, of 1 to {MAX_FRAMES:,} frames"),
+            (
+                "name",
+                name,
+                re.fullmatch(NAME, name),
+                "give a name of letters, digits, _, - and ., such as my_motions",
+            ),
+            (
+                "resident",
+                resident,
+                isinstance(resident, bool) or resident == "auto",
+                "give true, false or auto",
+            ),
+            (
+                "pad_multiple",
+                pad_multiple,
+                1 <= pad_multiple <= MAX_FRAMES,
+                f"give 1 to {MAX_FRAMES:,}",
+            ),
+            (
+                "crop",
+                crop,
+                is_crop,
+                f"give a rule of flame_mdm.data.crops, of 1 to {MAX_FRAMES:,} frames",
+            ),
         ):
             if not is_valid:
                 raise UserError(f"data.{key}={value!s:.80}: {remedy}")
@@ -156,9 +185,14 @@ class MotionDataModule(LightningDataModule):
         }
         prepared = {"version": 1} | store.info | store.info.get("source", {})
         if differing := [name for name in recipe if prepared.get(name) != recipe[name]]:
-            there, here = (", ".join(f"{name}={of.get(name)}" for name in differing) for of in (prepared, recipe))
+            there, here = (
+                ", ".join(f"{name}={of.get(name)}" for name in differing)
+                for of in (prepared, recipe)
+            )
             advice = "Prepare it again with force=true, choose another data_root or data.name, or change the recipe"
-            raise UserError(f"{self.folder}: prepared with {there}, but the recipe has {here}. {advice}")
+            raise UserError(
+                f"{self.folder}: prepared with {there}, but the recipe has {here}. {advice}"
+            )
         self.representation.mean.copy_(torch.from_numpy(store.mean))
         self.representation.std.copy_(torch.from_numpy(store.std))
         return store
@@ -178,7 +212,9 @@ class MotionDataModule(LightningDataModule):
                 own = " Add a `split` column to captions.csv" if self.source.named_by_recipe else ""
                 advice.append(f"no {split} clips.{own}")
         if not store.info["actions"] and not any(clip.captions for clip in store.clips):
-            advice.append("no captions: add captions.csv and prepare with force=true, or train with condition=none")
+            advice.append(
+                "no captions: add captions.csv and prepare with force=true, or train with condition=none"
+            )
         return ["clips: " + ", ".join(counts), *(() if store.info["published_split"] else advice)]
 
     def captions(self) -> list[str]:
@@ -190,7 +226,9 @@ class MotionDataModule(LightningDataModule):
         self.store = self.open()
         self.train, self.val, self.test = (self.clips(split) for split in ("train", "val", "test"))
         if not len(self.train):
-            raise UserError(f"{self.folder}: no training clip has {self.crop.min_frames} frames or more")
+            raise UserError(
+                f"{self.folder}: no training clip has {self.crop.min_frames} frames or more"
+            )
         self.features = None
         self.choose_device()
 
@@ -205,7 +243,9 @@ class MotionDataModule(LightningDataModule):
             raise UserError(
                 f"data.resident=true: {self.folder} and its captions take {numbers}. Set data.resident=auto"
             )
-        automatic = self.resident == "auto" and device.type in ("cpu", "cuda") and size <= free / SHARE
+        automatic = (
+            self.resident == "auto" and device.type in ("cpu", "cuda") and size <= free / SHARE
+        )
         self.device = device if self.resident is True or automatic else None
         return self.device
 
@@ -214,16 +254,24 @@ class MotionDataModule(LightningDataModule):
 
         A data set prepared with a published split that has no test clips (HumanAct12) is tested on its training clips.
         """
-        if split == "test" and self.store.info["published_split"] and not self.store.info["clips"]["test"]:
+        if (
+            split == "test"
+            and self.store.info["published_split"]
+            and not self.store.info["clips"]["test"]
+        ):
             split = "train"
-        return Clips(self.store, split, representation=self.representation, crop=self.crop, seed=self.seed)
+        return Clips(
+            self.store, split, representation=self.representation, crop=self.crop, seed=self.seed
+        )
 
     def train_dataloader(self) -> Loader:
         """Returns an endless loader that starts at the trainer's current step, so that a resumed run is unchanged."""
         trainer = self.trainer
         first = trainer.global_step * trainer.accumulate_grad_batches if trainer else 0
         rank, world = (trainer.global_rank, trainer.world_size) if trainer else (0, 1)
-        return self._loader(self.train, self.training_batches(seed=self.seed, first=first, rank=rank, world=world))
+        return self._loader(
+            self.train, self.training_batches(seed=self.seed, first=first, rank=rank, world=world)
+        )
 
     def training_batches(self, **of_process: int) -> Sampler[list[Draw]]:
         """Returns the endless batches of a process; the arguments are those of `TrainingBatches`."""
@@ -238,7 +286,9 @@ class MotionDataModule(LightningDataModule):
         trainer = self.trainer
         shared = trainer is not None and len(self.val) >= trainer.world_size
         rank, world = (trainer.global_rank, trainer.world_size) if trainer and shared else (0, 1)
-        return self._loader(self.val, evaluation_batches(self.val.lengths, self.batch_size, rank=rank, world=world))
+        return self._loader(
+            self.val, evaluation_batches(self.val.lengths, self.batch_size, rank=rank, world=world)
+        )
 
     def _loader(self, clips: Clips, batches: Iterable[list[Draw]]) -> Loader:
         if self.device is not None:

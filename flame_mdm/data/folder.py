@@ -85,22 +85,35 @@ class Folder(MotionSource):
         workers: int = 0,
     ):
         if balance < 0:
-            raise UserError(f"data.source.balance={balance}: give the number of clips per action, or 0")
+            raise UserError(
+                f"data.source.balance={balance}: give the number of clips per action, or 0"
+            )
         if mirror and motion == "smpl":
             raise UserError("data.source.mirror=true: needs data.source.motion=joints")
-        self.path, self.motion, self.mirror, self.exclude = Path(path), motion, mirror, tuple(exclude)
+        self.path, self.motion, self.mirror, self.exclude = (
+            Path(path),
+            motion,
+            mirror,
+            tuple(exclude),
+        )
         self.workers, self.balance, self.license = workers, balance, license
         self.options = {"motion": motion, "mirror": mirror, "exclude": list(exclude)}
         if balance:
             self.options["balance"] = balance
         if license:
             self.options["license"] = license
-        self._uprights: defaultdict[str, list[float]] = defaultdict(list)  # of the motions read so far, by layout
+        # Of the motions read so far, by layout
+        self._uprights: defaultdict[str, list[float]] = defaultdict(list)
         self._notes: Counter[str] = Counter()  # lines about the motions read so far
-        self._representation: Representation | None = None  # whose raw motions are yielded; see `suit`
+        self._representation: Representation | None = (
+            None  # whose raw motions are yielded; see `suit`
+        )
 
     def suit(self, representation: Representation) -> None:
-        name, needs_rotations = representation.name, isinstance(representation, SMPL | Rot6D | Motion272)
+        name, needs_rotations = (
+            representation.name,
+            isinstance(representation, SMPL | Rot6D | Motion272),
+        )
         if needs_rotations and self.motion == "joints":
             raise UserError(
                 f"{name} is made of rotations. Add data.source.motion=smpl: they are read, or fitted to joints"
@@ -110,7 +123,9 @@ class Folder(MotionSource):
         self._representation = representation
 
     def count(self) -> int:
-        images = sum(self.copies[name] for name in self.files if self.mirror and self.splits[name] == "train")
+        images = sum(
+            self.copies[name] for name in self.files if self.mirror and self.splits[name] == "train"
+        )
         return sum(self.copies.values()) + images
 
     def licenses(self) -> set[str]:
@@ -119,7 +134,9 @@ class Folder(MotionSource):
     @cached_property
     def copies(self) -> dict[str, int]:
         """How often each motion occurs in the set, see `balance`; a mirrored copy occurs as often."""
-        sizes = Counter(note.action for name, note in self.notes.items() if self.splits[name] == "train")
+        sizes = Counter(
+            note.action for name, note in self.notes.items() if self.splits[name] == "train"
+        )
         copies = dict.fromkeys(self.files, 1)
         for name, note in self.notes.items():
             if self.balance and self.splits[name] == "train":
@@ -129,7 +146,9 @@ class Folder(MotionSource):
 
     def clips(self, fps: float) -> Iterator[Clip]:
         """Yields the clips of all motions that can be read; `failures` lists the others."""
-        self.actions = tuple(sorted({note.action for note in self.notes.values() if note.action is not None}))
+        self.actions = tuple(
+            sorted({note.action for note in self.notes.values() if note.action is not None})
+        )
         for name, motion in self._motions(fps):
             note, split = self.notes[name], self.splits[name]
             action = None if note.action is None else self.actions.index(note.action)
@@ -145,7 +164,9 @@ class Folder(MotionSource):
             yield from _repeated(clip, self.copies[name])
             if self.mirror and split == "train":
                 skeleton = SMPL22 if self._representation is None else self._representation.skeleton
-                image = mirrored(clip, skeleton.mirror(torch.from_numpy(motion)).numpy(), self.actions)
+                image = mirrored(
+                    clip, skeleton.mirror(torch.from_numpy(motion)).numpy(), self.actions
+                )
                 yield from _repeated(image, self.copies[name])
         if len(self.failures) == len(self.files):
             self.require_all()
@@ -156,7 +177,11 @@ class Folder(MotionSource):
         """Yields name and motion of each file that can be read, and keeps what was learned of all."""
         self.failures = failures = list[str]()
         self._uprights, self._notes = defaultdict(list), Counter()
-        attempts = in_order(partial(_read, self.motion, self._representation, fps), self.files.values(), self.workers)
+        attempts = in_order(
+            partial(_read, self.motion, self._representation, fps),
+            self.files.values(),
+            self.workers,
+        )
         for name, attempt in zip(self.files, attempts, strict=True):
             if attempt.error:
                 failures.append(attempt.error)
@@ -167,7 +192,9 @@ class Folder(MotionSource):
 
     def findings(self) -> list[str]:
         """Returns the skeletons of the motions read so far, and what was left out of them."""
-        skeletons = [f"{layout}: {len(motions)} motions" for layout, motions in self._uprights.items()]
+        skeletons = [
+            f"{layout}: {len(motions)} motions" for layout, motions in self._uprights.items()
+        ]
         return skeletons + [f"{count} motions: {note}" for note, count in self._notes.items()]
 
     def check(self, fps: float) -> list[str]:
@@ -177,7 +204,10 @@ class Folder(MotionSource):
             return [*self.findings(), *self.failure_lines()]
         _check_upright(self.path, self._uprights)
         motions = ", ".join(f"{splits[split]} {split}" for split in SPLITS)
-        return [*self.findings(), f"{self.name}: {self.count()} clips can be prepared (motions: {motions})"]
+        return [
+            *self.findings(),
+            f"{self.name}: {self.count()} clips can be prepared (motions: {motions})",
+        ]
 
     def failure_lines(self) -> list[str]:
         if not self.failures:
@@ -198,22 +228,34 @@ class Folder(MotionSource):
         for path in motions_in(self.path):
             name = path.relative_to(self.path).with_suffix("").as_posix()
             if (shown := printable(name)) != name:
-                raise UserError(f"{shown}: its name contains control characters or is not UTF-8. Rename it")
+                raise UserError(
+                    f"{shown}: its name contains control characters or is not UTF-8. Rename it"
+                )
             for label, file in _animations(name, path):
                 if label in files:
                     other = files[label].path.name
-                    raise UserError(f"{path}: has the same name as {other}; each motion needs its own name")
+                    raise UserError(
+                        f"{path}: has the same name as {other}; each motion needs its own name"
+                    )
                 files[label] = file
         if not files:
             reason = "no motions in this folder" if self.path.is_dir() else "no such folder"
-            raise FileNotFoundError(f"{self.path}: {reason}. Give a folder of {', '.join(ENDINGS)} files")
+            raise FileNotFoundError(
+                f"{self.path}: {reason}. Give a folder of {', '.join(ENDINGS)} files"
+            )
         return self.not_excluded(dict(sorted(files.items())), self.path)
 
     def changed(self, store: Path) -> list[str]:
         when = store.stat().st_mtime
-        files = [path for path in self.path.rglob("*") if path.is_file() and path.stat().st_mtime > when]
+        files = [
+            path for path in self.path.rglob("*") if path.is_file() and path.stat().st_mtime > when
+        ]
         newer = [str(path.relative_to(self.path)) for path in files]
-        return [f"{self.path}: {some(newer)} changed since: prepare with force=true to read them"] if newer else []
+        return (
+            [f"{self.path}: {some(newer)} changed since: prepare with force=true to read them"]
+            if newer
+            else []
+        )
 
     @cached_property
     def notes(self) -> dict[str, Note]:
@@ -225,7 +267,9 @@ class Folder(MotionSource):
             texts = file.path.with_suffix(".txt")
             if os.path.lexists(texts):
                 lines = read_text(texts).splitlines()
-                notes[name].texts += [text for line in lines if (text := line.partition("#")[0].strip())]
+                notes[name].texts += [
+                    text for line in lines if (text := line.partition("#")[0].strip())
+                ]
         for kind, values in (("caption", "texts"), ("action", "action")):
             bare = [name for name, note in notes.items() if not getattr(note, values)]
             if 0 < len(bare) < len(notes):
@@ -307,7 +351,9 @@ class _Attempt:
     notes: Sequence[str] = ()
 
 
-def _read(kind: str, representation: Representation | None, fps: float, file: MotionFile) -> _Attempt:
+def _read(
+    kind: str, representation: Representation | None, fps: float, file: MotionFile
+) -> _Attempt:
     """Reads joints or, if `kind` is "smpl", a raw motion of SMPL's rotations, at `fps` frames per second.
 
     Without a `representation`, joints are SMPL's 22 and rotations are in AMASS's axes. KIT-ML's representations get
@@ -320,7 +366,9 @@ def _read(kind: str, representation: Representation | None, fps: float, file: Mo
         if doubts.jump:
             raise UserError(f"{path}: {doubts.jump}")
         if len(joints) < SHORTEST:
-            raise UserError(f"{path}: {len(joints)} frames at {fps:g} per second, but a motion has at least {SHORTEST}")
+            raise UserError(
+                f"{path}: {len(joints)} frames at {fps:g} per second, but a motion has at least {SHORTEST}"
+            )
         notes = [note for note in recording.motion.notes if note not in doubts.lines]
         of_kit = representation is not None and representation.skeleton is KIT21
         if kind == "joints" and of_kit and representation is not None:
@@ -332,7 +380,9 @@ def _read(kind: str, representation: Representation | None, fps: float, file: Mo
             motion = fitted.values.numpy().astype(np.float32)
             if fitted.note:
                 centimeters = math.ceil(100 * fitted.error)
-                notes.append(f"rotations were fitted to joints, with a mean error of at most {centimeters} cm")
+                notes.append(
+                    f"rotations were fitted to joints, with a mean error of at most {centimeters} cm"
+                )
         else:
             translation, turns = recording.smpl
             angles = rotation.quaternion_to_axis_angle(turns).flatten(1)

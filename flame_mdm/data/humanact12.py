@@ -15,9 +15,17 @@ from flame_mdm.data import Clip, MotionSource, restricted_pickle, split_blocks
 from flame_mdm.errors import UserError
 from flame_mdm.safe_io import naming, read_npy
 
-FPS = 20.0  # frames per second at which the authors' code plays the action data sets; frames are not resampled
-NO_NUMBERS = (TypeError, ValueError, OverflowError)  # errors that NumPy raises for what does not consist of numbers
-BLOCK = 10  # number of consecutive clips in the file that go to one split together: they may be cut from one recording
+# Frames per second at which the authors' code plays the action data sets; frames are not resampled
+FPS = 20.0
+# Errors that NumPy raises for what does not consist of numbers
+NO_NUMBERS = (
+    TypeError,
+    ValueError,
+    OverflowError,
+)
+# Number of consecutive clips in the file that go to one split together: they may be cut from one
+# recording
+BLOCK = 10
 
 
 class HumanAct12(MotionSource):
@@ -43,7 +51,9 @@ class HumanAct12(MotionSource):
     def clips(self, fps: float) -> Iterator[Clip]:
         self.check_fps(fps, FPS)
         clips, seen = Counter(action for _, action in self._motions), Counter[int]()
-        blocks = {a: split_blocks(f"humanact12_{a}", clips[a], BLOCK, val=0.1, test=0.2) for a in clips}
+        blocks = {
+            a: split_blocks(f"humanact12_{a}", clips[a], BLOCK, val=0.1, test=0.2) for a in clips
+        }
         for number, (motion, action) in enumerate(self._motions):
             name, block = f"humanact12_{number:04d}", seen[action] // BLOCK
             seen[action] += 1
@@ -59,11 +69,21 @@ class HumanAct12(MotionSource):
         A motion is the position of the root joint (meters, camera axes), then 24 axis-angle vectors.
         """
         path, motions = find(self.path, "humanact12poses.pkl"), []
-        for number, (poses, joints, action) in enumerate(zip(*read_lists(path, "poses", "joints3D", "y"), strict=True)):
-            with naming(f"{path}: clip {number}", *NO_NUMBERS, what="does not consist of numbers: "):
-                pose, joint, label = np.asarray(poses, np.float32), np.asarray(joints, np.float32), int(action)
+        for number, (poses, joints, action) in enumerate(
+            zip(*read_lists(path, "poses", "joints3D", "y"), strict=True)
+        ):
+            with naming(
+                f"{path}: clip {number}", *NO_NUMBERS, what="does not consist of numbers: "
+            ):
+                pose, joint, label = (
+                    np.asarray(poses, np.float32),
+                    np.asarray(joints, np.float32),
+                    int(action),
+                )
                 if pose.shape[1:] != (72,) or joint.shape != (len(pose), 24, 3) or not len(pose):
-                    raise UserError(f"poses {pose.shape} and joints {joint.shape}, not (F, 72) and (F, 24, 3)")
+                    raise UserError(
+                        f"poses {pose.shape} and joints {joint.shape}, not (F, 72) and (F, 24, 3)"
+                    )
                 if not 0 <= label < len(self.actions):
                     raise UserError(f"label {label}, not one of 0 to {len(self.actions) - 1}")
             motions.append((np.concatenate([joint[:, 0], pose], 1), label))
@@ -97,7 +117,9 @@ def read_lists(path: Path, *names: str) -> list[Any]:
     """Returns the lists of these names in a pickled dictionary, checked to have equal length."""
     data = restricted_pickle.read(path)
     if not isinstance(data, dict) or not set(names) <= set(data):
-        kind = f"keys {', '.join(map(str, data))}" if isinstance(data, dict) else type(data).__name__
+        kind = (
+            f"keys {', '.join(map(str, data))}" if isinstance(data, dict) else type(data).__name__
+        )
         raise UserError(f"{path}: must contain {', '.join(names)}; it contains {kind}")
     lists = [data[name] for name in names]
     are_lists = all(isinstance(values, list | tuple) or np.ndim(values) for values in lists)

@@ -52,7 +52,9 @@ class IndexedClip(NamedTuple):
 def read_index(path: Path) -> list[IndexedClip]:
     required(path, "it is index.csv of https://github.com/EricGuo5513/HumanML3D")
     rows = []
-    with naming(path, csv.Error, KeyError, TypeError, ValueError, what="not HumanML3D's index of clips: "):
+    with naming(
+        path, csv.Error, KeyError, TypeError, ValueError, what="not HumanML3D's index of clips: "
+    ):
         for line in csv.DictReader(read_text(path).splitlines()):
             source, name = line["source_path"], PurePosixPath(line["new_name"]).stem
             key = PurePosixPath(source).stem if "humanact12" in source.lower() else key_of(source)
@@ -121,7 +123,9 @@ class HumanML3D(T2MFolder):
 
     @cached_property
     def rows(self) -> list[IndexedClip]:
-        return [row for row in read_index(self._beside("index.csv")) if row.name not in self.exclude]
+        return [
+            row for row in read_index(self._beside("index.csv")) if row.name not in self.exclude
+        ]
 
     @cached_property
     def humanact12_files(self) -> dict[str, Path]:
@@ -141,7 +145,9 @@ class HumanML3D(T2MFolder):
 
     def _bodies(self) -> dict[str, Body]:
         if not self.body_models:
-            raise FileNotFoundError("data.source.body_models: not set; give the folder of the extended SMPL+H model")
+            raise FileNotFoundError(
+                "data.source.body_models: not set; give the folder of the extended SMPL+H model"
+            )
         return {gender: load_body(self.body_models, gender) for gender in ("male", "female")}
 
     def _missing(self, amass: Amass, todo: Sequence[IndexedClip]) -> list[str]:
@@ -159,18 +165,25 @@ class HumanML3D(T2MFolder):
         if todo := self._todo():
             _ = self.names, self.texts  # which may be missing
             if missing := self._missing(amass, todo):
-                raise FileNotFoundError(f"{self.name} cannot be created. Missing: {'; '.join(missing)}")
+                raise FileNotFoundError(
+                    f"{self.name} cannot be created. Missing: {'; '.join(missing)}"
+                )
             with made_folder(self.path / "new_joint_vecs"):
                 self._make_motions(amass, todo)
         if not (self.path / "Mean.npy").is_file():
             self._write_statistics()
 
     def _make_motions(self, amass: Amass, todo: Sequence[IndexedClip]) -> None:
-        folder, encoder = self.path / "new_joint_vecs", HumanML("smpl22", "legacy", bone_lengths=self.bone_lengths)
+        folder, encoder = (
+            self.path / "new_joint_vecs",
+            HumanML("smpl22", "legacy", bone_lengths=self.bone_lengths),
+        )
         write = partial(_write_features, folder, encoder)
         write_all = partial(_from_amass, write, self._bodies())
         try:
-            with ProgressBar(desc=f"creating {self.name}", total=len(todo), unit=" motions") as progress:
+            with ProgressBar(
+                desc=f"creating {self.name}", total=len(todo), unit=" motions"
+            ) as progress:
                 for _, count in amass.map(by_recording(todo), write_all, self.workers):
                     progress.update(count)
                 for row in todo:
@@ -184,8 +197,12 @@ class HumanML3D(T2MFolder):
         """Writes mean and std over all motions of any length and split, including mirrored ones."""
         representation = HumanML("smpl22", "legacy")
         shapes = {name: self._load(name, mmap=True).shape for name in sorted(self._motions())}
-        if wrong := [name for name, (_, features) in shapes.items() if features != representation.features]:
-            raise UserError(f"{self.path}: wrong number of features of {some(wrong)}; delete them and prepare again")
+        if wrong := [
+            name for name, (_, features) in shapes.items() if features != representation.features
+        ]:
+            raise UserError(
+                f"{self.path}: wrong number of features of {some(wrong)}; delete them and prepare again"
+            )
         count = sum(frames for frames, _ in shapes.values())
         frames = Frames(lambda: (self._load(name).astype(np.float32) for name in shapes), count)
         mean, std = representation.statistics(frames)
@@ -204,7 +221,9 @@ def _from_amass(
     return len(rows)
 
 
-def _write_features(folder: Path, representation: HumanML, row: IndexedClip, joints: np.ndarray) -> None:
+def _write_features(
+    folder: Path, representation: HumanML, row: IndexedClip, joints: np.ndarray
+) -> None:
     """Writes the features of a clip and of its mirror image, each under a temporary name first."""
     motion = torch.from_numpy(joints).double()
     with naming(f"clip {row.name} (data.source.exclude=[{row.name}] leaves it out)", ValueError):
@@ -220,8 +239,15 @@ def _save(path: Path, array: np.ndarray) -> None:
 
 def _read_joints(path: Path) -> np.ndarray:
     joints = read_npy(path)
-    if joints.dtype.kind not in "fiu" or joints.ndim != 3 or joints.shape[1] < 22 or joints.shape[2] != 3:
-        raise UserError(f"{path}: shape {joints.shape} of {joints.dtype}, not numbers (frames, 22 joints or more, 3)")
+    if (
+        joints.dtype.kind not in "fiu"
+        or joints.ndim != 3
+        or joints.shape[1] < 22
+        or joints.shape[2] != 3
+    ):
+        raise UserError(
+            f"{path}: shape {joints.shape} of {joints.dtype}, not numbers (frames, 22 joints or more, 3)"
+        )
     return joints[:, :22]
 
 
@@ -263,11 +289,14 @@ class HumanML3DSMPL(MotionSource):
             lacking = f"{len(absent)} clips have no text, such as {absent[0]}"
             raise FileNotFoundError(f"{self.folder.path}: {lacking}; unpack texts.zip again")
         used = [row for row in rows if self.humanact12 or not row.humanact12]
-        listed = sum(not name.startswith("M") for name in self.folder.names)  # without mirrored copies
+        # Without mirrored copies
+        listed = sum(not name.startswith("M") for name in self.folder.names)
         excluded = sum(not name.startswith("M") for name in self.folder.exclude)
         self.leave_out("motions by data.source.exclude", excluded)
         self.leave_out("motions that index.csv lacks", listed - len(rows))
-        self.leave_out("motions of HumanAct12, as data.source.humanact12 is not given", len(rows) - len(used))
+        self.leave_out(
+            "motions of HumanAct12, as data.source.humanact12 is not given", len(rows) - len(used)
+        )
         return used
 
     def count(self) -> int:
@@ -287,14 +316,20 @@ class HumanML3DSMPL(MotionSource):
         """Yields SMPL poses of HumanAct12; the root position is used as SMPL's translation, as in FLAME's code."""
         data = restricted_pickle.read(path)
         for row in sorted((row for row in self.rows if row.humanact12), key=lambda row: row.key):
-            entry = data.get(f"{row.key}.npy", data.get(row.key)) if isinstance(data, dict) else None
+            entry = (
+                data.get(f"{row.key}.npy", data.get(row.key)) if isinstance(data, dict) else None
+            )
             if entry is None:
                 self.leave_out(f"motions of HumanAct12 that {path.name} lacks")
                 continue
             errors = (KeyError, TypeError, ValueError, IndexError)
-            with naming(path, *errors, what=f"{row.key} lacks poses (F, 72) or joints3D (F, 24, 3): "):
+            with naming(
+                path, *errors, what=f"{row.key} lacks poses (F, 72) or joints3D (F, 24, 3): "
+            ):
                 poses = np.asarray(entry["poses"], np.float32)
-                motion = np.concatenate([np.asarray(entry["joints3D"], np.float32)[:, 0], poses.reshape(-1, 72)], 1)
+                motion = np.concatenate(
+                    [np.asarray(entry["joints3D"], np.float32)[:, 0], poses.reshape(-1, 72)], 1
+                )
             yield from self._clips(row, motion)
 
     def _clips(self, row: IndexedClip, motion: np.ndarray) -> Iterator[Clip]:

@@ -65,10 +65,20 @@ class KITTemos(MotionSource):
         names, texts = self.names, {}
         required(self.path, self.get_motions)
         for name in names:
-            captions, meta = (read_json(self.path / f"{name}_{kind}.json") for kind in ("annotations", "meta"))
-            are_texts = isinstance(captions, list) and all(isinstance(text, str) for text in captions)
-            if not are_texts or not isinstance(meta, dict) or len(captions) != meta.get("nb_annotations"):
-                raise UserError(f"{self.path}: {name}_annotations.json is damaged, or {name}_meta.json does not match")
+            captions, meta = (
+                read_json(self.path / f"{name}_{kind}.json") for kind in ("annotations", "meta")
+            )
+            are_texts = isinstance(captions, list) and all(
+                isinstance(text, str) for text in captions
+            )
+            if (
+                not are_texts
+                or not isinstance(meta, dict)
+                or len(captions) != meta.get("nb_annotations")
+            ):
+                raise UserError(
+                    f"{self.path}: {name}_annotations.json is damaged, or {name}_meta.json does not match"
+                )
             if captions:
                 texts[name] = captions
         return texts
@@ -76,7 +86,10 @@ class KITTemos(MotionSource):
     @cached_property
     def frames(self) -> dict[str, int]:
         """Number of frames, at 12.5 per second, of each motion with captions."""
-        rows = {name: len(read_text(self.path / f"{name}_fke.csv").splitlines()) - 1 for name in self.texts}
+        rows = {
+            name: len(read_text(self.path / f"{name}_fke.csv").splitlines()) - 1
+            for name in self.texts
+        }
         return {name: -(-count // 8) for name, count in rows.items()}
 
     def count(self) -> int:
@@ -89,21 +102,30 @@ class KITTemos(MotionSource):
                 self.leave_out(f"motions of {split} without a caption")
             elif not self._fits(name):
                 is_short = self.frames[name] < self.shortest
-                limit = f"shorter than {self.shortest}" if is_short else f"longer than {self.longest}"
+                limit = (
+                    f"shorter than {self.shortest}" if is_short else f"longer than {self.longest}"
+                )
                 self.leave_out(f"motions of {split} {limit} frames")
         names = [name for name in self.frames if self._fits(name)]
-        tasks = [(self.path / f"{name}_fke.csv", 1 if self.names[name] == "test" else 8) for name in names]
+        tasks = [
+            (self.path / f"{name}_fke.csv", 1 if self.names[name] == "test" else 8)
+            for name in names
+        ]
         for name, recording in zip(names, in_order(_recording, tasks, self.workers), strict=True):
             attributes = {"ghosh_test": name in self.ghosh_test}
             clip = Clip(name, recording, self.texts[name], self.names[name], name, None, attributes)
             if clip.split == "test":
-                clip = replace(clip, motion=recording[::8], captions=clip.captions[:1], reference=recording)
+                clip = replace(
+                    clip, motion=recording[::8], captions=clip.captions[:1], reference=recording
+                )
             yield clip
 
     def counts(self) -> dict[str, int]:
         texts = sum(len(read_json(path)) for path in self.path.glob("*_annotations.json"))
         splits = list(read_splits(self.splits, "", self.get_it).values())
-        counts = {split: splits.count(split) for split in SPLITS} | {"ghosh_test": len(self.ghosh_test)}
+        counts = {split: splits.count(split) for split in SPLITS} | {
+            "ghosh_test": len(self.ghosh_test)
+        }
         return {"motions": len(list(self.path.glob("*_fke.csv"))), "texts": texts, **counts}
 
     def _fits(self, name: str) -> bool:
@@ -120,5 +142,7 @@ def read_joints(path: Path, step: int = 8) -> np.ndarray:
     with naming(path, ValueError, what="damaged, exclude it by its number: "):
         rows = np.loadtxt(lines, delimiter=",", ndmin=2)
         if rows.shape[1] != 64 or not len(rows) or not np.isfinite(rows).all():
-            raise UserError(f"rows {rows.shape}, not a row number and 63 coordinates, finite numbers, in each")
+            raise UserError(
+                f"rows {rows.shape}, not a row number and 63 coordinates, finite numbers, in each"
+            )
     return (rows[:, 1:].reshape(-1, 21, 3) / UNITS_PER_METER).astype(np.float32)

@@ -40,7 +40,10 @@ class Mixture(MotionSource):
         self.parts, self.use = dict(parts), use
         self.captions_may_be_shared = all(part.captions_may_be_shared for part in parts.values())
         self.verbs = tuple(sorted({verb for part in parts.values() for verb in part.verbs}))
-        self.options = {"use": use, "parts": {name: dict(part.options) for name, part in self.parts.items()}}
+        self.options = {
+            "use": use,
+            "parts": {name: dict(part.options) for name, part in self.parts.items()},
+        }
 
     def count(self) -> int:
         self.check_licenses()

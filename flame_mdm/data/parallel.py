@@ -19,7 +19,8 @@ from flame_mdm.signals import ignore_interrupts
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
-PATIENCE = 2.0  # seconds of work before processes are started if their number is not given; starting takes as long
+# Seconds of work before processes are started if their number is not given; starting takes as long
+PATIENCE = 2.0
 
 
 def cores() -> int:
@@ -27,7 +28,9 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def in_order(function: Callable[[Task], Result], tasks: Iterable[Task], workers: int = 0) -> Generator[Result]:
+def in_order(
+    function: Callable[[Task], Result], tasks: Iterable[Task], workers: int = 0
+) -> Generator[Result]:
     """Yields `function(task)` for each task, in the order of the tasks; reads only a few tasks ahead.
 
     Nested calls, in which the results of one are tasks of the other, share their processes. Function, tasks and results
@@ -72,11 +75,14 @@ _pool: _Pool | None = None  # the pool in use, if any
 def _shared_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
     global _pool
     # Spawned, not forked: a fork would copy locks held by threads of this process, which may have used torch.
-    pool = _pool = _pool or _Pool(ProcessPoolExecutor(workers, get_context("spawn"), _start_worker), active_children())
+    pool = _pool = _pool or _Pool(
+        ProcessPoolExecutor(workers, get_context("spawn"), _start_worker), active_children()
+    )
     pool.users += 1
     try:
         yield pool.executor
-    except BaseException as error:  # an error or Ctrl-C must not wait for tasks that may take half an hour
+    # An error or Ctrl-C must not wait for tasks that may take half an hour
+    except BaseException as error:
         if isinstance(error, GeneratorExit) and pool.users > 1:  # the others still need the pool
             raise
         _pool = None
@@ -110,7 +116,9 @@ def _first(pending: deque[Future[Result]]) -> Result:
 
 def _start_worker() -> None:
     """Sets up a worker: one thread, ignores Ctrl-C (the parent handles it), and exits when the parent dies."""
-    os.environ["OMP_NUM_THREADS"] = "1"  # read when a task imports torch; importing it for tasks that do not takes long
+    os.environ["OMP_NUM_THREADS"] = (
+        "1"  # read when a task imports torch; importing it for tasks that do not takes long
+    )
 
     def follow() -> None:
         parent = parent_process()

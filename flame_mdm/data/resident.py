@@ -14,7 +14,9 @@ from flame_mdm.data.crops import Clips, Draw
 from flame_mdm.data.store import Store
 from flame_mdm.representations import Representation
 
-SHARE = 4  # data.resident=auto: data sets that take at most 1 / SHARE of the free memory of the device are kept there
+# data.resident=auto: data sets that take at most 1 / SHARE of the free memory of the device are
+# kept there
+SHARE = 4
 CHUNK = 1 << 16
 
 
@@ -24,11 +26,15 @@ def free_memory(device: torch.device) -> int:
         return torch.cuda.mem_get_info(device)[0]
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
-        free = 1024 * next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
+        free = 1024 * next(
+            int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")
+        )
     except (OSError, StopIteration):
         free = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     try:
-        limit, used = (Path(f"/sys/fs/cgroup/memory.{name}").read_text() for name in ("max", "current"))
+        limit, used = (
+            Path(f"/sys/fs/cgroup/memory.{name}").read_text() for name in ("max", "current")
+        )
         return min(free, int(limit) - int(used))
     except (OSError, ValueError):  # no container, or one without a limit
         return free
@@ -57,12 +63,18 @@ class ResidentLoader:
     `features` (N + 1, D) are those of `resident_features`; batches are padded to multiples of `multiple` frames.
     """
 
-    def __init__(self, clips: Clips, batches: Iterable[list[Draw]], features: Tensor, multiple: int):
+    def __init__(
+        self, clips: Clips, batches: Iterable[list[Draw]], features: Tensor, multiple: int
+    ):
         self.clips, self.batches, self.features, self.multiple = clips, batches, features, multiple
         self.begin = np.array([clip.start for clip in clips.clips], np.int64)
-        self.actions = np.array([-1 if clip.action is None else clip.action for clip in clips.clips], np.int64)
+        self.actions = np.array(
+            [-1 if clip.action is None else clip.action for clip in clips.clips], np.int64
+        )
         self.frames = torch.arange(clips.crop.longest(), device=features.device)
-        self.mean, self.std = (torch.from_numpy(values).to(features.device) for values in (clips.mean, clips.std))
+        self.mean, self.std = (
+            torch.from_numpy(values).to(features.device) for values in (clips.mean, clips.std)
+        )
 
     def __len__(self) -> int:
         return len(self.batches)  # type: ignore[arg-type]  # those of training have none
@@ -74,20 +86,30 @@ class ResidentLoader:
         rows = np.array([index for index, _ in draws])
         first, length, caption = self.clips.draw(rows, draws[0][1])
         begin = self.begin[rows]
-        values = np.stack([begin + first, begin + self.clips.frames[rows] - 1, length, self.actions[rows]])
-        start, last, lengths, action = sent(torch.from_numpy(values), self.features.device)[..., None]
+        values = np.stack(
+            [begin + first, begin + self.clips.frames[rows] - 1, length, self.actions[rows]]
+        )
+        start, last, lengths, action = sent(torch.from_numpy(values), self.features.device)[
+            ..., None
+        ]
         frames = self.frames[: padded_length(int(length.max()), self.multiple, len(self.frames))]
         mask = frames < lengths
-        rows_of_frames = torch.minimum(start + frames, last).masked_fill(~mask, len(self.features) - 1)
+        rows_of_frames = torch.minimum(start + frames, last).masked_fill(
+            ~mask, len(self.features) - 1
+        )
         x = F.embedding(rows_of_frames, self.features)
         if adapts_cuts(self.clips.representation):
-            x = ((self.clips.representation.rebase(x) - self.mean) / self.std).masked_fill(~mask[..., None], 0)
+            x = ((self.clips.representation.rebase(x) - self.mean) / self.std).masked_fill(
+                ~mask[..., None], 0
+            )
         entries = [self.clips.clips[index] for index in rows]
         has_text = bool(self.clips.captions[rows].all())
         return MotionBatch(
             x=x,
             mask=mask,
             ids=[clip.id for clip in entries],
-            text=[clip.captions[n] for clip, n in zip(entries, caption.tolist(), strict=True)] if has_text else None,
+            text=[clip.captions[n] for clip, n in zip(entries, caption.tolist(), strict=True)]
+            if has_text
+            else None,
             action=None if (values[3] < 0).any() else action[:, 0],
         )

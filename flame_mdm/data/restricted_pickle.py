@@ -33,12 +33,21 @@ class _Object:
 
 
 ARRAY, SCALAR, BUFFER, BYTES = ALLOWED = (
-    *("numpy.core.multiarray._reconstruct", "numpy.core.multiarray.scalar", "numpy.core.numeric._frombuffer"),
+    *(
+        "numpy.core.multiarray._reconstruct",
+        "numpy.core.multiarray.scalar",
+        "numpy.core.numeric._frombuffer",
+    ),
     "_codecs.encode",
 )
 KINDS = {name: type(name, (_Object,), {}) for name in (*ALLOWED, "numpy.ndarray", "numpy.dtype")}
 """All globals that a pickle may name -> the class of their objects."""
-BASES = ("copy_reg._reconstructor", "copyreg._reconstructor", "__builtin__.object", "builtins.object")
+BASES = (
+    "copy_reg._reconstructor",
+    "copyreg._reconstructor",
+    "__builtin__.object",
+    "builtins.object",
+)
 """Globals that old protocols name to make an object of a class."""
 
 

@@ -101,13 +101,16 @@ class Store:
         with _intact(contents):
             self.info: dict[str, Any] = read_json(contents)
             check_shape(self.info, Contents)
-        self.fingerprint: str = self.info["fingerprint"]  # in results: equal for equal clips and options anywhere
+        # In results: equal for equal clips and options anywhere
+        self.fingerprint: str = self.info["fingerprint"]
         self._check("clips.jsonl", "statistics.npz")
         frames, width = self.info["shape"]
         with _intact(self.folder / "features.npy") as path:
             self.features: np.ndarray = read_npy(path, mmap=True)
             if self.features.shape != (frames, width) or self.features.dtype != np.float32:
-                raise ValueError(f"shape {self.features.shape}, not {(frames, width)}, or not float32")
+                raise ValueError(
+                    f"shape {self.features.shape}, not {(frames, width)}, or not float32"
+                )
         self.clips = _entries(self.folder / "clips.jsonl", frames, len(self.info["actions"]))
         with _intact(self.folder / "statistics.npz") as path:
             statistics = read_npz(path)
@@ -118,7 +121,10 @@ class Store:
         name, fps = self.info["representation"], self.info["fps"]
         with _intact(contents):
             version = self.info.get("version", 1)
-            if _fingerprint(self.folder, name, fps, self.mean, self.std, version) != self.fingerprint:
+            if (
+                _fingerprint(self.folder, name, fps, self.mean, self.std, version)
+                != self.fingerprint
+            ):
                 raise ValueError("its fingerprint does not match the clips")
 
     def motion(self, clip: Entry) -> np.ndarray:
@@ -179,7 +185,8 @@ def write_store(folder: Path, source: MotionSource, representation: Representati
     lock = folder.with_name(folder.name + ".lock")
     waiting = f"{folder}: another process is preparing it; waiting"
     with locked(lock, lambda _: say(waiting), "prepare in one process at a time"):
-        remove_abandoned(folder.parent, folder, is_locked=True)  # also of a process that is just ending
+        # Also of a process that is just ending
+        remove_abandoned(folder.parent, folder, is_locked=True)
         remove_abandoned(folder.parent)
         if before or not (folder / "store.json").exists():
             replaced = _replaceable(folder)
@@ -205,11 +212,16 @@ def _replaceable(folder: Path) -> list[Path]:
         )
     store = Store(folder)
     store.verify()
-    return [folder / "store.json", *(folder / name for name in FILES if name in store.info["sha256"])]
+    return [
+        folder / "store.json",
+        *(folder / name for name in FILES if name in store.info["sha256"]),
+    ]
 
 
 def _write(folder: Path, source: MotionSource, representation: Representation, total: int) -> None:
-    bar = ProgressBar(source.clips(representation.fps), f"preparing {source.name}", total, unit=" clips")
+    bar = ProgressBar(
+        source.clips(representation.fps), f"preparing {source.name}", total, unit=" clips"
+    )
     with bar as clips, closing(_encoded(clips, representation, source.workers)) as encoded:
         entries, frames = _pack(folder, source.name, encoded, representation.features)
     splits = Counter(entry.split for entry in entries)
@@ -235,7 +247,9 @@ def _write(folder: Path, source: MotionSource, representation: Representation, t
         "shape": [frames, representation.features],
         "hours": round(frames / representation.fps / 3600, 3),
         **({"version": source.version} if source.version > 1 else {}),
-        "fingerprint": _fingerprint(folder, representation.name, representation.fps, mean, std, source.version),
+        "fingerprint": _fingerprint(
+            folder, representation.name, representation.fps, mean, std, source.version
+        ),
         "sha256": {path.name: sha256(path) for path in sorted(folder.iterdir())},
     }
     (folder / "store.json").write_text(json.dumps(info, indent=2) + "\n")
@@ -267,12 +281,17 @@ def _pack(
             if clip.motion is not motion:
                 motion, begin = clip.motion, frames
                 frames += len(values)
-                packed.write(values.tobytes())  # through a memory map, a full disk would kill the process (SIGBUS)
+                # Through a memory map, a full disk would kill the process (SIGBUS)
+                packed.write(values.tobytes())
             first, length = clip.window or (0, len(values))
             if first < 0 or length < 1 or first + length > len(values):
-                raise UserError(f"clip {clip.id}: window {clip.window} exceeds {len(values)} frames")
+                raise UserError(
+                    f"clip {clip.id}: window {clip.window} exceeds {len(values)} frames"
+                )
             if (other := split_of.setdefault(clip.source, clip.split)) != clip.split:
-                raise UserError(f"{name}: clips of {clip.source} are in both {other} and {clip.split}")
+                raise UserError(
+                    f"{name}: clips of {clip.source} are in both {other} and {clip.split}"
+                )
             if clip.id in entries:
                 raise UserError(f"{name}: two clips have the same id, {clip.id}")
             start, attributes = begin + first, dict(clip.attributes)
@@ -288,7 +307,9 @@ def _pack(
                 license=clip.license,
             )
             if clip.reference is not None:
-                references = references or stack.enter_context(zipfile.ZipFile(folder / "references.npz", "w"))
+                references = references or stack.enter_context(
+                    zipfile.ZipFile(folder / "references.npz", "w")
+                )
                 with references.open(f"{clip.id}.npy", "w", force_zip64=True) as file:
                     np.lib.format.write_array(file, np.asarray(clip.reference, np.float32))
         packed.seek(0)
@@ -298,7 +319,9 @@ def _pack(
 
 def _write_header(file: IO[bytes], frames: int, features: int) -> None:
     """Writes the header of features.npy. NumPy pads it to the same size for any number of frames."""
-    np.lib.format.write_array_header_1_0(file, {"descr": "<f4", "fortran_order": False, "shape": (frames, features)})
+    np.lib.format.write_array_header_1_0(
+        file, {"descr": "<f4", "fortran_order": False, "shape": (frames, features)}
+    )
 
 
 def training_statistics(
@@ -320,7 +343,9 @@ def training_statistics(
     return mean.numpy(), std.numpy()
 
 
-def _encoded(clips: Iterable[Clip], representation: Representation, workers: int) -> Generator[tuple[Clip, np.ndarray]]:
+def _encoded(
+    clips: Iterable[Clip], representation: Representation, workers: int
+) -> Generator[tuple[Clip, np.ndarray]]:
     """Yields each clip with the features of its entire motion, encoded in worker processes, each shared motion once."""
     groups: deque[list[Clip]] = deque()
 
@@ -338,22 +363,30 @@ def _encode(encoder: Representation, named: tuple[str, str, np.ndarray]) -> np.n
     """Returns the features of a motion with its name and its representation, if it is published as features."""
     name, encoded, motion = named
     if encoded and encoded not in (encoder.name, encoder.part_of):
-        raise UserError(f"clip {name}: published as {encoded}, which cannot be converted to {encoder.name}")
+        raise UserError(
+            f"clip {name}: published as {encoded}, which cannot be converted to {encoder.name}"
+        )
     if not encoded:
         try:
             motion = encoder.encode(torch.from_numpy(np.ascontiguousarray(motion))).numpy()
         except ValueError as error:
             raise UserError(f"clip {name}: {error}") from error
-    features = np.asarray(motion[:, : encoder.features] if encoded == encoder.part_of else motion, np.float32)
+    features = np.asarray(
+        motion[:, : encoder.features] if encoded == encoder.part_of else motion, np.float32
+    )
     if features.ndim != 2 or features.shape[1] != encoder.features:
         raise UserError(f"clip {name}: shape {features.shape}, not (frames, {encoder.features})")
     if not np.isfinite(features).all():
         frame = int(np.argwhere(~np.isfinite(features).all(1))[0, 0])
-        raise UserError(f"clip {name}: the features of frame {frame} are not finite. Exclude it by name")
+        raise UserError(
+            f"clip {name}: the features of frame {frame} are not finite. Exclude it by name"
+        )
     return features
 
 
-def _fingerprint(folder: Path, representation: str, fps: float, mean: np.ndarray, std: np.ndarray, version: int) -> str:
+def _fingerprint(
+    folder: Path, representation: str, fps: float, mean: np.ndarray, std: np.ndarray, version: int
+) -> str:
     digest = hashlib.sha256((folder / "clips.jsonl").read_bytes())
     # Features differ in their last bits between processors and thread counts, so the fingerprint depends on them only
     # through statistics rounded to a fixed number of decimals. Adding 0.0 makes -0.0 and 0.0 equal.
@@ -375,12 +408,18 @@ def _intact(path: Path) -> Iterator[Path]:
 
 def _entries(path: Path, frames: int, actions: int) -> list[Entry]:
     clips: list[Entry] = []
-    with _intact(path), path.open(encoding="utf-8") as lines:  # not splitlines: captions may contain other separators
+    # Not splitlines: captions may contain other separators
+    with (
+        _intact(path),
+        path.open(encoding="utf-8") as lines,
+    ):
         for number, line in enumerate(lines, 1):
             with naming(f"line {number}", ValueError):
                 clip: Entry = check_shape(parse_json(line), Entry, strict=False)
                 if clip.start + clip.length > frames:
-                    raise ValueError(f"{clip.id}: frames {clip.start} to {clip.start + clip.length} exceed {frames}")
+                    raise ValueError(
+                        f"{clip.id}: frames {clip.start} to {clip.start + clip.length} exceed {frames}"
+                    )
                 if clip.action is not None and clip.action >= actions:
                     raise ValueError(f"{clip.id}: action {clip.action} of {actions}")
             clips.append(clip)

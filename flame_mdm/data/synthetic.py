@@ -14,16 +14,30 @@ import numpy as np
 
 from flame_mdm.data import Clip, MotionSource, hashed_split
 from flame_mdm.data.parallel import in_order
-from flame_mdm.data.synthetic_actions import ACTIONS, BASES, CORE, CYCLES, GESTURES, MORE, drawn_from, move
+from flame_mdm.data.synthetic_actions import (
+    ACTIONS,
+    BASES,
+    CORE,
+    CYCLES,
+    GESTURES,
+    MORE,
+    drawn_from,
+    move,
+)
 from flame_mdm.data.synthetic_motions.body import Attributes, Body
 from flame_mdm.errors import UserError
 from flame_mdm.safe_io import read_yaml
 
 MIN_SECONDS, MAX_SECONDS = 2.0, 3.0  # durations of clips
 CAPTIONS = 8  # captions per clip
-SIMULTANEOUS, CYCLIC = 0.08, 0.04  # shares of clips of all actions that show two at once, or a part of a cycle
+# Shares of clips of all actions that show two at once, or a part of a cycle
+SIMULTANEOUS, CYCLIC = (
+    0.08,
+    0.04,
+)
 MARGIN = 1.0  # seconds before and after a part of a cycle, in which the body starts and stops
-PARTIAL = 0.25  # share of the training clips whose captions leave out attributes; those of val and test state all
+# Share of the training clips whose captions leave out attributes; those of val and test state all
+PARTIAL = 0.25
 ALWAYS = ("action", "while")  # attributes that each caption states
 UNSAID = {"speed": "normal", "amount": "quarter"}  # values that a caption need not state
 CHOICE = re.compile(r"\[([^\[\]]*)\]")
@@ -39,15 +53,21 @@ def content() -> dict[str, Any]:
     """
     grammar = read_yaml(Path(__file__).with_name("synthetic.yaml"))
     more = read_yaml(Path(__file__).with_name("synthetic_more.yaml"))
-    grammar["captions"] = {key: value for keys, value in grammar["captions"].items() for key in keys.split(", ")}
+    grammar["captions"] = {
+        key: value for keys, value in grammar["captions"].items() for key in keys.split(", ")
+    }
     for name in ("captions", "phrases", "stated", "widths"):
         if both := grammar[name].keys() & more[name].keys():
-            raise ValueError(f"synthetic_more.yaml: {name}: {sorted(both)} are in synthetic.yaml, too")
+            raise ValueError(
+                f"synthetic_more.yaml: {name}: {sorted(both)} are in synthetic.yaml, too"
+            )
         grammar[name] |= more[name]
 
     grammar |= {name: more[name] for name in ("simultaneous", "mains", "gestures")}
     grammar["core_verbs"] = {line.split()[0] for line in grammar["verbs"]}
-    grammar["verbs"] = {line.split()[0]: line.split() for line in (*grammar["verbs"], *more["verbs"])}
+    grammar["verbs"] = {
+        line.split()[0]: line.split() for line in (*grammar["verbs"], *more["verbs"])
+    }
     grammar["subjects"] = [group for group in grammar["subjects"] for _ in range(group["share"])]
     return grammar
 
@@ -59,10 +79,15 @@ def draw_captions(
 
     If `incomplete`, they leave out some attributes, all of them the same ones, if the grammar has such captions.
     """
-    everything = {name for name, value in attributes.items() if name not in ALWAYS and UNSAID.get(name) != value}
+    everything = {
+        name
+        for name, value in attributes.items()
+        if name not in ALWAYS and UNSAID.get(name) != value
+    }
     captions: list[str] = []
     stated = everything
-    for _ in range(30 if incomplete else 0):  # the first caption that leaves something out decides what is left out
+    # The first caption that leaves something out decides what is left out
+    for _ in range(30 if incomplete else 0):
         caption, said = _sentence(rng, attributes)
         if said != everything:
             captions, stated = [caption], said
@@ -73,7 +98,9 @@ def draw_captions(
             captions.append(caption)
     if stated == everything:
         return captions, dict(attributes)
-    return captions, {name: value for name, value in attributes.items() if name in stated or name in ALWAYS}
+    return captions, {
+        name: value for name, value in attributes.items() if name in stated or name in ALWAYS
+    }
 
 
 def _sentence(rng: np.random.Generator, attributes: Attributes) -> tuple[str, set[str]]:
@@ -82,13 +109,19 @@ def _sentence(rng: np.random.Generator, attributes: Attributes) -> tuple[str, se
     template = _template(rng, attributes)
     subject = _one(rng, grammar["subjects"])
     who = "" if template.startswith("=") else _one(rng, subject["who"])
-    text = template.lstrip("= ") if template.startswith("=") or "{who}" in template else f"{{who}} {template}"
+    text = (
+        template.lstrip("= ")
+        if template.startswith("=") or "{who}" in template
+        else f"{{who}} {template}"
+    )
     said: set[str] = set()
 
     def fill(slot: re.Match[str]) -> str:
         name, kind = slot.groups()
         if kind is None:
-            return {"who": who, "whose": subject["whose"]}.get(name) or grammar["phrases"].get(name, "")
+            return {"who": who, "whose": subject["whose"]}.get(name) or grammar["phrases"].get(
+                name, ""
+            )
         said.add(name)
         return f"[{grammar['stated'][f'{name}.{kind}'][attributes[name]]}]"
 
@@ -109,7 +142,9 @@ def _template(rng: np.random.Generator, attributes: Attributes) -> str:
     parts["gesture"] = _one(rng, grammar["gestures"][attributes["while"]])
     template = _one(rng, grammar["simultaneous"])
     for name, part in parts.items():
-        template = template.replace(f"{{{name}}}", part).replace(f"{{{name}.ing}}", part.replace("<", "<-"))
+        template = template.replace(f"{{{name}}}", part).replace(
+            f"{{{name}.ing}}", part.replace("<", "<-")
+        )
     return template
 
 
@@ -170,11 +205,21 @@ class Synthetic(MotionSource):
     license = "MIT"
     captions_may_be_shared = True
     actions = tuple(CORE)
-    verbs = tuple(sorted({form for name in content()["core_verbs"] for form in content()["verbs"][name]}))
+    verbs = tuple(
+        sorted({form for name in content()["core_verbs"] for form in content()["verbs"][name]})
+    )
 
-    def __init__(self, clips: int = 5000, seed: int = 0, workers: int = 0, actions: Literal["core", "all"] = "core"):
+    def __init__(
+        self,
+        clips: int = 5000,
+        seed: int = 0,
+        workers: int = 0,
+        actions: Literal["core", "all"] = "core",
+    ):
         if clips < 1 or seed < 0:
-            raise UserError(f"synthetic: clips={clips}, seed={seed}: give at least one clip and a seed from 0 on")
+            raise UserError(
+                f"synthetic: clips={clips}, seed={seed}: give at least one clip and a seed from 0 on"
+            )
         if actions not in ("core", "all"):
             raise UserError(f'synthetic: actions={actions!r}: choose "core" or "all"')
         self.size, self.seed, self.workers, self.everything = clips, seed, workers, actions == "all"
@@ -182,7 +227,9 @@ class Synthetic(MotionSource):
         if self.everything:
             self.options["actions"] = actions
             self.actions = tuple(ACTIONS)
-            self.verbs = tuple(sorted({form for forms in content()["verbs"].values() for form in forms}))
+            self.verbs = tuple(
+                sorted({form for forms in content()["verbs"].values() for form in forms})
+            )
 
     def count(self) -> int:
         return self.size
@@ -199,7 +246,8 @@ class Synthetic(MotionSource):
         seconds = rng.uniform(max(MIN_SECONDS, repeating, ACTIONS[action].seconds), MAX_SECONDS)
         name = f"synthetic_{'all_' if self.everything else ''}{self.seed}_{index:06d}"
         split = hashed_split(name, val=5, test=10)
-        words = np.random.default_rng((self.seed, index, 1))  # so that motions do not depend on the grammar
+        # So that motions do not depend on the grammar
+        words = np.random.default_rng((self.seed, index, 1))
         incomplete = split == "train" and words.random() < PARTIAL
         texts, stated = draw_captions(words, attributes, CAPTIONS, incomplete)
         return Clip(
@@ -231,7 +279,10 @@ class Synthetic(MotionSource):
 
 def prompts() -> list[tuple[str, Attributes]]:
     """Returns fixed prompts with their attributes, for dashboard samples and `evaluators.metrics.attributes`."""
-    return [(row["text"], {name: row[name] for name in row if name != "text"}) for row in content()["prompts"]]
+    return [
+        (row["text"], {name: row[name] for name in row if name != "text"})
+        for row in content()["prompts"]
+    ]
 
 
 def example(attributes: Attributes, fps: float = 20.0) -> np.ndarray:

@@ -9,7 +9,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flame_mdm.data.synthetic_motions import combat, everyday, exercise, gestures, locomotion, travel
+from flame_mdm.data.synthetic_motions import (
+    combat,
+    everyday,
+    exercise,
+    gestures,
+    locomotion,
+    travel,
+)
 from flame_mdm.data.synthetic_motions.body import Attributes, Body
 
 
@@ -37,11 +44,16 @@ class Action(NamedTuple):
 SIDE, ANY_SIDE = {"side": ("left", "right")}, {"side": ("left", "right", "both")}
 ONCE_OR_TWICE, UP_TO_THREE = {"count": (1, 2)}, {"count": (1, 2, 3)}
 FORWARD = {"direction": ("forward",)}
-WAYS = {"forward": 0.3, **dict.fromkeys(("backward", "left", "right", "clockwise", "counterclockwise"), 0.14)}
+WAYS = {
+    "forward": 0.3,
+    **dict.fromkeys(("backward", "left", "right", "clockwise", "counterclockwise"), 0.14),
+}
 CORE = {
     "walk": Action(locomotion.walk, 6, {"direction": WAYS, "speed": ("slow", "normal", "fast")}),
     "run": Action(locomotion.run, 1, FORWARD),
-    "turn": Action(locomotion.turn, 3, {"direction": ("left", "right"), "amount": ("quarter", "half")}),
+    "turn": Action(
+        locomotion.turn, 3, {"direction": ("left", "right"), "amount": ("quarter", "half")}
+    ),
     "jump": Action(gestures.jump, 2, UP_TO_THREE),
     "wave": Action(gestures.wave, 2, ANY_SIDE),
     "raise": Action(gestures.raise_arms, 2, ANY_SIDE),
@@ -138,7 +150,9 @@ CYCLES = {
 BASES = {
     "walk": Action(locomotion.walk, 4, FORWARD | SPEEDS),
     "run": Action(locomotion.run, 1, FORWARD),
-    "turn": Action(locomotion.turn, 1, {"direction": ("left", "right"), "amount": ("quarter", "half")}),
+    "turn": Action(
+        locomotion.turn, 1, {"direction": ("left", "right"), "amount": ("quarter", "half")}
+    ),
     "sneak": Action(travel.sneak),
     "seated": Action(everyday.stay_seated, 2),
 }

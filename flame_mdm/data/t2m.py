@@ -20,7 +20,9 @@ from flame_mdm.data import SPLITS, Clip, MotionSource, Split, archives, required
 from flame_mdm.errors import UserError
 from flame_mdm.safe_io import naming, read_npy, read_text
 
-TAG_FPS = 20  # frames per second of the tags `from` and `to`, also in KIT-ML, whose motions have 12.5
+TAG_FPS = (
+    20  # frames per second of the tags `from` and `to`, also in KIT-ML, whose motions have 12.5
+)
 MAX_LENGTH = 200  # motions and cuts of this many frames or more are left out
 MAX_TOKENS = 20
 
@@ -42,7 +44,9 @@ class Cut(NamedTuple):
     length: int
     descriptions: list[Description]
 
-    def clip(self, motion: np.ndarray, split: Split, source: str, encoded: str = "", **facts: str) -> Clip:
+    def clip(
+        self, motion: np.ndarray, split: Split, source: str, encoded: str = "", **facts: str
+    ) -> Clip:
         """Returns the clip of a motion; `facts` are attributes beside the tokens, which are left out if empty."""
         captions, tokens, *_ = map(list, zip(*self.descriptions, strict=True))
         attributes = facts | ({"tokens": tokens} if all(tokens) else {})
@@ -55,7 +59,11 @@ def parse(text: str, where: str) -> list[Description]:
     descriptions = []
     for number, line in enumerate(map(str.strip, text.splitlines()), 1):
         if line:
-            with naming(f"{where}, line {number}", ValueError, what=f"not caption#words#from#to: {line[:60]!r}: "):
+            with naming(
+                f"{where}, line {number}",
+                ValueError,
+                what=f"not caption#words#from#to: {line[:60]!r}: ",
+            ):
                 caption, tokens, *tags = line.rsplit("#", 3)
                 begin, end = (0.0 if math.isnan(float(tag)) else float(tag) for tag in tags)
             descriptions.append(Description(caption, tokens.split(" "), begin, end))
@@ -80,7 +88,9 @@ def cuts(name: str, frames: int, descriptions: Sequence[Description], shortest: 
         if shortest <= length < MAX_LENGTH:
             id_ = f"{name}@{description.begin:g}-{description.end:g}"
             seen[id_] += 1
-            items.append(Cut(id_ if seen[id_] == 1 else f"{id_}#{seen[id_]}", start, length, [description]))
+            items.append(
+                Cut(id_ if seen[id_] == 1 else f"{id_}#{seen[id_]}", start, length, [description])
+            )
     whole = [d for d in descriptions if d.begin == d.end == 0]
     return [*items, Cut(name, 0, frames, whole)] if whole else items
 
@@ -132,9 +142,13 @@ class T2MFolder(MotionSource):
         """Descriptions of each motion, from the folder `texts` or from `texts.zip`."""
         folder = self.path / "texts"
         if not folder.is_dir():
-            archive = required(self.path / "texts.zip", f"nor is the folder texts there; {self.get_it}")
+            archive = required(
+                self.path / "texts.zip", f"nor is the folder texts there; {self.get_it}"
+            )
             folder = archives.as_folder(archive, self, lambda name: name.endswith(".txt"))
-        return {file.stem: parse(read_text(file), str(file)) for file in sorted(folder.rglob("*.txt"))}
+        return {
+            file.stem: parse(read_text(file), str(file)) for file in sorted(folder.rglob("*.txt"))
+        }
 
     @cached_property
     def frames(self) -> dict[str, int]:
@@ -149,7 +163,10 @@ class T2MFolder(MotionSource):
         return {name: len(self._load(name, mmap=True)) for name in names}
 
     def count(self) -> int:
-        total = sum(len(cuts(name, length, self.texts[name], self.shortest)) for name, length in self.frames.items())
+        total = sum(
+            len(cuts(name, length, self.texts[name], self.shortest))
+            for name, length in self.frames.items()
+        )
         self.statistics()
         return total
 
@@ -163,18 +180,24 @@ class T2MFolder(MotionSource):
             self._account(name, length, items)
             motion = self._load(name) if items else np.zeros(0)
             for cut in items:
-                yield cut.clip(motion, self.names[name], name.removeprefix("M"), self.representation)
+                yield cut.clip(
+                    motion, self.names[name], name.removeprefix("M"), self.representation
+                )
 
     def statistics(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns the published mean and std, which are over all motions of all splits."""
         mean, std = (self._array(f"{name}.npy", 1).astype(np.float32) for name in ("Mean", "Std"))
         if mean.shape != std.shape or not np.isfinite(mean).all() or not (std > 0).all():
-            raise UserError(f"{self.path}: Mean.npy {mean.shape} or Std.npy {std.shape} is not a mean or positive std")
+            raise UserError(
+                f"{self.path}: Mean.npy {mean.shape} or Std.npy {std.shape} is not a mean or positive std"
+            )
         return mean, std
 
     def counts(self) -> dict[str, float]:
         """Returns the figures of `published.yaml`, in which motions and texts do not include mirrored copies."""
-        texts = [text for name, texts in self.texts.items() if not name.startswith("M") for text in texts]
+        texts = [
+            text for name, texts in self.texts.items() if not name.startswith("M") for text in texts
+        ]
         words = [word for text in texts for word in words_of(text.caption)]
         splits = Counter(self.names.values())
         return {
@@ -183,12 +206,16 @@ class T2MFolder(MotionSource):
             "vocabulary": len(set(words)),
             "words per caption": round(len(words) / max(len(texts), 1), 2),
             **{split: splits[split] for split in SPLITS},
-            **{f"{split} share, %": round(100 * splits[split] / max(len(self.names), 1), 2) for split in SPLITS},
+            **{
+                f"{split} share, %": round(100 * splits[split] / max(len(self.names), 1), 2)
+                for split in SPLITS
+            },
         }
 
     def _motions(self) -> set[str]:
         files = (self.path / "new_joint_vecs").glob("*.npy")
-        return {path.stem for path in files if not path.name.startswith(".")}  # unfinished, of a killed process
+        # Unfinished, of a killed process
+        return {path.stem for path in files if not path.name.startswith(".")}
 
     def _load(self, name: str, mmap: bool = False) -> np.ndarray:
         return self._array(f"new_joint_vecs/{name}.npy", 2, mmap)
@@ -197,7 +224,9 @@ class T2MFolder(MotionSource):
         path = self.path / name
         array = read_npy(required(path, self.get_it), mmap=mmap)
         if array.ndim != dimensions or array.dtype.kind not in "fiu":
-            raise UserError(f"{path}: shape {array.shape} of {array.dtype}, not numbers of {dimensions} dimensions")
+            raise UserError(
+                f"{path}: shape {array.shape} of {array.dtype}, not numbers of {dimensions} dimensions"
+            )
         return array
 
     def _account(self, name: str, frames: int, items: Sequence[Cut]) -> None:

@@ -19,14 +19,71 @@ from flame_mdm.errors import UserError
 from flame_mdm.safe_io import naming, read_text
 
 TRAIN_SUBJECTS = (
-    *(1, 2, 6, 12, 13, 16, 21, 24, 28, 29, 30, 31, 33, 35, 39, 41, 42, 45, 47, 50, 52, 54, 55, 57, 59, 61, 63),
-    *(64, 67, 69, 70, 71, 73, 77, 81, 84, 86, 87, 88, 90, 91, 93, 96, 99, 102, 103, 104, 107, 108, 112, 113),
+    *(
+        1,
+        2,
+        6,
+        12,
+        13,
+        16,
+        21,
+        24,
+        28,
+        29,
+        30,
+        31,
+        33,
+        35,
+        39,
+        41,
+        42,
+        45,
+        47,
+        50,
+        52,
+        54,
+        55,
+        57,
+        59,
+        61,
+        63,
+    ),
+    *(
+        64,
+        67,
+        69,
+        70,
+        71,
+        73,
+        77,
+        81,
+        84,
+        86,
+        87,
+        88,
+        90,
+        91,
+        93,
+        96,
+        99,
+        102,
+        103,
+        104,
+        107,
+        108,
+        112,
+        113,
+    ),
 )
 """Training subjects of the cross-subject protocol: 51 of 118; the other 67 are for testing."""
 VAL_SUBJECTS = 5  # number of training subjects that our split uses for validation
 MIN_FRAMES = 45  # minimum length of a training clip: three quarters of 60
 ROOT = 8  # index of the middle of the hips among VIBE's 49 joints, which ACTOR uses as the root
-FOCAL_LENGTH, IMAGE_SIZE = 500.0, 540.0  # camera in pixels that ACTOR assumes, since VIBE estimates only a scale
+# Camera in pixels that ACTOR assumes, since VIBE estimates only a scale
+FOCAL_LENGTH, IMAGE_SIZE = (
+    500.0,
+    540.0,
+)
 NAME = re.compile(r"(a(\d+)_d(\d+)_p(\d+)_c(\d+))(_.*)?")
 
 
@@ -76,7 +133,9 @@ class UESTC(MotionSource):
             match = NAME.fullmatch(name)
             if match is None or int(match[2]) >= len(self.actions):
                 row = f"{self.poses.parent}/info/names.txt, line {index + 1}"
-                raise UserError(f"{row}: {name!r} is not the name of a video of one of the {len(self.actions)} actions")
+                raise UserError(
+                    f"{row}: {name!r} is not the name of a video of one of the {len(self.actions)} actions"
+                )
             videos.append(Video(index, match[1], *(int(match[k]) for k in range(2, 6))))
         return videos
 
@@ -87,7 +146,9 @@ class UESTC(MotionSource):
 
     def _lines(self, name: str) -> list[str]:
         path = self.poses.parent / "info" / name
-        return read_text(required(path, "it is published with the poses; unpack the archive again")).splitlines()
+        return read_text(
+            required(path, "it is published with the poses; unpack the archive again")
+        ).splitlines()
 
     def clips(self, fps: float) -> Iterator[Clip]:
         self.check_fps(fps, FPS)
@@ -100,17 +161,29 @@ class UESTC(MotionSource):
         self.leave_out("videos of view 8, side 2", count - len(self.used))
         for video in self.used:
             with naming(f"{path}: {video.id}", *NO_NUMBERS, what="does not consist of numbers: "):
-                pose, joint, camera = (np.asarray(column[video.index], np.float64) for column in columns)
+                pose, joint, camera = (
+                    np.asarray(column[video.index], np.float64) for column in columns
+                )
                 limit = int(frames[video.index])
-                if pose.shape[1:] != (72,) or joint.shape != (len(pose), 49, 3) or camera.shape != (len(pose), 4):
-                    raise UserError(f"wrong: pose {pose.shape}, joints3d {joint.shape} or orig_cam {camera.shape}")
+                if (
+                    pose.shape[1:] != (72,)
+                    or joint.shape != (len(pose), 49, 3)
+                    or camera.shape != (len(pose), 4)
+                ):
+                    raise UserError(
+                        f"wrong: pose {pose.shape}, joints3d {joint.shape} or orig_cam {camera.shape}"
+                    )
             split, length = self.split(video.subject), min(len(pose), limit)
             if length < (1 if split == "test" else MIN_FRAMES):
-                self.leave_out(f"{'test' if split == 'test' else 'training'} clips that are too short")
+                self.leave_out(
+                    f"{'test' if split == 'test' else 'training'} clips that are too short"
+                )
                 continue
             motion = front_view(pose[:length], joint[:length, ROOT], camera[:length], video)
             attributes = {"subject": video.subject, "view": video.view, "side": video.side}
-            yield Clip(video.id, motion, [], split, f"subject {video.subject}", video.action, attributes)
+            yield Clip(
+                video.id, motion, [], split, f"subject {video.subject}", video.action, attributes
+            )
 
     def split(self, subject: int) -> Split:
         if subject not in TRAIN_SUBJECTS:
@@ -132,6 +205,8 @@ def front_view(pose: np.ndarray, root: np.ndarray, camera: np.ndarray, video: Vi
     shift -= shift[0]
     if video.side != 1:
         turn = Rotation.from_rotvec([0.0, -video.view * math.pi / 4, 0.0])
-        pose = np.concatenate([(turn * Rotation.from_rotvec(pose[:, :3])).as_rotvec(), pose[:, 3:]], 1)
+        pose = np.concatenate(
+            [(turn * Rotation.from_rotvec(pose[:, :3])).as_rotvec(), pose[:, 3:]], 1
+        )
         root, shift = turn.apply(root), turn.apply(shift)
     return np.concatenate([root + shift, pose], 1).astype(np.float32)

@@ -20,7 +20,9 @@ from flame_mdm.representations import Representation
 from flame_mdm.safe_io import read_yaml, write_text
 
 PUBLISHED = Path(__file__).with_name("published.yaml")
-STILL_DISTANCE = 0.01  # meters; a clip in which no joint moves farther from its first position counts as still
+STILL_DISTANCE = (
+    0.01  # meters; a clip in which no joint moves farther from its first position counts as still
+)
 
 
 def report(data: MotionDataModule) -> dict[str, Any]:
@@ -34,9 +36,14 @@ def report(data: MotionDataModule) -> dict[str, Any]:
     lengths = [clip.length for clip in store.clips]
     captions = [caption for clip in store.clips for caption in clip.captions]
     still, duplicates = _anomalies(store, data.representation)
-    mean, std = training_statistics(store.folder, store.clips, len(store.features), data.representation)
+    mean, std = training_statistics(
+        store.folder, store.clips, len(store.features), data.representation
+    )
     content = {
-        **{key: store.info[key] for key in ("dataset", "representation", "fps", "fingerprint", "published_split")},
+        **{
+            key: store.info[key]
+            for key in ("dataset", "representation", "fps", "fingerprint", "published_split")
+        },
         "files": store.info["sha256"],
         "figures": _figures(store),
         "captions": {
@@ -46,7 +53,10 @@ def report(data: MotionDataModule) -> dict[str, Any]:
             "clips without a caption": sum(not clip.captions for clip in store.clips),
         },
         "actions": {
-            name: {split: sum(c.action == number and c.split == split for c in store.clips) for split in SPLITS}
+            name: {
+                split: sum(c.action == number and c.split == split for c in store.clips)
+                for split in SPLITS
+            }
             for number, name in enumerate(store.info["actions"])
         },
         "frames": {
@@ -55,32 +65,46 @@ def report(data: MotionDataModule) -> dict[str, Any]:
             "shortest clip": min(lengths),
             "median clip": float(np.median(lengths)),
             "longest clip": max(lengths),
-            f"clips below the {needed} frames that cropping needs": sum(length < needed for length in lengths),
+            f"clips below the {needed} frames that cropping needs": sum(
+                length < needed for length in lengths
+            ),
         },
         "still": [clip.id for clip in still],
         "duplicates": [[clip.id for clip in group] for group in duplicates],
-        "duplicates_across_splits": sum(len({clip.split for clip in group}) > 1 for group in duplicates),
-        "statistics": {  # those of the store may be published with the data set, so they are compared
+        "duplicates_across_splits": sum(
+            len({clip.split for clip in group}) > 1 for group in duplicates
+        ),
+        # Those of the store may be published with the data set, so they are compared
+        "statistics": {
             "largest difference of a mean, in std": float((np.abs(store.mean - mean) / std).max()),
             "largest relative difference of a std": float(np.abs(store.std / std - 1).max()),
         },
         "excluded": store.info["excluded"],
     }
-    write_text(store.folder / "verify.json", json.dumps(content, indent=2, ensure_ascii=False) + "\n")
+    write_text(
+        store.folder / "verify.json", json.dumps(content, indent=2, ensure_ascii=False) + "\n"
+    )
     return content
 
 
 def lines(content: dict[str, Any]) -> list[str]:
     """Returns the lines of a report as YAML, with the first of many still clips and duplicates."""
     groups = [" = ".join(group) for group in content["duplicates"]]
-    shown = content | {"still": some(content["still"]) or "none", "duplicates": some(groups) or "none"}
-    return yaml.safe_dump(shown, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120).splitlines()
+    shown = content | {
+        "still": some(content["still"]) or "none",
+        "duplicates": some(groups) or "none",
+    }
+    return yaml.safe_dump(
+        shown, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120
+    ).splitlines()
 
 
 def deviations(content: dict[str, Any]) -> list[str]:
     """Returns which figures of a report differ from the published ones, and by how much."""
     differing = [
-        (name, f["found"], f["published"]) for name, f in content["figures"].items() if f["state"] == "differs"
+        (name, f["found"], f["published"])
+        for name, f in content["figures"].items()
+        if f["state"] == "differs"
     ]
     return [
         f"{name}: {count:,} found, {published:,} published ({count - published:+,g}, {count / published - 1:+.2%})"
@@ -99,7 +123,9 @@ def _figures(store: Store) -> dict[str, dict[str, Any]]:
             counted[f"fewest {kind} per action"] = min(counts.values())
             counted[f"most {kind} per action"] = max(counts.values())
     raw: dict[str, float] = store.info.get("counts", {})
-    counted = {f"{name} of the store" if name in raw else name: number for name, number in counted.items()} | raw
+    counted = {
+        f"{name} of the store" if name in raw else name: number for name, number in counted.items()
+    } | raw
     published = read_yaml(PUBLISHED).get(store.info["dataset"], {})
     figures = {}
     for name in published | counted:
@@ -115,7 +141,9 @@ def _figures(store: Store) -> dict[str, dict[str, Any]]:
     return figures
 
 
-def _anomalies(store: Store, representation: Representation) -> tuple[list[Entry], list[list[Entry]]]:
+def _anomalies(
+    store: Store, representation: Representation
+) -> tuple[list[Entry], list[list[Entry]]]:
     """Returns the clips without movement, and groups of clips of bit-identical motions.
 
     Clips that share all their frames are one motion: they differ only in caption. Raises `UserError` if a frame is not
@@ -131,7 +159,9 @@ def _anomalies(store: Store, representation: Representation) -> tuple[list[Entry
         finite = np.isfinite(motion).all(1)
         if not finite.all():
             frame = int(np.argmin(finite))
-            raise UserError(f"{store.folder}: damaged: frame {frame} of clip {clip.id} is not finite; prepare it again")
+            raise UserError(
+                f"{store.folder}: damaged: frame {frame} of clip {clip.id} is not finite; prepare it again"
+            )
         joints = representation.decode(torch.from_numpy(motion))
         if float((joints - joints[:1]).norm(dim=-1).max()) < STILL_DISTANCE:
             still += clips

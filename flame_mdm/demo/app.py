@@ -9,7 +9,11 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-os.environ |= {"GRADIO_ANALYTICS_ENABLED": "False", "HF_HUB_DISABLE_TELEMETRY": "1"}  # read when gradio is imported
+# Read when gradio is imported
+os.environ |= {
+    "GRADIO_ANALYTICS_ENABLED": "False",
+    "HF_HUB_DISABLE_TELEMETRY": "1",
+}
 
 import gradio as gr
 import uvicorn
@@ -26,8 +30,13 @@ from flame_mdm.demo.studio import Studio
 from flame_mdm.demo.studio_page import build_page
 from flame_mdm.errors import UserError, first_line, one_line, say
 
-SESSIONS = 64  # open pages that gradio remembers; it keeps half a megabyte for each, and the page needs none of it
-WRITERS, WAITING_FILES = 2, 32  # motion files that are written at the same time, and those that wait for it
+# Open pages that gradio remembers; it keeps half a megabyte for each, and the page needs none of it
+SESSIONS = 64
+# Motion files that are written at the same time, and those that wait for it
+WRITERS, WAITING_FILES = (
+    2,
+    32,
+)
 FONT, MONO = ("system-ui", "sans-serif"), ("ui-monospace", "monospace")
 
 
@@ -42,15 +51,21 @@ def serve(
     import torch
 
     try:
-        listening = socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+        listening = socket.create_server(
+            (host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET
+        )
     except OSError as error:
-        raise UserError(f"host={host} port={port}: {error.strerror}. Choose another host or port") from error
+        raise UserError(
+            f"host={host} port={port}: {error.strerror}. Choose another host or port"
+        ) from error
     with listening:
         studio = Studio(sources, device or ("cuda" if torch.cuda.is_available() else "cpu"))
         with tempfile.TemporaryDirectory(prefix="flame_mdm_demo_") as folder:
             os.environ["GRADIO_TEMP_DIR"] = folder
             app = web_app(studio, {host, *hosts})
-            say(f"http://{f'[{host}]' if ':' in host else host}:{listening.getsockname()[1]}  (Ctrl+C stops the demo)")
+            say(
+                f"http://{f'[{host}]' if ':' in host else host}:{listening.getsockname()[1]}  (Ctrl+C stops the demo)"
+            )
             Server(server_settings(app, connection_limits(hosts))).run([listening])
 
 
@@ -90,13 +105,16 @@ def web_app(studio: Studio, hosts: Collection[str] = ()) -> Guard:
                 await web.body()  # a disconnection is reported after the body
                 if await web.is_disconnected():
                     return Response(status_code=499)
-                content = await run_in_threadpool(studio.file, request, int(number), extension, options.get("rig"))
+                content = await run_in_threadpool(
+                    studio.file, request, int(number), extension, options.get("rig")
+                )
         except UserError as error:
             return PlainTextResponse(first_line(error), 400)
         finally:
             waiting -= 1
         words = "-".join(re.findall(r"[a-z0-9]+", request.text.lower()))[:60]
-        rig = f"-{options['rig']}" if options.get("rig") else ""  # the name of one of the rigs, as a file was written
+        # The name of one of the rigs, as a file was written
+        rig = f"-{options['rig']}" if options.get("rig") else ""
         name = f"{words or 'motion'}-{int(number) + 1}{rig}{extension}"
         headers = {"Content-Disposition": f'attachment; filename="{name}"'}
         return Response(content, media_type="application/octet-stream", headers=headers)
@@ -125,4 +143,6 @@ def web_app(studio: Studio, hosts: Collection[str] = ()) -> Guard:
         "switch": (direct, lambda data: len(data) == 1 and data[0] in studio.files),
     }
     numbers = {number: calls[fn.name] for number, fn in blocks.fns.items() if fn.name in calls}
-    return Guard(app, hosts, numbers, lambda session: session in blocks._queue.pending_messages_per_session)
+    return Guard(
+        app, hosts, numbers, lambda session: session in blocks._queue.pending_messages_per_session
+    )

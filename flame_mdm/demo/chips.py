@@ -36,7 +36,9 @@ def chips(abilities: Abilities, parts: Sequence[Part], readings: Sequence[Readin
     return f'<p class="chips">{" ".join(rows)}{crossed}</p>' if rows else ""
 
 
-def _step(abilities: Abilities, parts: Sequence[Part], number: int, step: Step, can_change: bool) -> Iterator[str]:
+def _step(
+    abilities: Abilities, parts: Sequence[Part], number: int, step: Step, can_change: bool
+) -> Iterator[str]:
     """Yields the chips of each action of a step."""
     for position, mention in enumerate(step):
         if not can_change:
@@ -46,8 +48,13 @@ def _step(abilities: Abilities, parts: Sequence[Part], number: int, step: Step, 
         def text(changed: Mention, position: int = position) -> str:
             """Returns the text of the form with a changed action."""
             words = caption((*step[:position], changed, *step[position + 1 :]))
-            rows = [(words if row == number else own, seconds) for row, (own, seconds) in enumerate(parts)]
-            return " | ".join(own if seconds is None else f"{own} @{seconds:g}" for own, seconds in rows)
+            rows = [
+                (words if row == number else own, seconds)
+                for row, (own, seconds) in enumerate(parts)
+            ]
+            return " | ".join(
+                own if seconds is None else f"{own} @{seconds:g}" for own, seconds in rows
+            )
 
         others = [mention.action, *(name for name in abilities.actions if name != mention.action)]
         named = [(_with_action(mention, name), predicate(Mention(name))) for name in others]
@@ -55,7 +62,10 @@ def _step(abilities: Abilities, parts: Sequence[Part], number: int, step: Step, 
         for name, values in abilities.choices(mention.action).items():
             stated = mention.attributes.get(name)
             options: list[tuple[str, str]] = [(text(_with(mention, name, None)), f"any {name}")]
-            options += [(text(_with(mention, name, value)), attribute_words(name, value)) for value in values]
+            options += [
+                (text(_with(mention, name, value)), attribute_words(name, value))
+                for value in values
+            ]
             chosen = 0 if stated not in values else 1 + values.index(stated)
             selects.append(_select(name.capitalize(), options, chosen))
         yield " ".join(selects)
@@ -77,5 +87,7 @@ def _with(mention: Mention, name: str, value: Value | None) -> Mention:
 
 def _with_action(mention: Mention, action: str) -> Mention:
     takes = actions()[action].takes
-    kept = {name: value for name, value in mention.attributes.items() if name in takes and name in SHOWN}
+    kept = {
+        name: value for name, value in mention.attributes.items() if name in takes and name in SHOWN
+    }
     return replace(mention, action=action, attributes=kept)

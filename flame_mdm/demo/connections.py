@@ -61,8 +61,12 @@ class Connection(H11Protocol):
         self.network = _network(self.client[0]) if self.client else None
         self._watch()
 
-        others = [connection for connection in self.connections if isinstance(connection, Connection)]
-        self._make_room([other for other in others if other.network == self.network], self.limits.per_address)
+        others = [
+            connection for connection in self.connections if isinstance(connection, Connection)
+        ]
+        self._make_room(
+            [other for other in others if other.network == self.network], self.limits.per_address
+        )
         self._make_room(others, self.limits.total)
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -112,7 +116,11 @@ class Connection(H11Protocol):
         if excess <= 0:
             return
 
-        deadlines = [(other.deadline.when(), other) for other in group if other.deadline and other is not self]
+        deadlines = [
+            (other.deadline.when(), other)
+            for other in group
+            if other.deadline and other is not self
+        ]
         closed = sorted(deadlines, key=lambda pair: pair[0])[:excess]
         for _, other in closed:
             other.close()

@@ -105,15 +105,24 @@ class Guard:
 
         async def send_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
-                kept = [(k, v) for k, v in message.get("headers", ()) if not k.lower().startswith(b"access-control")]
-                message["headers"] = [*kept, *((k.lower().encode(), v.encode()) for k, v in HEADERS.items())]
+                kept = [
+                    (k, v)
+                    for k, v in message.get("headers", ())
+                    if not k.lower().startswith(b"access-control")
+                ]
+                message["headers"] = [
+                    *kept,
+                    *((k.lower().encode(), v.encode()) for k, v in HEADERS.items()),
+                ]
             await send(message)
 
         try:
             headers = Headers(scope=scope)
             self._check_sender(headers, scope["path"])
             if scope["method"] == "POST" and headers.get("content-type") != "application/json":
-                raise HTTPException(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "this is not a request of this page")
+                raise HTTPException(
+                    HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "this is not a request of this page"
+                )
             body = await _body(Request(scope, receive))
             self._check_content(scope, body)
         except HTTPException as refusal:
@@ -145,12 +154,21 @@ class Guard:
         origin = headers.get("origin", f"http://{host}")
         # a proxy may have replaced the host, but not the origin
         same = _network_location(origin) == host.lower() or _host_name(origin) in self.hosts
-        if not same or (path != "/" and headers.get("sec-fetch-site", "none") not in ("same-origin", "none")):
-            raise HTTPException(HTTPStatus.FORBIDDEN, "this request comes from a page of another site")
+        if not same or (
+            path != "/" and headers.get("sec-fetch-site", "none") not in ("same-origin", "none")
+        ):
+            raise HTTPException(
+                HTTPStatus.FORBIDDEN, "this request comes from a page of another site"
+            )
 
     def _check_content(self, scope: Scope, body: bytes) -> None:
         method, path = scope["method"], scope["path"]
-        if method in ("GET", "HEAD") and len(path) <= MAX_PATH and READ.fullmatch(path) and not body:
+        if (
+            method in ("GET", "HEAD")
+            and len(path) <= MAX_PATH
+            and READ.fullmatch(path)
+            and not body
+        ):
             if path == STREAM:
                 self._check_session(QueryParams(scope["query_string"]))
             return
@@ -159,7 +177,9 @@ class Guard:
         try:
             content = POSTS[path].model_validate_json(body)
         except ValidationError as error:
-            raise HTTPException(HTTPStatus.BAD_REQUEST, "this is not a request of this page") from error
+            raise HTTPException(
+                HTTPStatus.BAD_REQUEST, "this is not a request of this page"
+            ) from error
         if isinstance(content, Call):
             address, accepts = self.calls.get(content.fn_index, ("", bool))
             if address != path or not accepts(content.data):
@@ -178,11 +198,15 @@ async def _body(request: Request) -> bytes:
             async for part in request.stream():
                 body += part
                 if len(body) > MAX_BODY:
-                    raise HTTPException(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "this request is too large")
+                    raise HTTPException(
+                        HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "this request is too large"
+                    )
     except ClientDisconnect as error:
         raise HTTPException(HTTPStatus.BAD_REQUEST, "the request is incomplete") from error
     except TimeoutError as error:
-        raise HTTPException(HTTPStatus.REQUEST_TIMEOUT, "the request took too long to arrive") from error
+        raise HTTPException(
+            HTTPStatus.REQUEST_TIMEOUT, "the request took too long to arrive"
+        ) from error
     return bytes(body)
 
 

@@ -5,12 +5,27 @@ from collections.abc import Iterable
 from typing import Annotated, Any, Literal
 from urllib.parse import parse_qsl, urlencode
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, StringConstraints, ValidationError
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    StringConstraints,
+    ValidationError,
+)
 
 from flame_mdm.errors import UserError, did_you_mean, one_line, shortened
 from flame_mdm.sampling.motion_request import path_targets, read_parts, read_path
 
-MAX_TEXT, MAX_SECONDS, MAX_SAMPLES, MAX_STEPS, MAX_EDITS = 300, 30, 4, 1000, 8  # limits of a request
+# Limits of a request
+MAX_TEXT, MAX_SECONDS, MAX_SAMPLES, MAX_STEPS, MAX_EDITS = (
+    300,
+    30,
+    4,
+    1000,
+    8,
+)
 MAX_SEED = 2**31 - 1
 MAX_FIELDS = 50  # of a query string
 MAX_WAY_POINTS, FAR = 16, 20.0  # a path: way points, and meters along x and z
@@ -21,7 +36,9 @@ PLAIN = r"^[^\x00-\x1f\x7f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]*$"
 Text = Annotated[str, StringConstraints(strip_whitespace=True, max_length=MAX_TEXT, pattern=PLAIN)]
 Samples = Annotated[int, Field(ge=1, le=MAX_SAMPLES)]
 Seed = Annotated[int, Field(ge=0, le=MAX_SEED)]
-Part = Literal["left_arm", "right_arm", "left_leg", "right_leg", "arms", "legs", "upper_body", "lower_body"]
+Part = Literal[
+    "left_arm", "right_arm", "left_leg", "right_leg", "arms", "legs", "upper_body", "lower_body"
+]
 Coordinate = Annotated[float, Field(ge=-FAR, le=FAR)]
 RULES = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -84,7 +101,9 @@ class DemoRequest(BaseModel):
 
     def steps(self, kind: str) -> list[tuple[int | None, dict[str, Any]]]:
         """Returns (number of the motion to edit, None at first; keywords of `generate` or `edit`) for each step."""
-        shared = self.model_dump(include={"guidance_scale", "num_inference_steps", "sampler"}, exclude_none=True)
+        shared = self.model_dump(
+            include={"guidance_scale", "num_inference_steps", "sampler"}, exclude_none=True
+        )
         path = {"targets": self.targets(kind)} if self.path else {}
         split = {} if self.split else {"split": False}
 
@@ -98,20 +117,27 @@ class DemoRequest(BaseModel):
             options = {"region_seconds", "joints", "strength"}
             editing = part.model_dump(mode="json", include=options, exclude_defaults=True)
             if editing.keys() == {"strength"}:
-                steps.append((part.motion, keywords(part, part.text or self.text, **editing, **path)))
+                steps.append(
+                    (part.motion, keywords(part, part.text or self.text, **editing, **path))
+                )
             else:
                 steps.append((part.motion, keywords(part, part.text, **editing)))
-        if self.cleanup and not self.path:  # cleanup moves the root off the way points, by 0.3 m in one example
+        # Cleanup moves the root off the way points, by 0.3 m in one example
+        if self.cleanup and not self.path:
             steps[-1][1]["cleanup"] = True
         return steps
 
     def python(self, kind: str, device: str) -> str:
         model, _, adapter = self.model.partition(PLUS)
-        options = ("" if device == "cpu" else f", {device!r}") + (f", adapter={adapter!r}" if adapter else "")
+        options = ("" if device == "cpu" else f", {device!r}") + (
+            f", adapter={adapter!r}" if adapter else ""
+        )
         lines = ["import flame_mdm", "", f"model = flame_mdm.load({model!r}{options})"]
         for source, keywords in self.steps(kind):
             call = "generate(model" if source is None else f"edit(model, motions[{source}]"
-            lines.append(f"motions = flame_mdm.{call}, {', '.join(f'{k}={v!r}' for k, v in keywords.items())})")
+            lines.append(
+                f"motions = flame_mdm.{call}, {', '.join(f'{k}={v!r}' for k, v in keywords.items())})"
+            )
         return "\n".join([*lines, 'motions[0].save("motion.bvh")  # or .glb, .npz, .mp4'])
 
 
@@ -133,7 +159,9 @@ def parse_query(pairs: Iterable[tuple[str, str]]) -> DemoRequest:
             try:
                 edits.append(json.loads(value))
             except (ValueError, RecursionError):
-                raise UserError(f"edit={_shown(value)}: not an edit of this page. Copy the whole link") from None
+                raise UserError(
+                    f"edit={_shown(value)}: not an edit of this page. Copy the whole link"
+                ) from None
         elif key in values:
             raise UserError(f"{_shown(key)} is given twice. Remove one")
         elif not key.startswith("__"):
@@ -144,14 +172,18 @@ def parse_query(pairs: Iterable[tuple[str, str]]) -> DemoRequest:
 def checked(values: dict[str, Any]) -> DemoRequest:
     """Returns a request; empty values are left to the defaults. A `UserError` quotes the invalid value."""
     try:
-        return DemoRequest(**{key: value for key, value in values.items() if value not in (None, "")})
+        return DemoRequest(
+            **{key: value for key, value in values.items() if value not in (None, "")}
+        )
     except ValidationError as error:
         first: Any = error.errors()[0]
         if first["type"] == "value_error":  # of `read_path`
             raise first["ctx"]["error"] from None
         name = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
-            raise UserError(f"unknown option {_shown(name)}.{did_you_mean(name, DemoRequest.model_fields)}") from None
+            raise UserError(
+                f"unknown option {_shown(name)}.{did_you_mean(name, DemoRequest.model_fields)}"
+            ) from None
         raise UserError(f"{name}={_shown(first['input'])}: {first['msg'].lower()}") from None
 
 

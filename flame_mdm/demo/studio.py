@@ -21,15 +21,17 @@ from flame_mdm.sampling.generation import generate
 from flame_mdm.sampling.motion_request import SamplingRequest, read_parts
 from flame_mdm.sampling.resolution import resolve
 
-KEPT = 64  # number of requests whose motions stay in memory; a download or an edit of them needs no model
+# Number of requests whose motions stay in memory; a download or an edit of them needs no model
+KEPT = 64
 TIME_LIMIT = 300.0  # maximum number of seconds of one request on the model
+# Files to download, and their names on the page
 FORMATS = {
     ".bvh": "BVH",
     ".fbx": "FBX",
     ".glb": "GLB",
     ".npz": "NPZ",
     ".mp4": "MP4",
-}  # files to download, and their names on the page
+}
 
 
 class Studio:
@@ -47,13 +49,16 @@ class Studio:
     def model(self, name: str) -> MotionGenerator:
         if name not in self.files:
             near = did_you_mean(name, self.files)
-            raise UserError(f"unknown model {name[:60]!r}.{near} This page has: {', '.join(self.files)}")
+            raise UserError(
+                f"unknown model {name[:60]!r}.{near} This page has: {', '.join(self.files)}"
+            )
         if name not in self._models:
             adapter = name.partition(PLUS)[2]
             model = load(self.files[name], self.device, adapter=[adapter] if adapter else ())
             if model.conditioned_on == "text" and Reader.fits(model.facts):
                 reader = self._readers[name] = Reader(model.facts)
-                for action in reader.abilities.actions:  # so that the first answer does not wait for its tables
+                # So that the first answer does not wait for its tables
+                for action in reader.abilities.actions:
                     reader.abilities.choices(action)
             self._models[name] = model
         return self._models[name]
@@ -64,7 +69,10 @@ class Studio:
         return self._readers.get(name)
 
     def motions(
-        self, request: DemoRequest, report: Callable[[int], None] = lambda calls: None, stop: Event | None = None
+        self,
+        request: DemoRequest,
+        report: Callable[[int], None] = lambda calls: None,
+        stop: Event | None = None,
     ) -> Sequence[Motion]:
         """Returns the motions of a request, from memory if possible; `report` gets the number of network calls."""
         with self._working:
@@ -77,7 +85,9 @@ class Studio:
                 if stop is not None and stop.is_set():
                     raise UserError("canceled")
                 if time.monotonic() > deadline:
-                    raise UserError(f"stopped after {TIME_LIMIT:g} seconds. Take fewer steps, samples or seconds")
+                    raise UserError(
+                        f"stopped after {TIME_LIMIT:g} seconds. Take fewer steps, samples or seconds"
+                    )
                 report(calls)
                 calls += 1
 
@@ -124,19 +134,29 @@ class Studio:
             return []
         texts = [part.text for part in (request, *request.edits) if part.text]
         parts = dict.fromkeys(words for text in texts for words, _ in read_parts(text))
-        return [line for words in parts for line in advice(words, model.facts, model.condition.max_words)]
+        return [
+            line
+            for words in parts
+            for line in advice(words, model.facts, model.condition.max_words)
+        ]
 
-    def file(self, request: DemoRequest, number: int, extension: str, rig: str | None = None) -> bytes:
+    def file(
+        self, request: DemoRequest, number: int, extension: str, rig: str | None = None
+    ) -> bytes:
         """Returns the bytes of a file of motion `number`, from memory, so that it waits for nobody's request."""
         if extension not in FORMATS:
-            raise UserError(f"{one_line(extension[:20])}: not a format of this page. Use {', '.join(FORMATS)}")
+            raise UserError(
+                f"{one_line(extension[:20])}: not a format of this page. Use {', '.join(FORMATS)}"
+            )
         motions = None
         if model := self._models.get(request.model):
             steps, cleanup = _plan(model, request)
             with self._memory:
                 motions = self._made.get((request.model, repr(steps)))
         if model is None or motions is None:
-            raise UserError("this motion is not in memory. Open its link, and download it from there")
+            raise UserError(
+                "this motion is not in memory. Open its link, and download it from there"
+            )
         motion = _numbered(_cleaned(model, motions) if cleanup else motions, number)
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder, f"motion{extension}")
@@ -153,7 +173,9 @@ def _numbered(motions: Sequence[Motion], number: int) -> Motion:
     return motions[number]
 
 
-def _plan(model: MotionGenerator, request: DemoRequest) -> tuple[list[tuple[int | None, dict[str, Any]]], bool]:
+def _plan(
+    model: MotionGenerator, request: DemoRequest
+) -> tuple[list[tuple[int | None, dict[str, Any]]], bool]:
     if model.conditioned_on != "none" and not request.text:
         raise UserError("the text is empty. Describe what the person does")
     check_length(request)

@@ -29,7 +29,16 @@ from flame_mdm.visualize import player_page
 from flame_mdm.visualize.render import thumbnail
 
 QUEUE = 64  # maximum number of waiting requests; further ones are told to come back
-FORM = ["model", "text", "seconds", "seed", "samples", "guidance_scale", "num_inference_steps", "sampler"]
+FORM = [
+    "model",
+    "text",
+    "seconds",
+    "seed",
+    "samples",
+    "guidance_scale",
+    "num_inference_steps",
+    "sampler",
+]
 FORM += ["cleanup", "split", "path"]
 PARTS = ("left_arm", "right_arm", "left_leg", "right_leg", "upper_body", "lower_body")
 RIGGED = (".bvh", ".fbx", ".glb")
@@ -94,8 +103,14 @@ def build_page(studio: Studio) -> gr.Blocks:
         ui = _layout(studio)
         fields = [vars(ui)[name] for name in FORM]
         edit = [ui.query, ui.chosen, ui.new, ui.begin, ui.end, ui.parts, ui.again]
-        quick: dict[str, Any] = {"queue": False, "show_progress": "hidden", "api_visibility": "private"}
-        read, compose = (f"(...values) => links.{name}({FORM}, values)" for name in ("read", "compose"))
+        quick: dict[str, Any] = {
+            "queue": False,
+            "show_progress": "hidden",
+            "api_visibility": "private",
+        }
+        read, compose = (
+            f"(...values) => links.{name}({FORM}, values)" for name in ("read", "compose")
+        )
         calls = ("links.change", "links.vary", "editor")
         change, vary, sketch = (f"(...values) => {name}(...values)" for name in calls)
         first = [
@@ -104,11 +119,20 @@ def build_page(studio: Studio) -> gr.Blocks:
             ui.text.submit(None, fields, ui.request, js=compose, **quick),
             ui.apply.click(None, edit, ui.request, js=change, **quick),
             ui.new.submit(None, edit, ui.request, js=change, **quick),
-            ui.variations.click(None, [ui.query, ui.chosen, ui.again], ui.request, js=vary, **quick),
+            ui.variations.click(
+                None, [ui.query, ui.chosen, ui.again], ui.request, js=vary, **quick
+            ),
         ]
         outputs = [ui.player, ui.notes, ui.query, ui.files, ui.python, ui.chosen, ui.text]
-        run: dict[str, Any] = {"show_progress_on": ui.player, "concurrency_limit": 1, "concurrency_id": "model"}
-        running = [event.then(show, ui.request, outputs, api_visibility="private", **run) for event in first]
+        run: dict[str, Any] = {
+            "show_progress_on": ui.player,
+            "concurrency_limit": 1,
+            "concurrency_id": "model",
+        }
+        running = [
+            event.then(show, ui.request, outputs, api_visibility="private", **run)
+            for event in first
+        ]
         for event in running:
             event.then(None, ui.query, ui.link, js=SHOW_LINK, **quick)
         ui.cancel.click(halt, None, ui.notes, cancels=running, **quick)
@@ -131,11 +155,18 @@ def _layout(studio: Studio) -> SimpleNamespace:
     ui.examples = gr.HTML(_buttons(examples), elem_id="examples")
     with gr.Row(elem_id="stage"):
         with gr.Column(elem_id="ask"):
-            options: dict[str, Any] = {"max_length": MAX_TEXT, "lines": 2, "autofocus": True, "elem_id": "text"}
+            options: dict[str, Any] = {
+                "max_length": MAX_TEXT,
+                "lines": 2,
+                "autofocus": True,
+                "elem_id": "text",
+            }
             ui.text = gr.Textbox(next(iter(examples)), label="What the person does", **options)
             gr.HTML(EDITORS, js_on_load="editor()")
             label = "Way points: meters to the left, meters ahead"
-            ui.path = gr.Textbox(label=label, placeholder="0,1 0.5,2", max_length=MAX_TEXT, elem_id="path")
+            ui.path = gr.Textbox(
+                label=label, placeholder="0,1 0.5,2", max_length=MAX_TEXT, elem_id="path"
+            )
             with gr.Row():
                 ui.go = gr.Button("Generate", variant="primary", min_width=90, elem_id="go")
                 ui.cancel = gr.Button("Cancel", min_width=90)
@@ -151,7 +182,11 @@ def _layout(studio: Studio) -> SimpleNamespace:
             with gr.Accordion("Model and sampling", open=len(names) > 1):
                 ui.model = gr.Dropdown(names, value=names[0], label="Model")
                 with gr.Row():
-                    number: dict[str, Any] = {"placeholder": "model's", "max_length": 9, "min_width": 90}
+                    number: dict[str, Any] = {
+                        "placeholder": "model's",
+                        "max_length": 9,
+                        "min_width": 90,
+                    }
                     ui.guidance_scale = gr.Textbox(label="Guidance", **number)
                     ui.num_inference_steps = gr.Textbox(label="Steps", **number)
                     ui.sampler = gr.Dropdown(samplers, value=None, label="Sampler", min_width=120)
@@ -164,24 +199,34 @@ def _layout(studio: Studio) -> SimpleNamespace:
         gr.Markdown("Choose a time, body parts, or both. They change; everything else is kept.")
         ui.chosen = gr.Radio([("1", 0)], value=0, label="Motion to edit", visible=False)
         with gr.Row():
-            ui.begin = gr.Textbox(label="Change from second", placeholder="start", max_length=9, min_width=120)
+            ui.begin = gr.Textbox(
+                label="Change from second", placeholder="start", max_length=9, min_width=120
+            )
             ui.end = gr.Textbox(label="to second", placeholder="end", max_length=9, min_width=120)
-            ui.parts = gr.Dropdown(PARTS, multiselect=True, label="Body parts that change", min_width=220)
+            ui.parts = gr.Dropdown(
+                PARTS, multiselect=True, label="Body parts that change", min_width=220
+            )
         with gr.Row():
-            ui.new = gr.Textbox(label="What the person does there", max_length=MAX_TEXT, scale=3, min_width=220)
+            ui.new = gr.Textbox(
+                label="What the person does there", max_length=MAX_TEXT, scale=3, min_width=220
+            )
             ui.again = gr.Number(0, label="Seed", precision=0, min_width=90)
         with gr.Row():
             ui.apply = gr.Button("Change")
             ui.variations = gr.Button("Three variations of the whole motion")
     with gr.Accordion("The same motion by link and Python", open=False, elem_id="same"):
         ui.link = gr.Textbox(label="Link", interactive=False, buttons=["copy"], elem_id="link")
-        ui.python = gr.Code(label="Python", language="python", lines=2, interactive=False, wrap_lines=True)
+        ui.python = gr.Code(
+            label="Python", language="python", lines=2, interactive=False, wrap_lines=True
+        )
     ui.request = gr.Textbox(visible="hidden", elem_id="request")
     ui.query = gr.Textbox(visible="hidden", elem_id="query")
     return ui
 
 
-def _result(ui: SimpleNamespace, studio: Studio, request: DemoRequest, motions: Sequence[Motion]) -> dict[Any, Any]:
+def _result(
+    ui: SimpleNamespace, studio: Studio, request: DemoRequest, motions: Sequence[Motion]
+) -> dict[Any, Any]:
     kind = studio.model(request.model).conditioned_on
     names = [f"Motion {number + 1}" if len(motions) > 1 else "" for number in range(len(motions))]
     scene = [replace(motion, id=name) for motion, name in zip(motions, names, strict=True)]
@@ -193,8 +238,14 @@ def _result(ui: SimpleNamespace, studio: Studio, request: DemoRequest, motions: 
     for number in range(len(motions)):
         address = f"?{escape(request.query())}&amp;motion={number}"
         files = [(f"motion{extension}{address}", name) for extension, name in FORMATS.items()]
-        programs = [(f"motion.{ending}{address}{rig}", name) for name, (ending, rig) in PROGRAMS.items()]
-        rigs = [(f"motion{end}{address}&amp;rig={rig}", f"{rig} {end[1:]}") for rig in presets() for end in RIGGED]
+        programs = [
+            (f"motion.{ending}{address}{rig}", name) for name, (ending, rig) in PROGRAMS.items()
+        ]
+        rigs = [
+            (f"motion{end}{address}&amp;rig={rig}", f"{rig} {end[1:]}")
+            for rig in presets()
+            for end in RIGGED
+        ]
         links += f"<div>{names[number]} For {_links(programs)}</div>"
         links += f"<div>Files {_links(files)}</div>"
         links += f"<details><summary>More</summary><div>{_links(rigs)}</div></details>"
@@ -207,7 +258,9 @@ def _result(ui: SimpleNamespace, studio: Studio, request: DemoRequest, motions: 
         ui.query: request.query(),
         ui.files: links,
         ui.python: request.python(kind, studio.device),
-        ui.chosen: gr.Radio([(str(k + 1), k) for k in range(len(motions))], value=0, visible=len(motions) > 1),
+        ui.chosen: gr.Radio(
+            [(str(k + 1), k) for k in range(len(motions))], value=0, visible=len(motions) > 1
+        ),
     }
 
 
@@ -224,7 +277,9 @@ def _understood(studio: Studio, request: DemoRequest) -> str:
 
 def _refusal(error: NotUnderstood) -> str:
     """Returns the message about a text without a known action; the nearest actions are buttons with pictures."""
-    message = f'<p class="error" role="alert">{escape(one_line(error.message))}. Nearest in meaning:</p>'
+    message = (
+        f'<p class="error" role="alert">{escape(one_line(error.message))}. Nearest in meaning:</p>'
+    )
     return f'{message}<p class="nearest">{_buttons({text: _still(text) for text in error.nearest})}</p>'
 
 
@@ -237,7 +292,11 @@ def _still(text: str) -> str:
 
 def _note(kind: str, line: str) -> str:
     """Returns a message; a suggested text is a button that replaces the text of the form."""
-    shown = re.sub(r"Did you mean &#x27;(.+?)&#x27;\?$", r'<button type="button">\1</button>', escape(one_line(line)))
+    shown = re.sub(
+        r"Did you mean &#x27;(.+?)&#x27;\?$",
+        r'<button type="button">\1</button>',
+        escape(one_line(line)),
+    )
     alert = ' role="alert"' if kind == "error" else ""
     return f'<p class="{kind}"{alert}>{shown}</p>'
 
@@ -250,10 +309,18 @@ def _examples(model: MotionGenerator) -> dict[str, str]:
     """Returns texts or actions of the training data, and the address of a picture of each; "" = no picture."""
     if model.facts.get("dataset") == "synthetic" and model.conditioned_on == "text":
         actions = {str(attributes["action"]): text for text, attributes in reversed(prompts())}
-        texts = [text for action, text in reversed(actions.items()) if action in model.facts["actions"]]
+        texts = [
+            text for action, text in reversed(actions.items()) if action in model.facts["actions"]
+        ]
         return {text: _picture(text) for text in texts[:: -(-len(texts) // EXAMPLES)]}
-    texts = list(model.facts["actions"] if model.conditioned_on == "action" else model.facts.get("captions", ()))
-    return {one_line(text): "" for text in texts[:: max(1, len(texts) // 6)][:6]} or {"a person walks": ""}
+    texts = list(
+        model.facts["actions"]
+        if model.conditioned_on == "action"
+        else model.facts.get("captions", ())
+    )
+    return {one_line(text): "" for text in texts[:: max(1, len(texts) // 6)][:6]} or {
+        "a person walks": ""
+    }
 
 
 @cache
@@ -264,10 +331,16 @@ def _picture(prompt: str) -> str:
 
 def _buttons(examples: Mapping[str, str]) -> str:
     image = '<img src="{}" alt="">'
-    texts = (f"{picture and image.format(picture)}{escape(text)}" for text, picture in examples.items())
+    texts = (
+        f"{picture and image.format(picture)}{escape(text)}" for text, picture in examples.items()
+    )
     return "".join(f'<button type="button">{text}</button>' for text in texts)
 
 
 def _vocabulary(model: MotionGenerator) -> str:
-    words = model.facts["actions"] if model.conditioned_on == "action" else model.facts.get("vocabulary", ())
+    words = (
+        model.facts["actions"]
+        if model.conditioned_on == "action"
+        else model.facts.get("vocabulary", ())
+    )
     return ", ".join(map(markdown_text, words)) or "The model does not list them."

@@ -45,14 +45,22 @@ class FLAME(Denoiser):
         super().__init__()
         if type(length_unit) is not int or length_unit < 1:
             raise UserError(f"length_unit is {length_unit}: choose a number of frames, 1 or more")
-        self.max_frames, self.condition_frames, self.length_unit = max_frames, condition_frames, length_unit
+        self.max_frames, self.condition_frames, self.length_unit = (
+            max_frames,
+            condition_frames,
+            length_unit,
+        )
         # A table of max_frames rows is enough for the lengths 1 to max_frames: row 0, which the authors' code never
         # reads, is used for the longest motion.
         self.length_embedding = nn.Embedding(max_frames, latent_dim) if length_token else None
         self.input = nn.Linear(in_features, latent_dim)
         self.pooled_projection = nn.Linear(cond_features, latent_dim) if cond_features else None
-        self.token_projection = nn.Linear(cond_features, latent_dim) if cond_features and cross_attention else None
-        self.transformer = Transformer(latent_dim, ff_size, num_layers, num_heads, dropout, nn.ReLU, cross_attention)
+        self.token_projection = (
+            nn.Linear(cond_features, latent_dim) if cond_features and cross_attention else None
+        )
+        self.transformer = Transformer(
+            latent_dim, ff_size, num_layers, num_heads, dropout, nn.ReLU, cross_attention
+        )
         self.output = nn.Linear(latent_dim, out_features)
 
     def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
@@ -70,14 +78,23 @@ class FLAME(Denoiser):
         if self.pooled_projection is not None:
             prefix.append(self.pooled_projection(cond.pooled))
         if self.condition_frames:
-            x = x + (prefix[-1] if self.pooled_projection is None else prefix[-1] + prefix[-2])[:, None]
+            x = (
+                x
+                + (prefix[-1] if self.pooled_projection is None else prefix[-1] + prefix[-2])[
+                    :, None
+                ]
+            )
         prefix = torch.stack(prefix, 1)
         memory, memory_mask = prefix, None
         if self.token_projection is not None:
             memory = torch.cat([prefix, self.token_projection(cond.tokens)], 1)
-            memory_mask = None if cond.token_mask is None else with_prefix(cond.token_mask, prefix.shape[1])
+            memory_mask = (
+                None if cond.token_mask is None else with_prefix(cond.token_mask, prefix.shape[1])
+            )
         x = torch.cat([prefix, x], 1)
-        x = x + cosine_first_sinusoid(torch.arange(x.shape[1], device=x.device), x.shape[-1]).to(x_t.dtype)
+        x = x + cosine_first_sinusoid(torch.arange(x.shape[1], device=x.device), x.shape[-1]).to(
+            x_t.dtype
+        )
         x = self.transformer(x, with_prefix(mask, prefix.shape[1]), memory, memory_mask)
         return self.output(x[:, prefix.shape[1] :]) * mask[..., None]
 
@@ -85,6 +102,8 @@ class FLAME(Denoiser):
 def cosine_first_sinusoid(position: Tensor, features: int) -> Tensor:
     """Embeds positions or times (N,) as (N, features) float32: cosines in the first half, sines in the second."""
     half = features // 2
-    frequency = torch.exp(-math.log(10000.0) * torch.arange(half, device=position.device, dtype=torch.float32) / half)
+    frequency = torch.exp(
+        -math.log(10000.0) * torch.arange(half, device=position.device, dtype=torch.float32) / half
+    )
     angle = position.float()[:, None] * frequency
     return torch.cat([angle.cos(), angle.sin()], -1)

@@ -41,5 +41,7 @@ class MDMGRU(Denoiser):
         frames = x_t.shape[1]
         token = self.condition(t, cond.pooled)[:, None].expand(-1, frames, -1)
         x = self.input(torch.cat([x_t, token], -1))
-        x = self.dropout(x + sinusoid(torch.arange(frames, device=x.device), x.shape[-1]).to(x_t.dtype))
+        x = self.dropout(
+            x + sinusoid(torch.arange(frames, device=x.device), x.shape[-1]).to(x_t.dtype)
+        )
         return self.output(self.gru(x)[0])

@@ -58,7 +58,11 @@ class Attention(nn.Module):
             key, value = heads(functional.linear(memory, weight[size:], bias[size:]), 2)
         mask = None if mask is None else mask[:, None, None]
         dropout = self.dropout if self.training else 0.0
-        return self.out(self.attend(query, key, value, attn_mask=mask, dropout_p=dropout).transpose(1, 2).flatten(2))
+        return self.out(
+            self.attend(query, key, value, attn_mask=mask, dropout_p=dropout)
+            .transpose(1, 2)
+            .flatten(2)
+        )
 
 
 class TransformerLayer(nn.Module):
@@ -79,12 +83,17 @@ class TransformerLayer(nn.Module):
         self.cross_attention = Attention(features, num_heads, dropout) if cross_attention else None
         self.cross_norm = nn.LayerNorm(features) if cross_attention else None
         self.feed_forward = nn.Sequential(
-            nn.Linear(features, ff_size), activation(), nn.Dropout(dropout), nn.Linear(ff_size, features)
+            nn.Linear(features, ff_size),
+            activation(),
+            nn.Dropout(dropout),
+            nn.Linear(ff_size, features),
         )
         self.feed_forward_norm = nn.LayerNorm(features)
         self.dropout = nn.Dropout(dropout)
 
-    def forward(self, x: Tensor, mask: Tensor | None, memory: Tensor | None, memory_mask: Tensor | None) -> Tensor:
+    def forward(
+        self, x: Tensor, mask: Tensor | None, memory: Tensor | None, memory_mask: Tensor | None
+    ) -> Tensor:
         x = self.self_norm(x + self.dropout(self.self_attention(x, mask)))
         if self.cross_attention is not None and self.cross_norm is not None:
             x = self.cross_norm(x + self.dropout(self.cross_attention(x, memory_mask, memory)))
@@ -109,7 +118,11 @@ class Transformer(nn.Module):
         self.layers = nn.ModuleList(TransformerLayer(*options) for _ in range(num_layers))
 
     def forward(
-        self, x: Tensor, mask: Tensor | None, memory: Tensor | None = None, memory_mask: Tensor | None = None
+        self,
+        x: Tensor,
+        mask: Tensor | None,
+        memory: Tensor | None = None,
+        memory_mask: Tensor | None = None,
     ) -> Tensor:
         """Transforms x (B, N, C), with memory (B, S, C) for a decoder; masks (B, N) and (B, S), None = all real."""
         for layer in self.layers:
@@ -126,10 +139,18 @@ class TimeAndCondition(nn.Module):
     def __init__(self, features: int, cond_features: int, project_condition: bool):
         super().__init__()
         if cond_features and not project_condition and cond_features != features:
-            raise UserError(f"project_condition=false needs latent_dim={cond_features}, the width of the condition")
+            raise UserError(
+                f"project_condition=false needs latent_dim={cond_features}, the width of the condition"
+            )
         self.features, self.cond_features = features, cond_features
-        self.time_embedding = nn.Sequential(nn.Linear(features, features), nn.SiLU(), nn.Linear(features, features))
-        self.projection = nn.Linear(cond_features, features) if cond_features and project_condition else nn.Identity()
+        self.time_embedding = nn.Sequential(
+            nn.Linear(features, features), nn.SiLU(), nn.Linear(features, features)
+        )
+        self.projection = (
+            nn.Linear(cond_features, features)
+            if cond_features and project_condition
+            else nn.Identity()
+        )
 
     def time(self, t: Tensor) -> Tensor:
         """Embeds times (B,) as (B, features)."""

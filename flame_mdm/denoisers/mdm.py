@@ -41,7 +41,11 @@ class MDMEncoder(Denoiser):
         condition_frames: bool = False,
     ):
         super().__init__()
-        self.max_tokens, self.mask_padding, self.condition_frames = max_tokens, mask_padding, condition_frames
+        self.max_tokens, self.mask_padding, self.condition_frames = (
+            max_tokens,
+            mask_padding,
+            condition_frames,
+        )
         self.condition = TimeAndCondition(latent_dim, cond_features, project_condition)
         self.input = nn.Linear(in_features, latent_dim)
         self.dropout = nn.Dropout(dropout)
@@ -53,13 +57,18 @@ class MDMEncoder(Denoiser):
         if self.max_tokens:
             tokens, token_mask = condition_tokens(cond)
             if tokens.shape[1] > self.max_tokens:
-                raise UserError(f"denoiser.max_tokens={self.max_tokens}: give at least {tokens.shape[1]}")
-            prefix = torch.cat([self.condition.time(t)[:, None], self.condition.projection(tokens)], 1)
+                raise UserError(
+                    f"denoiser.max_tokens={self.max_tokens}: give at least {tokens.shape[1]}"
+                )
+            prefix = torch.cat(
+                [self.condition.time(t)[:, None], self.condition.projection(tokens)], 1
+            )
         else:
             prefix = self.condition(t, cond.pooled)[:, None]
         size = prefix.shape[1]
         positions = torch.arange(1 + self.max_tokens + x_t.shape[1], device=x_t.device)
-        positions = torch.cat([positions[:size], positions[1 + self.max_tokens :]])  # frames keep theirs
+        # Frames keep theirs
+        positions = torch.cat([positions[:size], positions[1 + self.max_tokens :]])
         frames = self.input(x_t)
         x = torch.cat([prefix, frames + prefix[:, :1] if self.condition_frames else frames], 1)
         x = self.dropout(x + sinusoid(positions, x.shape[-1]).to(x_t.dtype))
@@ -107,10 +116,18 @@ class MDMDecoder(Denoiser):
     ):
         super().__init__()
         if memory == "concat" and not token_memory:
-            raise UserError("denoiser.memory=concat: a token of the time needs the other tokens. Set token_memory=true")
+            raise UserError(
+                "denoiser.memory=concat: a token of the time needs the other tokens. Set token_memory=true"
+            )
         if type(context_frames) is not int or context_frames < 0:
-            raise UserError(f"denoiser.context_frames={context_frames}: give the number of frames, 0 or more")
-        self.input_token, self.mask_padding, self.context_frames = input_token, mask_padding, context_frames
+            raise UserError(
+                f"denoiser.context_frames={context_frames}: give the number of frames, 0 or more"
+            )
+        self.input_token, self.mask_padding, self.context_frames = (
+            input_token,
+            mask_padding,
+            context_frames,
+        )
         self.token_memory, self.memory = token_memory and cond_features > 0, memory
         self.condition = TimeAndCondition(latent_dim, cond_features, project_condition)
         self.target: TargetEncoder | None = None
@@ -118,7 +135,9 @@ class MDMDecoder(Denoiser):
             self.target = TARGET_ENCODERS[target_encoder](latent_dim, target_layers)
         self.input = nn.Linear(in_features, latent_dim)
         self.dropout = nn.Dropout(dropout)
-        self.transformer = Transformer(latent_dim, ff_size, num_layers, num_heads, dropout, cross_attention=True)
+        self.transformer = Transformer(
+            latent_dim, ff_size, num_layers, num_heads, dropout, cross_attention=True
+        )
         self.output = nn.Linear(latent_dim, out_features)
 
     def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
@@ -131,11 +150,15 @@ class MDMDecoder(Denoiser):
             x = torch.cat([self.condition.add(time, cond.pooled)[:, None], x], 1)
         elif self.input_token == "time":
             x = torch.cat([time[:, None], x], 1)
-        x = self.dropout(x + sinusoid(torch.arange(x.shape[1], device=x.device), x.shape[-1]).to(x_t.dtype))
+        x = self.dropout(
+            x + sinusoid(torch.arange(x.shape[1], device=x.device), x.shape[-1]).to(x_t.dtype)
+        )
 
         memory, memory_mask = self._memory(time, cond)
         before = x.shape[1] - x_t.shape[1]
-        x = self.transformer(x, with_prefix(mask, before) if self.mask_padding else None, memory, memory_mask)
+        x = self.transformer(
+            x, with_prefix(mask, before) if self.mask_padding else None, memory, memory_mask
+        )
         return self.output(x[:, before:])
 
     def _with_context(self, x_t: Tensor, cond: Condition) -> Tensor:
@@ -144,7 +167,9 @@ class MDMDecoder(Denoiser):
             return x_t
         frames = 0 if cond.prefix is None else cond.prefix.shape[1]
         if cond.prefix is None or frames != self.context_frames:
-            raise UserError(f"a prefix of {frames} frames: this denoiser continues {self.context_frames} clean frames")
+            raise UserError(
+                f"a prefix of {frames} frames: this denoiser continues {self.context_frames} clean frames"
+            )
         return torch.cat([cond.prefix.to(x_t), x_t], 1)
 
     def _memory(self, time: Tensor, cond: Condition) -> tuple[Tensor, Tensor | None]:
@@ -154,11 +179,15 @@ class MDMDecoder(Denoiser):
         tokens, mask = condition_tokens(cond)
         if self.memory == "add":
             return self.condition.add(time, tokens), mask
-        return torch.cat([time[:, None], self.condition.projection(tokens)], 1), with_prefix(mask, 1)
+        return torch.cat([time[:, None], self.condition.projection(tokens)], 1), with_prefix(
+            mask, 1
+        )
 
 
 def condition_tokens(cond: Condition) -> tuple[Tensor, Tensor]:
     """Returns the tokens (B, S, C) and their mask (B, S); raises `UserError` if there are none."""
     if cond.token_mask is None or not cond.tokens.shape[1]:
-        raise UserError("this denoiser needs condition tokens, but the condition encoder has none: choose another one")
+        raise UserError(
+            "this denoiser needs condition tokens, but the condition encoder has none: choose another one"
+        )
     return cond.tokens, cond.token_mask

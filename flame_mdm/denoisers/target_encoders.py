@@ -49,11 +49,17 @@ class SplitTarget(TargetEncoder):
     def __init__(self, features: int, layers: int):
         super().__init__()
         if features % SLOTS:
-            raise UserError(f"target_encoder=split needs a latent_dim that is a multiple of {SLOTS}, not {features}")
-        self.networks = nn.ModuleList(perceptron(4, features // SLOTS, layers) for _ in range(SLOTS))
+            raise UserError(
+                f"target_encoder=split needs a latent_dim that is a multiple of {SLOTS}, not {features}"
+            )
+        self.networks = nn.ModuleList(
+            perceptron(4, features // SLOTS, layers) for _ in range(SLOTS)
+        )
 
     def embed(self, target: Tensor) -> Tensor:
-        return torch.cat([network(target[:, slot]) for slot, network in enumerate(self.networks)], -1)
+        return torch.cat(
+            [network(target[:, slot]) for slot, network in enumerate(self.networks)], -1
+        )
 
 
 class MultiTarget(TargetEncoder):
@@ -70,7 +76,9 @@ class MultiTarget(TargetEncoder):
 
     def embed(self, target: Tensor) -> Tensor:
         position, requested = target[..., :3], target[..., 3:]
-        embedded = torch.stack([network(position[:, slot]) for slot, network in enumerate(self.networks)], 1)
+        embedded = torch.stack(
+            [network(position[:, slot]) for slot, network in enumerate(self.networks)], 1
+        )
         return ((self.weights / self.weights.sum())[:, None] * requested * embedded).sum(1)
 
 

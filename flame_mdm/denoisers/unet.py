@@ -46,7 +46,9 @@ class MDMUNet(Denoiser):
         self.input = nn.Conv1d(in_features, channels[0], 3, padding=1)
         finer = [channels[0], *channels[:-1]]
         self.down = nn.ModuleList(block(a, b) for a, b in zip(finer, channels, strict=True))
-        self.downsample = nn.ModuleList(nn.Conv1d(c, c, 3, stride=2, padding=1) for c in channels[:-1])
+        self.downsample = nn.ModuleList(
+            nn.Conv1d(c, c, 3, stride=2, padding=1) for c in channels[:-1]
+        )
         self.middle = nn.ModuleList(block(channels[-1], channels[-1]) for _ in range(2))
         self.up = nn.ModuleList(block(2 * b, a) for a, b in zip(finer, channels, strict=True))
         self.upsample = nn.ModuleList(nn.Conv1d(c, c, 3, padding=1) for c in channels[:-1])
@@ -77,7 +79,9 @@ class MDMUNet(Denoiser):
 class ResidualBlock(nn.Module):
     """Norm, SiLU and convolution, twice; time and condition scale and shift the second norm."""
 
-    def __init__(self, in_channels: int, out_channels: int, features: int, num_groups: int, dropout: float):
+    def __init__(
+        self, in_channels: int, out_channels: int, features: int, num_groups: int, dropout: float
+    ):
         super().__init__()
         self.norm1 = MaskedGroupNorm(in_channels, num_groups)
         self.conv1 = nn.Conv1d(in_channels, out_channels, 3, padding=1)
@@ -85,7 +89,11 @@ class ResidualBlock(nn.Module):
         self.norm2 = MaskedGroupNorm(out_channels, num_groups)
         self.dropout = nn.Dropout(dropout)
         self.conv2 = nn.Conv1d(out_channels, out_channels, 3, padding=1)
-        self.skip = nn.Conv1d(in_channels, out_channels, 1) if in_channels != out_channels else nn.Identity()
+        self.skip = (
+            nn.Conv1d(in_channels, out_channels, 1)
+            if in_channels != out_channels
+            else nn.Identity()
+        )
 
     def forward(self, x: Tensor, token: Tensor, mask: Tensor) -> Tensor:
         """Maps x (B, in_channels, F), token (B, features), mask (B, 1, F) of 0 and 1 -> (B, out_channels, F)."""
@@ -101,7 +109,9 @@ class MaskedGroupNorm(nn.Module):
     def __init__(self, channels: int, num_groups: int):
         super().__init__()
         if channels % num_groups:
-            raise UserError(f"num_groups ({num_groups}) does not divide the number of channels ({channels})")
+            raise UserError(
+                f"num_groups ({num_groups}) does not divide the number of channels ({channels})"
+            )
         self.num_groups = num_groups
         self.weight = nn.Parameter(torch.ones(channels))
         self.bias = nn.Parameter(torch.zeros(channels))
@@ -113,4 +123,6 @@ class MaskedGroupNorm(nn.Module):
         count = groups.shape[2] * mask.sum(-1, keepdim=True).clamp(min=1)
         centered = groups - (groups * mask).sum((2, 3), keepdim=True) / count
         variance = (centered * mask).square().sum((2, 3), keepdim=True) / count
-        return (centered * (variance + 1e-5).rsqrt()).flatten(1, 2) * self.weight[:, None] + self.bias[:, None]
+        return (centered * (variance + 1e-5).rsqrt()).flatten(1, 2) * self.weight[
+            :, None
+        ] + self.bias[:, None]

@@ -10,7 +10,16 @@ ENDINGS = (".npz", ".bvh", *SCENES, ".amc", ".json", ".npy")  # of motion files 
 TREES = (".bvh", ".amc")  # of those that contain a tree of joints and their rotations
 USD = (".usda", ".usdc", ".usdz")  # Universal Scene Description
 RIGGED = (".bvh", ".glb", ".fbx", *USD)  # of files that can have the skeleton of another program
-WRITTEN = (*RIGGED, ".vrma", ".npz", ".json", ".npy", ".gif", ".mp4")  # of the files that `Motion.save` writes
+# Of the files that `Motion.save` writes
+WRITTEN = (
+    *RIGGED,
+    ".vrma",
+    ".npz",
+    ".json",
+    ".npy",
+    ".gif",
+    ".mp4",
+)
 
 ADVICE = {
     ".gltf": "Save it as .glb, which is one file, for example with Blender (File > Export > glTF 2.0)",
@@ -31,7 +40,9 @@ JOINTS_IN_JSON = re.compile(rb'"(joints|posed_joints)"\s*:\s*\[\s*\[')  # as oth
 def unread(path: Path) -> UserError:
     """Returns the error for a file whose ending is none of a motion file."""
     advice = ADVICE.get(path.suffix.lower(), f"Use one of {', '.join(ENDINGS)}")
-    return UserError(f"{path}: {path.suffix or 'a file without ending'} is not read as a motion. {advice}")
+    return UserError(
+        f"{path}: {path.suffix or 'a file without ending'} is not read as a motion. {advice}"
+    )
 
 
 def motions_in(folder: Path) -> list[Path]:
@@ -53,7 +64,12 @@ def motion_files(folder: Path) -> list[Path]:
 
 def _is_motion(file: Path, folder: Path) -> bool:
     parts, suffix = file.relative_to(folder).parts, file.suffix.lower()
-    if suffix not in ENDINGS or file.is_dir() or "__MACOSX" in parts or any(part.startswith(".") for part in parts):
+    if (
+        suffix not in ENDINGS
+        or file.is_dir()
+        or "__MACOSX" in parts
+        or any(part.startswith(".") for part in parts)
+    ):
         return False
     if file.name.lower().endswith(NO_MOTIONS):
         return False

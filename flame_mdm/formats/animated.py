@@ -63,7 +63,9 @@ def choose(animations: Sequence[tuple[str, Item]], requested: str | int | None) 
     listed = ", ".join(f"{number} {name}" for number, name in enumerate(names[:20], 1))
     more = f" and {len(names) - 20} more" if len(names) > 20 else ""
     similar = did_you_mean(str(requested), names)
-    raise UserError(f"animation={requested}: no such animation.{similar} The file contains {listed}{more}")
+    raise UserError(
+        f"animation={requested}: no such animation.{similar} The file contains {listed}{more}"
+    )
 
 
 def parents_first(parents: Sequence[int]) -> list[int]:

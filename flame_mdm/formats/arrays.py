@@ -13,12 +13,31 @@ from flame_mdm.representations import rotation
 from flame_mdm.representations.smpl import AXIS_ANGLES, read_pose
 from flame_mdm.safe_io import MEBIBYTE, read_json, read_npy, read_npz
 
-JSON_LIMIT = 128 * MEBIBYTE  # maximum size of a `.json` motion; parsed, it takes many times its size
+# Maximum size of a `.json` motion; parsed, it takes many times its size
+JSON_LIMIT = 128 * MEBIBYTE
 RATES = ("fps", "mocap_framerate", "mocap_frame_rate")  # names of the frame rate
 BODY = ("root_orient", "pose_body")  # names of parts of `poses` in AMASS's SMPL-X files
-NEEDED = {"joints", "posed_joints", "poses", "trans", *BODY, *RATES, "text", "features", "representation"}
+NEEDED = {
+    "joints",
+    "posed_joints",
+    "poses",
+    "trans",
+    *BODY,
+    *RATES,
+    "text",
+    "features",
+    "representation",
+}
 """Arrays of an .npz file that are read. Others, which may hold pickled objects, are never opened."""
-LENGTHS = {"m": 1.0, "meter": 1.0, "metre": 1.0, "cm": 0.01, "centimeter": 0.01, "centimetre": 0.01, "mm": 0.001}
+LENGTHS = {
+    "m": 1.0,
+    "meter": 1.0,
+    "metre": 1.0,
+    "cm": 0.01,
+    "centimeter": 0.01,
+    "centimetre": 0.01,
+    "mm": 0.001,
+}
 """Names of units in `.json` files, in meters."""
 NUMBERS = ", ".join(map(str, AXIS_ANGLES))
 
@@ -43,7 +62,9 @@ def read_arrays(path: Path) -> dict[str, Any]:
     if "poses" not in data and set(BODY) <= data.keys():
         data["poses"] = _joined([data[name] for name in BODY])
     if not {"joints", "poses"} & data.keys():
-        raise UserError("contains neither joints nor poses; a motion has joints and fps, or poses, trans and a rate")
+        raise UserError(
+            "contains neither joints nor poses; a motion has joints and fps, or poses, trans and a rate"
+        )
     for name in {"joints", "poses", "trans"} & data.keys():
         check_numbers(name, data[name])
     if "features" in data and (not is_real(data["features"]) or data["features"].ndim != 2):
@@ -92,7 +113,9 @@ def _axis_angles(poses: np.ndarray) -> np.ndarray:
             advice = ". They seem to be rotation matrices: convert them to axis-angle vectors"
         elif count in (6 * joints for joints in AXIS_ANGLES.values()):
             advice = ". They seem to be 6D rotations: convert them to axis-angle vectors"
-        raise UserError(f"poses of shape {poses.shape}, not {NUMBERS} axis-angle numbers per frame{advice}")
+        raise UserError(
+            f"poses of shape {poses.shape}, not {NUMBERS} axis-angle numbers per frame{advice}"
+        )
     vectors = poses.reshape(len(poses), count)[:, :72].astype(float)
     return np.pad(vectors, ((0, 0), (0, 72 - vectors.shape[1])))
 
@@ -105,17 +128,24 @@ def check_numbers(name: str, values: np.ndarray) -> None:
         raise UserError(f"{name} of shape {values.shape} have no frames")
     check_frames(len(values))
     if (beyond := ~(np.abs(values.astype(float)) < 1e6)).any():
-        raise UserError(f"numbers of {name} in frame {np.argwhere(beyond)[0][0]} are not finite, or exceed a million")
+        raise UserError(
+            f"numbers of {name} in frame {np.argwhere(beyond)[0][0]} are not finite, or exceed a million"
+        )
 
 
 def _read_json(path: Path) -> dict[str, Any]:
     content = read_json(path, JSON_LIMIT)
     try:
-        data: dict[str, Any] = {"joints": np.array(content["joints"], float), "text": str(content.get("caption", ""))}
+        data: dict[str, Any] = {
+            "joints": np.array(content["joints"], float),
+            "text": str(content.get("caption", "")),
+        }
         data |= {key: content[key] for key in ("fps", "up", "names") if key in content}
         if "unit" in content:
             data["unit"] = LENGTHS.get(str(content["unit"]).lower(), content["unit"])
     except (AttributeError, ValueError, TypeError, KeyError, OverflowError) as error:
-        raise UserError(f"not a motion in JSON, which is an object with joints and fps: {error}") from error
+        raise UserError(
+            f"not a motion in JSON, which is an object with joints and fps: {error}"
+        ) from error
     data["ours"] = "caption" in content and (data.get("up"), data.get("unit")) == ("y", 1.0)
     return data

@@ -42,7 +42,9 @@ def read(path: Path, fps: float | None) -> Bvh:
     lines = read_lines(path)
     bones, parents = read_skeleton(skeleton_of(path))
     if fps is None:
-        raise UserError(f"{path}: AMC files contain no frame rate: give fps=120, or `fps: 120` in skeleton.yaml")
+        raise UserError(
+            f"{path}: AMC files contain no frame rate: give fps=120, or `fps: 120` in skeleton.yaml"
+        )
     names = tuple(bones)
     inner = set(parents.values())
     parents |= {f"{name}.end": name for name in names if name not in inner}
@@ -54,7 +56,9 @@ def read(path: Path, fps: float | None) -> Bvh:
             columns += [values.get(move, np.zeros(len(angles[name])))[:, None] for move in MOVES]
         if turns := [f"R{axis}" for axis in bone.order if f"R{axis}" in values]:
             order = "".join(turn[1] for turn in turns).lower()  # lower case: about fixed axes
-            turned = Rotation.from_euler(order, np.stack([values[turn] for turn in turns], 1), degrees=True)
+            turned = Rotation.from_euler(
+                order, np.stack([values[turn] for turn in turns], 1), degrees=True
+            )
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # in gimbal lock, any third angle is as good
                 columns.append((bone.axes * turned * bone.axes.inv()).as_euler("ZYX", degrees=True))
@@ -76,7 +80,9 @@ def skeleton_of(path: Path) -> Path:
     files = sorted(path.parent.glob("*.asf"))
     chosen = next((file for file in own if file.exists()), files[0] if len(files) == 1 else None)
     if chosen is None:
-        raise UserError(f"{path}: no skeleton {own[1].name} next to it; AMC files need their ASF file")
+        raise UserError(
+            f"{path}: no skeleton {own[1].name} next to it; AMC files need their ASF file"
+        )
     return chosen
 
 
@@ -97,7 +103,11 @@ def read_skeleton(path: Path) -> tuple[dict[str, Bone], dict[str, str]]:
             read["root"] = root._replace(freedoms=tuple(word.upper() for word in words[1:]))
         elif section == ":root" and word == "axis":
             read["root"] = read["root"]._replace(order=_order(lines, words[1:]))
-        elif section == ":root" and word in ("position", "orientation") and any(lines.numbers(words[1:], 3)):
+        elif (
+            section == ":root"
+            and word in ("position", "orientation")
+            and any(lines.numbers(words[1:], 3))
+        ):
             lines.fail(f"a root whose {word} is not 0 0 0 is not supported")
         elif section == ":bonedata" and word == "begin":
             fields = {}
@@ -111,7 +121,9 @@ def read_skeleton(path: Path) -> tuple[dict[str, Bone], dict[str, str]]:
             for child in words[1:]:
                 has_parent = words[0] == "root" or words[0] in parents
                 if child not in read or not has_parent or child == "root" or child in parents:
-                    lines.fail(f"bone {child[:40]} is unknown, has two parents, or precedes its parent")
+                    lines.fail(
+                        f"bone {child[:40]} is unknown, has two parents, or precedes its parent"
+                    )
                 parents[child] = words[0]
     if not parents:
         lines.fail("not an ASF file (no bones in a :hierarchy)")
@@ -119,14 +131,20 @@ def read_skeleton(path: Path) -> tuple[dict[str, Bone], dict[str, str]]:
 
 
 def _bone(lines: Lines, fields: dict[str, list[str]]) -> Bone:
-    if missing := [name for name in ("name", "direction", "length", "axis") if not fields.get(name)]:
+    if missing := [
+        name for name in ("name", "direction", "length", "axis") if not fields.get(name)
+    ]:
         lines.fail(f"a bone without {missing[0]}")
     freedoms = tuple(word.upper() for word in fields.get("dof", ()))
     if not set(freedoms) <= set(TURNS) or len(set(freedoms)) < len(freedoms):
-        lines.fail(f"degrees of freedom must be among rx, ry and rz, found {' '.join(fields['dof'])[:40]}")
+        lines.fail(
+            f"degrees of freedom must be among rx, ry and rz, found {' '.join(fields['dof'])[:40]}"
+        )
     direction, (length,) = lines.numbers(fields["direction"], 3), lines.numbers(fields["length"], 1)
     axis, order = lines.numbers(fields["axis"][:3], 3), _order(lines, fields["axis"][3:])
-    axes = Rotation.from_euler(order.lower(), [axis["XYZ".index(letter)] for letter in order], degrees=True)
+    axes = Rotation.from_euler(
+        order.lower(), [axis["XYZ".index(letter)] for letter in order], degrees=True
+    )
     return Bone(np.array(direction) * length, axes, order, freedoms)
 
 
@@ -154,7 +172,9 @@ def _angles(lines: Lines, bones: dict[str, Bone], joints: int) -> dict[str, np.n
                 lines.fail(f"frame {frames} ends without {', '.join(absent)[:80]}")
             frames += 1
         elif words[0] not in rows or len(rows[words[0]]) != frames - 1:
-            lines.fail(f"{words[0][:40]} is no moving bone of the skeleton, outside of a frame, or there twice")
+            lines.fail(
+                f"{words[0][:40]} is no moving bone of the skeleton, outside of a frame, or there twice"
+            )
         else:
             rows[words[0]].append(lines.numbers(words[1:], len(bones[words[0]].freedoms)))
     if frames < 2:

@@ -20,7 +20,11 @@ WIDER = (0.8, 1.25)  # limits of the width of hips and shoulders relative to tha
 LONGER = (0.4, 2.5)  # limits of the length of a limb relative to the mesh's
 TALLER = (0.6, 1.6)  # limits of the length of other parts relative to that of the limbs
 ORTHONORMAL = 0.1  # largest error of the products of two rows of a rotation matrix
-LIMBS = tuple(JOINT[f"{side}_{name}"] for side in ("left", "right") for name in ("knee", "ankle", "elbow", "wrist"))
+LIMBS = tuple(
+    JOINT[f"{side}_{name}"]
+    for side in ("left", "right")
+    for name in ("knee", "ankle", "elbow", "wrist")
+)
 
 
 @dataclass(eq=False, repr=False)
@@ -149,6 +153,8 @@ def _with_helpers(world: np.ndarray, offsets: np.ndarray) -> np.ndarray:
         turn = Rotation.from_matrix(world[:, above].mT @ world[:, below]).as_quat()
         twist = 2 * np.arctan2(turn[:, :3] @ axis, turn[:, 3])
         twist = (twist + np.pi) % (2 * np.pi) - np.pi
-        back = Rotation.from_rotvec(np.outer((share if of_wrist else share - 1) * twist, axis)).as_matrix()
+        back = Rotation.from_rotvec(
+            np.outer((share if of_wrist else share - 1) * twist, axis)
+        ).as_matrix()
         helpers.append(world[:, joint] @ back)
     return np.concatenate([world, np.stack(helpers, 1)], 1)

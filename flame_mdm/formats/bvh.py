@@ -32,17 +32,22 @@ LARGEST = 1e9  # largest number that is read, and largest sum of the numbers in 
 class Bvh:
     """A skeleton and its motion. J joints, F frames, C channels; lengths in the file's unit."""
 
-    joints: tuple[str, ...]  # J names; the end site of a joint is a joint without channels, `NAME.end`
+    # J names; the end site of a joint is a joint without channels, `NAME.end`
+    joints: tuple[str, ...]
     parents: tuple[int, ...]  # index of each joint's parent, smaller than its own; -1 for a root
     offsets: np.ndarray  # (J, 3) float64, rest position of each joint in its parent's frame
-    channels: tuple[tuple[str, ...], ...]  # names of each joint's channels in the order of its columns, from `CHANNELS`
-    frames: np.ndarray  # (F, C) float64, the channels of all joints in joint order; angles in degrees
+    # Names of each joint's channels in the order of its columns, from `CHANNELS`
+    channels: tuple[tuple[str, ...], ...]
+    # (F, C) float64, the channels of all joints in joint order; angles in degrees
+    frames: np.ndarray
     fps: float  # frames per second
 
     def columns(self) -> list[slice]:
         """Returns the columns of `frames` with each joint's channels."""
         ends = list(itertools.accumulate(map(len, self.channels)))
-        return [slice(end - len(names), end) for end, names in zip(ends, self.channels, strict=True)]
+        return [
+            slice(end - len(names), end) for end, names in zip(ends, self.channels, strict=True)
+        ]
 
     def rotations(self) -> np.ndarray:
         """Returns the rotation (F, J, 3, 3) of each joint in its parent's frame."""
@@ -50,7 +55,10 @@ class Bvh:
         for joint, (names, column) in enumerate(zip(self.channels, self.columns(), strict=True)):
             turning = [k for k, name in enumerate(names) if name.endswith("rotation")]
             if turning:
-                order, angles = "".join(names[k][0] for k in turning), self.frames[:, column][:, turning]
+                order, angles = (
+                    "".join(names[k][0] for k in turning),
+                    self.frames[:, column][:, turning],
+                )
                 rotations[:, joint] = Rotation.from_euler(order, angles, degrees=True).as_matrix()
         return rotations
 
@@ -73,7 +81,9 @@ class Bvh:
         Rotations are interpolated on the sphere (slerp), so that bones keep their length. Translations are interpolated
         linearly, or with `cubic` splines.
         """
-        before, after, share = frame_pairs(len(self.frames), self.fps, fps, len(self.joints), slack=0)
+        before, after, share = frame_pairs(
+            len(self.frames), self.fps, fps, len(self.joints), slack=0
+        )
         translations = self.translations()
         share = share[:, None, None]
         if cubic:
@@ -83,7 +93,9 @@ class Bvh:
         rotations = self.rotations()
         turn = rotations[before].mT @ rotations[after]
         vectors = Rotation.from_matrix(turn.reshape(-1, 3, 3)).as_rotvec().reshape(turn.shape[:3])
-        part = Rotation.from_rotvec((share * vectors).reshape(-1, 3)).as_matrix().reshape(turn.shape)
+        part = (
+            Rotation.from_rotvec((share * vectors).reshape(-1, 3)).as_matrix().reshape(turn.shape)
+        )
         return rotations[before] @ part, moved
 
 
@@ -127,10 +139,17 @@ def read(path: str | Path) -> Bvh:
         if keyword == "OFFSET":
             node.offset = source.numbers([source.word() for _ in range(3)], 3)
         elif keyword == "CHANNELS":
-            node.channels = tuple(source.word().capitalize() for _ in range(int(source.numbers([source.word()], 1)[0])))
-            if len(set(node.channels)) < len(node.channels) or not set(node.channels) <= set(CHANNELS):
+            node.channels = tuple(
+                source.word().capitalize()
+                for _ in range(int(source.numbers([source.word()], 1)[0]))
+            )
+            if len(set(node.channels)) < len(node.channels) or not set(node.channels) <= set(
+                CHANNELS
+            ):
                 names = " ".join(node.channels)[:80]
-                source.fail(f"channels must be distinct and among {', '.join(CHANNELS)}, found {names}")
+                source.fail(
+                    f"channels must be distinct and among {', '.join(CHANNELS)}, found {names}"
+                )
         elif keyword == "}":
             if not node.offset:
                 source.fail("joint or end site without OFFSET")
@@ -138,7 +157,11 @@ def read(path: str | Path) -> Bvh:
         else:
             name = source.word("SITE") if keyword == "END" else source.name_of_joint()
             blocks.append(len(nodes))
-            nodes.append(_Node(f"{node.name}.end", parent, _IN_END) if keyword == "END" else _Node(name, parent))
+            nodes.append(
+                _Node(f"{node.name}.end", parent, _IN_END)
+                if keyword == "END"
+                else _Node(name, parent)
+            )
             source.word("{")
     if blocks or not nodes or source.row[-1].upper() != "MOTION":
         source.fail("MOTION before the end of the hierarchy, or before the end of its line")
@@ -194,8 +217,13 @@ class Lines:
         except UnicodeDecodeError as error:
             self.line = data.count(b"\n", 0, error.start) + 1
             self.fail("not UTF-8 text")
-        self.lines = ((number, line.split()) for number, line in enumerate(lines, 1) if not line.startswith("#"))
-        self.pending: list[str] = []  # words of the current line that are not read yet, the last one first
+        self.lines = (
+            (number, line.split())
+            for number, line in enumerate(lines, 1)
+            if not line.startswith("#")
+        )
+        # Words of the current line that are not read yet, the last one first
+        self.pending: list[str] = []
 
     def __iter__(self) -> Iterator[list[str]]:
         for number, words in self.lines:
@@ -258,7 +286,11 @@ def write(bvh: Bvh, path: str | Path) -> None:
             continue
         is_end = name.endswith(".end") and not channels and not children[joint]
         head = "End Site" if is_end else f"{'JOINT' if depth else 'ROOT'} {name}"
-        lines += [f"{indent}{head}", f"{indent}{{", f"{indent}\tOFFSET {_numbers(bvh.offsets[joint])}"]
+        lines += [
+            f"{indent}{head}",
+            f"{indent}{{",
+            f"{indent}\tOFFSET {_numbers(bvh.offsets[joint])}",
+        ]
         if not is_end:
             lines.append(" ".join([f"{indent}\tCHANNELS", str(len(channels)), *channels]))
         order.append(joint)

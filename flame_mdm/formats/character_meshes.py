@@ -31,7 +31,9 @@ def character_clip(character: Character, motion: PosedFigure, name: str) -> Rigg
     try:
         skins = meshes(file)
     except (ValueError, KeyError, TypeError, IndexError) as error:
-        raise UserError(f"a mesh of this character cannot be converted: {error}. Write a .glb file") from error
+        raise UserError(
+            f"a mesh of this character cannot be converted: {error}. Write a .glb file"
+        ) from error
     return RiggedClip(
         name=name,
         fps=motion.fps,
@@ -102,7 +104,8 @@ def _part(
     uvs = np.zeros((0, 2))
     if "TEXCOORD_0" in attributes:
         uvs = glb.numbers(file, attributes["TEXCOORD_0"], "VEC2")
-        uvs = np.stack([uvs[:, 0], 1 - uvs[:, 1]], 1)  # glTF counts from the upper edge of the image
+        # GlTF counts from the upper edge of the image
+        uvs = np.stack([uvs[:, 0], 1 - uvs[:, 1]], 1)
 
     if bound is None or "JOINTS_0" not in attributes:
         ordered = (node,)
@@ -124,7 +127,9 @@ def _part(
         points=points,
         normals=normals,
         triangles=triangles,
-        palette=(palette[material] if material is not None else Material("material", (0.8, 0.8, 0.8)),),
+        palette=(
+            palette[material] if material is not None else Material("material", (0.8, 0.8, 0.8)),
+        ),
         materials=np.zeros(len(triangles), int),
         ordered=ordered,
         bones=bones,
@@ -134,7 +139,9 @@ def _part(
     )
 
 
-def _normals(file: glb.Glb, attributes: dict[str, Any], points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+def _normals(
+    file: glb.Glb, attributes: dict[str, Any], points: np.ndarray, triangles: np.ndarray
+) -> np.ndarray:
     """Returns the normals (V, 3) of a mesh; without stored ones, the mean normals of the adjacent triangles."""
     if "NORMAL" in attributes:
         return glb.numbers(file, attributes["NORMAL"], "VEC3")

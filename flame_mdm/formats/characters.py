@@ -55,14 +55,18 @@ def read(path: str | Path) -> Character | BvhCharacter:
 def _read_bvh(path: Path) -> BvhCharacter:
     """Reads the skeleton of a BVH file; its rest pose is the one without rotations, or else the first frame."""
     file = bvh.read(path)
-    joints = identify(path, {number: file.joints[number] for number, names in enumerate(file.channels) if names})
+    joints = identify(
+        path, {number: file.joints[number] for number, names in enumerate(file.channels) if names}
+    )
     for joint, number in joints.items():
         if len(turning := _order(file.channels[number])) < 3:
             name = f"{file.joints[number]} ({joint})"
             raise UserError(f"{path}: {name} has {len(turning)} rotation channels. Give it three")
     if not any(_moves(names) for names in _above(file, joints["pelvis"]).values()):
         name = file.joints[joints["pelvis"]]
-        raise UserError(f"{path}: {name} and the joints above it have no position channels. Give them to the root")
+        raise UserError(
+            f"{path}: {name} and the joints above it have no position channels. Give them to the root"
+        )
 
     still = np.tile(np.eye(3), (1, len(file.joints), 1, 1))
     first = replace(file, frames=file.frames[:1])
@@ -72,7 +76,9 @@ def _read_bvh(path: Path) -> BvhCharacter:
         (positions,), (turned,) = bvh.forward_kinematics(file.parents, rotations, translations)
         up = _vertical(positions, joints)
         try:
-            pose = rest_pose(path, file.joints, file.parents, positions, turned, joints, positions, up)
+            pose = rest_pose(
+                path, file.joints, file.parents, positions, turned, joints, positions, up
+            )
             return BvhCharacter(pose.rig, pose.map, pose.floor, file)
         except UserError as error:  # many files are upright in their first frame alone
             problem = problem or error
@@ -111,21 +117,31 @@ def read_skinned(path: Path) -> Character:
     skeletons: list[set[int]] = []
     for skin in file.skins:
         shared = [skeleton for skeleton in skeletons if skeleton & set(skin.joints)]
-        skeletons = [skeleton for skeleton in skeletons if skeleton not in shared] + [set(skin.joints).union(*shared)]
+        skeletons = [skeleton for skeleton in skeletons if skeleton not in shared] + [
+            set(skin.joints).union(*shared)
+        ]
     if len(skeletons) != 1:
-        raise UserError(f"{path}: {len(skeletons)} skeletons with a skin, not one. Export one mesh with its armature")
+        raise UserError(
+            f"{path}: {len(skeletons)} skeletons with a skin, not one. Export one mesh with its armature"
+        )
     joints = identify(path, {joint: file.names[joint] for joint in sorted(skeletons[0])})
     worlds, corners = _rest(file, joints["pelvis"])
     if not (np.abs(worlds) <= glb.LARGEST).all() or not (np.abs(corners) <= glb.LARGEST).all():
-        raise UserError(f"{path}: the rest pose is not finite, or too large. Export the character again")
+        raise UserError(
+            f"{path}: the rest pose is not finite, or too large. Export the character again"
+        )
     scales = np.cbrt(np.linalg.det(worlds[:, :3, :3]))
     for joint, number in joints.items():
         sizes = np.linalg.svd(worlds[number, :3, :3], compute_uv=False)
         if scales[number] <= 0 or sizes[0] > 1.01 * sizes[2]:
             name = f"{file.names[number]} ({joint})"
-            raise UserError(f"{path}: {name} is mirrored or scaled unevenly. Apply the scale of the armature")
+            raise UserError(
+                f"{path}: {name} is mirrored or scaled unevenly. Apply the scale of the armature"
+            )
     turned = worlds[:, :3, :3] / np.where(scales == 0, 1, scales)[:, None, None]
-    pose = rest_pose(path, file.names, file.parents, worlds[:, :3, 3], turned, joints, corners, (0, 1, 0))
+    pose = rest_pose(
+        path, file.names, file.parents, worlds[:, :3, 3], turned, joints, corners, (0, 1, 0)
+    )
     return Character(replace(pose.rig, scales=scales), pose.map, pose.floor, file)
 
 
@@ -160,7 +176,10 @@ def _rest(file: glb.Glb, pelvis: int) -> tuple[np.ndarray, np.ndarray]:
 def moved(character: RestPose, motion: PosedFigure) -> tuple[np.ndarray, np.ndarray, Rig]:
     """Moves a character as in a motion; see `follow`."""
     body = fit_body(motion)
-    joints, world = motion.joints[:, : len(SMPL22)], world_rotations(local_rotations(body)) @ body.neutral
+    joints, world = (
+        motion.joints[:, : len(SMPL22)],
+        world_rotations(local_rotations(body)) @ body.neutral,
+    )
     return follow(character, joints, motion.posed().offsets.numpy(), body.neutral, world)
 
 
@@ -176,10 +195,17 @@ def identify(path: Path, names: Mapping[int, str]) -> dict[str, int]:
     """Returns SMPL's joints -> numbers, among numbers -> names of a character; raises `UnknownJoints` if some lack."""
     listed = path.with_suffix(".yaml")
     chosen = read_yaml(listed) if listed.exists() else None
-    candidates = _listed(path, listed, chosen, names) if chosen else recognized(names, known_skeletons())
+    candidates = (
+        _listed(path, listed, chosen, names) if chosen else recognized(names, known_skeletons())
+    )
     numbers, missing = matched(path, names, candidates)
-    if twice := next((joint for joint, number in numbers.items() if list(numbers.values()).count(number) > 1), None):
-        raise UserError(f"{listed}: {names[numbers[twice]]} is listed for {twice} and for another joint. Remove one")
+    if twice := next(
+        (joint for joint, number in numbers.items() if list(numbers.values()).count(number) > 1),
+        None,
+    ):
+        raise UserError(
+            f"{listed}: {names[numbers[twice]]} is listed for {twice} and for another joint. Remove one"
+        )
     if missing:
         own = {joint: f" {json.dumps(names[number])}" for joint, number in numbers.items()}
         template = [f"# Joints of {path.name}: {', '.join(names.values())}"]
@@ -192,13 +218,19 @@ def identify(path: Path, names: Mapping[int, str]) -> dict[str, int]:
     return numbers
 
 
-def _listed(path: Path, listed: Path, chosen: object, names: Mapping[int, str]) -> dict[str, list[int]]:
+def _listed(
+    path: Path, listed: Path, chosen: object, names: Mapping[int, str]
+) -> dict[str, list[int]]:
     if not isinstance(chosen, dict):
-        raise UserError(f"{listed}: not a list of names, each on a line such as `left_knee: Calf L`")
+        raise UserError(
+            f"{listed}: not a list of names, each on a line such as `left_knee: Calf L`"
+        )
     candidates = {}
     for joint, name in chosen.items():
         if joint not in JOINT:
-            raise UserError(f"{listed}: {joint} is no joint of SMPL.{did_you_mean(str(joint), JOINT)}")
+            raise UserError(
+                f"{listed}: {joint} is no joint of SMPL.{did_you_mean(str(joint), JOINT)}"
+            )
         if name is not None:
             candidates[joint] = [number for number, own in names.items() if own == name]
             if not candidates[joint]:
@@ -234,15 +266,27 @@ def write(path: Path, character: Character, motion: PosedFigure, name: str) -> s
         if source >= 0 or joint in skinned:
             turns = glb.quaternions(np.concatenate([rest[None, joint], local[:, joint]]))
             # the rest pose, also where the file has another pose, and in the form that animations need
-            size = float(rig.scales[joint] / (rig.scales[rig.parents[joint]] if rig.parents[joint] >= 0 else 1))
+            size = float(
+                rig.scales[joint]
+                / (rig.scales[rig.parents[joint]] if rig.parents[joint] >= 0 else 1)
+            )
             node = document["nodes"][file.nodes[joint]]
             node.pop("matrix", None)
-            node |= {"translation": offsets[joint].tolist(), "rotation": turns[0].tolist(), "scale": [size] * 3}
+            node |= {
+                "translation": offsets[joint].tolist(),
+                "rotation": turns[0].tolist(),
+                "scale": [size] * 3,
+            }
             if source >= 0:
                 curves.append(("rotation", file.nodes[joint], turns[1:]))
-    curves.append(("translation", file.nodes[hips], rig.within(positions[:, hips], hips).astype("f4")))
+    curves.append(
+        ("translation", file.nodes[hips], rig.within(positions[:, hips], hips).astype("f4"))
+    )
     # programs show the first animation
-    document["animations"] = [binary.animation(name, motion.fps, curves), *document.get("animations", [])]
+    document["animations"] = [
+        binary.animation(name, motion.fps, curves),
+        *document.get("animations", []),
+    ]
     binary.save(path, document)
     return _following(rig, len(rig.joints))
 
@@ -250,7 +294,9 @@ def write(path: Path, character: Character, motion: PosedFigure, name: str) -> s
 def write_bvh(path: Path, character: BvhCharacter, motion: PosedFigure) -> str:
     """Writes the character's file with a motion in place of its own, and returns a line that describes it."""
     if path.suffix.lower() != ".bvh":
-        raise UserError(f"{path}: this character is a .bvh file without meshes, so name a .bvh file for the result")
+        raise UserError(
+            f"{path}: this character is a .bvh file without meshes, so name a .bvh file for the result"
+        )
     file, (world, positions, rig) = character.file, moved(character, motion)
     local, offsets, hips = rig.local(world), rig.offsets(), rig.hips
     # the joint that carries the body: the hips, or a root above them
@@ -263,7 +309,10 @@ def write_bvh(path: Path, character: BvhCharacter, motion: PosedFigure) -> str:
         values = {f"{axis}position": position[:, number] for number, axis in enumerate("XYZ")}
         if len(order := _order(names)) == 3:
             angles = continuous_euler(torch.from_numpy(local[:, [joint]]), (order,))[:, 0].numpy()
-            values |= {f"{axis}rotation": np.degrees(angles[:, number]) for number, axis in enumerate(order)}
+            values |= {
+                f"{axis}rotation": np.degrees(angles[:, number])
+                for number, axis in enumerate(order)
+            }
         for number, name in enumerate(names):
             if name in values:
                 frames[:, columns.start + number] = np.round(values[name], 6)

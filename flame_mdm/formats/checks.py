@@ -9,14 +9,21 @@ LYING = 0.3  # mean vertical component of the direction of the trunk below which
 STANDING = 0.7  # the same, above which it would stand with another axis up
 FASTEST = 15.0  # m/s of the pelvis, above which a file is damaged; sprinters reach 12
 AVERAGED = 0.05  # seconds over which the speed of the pelvis is averaged
-KICK = 30.0  # m/s of an ankle relative to the pelvis, above which a leg has flipped; the fastest kicks reach 20
+# M/s of an ankle relative to the pelvis, above which a leg has flipped; the fastest kicks reach 20
+KICK = 30.0
 UNDER = 0.02  # depth in meters below the floor at which the file's body is called smaller
 
-BLEND = 0.04  # seconds from a rest pose in front of a motion to the motion; some conversions blend a few frames
+# Seconds from a rest pose in front of a motion to the motion; some conversions blend a few frames
+BLEND = 0.04
 CALM = 8  # number of the following frames with which the first steps are compared
-JUMP = (0.15, 3.0)  # meters from the rest pose to the motion, and how much longer than the following steps
+# Meters from the rest pose to the motion, and how much longer than the following steps
+JUMP = (
+    0.15,
+    3.0,
+)
 STRAIGHT = np.cos(np.radians(25))  # of arms and legs in a rest pose
-HANGING = np.cos(np.radians(25))  # arms in a rest pose are raised from the trunk by at least 25 degrees
+# Arms in a rest pose are raised from the trunk by at least 25 degrees
+HANGING = np.cos(np.radians(25))
 SYMMETRIC = 0.2  # largest difference of the cosines of left and right arm
 
 _NUMBER = {joint: number for number, joint in enumerate(SMPL22.joints)}
@@ -47,7 +54,9 @@ def lying(joints: np.ndarray, up: str, axes: np.ndarray) -> str:
     if uprightness(joints) >= LYING:
         return ""
     backwards = _trunk(joints).mean(0) @ axes  # in the axes of the file
-    heights = {axis: float(backwards @ np.array(rows, float)[1]) for axis, rows in UP.items() if axis != up}
+    heights = {
+        axis: float(backwards @ np.array(rows, float)[1]) for axis, rows in UP.items() if axis != up
+    }
     axis = max(heights, key=lambda axis: heights[axis])
     if heights[axis] < STANDING:
         return "the body is lying down"
@@ -63,7 +72,11 @@ def jump(joints: np.ndarray, fps: float) -> str:
         ("the body jumps", joints[:, :1], apart, FASTEST),
         ("a leg flips", ankles, 1, KICK),
     ):
-        speeds = np.linalg.norm((points[frames:] - points[:-frames]).astype(float), axis=-1) * fps / frames
+        speeds = (
+            np.linalg.norm((points[frames:] - points[:-frames]).astype(float), axis=-1)
+            * fps
+            / frames
+        )
         if speeds.max(initial=0.0) > fastest:
             frame = int(speeds.max(1).argmax())
             return f"{verb}, it moves at {speeds.max():.0f} m/s in frame {frame} ({fps:g} per second): a damaged file"
@@ -107,9 +120,13 @@ def _is_rest_pose(pose: np.ndarray) -> bool:
             if upper @ lower < STRAIGHT:
                 return False
             raised.append(-upper @ trunk)
-    left_arm, left_leg, right_arm, right_leg = raised  # cosine of the angle to the direction down the trunk
+    left_arm, left_leg, right_arm, right_leg = (
+        raised  # cosine of the angle to the direction down the trunk
+    )
     legs_hang = min(left_leg, right_leg) > STRAIGHT
-    return bool(legs_hang and max(left_arm, right_arm) < HANGING and abs(left_arm - right_arm) < SYMMETRIC)
+    return bool(
+        legs_hang and max(left_arm, right_arm) < HANGING and abs(left_arm - right_arm) < SYMMETRIC
+    )
 
 
 def _trunk(joints: np.ndarray) -> np.ndarray:

@@ -12,10 +12,12 @@ from flame_mdm.formats.faults import depths, unit
 from flame_mdm.formats.motion import Motion
 from flame_mdm.representations.skeleton import Skeleton
 
-SMOOTHNESS = 0.034  # weight of the squared third differences of a joint's path, relative to its squared change
+# Weight of the squared third differences of a joint's path, relative to its squared change
+SMOOTHNESS = 0.034
 OUTLIER = 0.03  # distance in meters from the smooth path at which a position has half its weight
 LOW = 0.07  # height in meters above the floor at which a toe counts as in the air
-SLOW = 0.5  # horizontal speed in m/s at which a low toe counts as off the ground while the body stands still
+# Horizontal speed in m/s at which a low toe counts as off the ground while the body stands still
+SLOW = 0.5
 SHARE, SHARE_PINNED = 0.5, 0.4
 """Fraction of the body's speed added to `SLOW`, before and after the body follows its feet. In generated motion, a foot
 on the floor may slide along with the body; a swinging foot is faster than the body."""
@@ -23,17 +25,28 @@ DRIFT = 0.2
 """Speed in m/s up to which the body may slide over its feet, for which the legs compensate. Above 1.5 times this speed,
 the body follows its feet entirely."""
 CLEAR = 0.15  # seconds in which a hand that would be inside the body starts to avoid it
-REACH = 0.999  # maximum distance from hip to ankle relative to the straight leg, unless it was longer before
+# Maximum distance from hip to ankle relative to the straight leg, unless it was longer before
+REACH = 0.999
 
 
 def cleaned(motion: Motion, contacts: np.ndarray | None = None) -> Motion:
     """Returns the motion with joints from `cleanup`, without features, rotations and contacts, which no longer fit."""
     joints = cleanup(motion.joints, motion.fps, motion.skeleton, contacts)
     none = np.zeros((0, 0), np.float32)
-    return replace(motion, joints=joints, features=none, representation="", poses=None, contacts=None, cleanup=True)
+    return replace(
+        motion,
+        joints=joints,
+        features=none,
+        representation="",
+        poses=None,
+        contacts=None,
+        cleanup=True,
+    )
 
 
-def cleanup(joints: np.ndarray, fps: float, skeleton: Skeleton, contacts: np.ndarray | None = None) -> np.ndarray:
+def cleanup(
+    joints: np.ndarray, fps: float, skeleton: Skeleton, contacts: np.ndarray | None = None
+) -> np.ndarray:
     """Removes pops, changes of bone lengths, sliding feet and hands inside the body from joints (F, J, 3), y up.
 
     Paths of joints are smoothed, bones get their median lengths, the body moves over the ground so that its feet in
@@ -55,16 +68,24 @@ def cleanup(joints: np.ndarray, fps: float, skeleton: Skeleton, contacts: np.nda
     else:
         contact = np.clip(2 * contacts[:-1, [skeleton.feet.index(toe) for toe in toes]] - 0.5, 0, 1)
     for chain, weight in zip(skeleton.chains[:2], contact.T, strict=True):
-        toe, shift = motion[:, chain[-1]], np.zeros((len(motion), 3))  # over the ground, fades out between contacts
+        # Over the ground, fades out between contacts
+        toe, shift = (
+            motion[:, chain[-1]],
+            np.zeros((len(motion), 3)),
+        )
         still = -np.diff(toe[:, [0, 2]], axis=0)
-        shift[:, [0, 2]] = _least_squares(len(toe), (1, 30 * weight, still), (0, 0.03, 0.0), (2, 0.1, 0.0))
+        shift[:, [0, 2]] = _least_squares(
+            len(toe), (1, 30 * weight, still), (0, 0.03, 0.0), (2, 0.1, 0.0)
+        )
         bend(motion, chain[1:], shift)
     for side in ("left", "right"):
         _push_out(motion, skeleton, side, fps)
     return motion.astype(np.float32)
 
 
-def _least_squares(frames: int, *terms: tuple[int, np.ndarray | float, np.ndarray | float]) -> np.ndarray:
+def _least_squares(
+    frames: int, *terms: tuple[int, np.ndarray | float, np.ndarray | float]
+) -> np.ndarray:
     """Returns x (frames, N) with the minimum sum of all terms: weight (n-th differences of x - target)^2.
 
     A term is n, weight (frames - n,) or a number, and target (frames - n, N) or a number; one is an array.
@@ -143,8 +164,12 @@ def _follow_feet(motion: np.ndarray, toes: list[int], fps: float) -> np.ndarray:
     drift = np.zeros((len(slides), 2))
     for _ in range(10):  # feet that move differently lose weight
         mean = (weights[..., None] * slides).sum(1) / np.maximum(weights.sum(1), 1e-9)[:, None]
-        drift = _least_squares(len(slides), (0, weights.sum(1), mean), (0, 0.01, 0.0), (1, 1.0, 0.0))
-        weights = contact / (1 + (np.linalg.norm(slides - drift[:, None], axis=-1) * fps / 0.2) ** 2)
+        drift = _least_squares(
+            len(slides), (0, weights.sum(1), mean), (0, 0.01, 0.0), (1, 1.0, 0.0)
+        )
+        weights = contact / (
+            1 + (np.linalg.norm(slides - drift[:, None], axis=-1) * fps / 0.2) ** 2
+        )
     speed = np.linalg.norm(drift, axis=-1, keepdims=True) * fps
     drift = drift * np.clip(2 * speed / DRIFT - 2, 0, 1)
     out = motion.copy()
@@ -166,7 +191,9 @@ def _push_out(motion: np.ndarray, skeleton: Skeleton, side: str, fps: float) -> 
             return
         away = size * (np.take_along_axis(away, deepest[..., None], 1)[:, 0] + 0.7 * aside)
         away = unit(gaussian_filter1d(away, frames, axis=0, mode="nearest"))
-        size = gaussian_filter1d(maximum_filter1d(size, 2 * round(frames) + 1, axis=0), frames / 2, axis=0)
+        size = gaussian_filter1d(
+            maximum_filter1d(size, 2 * round(frames) + 1, axis=0), frames / 2, axis=0
+        )
         bend(motion, arm, size * away)
 
 

@@ -22,7 +22,11 @@ CAMERA_AXES = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))
 KIT_SOURCES = {"root": "pelvis", "belly": "spine2", "thorax": "spine3"}
 KIT_SOURCES |= {f"{side}_toes": f"{side}_foot" for side in ("left", "right")}
 """Joints of KIT-ML -> joints of SMPL at the same point of the body, where names differ."""
-LEGS = tuple(SMPL22.joints.index(f"{side}_{name}") for side in ("left", "right") for name in ("knee", "ankle"))
+LEGS = tuple(
+    SMPL22.joints.index(f"{side}_{name}")
+    for side in ("left", "right")
+    for name in ("knee", "ankle")
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,8 +69,12 @@ def kit_joints(joints: np.ndarray) -> np.ndarray:
     The middle of KIT-ML's feet is taken to be halfway between ankle and toes.
     """
     at = {name: joints[:, number] for number, name in enumerate(SMPL22.joints)}
-    feet = {f"{side}_foot": (at[f"{side}_ankle"] + at[f"{side}_foot"]) / 2 for side in ("left", "right")}
-    points = [feet[name] if name in feet else at[KIT_SOURCES.get(name, name)] for name in KIT21.joints]
+    feet = {
+        f"{side}_foot": (at[f"{side}_ankle"] + at[f"{side}_foot"]) / 2 for side in ("left", "right")
+    }
+    points = [
+        feet[name] if name in feet else at[KIT_SOURCES.get(name, name)] for name in KIT21.joints
+    ]
     return np.stack(points, 1) * [-1.0, 1.0, 1.0]
 
 
@@ -79,7 +87,9 @@ def _rotations(motion: Motion, fps: float, axes: Tensor) -> RawMotion:
         )
     note, error = "", 0.0
     if motion.poses is None:
-        moved = Motion(resample(motion.joints.astype(float), motion.fps, fps, cubic=True), fps, motion.skeleton)
+        moved = Motion(
+            resample(motion.joints.astype(float), motion.fps, fps, cubic=True), fps, motion.skeleton
+        )
         poses, note, error = _adult(moved)
     else:
         poses = _resampled(motion.poses, motion.fps, fps)
@@ -95,12 +105,18 @@ def _adult(motion: Motion) -> tuple[Poses, str, float]:
     """Returns the motion on the body of an adult, a line about the distance of its joints, and the mean in meters."""
     solved = motion.posed()
     adult = solved.offsets.new_tensor(ADULT[: len(SMPL22)])
-    scale = float(adult[list(LEGS)].norm(dim=1).sum() / solved.offsets[list(LEGS)].norm(dim=1).sum())
+    scale = float(
+        adult[list(LEGS)].norm(dim=1).sum() / solved.offsets[list(LEGS)].norm(dim=1).sum()
+    )
     poses = Poses(adult, solved.rotations, scale * solved.root)
     joints = forward_kinematics(SMPL22, poses.rotations, adult, poses.root).numpy()
     apart = 100 * np.linalg.norm(joints - scale * motion.joints[:, : len(SMPL22)], axis=-1)
     note = "rotations were fitted to joints, on the body of an adult"
-    return poses, f"{note}: mean error {apart.mean():.1f} cm, max {apart.max():.1f} cm", float(apart.mean()) / 100
+    return (
+        poses,
+        f"{note}: mean error {apart.mean():.1f} cm, max {apart.max():.1f} cm",
+        float(apart.mean()) / 100,
+    )
 
 
 def _resampled(poses: Poses, rate: float, fps: float) -> Poses:
@@ -108,6 +124,8 @@ def _resampled(poses: Poses, rate: float, fps: float) -> Poses:
         return poses
     before, after, share = frame_pairs(len(poses.root), rate, fps, len(SMPL22))
     quaternions = rotation.matrix_to_quaternion(poses.rotations)
-    turns = rotation.slerp(quaternions[before], quaternions[after], torch.from_numpy(share)[:, None, None])
+    turns = rotation.slerp(
+        quaternions[before], quaternions[after], torch.from_numpy(share)[:, None, None]
+    )
     root = torch.from_numpy(resample(poses.root.numpy(), rate, fps, cubic=True))
     return Poses(poses.offsets, rotation.quaternion_to_matrix(turns), root)

@@ -9,20 +9,49 @@ from scipy.ndimage import binary_opening
 
 from flame_mdm.formats.motion import Motion
 
-LOW = 0.05  # height in meters above the floor, y = 0, below which a toe joint touches it; also of foot skating
-STANDSTILL = 0.2  # speed of the root in m/s below which the body does not jump, except for 0.04 s at the top
+# Height in meters above the floor, y = 0, below which a toe joint touches it; also of foot skating
+LOW = 0.05
+STANDSTILL = (
+    0.2  # speed of the root in m/s below which the body does not jump, except for 0.04 s at the top
+)
 LIMITS = {
-    "skating": (0.5, "m/s", "a toe below 5 cm moves faster than 0.5 m/s for 0.4 s or more, longer than a step takes"),
-    "pop": (200.0, "m/s^2", "a joint jumps: it accelerates by more than 200 m/s^2 and stops within two frames"),
-    "bone length": (0.1, "of its median", "the length of a bone differs from its median by more than 10 % and 1 cm"),
+    "skating": (
+        0.5,
+        "m/s",
+        "a toe below 5 cm moves faster than 0.5 m/s for 0.4 s or more, longer than a step takes",
+    ),
+    "pop": (
+        200.0,
+        "m/s^2",
+        "a joint jumps: it accelerates by more than 200 m/s^2 and stops within two frames",
+    ),
+    "bone length": (
+        0.1,
+        "of its median",
+        "the length of a bone differs from its median by more than 10 % and 1 cm",
+    ),
     "penetration": (0.05, "m", "a joint is more than 5 cm below the floor, y = 0"),
-    "inside": (0.035, "m", "an elbow, a wrist or the middle of a hand is more than 3.5 cm inside the trunk or a thigh"),
-    "floating": (LOW, "m", "no joint is within 5 cm of the floor for 0.8 s, longer than a jump, or 0.3 s at rest"),
-    "limit": (15.0, "degrees", "a knee bends forward by more than 15 degrees, or a knee or elbow is folded to less"),
+    "inside": (
+        0.035,
+        "m",
+        "an elbow, a wrist or the middle of a hand is more than 3.5 cm inside the trunk or a thigh",
+    ),
+    "floating": (
+        LOW,
+        "m",
+        "no joint is within 5 cm of the floor for 0.8 s, longer than a jump, or 0.3 s at rest",
+    ),
+    "limit": (
+        15.0,
+        "degrees",
+        "a knee bends forward by more than 15 degrees, or a knee or elbow is folded to less",
+    ),
     "frozen": (0.02, "m/s", "no joint moves faster than 2 cm/s for a second or more"),
 }
 """Fault -> limit, its unit, and what it is. docs/motion-faults.md has the share of real clips that each flags."""
-PALM = 0.3  # distance from the wrist to the middle of the hand, which continues the forearm, relative to the forearm
+# Distance from the wrist to the middle of the hand, which continues the forearm, relative to the
+# forearm
+PALM = 0.3
 TRUNK = 0.18  # radius of the trunk from front to back, relative to its length from pelvis to neck
 WIDTH = 1.4  # width of the trunk relative to its depth
 THIGH = 0.17  # radius of a thigh, relative to its length
@@ -39,7 +68,11 @@ class Fault(NamedTuple):
 
     def __str__(self) -> str:
         unit = LIMITS[self.kind][1]
-        where = f"frame {self.start}" if self.end - self.start == 1 else f"frames {self.start} to {self.end - 1}"
+        where = (
+            f"frame {self.start}"
+            if self.end - self.start == 1
+            else f"frames {self.start} to {self.end - 1}"
+        )
         return f"{self.kind}: {self.joint}, {where}, {self.worst:.3g} {unit} (limit {LIMITS[self.kind][0]:g})"
 
 
@@ -54,9 +87,13 @@ def find_faults(motion: Motion) -> list[Fault]:
     low = joints[:, toes, 1] < LOW
     travel = np.linalg.norm(np.diff(joints[:, toes][..., [0, 2]], axis=0), axis=-1) * fps
     slides[:-1, toes] = travel * (low[1:] & low[:-1])
-    jumps = np.zeros(joints.shape[:2])  # distances from the middle of the neighbors in time, as accelerations
+    # Distances from the middle of the neighbors in time, as accelerations
+    jumps = np.zeros(joints.shape[:2])
     jumps[1:-1] = np.linalg.norm(np.diff(joints, n=2, axis=0), axis=-1) * fps**2
-    floats = [binary_opening(flag, np.ones((math.ceil(s * fps), 1))) for s, flag in ((0.8, aloft), (0.3, aloft & slow))]
+    floats = [
+        binary_opening(flag, np.ones((math.ceil(s * fps), 1)))
+        for s, flag in ((0.8, aloft), (0.3, aloft & slow))
+    ]
     faults = [
         *_runs("skating", names, slides, frames=math.ceil(0.4 * fps)),
         *_runs("pop", names, jumps),
@@ -71,7 +108,11 @@ def find_faults(motion: Motion) -> list[Fault]:
 
 
 def _runs(
-    kind: str, names: Sequence[str], values: np.ndarray, flags: np.ndarray | None = None, frames: int = 1
+    kind: str,
+    names: Sequence[str],
+    values: np.ndarray,
+    flags: np.ndarray | None = None,
+    frames: int = 1,
 ) -> list[Fault]:
     """Returns the runs of at least `frames` frames with flags (F, J), or values (F, J) above the limit."""
     runs, flags = [], values > LIMITS[kind][0] if flags is None else flags
@@ -79,17 +120,23 @@ def _runs(
         flag = binary_opening(flags[:, joint], np.ones(frames)) if frames > 1 else flags[:, joint]
         edges = np.flatnonzero(np.diff(np.r_[0, flag.astype(int), 0]))
         for start, end in edges.reshape(-1, 2).tolist():
-            runs.append(Fault(kind, names[joint], start, end, float(values[start:end, joint].max())))
+            runs.append(
+                Fault(kind, names[joint], start, end, float(values[start:end, joint].max()))
+            )
     return runs
 
 
-def _stretched(joints: np.ndarray, edges: Sequence[tuple[int, int]]) -> tuple[np.ndarray, np.ndarray]:
+def _stretched(
+    joints: np.ndarray, edges: Sequence[tuple[int, int]]
+) -> tuple[np.ndarray, np.ndarray]:
     change, flags = np.zeros(joints.shape[:2]), np.zeros(joints.shape[:2], bool)
     for parent, joint in edges:
         length = np.linalg.norm(joints[:, joint] - joints[:, parent], axis=-1)
         usual = np.median(length)
         change[:, joint] = np.abs(length - usual) / max(usual, 1e-6)
-        flags[:, joint] = (change[:, joint] > LIMITS["bone length"][0]) & (np.abs(length - usual) > 0.01)
+        flags[:, joint] = (change[:, joint] > LIMITS["bone length"][0]) & (
+            np.abs(length - usual) > 0.01
+        )
     return change, flags
 
 
@@ -105,7 +152,11 @@ def _inside(joints: np.ndarray, names: Sequence[str]) -> np.ndarray:
 
 def _bends(joints: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
     """Finds knees that bend forward, judged by the direction of the foot, and knees and elbows folded into the limb."""
-    limit, flags, worst = LIMITS["limit"][0], np.zeros(joints.shape[:2], bool), np.zeros(joints.shape[:2])
+    limit, flags, worst = (
+        LIMITS["limit"][0],
+        np.zeros(joints.shape[:2], bool),
+        np.zeros(joints.shape[:2]),
+    )
     for side in ("left", "right"):
         for limb in (("hip", "knee", "ankle"), ("shoulder", "elbow", "wrist")):
             chain = [f"{side}_{name}" for name in limb]
@@ -118,7 +169,8 @@ def _bends(joints: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.nda
                 toes = unit(joints[:, names.index(f"{side}_foot")] - lower)
                 front = toes - (toes * b).sum(-1, keepdims=True) * b
                 tilt = np.degrees(np.arcsin(np.clip(-(a * unit(front)).sum(-1), -1, 1)))
-                forward = (tilt > limit) & (np.linalg.norm(front, axis=-1) > 0.5)  # a pointed foot has no front
+                # A pointed foot has no front
+                forward = (tilt > limit) & (np.linalg.norm(front, axis=-1) > 0.5)
                 flags[:, at] |= forward
                 worst[:, at] = np.where(forward, tilt, worst[:, at])
     return worst, flags
@@ -134,13 +186,18 @@ def depths(joints: np.ndarray, names: Sequence[str], side: str) -> tuple[np.ndar
     elbow, wrist = at[f"{side}_elbow"], at[f"{side}_wrist"]
     points = np.stack([elbow, wrist, wrist + PALM * (wrist - elbow)], 1)
     across = unit(at["left_shoulder"] - at["right_shoulder"])
-    bones = [(joints[:, 0], at["neck"]), *((at[f"{leg}_hip"], at[f"{leg}_knee"]) for leg in ("left", "right"))]
+    bones = [
+        (joints[:, 0], at["neck"]),
+        *((at[f"{leg}_hip"], at[f"{leg}_knee"]) for leg in ("left", "right")),
+    ]
     away = [_away(points, start, end) for start, end in bones]
     lateral = (away[0] * across[:, None]).sum(-1, keepdims=True) * across[:, None]
     away[0] = away[0] - (1 - 1 / WIDTH) * lateral
     lengths = [float(np.median(np.linalg.norm(end - start, axis=-1))) for start, end in bones]
     sizes = np.multiply([TRUNK, THIGH, THIGH], lengths)
-    depth = np.stack([size - np.linalg.norm(way, axis=-1) for size, way in zip(sizes, away, strict=True)])
+    depth = np.stack(
+        [size - np.linalg.norm(way, axis=-1) for size, way in zip(sizes, away, strict=True)]
+    )
     deepest = depth.argmax(0)[None]
     way = np.take_along_axis(np.stack(away), deepest[..., None], 0)[0]
     return np.take_along_axis(depth, deepest, 0)[0], unit(way)
@@ -149,7 +206,9 @@ def depths(joints: np.ndarray, names: Sequence[str], side: str) -> tuple[np.ndar
 def _away(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Returns vectors (F, P, 3) to points (F, P, 3) from the nearest point of a segment with ends (F, 3)."""
     axis, points = (end - start)[:, None], points - start[:, None]
-    share = (points * axis).sum(-1, keepdims=True) / np.maximum((axis**2).sum(-1, keepdims=True), 1e-9)
+    share = (points * axis).sum(-1, keepdims=True) / np.maximum(
+        (axis**2).sum(-1, keepdims=True), 1e-9
+    )
     return points - np.clip(share, 0, 1) * axis
 
 

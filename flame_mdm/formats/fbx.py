@@ -18,17 +18,35 @@ from flame_mdm.errors import UserError
 from flame_mdm.safe_io import MEBIBYTE, atomic_write, regular_file
 
 MAGIC = b"Kaydara FBX Binary  \x00\x1a\x00"
-VERSION = 7400  # FBX 7.4 of 2014: the newest version whose records have 32-bit offsets, read by all programs
+# FBX 7.4 of 2014: the newest version whose records have 32-bit offsets, read by all programs
+VERSION = 7400
 WIDE_VERSION = 7500  # the version from which records have 64-bit offsets
 OLDEST_VERSION = 7000  # earlier files store animations in another structure
 LIMIT = 512 * MEBIBYTE  # maximum size of a file that is read
-EXPANDED_LIMIT = 512 * MEBIBYTE  # maximum size of all arrays of a file together, after decompression
+# Maximum size of all arrays of a file together, after decompression
+EXPANDED_LIMIT = 512 * MEBIBYTE
 MAX_DEPTH = 32  # maximum nesting of records; programs write about 8
 MAX_RECORDS = 1_000_000  # maximum number of records of a file
 MAX_NAME = 255  # the length of a name is stored in one byte
 
-SCALARS = {"Y": "<h", "C": "<?", "I": "<i", "F": "<f", "D": "<d", "L": "<q"}  # type code -> format of the number
-ARRAYS = {"f": "<f4", "d": "<f8", "l": "<i8", "i": "<i4", "b": "<u1", "c": "<u1"}  # type code -> type of the items
+# Type code -> format of the number
+SCALARS = {
+    "Y": "<h",
+    "C": "<?",
+    "I": "<i",
+    "F": "<f",
+    "D": "<d",
+    "L": "<q",
+}
+# Type code -> type of the items
+ARRAYS = {
+    "f": "<f4",
+    "d": "<f8",
+    "l": "<i8",
+    "i": "<i4",
+    "b": "<u1",
+    "c": "<u1",
+}
 DEFLATED = 128  # size of an array in bytes from which it is written compressed
 
 # Constants at the end of each file, equal in all files without a password.
@@ -92,7 +110,9 @@ def read(path: Path) -> Record:
     content = path.read_bytes()
     if not content.startswith(MAGIC[:18]):
         if content.lstrip()[:1] == b";" or b"FBXHeaderExtension" in content[:4096]:
-            raise UserError(f"{path}: an FBX file in ASCII. Export it as binary FBX, the default of most programs")
+            raise UserError(
+                f"{path}: an FBX file in ASCII. Export it as binary FBX, the default of most programs"
+            )
         raise UserError(f"{path}: not an FBX file")
     try:
         (version,) = struct.unpack_from("<I", content, len(MAGIC))
@@ -184,7 +204,8 @@ class _Reader:
             raise ValueError(f"arrays of more than {EXPANDED_LIMIT // MEBIBYTE} MiB")
         if encoding == 1:
             unpacker = zlib.decompressobj()
-            packed = unpacker.decompress(packed, size + 1)  # one byte more, to notice arrays that are too long
+            # One byte more, to notice arrays that are too long
+            packed = unpacker.decompress(packed, size + 1)
         elif encoding != 0:
             raise ValueError(f"unknown encoding {encoding} of an array")
         if len(packed) != size:

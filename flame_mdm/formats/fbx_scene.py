@@ -125,7 +125,9 @@ class _Model:
         value = self.properties.get(name, (0,))
         return int(value[0]) if value and abs(value[0]) < 1000 else 0
 
-    def animated(self, name: str, default: tuple[float, float, float], times: np.ndarray) -> np.ndarray:
+    def animated(
+        self, name: str, default: tuple[float, float, float], times: np.ndarray
+    ) -> np.ndarray:
         """Returns a property (F, 3) at times (F,)."""
         values = np.tile(self.vector(name, default), (len(times), 1))
         for axis, curve in self.curves.get(name, {}).items():
@@ -193,7 +195,9 @@ class _Scene:
         connections = root.first("Connections") or fbx.Record("")
         self.settings = _properties(root.first("GlobalSettings"))
         defaults = _model_defaults(root)
-        self.records = {record.properties[0]: record for record in objects.children if _is_object(record)}
+        self.records = {
+            record.properties[0]: record for record in objects.children if _is_object(record)
+        }
 
         self.models: dict[int, _Model] = {}
         for number, record in self.records.items():
@@ -202,7 +206,8 @@ class _Scene:
         if len(self.models) > MAX_MODELS:
             raise ValueError(f"more than {MAX_MODELS} models")
 
-        self.below: dict[int, list[tuple[int, str]]] = defaultdict(list)  # id -> ids connected to it, and the property
+        # Id -> ids connected to it, and the property
+        self.below: dict[int, list[tuple[int, str]]] = defaultdict(list)
         for record in connections.all("C"):
             if len(record.properties) < 3:
                 raise ValueError("a connection without ends")
@@ -219,13 +224,17 @@ class _Scene:
                 continue
             layers = [layer for layer in self._below(number, "AnimationLayer") if self._keys(layer)]
             if len(layers) > 1:
-                raise UserError(f"{len(layers)} animation layers in {_name(record)}. Bake or merge them into one")
+                raise UserError(
+                    f"{len(layers)} animation layers in {_name(record)}. Bake or merge them into one"
+                )
             takes += [(_name(record), layer) for layer in layers]
         return takes
 
     def _below(self, number: int, kind: str) -> list[int]:
         ids = [child for child, _ in self.below[number]]
-        return [child for child in ids if child in self.records and self.records[child].name == kind]
+        return [
+            child for child in ids if child in self.records and self.records[child].name == kind
+        ]
 
     def _keys(self, layer: int) -> list[tuple[int, int, int]]:
         """Returns curve node, axis and curve of all curves in a layer."""
@@ -233,7 +242,11 @@ class _Scene:
         curves = []
         for node in self._below(layer, "AnimationCurveNode"):
             for curve, name in self.below[node]:
-                if name in axes and curve in self.records and self.records[curve].name == "AnimationCurve":
+                if (
+                    name in axes
+                    and curve in self.records
+                    and self.records[curve].name == "AnimationCurve"
+                ):
                     curves.append((node, axes[name], curve))
         return curves
 
@@ -252,7 +265,9 @@ class _Scene:
                 curves.append(_curve(self.records[number]))
                 self.models[model].curves.setdefault(target, {})[axis] = curves[-1]
         if not curves:
-            raise UserError("contains no animation of its bones. Export the file with its animation")
+            raise UserError(
+                "contains no animation of its bones. Export the file with its animation"
+            )
 
         fps = self._rate()
         start = min(curve.times[0] for curve in curves)
@@ -320,7 +335,9 @@ def _properties(record: fbx.Record | None) -> dict[str, tuple[float, ...]]:
     properties = {}
     for entry in block.all("P") if block else ():
         numbers = tuple(entry.properties[4:])
-        if numbers and all(isinstance(number, int | float) and abs(number) < LARGEST for number in numbers):
+        if numbers and all(
+            isinstance(number, int | float) and abs(number) < LARGEST for number in numbers
+        ):
             properties[str(entry.properties[0])] = tuple(map(float, numbers))
     return properties
 

@@ -21,13 +21,15 @@ from flame_mdm.formats.rigged import Material, RiggedClip, Skin
 
 PER_METER = 100  # the files are in centimeters
 CUSTOM_RATE = 14  # `TimeMode` of a rate in `CustomFrameRate`
-CREATED = "1970-01-01 10:00:00:000"  # equal files for equal motions; readers check the time against `FileId`
+# Equal files for equal motions; readers check the time against `FileId`
+CREATED = "1970-01-01 10:00:00:000"
 FILE_ID = bytes.fromhex("28b32aebb624ccc2bfc8b02aa92bfcf1")
 EULER = "ZYX"  # R = Rz Ry Rx, the order that FBX calls eEulerXYZ
-LINEAR_KEY = 0x4 | 0x100 | 0x2000 | 0x4000  # interpolation and tangents of a key, as Blender and the SDK write them
-ROOT_BACK = (
-    1e-4  # meters by which a root is moved back: Blender keeps a pelvis in place that is at the tail of its root
-)
+# Interpolation and tangents of a key, as Blender and the SDK write them
+LINEAR_KEY = 0x4 | 0x100 | 0x2000 | 0x4000
+# Meters by which a root is moved back: Blender keeps a pelvis in place that is at the tail of its
+# root
+ROOT_BACK = 1e-4
 AXES = ("X", "Y", "Z")
 HELD_KEY = 0x2  # a value that is held until the next key
 CONTACTS = ("LeftFootContact", "RightFootContact")
@@ -59,7 +61,8 @@ class _Writer:
         for skin in clip.skins:
             poses |= self._mesh(skin, bones, materials)
         if poses and clip.root >= 0:
-            poses[bones[clip.root]][2, 3] -= PER_METER * ROOT_BACK  # three.js takes its place from the bind pose
+            # three.js takes its place from the bind pose
+            poses[bones[clip.root]][2, 3] -= PER_METER * ROOT_BACK
         if poses:
             self._bind_pose(poses)
         self._animation(bones, duration)
@@ -87,7 +90,9 @@ class _Writer:
         self.last_id += 1
         return self.last_id
 
-    def _object(self, kind: str, name: str, category: str, label: str | None = None) -> tuple[int, Record]:
+    def _object(
+        self, kind: str, name: str, category: str, label: str | None = None
+    ) -> tuple[int, Record]:
         number = self._new()
         return number, self.objects.add(kind, number, f"{name}\x00\x01{label or kind}", category)
 
@@ -132,7 +137,9 @@ class _Writer:
             self._connect(number, bones[parent] if parent >= 0 else 0)
         return bones
 
-    def _mesh(self, skin: Skin, bones: Sequence[int], materials: dict[Material, int]) -> dict[int, np.ndarray]:
+    def _mesh(
+        self, skin: Skin, bones: Sequence[int], materials: dict[Material, int]
+    ) -> dict[int, np.ndarray]:
         """Adds a mesh in the pose in which it is bound, with its materials and its skin.
 
         `materials` holds the ids of the materials that the file has so far. Returns the matrix (4, 4) of each object,
@@ -230,10 +237,21 @@ class _Writer:
             self._curves(layer, bone, "Lcl Rotation", "R", times, angles[:, joint])
         for joint, moved in self.moves.items():
             self._curves(layer, bones[joint], "Lcl Translation", "T", times, moved)
-        for foot, name in enumerate(CONTACTS[: clip.contacts.shape[1] if len(clip.contacts) else 0]):
+        for foot, name in enumerate(
+            CONTACTS[: clip.contacts.shape[1] if len(clip.contacts) else 0]
+        ):
             planted = clip.contacts[:, foot].astype(float)
             changes = np.flatnonzero(np.diff(planted, prepend=-1.0))
-            self._curves(layer, bones[0], name, name, times[changes], planted[changes, None], (name,), HELD_KEY)
+            self._curves(
+                layer,
+                bones[0],
+                name,
+                name,
+                times[changes],
+                planted[changes, None],
+                (name,),
+                HELD_KEY,
+            )
 
     def _curves(
         self,
@@ -275,8 +293,12 @@ def _matrix(matrix: np.ndarray) -> np.ndarray:
     return matrix.T.astype("<f8").ravel()
 
 
-def _vector(properties: Record, name: str, kind: str, flags: str, values: Sequence[float] | np.ndarray) -> None:
-    properties.add("P", name, kind, "Vector" if kind == "Vector3D" else "", flags, *map(float, values))
+def _vector(
+    properties: Record, name: str, kind: str, flags: str, values: Sequence[float] | np.ndarray
+) -> None:
+    properties.add(
+        "P", name, kind, "Vector" if kind == "Vector3D" else "", flags, *map(float, values)
+    )
 
 
 def _model(record: Record, offset: np.ndarray, before: np.ndarray, scale: float = 1.0) -> Record:
@@ -344,7 +366,15 @@ def _header(root: Record) -> None:
     header.add("EncryptionType", Int(0))
     stamp = header.add("CreationTimeStamp")
     stamp.add("Version", Int(1000))
-    date = {"Year": 1970, "Month": 1, "Day": 1, "Hour": 10, "Minute": 0, "Second": 0, "Millisecond": 0}
+    date = {
+        "Year": 1970,
+        "Month": 1,
+        "Day": 1,
+        "Hour": 10,
+        "Minute": 0,
+        "Second": 0,
+        "Millisecond": 0,
+    }
     for name, value in date.items():
         stamp.add(name, Int(value))
     header.add("Creator", "flame_mdm")

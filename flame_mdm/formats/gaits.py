@@ -34,7 +34,11 @@ MARGIN = 0.15  # seconds of standing that are kept before a start and after a st
 FADE = 0.5  # seconds in which the first or the last pose of a clip changes into the motion
 OVERSHOOT = (0.6, 1.6)  # smallest and largest turn relative to the requested one
 PART = 0.5  # shortest start and stop in seconds
-STILL = (0.1, 10.0)  # meters and degrees; a loop that moves less from repetition to repetition stays in its place
+# Meters and degrees; a loop that moves less from repetition to repetition stays in its place
+STILL = (
+    0.1,
+    10.0,
+)
 TALL = 0.15  # meters per joint; poses of two cycles that differ more do not make a loop
 
 
@@ -72,7 +76,11 @@ def direction(degrees: float) -> np.ndarray:
 def progress(motion: GroundedMotion, degrees: float) -> tuple[np.ndarray, np.ndarray]:
     """Returns the velocities (F,) of the root along a direction relative to its facing, and to the left of it."""
     cosine, sine = np.cos(motion.heading), np.sin(motion.heading)
-    dx, dz = np.gradient(motion.path, axis=0).T * motion.fps if len(motion) > 1 else np.zeros((2, len(motion)))
+    dx, dz = (
+        np.gradient(motion.path, axis=0).T * motion.fps
+        if len(motion) > 1
+        else np.zeros((2, len(motion)))
+    )
     x, z = cosine * dx - sine * dz, sine * dx + cosine * dz
     along = direction(degrees)
     aside = direction(degrees + 90)
@@ -95,7 +103,8 @@ def find_cycle(motion: GroundedMotion, degrees: float) -> Cycle | None:
     begin, end = max(begin, first + part), min(end, last - part)
     if (
         end <= begin
-        or abs(np.degrees(np.arctan2(aside[begin : end + 1].mean(), along[begin : end + 1].mean()))) > ASIDE
+        or abs(np.degrees(np.arctan2(aside[begin : end + 1].mean(), along[begin : end + 1].mean())))
+        > ASIDE
     ):
         return None
 
@@ -108,7 +117,9 @@ def find_cycle(motion: GroundedMotion, degrees: float) -> Cycle | None:
         for first in starts:
             for last in range(first + shortest, min(first + longest, end) + 1):
                 apart = np.linalg.norm(poses[first] - poses[last], axis=-1).mean()
-                changed = np.linalg.norm(speeds[first] - speeds[last], axis=-1).mean() + abs(even[first] - even[last])
+                changed = np.linalg.norm(speeds[first] - speeds[last], axis=-1).mean() + abs(
+                    even[first] - even[last]
+                )
                 cycles.append(Cycle(first, last, float(apart + VELOCITY * changed)))
         best = min(cycles, key=lambda cycle: cycle.difference, default=None)
         if best is not None and best.difference < TALL:
@@ -116,7 +127,9 @@ def find_cycle(motion: GroundedMotion, degrees: float) -> Cycle | None:
     return None
 
 
-def gait(motion: GroundedMotion, cycle: Cycle, degrees: float, stand: np.ndarray) -> list[GroundedMotion]:
+def gait(
+    motion: GroundedMotion, cycle: Cycle, degrees: float, stand: np.ndarray
+) -> list[GroundedMotion]:
     """Returns start, loop and stop of a gait on a straight path.
 
     Args:
@@ -147,7 +160,9 @@ def straightened(motion: GroundedMotion, degrees: float) -> GroundedMotion:
     """Returns the motion with a root that faces +z and moves along a straight line."""
     along, _ = progress(motion, degrees)
     distance = np.concatenate([[0], np.cumsum((along[1:] + along[:-1]) / 2) / motion.fps])
-    return replace(motion, path=distance[:, None] * direction(degrees), heading=np.zeros(len(motion)))
+    return replace(
+        motion, path=distance[:, None] * direction(degrees), heading=np.zeros(len(motion))
+    )
 
 
 def closed(motion: GroundedMotion) -> GroundedMotion:
@@ -238,7 +253,9 @@ def with_neighbors(clips: Sequence[Clip], frames: int) -> tuple[np.ndarray, list
             begin = (len(several) - len(local)) // 2
             part = several[begin - frames : begin + len(local) + frames]
         else:
-            part = np.concatenate([np.repeat(local[:1], frames, 0), local, np.repeat(local[-1:], frames, 0)])
+            part = np.concatenate(
+                [np.repeat(local[:1], frames, 0), local, np.repeat(local[-1:], frames, 0)]
+            )
         parts.append(part)
         slices.append(slice(position + frames, position + frames + len(local)))
         position += len(part)

@@ -21,19 +21,34 @@ from flame_mdm.representations import rotation
 from flame_mdm.safe_io import MEBIBYTE, atomic_write, parse_json, regular_file
 
 UNSIGNED_BYTE, UNSIGNED_SHORT, FLOAT = 5121, 5123, 5126
-WHOLE = {5120: 127, UNSIGNED_BYTE: 255, 5122: 32767, UNSIGNED_SHORT: 65535}  # integers that mean 1, if normalized
-COMPONENTS = {5120: "<i1", UNSIGNED_BYTE: "<u1", 5122: "<i2", UNSIGNED_SHORT: "<u2", 5125: "<u4", FLOAT: "<f4"}
+# Integers that mean 1, if normalized
+WHOLE = {
+    5120: 127,
+    UNSIGNED_BYTE: 255,
+    5122: 32767,
+    UNSIGNED_SHORT: 65535,
+}
+COMPONENTS = {
+    5120: "<i1",
+    UNSIGNED_BYTE: "<u1",
+    5122: "<i2",
+    UNSIGNED_SHORT: "<u2",
+    5125: "<u4",
+    FLOAT: "<f4",
+}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}  # numbers per item
 KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 LIMIT = 512 * MEBIBYTE  # maximum size of a file that is read
-DOCUMENT_LIMIT = 16 * MEBIBYTE  # maximum size of its JSON part, which takes many times its size in memory
+# Maximum size of its JSON part, which takes many times its size in memory
+DOCUMENT_LIMIT = 16 * MEBIBYTE
 MAX_NODES, MAX_ITEMS = 4096, 65_536  # maximum number of nodes, and of all other items of one list
 LARGEST = 1e9  # largest coordinate or matrix entry that is read
 HARMLESS = re.compile(r"KHR_(materials|texture|lights|mesh|draco)_|EXT_texture_|VRM")
 """Required extensions that change neither nodes, skins nor bounds: a character is read, and written with them."""
 
 Item = TypeVar("Item")
-Index = Annotated[int, Field(ge=0, lt=2**40)]  # into another list, or a number of bytes; -1 if it is missing
+# Into another list, or a number of bytes; -1 if it is missing
+Index = Annotated[int, Field(ge=0, lt=2**40)]
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
 Items = Annotated[list[Item], Field(max_length=MAX_ITEMS), FailFast()]
 NodeItems = Annotated[list[Item], Field(max_length=MAX_NODES), FailFast()]
@@ -149,7 +164,8 @@ class Skin:
 class Glb:
     """A valid .glb file. N nodes, in an order in which parents precede their children."""
 
-    document: dict[str, Any]  # the JSON part, with the lists `buffers`, `bufferViews` and `accessors`
+    # The JSON part, with the lists `buffers`, `bufferViews` and `accessors`
+    document: dict[str, Any]
     data: bytes  # the binary part
     nodes: tuple[int, ...]  # index of each node in the document
     names: tuple[str, ...]  # name of each node
@@ -169,7 +185,9 @@ def read(path: Path) -> Glb:
         document, data = _chunks(content)
         parts = _Document.model_validate(document)
         if unread := [name for name in parts.extensionsRequired if not HARMLESS.match(name)]:
-            raise UserError(f"it requires {unread[0][:80]}, which is not read. Export it without this compression")
+            raise UserError(
+                f"it requires {unread[0][:80]}, which is not read. Export it without this compression"
+            )
         order, above = _ordered(parts.nodes)
         rank = np.argsort(order).tolist()  # index in the document -> number
         parents = tuple(rank[above[number]] if number in above else -1 for number in order)
@@ -207,7 +225,9 @@ def _chunks(content: bytes) -> tuple[Any, bytes]:
         return document, b""
     length, kind = struct.unpack_from("<I4s", content, 20 + size)
     if kind != b"BIN\0" or len(content) < 28 + size + length:
-        raise ValueError(f"a second part {kind!r} of {length} bytes, which the file does not contain")
+        raise ValueError(
+            f"a second part {kind!r} of {length} bytes, which the file does not contain"
+        )
     return document, content[28 + size : 28 + size + length]
 
 
@@ -216,7 +236,10 @@ def _skins(parts: _Document, data: bytes, rank: Sequence[int]) -> tuple[Skin, ..
     corners: list[list[np.ndarray]] = [[np.zeros((0, 3))] for _ in parts.skins]
     for node in (node for node in parts.nodes if min(node.mesh, node.skin) >= 0):
         own = _item(corners, node.skin, "skin")
-        own += [_corners(parts, primitive) for primitive in _item(parts.meshes, node.mesh, "mesh").primitives]
+        own += [
+            _corners(parts, primitive)
+            for primitive in _item(parts.meshes, node.mesh, "mesh").primitives
+        ]
         if sum(map(len, corners)) > MAX_ITEMS:
             raise ValueError(f"more than {MAX_ITEMS:,} parts of meshes with a skin")
     skins = []
@@ -242,10 +265,14 @@ def _binds(parts: _Document, skin: _Skin, data: bytes) -> np.ndarray:
         return np.zeros((0, 4, 4))
     accessor = _item(parts.accessors, skin.inverseBindMatrices, "inverseBindMatrices")
     view = _item(parts.bufferViews, accessor.bufferView, "bufferView")
-    fits = (accessor.componentType, accessor.type) == (FLOAT, "MAT4") and accessor.count >= len(skin.joints)
+    fits = (accessor.componentType, accessor.type) == (FLOAT, "MAT4") and accessor.count >= len(
+        skin.joints
+    )
     if view.buffer or view.byteStride not in (0, 64) or not fits:
         raise ValueError("inverse bind matrices are not floats, or not one per joint")
-    values = np.frombuffer(data, "<f4", 16 * len(skin.joints), view.byteOffset + accessor.byteOffset)
+    values = np.frombuffer(
+        data, "<f4", 16 * len(skin.joints), view.byteOffset + accessor.byteOffset
+    )
     with np.errstate(all="ignore"):  # checked below
         binds = values.reshape(-1, 4, 4).mT.astype(float)
     if not ((np.abs(binds) <= LARGEST).all() and (np.abs(np.linalg.det(binds)) > 1e-30).all()):
@@ -274,7 +301,9 @@ def numbers(file: Glb, accessor: int, kind: str) -> np.ndarray:
     size = stride * (item.count - 1) + dtype.itemsize * width if item.count else 0
     if stride < dtype.itemsize * width or start + size > len(file.data):
         raise ValueError(f"accessor {accessor}: ends outside the file")
-    values = np.ndarray((item.count, width), dtype, file.data, start, (stride, dtype.itemsize)).astype(float)
+    values = np.ndarray(
+        (item.count, width), dtype, file.data, start, (stride, dtype.itemsize)
+    ).astype(float)
     if item.normalized and item.componentType in WHOLE:
         values = np.maximum(values / WHOLE[item.componentType], -1)
     return values
@@ -283,11 +312,19 @@ def numbers(file: Glb, accessor: int, kind: str) -> np.ndarray:
 class Binary:
     """The binary part of the file: concatenated arrays, with buffer views and accessors that describe them."""
 
-    def __init__(self, data: bytes = b"", views: Sequence[Any] = (), accessors: Sequence[Any] = ()) -> None:
+    def __init__(
+        self, data: bytes = b"", views: Sequence[Any] = (), accessors: Sequence[Any] = ()
+    ) -> None:
         self.data = bytearray(data) + b"\0" * (-len(data) % 4)
         self.views, self.accessors = list(views), list(accessors)
 
-    def add(self, array: np.ndarray, target: int | None = None, bounds: bool = False, normalized: bool = False) -> int:
+    def add(
+        self,
+        array: np.ndarray,
+        target: int | None = None,
+        bounds: bool = False,
+        normalized: bool = False,
+    ) -> int:
         """Appends numbers (N,) or (N, K) and returns the index of their accessor; `normalized`: bytes mean 0 to 1."""
         rows = array.reshape(len(array), -1)
         component = {"u1": UNSIGNED_BYTE, "u2": UNSIGNED_SHORT, "f4": FLOAT}[rows.dtype.str[1:]]
@@ -304,12 +341,18 @@ class Binary:
         self.data += b"\0" * (-len(self.data) % 4)
         return len(self.accessors) - 1
 
-    def animation(self, name: str, fps: float, curves: Sequence[tuple[str, int, np.ndarray]]) -> dict[str, Any]:
+    def animation(
+        self, name: str, fps: float, curves: Sequence[tuple[str, int, np.ndarray]]
+    ) -> dict[str, Any]:
         """Appends an animation of properties of nodes and returns it: property, node, values (F, K) in frames."""
-        times = self.add(np.arange(len(curves[0][2]), dtype=np.float32) / np.float32(fps), bounds=True)
+        times = self.add(
+            np.arange(len(curves[0][2]), dtype=np.float32) / np.float32(fps), bounds=True
+        )
         samplers = [{"input": times, "output": self.add(values)} for _, _, values in curves]
         targets = [{"node": node, "path": kind} for kind, node, _ in curves]
-        channels = [{"sampler": sampler, "target": target} for sampler, target in enumerate(targets)]
+        channels = [
+            {"sampler": sampler, "target": target} for sampler, target in enumerate(targets)
+        ]
         return {"name": name, "samplers": samplers, "channels": channels}
 
     def save(self, path: Path, document: dict[str, Any]) -> None:
@@ -319,7 +362,11 @@ class Binary:
         document["buffers"] = [{**own, "byteLength": len(self.data)}, *others]
         head = json.dumps(document, separators=(",", ":")).encode()
         head += b" " * (-len(head) % 4)
-        chunks = struct.pack("<I4s", len(head), b"JSON") + head + struct.pack("<I4s", len(self.data), b"BIN\0")
+        chunks = (
+            struct.pack("<I4s", len(head), b"JSON")
+            + head
+            + struct.pack("<I4s", len(self.data), b"BIN\0")
+        )
         chunks += self.data
         with atomic_write(path) as temporary:
             temporary.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)

@@ -21,9 +21,16 @@ from flame_mdm.formats.fbx_scene import hermite
 from flame_mdm.formats.resampling import MAX_FRAMES, RATES
 
 MAX_CELLS = 4_000_000  # maximum number of frames times nodes
-SPARSE_RATE = 24.0  # keys farther apart than at this rate are placed by hand: motions are sampled more often
+SPARSE_RATE = (
+    24.0  # keys farther apart than at this rate are placed by hand: motions are sampled more often
+)
 USUAL_RATE = 30.0  # rate at which such motions are sampled
-WIDTHS = {"translation": 3, "rotation": 4, "scale": 3}  # numbers per key of the properties that move nodes
+# Numbers per key of the properties that move nodes
+WIDTHS = {
+    "translation": 3,
+    "rotation": 4,
+    "scale": 3,
+}
 
 # Bones of VRM's humanoid -> joints of SMPL.
 HUMANOID = {
@@ -44,7 +51,9 @@ _SIDED = {
     "Foot": "ankle",
     "Toes": "foot",
 }
-HUMANOID |= {side + bone: f"{side}_{joint}" for side in ("left", "right") for bone, joint in _SIDED.items()}
+HUMANOID |= {
+    side + bone: f"{side}_{joint}" for side in ("left", "right") for bone, joint in _SIDED.items()
+}
 
 Index = Annotated[int, Field(ge=0, lt=2**40)]
 
@@ -159,7 +168,11 @@ def animations(path: Path) -> list[str]:
 def _animations(file: glb.Glb) -> list[tuple[str, _Animation]]:
     parsed = [_Animation.model_validate(item) for item in file.document.get("animations", [])]
     named = [(item.name or f"animation {number}", item) for number, item in enumerate(parsed, 1)]
-    return [(name, item) for name, item in named if any(channel.target.path in WIDTHS for channel in item.channels)]
+    return [
+        (name, item)
+        for name, item in named
+        if any(channel.target.path in WIDTHS for channel in item.channels)
+    ]
 
 
 def _motion(file: glb.Glb, animation: str | int | None) -> AnimatedNodes:
@@ -273,7 +286,11 @@ def humanoid(file: glb.Glb) -> dict[str, int]:
     for name in ("VRMC_vrm", "VRMC_vrm_animation"):
         try:
             bones = extensions[name]["humanoid"]["humanBones"]
-            numbers = {HUMANOID[bone]: rank[entry["node"]] for bone, entry in bones.items() if bone in HUMANOID}
+            numbers = {
+                HUMANOID[bone]: rank[entry["node"]]
+                for bone, entry in bones.items()
+                if bone in HUMANOID
+            }
         except (KeyError, TypeError, AttributeError):
             continue
         return numbers

@@ -29,14 +29,20 @@ def write(path: Path, clip: RiggedClip, text: str) -> None:
             nodes[parent].setdefault("children", []).append(joint)
     animation = binary.animation(clip.name, clip.fps, curves)
     if len(clip.contacts):
-        animation["extras"] = {"markers": [event._asdict() for event in contact_events(clip.contacts, clip.fps)]}
+        animation["extras"] = {
+            "markers": [event._asdict() for event in contact_events(clip.contacts, clip.fps)]
+        }
     figure: dict[str, Any] = {}
     for skin in clip.skins:
         nodes.append({"name": "figure", "mesh": 0, "skin": 0})
         figure = _skin(binary, skin)
     nodes.append({"name": "lifted", "children": [0], "translation": [0, clip.lift, 0]})
     document = {
-        "asset": {"version": "2.0", "generator": "flame_mdm", "extras": {"fps": clip.fps, "text": text}},
+        "asset": {
+            "version": "2.0",
+            "generator": "flame_mdm",
+            "extras": {"fps": clip.fps, "text": text},
+        },
         "scene": 0,
         "scenes": [{"nodes": list(range(len(clip.joints), len(nodes)))}],
         "nodes": nodes,
@@ -55,10 +61,13 @@ def _skin(binary: Binary, skin: Skin) -> dict[str, Any]:
         "NORMAL": binary.add(skin.normals.astype("<f4"), VERTICES),
         "COLOR_0": binary.add(light, VERTICES, normalized=True),
         "JOINTS_0": binary.add(skin.bones, VERTICES),
-        "WEIGHTS_0": binary.add(np.rint(255 * skin.weights).astype("u1"), VERTICES, normalized=True),
+        "WEIGHTS_0": binary.add(
+            np.rint(255 * skin.weights).astype("u1"), VERTICES, normalized=True
+        ),
     }
     indices = binary.add(skin.triangles.astype("<u2").ravel(), INDICES)
-    matrices = binary.add(skin.binds.mT.reshape(-1, 16).astype("<f4"))  # matrices are stored in column-major order
+    # Matrices are stored in column-major order
+    matrices = binary.add(skin.binds.mT.reshape(-1, 16).astype("<f4"))
     return {
         "meshes": [{"primitives": [{"attributes": attributes, "indices": indices, "material": 0}]}],
         "materials": [{"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.8}}],

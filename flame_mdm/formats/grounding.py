@@ -15,13 +15,19 @@ from scipy.ndimage import binary_closing, binary_opening, gaussian_filter1d, max
 from flame_mdm.formats.cleanup import REACH, bend
 from flame_mdm.representations.skeleton import JOINT, SMPL22
 
-SMOOTHNESS = 0.15  # seconds over which the path of the root is smoothed, so that it does not follow single steps
+# Seconds over which the path of the root is smoothed, so that it does not follow single steps
+SMOOTHNESS = 0.15
 LOW = 0.05  # height in meters above its lowest height at which a toe touches the floor
 SLOW = 0.25  # speed in m/s of a toe over the floor below which it is planted
 SHORT = 0.1  # seconds; shorter contacts, and shorter gaps between contacts, are left out
 LOWERING = 0.2  # seconds in which the body is lowered for a leg that is too short
-COPIES = 3  # repetitions of a loop that are planted together; the middle one has neighbors on both sides
-FEET = tuple(tuple(JOINT[f"{side}_{name}"] for name in ("hip", "knee", "ankle", "foot")) for side in ("left", "right"))
+COPIES = (
+    3  # repetitions of a loop that are planted together; the middle one has neighbors on both sides
+)
+FEET = tuple(
+    tuple(JOINT[f"{side}_{name}"] for name in ("hip", "knee", "ankle", "foot"))
+    for side in ("left", "right")
+)
 """Joints of the legs, the left one first."""
 
 
@@ -66,7 +72,11 @@ class GroundedMotion:
         away[:, [0, 2]] = self.path[frames] - start
         path = turned(away, -heading)[:, [0, 2]]
         return GroundedMotion(
-            self.local[frames].copy(), path, self.heading[frames] - heading, self.contacts[frames].copy(), self.fps
+            self.local[frames].copy(),
+            path,
+            self.heading[frames] - heading,
+            self.contacts[frames].copy(),
+            self.fps,
         )
 
 
@@ -79,7 +89,9 @@ def turned(points: np.ndarray, angles: np.ndarray | float) -> np.ndarray:
 
 def facing(joints: np.ndarray) -> np.ndarray:
     """Returns the direction (F,) that hips and shoulders face, without jumps of a full turn."""
-    right_hip, left_hip, right_shoulder, left_shoulder = (joints[:, joint] for joint in SMPL22.facing)
+    right_hip, left_hip, right_shoulder, left_shoulder = (
+        joints[:, joint] for joint in SMPL22.facing
+    )
     left = left_hip - right_hip + left_shoulder - right_shoulder
     return np.unwrap(np.arctan2(-left[:, 2], left[:, 0]))
 
@@ -109,7 +121,9 @@ def planted_toes(joints: np.ndarray, fps: float) -> np.ndarray:
     return filtered[padding:-padding]
 
 
-def anchored(motion: GroundedMotion, pose: np.ndarray, seconds: float, *, at_end: bool) -> GroundedMotion:
+def anchored(
+    motion: GroundedMotion, pose: np.ndarray, seconds: float, *, at_end: bool
+) -> GroundedMotion:
     """Returns the motion with another first or last pose; the change fades over some seconds.
 
     `pose` (22, 3) is seen from the root. Bones keep their lengths.
@@ -128,7 +142,9 @@ def with_lengths(joints: np.ndarray, pose: np.ndarray) -> np.ndarray:
     for parent, joint in SMPL22.edges:
         bone = joints[:, joint] - joints[:, parent]
         length = np.linalg.norm(pose[joint] - pose[parent])
-        out[:, joint] = out[:, parent] + bone * length / np.maximum(np.linalg.norm(bone, axis=-1, keepdims=True), 1e-9)
+        out[:, joint] = out[:, parent] + bone * length / np.maximum(
+            np.linalg.norm(bone, axis=-1, keepdims=True), 1e-9
+        )
     return out
 
 
@@ -138,7 +154,9 @@ def runs(flags: np.ndarray) -> list[tuple[int, int]]:
     return [(begin, end - 1) for begin, end in edges.reshape(-1, 2).tolist()]
 
 
-def planted(motion: GroundedMotion, *, fixed_start: bool = False, fixed_end: bool = False) -> GroundedMotion:
+def planted(
+    motion: GroundedMotion, *, fixed_start: bool = False, fixed_end: bool = False
+) -> GroundedMotion:
     """Returns the motion with toes that do not move during their contacts.
 
     The body is lowered where a leg would be too short. With `fixed_start` and `fixed_end`, the first and the last pose
@@ -149,10 +167,14 @@ def planted(motion: GroundedMotion, *, fixed_start: bool = False, fixed_end: boo
         _shift(world[:, leg[-1]], flags, fixed_start, fixed_end)
         for leg, flags in zip(FEET, motion.contacts.T, strict=True)
     ]
-    lack = np.max([_lack(world, leg, shift) for leg, shift in zip(FEET, shifts, strict=True)], axis=0)
+    lack = np.max(
+        [_lack(world, leg, shift) for leg, shift in zip(FEET, shifts, strict=True)], axis=0
+    )
     if lack.any():
         width = LOWERING * motion.fps
-        drop = gaussian_filter1d(maximum_filter1d(lack, 2 * round(width) + 1), width / 2, mode="nearest")
+        drop = gaussian_filter1d(
+            maximum_filter1d(lack, 2 * round(width) + 1), width / 2, mode="nearest"
+        )
         frames = np.arange(len(motion))
         if fixed_start:
             drop *= np.clip(frames / width, 0, 1)
@@ -248,5 +270,9 @@ def slide(motion: GroundedMotion) -> float:
     distances = [0.0]
     for foot in range(2):
         for begin, end in runs(motion.contacts[:, foot]):
-            distances.append(float(np.linalg.norm(toes[begin : end + 1, foot] - toes[begin, foot], axis=-1).max()))
+            distances.append(
+                float(
+                    np.linalg.norm(toes[begin : end + 1, foot] - toes[begin, foot], axis=-1).max()
+                )
+            )
     return max(distances)

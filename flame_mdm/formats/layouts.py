@@ -21,16 +21,23 @@ from flame_mdm.formats.retarget import joint_names, presets
 from flame_mdm.representations.skeleton import SKELETONS, SMPL22
 from flame_mdm.safe_io import read_yaml, regular_file
 
+# The axis that points up -> rows of the rotation that maps it to +y
 UP = {
     "y": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
     "z": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
     "-y": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
-}  # the axis that points up -> rows of the rotation that maps it to +y
-LEG, USUAL_LEG = (0.6, 1.2), 0.83  # shortest, longest and usual leg of an adult, in meters: hip to knee to ankle
+}
+# Shortest, longest and usual leg of an adult, in meters: hip to knee to ankle
+LEG, USUAL_LEG = (
+    (0.6, 1.2),
+    0.83,
+)
 CHILD = 0.25  # shortest leg of a child in meters, at about one year
 FOOT = 0.02  # shortest foot in meters, ankle to toes
-UNEQUAL = 1.5  # ratio of the left and right bones of limbs above which joints are not in the assumed order
-CHANGING = 0.25  # standard deviation of the bones of limbs over their mean length, above which the same holds
+# Ratio of the left and right bones of limbs above which joints are not in the assumed order
+UNEQUAL = 1.5
+# Standard deviation of the bones of limbs over their mean length, above which the same holds
+CHANGING = 0.25
 LIMBS = (("hip", "knee"), ("knee", "ankle"), ("shoulder", "elbow"), ("elbow", "wrist"))
 SIDES = ("left_", "right_")  # prefixes of SMPL's joints
 UNITS = {  # in meters
@@ -38,18 +45,22 @@ UNITS = {  # in meters
     **{"the unit of CMU's recordings": 0.0564444},
 }
 
-Source = str | Annotated[dict[str, FiniteFloat], Field(min_length=1)]  # a joint, or weights of a mean of joints
+# A joint, or weights of a mean of joints
+Source = str | Annotated[dict[str, FiniteFloat], Field(min_length=1)]
 
 
 class Layout(BaseModel):
     """Mapping from the joints of files to the 22 joints of SMPL, in meters, y up; the keys of `skeleton.yaml`."""
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
-    map: dict[str, Source] = {joint: joint for joint in SMPL22.joints}  # for SMPL's joints, those of the files
+    # For SMPL's joints, those of the files
+    map: dict[str, Source] = {joint: joint for joint in SMPL22.joints}
     joints: list[str] = []  # names of the joints of arrays, in order; BVH files contain their own
     unit: Annotated[FiniteFloat, Field(gt=0)] = 1.0  # meters per unit of length in the files
     up: Literal["y", "z", "-y"] = "y"  # the axis that points up
-    fps: Annotated[float, Field(ge=RATES[0], le=RATES[1])] | None = None  # of files that do not contain it
+    fps: Annotated[float, Field(ge=RATES[0], le=RATES[1])] | None = (
+        None  # of files that do not contain it
+    )
     mirrored: bool = False  # the files contain mirrored motion; the sign of x is changed
     children: bool = False  # the bodies may be those of children
     _name: str = PrivateAttr("own map")
@@ -78,7 +89,11 @@ class Layout(BaseModel):
 
     def ending(self, **ends: str) -> dict[str, Source]:
         """Returns a map with the end sites of joints instead of the joints that follow: SMPL's joint=its parent."""
-        return {side + joint: f"{self.map[side + parent]}.end" for joint, parent in ends.items() for side in SIDES}
+        return {
+            side + joint: f"{self.map[side + parent]}.end"
+            for joint, parent in ends.items()
+            for side in SIDES
+        }
 
     def pairs(self) -> dict[str, str]:
         """Returns the joints of files that the mapping uses -> their counterparts on the other side, or themselves."""
@@ -86,7 +101,9 @@ class Layout(BaseModel):
         for joint, source in self.map.items():
             other = self.map[opposite(joint)]
             shares, others = list(_shares(source)), list(_shares(other))
-            pairs |= dict(zip(shares, others if len(others) == len(shares) else shares, strict=True))
+            pairs |= dict(
+                zip(shares, others if len(others) == len(shares) else shares, strict=True)
+            )
         return pairs
 
     def apply(self, positions: np.ndarray, names: Sequence[str]) -> np.ndarray:
@@ -99,7 +116,12 @@ class Layout(BaseModel):
 
     def turn(self, positions: np.ndarray) -> np.ndarray:
         """Returns positions (F, J, 3) of a file in meters, y up, of the same joints."""
-        return self.unit * positions @ np.array(UP[self.up], float).T * [-1 if self.mirrored else 1, 1, 1]
+        return (
+            self.unit
+            * positions
+            @ np.array(UP[self.up], float).T
+            * [-1 if self.mirrored else 1, 1, 1]
+        )
 
 
 def opposite(joint: str) -> str:
@@ -114,24 +136,35 @@ def _shares(source: Source) -> Mapping[str, float]:
     return {source: 1.0} if isinstance(source, str) else source
 
 
-def _layout(joints: str | Sequence[str] = (), rig: str = "", map: Mapping = {}, **fields: Any) -> Layout:
+def _layout(
+    joints: str | Sequence[str] = (), rig: str = "", map: Mapping = {}, **fields: Any
+) -> Layout:
     """Returns a layout of `layouts.yaml`, which describes the arguments."""
     parts = {key: fields.pop(key) for key in ("sides", "trunk", "arm", "leg") if key in fields}
     skeleton = presets()[rig] if rig else parts
     bones = joint_names(skeleton) if skeleton else {joint: joint for joint in SMPL22.joints}
     sources: dict[str, Source] = dict(bones)
     for joint, shares in map.items():
-        sides = [("", "")] if joint in SMPL22.joints else zip(("left_", "right_"), skeleton["sides"], strict=True)
+        sides = (
+            [("", "")]
+            if joint in SMPL22.joints
+            else zip(("left_", "right_"), skeleton["sides"], strict=True)
+        )
         for side, mark in sides:
-            sources[side + joint] = {name.replace("*", mark): share for name, share in shares.items()}
+            sources[side + joint] = {
+                name.replace("*", mark): share for name, share in shares.items()
+            }
     names = SKELETONS[joints].joints if isinstance(joints, str) else joints
-    layout = Layout(map={joint: sources[joint] for joint in SMPL22.joints}, joints=list(names), **fields)
+    layout = Layout(
+        map={joint: sources[joint] for joint in SMPL22.joints}, joints=list(names), **fields
+    )
     layout._bones = bones
     return layout
 
 
 LAYOUTS: dict[str, Layout] = {
-    name: _layout(**fields) for name, fields in read_yaml(Path(__file__).with_name("layouts.yaml")).items()
+    name: _layout(**fields)
+    for name, fields in read_yaml(Path(__file__).with_name("layouts.yaml")).items()
 }
 """Known skeletons, recognized by the names of their joints."""
 
@@ -189,10 +222,18 @@ def array_layout(joints: np.ndarray, fields: Mapping[str, Any]) -> tuple[Layout,
     if not names and count in (22, 24, 52):
         names = (*SMPL22.joints, *(f"joint{number}" for number in range(len(SMPL22), count)))
     elif not names:
-        names = next((layout.joints for layout in LAYOUTS.values() if count == len(layout.joints)), ())
+        names = next(
+            (layout.joints for layout in LAYOUTS.values() if count == len(layout.joints)), ()
+        )
     if len(names) != count:
-        rest = f"but skeleton.yaml names {len(names)}" if names else "not the 22, 24 or 52 of SMPL or 30 or 77 of SOMA"
-        raise UserError(f"{count} joints, {rest}: write the names of all joints and a map into skeleton.yaml")
+        rest = (
+            f"but skeleton.yaml names {len(names)}"
+            if names
+            else "not the 22, 24 or 52 of SMPL or 30 or 77 of SOMA"
+        )
+        raise UserError(
+            f"{count} joints, {rest}: write the names of all joints and a map into skeleton.yaml"
+        )
     return find_layout(names, fields), names
 
 
@@ -221,7 +262,10 @@ def find_layout(names: Sequence[str], fields: Mapping[str, Any]) -> Layout:
         if mapped:
             reason = f"the map in skeleton.yaml uses joints that the file lacks: {lacking}"
         raise UserError(f"{reason}. {advice}")
-    chosen = {name: _one(name, [names[number] for number in numbers]) for name, numbers in match.numbers.items()}
+    chosen = {
+        name: _one(name, [names[number] for number in numbers])
+        for name, numbers in match.numbers.items()
+    }
     map = {joint: _renamed(source, chosen) for joint, source in layout.map.items()}
     return layout.named(layout.name, map).model_copy(update={**fields, "map": map})
 
@@ -231,7 +275,9 @@ def _one(name: str, candidates: Sequence[str]) -> str:
     if len(set(candidates)) == 1 or name in candidates:
         return name if name in candidates else candidates[0]
     listed = " or ".join(dict.fromkeys(candidates))[:500]
-    raise UserError(f"{name} may be {listed}. Remove one from the file, or map SMPL's joints in skeleton.yaml")
+    raise UserError(
+        f"{name} may be {listed}. Remove one from the file, or map SMPL's joints in skeleton.yaml"
+    )
 
 
 def _renamed(source: Source, names: Mapping[str, str]) -> Source:
@@ -262,9 +308,14 @@ def read_skeleton(path: Path) -> dict[str, Any]:
     try:
         fields = Layout.model_validate(read_yaml(path)).model_dump(exclude_unset=True)
     except ValidationError as error:
-        first, keys = error.errors(include_url=False, include_input=False)[0], ", ".join(Layout.model_fields)
+        first, keys = (
+            error.errors(include_url=False, include_input=False)[0],
+            ", ".join(Layout.model_fields),
+        )
         where = ".".join(map(str, first["loc"]))[:100]
-        raise UserError(f"{path}: {where}: {first['msg']}. Use {keys} (docs/own-data.md)") from error
+        raise UserError(
+            f"{path}: {where}: {first['msg']}. Use {keys} (docs/own-data.md)"
+        ) from error
     if missing := sorted(set(SMPL22.joints) - set(fields.get("map", SMPL22.joints))):
         raise UserError(f"{path}: map: no joint given for {', '.join(missing)}")
     return fields
@@ -289,10 +340,18 @@ def check_size(joints: np.ndarray, unit: float, children: bool = False, doubt: s
     if shortest <= leg <= LEG[1]:
         return
     fitting = {name: u for name, u in UNITS.items() if LEG[0] <= leg / unit * u <= LEG[1]}
-    name = min(fitting, key=lambda name: abs(math.log(leg / unit * fitting[name] / USUAL_LEG)), default=None)
+    name = min(
+        fitting,
+        key=lambda name: abs(math.log(leg / unit * fitting[name] / USUAL_LEG)),
+        default=None,
+    )
     advice = f"The unit may be {fitting[name]:.6g} ({name})" if name else _usual_unit(leg, unit)
     also = f". Also, {doubt}" if doubt else ""
-    small = " If these are children, set `children: true`." if not children and CHILD <= leg < LEG[0] else ""
+    small = (
+        " If these are children, set `children: true`."
+        if not children and CHILD <= leg < LEG[0]
+        else ""
+    )
     raise UserError(
         f"the legs are {leg:.3g} m long (unit {unit:.6g}), but people's are {shortest:g} to {LEG[1]:g} m.{small} "
         f"{advice}: set `unit` in skeleton.yaml, or unit=... of convert and edit{also}"
@@ -307,7 +366,9 @@ def _usual_unit(leg: float, unit: float) -> str:
     return f"The file has no usual unit; {usual:.3g} gives the usual legs of {USUAL_LEG:g} m"
 
 
-BACKWARDS = 0.25  # share of the frames in which the toes of both feet point backwards, above which sides are exchanged
+# Share of the frames in which the toes of both feet point backwards, above which sides are
+# exchanged
+BACKWARDS = 0.25
 
 
 def check_feet(joints: np.ndarray) -> None:
@@ -316,17 +377,23 @@ def check_feet(joints: np.ndarray) -> None:
     for side in ("left", "right"):
         if _bone(joints, f"{side}_ankle", f"{side}_foot") < FOOT:
             advice = "to the toes, or to the end site of the ankle, such as LeftAnkle.end"
-            raise UserError(f"the {side} foot has no length. Map {side}_foot in skeleton.yaml {advice}")
+            raise UserError(
+                f"the {side} foot has no length. Map {side}_foot in skeleton.yaml {advice}"
+            )
     # The toes of a foot in the air may point backwards, as while running: of each frame, the lower foot counts. So do
     # the toes of one foot of a person who kneels: both feet point backwards in a part of the frames.
     across, trunk = at["left_hip"] - at["right_hip"], at["neck"] - at["pelvis"]
-    depths = [((at[f"{side}_hip"] - at[f"{side}_ankle"]) * trunk).sum(1) for side in ("left", "right")]
+    depths = [
+        ((at[f"{side}_hip"] - at[f"{side}_ankle"]) * trunk).sum(1) for side in ("left", "right")
+    ]
     left, right = (at[f"{side}_foot"] - at[f"{side}_ankle"] for side in ("left", "right"))
     ahead = np.cross(across, trunk)
     forward = np.stack([(ahead * foot).sum(1) for foot in (left, right)])
     lower = np.where(depths[0] > depths[1], *forward)
     if np.median(lower) < 0 and np.mean(forward.max(0) < 0) > BACKWARDS:
-        raise UserError("the toes point backwards. Exchange left and right in skeleton.yaml, or set `mirrored: true`")
+        raise UserError(
+            "the toes point backwards. Exchange left and right in skeleton.yaml, or set `mirrored: true`"
+        )
 
 
 def check_order(joints: np.ndarray, count: int, skeleton: str) -> None:
@@ -340,12 +407,18 @@ def check_order(joints: np.ndarray, count: int, skeleton: str) -> None:
     The bones of a person's limbs are equally long on both sides and keep their length. In another order of joints, or
     on another skeleton, the same pairs of joints are not bones.
     """
-    lengths = np.stack([_lengths(joints, side + start, side + end) for side in SIDES for start, end in LIMBS], 1)
+    lengths = np.stack(
+        [_lengths(joints, side + start, side + end) for side in SIDES for start, end in LIMBS], 1
+    )
     usual = np.maximum(lengths.mean(0), 1e-9)
     unequal = np.abs(np.log(usual[:4] / usual[4:])).mean() > math.log(UNEQUAL)
     changing = (lengths.std(0) / usual).mean() > CHANGING
     if unequal or changing:
-        fault = "left and right limbs are not equally long" if unequal else "the limbs change their length"
+        fault = (
+            "left and right limbs are not equally long"
+            if unequal
+            else "the limbs change their length"
+        )
         raise UserError(
             f"{count} joints, not those of {skeleton} in their order: {fault}. Write the names of all joints and a map "
             "into skeleton.yaml"

@@ -19,7 +19,17 @@ import numpy as np
 import torch
 
 from flame_mdm.errors import UserError, shortened
-from flame_mdm.formats import RIGGED, USD, WRITTEN, bvh, characters, fbx_writer, glb_writer, usd, vrma
+from flame_mdm.formats import (
+    RIGGED,
+    USD,
+    WRITTEN,
+    bvh,
+    characters,
+    fbx_writer,
+    glb_writer,
+    usd,
+    vrma,
+)
 from flame_mdm.formats.body import PosedFigure
 from flame_mdm.formats.character_meshes import character_clip
 from flame_mdm.formats.characters import BvhCharacter, Character
@@ -72,16 +82,22 @@ class Motion(PosedFigure):
         self.joints = np.asarray(self.joints, dtype=np.float32)
         shape = self.joints.shape
         if shape[1:] != (len(skeleton), 3) or not shape[0]:
-            raise UserError(f"{name}: joints have shape {shape}, {skeleton.name} needs (frames, {len(skeleton)}, 3)")
+            raise UserError(
+                f"{name}: joints have shape {shape}, {skeleton.name} needs (frames, {len(skeleton)}, 3)"
+            )
         if not np.isfinite(self.joints).all():
             frame, joint, _ = np.argwhere(~np.isfinite(self.joints))[0]
-            raise UserError(f"{name}: joint {joint} in frame {frame} is not finite; did the model diverge?")
+            raise UserError(
+                f"{name}: joint {joint} in frame {frame} is not finite; did the model diverge?"
+            )
         self.fps = frame_rate(self.fps, f"{name}: fps")
         if self.contacts is not None:
             self.contacts = np.asarray(self.contacts, dtype=bool)
             expected = (shape[0], len(skeleton.feet))
             if self.contacts.shape != expected:
-                raise UserError(f"{name}: contacts have shape {self.contacts.shape}, expected {expected}")
+                raise UserError(
+                    f"{name}: contacts have shape {self.contacts.shape}, expected {expected}"
+                )
 
     def __repr__(self) -> str:
         name = shortened(self.text or self.id, 60)
@@ -120,11 +136,15 @@ class Motion(PosedFigure):
             raise UserError(f"{path}: unknown kind of motion file. Use one of {', '.join(WRITTEN)}")
         on_a_rig = character is None and ending in RIGGED
         if rig is not None and not on_a_rig:
-            raise UserError(f"{path}: rig is only for {', '.join(RIGGED)} files, and not for characters")
+            raise UserError(
+                f"{path}: rig is only for {', '.join(RIGGED)} files, and not for characters"
+            )
         if rest_pose and (ending != ".bvh" or not on_a_rig):
             raise UserError(f"{path}: rest_pose is only for .bvh files, and not for characters")
         if root_motion and (ending == ".bvh" or not on_a_rig or rig is None):
-            raise UserError(f"{path}: root_motion is only for .glb, .fbx and USD files with rig=unreal or rig=soma")
+            raise UserError(
+                f"{path}: root_motion is only for .glb, .fbx and USD files with rig=unreal or rig=soma"
+            )
         if character is not None:
             if not isinstance(character, Character | BvhCharacter):
                 character = characters.read(character)
@@ -159,11 +179,15 @@ class Motion(PosedFigure):
         nearest = np.where(share < 0.5, before, after)
         contacts = None if self.contacts is None else self.contacts[nearest]
         ratio = fps / self.fps
-        parts = tuple((text, round(begin * ratio), round(end * ratio)) for text, begin, end in self.parts)
+        parts = tuple(
+            (text, round(begin * ratio), round(end * ratio)) for text, begin, end in self.parts
+        )
         joints, poses = resample(self.joints.astype(float), self.fps, fps, cubic=True), None
         if self.poses is not None:
             turns = rotation.matrix_to_quaternion(self.poses.rotations)
-            turns = rotation.slerp(turns[before], turns[after], torch.from_numpy(share)[:, None, None])
+            turns = rotation.slerp(
+                turns[before], turns[after], torch.from_numpy(share)[:, None, None]
+            )
             path = torch.from_numpy(resample(self.poses.root.numpy(), self.fps, fps, cubic=True))
             poses = Poses(self.poses.offsets, rotation.quaternion_to_matrix(turns), path)
             joints[:, : len(SMPL22)] = poses.joints().numpy()
@@ -189,7 +213,8 @@ class Motion(PosedFigure):
         if hasattr(ipython, "kernel"):  # a notebook, not a terminal
             style = "width:100%;height:560px;border:0"
             frame = f'<iframe sandbox="allow-scripts allow-downloads" style="{style}" srcdoc="{escape(page)}"></iframe>'
-            return import_module("IPython.display").HTML(f"<div>{frame}</div>")  # it warns of a bare iframe
+            # It warns of a bare iframe
+            return import_module("IPython.display").HTML(f"<div>{frame}</div>")
         path = Path(tempfile.mkdtemp(prefix="flame_mdm_")) / "motion.html"
         write_text(path, page)
         return path
@@ -209,17 +234,33 @@ def motion_of_poses(poses: Poses, fps: float, text: str = "", id: str = "") -> M
 
 
 def _write_npz(motion: Motion, path: Path, facts: dict[str, Any]) -> str:
-    content: dict[str, Any] = {"joints": motion.joints, "features": motion.features, "fps": motion.fps}
-    content |= {"text": motion.text, "representation": motion.representation, "cleanup": motion.cleanup}
+    content: dict[str, Any] = {
+        "joints": motion.joints,
+        "features": motion.features,
+        "fps": motion.fps,
+    }
+    content |= {
+        "text": motion.text,
+        "representation": motion.representation,
+        "cleanup": motion.cleanup,
+    }
     if not motion.features.size:
         del content["features"], content["representation"]
     what = f"{len(motion.skeleton)} joints in meters, y up"
     if motion.poses is not None:
         turns, translation = amass_parameters(motion.poses)
-        content |= {"poses": np.pad(turns, ((0, 0), (0, 90))), "trans": translation}  # hands at rest
+        # Hands at rest
+        content |= {
+            "poses": np.pad(turns, ((0, 0), (0, 90))),
+            "trans": translation,
+        }
         content |= {"betas": np.zeros(16), "gender": "neutral", "mocap_framerate": motion.fps}
         # names of AMASS's SMPL-X files, which GMR reads
-        content |= {"root_orient": turns[:, :3], "pose_body": turns[:, 3:], "mocap_frame_rate": motion.fps}
+        content |= {
+            "root_orient": turns[:, :3],
+            "pose_body": turns[:, 3:],
+            "mocap_frame_rate": motion.fps,
+        }
         what += "; also in AMASS's format: SMPL+H poses in axis-angle, meters, z up, bone lengths of SMPL's body"
     with atomic_write(path) as temporary:
         np.savez_compressed(temporary, **content, **facts)
@@ -234,7 +275,9 @@ def _write_bvh(motion: Motion, path: Path, rest_pose: bool, rig: str | None) -> 
     if rest_pose:
         turns = np.concatenate([skeleton.rest()[None], turns])
         root = np.concatenate([skeleton.positions[None, skeleton.hips], root])
-    angles = np.round(np.degrees(continuous_euler(torch.from_numpy(turns), skeleton.orders).numpy()), 6)
+    angles = np.round(
+        np.degrees(continuous_euler(torch.from_numpy(turns), skeleton.orders).numpy()), 6
+    )
     channels, columns = [], []
     for joint, order in enumerate(skeleton.orders):
         channels.append(tuple(f"{axis}rotation" for axis in order))
@@ -243,9 +286,15 @@ def _write_bvh(motion: Motion, path: Path, rest_pose: bool, rig: str | None) -> 
             at_rest = np.tile(offsets[joint], (len(angles), 1))
             columns.append(np.round(root / skeleton.unit, 5) if joint == skeleton.hips else at_rest)
         columns.append(angles[:, joint])
-    offsets[skeleton.hips] = 0  # programs disagree on whether the channels replace the offset or add to it
-    ends = {skeleton.sources.index(SMPL22.joints.index(name)): site for name, site in END_SITES.items()}
-    end_offsets = np.stack([site @ skeleton.neutral[joint] for joint, site in ends.items()]) / skeleton.unit
+    offsets[skeleton.hips] = (
+        0  # programs disagree on whether the channels replace the offset or add to it
+    )
+    ends = {
+        skeleton.sources.index(SMPL22.joints.index(name)): site for name, site in END_SITES.items()
+    }
+    end_offsets = (
+        np.stack([site @ skeleton.neutral[joint] for joint, site in ends.items()]) / skeleton.unit
+    )
     file = bvh.Bvh(
         joints=(*skeleton.joints, *(f"{skeleton.joints[joint]}.end" for joint in ends)),
         parents=(*skeleton.parents, *ends),
@@ -256,10 +305,14 @@ def _write_bvh(motion: Motion, path: Path, rest_pose: bool, rig: str | None) -> 
     )
     bvh.write(file, path)
     unit = "centimeters" if skeleton.unit == CENTIMETER else f"unit {skeleton.unit:.4g} m"
-    return f"{unit}, y up; {_error(motion, poses)}" + "; the first frame is the rest pose" * rest_pose
+    return (
+        f"{unit}, y up; {_error(motion, poses)}" + "; the first frame is the rest pose" * rest_pose
+    )
 
 
-def _write_rigged(motion: Motion, path: Path, rig: str | None, body: Mesh | None, root_motion: bool) -> str:
+def _write_rigged(
+    motion: Motion, path: Path, rig: str | None, body: Mesh | None, root_motion: bool
+) -> str:
     """Writes a .glb, .fbx or USD file: the skeleton in motion, with a skinned body, if one fits."""
     poses = motion.posed()
     fitted, reason = motion.try_fit(body)
@@ -299,7 +352,13 @@ def _write_vrma(motion: Motion, path: Path) -> str:
 
 
 def _write_json(motion: Motion, path: Path) -> str:
-    content: dict[str, Any] = {"id": motion.id, "caption": motion.text, "fps": motion.fps, "unit": "metre", "up": "y"}
+    content: dict[str, Any] = {
+        "id": motion.id,
+        "caption": motion.text,
+        "fps": motion.fps,
+        "unit": "metre",
+        "up": "y",
+    }
     content |= {"names": motion.skeleton.joints, "parents": motion.skeleton.parents}
     content["joints"] = np.round(motion.joints.astype(float), 5).tolist()
     write_text(path, json.dumps(content, separators=(",", ":"), ensure_ascii=False))

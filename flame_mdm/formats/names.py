@@ -47,7 +47,9 @@ def spellings(name: str, opposite: str) -> list[str]:
             for start in [match.start() for match in re.finditer(f"(?={mark})", name)]:
                 before, after = name[:start], name[start + len(mark) :]
                 if before + other + after == opposite:
-                    options += [mark + before + after for mark in marks] + [before + after + mark for mark in marks]
+                    options += [mark + before + after for mark in marks] + [
+                        before + after + mark for mark in marks
+                    ]
     return list(dict.fromkeys(options))
 
 
@@ -100,14 +102,20 @@ def _match(key: str, skeleton: Mapping[str, str], by_name: Mapping[str, list[int
     for spelling, name in skeleton.items():
         if spelling in by_name:
             numbers.setdefault(name, by_name[spelling])
-    return Match(key, dict(numbers), [name for name in dict.fromkeys(skeleton.values()) if name not in numbers])
+    return Match(
+        key,
+        dict(numbers),
+        [name for name in dict.fromkeys(skeleton.values()) if name not in numbers],
+    )
 
 
 def _prefixes(names: Sequence[str]) -> list[str]:
     """Returns "" and the prefixes that at least `SHARED` names have, up to a separator, the most frequent first."""
     counts: Counter[str] = Counter()
     for name in set(names):
-        counts.update({name[: end.end()] for end in re.finditer(r"[\W_]+", name) if end.end() < len(name)})
+        counts.update(
+            {name[: end.end()] for end in re.finditer(r"[\W_]+", name) if end.end() < len(name)}
+        )
         counts.update(match[0] for match in [JOINED.match(name)] if match)
     shared = [prefix for prefix, count in counts.most_common() if count >= SHARED]
     return ["", *shared[:PREFIXES]]

@@ -48,13 +48,21 @@ PARTS = {
     "foot": "toe",
 }
 """Joint of SMPL -> beginnings of the names of Anny's bones that follow it; all others follow the pelvis."""
-HEADS = {"hip": "upperleg01", "knee": "lowerleg01", "ankle": "foot", "foot": "toe2-1", "shoulder": "upperarm01"} | {
-    **{"elbow": "lowerarm01", "wrist": "wrist", "head": "head"}
-}
+HEADS = {
+    "hip": "upperleg01",
+    "knee": "lowerleg01",
+    "ankle": "foot",
+    "foot": "toe2-1",
+    "shoulder": "upperarm01",
+} | {**{"elbow": "lowerarm01", "wrist": "wrist", "head": "head"}}
 """Joint of SMPL -> the bone of Anny that begins there."""
-CLOTHES = {"neck": SKIN, "head": SKIN, "wrist": SKIN, "ankle": SHOES, "foot": SHOES} | dict.fromkeys(
-    ("pelvis", "hip", "knee"), TROUSERS
-)
+CLOTHES = {
+    "neck": SKIN,
+    "head": SKIN,
+    "wrist": SKIN,
+    "ankle": SHOES,
+    "foot": SHOES,
+} | dict.fromkeys(("pelvis", "hip", "knee"), TROUSERS)
 
 
 def load_body(name: str) -> Mesh:
@@ -90,7 +98,9 @@ def shape_of(words: list[str]) -> dict[str, float]:
         except ValueError:
             shape[key] = np.nan
         if not 0 <= shape[key] <= 1:
-            raise UserError(f"body=anny: {word} is not one of {', '.join(SHAPE)} with a number from 0 to 1")
+            raise UserError(
+                f"body=anny: {word} is not one of {', '.join(SHAPE)} with a number from 0 to 1"
+            )
     return shape
 
 
@@ -99,11 +109,15 @@ def bake(shape: dict[str, float]) -> dict[str, np.ndarray]:
     try:
         package = import_module("anny")
     except ImportError:
-        raise UserError('body=anny needs the package anny. Run pip install "flame-mdm[body]"') from None
+        raise UserError(
+            'body=anny needs the package anny. Run pip install "flame-mdm[body]"'
+        ) from None
     model = package.Anny(rig="anny", topology="notoes_collapse10pc", skinning_method="lbs")
     output = model(phenotype_kwargs={**shape, "muscle": 0.5, "proportions": 0.5})
     axes = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # Anny's z is up, and it faces -y
-    points, heads = (output[key][0].detach().numpy() @ axes.T for key in ("rest_vertices", "rest_bone_heads"))
+    points, heads = (
+        output[key][0].detach().numpy() @ axes.T for key in ("rest_vertices", "rest_bone_heads")
+    )
     bones = model.bone_labels
     joints = _joints(dict(zip(bones, heads, strict=True)))
     weights = np.zeros((len(points), len(SMPL22)))
@@ -116,14 +130,20 @@ def bake(shape: dict[str, float]) -> dict[str, np.ndarray]:
     np.add.at(normals, triangles.ravel(), np.repeat(np.cross(sides[:, 0], sides[:, 1]), 3, axis=0))
     colors = _clothes(points - joints[0], weights)
     helped = with_helpers(points, weights, joints)
-    return packed(points - joints[0], normals, helped, colors, triangles, joints - joints[0], _turns(joints))
+    return packed(
+        points - joints[0], normals, helped, colors, triangles, joints - joints[0], _turns(joints)
+    )
 
 
 def _owner(bone: str) -> int:
     name, _, side = bone.partition(".")
     for part, beginnings in PARTS.items():
         if name.startswith(tuple(beginnings.split())):
-            return JOINT[part] if part in JOINT else JOINT[f"{'left' if side == 'L' else 'right'}_{part}"]
+            return (
+                JOINT[part]
+                if part in JOINT
+                else JOINT[f"{'left' if side == 'L' else 'right'}_{part}"]
+            )
     return JOINT["pelvis"]
 
 
@@ -132,16 +152,25 @@ def _joints(heads: dict[str, np.ndarray]) -> np.ndarray:
     joints = np.zeros((len(SMPL22), 3))
     for joint, bone in HEADS.items():
         for side in ("left", "right") if joint not in JOINT else ("",):
-            joints[JOINT[f"{side}_{joint}" if side else joint]] = heads[f"{bone}.{side[0].upper()}" if side else bone]
+            joints[JOINT[f"{side}_{joint}" if side else joint]] = heads[
+                f"{bone}.{side[0].upper()}" if side else bone
+            ]
     joints[JOINT["neck"]] = heads["neck01"] + [0, 0.02, 0]
     hips = joints[JOINT["left_hip"], 1]
     spine = np.array([heads[f"spine0{k}"] for k in (5, 4, 3, 2, 1)] + [heads["neck01"]])
-    for joint, share in (("pelvis", 0.137), ("spine1", 0.339), ("spine2", 0.565), ("spine3", 0.653)):
+    for joint, share in (
+        ("pelvis", 0.137),
+        ("spine1", 0.339),
+        ("spine2", 0.565),
+        ("spine3", 0.653),
+    ):
         height = hips + share * (joints[JOINT["neck"], 1] - hips)
         joints[JOINT[joint]] = [0, height, np.interp(height, spine[:, 1], spine[:, 2])]
     for side in ("left", "right"):
         letter = side[0].upper()
-        joints[JOINT[f"{side}_collar"]] = (heads[f"clavicle.{letter}"] + heads[f"shoulder01.{letter}"]) / 2
+        joints[JOINT[f"{side}_collar"]] = (
+            heads[f"clavicle.{letter}"] + heads[f"shoulder01.{letter}"]
+        ) / 2
     return joints
 
 
@@ -158,7 +187,9 @@ def _turns(joints: np.ndarray) -> np.ndarray:
         if name not in ("pelvis", "spine3"):
             turns[parent] = shortest_turns(usual[joint] * level, along * level)
     for side in ("left", "right"):
-        shoulder, elbow, wrist = (JOINT[f"{side}_{name}"] for name in ("shoulder", "elbow", "wrist"))
+        shoulder, elbow, wrist = (
+            JOINT[f"{side}_{name}"] for name in ("shoulder", "elbow", "wrist")
+        )
         upper, lower = joints[elbow] - joints[shoulder], joints[wrist] - joints[elbow]
         hinge, rest = np.cross(upper, lower), np.cross(usual[elbow], [0, 0, 1])
         turns[shoulder] = orthonormal(upper, hinge).T @ orthonormal(usual[elbow], rest)
@@ -175,14 +206,18 @@ def _clothes(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
     usual = figure.points[figure.weights[:, JOINT["head"]] > 0.5]
     own = points[head]
     alike = usual.min(0) + (own - own.min(0)) / np.ptp(own, 0) * np.ptp(usual, 0)
-    colors[head] += smooth(-0.006, 0.006, hairline(alike))[:, None] * (np.array(HAIR) - colors[head])
+    colors[head] += smooth(-0.006, 0.006, hairline(alike))[:, None] * (
+        np.array(HAIR) - colors[head]
+    )
     return colors
 
 
 def hairline(points: np.ndarray) -> np.ndarray:
     """Returns the distance of points of the head into the hair: above the forehead, and behind the ears."""
     above = (points - [0, 0.757, 0.086]) @ np.array([0, 0.84, -0.54])
-    behind = np.minimum((points - [0, 0.70, 0.016]) @ np.array([0, 0.10, -0.99]), points[..., 1] - 0.652)
+    behind = np.minimum(
+        (points - [0, 0.70, 0.016]) @ np.array([0, 0.10, -0.99]), points[..., 1] - 0.652
+    )
     return np.maximum(above, behind)
 
 

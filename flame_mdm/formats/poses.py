@@ -12,18 +12,28 @@ from flame_mdm.representations import rotation
 from flame_mdm.representations.skeleton import SMPL22, forward_kinematics
 from flame_mdm.representations.smpl import ADULT
 
-CHILDREN = tuple(tuple(joint for joint, parent in enumerate(SMPL22.parents) if parent == j) for j in range(len(SMPL22)))
+CHILDREN = tuple(
+    tuple(joint for joint, parent in enumerate(SMPL22.parents) if parent == j)
+    for j in range(len(SMPL22))
+)
 PELVIS, SPINE3 = 0, 9
 ALIKE = ((0,), (1, 2), (3,), (4, 5), (6,), (7, 8), (9,), (12,), (13, 14), (16, 17), (18, 19))
 """Joints with children, from the root outward; those of both sides together."""
-SPINE = {3: 1 / 3, 6: 2 / 3}  # joints between pelvis and chest -> fraction of the rotation from pelvis to chest
+# Joints between pelvis and chest -> fraction of the rotation from pelvis to chest
+SPINE = {
+    3: 1 / 3,
+    6: 2 / 3,
+}
 BENDS = {1: -1.0, 2: -1.0, 16: 1.0, 17: 1.0}
 """Hips and shoulders -> z of the direction in which the knee or elbow bends the limb in the rest pose."""
 STRAIGHT = 0.15
 """Sine of the bend of a knee or elbow at which bend and parent's rotation have the same weight for the limb's twist.
 Weights are squared, so that a clear bend dominates."""
-FOOT = 0.3  # weight of the foot relative to the shin in the twist of a thigh: it determines the twist of a straight leg
-SMOOTH = 0.1  # seconds over which bends are averaged, so that an arm does not spin while it is nearly straight
+# Weight of the foot relative to the shin in the twist of a thigh: it determines the twist of a
+# straight leg
+FOOT = 0.3
+# Seconds over which bends are averaged, so that an arm does not spin while it is nearly straight
+SMOOTH = 0.1
 SQUARINGS = 12  # squarings that isolate an eigenvector; others shrink by the power 4,096
 
 
@@ -31,8 +41,10 @@ SQUARINGS = 12  # squarings that isolate an eigenvector; others shrink by the po
 class Poses:
     """A body in motion, in meters, y up; the rest pose is SMPL's: arms out to the sides, facing +z, left at +x."""
 
-    offsets: Tensor  # (22, 3) float64, position of each joint of `SMPL22` relative to its parent in the rest pose
-    rotations: Tensor  # (F, 22, 3, 3) float64, relative to parents; they apply to the bones that leave a joint
+    # (22, 3) float64, position of each joint of `SMPL22` relative to its parent in the rest pose
+    offsets: Tensor
+    # (F, 22, 3, 3) float64, relative to parents; they apply to the bones that leave a joint
+    rotations: Tensor
     root: Tensor  # (F, 3) float64, position of the pelvis
 
     def joints(self) -> Tensor:
@@ -64,7 +76,9 @@ def solve(joints: Tensor, fps: float) -> Poses:
     lengths = torch.linalg.vector_norm(SMPL22.bones(joints), dim=-1).mean(0)
     if (lengths[1:] < 1e-4).any():
         name = SMPL22.joints[int(lengths[1:].argmin()) + 1]
-        raise UserError(f"the bone that ends in {name} has no length, so its direction is undefined")
+        raise UserError(
+            f"the bone that ends in {name} has no length, so its direction is undefined"
+        )
     offsets, quaternions = solve_checked(joints, fps)
     return Poses(offsets, rotation.quaternion_to_matrix(quaternions), joints[:, 0])
 
@@ -89,26 +103,40 @@ def solve_checked(joints: Tensor, fps: float) -> tuple[Tensor, Tensor]:
     positions = {PELVIS: joints[:, 0]}
     for group in ALIKE:
         children = [CHILDREN[joint][0] for joint in group]
-        start = torch.stack([turned[max(SMPL22.parents[joint], 0)] for joint in group], 1) if turned else chest
+        start = (
+            torch.stack([turned[max(SMPL22.parents[joint], 0)] for joint in group], 1)
+            if turned
+            else chest
+        )
         if len(CHILDREN[group[0]]) > 1:
             children = list(CHILDREN[group[0]])
-            swung = _fit(offsets[children], joints[:, children] - positions[group[0]][:, None])[:, None]
+            swung = _fit(offsets[children], joints[:, children] - positions[group[0]][:, None])[
+                :, None
+            ]
         else:
             if group[0] in SPINE:
                 start = rotation.slerp(turned[PELVIS], chest, SPINE[group[0]])[:, None]
             aims = joints[:, children] - torch.stack([positions[joint] for joint in group], 1)
-            swung = rotation.multiply(rotation.between(rotation.rotate(start, offsets[children]), aims), start)
+            swung = rotation.multiply(
+                rotation.between(rotation.rotate(start, offsets[children]), aims), start
+            )
             if group[0] in BENDS:
-                swung = rotation.multiply(_twist(group, swung, offsets[children], bones, fps), swung)
+                swung = rotation.multiply(
+                    _twist(group, swung, offsets[children], bones, fps), swung
+                )
         for number, joint in enumerate(group):
             turned[joint] = swung[:, number]
-        turned |= {child: turned[SMPL22.parents[child]] for child in children if not CHILDREN[child]}
+        turned |= {
+            child: turned[SMPL22.parents[child]] for child in children if not CHILDREN[child]
+        }
         reached = rotation.rotate(swung, offsets[children])
         for number, child in enumerate(children):
             positions[child] = positions[SMPL22.parents[child]] + reached[:, number]
     world = torch.stack([turned[joint] for joint in range(len(SMPL22))], 1)
     above = rotation.inverse(world[:, list(SMPL22.parents[1:])])
-    return offsets, rotation.standardize(torch.cat([world[:, :1], rotation.multiply(above, world[:, 1:])], 1))
+    return offsets, rotation.standardize(
+        torch.cat([world[:, :1], rotation.multiply(above, world[:, 1:])], 1)
+    )
 
 
 def _fit(offsets: Tensor, bones: Tensor) -> Tensor:
@@ -134,7 +162,9 @@ def _fit(offsets: Tensor, bones: Tensor) -> Tensor:
     return F.normalize(power.gather(1, largest[:, None, None].expand(-1, 1, 4))[:, 0], dim=-1)
 
 
-def _twist(group: Sequence[int], swung: Tensor, offsets: Tensor, bones: Tensor, fps: float) -> Tensor:
+def _twist(
+    group: Sequence[int], swung: Tensor, offsets: Tensor, bones: Tensor, fps: float
+) -> Tensor:
     """Returns quaternions (F, G, 4) that rotate limbs, which begin at G joints, about their axes until hinges match.
 
     `swung` (F, G, 4) are the limbs before, with `offsets` (G, 3); `bones` (F, 22, 3) are all of them.
@@ -147,12 +177,18 @@ def _twist(group: Sequence[int], swung: Tensor, offsets: Tensor, bones: Tensor, 
     limb, beyond = F.normalize(bones[:, middle], dim=-1), F.normalize(bones[:, end], dim=-1)
     bend = torch.linalg.cross(limb, beyond)
     if group[0] == SMPL22.joints.index("left_hip"):
-        bend = bend + FOOT * torch.linalg.cross(F.normalize(bones[:, [CHILDREN[j][0] for j in end]], dim=-1), limb)
+        bend = bend + FOOT * torch.linalg.cross(
+            F.normalize(bones[:, [CHILDREN[j][0] for j in end]], dim=-1), limb
+        )
     across = torch.linalg.cross(axis, hinge)
     shown = torch.stack([(bend * hinge).sum(-1), (bend * across).sum(-1)], -1)
     shown = _smooth(shown.flatten(1), SMOOTH * fps).unflatten(1, (-1, 2))
-    shown = torch.linalg.vector_norm(shown, dim=-1, keepdim=True) * shown + shown.new_tensor([STRAIGHT**2, 0.0])
-    return rotation.axis_angle_to_quaternion(axis * torch.atan2(shown[..., 1], shown[..., 0])[..., None])
+    shown = torch.linalg.vector_norm(shown, dim=-1, keepdim=True) * shown + shown.new_tensor(
+        [STRAIGHT**2, 0.0]
+    )
+    return rotation.axis_angle_to_quaternion(
+        axis * torch.atan2(shown[..., 1], shown[..., 0])[..., None]
+    )
 
 
 def _smooth(x: Tensor, frames: float) -> Tensor:

@@ -4,13 +4,16 @@ import numpy as np
 
 from flame_mdm.representations.skeleton import JOINT, SMPL22
 
-UPRIGHT = np.cos(np.radians(30))  # cosine of the largest tilt of the chest at which the head is level on average
+# Cosine of the largest tilt of the chest at which the head is level on average
+UPRIGHT = np.cos(np.radians(30))
 STANDING = 0.02  # largest height in meters of a flat foot above its lowest position
 TOES = (0.02, 0.09, np.radians(60))
 """Heights of the toe joint below which toes stay flat, and above which they follow the foot; and the largest bend."""
 
 
-def complete(joints: np.ndarray, offsets: np.ndarray, world: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def complete(
+    joints: np.ndarray, offsets: np.ndarray, world: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Completes rotations solved from positions, which determine neither the head's pitch nor the toes.
 
     The median pitch of the head while the chest is upright is level, and the toes stay flat while the heel rises. Takes
@@ -58,7 +61,9 @@ def shortest_turns(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     a, b = (vector / np.linalg.norm(vector, axis=-1, keepdims=True) for vector in (start, end))
     axis = np.cross(a, b)
     sine = np.linalg.norm(axis, axis=-1)
-    return rotations_about(axis / np.maximum(sine, 1e-9)[..., None], np.arctan2(sine, (a * b).sum(-1)))
+    return rotations_about(
+        axis / np.maximum(sine, 1e-9)[..., None], np.arctan2(sine, (a * b).sum(-1))
+    )
 
 
 def rotations_about(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:

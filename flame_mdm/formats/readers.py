@@ -40,8 +40,14 @@ from flame_mdm.representations.skeleton import SKELETONS, SMPL22, Skeleton
 from flame_mdm.representations.smpl import ADULT
 from flame_mdm.safe_io import naming, regular_file
 
-CAMERA_AXES = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))  # of the action data sets: y down to y up
-ROTATED = {"smpl147": 147, "rot6d-25": 150, "motion272": 272}  # with SMPL's rotations -> number of features
+# Of the action data sets: y down to y up
+CAMERA_AXES = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))
+# With SMPL's rotations -> number of features
+ROTATED = {
+    "smpl147": 147,
+    "rot6d-25": 150,
+    "motion272": 272,
+}
 BODY_AXES = {"z": AMASS_AXES, "y": torch.eye(3, dtype=torch.float64), "-y": CAMERA_AXES}
 """Axis that points up in a file of SMPL's rotations -> the rotation to y up; as in AMASS, it is z by default."""
 PELVIS = (0.0, -0.223, 0.028)
@@ -143,7 +149,9 @@ def read_recording(
     rate = None if fps is None else frame_rate(fps)
     fields = find_skeleton(path, up) | said
     if animation is not None and path.suffix.lower() not in SCENES:
-        raise UserError(f"{path}: animation={animation} has no effect, {path.suffix} files have one. Drop animation=")
+        raise UserError(
+            f"{path}: animation={animation} has no effect, {path.suffix} files have one. Drop animation="
+        )
     with naming(path, ValueError):
         if path.suffix.lower() in SCENES:
             return _of_scene(path, animation, rate, resample_to, fields)
@@ -162,7 +170,9 @@ def from_array(joints: Any, fps: float | None) -> Motion:
     values = joints.detach().cpu().numpy() if isinstance(joints, Tensor) else np.asarray(joints)
     if not is_real(values):
         name = type(joints).__name__
-        raise UserError(f"{name}: not a motion. Give a path, a Motion, or an array of joints (frames, joints, 3)")
+        raise UserError(
+            f"{name}: not a motion. Give a path, a Motion, or an array of joints (frames, joints, 3)"
+        )
     check_numbers("joints", values)
     skeleton = _skeleton(values)
     if fps is None:
@@ -178,7 +188,9 @@ def _of_tree(
     standard: Standard | None,
 ) -> Recording:
     _refuse(fields, ["joints"], "BVH and AMC files contain the names of their joints")
-    tree = read_tree(path, fields.get("fps") if rate is None and path.suffix.lower() == ".amc" else rate)
+    tree = read_tree(
+        path, fields.get("fps") if rate is None and path.suffix.lower() == ".amc" else rate
+    )
     notes = []
     if (people := tree.parents.count(-1)) > 1:
         notes.append(f"{people} people in the file (ROOT): the first one is read")
@@ -187,7 +199,11 @@ def _of_tree(
         tree, own = standard(tree)
         fields = own or fields
     layout, names = tree_layout(tree, fields)
-    if standard is None and rate is None and (recorded := known_rate(path.stem, layout_name(layout), tree.fps)):
+    if (
+        standard is None
+        and rate is None
+        and (recorded := known_rate(path.stem, layout_name(layout), tree.fps))
+    ):
         notes.append(
             f"CMU recorded it at {recorded:g} frames per second, not {tree.fps:g} as the file says: read at that"
         )
@@ -250,13 +266,26 @@ def _of_joints(
     stated = {key: data[key] for key in ("up", "unit") if key in data}
     fields = _checked(fields | stated | said)
     names = tuple(data.get("names", ()))
-    is_counted = not names and not {"joints", "map"} & fields.keys()  # the skeleton follows from the number of joints
-    if names and not {"joints", "map"} & fields.keys() and all(names != s.joints for s in SKELETONS.values()):
+    # The skeleton follows from the number of joints
+    is_counted = not names and not {"joints", "map"} & fields.keys()
+    if (
+        names
+        and not {"joints", "map"} & fields.keys()
+        and all(names != s.joints for s in SKELETONS.values())
+    ):
         fields["joints"] = list(names)
 
-    if as_smpl or {"joints", "map"} & fields.keys() or joints.shape[1:2] not in [(len(s),) for s in SKELETONS.values()]:
+    if (
+        as_smpl
+        or {"joints", "map"} & fields.keys()
+        or joints.shape[1:2] not in [(len(s),) for s in SKELETONS.values()]
+    ):
         layout, names = array_layout(joints, fields)
-        joints, skeleton, assumed = layout.apply(joints.astype(float), names), SMPL22, layout_name(layout)
+        joints, skeleton, assumed = (
+            layout.apply(joints.astype(float), names),
+            SMPL22,
+            layout_name(layout),
+        )
     else:
         layout, skeleton, assumed = Layout(**fields), _skeleton(joints), "SMPL"
         joints = layout.turn(joints.astype(float)).astype(np.float32)
@@ -272,12 +301,18 @@ def _of_joints(
         checks.check_body(body, layout)
         doubts = _doubts(body, rate, layout.up, np.array(UP[layout.up], float))
     notes += doubts.lines
-    motion = Motion(joints[start:], rate, skeleton, data.get("text", ""), path.stem, notes=tuple(notes))
+    motion = Motion(
+        joints[start:], rate, skeleton, data.get("text", ""), path.stem, notes=tuple(notes)
+    )
     return Recording(_resampled(motion, resample_to), _label(path, layout, rate), doubts)
 
 
 def _of_smpl(
-    path: Path, data: dict[str, Any], rate: float | None, resample_to: float | None, fields: Mapping[str, Any]
+    path: Path,
+    data: dict[str, Any],
+    rate: float | None,
+    resample_to: float | None,
+    fields: Mapping[str, Any],
 ) -> Recording:
     others = [key for key in Layout.model_fields if key not in ("up", "fps")]
     _refuse(fields, others, "the joints and lengths of SMPL's rotations are known")
@@ -314,14 +349,24 @@ def _of_ours(
 ) -> Recording:
     """Returns the recording of a file that this project wrote: in meters, y up, with rotations and features."""
     for key, value in said.items():
-        raise UserError(f"{key}={value} has no effect: this project wrote the file, in meters, y up. Drop {key}=")
+        raise UserError(
+            f"{key}={value} has no effect: this project wrote the file, in meters, y up. Drop {key}="
+        )
     rate = _rate(data, rate, {})
     notes = ("skeleton.yaml does not apply: this project wrote the file",) if fields else ()
     joints, layout = data["joints"], Layout()
     if as_smpl:
         layout, names = array_layout(joints, {})
         joints = layout.apply(joints.astype(float), names)
-    motion = Motion(joints, rate, _skeleton(joints), str(data.get("text", "")), path.stem, _poses(data), notes=notes)
+    motion = Motion(
+        joints,
+        rate,
+        _skeleton(joints),
+        str(data.get("text", "")),
+        path.stem,
+        _poses(data),
+        notes=notes,
+    )
     if "features" in data:
         motion.features = data["features"].astype(np.float32)
         motion.representation = str(data.get("representation", ""))
@@ -332,7 +377,9 @@ def _rate(data: Mapping[str, Any], rate: float | None, fields: Mapping[str, Any]
     """Returns the frame rate of arrays: that of the command, of the file, or of skeleton.yaml."""
     rate = data.get("fps", fields.get("fps")) if rate is None else rate
     if rate is None:
-        raise UserError("no frame rate in the file: give fps=20, or write `fps: 20` into skeleton.yaml")
+        raise UserError(
+            "no frame rate in the file: give fps=20, or write `fps: 20` into skeleton.yaml"
+        )
     return frame_rate(rate)
 
 
@@ -342,7 +389,9 @@ def _checked(fields: dict[str, Any]) -> dict[str, Any]:
         Layout(**{key: value for key, value in fields.items() if key in ("up", "unit")})
     except ValueError as error:
         stated = ", ".join(f"{key}: {fields[key]}" for key in ("up", "unit") if key in fields)
-        raise UserError(f"{stated[:80]}: up is y, z or -y, and unit a number of meters, or m, cm or mm") from error
+        raise UserError(
+            f"{stated[:80]}: up is y, z or -y, and unit a number of meters, or m, cm or mm"
+        ) from error
     return fields
 
 
@@ -350,7 +399,9 @@ def _refuse(fields: Mapping[str, Any], without_effect: Collection[str], reason: 
     """Raises `UserError` if a key cannot have an effect on the file."""
     for key in without_effect:
         if key in fields:
-            raise UserError(f"{key} has no effect, because {reason}. Remove it from the command or from skeleton.yaml")
+            raise UserError(
+                f"{key} has no effect, because {reason}. Remove it from the command or from skeleton.yaml"
+            )
 
 
 def _rest_note(frames: int) -> str:
@@ -360,7 +411,9 @@ def _rest_note(frames: int) -> str:
 
 
 def _doubts(joints: np.ndarray, fps: float, up: str, axes: np.ndarray) -> Doubts:
-    return Doubts(checks.uprightness(joints), checks.lying(joints, up, axes), checks.jump(joints, fps))
+    return Doubts(
+        checks.uprightness(joints), checks.lying(joints, up, axes), checks.jump(joints, fps)
+    )
 
 
 def _described(path: Path) -> str:
@@ -383,7 +436,9 @@ def _resampled(motion: Motion, fps: float | None) -> Motion:
 def _matrices(smpl: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
     """Returns the position of the pelvis (F, 3) and rotations (F, 24, 3, 3) of a translation and quaternions."""
     translation, turns = smpl
-    return translation + torch.tensor(PELVIS, dtype=torch.float64), rotation.quaternion_to_matrix(turns)
+    return translation + torch.tensor(PELVIS, dtype=torch.float64), rotation.quaternion_to_matrix(
+        turns
+    )
 
 
 def _in_amass_axes(translation: Tensor, turns: Tensor, axes: Tensor) -> tuple[Tensor, Tensor]:
@@ -399,14 +454,18 @@ def _smpl_poses(pelvis: Tensor, rotations: Tensor, axes: Tensor) -> Poses:
     """Returns poses of SMPL's mean body, rotated to y up by `axes` (3, 3)."""
     rotations = rotations[:, : len(SMPL22)].clone()
     rotations[:, 0] = axes @ rotations[:, 0]
-    return Poses(torch.tensor(ADULT[: len(SMPL22)], dtype=torch.float64), rotations, pelvis @ axes.T)
+    return Poses(
+        torch.tensor(ADULT[: len(SMPL22)], dtype=torch.float64), rotations, pelvis @ axes.T
+    )
 
 
 def _poses(data: dict[str, Any]) -> Poses | None:
     """Returns the rotations stored with joints, from AMASS arrays or SMPL features; HumanML3D features contain none."""
     if "poses" in data:
         if len(data["poses"]) != len(data["joints"]):
-            raise UserError(f"{len(data['poses'])} frames of poses, but {len(data['joints'])} of joints")
+            raise UserError(
+                f"{len(data['poses'])} frames of poses, but {len(data['joints'])} of joints"
+            )
         translation, turns = smpl_motion(data)  # written without the template's pelvis
         return _smpl_poses(translation, rotation.quaternion_to_matrix(turns), AMASS_AXES)
     representation = str(data.get("representation", ""))
@@ -414,7 +473,9 @@ def _poses(data: dict[str, Any]) -> Poses | None:
         return None
     expected = (len(data["joints"]), ROTATED[representation])
     if data["features"].shape != expected:
-        raise UserError(f"features of shape {data['features'].shape}, but {representation} has {expected}")
+        raise UserError(
+            f"features of shape {data['features'].shape}, but {representation} has {expected}"
+        )
     x = torch.from_numpy(data["features"]).double()
     if representation == "motion272":
         pelvis, turns = Motion272().poses(x)
@@ -423,7 +484,9 @@ def _poses(data: dict[str, Any]) -> Poses | None:
         translation, rows, axes = x[:, :3], x[:, 3:], AMASS_AXES
     else:
         translation, rows, axes = x[:, 144:147], x[:, :144], CAMERA_AXES
-    return _smpl_poses(translation, rotation.rot6d_to_matrix(rows.unflatten(1, (24, 6)), "rows"), axes)
+    return _smpl_poses(
+        translation, rotation.rot6d_to_matrix(rows.unflatten(1, (24, 6)), "rows"), axes
+    )
 
 
 def _skeleton(joints: np.ndarray) -> Skeleton:

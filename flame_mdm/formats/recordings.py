@@ -7,8 +7,15 @@ from flame_mdm.safe_io import read_yaml
 
 AT_60: frozenset[str] = frozenset(read_yaml(Path(__file__).with_suffix(".yaml"))["cmu_at_60"])
 """Subjects, and single recordings, of CMU at 60 frames per second."""
-CMU_SKELETONS = ("CMU", "CMU ASF", "Daz", "Character Creator")  # skeletons of CMU's recordings and their conversions
-TRIAL = re.compile(r"(?<!\d)(\d{2,3})_\d{2,3}(?!\d)")  # name of a recording of CMU, with its subject
+# Skeletons of CMU's recordings and their conversions
+CMU_SKELETONS = (
+    "CMU",
+    "CMU ASF",
+    "Daz",
+    "Character Creator",
+)
+# Name of a recording of CMU, with its subject
+TRIAL = re.compile(r"(?<!\d)(\d{2,3})_\d{2,3}(?!\d)")
 
 
 def is_at_60(trial: str) -> bool:
@@ -22,6 +29,11 @@ def known_rate(name: str, skeleton: str, fps: float) -> float | None:
     Conversions of CMU's recordings to BVH say 120 frames per second for nearly all of them.
     """
     trial = TRIAL.search(name)
-    if trial and skeleton.partition(" without")[0] in CMU_SKELETONS and round(fps) == 120 and is_at_60(trial[0]):
+    if (
+        trial
+        and skeleton.partition(" without")[0] in CMU_SKELETONS
+        and round(fps) == 120
+        and is_at_60(trial[0])
+    ):
         return 60.0
     return None

@@ -9,18 +9,23 @@ from flame_mdm.errors import UserError
 
 RATES = (0.1, 1000.0)  # lowest and highest frame rate of a motion file, in frames per second
 MAX_FRAMES = 500_000  # maximum number of frames of a motion: 70 minutes at 120 frames per second
-MAX_POSITIONS = 25_000_000  # maximum frames times joints of a tree: an hour of 57 joints at 120 frames per second
-FEW_POSITIONS = 1_000_000  # frames times joints that a file of any size may have: 300 MB while it is read
+# Maximum frames times joints of a tree: an hour of 57 joints at 120 frames per second
+MAX_POSITIONS = 25_000_000
+FEW_POSITIONS = (
+    1_000_000  # frames times joints that a file of any size may have: 300 MB while it is read
+)
 BYTES_PER_POSITION = 4
 """Smallest number of bytes of a larger file per frame and joint. A joint with three numbers of one digit takes 6 bytes
 in each frame, but end sites take none."""
-MAX_RESAMPLED = 1_000_000  # maximum number of joint positions after upsampling: 38 minutes of 22 joints at 20 fps
+# Maximum number of joint positions after upsampling: 38 minutes of 22 joints at 20 fps
+MAX_RESAMPLED = 1_000_000
 
 
 def frame_rate(value: Any, name: str = "fps") -> float:
     """Returns a frame rate, `name` in its file, as a float; raises `UserError` unless it is a number in `RATES`."""
     number = np.asarray(value)
-    number = number.reshape(()) if number.size == 1 else number  # some programs write an array of one number
+    # Some programs write an array of one number
+    number = number.reshape(()) if number.size == 1 else number
     if number.shape or number.dtype.kind not in "fiu" or not RATES[0] <= float(number) <= RATES[1]:
         limits = f"from {RATES[0]:g} to {RATES[1]:g}"
         raise UserError(f"{name} is {str(value)[:40]}, not a number of frames per second {limits}")

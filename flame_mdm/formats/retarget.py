@@ -49,14 +49,20 @@ def preset(name: str | None, poses: Poses) -> Rig:
     """Returns a skeleton of `rigs.yaml` with the bone lengths of a body; None = SMPL's own skeleton."""
     if name is None:
         same, sources = np.tile(np.eye(3), (len(SMPL22), 1, 1)), tuple(range(len(SMPL22)))
-        return Rig(SMPL22.joints, SMPL22.parents, poses.rest().numpy(), same, sources, same, SMPL_ORDERS)
+        return Rig(
+            SMPL22.joints, SMPL22.parents, poses.rest().numpy(), same, sources, same, SMPL_ORDERS
+        )
     if name not in presets():
-        raise UserError(f"rig={name}: unknown.{did_you_mean(name, presets())} Use one of {', '.join(presets())}")
+        raise UserError(
+            f"rig={name}: unknown.{did_you_mean(name, presets())} Use one of {', '.join(presets())}"
+        )
     data = presets()[name]
     offsets, posed = poses.offsets.numpy(), np.tile(np.eye(3), (len(SMPL22), 1, 1))
     for joint, degrees in data.get("pose", {}).items():
         for side, sign in (("left", -1), ("right", 1)):
-            posed[JOINT[f"{side}_{joint}"]] = Rotation.from_euler("z", sign * degrees, degrees=True).as_matrix()
+            posed[JOINT[f"{side}_{joint}"]] = Rotation.from_euler(
+                "z", sign * degrees, degrees=True
+            ).as_matrix()
     posed = world_rotations(posed)
     rest = np.zeros((len(SMPL22), 3))
     for parent, joint in SMPL22.edges:
@@ -73,12 +79,20 @@ def preset(name: str | None, poses: Poses) -> Rig:
             label = label.replace("*", mark)
             if isinstance(source, str):
                 joint = JOINT[side + source]
-                end = SMPL22.parents.index(joint) if joint in SMPL22.parents else joint  # continues the bone before it
+                # Continues the bone before it
+                end = SMPL22.parents.index(joint) if joint in SMPL22.parents else joint
                 local = _axes(data.get("axes", {}), part, source, offsets[end], side == "right_")
-                joints.append(_RigJoint(label, parent, joint, rest[joint], posed[joint] @ local, local))
+                joints.append(
+                    _RigJoint(label, parent, joint, rest[joint], posed[joint] @ local, local)
+                )
             else:
-                above, following = joints[parent], next(ours for _, ours in names[number:] if isinstance(ours, str))
-                position = above.position + source * (rest[JOINT[side + following]] - above.position)
+                above, following = (
+                    joints[parent],
+                    next(ours for _, ours in names[number:] if isinstance(ours, str)),
+                )
+                position = above.position + source * (
+                    rest[JOINT[side + following]] - above.position
+                )
                 joints.append(_RigJoint(label, parent, -1, position, above.turn, above.neutral))
             parent = len(joints) - 1
     names, parents, sources, positions, turns, neutral = zip(*joints, strict=True)
@@ -109,7 +123,8 @@ def _axes(axes: dict[str, Any], part: str, joint: str, bone: np.ndarray, right: 
     """Returns the local axes (3, 3) in a T-pose of a joint whose bone has the direction `bone`."""
     flip = np.array([-1, 1, 1]) if right else np.ones(3)
     matrix, columns = np.eye(3), []
-    for axis, direction in axes.get(joint, axes.get(part, {})).items():  # two of them, of the left side
+    # Two of them, of the left side
+    for axis, direction in axes.get(joint, axes.get(part, {})).items():
         toward = np.array(DIRECTIONS[direction], float) if direction in DIRECTIONS else bone * flip
         for column in columns:
             toward = toward - matrix[:, column] * (matrix[:, column] @ toward)
@@ -136,8 +151,12 @@ def continuous_euler(matrices: Tensor, orders: Sequence[str] = SMPL_ORDERS) -> T
     are used, so that programs can interpolate.
     """
     turn = 2 * torch.pi
-    first = torch.stack([rotation.matrix_to_euler(matrices[:, j], order) for j, order in enumerate(orders)], 1)
-    second = torch.stack([first[..., 0] + torch.pi, torch.pi - first[..., 1], first[..., 2] + torch.pi], -1)
+    first = torch.stack(
+        [rotation.matrix_to_euler(matrices[:, j], order) for j, order in enumerate(orders)], 1
+    )
+    second = torch.stack(
+        [first[..., 0] + torch.pi, torch.pi - first[..., 1], first[..., 2] + torch.pi], -1
+    )
     chosen = [first[0]]
     for pair in torch.stack([first, second], -2)[1:]:
         before = chosen[-1][:, None]

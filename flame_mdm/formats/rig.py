@@ -18,9 +18,12 @@ LIMBS = {"hip": "knee", "knee": "ankle", "shoulder": "elbow", "elbow": "wrist"}
 SPINE = ("spine1", "spine2", "spine3")
 TILT = 45  # degrees between trunk and vertical at which a rest pose is refused
 SNAP = 8  # largest angle in degrees between the facing direction and an axis that it is taken for
-BEND = 0.15  # minimum sine of the bend of an elbow or knee in the rest pose from which the twist of the limb is read
+# Minimum sine of the bend of an elbow or knee in the rest pose from which the twist of the limb is
+# read
+BEND = 0.15
 GROUND = 0.1  # largest height in meters at which the lowest joint of a clip counts as on the floor
-STRAIGHT = 0.05  # distance of the knee from the line of the leg, in thighs, at which bend and thigh weigh the same
+# Distance of the knee from the line of the leg, in thighs, at which bend and thigh weigh the same
+STRAIGHT = 0.05
 REACH = 0.999  # maximum distance from hip to ankle relative to the length of the straight leg
 
 
@@ -32,12 +35,16 @@ class Rig:
     parents: tuple[int, ...]  # index of each joint's parent, -1 for a root
     positions: np.ndarray  # (J, 3) of the joints
     turns: np.ndarray  # (J, 3, 3), rotations of the joints in the world
-    sources: tuple[int, ...]  # for each joint, the index of the joint of SMPL whose rotation it takes, or -1
-    neutral: np.ndarray  # (J, 3, 3), rotations of these joints in the world while SMPL's are those of its rest pose
+    # For each joint, the index of the joint of SMPL whose rotation it takes, or -1
+    sources: tuple[int, ...]
+    # (J, 3, 3), rotations of these joints in the world while SMPL's are those of its rest pose
+    neutral: np.ndarray
     orders: tuple[str, ...]  # of the Euler angles of each joint in BVH files
     unit: float = CENTIMETER  # meters per unit of length in BVH files
-    frame: np.ndarray = field(default_factory=lambda: np.eye(3))  # (3, 3), rotation from the world of the file
-    scales: np.ndarray = field(default_factory=lambda: np.ones(0))  # (J,), world units per unit of a joint; none = 1
+    # (3, 3), rotation from the world of the file
+    frame: np.ndarray = field(default_factory=lambda: np.eye(3))
+    # (J,), world units per unit of a joint; none = 1
+    scales: np.ndarray = field(default_factory=lambda: np.ones(0))
 
     @property
     def hips(self) -> int:
@@ -46,7 +53,9 @@ class Rig:
 
     def offsets(self) -> np.ndarray:
         """Returns the position (J, 3) of each joint in the frame of its parent, or in the world of the file."""
-        return np.stack([self.within(self.positions[joint], joint) for joint in range(len(self.joints))])
+        return np.stack(
+            [self.within(self.positions[joint], joint) for joint in range(len(self.joints))]
+        )
 
     def within(self, positions: np.ndarray, joint: int) -> np.ndarray:
         """Converts positions (..., 3) in the world to the frame of a joint's parent in the rest pose."""
@@ -90,14 +99,20 @@ class Rig:
         return positions
 
 
-def recognized(names: Mapping[int, str], skeletons: Sequence[Mapping[str, str]]) -> dict[str, list[int]]:
+def recognized(
+    names: Mapping[int, str], skeletons: Sequence[Mapping[str, str]]
+) -> dict[str, list[int]]:
     """Returns the numbers of the joints that the most similar skeleton names: joint of SMPL -> numbers.
 
     `skeletons` are spellings of joints -> joints of SMPL, as in `flame_mdm.formats.names.best_match`.
     """
     numbers = list(names)
-    match = best_match(list(names.values()), {str(key): skeleton for key, skeleton in enumerate(skeletons)})
-    return {joint: [numbers[index] for index in indices] for joint, indices in match.numbers.items()}
+    match = best_match(
+        list(names.values()), {str(key): skeleton for key, skeleton in enumerate(skeletons)}
+    )
+    return {
+        joint: [numbers[index] for index in indices] for joint, indices in match.numbers.items()
+    }
 
 
 def matched(
@@ -106,8 +121,13 @@ def matched(
     """Returns numbers of a character's joints by SMPL's, each at most once, and the required ones that it lacks."""
     if double := next((joint for joint, numbers in candidates.items() if len(numbers) > 1), None):
         same = ", ".join(names[number] for number in candidates[double])
-        raise UserError(f"{source}: {len(candidates[double])} joints for {double}: {same}. Rename all but one")
-    required = ["pelvis", *(f"{side}_{name}" for side in SIDES for limb in LIMBS.items() for name in limb)]
+        raise UserError(
+            f"{source}: {len(candidates[double])} joints for {double}: {same}. Rename all but one"
+        )
+    required = [
+        "pelvis",
+        *(f"{side}_{name}" for side in SIDES for limb in LIMBS.items() for name in limb),
+    ]
     missing = [joint for joint in JOINT if joint in required and joint not in candidates]
     return {joint: number for joint, (number,) in candidates.items()}, missing
 
@@ -116,7 +136,9 @@ def matched(
 class RestPose:
     """A character's skeleton in its rest pose, y up, facing +z, in its own unit."""
 
-    rig: Rig  # the skeleton; its neutral rotations are those of `fitted`, which depend on the motion
+    rig: (
+        Rig  # the skeleton; its neutral rotations are those of `fitted`, which depend on the motion
+    )
     map: Mapping[str, int]  # SMPL's joint -> index of the character's
     floor: float  # height of the lowest point in the rest pose
 
@@ -151,8 +173,13 @@ def rest_pose(
     for side in SIDES:
         for start, end in LIMBS.items():
             if np.linalg.norm(at[f"{side}_{start}"] - at[f"{side}_{end}"]) <= shortest:
-                raise UserError(f"{source}: the bone from {side}_{start} to {side}_{end} has no length")
-    tilt = max(np.degrees(np.arccos(np.clip(v @ up / max(np.linalg.norm(v), 1e-9), -1, 1))) for v in (trunk, legs))
+                raise UserError(
+                    f"{source}: the bone from {side}_{start} to {side}_{end} has no length"
+                )
+    tilt = max(
+        np.degrees(np.arccos(np.clip(v @ up / max(np.linalg.norm(v), 1e-9), -1, 1)))
+        for v in (trunk, legs)
+    )
     if not tilt <= TILT:
         raise UserError(
             f"{source}: the rest pose is not upright, it leans by {tilt:.0f} degrees. Use a T- or an A-pose"
@@ -167,7 +194,9 @@ def rest_pose(
     frame = np.stack([left, up, np.cross(left, up)])
     feet = [at[f"{side}_foot"] - at[f"{side}_ankle"] for side in SIDES if f"{side}_foot" in at]
     if feet and frame[2] @ np.sum(feet, 0) < 0:
-        raise UserError(f"{source}: the toes point backward. Are left and right exchanged, or mirrored?")
+        raise UserError(
+            f"{source}: the toes point backward. Are left and right exchanged, or mirrored?"
+        )
     sources = dict(joints)
     spine = [joint for joint in SPINE if joint in sources]
     if spine:  # the arms start at the last joint of the spine, which moves as the chest
@@ -190,23 +219,38 @@ def fitted(character: RestPose, offsets: np.ndarray) -> Rig:
     """Returns the skeleton with its neutral rotations: limbs point as a body's with `offsets` (22, 3) at rest."""
     rig, turns = character.rig, np.tile(np.eye(3), (len(SMPL22), 1, 1))
     for side in SIDES:
-        for (start, middle, end), bend in ((("hip", "knee", "ankle"), -1), (("shoulder", "elbow", "wrist"), 1)):
-            first, second, third = (character.position(f"{side}_{name}") for name in (start, middle, end))
+        for (start, middle, end), bend in (
+            (("hip", "knee", "ankle"), -1),
+            (("shoulder", "elbow", "wrist"), 1),
+        ):
+            first, second, third = (
+                character.position(f"{side}_{name}") for name in (start, middle, end)
+            )
             ours = [offsets[JOINT[f"{side}_{name}"]] for name in (middle, end)]
             theirs = [second - first, third - second]
             hinge, usual = np.cross(ours[0], [0, 0, bend]), np.cross(theirs[0], [0, 0, bend])
-            shown = np.cross(theirs[0], theirs[1]) / (np.linalg.norm(theirs[0]) * np.linalg.norm(theirs[1]))
+            shown = np.cross(theirs[0], theirs[1]) / (
+                np.linalg.norm(theirs[0]) * np.linalg.norm(theirs[1])
+            )
             clear = np.linalg.norm(shown) > BEND and shown @ usual > 0
             for name, bone, their_bone in zip((start, middle), ours, theirs, strict=True):
-                turn = orthonormal(bone, hinge).T @ orthonormal(their_bone, shown if clear else usual)
+                turn = orthonormal(bone, hinge).T @ orthonormal(
+                    their_bone, shown if clear else usual
+                )
                 turns[JOINT[f"{side}_{name}"]] = turn
         turns[JOINT[f"{side}_wrist"]] = turns[JOINT[f"{side}_elbow"]]
-    neutral = np.stack([turns[max(source, 0)] @ turn for source, turn in zip(rig.sources, rig.turns, strict=True)])
+    neutral = np.stack(
+        [turns[max(source, 0)] @ turn for source, turn in zip(rig.sources, rig.turns, strict=True)]
+    )
     return replace(rig, neutral=neutral)
 
 
 def follow(
-    character: RestPose, joints: np.ndarray, offsets: np.ndarray, neutral: np.ndarray, world: np.ndarray
+    character: RestPose,
+    joints: np.ndarray,
+    offsets: np.ndarray,
+    neutral: np.ndarray,
+    world: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, Rig]:
     """Moves a character as a body moves; returns rotations (F, J, 3, 3), positions (F, J, 3) and the skeleton for it.
 
@@ -221,11 +265,17 @@ def follow(
     lowest = joints[..., 1].min()
     joints[..., 1] -= lowest if abs(lowest) <= GROUND else 0
     legs = [offsets[JOINT[f"{s}_{name}"]] for s in SIDES for name in ("knee", "ankle")]
-    own = [character.position(f"{s}_{b}") - character.position(f"{s}_{a}") for s in SIDES for a, b in LEGS]
+    own = [
+        character.position(f"{s}_{b}") - character.position(f"{s}_{a}")
+        for s in SIDES
+        for a, b in LEGS
+    ]
     scale = float(np.linalg.norm(own, axis=1).sum() / np.linalg.norm(legs, axis=1).sum())
     # heights of the ankles above the floor while the feet are flat
     flat = {s: (neutral[JOINT[f"{s}_ankle"]].T @ offsets[JOINT[f"{s}_foot"]])[1] for s in SIDES}
-    higher = {s: character.position(f"{s}_ankle")[1] - character.floor + scale * flat[s] for s in SIDES}
+    higher = {
+        s: character.position(f"{s}_ankle")[1] - character.floor + scale * flat[s] for s in SIDES
+    }
 
     hips = scale * joints[:, [JOINT["left_hip"], JOINT["right_hip"]]].mean(1)
     hips[:, 1] += np.mean(list(higher.values()))
@@ -238,19 +288,25 @@ def follow(
         target = scale * joints[:, JOINT[f"{side}_ankle"]] + [0, higher[side], 0]
         if f"{side}_foot" in character.map:
             toe = character.map[f"{side}_foot"]
-            target = scale * joints[:, JOINT[f"{side}_foot"]] - (positions[:, toe] - positions[:, ankle])
+            target = scale * joints[:, JOINT[f"{side}_foot"]] - (
+                positions[:, toe] - positions[:, ankle]
+            )
             target[:, 1] += rig.positions[toe, 1] - character.floor
         forward = turned[:, JOINT[f"{side}_hip"], :, 2]
         bent = _bent(positions[:, hip], positions[:, knee], positions[:, ankle], target, forward)
         bones = (("hip", bent - positions[:, hip], hip, knee), ("knee", target - bent, knee, ankle))
         for name, bone, start, end in bones:
             number = JOINT[f"{side}_{name}"]
-            turned[:, number] = shortest_turns(positions[:, end] - positions[:, start], bone) @ turned[:, number]
+            turned[:, number] = (
+                shortest_turns(positions[:, end] - positions[:, start], bone) @ turned[:, number]
+            )
     world = rig.turned(turned)
     return world, rig.assembled(world, pelvis), rig
 
 
-def _bent(hip: np.ndarray, knee: np.ndarray, ankle: np.ndarray, target: np.ndarray, forward: np.ndarray) -> np.ndarray:
+def _bent(
+    hip: np.ndarray, knee: np.ndarray, ankle: np.ndarray, target: np.ndarray, forward: np.ndarray
+) -> np.ndarray:
     """Returns where a knee (F, 3) is if the ankle is at `target`, or as near as the leg reaches; it bends as before."""
     thigh, shin = np.linalg.norm(knee - hip, axis=1), np.linalg.norm(ankle - knee, axis=1)
     line = target - hip
@@ -259,7 +315,9 @@ def _bent(hip: np.ndarray, knee: np.ndarray, ankle: np.ndarray, target: np.ndarr
     length = np.clip(length, np.abs(thigh - shin) / REACH, REACH * (thigh + shin))
     along = (thigh**2 - shin**2 + length**2) / (2 * length)
     before = ankle - hip
-    out = (knee - hip) - before * ((knee - hip) * before).sum(1, keepdims=True) / (before**2).sum(1, keepdims=True)
+    out = (knee - hip) - before * ((knee - hip) * before).sum(1, keepdims=True) / (before**2).sum(
+        1, keepdims=True
+    )
     # a straight leg does not show where its knee points
     out = out + STRAIGHT * thigh[:, None] * forward
     out = out - line * (out * line).sum(1, keepdims=True)

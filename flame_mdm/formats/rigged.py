@@ -206,12 +206,18 @@ def rigged(
 
     Raises `UserError` for `root_motion` of a skeleton without a root on the floor.
     """
-    moved = poses if fitted is None else Poses(poses.offsets, torch.from_numpy(local_rotations(fitted)), poses.root)
+    moved = (
+        poses
+        if fitted is None
+        else Poses(poses.offsets, torch.from_numpy(local_rotations(fitted)), poses.root)
+    )
     turns, hips = retarget(moved, skeleton)
     moves = {skeleton.hips: hips}
     if root_motion:
         if skeleton.parents[skeleton.hips] < 0:
-            raise UserError("root_motion=true: this skeleton has no root on the floor. Use rig=unreal or rig=soma")
+            raise UserError(
+                "root_motion=true: this skeleton has no root on the floor. Use rig=unreal or rig=soma"
+            )
         turns, moves = _with_root_motion(turns, hips, skeleton)
     return RiggedClip(
         name=name,
@@ -229,7 +235,9 @@ def rigged(
     )
 
 
-def _with_root_motion(turns: np.ndarray, hips: np.ndarray, skeleton: Rig) -> tuple[np.ndarray, dict[int, np.ndarray]]:
+def _with_root_motion(
+    turns: np.ndarray, hips: np.ndarray, skeleton: Rig
+) -> tuple[np.ndarray, dict[int, np.ndarray]]:
     """Moves the path of the hips on the floor, and their direction, to the root, the joint above the hips.
 
     The direction is the heading of the hips relative to the first frame's axes, a turn about the vertical.

@@ -24,7 +24,9 @@ def write(path: Path, clip: RiggedClip) -> None:
         from pxr import Sdf, Usd, UsdGeom, UsdSkel, UsdUtils
     except ImportError as error:
         advice = 'install it with pip install "flame-mdm[usd]"'
-        raise UserError(f"{path}: {path.suffix} files need the package usd-core: {advice}") from error
+        raise UserError(
+            f"{path}: {path.suffix} files need the package usd-core: {advice}"
+        ) from error
 
     with atomic_write(path) as temporary, tempfile.TemporaryDirectory() as folder:
         ending = ".usdc" if path.suffix == ".usdz" else path.suffix
@@ -93,7 +95,9 @@ def _skeleton(stage: Any, clip: RiggedClip) -> None:
 
     animation = UsdSkel.Animation.Define(stage, "/person/skeleton/animation")
     animation.CreateJointsAttr(paths)
-    animation.CreateScalesAttr(Vt.Vec3hArray([Gf.Vec3h(size, size, size) for size in clip.scales.tolist()]))
+    animation.CreateScalesAttr(
+        Vt.Vec3hArray([Gf.Vec3h(size, size, size) for size in clip.scales.tolist()])
+    )
     turns = quaternions(clip.turns)
     moved = np.tile(offsets, (len(clip.turns), 1, 1))
     for joint, path in moves.items():
@@ -123,8 +127,12 @@ def _mesh(stage: Any, skin: Skin) -> None:
     binding.CreateSkeletonRel().SetTargets([Sdf.Path("/person/skeleton")])
     joints = np.array(skin.ordered, "i4")[skin.bones]
     shares = skin.weights.astype("f4")
-    binding.CreateJointIndicesPrimvar(False, skin.bones.shape[1]).Set(Vt.IntArray.FromNumpy(joints.ravel()))
-    binding.CreateJointWeightsPrimvar(False, skin.bones.shape[1]).Set(Vt.FloatArray.FromNumpy(shares.ravel()))
+    binding.CreateJointIndicesPrimvar(False, skin.bones.shape[1]).Set(
+        Vt.IntArray.FromNumpy(joints.ravel())
+    )
+    binding.CreateJointWeightsPrimvar(False, skin.bones.shape[1]).Set(
+        Vt.FloatArray.FromNumpy(shares.ravel())
+    )
     binding.CreateGeomBindTransformAttr(Gf.Matrix4d(1))
 
     for number, paint in enumerate(skin.palette):
@@ -132,7 +140,9 @@ def _mesh(stage: Any, skin: Skin) -> None:
         shader = UsdShade.Shader.Define(stage, f"/person/materials/{_name(paint.name)}/surface")
         shader.CreateIdAttr("UsdPreviewSurface")
         linear = np.array(paint.color) ** 2.2
-        shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).Set(Gf.Vec3f(*linear.tolist()))
+        shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).Set(
+            Gf.Vec3f(*linear.tolist())
+        )
         shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(0.8)
         material.CreateSurfaceOutput().ConnectToSource(shader.ConnectableAPI(), "surface")
         triangles = np.nonzero(skin.materials == number)[0].astype("i4")
@@ -148,7 +158,9 @@ def _extent(stage: Any, root: Any, clip: RiggedClip) -> None:
 
     positions, _ = clip.world()  # scales are ignored: the box only has to be large enough
     positions[..., 1] += clip.lift
-    margin = 0.25  # meters from joints to the farthest point of the surface, the tips of hands and head
+    margin = (
+        0.25  # meters from joints to the farthest point of the surface, the tips of hands and head
+    )
     boxes = UsdGeom.Boundable(root.GetPrim()).CreateExtentAttr()
     for frame, points in enumerate(positions):
         box = np.stack([points.min(0) - margin, points.max(0) + margin]).astype("f4")

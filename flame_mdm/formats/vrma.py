@@ -70,7 +70,8 @@ def write(path: Path, clip: RiggedClip) -> None:
     offsets = clip.offsets.copy()
     offsets[0, 1] += clip.lift
     nodes: list[dict[str, Any]] = [
-        {"name": name, "translation": offset.tolist()} for name, offset in zip(clip.joints, offsets, strict=True)
+        {"name": name, "translation": offset.tolist()}
+        for name, offset in zip(clip.joints, offsets, strict=True)
     ]
     for joint, parent in enumerate(clip.parents):
         if parent >= 0:

@@ -55,7 +55,9 @@ class Process(nn.Module, ABC):
         """Converts times (B,) of this process to times for the denoiser in [0, 1000)."""
         return t
 
-    def clean(self, denoise: Denoise, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
+    def clean(
+        self, denoise: Denoise, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition
+    ) -> Tensor:
         """Returns the clean estimate (B, F, D) of a denoiser at times t (B,)."""
         return self.to_x0(denoise(x_t, self.table_time(t), mask, cond).to(x_t.dtype), x_t, t)
 
@@ -121,24 +123,36 @@ class Process(nn.Module, ABC):
         """Returns the requested sampler; raises `UserError` if there is none, or it has not one of the options."""
         name = options.sampler
         if name is None or name not in self.samplers:
-            raise UserError(f"unknown sampler '{name}': {type(self).__name__} has {', '.join(self.samplers)}")
+            raise UserError(
+                f"unknown sampler '{name}': {type(self).__name__} has {', '.join(self.samplers)}"
+            )
         names = ["guidance_scale", "sampler", "num_inference_steps", *self.samplers[name].options]
         for option, value in options.chosen().items():
             if option not in names:
                 has = ", ".join(names)
-                raise UserError(f"{option}={value}: the sampler {name} has no such option. Omit it, or give {has}")
+                raise UserError(
+                    f"{option}={value}: the sampler {name} has no such option. Omit it, or give {has}"
+                )
         return self.samplers[name]
 
     def check_edit(self, edit: Edit, mask: Tensor, options: SamplerOptions) -> None:
         """Raises `UserError` if process or sampler cannot make an edit, or its shape is not that of the motions."""
         if edit.mode not in self.edit_modes:
             modes = ", ".join(self.edit_modes)
-            raise UserError(f"edit mode '{edit.mode}' is not supported: {type(self).__name__} has {modes}")
+            raise UserError(
+                f"edit mode '{edit.mode}' is not supported: {type(self).__name__} has {modes}"
+            )
         kinds = {edit.mode, "resample"} if edit.resample > 1 else {edit.mode}
-        able = [name for name, sampler in self.samplers.items() if not kinds & set(sampler.unsupported)]
+        able = [
+            name for name, sampler in self.samplers.items() if not kinds & set(sampler.unsupported)
+        ]
         if options.sampler not in able:
             edits = " and ".join(sorted(kinds))
-            raise UserError(f"{options.sampler} cannot edit with {edits}: choose the sampler from {', '.join(able)}")
+            raise UserError(
+                f"{options.sampler} cannot edit with {edits}: choose the sampler from {', '.join(able)}"
+            )
         shapes = [tuple(x.shape) for x in (edit.known, edit.keep, mask)]
         if shapes[0] != shapes[1] or shapes[0][:2] != shapes[2]:
-            raise UserError(f"edit does not match the shape of the motions: known, keep and mask have shapes {shapes}")
+            raise UserError(
+                f"edit does not match the shape of the motions: known, keep and mask have shapes {shapes}"
+            )

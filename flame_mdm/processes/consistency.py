@@ -47,7 +47,9 @@ def consistency_terms(
         zero, one = torch.zeros_like(x), torch.ones_like(x)
         left = (x_t - process.corrupt(guided, zero, t)) / process.corrupt(zero, one, t)
         nearer = process.corrupt(guided, left, end)
-        target = torch.where(is_last[:, None, None], guided, process.clean(follower, nearer, end, mask, cond))
+        target = torch.where(
+            is_last[:, None, None], guided, process.clean(follower, nearer, end, mask, cond)
+        )
     estimate = process.clean(student, x_t, t, mask, cond)
     terms = {"consistency": masked_mse(estimate, target, mask)} | auxiliary(estimate, target, mask)
     return terms | {"loss": torch.stack(list(terms.values())).sum(0)}

@@ -96,7 +96,9 @@ class GaussianDiffusion(Process):
         count = min(count, total)
         return [float(round(total * k / count) - 1) for k in range(count, 0, -1)]
 
-    def log_variance(self, output: Tensor, x_t: Tensor, i: Tensor | int, schedule: Schedule) -> Tensor | float:
+    def log_variance(
+        self, output: Tensor, x_t: Tensor, i: Tensor | int, schedule: Schedule
+    ) -> Tensor | float:
         """Returns the log-variance of x_{t-1} at step i of `schedule`: a number, (B, 1, 1), or (B, F, D) if learned."""
         small = schedule.factor("posterior_log_variance", i, x_t)
         if self.variance == "fixed_small":
@@ -112,19 +114,30 @@ class GaussianDiffusion(Process):
         """Returns the losses "mse" (FLAME, eq. 3) and, if the variance is learned, "vlb"."""
         # With the skip, an error in the output is that in the noise divided by the signal.
         scale = self.schedule.at("signal", t, x) if self.skip else 1.0
-        error = masked_mse(scale * output[..., : x.shape[-1]], scale * self.target(x, noise, t), mask)
+        error = masked_mse(
+            scale * output[..., : x.shape[-1]], scale * self.target(x, noise, t), mask
+        )
         terms = {"mse": self._snr_weight(t) * error}
         if self.variance == "learned_range" and self.vlb_weight:
-            terms["vlb"] = self.vlb_weight * len(self.schedule) * masked_mean(self.vlb(output, x, x_t, t), mask)
+            terms["vlb"] = (
+                self.vlb_weight
+                * len(self.schedule)
+                * masked_mean(self.vlb(output, x, x_t, t), mask)
+            )
         return terms
 
     def _snr_weight(self, t: Tensor) -> Tensor | float:
         """Returns the weight (B,) of the squared error of the prediction at steps t (B,)."""
         if self.min_snr is None:
             return 1.0
-        snr = (self.schedule.at("signal", t, t) / self.schedule.at("noise", t, t)).square().flatten()
+        snr = (
+            (self.schedule.at("signal", t, t) / self.schedule.at("noise", t, t)).square().flatten()
+        )
         # A squared error of 1 in the clean motion is one of SNR in the noise, and of SNR + 1 in the velocity.
-        return snr.clamp(max=self.min_snr) / {"x0": 1.0, "epsilon": snr, "velocity": snr + 1}[self.prediction]
+        return (
+            snr.clamp(max=self.min_snr)
+            / {"x0": 1.0, "epsilon": snr, "velocity": snr + 1}[self.prediction]
+        )
 
     def vlb(self, output: Tensor, x: Tensor, x_t: Tensor, t: Tensor) -> Tensor:
         """Returns terms of the variational bound (B, F, D) at steps t (B,), in nats (Ho et al. 2020, eq. 5).
@@ -137,7 +150,9 @@ class GaussianDiffusion(Process):
         log_variance = torch.as_tensor(self.log_variance(output, x_t, t, self.schedule))
         # KL divergence of two normal distributions
         difference = self.schedule.at("posterior_log_variance", t, x_t) - log_variance
-        return 0.5 * (difference.exp() - 1 - difference + (real - mean).square() * (-log_variance).exp())
+        return 0.5 * (
+            difference.exp() - 1 - difference + (real - mean).square() * (-log_variance).exp()
+        )
 
     def sample(
         self,
@@ -193,11 +208,15 @@ class GaussianDiffusion(Process):
         if isinstance(chosen, Sequence):
             steps = list(chosen)
             if len(steps) < 2 or steps != sorted(set(steps)) or steps[-1] >= total:
-                raise UserError(f"sampling steps must be 2 or more from 0 to {total - 1}, increasing: got {steps}")
+                raise UserError(
+                    f"sampling steps must be 2 or more from 0 to {total - 1}, increasing: got {steps}"
+                )
             return steps
         least = 1 if options.sampler == "consistency" else 2
         if chosen is None or not least <= chosen <= total:
-            raise UserError(f"num_inference_steps={chosen}: diffusion takes {least} to {total} steps")
+            raise UserError(
+                f"num_inference_steps={chosen}: diffusion takes {least} to {total} steps"
+            )
         if options.sampler == "consistency":
             return [int(step) for step in reversed(self.grid(chosen))]
         return timesteps(total, chosen, options.spacing or "linspace")

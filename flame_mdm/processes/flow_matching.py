@@ -40,7 +40,11 @@ class FlowMatching(Process):
         super().__init__()
         if not 0 <= sigma_min < 1:
             raise UserError(f"sigma_min is {sigma_min}: choose a number in [0, 1)")
-        self.sigma_min, self.prediction, self.time_distribution = sigma_min, prediction, time_distribution
+        self.sigma_min, self.prediction, self.time_distribution = (
+            sigma_min,
+            prediction,
+            time_distribution,
+        )
         self.quantize_time, self.odeint_grid = quantize_time, odeint_grid
 
     def out_features(self, features: int) -> int:
@@ -105,7 +109,11 @@ class FlowMatching(Process):
         def velocity(x: Tensor, t: float | Tensor) -> Tensor:
             # Filling a tensor on the device with a number needs no copy and no synchronization.
             precision = torch.promote_types(x.dtype, torch.float32)
-            time = t.expand(len(x)) if isinstance(t, Tensor) else x.new_full((len(x),), t, dtype=precision)
+            time = (
+                t.expand(len(x))
+                if isinstance(t, Tensor)
+                else x.new_full((len(x),), t, dtype=precision)
+            )
             seen = x
             if guide is not None:
                 seen = guide.steer(lambda x: self.clean(denoise, x, time, mask, cond), x)
@@ -117,7 +125,9 @@ class FlowMatching(Process):
                 x0_hat = imposed.impose(x0_hat)
             if trajectory is not None:
                 trajectory.append(x0_hat * mask[..., None])
-            straight = (x0_hat - (1 - self.sigma_min) * x) / (1 - (1 - self.sigma_min) * time[:, None, None])
+            straight = (x0_hat - (1 - self.sigma_min) * x) / (
+                1 - (1 - self.sigma_min) * time[:, None, None]
+            )
             if self.prediction == "x0" or guide is not None:
                 return straight
             return output if imposed is None else torch.where(imposed.keep, straight, output)

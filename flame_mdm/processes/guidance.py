@@ -41,7 +41,9 @@ def classifier_free_guidance(denoise: Denoise, scale: float | Tensor, features: 
         nonlocal seen, doubled
         if seen is None or seen[0] is not mask or seen[1] is not cond:
             seen, doubled = (mask, cond), (torch.cat([mask, mask]), cond.with_null())
-        with_cond, null = denoise(torch.cat([x_t, x_t]), torch.cat([t, t]), *doubled).unflatten(0, (2, -1))
+        with_cond, null = denoise(torch.cat([x_t, x_t]), torch.cat([t, t]), *doubled).unflatten(
+            0, (2, -1)
+        )
         mean = null[..., :features] + strength * (with_cond[..., :features] - null[..., :features])
         variance = with_cond[..., features:]
         return torch.cat([mean, variance], -1) if variance.shape[-1] else mean
@@ -64,7 +66,10 @@ class Positions:
 
 
 def steer(
-    clean: Callable[[Tensor], Tensor], x_t: Tensor, to_joints: Callable[[Tensor], Tensor], positions: Positions
+    clean: Callable[[Tensor], Tensor],
+    x_t: Tensor,
+    to_joints: Callable[[Tensor], Tensor],
+    positions: Positions,
 ) -> Tensor:
     """Returns noisy motions (B, F, D) whose `clean` estimates are nearer to positions in the world.
 
@@ -112,7 +117,9 @@ def reach(
         return torch.cat([positions.of(joints), lengths])
 
     around = frames.unique()
-    near = torch.exp(-0.5 * ((torch.arange(x.shape[1], device=x.device)[:, None] - around) / smoothness) ** 2)
+    near = torch.exp(
+        -0.5 * ((torch.arange(x.shape[1], device=x.device)[:, None] - around) / smoothness) ** 2
+    )
     changed = []
     for motion, may in zip(x, free, strict=True):
         joints = to_joints(motion)
@@ -127,7 +134,9 @@ def reach(
             smooth = smooth.unflatten(0, (len(error), -1)).movedim(1, 2) * may
             gram = torch.einsum("mfd,nfd->mn", smooth, slope).double()
             gram += torch.diag(RELAXATION * gram.diagonal() + 1e-9)
-            motion = motion + torch.einsum("m,mfd->fd", torch.linalg.solve(gram, error.double()).to(x), smooth)
+            motion = motion + torch.einsum(
+                "m,mfd->fd", torch.linalg.solve(gram, error.double()).to(x), smooth
+            )
         if len(around):
             all_edges = edges[frames == around[0]]
             before, weight = bone_lengths(joints, all_edges), near.amax(1, keepdim=True)
@@ -138,7 +147,11 @@ def reach(
 
 
 def _with_bones(
-    motion: Tensor, to_joints: Callable[[Tensor], Tensor], edges: Tensor, lengths: Tensor, free: Tensor
+    motion: Tensor,
+    to_joints: Callable[[Tensor], Tensor],
+    edges: Tensor,
+    lengths: Tensor,
+    free: Tensor,
 ) -> Tensor:
     """Returns the nearest motion (F, D) whose bones `edges` (N, 2) have `lengths` (F, N) in each frame."""
 
@@ -152,5 +165,7 @@ def _with_bones(
         slope = torch.func.vmap(torch.func.jacrev(lengths_of))(motion) * free[:, None]  # (F, N, D)
         gram = (slope @ slope.mT).double()
         gram = gram + torch.diag_embed(RELAXATION * gram.diagonal(dim1=1, dim2=2) + 1e-9)
-        motion = motion + (torch.linalg.solve(gram, error.double()).to(motion)[..., None] * slope).sum(1)
+        motion = motion + (
+            torch.linalg.solve(gram, error.double()).to(motion)[..., None] * slope
+        ).sum(1)
     return motion

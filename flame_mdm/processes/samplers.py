@@ -62,7 +62,9 @@ def ancestral(x: Tensor, run: Descent, i: int) -> Tensor:
     mean = run.schedule.posterior_mean(x0_hat, x, i)
     if i == 0:
         return mean
-    deviation = (log_variance / 2).exp() if isinstance(log_variance, Tensor) else math.exp(log_variance / 2)
+    deviation = (
+        (log_variance / 2).exp() if isinstance(log_variance, Tensor) else math.exp(log_variance / 2)
+    )
     return mean + deviation * next(run.draws)
 
 
@@ -91,7 +93,9 @@ def dpm_solver_pp_2m(x: Tensor, run: Descent, i: int) -> Tensor:
     size = schedule.log_snr(i - 1) - schedule.log_snr(i)
     data = x0_hat
     if last is not None:
-        data = x0_hat + size / (2 * (schedule.log_snr(i) - schedule.log_snr(i + 1))) * (x0_hat - last)
+        data = x0_hat + size / (2 * (schedule.log_snr(i) - schedule.log_snr(i + 1))) * (
+            x0_hat - last
+        )
     shrink = schedule.number("noise", i - 1) / schedule.number("noise", i)
     return shrink * x - schedule.number("signal", i - 1) * math.expm1(-size) * data
 
@@ -102,7 +106,9 @@ def consistency(x: Tensor, run: Descent, i: int) -> Tensor:
     return run.schedule.corrupt(x0_hat, next(run.draws), i - 1) if i else x0_hat
 
 
-def blended(sampler: Sampler, x: Tensor, run: Descent, steps: Sequence[int], edit: Edit, start: Tensor) -> Tensor:
+def blended(
+    sampler: Sampler, x: Tensor, run: Descent, steps: Sequence[int], edit: Edit, start: Tensor
+) -> Tensor:
     """Takes `steps` and replaces the kept part of each noisy motion by the known motion, as noisy as the rest.
 
     With the blend "after", the kept part of the first x_t has the noise of the `start`, as if blended after a step

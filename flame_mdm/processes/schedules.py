@@ -16,8 +16,12 @@ def cosine_betas(num_train_timesteps: int) -> Tensor:
         return math.cos((t + 0.008) / 1.008 * math.pi / 2) ** 2
 
     steps = range(num_train_timesteps)
-    ratios = [alpha_bar((i + 1) / num_train_timesteps) / alpha_bar(i / num_train_timesteps) for i in steps]
-    return torch.tensor([min(1 - ratio, 0.999) for ratio in ratios], dtype=torch.float64, device="cpu")
+    ratios = [
+        alpha_bar((i + 1) / num_train_timesteps) / alpha_bar(i / num_train_timesteps) for i in steps
+    ]
+    return torch.tensor(
+        [min(1 - ratio, 0.999) for ratio in ratios], dtype=torch.float64, device="cpu"
+    )
 
 
 def linear_betas(num_train_timesteps: int) -> Tensor:
@@ -26,7 +30,9 @@ def linear_betas(num_train_timesteps: int) -> Tensor:
     For other T they are scaled by 1000 / T to end at the same noise, as in guided-diffusion, and clipped at 0.999.
     """
     scale = 1000 / num_train_timesteps
-    betas = torch.linspace(scale * 1e-4, scale * 0.02, num_train_timesteps, dtype=torch.float64, device="cpu")
+    betas = torch.linspace(
+        scale * 1e-4, scale * 0.02, num_train_timesteps, dtype=torch.float64, device="cpu"
+    )
     return betas.clamp(max=0.999)
 
 
@@ -57,7 +63,9 @@ class Schedule:
             "log_betas": betas.log(),
             "large_log_variance": torch.cat([clipped[:1], betas[1:]]).log(),
         }
-        self.numbers: dict[str, list[float]] = {name: table.tolist() for name, table in self.tables.items()}
+        self.numbers: dict[str, list[float]] = {
+            name: table.tolist() for name, table in self.tables.items()
+        }
         self._moved: dict[tuple[str, torch.device, torch.dtype], Tensor] = {}
 
     def __len__(self) -> int:
@@ -100,11 +108,15 @@ class Schedule:
 def build_schedule(name: str, num_train_timesteps: int) -> Schedule:
     """Returns the schedule "cosine" or "linear" with 2 to `MAX_STEPS` steps."""
     if not 2 <= num_train_timesteps <= MAX_STEPS:
-        raise UserError(f"num_train_timesteps is {num_train_timesteps}: a diffusion has 2 to {MAX_STEPS:,} steps")
+        raise UserError(
+            f"num_train_timesteps is {num_train_timesteps}: a diffusion has 2 to {MAX_STEPS:,} steps"
+        )
     return Schedule({"cosine": cosine_betas, "linear": linear_betas}[name](num_train_timesteps))
 
 
-def timesteps(num_train_timesteps: int, num_inference_steps: int, spacing: str = "linspace") -> list[int]:
+def timesteps(
+    num_train_timesteps: int, num_inference_steps: int, spacing: str = "linspace"
+) -> list[int]:
     """Returns N = `num_inference_steps` increasing sampling steps from 0 ... T - 1.
 
     "linspace" includes both ends and rounds half to even ("N" in the code of MDM and FLAME, after Nichol and Dhariwal
@@ -113,12 +125,16 @@ def timesteps(num_train_timesteps: int, num_inference_steps: int, spacing: str =
     """
     total, count = num_train_timesteps, num_inference_steps
     if not 1 <= count <= total:
-        raise UserError(f"num_inference_steps is {count}: choose from 1 to num_train_timesteps = {total}")
+        raise UserError(
+            f"num_inference_steps is {count}: choose from 1 to num_train_timesteps = {total}"
+        )
     if spacing == "stride":
         for steps in (range(0, total, stride) for stride in range(1, total + 1)):
             if len(steps) == count:
                 return list(steps)
-        raise UserError(f"no stride gives {count} of {total} steps: choose another number or spacing=linspace")
+        raise UserError(
+            f"no stride gives {count} of {total} steps: choose another number or spacing=linspace"
+        )
     stride = (total - 1) / (count - 1) if count > 1 else 1.0
     # A running sum, not i * stride: its rounding decides ties, and the released models were sampled at those steps.
     steps, position = [], 0.0

@@ -32,12 +32,16 @@ def blended(denoise: Denoise, windows: Windows) -> Denoise:
         output = denoise(x_t[rows, windows.frames], t[windows.rows], windows.batch.mask, cond)
         weighted = output * windows.weights[..., None].to(output.dtype)
         total = output.new_zeros(*x_t.shape[:2], output.shape[-1])
-        return total.index_put((rows.expand_as(windows.frames), windows.frames), weighted, accumulate=True)
+        return total.index_put(
+            (rows.expand_as(windows.frames), windows.frames), weighted, accumulate=True
+        )
 
     return blend
 
 
-def spans(lengths: Sequence[int], longest: int, overlap: int, loop: bool = False) -> list[tuple[int, int, int]]:
+def spans(
+    lengths: Sequence[int], longest: int, overlap: int, loop: bool = False
+) -> list[tuple[int, int, int]]:
     """Covers the consecutive parts of a motion with windows: part, first frame and number of frames of each.
 
     The windows of a part reach half the overlap, an even number, into its neighbors. A part that does not fit into one
@@ -50,12 +54,19 @@ def spans(lengths: Sequence[int], longest: int, overlap: int, loop: bool = False
         size = begin + overlap // 2 * (loop or begin < total) - first
         count = max(1, -(-(size - overlap) // (longest - overlap)))
         width = -(-(size + (count - 1) * overlap) // count)
-        windows += [(part, first + round(i * (size - width) / max(1, count - 1)), width) for i in range(count)]
+        windows += [
+            (part, first + round(i * (size - width) / max(1, count - 1)), width)
+            for i in range(count)
+        ]
     return windows
 
 
 def cover(
-    windows: Sequence[tuple[int, int, int]], totals: Sequence[int], overlap: int, width: int, device: torch.device
+    windows: Sequence[tuple[int, int, int]],
+    totals: Sequence[int],
+    overlap: int,
+    width: int,
+    device: torch.device,
 ) -> Windows:
     """Returns windows, without conditions, by motion, first frame and length of each.
 
@@ -66,7 +77,10 @@ def cover(
     mask, position = length_mask(size, width), torch.arange(width, device=device)
     frames = (first[:, None] + position) % torch.tensor(totals, device=device)[rows, None]
     ramp = torch.minimum(position + 0.5, size[:, None] - position - 0.5) / overlap
-    weights, index = torch.sin(ramp.clamp(0, 1) * torch.pi / 2) ** 2 * mask, (rows[:, None].expand_as(frames), frames)
+    weights, index = (
+        torch.sin(ramp.clamp(0, 1) * torch.pi / 2) ** 2 * mask,
+        (rows[:, None].expand_as(frames), frames),
+    )
     total = weights.new_zeros(len(totals), max(totals)).index_put(index, weights, accumulate=True)
     batch = MotionBatch(torch.zeros(*mask.shape, 0, device=device), mask, [""] * len(windows))
     return Windows(batch, rows, frames, weights / total[index])

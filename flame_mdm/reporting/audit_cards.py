@@ -44,7 +44,9 @@ def seen(card: AuditCard, perturbation: AuditedPerturbation, metric: str) -> See
     graded = [(grade.grade, *grade.values[metric]) for grade in perturbation.grades]
     if real is None or width is None:
         return None
-    changes = [(grade, d, half) for grade, _, _, d, half in graded if d is not None and half is not None]
+    changes = [
+        (grade, d, half) for grade, _, _, d, half in graded if d is not None and half is not None
+    ]
     if len(changes) < len(graded):
         return None
 
@@ -56,7 +58,12 @@ def seen(card: AuditCard, perturbation: AuditedPerturbation, metric: str) -> See
     higher, strongest = card.metrics[metric], changes[-1][1]
     rewarded = since(0) is not None and higher is not None and (strongest > 0) == higher
     pairs = itertools.pairwise(changes)
-    return Seen(since(0), since(width), rewarded, all(abs(b) + half >= abs(a) for (_, a, _), (_, b, half) in pairs))
+    return Seen(
+        since(0),
+        since(width),
+        rewarded,
+        all(abs(b) + half >= abs(a) for (_, a, _), (_, b, half) in pairs),
+    )
 
 
 def card_name(card: AuditCard) -> str:
@@ -98,7 +105,12 @@ class CitedCard:
         Cards are compared in this order.
         """
         same_frames = self.data.frames == data.frames
-        return same_frames, self.split == "test", self.data.fingerprint == data.fingerprint, self.motions
+        return (
+            same_frames,
+            self.split == "test",
+            self.data.fingerprint == data.fingerprint,
+            self.motions,
+        )
 
     def __str__(self) -> str:
         return f"{self.path.as_posix()} ({self.motions} motions)"
@@ -117,7 +129,9 @@ def card_of(data: Data, sha256: str | None) -> CitedCard | None:
     for path in sorted(folder.glob(f"{data.dataset}-{extractor or 'none'}*.json")):
         card = read_card(path)
         if (card.extractor.sha256[:12] if card.extractor else None) == extractor:
-            fitting.append(CitedCard(path.with_suffix(".html"), card.motions, card.split, card.data))
+            fitting.append(
+                CitedCard(path.with_suffix(".html"), card.motions, card.split, card.data)
+            )
     fitting = [card for card in fitting if card.data.dataset == data.dataset]
     return max(fitting, key=lambda card: card.strength(data), default=None)
 
@@ -134,7 +148,9 @@ def write_card(cards: Sequence[AuditCard], out: Path, name: str = "") -> list[Pa
     metrics = list(dict.fromkeys(metric for card in cards for metric in card.metrics))
     metrics.sort(key=lambda metric: any(_facts_of(card, metric).exact for card in cards))
     values = {
-        "title": " and ".join(f"Audit of {_evaluator(card)} on {card.data.dataset}" for card in cards),
+        "title": " and ".join(
+            f"Audit of {_evaluator(card)} on {card.data.dataset}" for card in cards
+        ),
         "cards": [_section(card) for card in cards],
         "metrics": metrics,
         "rows": _rows(cards, metrics),
@@ -142,13 +158,19 @@ def write_card(cards: Sequence[AuditCard], out: Path, name: str = "") -> list[Pa
     }
     name = name or "-and-".join(map(card_name, cards))
     paths = [out / f"{name}{suffix}" for suffix in (".html", ".md")]
-    write_text(paths[0], page(str(values["title"]), render("audit.html", **values, wide=WIDE, high=HIGH)))
+    write_text(
+        paths[0], page(str(values["title"]), render("audit.html", **values, wide=WIDE, high=HIGH))
+    )
     write_text(paths[1], str(render("audit.md", **values, metric_text=_metric_text)))
     return paths
 
 
 def _evaluator(card: AuditCard) -> str:
-    return f"{card.extractor.name} ({card.extractor.sha256[:12]})" if card.extractor else "metrics of joints"
+    return (
+        f"{card.extractor.name} ({card.extractor.sha256[:12]})"
+        if card.extractor
+        else "metrics of joints"
+    )
 
 
 def _section(card: AuditCard) -> dict[str, object]:
@@ -157,17 +179,24 @@ def _section(card: AuditCard) -> dict[str, object]:
         "name": _evaluator(card),
         "facts": _facts(card),
         "findings": findings(card),
-        "truth": [(name, number(x["auc"]), number(x["correlation"])) for name, x in card.truth.items()],
+        "truth": [
+            (name, number(x["auc"]), number(x["correlation"])) for name, x in card.truth.items()
+        ],
         "real": [(name, interval(*pair)) for name, pair in card.real.items()],
     }
 
 
 def _rows(cards: Sequence[AuditCard], metrics: Sequence[str]) -> list[dict[str, object]]:
     """Returns the perturbations of all cards, each with one cell per metric and card, and its curves by metric."""
-    by_name = [{perturbation.name: perturbation for perturbation in card.perturbations} for card in cards]
+    by_name = [
+        {perturbation.name: perturbation for perturbation in card.perturbations} for card in cards
+    ]
     rows = []
     for name in dict.fromkeys(name for names in by_name for name in names):
-        pairs = [(card, perturbations.get(name)) for card, perturbations in zip(cards, by_name, strict=True)]
+        pairs = [
+            (card, perturbations.get(name))
+            for card, perturbations in zip(cards, by_name, strict=True)
+        ]
         curves = []
         for metric in metrics:
             drawn = [_curve(card, perturbation, metric) for card, perturbation in pairs]
@@ -176,7 +205,10 @@ def _rows(cards: Sequence[AuditCard], metrics: Sequence[str]) -> list[dict[str, 
         rows.append(
             {
                 "about": next(perturbation for _, perturbation in pairs if perturbation),
-                "cells": [[_cell(card, perturbation, metric) for card, perturbation in pairs] for metric in metrics],
+                "cells": [
+                    [_cell(card, perturbation, metric) for card, perturbation in pairs]
+                    for metric in metrics
+                ],
                 "curves": curves,
             }
         )
@@ -186,9 +218,18 @@ def _rows(cards: Sequence[AuditCard], metrics: Sequence[str]) -> list[dict[str, 
 def _facts(card: AuditCard) -> list[list[str]]:
     data, protocol = card.data, card.protocol
     return [
-        ["extractor", f"{card.extractor.name}, sha256 {card.extractor.sha256}" if card.extractor else "none"],
-        ["data", f"{card.split} split of {data.dataset}, fingerprint {data.fingerprint}, {data.representation}"],
-        ["motions", f"{card.motions}" + (" of {} to {} frames".format(*data.frames) if data.frames else "")],
+        [
+            "extractor",
+            f"{card.extractor.name}, sha256 {card.extractor.sha256}" if card.extractor else "none",
+        ],
+        [
+            "data",
+            f"{card.split} split of {data.dataset}, fingerprint {data.fingerprint}, {data.representation}",
+        ],
+        [
+            "motions",
+            f"{card.motions}" + (" of {} to {} frames".format(*data.frames) if data.frames else ""),
+        ],
         ["protocol", f"{protocol.name} version {protocol.version}, seed {card.seed}"],
         ["intervals", f"95 %, from {card.resamples} bootstrap resamples of the motions"],
         ["versions", ", ".join(f"{name} {version}" for name, version in card.packages.items())],
@@ -203,10 +244,17 @@ def findings(card: AuditCard) -> list[str]:
     group = {p.name: p.group for p in card.perturbations}
     wrong = [name for name in group if group[name] in ("joints", "meaning") and ":" not in name]
     expected = [name for name in group if name in wrong or name == "memorized"]
-    blind = [name for name in expected if not any((name, metric) in noticed for metric in card.metrics)]
+    blind = [
+        name for name in expected if not any((name, metric) in noticed for metric in card.metrics)
+    ]
     lines = [f"No metric sees: {', '.join(blind)}."] if blind else []
-    single = {m: [n for n in wrong if [x for x in card.metrics if (n, x) in noticed] == [m]] for m in card.metrics}
-    lines += [f"Only {metric} sees: {', '.join(names)}." for metric, names in single.items() if names]
+    single = {
+        m: [n for n in wrong if [x for x in card.metrics if (n, x) in noticed] == [m]]
+        for m in card.metrics
+    }
+    lines += [
+        f"Only {metric} sees: {', '.join(names)}." for metric, names in single.items() if names
+    ]
     for metric in card.metrics:
         unseen = [n for n in wrong if (n, metric) not in noticed and n not in blind]
         unseen = [n for n in unseen if group[n] == "joints" or _facts_of(card, metric).sees_meaning]
@@ -233,7 +281,9 @@ def _facts_of(card: AuditCard, metric: str) -> AuditedMetric:
     return card.facts.get(metric, AuditedMetric())
 
 
-def _cell(card: AuditCard, perturbation: AuditedPerturbation | None, metric: str) -> tuple[str, str]:
+def _cell(
+    card: AuditCard, perturbation: AuditedPerturbation | None, metric: str
+) -> tuple[str, str]:
     """Returns the text of a cell of the summary, and its class."""
     response = seen(card, perturbation, metric) if perturbation and metric in card.metrics else None
     if perturbation is None or metric not in card.metrics:
@@ -243,7 +293,10 @@ def _cell(card: AuditCard, perturbation: AuditedPerturbation | None, metric: str
     if response.grade is None:
         return "–", "faint"
     graded = len(perturbation.grades) > 1
-    first, then = (("–" if g is None else f"{g:g}" if graded else "yes") for g in (response.grade, response.outside))
+    first, then = (
+        ("–" if g is None else f"{g:g}" if graded else "yes")
+        for g in (response.grade, response.outside)
+    )
     text = first if first == then else f"{first} → {then}"
     if not response.monotone:
         text += " ~"
@@ -258,12 +311,18 @@ def _not_computed(card: AuditCard, perturbation: AuditedPerturbation, metric: st
     return f"not computed at {', '.join(f'{grade:g}' for grade in grades)}"
 
 
-def _curve(card: AuditCard, perturbation: AuditedPerturbation | None, metric: str) -> dict[str, str] | None:
+def _curve(
+    card: AuditCard, perturbation: AuditedPerturbation | None, metric: str
+) -> dict[str, str] | None:
     """Returns a response curve over real motions and all grades; None if the metric never changes."""
     if perturbation is None or metric not in card.metrics:
         return None
     pairs = [card.real[metric], *(grade.values[metric][:2] for grade in perturbation.grades)]
-    points = [(i, value, half) for i, (value, half) in enumerate(pairs) if value is not None and half is not None]
+    points = [
+        (i, value, half)
+        for i, (value, half) in enumerate(pairs)
+        if value is not None and half is not None
+    ]
     real = card.real[metric][0]
     if real is None or all(abs(value - real) <= ROUNDING * abs(real) for _, value, _ in points):
         return None

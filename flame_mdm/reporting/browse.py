@@ -34,8 +34,13 @@ def find(clips: Sequence[Entry], split: str | None, search: str) -> list[list[En
             families.setdefault(original, []).append(clip)
     words = search.lower().split()
     texts = {clip.id: " ".join([clip.id, *clip.captions]).lower() for clip in clips}
-    matching = (f for f in families.values() if any(all(word in texts[clip.id] for word in words) for clip in f))
-    return [sorted(family, key=lambda clip: len(clip.id)) for family in matching]  # a mirrored id is longer
+    matching = (
+        f
+        for f in families.values()
+        if any(all(word in texts[clip.id] for word in words) for clip in f)
+    )
+    # A mirrored id is longer
+    return [sorted(family, key=lambda clip: len(clip.id)) for family in matching]
 
 
 def choose(families: Sequence[list[Entry]], most: int) -> list[list[Entry]]:
@@ -51,7 +56,8 @@ def motion(store: Store, representation: Representation, clip: Entry) -> Motion:
     shown = round(SECONDS * representation.fps)
     joints = representation.decode(torch.from_numpy(store.motion(clip)[:shown].copy())).numpy()
     below = joints[..., 1].min()
-    if below < -0.3:  # the action data sets use camera coordinates, without a floor: put the lowest joint on it
+    # The action data sets use camera coordinates, without a floor: put the lowest joint on it
+    if below < -0.3:
         joints[..., 1] -= below
     actions = store.info["actions"]
     caption = " · ".join(clip.captions) or ("" if clip.action is None else actions[clip.action])
@@ -61,7 +67,12 @@ def motion(store: Store, representation: Representation, clip: Entry) -> Motion:
 
 
 def write_page(
-    path: Path, store: Store, representation: Representation, clips: Sequence[Entry], title: str, body: Mesh | None
+    path: Path,
+    store: Store,
+    representation: Representation,
+    clips: Sequence[Entry],
+    title: str,
+    body: Mesh | None,
 ) -> None:
     write_player(
         path,
@@ -93,7 +104,9 @@ def write_clips(
     """
     ids = [re.sub(r"[^\w.-]+", "_", clip.id)[:100] for clip in clips]
     paths = [folder / f"motion_{number:03d}_{name}.npz" for number, name in enumerate(ids)]
-    others = sorted(path for path in folder.glob("*.npz") if path not in paths and path.name[0] != ".")
+    others = sorted(
+        path for path in folder.glob("*.npz") if path not in paths and path.name[0] != "."
+    )
     if others:
         raise UserError(
             f"motions={folder}: the folder holds other motions, such as {others[0].name}. Delete it, or choose another"
@@ -102,7 +115,9 @@ def write_clips(
     used: set[str] = set()
     with atomic_folder(folder) as temporary:
         for path, clip in zip(paths, clips, strict=True):
-            captions = clip.captions or ([] if clip.action is None else [store.info["actions"][clip.action]])
+            captions = clip.captions or (
+                [] if clip.action is None else [store.info["actions"][clip.action]]
+            )
             unused = [caption for caption in captions if caption not in used]
             caption = [*unused, *captions, ""][0]
             used.add(caption)
@@ -111,18 +126,32 @@ def write_clips(
             joints = representation.decode(torch.from_numpy(features.copy())).numpy()
             written = Motion(joints, representation.fps, representation.skeleton, caption, clip.id)
             written.features, written.representation = features, representation.name
-            written.save(temporary / path.name, clip=clip.id, split=clip.split, data=store.fingerprint)
+            written.save(
+                temporary / path.name, clip=clip.id, split=clip.split, data=store.fingerprint
+            )
 
 
 def describe(store: Store) -> Markup:
     info, fps = store.info, store.info["fps"]
-    splits = {name: [clip for clip in store.clips if clip.split == name] for name, n in info["clips"].items() if n}
-    counts = Counter(info["actions"][clip.action] for clip in store.clips if clip.action is not None)
+    splits = {
+        name: [clip for clip in store.clips if clip.split == name]
+        for name, n in info["clips"].items()
+        if n
+    }
+    counts = Counter(
+        info["actions"][clip.action] for clip in store.clips if clip.action is not None
+    )
     rows = []
     for name, clips in splits.items():
         lengths = np.array([clip.length for clip in clips])
         captions = [caption for clip in clips for caption in clip.captions]
         words = f"{np.mean([len(caption.split()) for caption in captions]):.1f}" if captions else ""
-        cells = [len(clips), f"{lengths.sum() / fps / 60:.1f}", lengths.min(), f"{np.median(lengths):g}", lengths.max()]
+        cells = [
+            len(clips),
+            f"{lengths.sum() / fps / 60:.1f}",
+            lengths.min(),
+            f"{np.median(lengths):g}",
+            lengths.max(),
+        ]
         rows.append([name, *cells, len(captions), len(set(captions)), words])
     return render("browse.html", info=info, actions=counts.most_common(), rows=rows)

@@ -17,7 +17,15 @@ from flame_mdm.formats import ENDINGS
 from flame_mdm.records import Result, Value
 from flame_mdm.reporting.page import filled, number, page, render
 from flame_mdm.reporting.plots import Curve, chart
-from flame_mdm.reporting.report import charted, evaluation_title, labeled, last, marks, printed, sampling
+from flame_mdm.reporting.report import (
+    charted,
+    evaluation_title,
+    labeled,
+    last,
+    marks,
+    printed,
+    sampling,
+)
 from flame_mdm.runs import CONFIG, Run, read_run
 
 if TYPE_CHECKING:
@@ -27,7 +35,8 @@ if TYPE_CHECKING:
     from flame_mdm.formats.motion import Motion
     from flame_mdm.visualize.body import Mesh
 
-Prompt = tuple[str, int]  # requested caption or action, and the index of the motion among those with the same request
+# Requested caption or action, and the index of the motion among those with the same request
+Prompt = tuple[str, int]
 
 
 @dataclass(frozen=True)
@@ -46,7 +55,9 @@ def find(folders: Sequence[Path]) -> list[ComparedRun]:
     the same.
     """
     if len(set(folders)) < 2:
-        raise UserError(f'a comparison needs two or more runs: runs="A B", not {" ".join(map(str, folders))}')
+        raise UserError(
+            f'a comparison needs two or more runs: runs="A B", not {" ".join(map(str, folders))}'
+        )
 
     compared = []
     for folder in folders:
@@ -57,12 +68,17 @@ def find(folders: Sequence[Path]) -> list[ComparedRun]:
             compared.append(ComparedRun(run.label, folder, run))
 
     labels = Counter(entry.label for entry in compared)
-    return [entry if labels[entry.label] == 1 else replace(entry, label=str(entry.folder)) for entry in compared]
+    return [
+        entry if labels[entry.label] == 1 else replace(entry, label=str(entry.folder))
+        for entry in compared
+    ]
 
 
 def _direct_motions(folder: Path) -> list[Path]:
     """Returns the motion files that are in a folder itself, sorted, without hidden ones."""
-    files = (path for path in folder.iterdir() if path.suffix.lower() in ENDINGS and path.name[0] != ".")
+    files = (
+        path for path in folder.iterdir() if path.suffix.lower() in ENDINGS and path.name[0] != "."
+    )
     return sorted(file for file in files if file.is_file())
 
 
@@ -89,7 +105,9 @@ def only_runs(compared: Sequence[ComparedRun]) -> dict[str, Run]:
 
 
 def comparison(
-    compared: Sequence[ComparedRun], shown: Sequence[Mapping[Prompt, Motion]], mesh: Mesh | None = None
+    compared: Sequence[ComparedRun],
+    shown: Sequence[Mapping[Prompt, Motion]],
+    mesh: Mesh | None = None,
 ) -> str:
     """Returns the page that compares runs side by side. The same runs give the same bytes.
 
@@ -117,13 +135,25 @@ def comparison(
 
 
 def _facts(runs: Mapping[str, Run]) -> tuple[list[str], list[list[str]]]:
-    head = ("run", "steps", "passes", "parameters", "s/step", "samples per second", "device", "data", "folder")
+    head = (
+        "run",
+        "steps",
+        "passes",
+        "parameters",
+        "s/step",
+        "samples per second",
+        "device",
+        "data",
+        "folder",
+    )
     rows = []
     for label, run in runs.items():
         facts = run.provenance
         row = [label, f"{run.steps:,}", number(last(run.curves.get("train/epochs", {})))]
         row += [f"{facts.parameters / 1e6:.2f} M" if facts and facts.parameters else "–"]
-        curves = [run.curves.get(f"train/{name}") for name in ("seconds_per_step", "samples_per_second")]
+        curves = [
+            run.curves.get(f"train/{name}") for name in ("seconds_per_step", "samples_per_second")
+        ]
         row += [number(statistics.median(curve.values()) if curve else None) for curve in curves]
         row += [facts.device, facts.data.fingerprint] if facts else ["–", "–"]
         rows.append([*row, str(run.folder)])
@@ -132,12 +162,23 @@ def _facts(runs: Mapping[str, Run]) -> tuple[list[str], list[list[str]]]:
 
 def _differences(runs: Mapping[str, Run]) -> list[list[str]]:
     configs = [flatten(run.config) for run in runs.values()]
-    keys = sorted({key for config in configs for key in config if key != "experiment" and not key.startswith("run.")})
-    rows = [[key, *(str(config[key]) if key in config else "–" for config in configs)] for key in keys]
+    keys = sorted(
+        {
+            key
+            for config in configs
+            for key in config
+            if key != "experiment" and not key.startswith("run.")
+        }
+    )
+    rows = [
+        [key, *(str(config[key]) if key in config else "–" for config in configs)] for key in keys
+    ]
     return [row for row in rows if len(set(row[1:])) > 1]
 
 
-def _player(labels: Sequence[str], shown: Sequence[Mapping[Prompt, Motion]], body: Mesh | None) -> str:
+def _player(
+    labels: Sequence[str], shown: Sequence[Mapping[Prompt, Motion]], body: Mesh | None
+) -> str:
     """Plays the motions for the prompts that all runs have, in the order of the first run."""
     from flame_mdm.visualize import player_page
 
@@ -193,7 +234,11 @@ def paired_difference(first: ArrayLike, second: ArrayLike) -> tuple[float, float
 
     difference = np.subtract(second, first)
     count, mean = len(difference), float(difference.mean())
-    half = float(t.ppf(0.975, count - 1) * difference.std(ddof=1) / count**0.5) if count > 1 else float("nan")
+    half = (
+        float(t.ppf(0.975, count - 1) * difference.std(ddof=1) / count**0.5)
+        if count > 1
+        else float("nan")
+    )
     return mean, mean - half, mean + half
 
 
@@ -210,9 +255,14 @@ def grouped(runs: Mapping[str, Run]) -> dict[str, list[tuple[str, Result]]]:
 def in_common(runs: Mapping[str, Run]) -> list[str]:
     """Returns why no evaluation can be compared; [] if two runs have the same evaluation."""
     groups = grouped(runs)
-    if len(runs) < 2 or any(len({label for label, _ in columns}) > 1 for columns in groups.values()):
+    if len(runs) < 2 or any(
+        len({label for label, _ in columns}) > 1 for columns in groups.values()
+    ):
         return []
-    return ["No evaluation in common: differences need the same protocol, data and extractor.", *groups]
+    return [
+        "No evaluation in common: differences need the same protocol, data and extractor.",
+        *groups,
+    ]
 
 
 def tested(columns: Sequence[tuple[str, Result]]) -> list[tuple[str, list[list[str]]]]:
@@ -226,7 +276,9 @@ def tested(columns: Sequence[tuple[str, Result]]) -> list[tuple[str, list[list[s
     return tables
 
 
-def _evaluations(runs: Mapping[str, Run]) -> list[tuple[str, list[str], list[list[str]], list[Any], list[Any]]]:
+def _evaluations(
+    runs: Mapping[str, Run],
+) -> list[tuple[str, list[str], list[list[str]], list[Any], list[Any]]]:
     tables = []
     for title, columns in grouped(runs).items():
         results = [result for _, result in columns]
@@ -246,8 +298,12 @@ def _charts(runs: Mapping[str, Run]) -> dict[str, list[Markup]]:
     groups: dict[str, list[Markup]] = {}
     for heading, titles in charted({name for run in runs.values() for name in run.curves}).items():
         groups[heading] = []
-        for name in (f"{family}/{rest}" for rest, families in titles.items() for family in families):
-            lines: dict[str, Curve] = {label: run.curves.get(name, {}) for label, run in runs.items()}
+        for name in (
+            f"{family}/{rest}" for rest, families in titles.items() for family in families
+        ):
+            lines: dict[str, Curve] = {
+                label: run.curves.get(name, {}) for label, run in runs.items()
+            }
             if len({value for line in lines.values() for value in line.values()}) > 1:
                 bands = {label: run.curves.get(f"{name}/ci", {}) for label, run in runs.items()}
                 groups[heading].append(chart(name, lines, bands))

@@ -16,10 +16,13 @@ if TYPE_CHECKING:
 WIDE, HIGH = 460, 230
 LEFT, RIGHT, TOP, BOTTOM = 58, 10, 8, 24
 ROW = 16  # height of a line of text
-MOST = 300  # maximum number of segments per curve; the lowest and the highest point of each are drawn
+MOST = (
+    300  # maximum number of segments per curve; the lowest and the highest point of each are drawn
+)
 LOG_RANGE = 15  # positive values that span more than this factor get a logarithmic axis
 COLORS = 8
-SMALLEST = 1e-300  # numbers closer to 0 are treated as 0 on axes, since steps between ticks would underflow
+# Numbers closer to 0 are treated as 0 on axes, since steps between ticks would underflow
+SMALLEST = 1e-300
 
 Curve = Mapping[int, float]  # values by step
 
@@ -61,12 +64,19 @@ def svg(title: str, panels: Sequence[Panel]) -> Markup | None:
     if not any(drawn):
         return None
     high = max(panel["high"] for panel in drawn if panel)
-    return render("plot.svg", title=title, panels=drawn, width=WIDE, high=high, left=LEFT, right=WIDE - RIGHT)
+    return render(
+        "plot.svg", title=title, panels=drawn, width=WIDE, high=high, left=LEFT, right=WIDE - RIGHT
+    )
 
 
-def chart(title: str, curves: Mapping[str, Curve], bands: Mapping[str, Curve] | None = None) -> Markup:
+def chart(
+    title: str, curves: Mapping[str, Curve], bands: Mapping[str, Curve] | None = None
+) -> Markup:
     """Draws curves over training steps, and lists their last finite values; `bands` are half widths of intervals."""
-    spread = {name: {x: abs(width) for x, width in _finite(curve)} for name, curve in (bands or {}).items()}
+    spread = {
+        name: {x: abs(width) for x, width in _finite(curve)}
+        for name, curve in (bands or {}).items()
+    }
     series = [Series(name, _finite(curve), spread.get(name, {})) for name, curve in curves.items()]
     key = [(s.name, number(s.points[-1][1]) if s.points else "–") for s in series]
     plot = svg(title, [Panel(series, from_zero=True, legend=False)])
@@ -99,11 +109,18 @@ def _drawn(panel: Panel) -> dict[str, Any] | None:
     low, high = min(ys), max(ys)
     logarithmic = panel.from_zero and low > 0 and high > LOG_RANGE * low
     if not logarithmic:
-        reach = [y + sign * s.spread.get(x, 0) for s in series for x, y in points[s.name] for sign in (-1, 1)]
+        reach = [
+            y + sign * s.spread.get(x, 0)
+            for s in series
+            for x, y in points[s.name]
+            for sign in (-1, 1)
+        ]
         low, high = min([low, *reach, *panel.levels]), max([high, *reach, *panel.levels])
     y_axis = _log_axis(low, high) if logarithmic else _linear_axis(low, high, to_ticks=True)
     first = 0 if panel.from_zero else min(xs)
-    x_axis = _log_axis(min(xs), max(xs)) if panel.log_x else _linear_axis(first, max(xs), to_ticks=False)
+    x_axis = (
+        _log_axis(min(xs), max(xs)) if panel.log_x else _linear_axis(first, max(xs), to_ticks=False)
+    )
 
     def at(x: float, y: float) -> tuple[str, str]:
         across, down = WIDE - LEFT - RIGHT, HIGH - TOP - BOTTOM
@@ -116,7 +133,9 @@ def _drawn(panel: Panel) -> dict[str, Any] | None:
     for k, s in enumerate(series):
         curve = points[s.name]
         wide = [(x, y) for x, y in curve if x in s.spread]
-        rim = [(x, y + s.spread[x]) for x, y in wide] + [(x, y - s.spread[x]) for x, y in reversed(wide)]
+        rim = [(x, y + s.spread[x]) for x, y in wide] + [
+            (x, y - s.spread[x]) for x, y in reversed(wide)
+        ]
         errors = [(*at(x, y - s.spread[x]), at(x, y + s.spread[x])[1]) for x, y in wide]
         shown = _thinned(curve)
         dots = [at(x, y) for x, y in shown] if len(curve) <= 40 or s.kind == "dots" else []
@@ -141,12 +160,15 @@ def _bars(histogram: Histogram, at: Any) -> list[tuple[int, str, str, str, str, 
     for begin, count in zip(itertools.count(0, histogram.step), histogram.counts, strict=False):
         (left, top), (right, bottom) = at(begin, count), at(begin + histogram.step, 0)
         size = (f"{float(right) - float(left) - 1:.1f}", f"{float(bottom) - float(top):.1f}")
-        bars.append((0, left, top, *size, f"{begin} to {begin + histogram.step} frames: {count} motions"))
+        bars.append(
+            (0, left, top, *size, f"{begin} to {begin + histogram.step} frames: {count} motions")
+        )
     return bars
 
 
 def _finite(curve: Curve) -> list[tuple[float, float]]:
-    return [(x, y) for x, y in sorted(curve.items()) if abs(y) < 1e300]  # drops NaN and values that would overflow
+    # Drops NaN and values that would overflow
+    return [(x, y) for x, y in sorted(curve.items()) if abs(y) < 1e300]
 
 
 def _thinned(points: Sequence[tuple[float, float]]) -> Sequence[tuple[float, float]]:
@@ -154,7 +176,11 @@ def _thinned(points: Sequence[tuple[float, float]]) -> Sequence[tuple[float, flo
         return points
     size = -(-len(points) // MOST)
     parts = [points[begin : begin + size] for begin in range(0, len(points), size)]
-    return [p for part in parts for p in sorted({min(part, key=lambda q: q[1]), max(part, key=lambda q: q[1])})]
+    return [
+        p
+        for part in parts
+        for p in sorted({min(part, key=lambda q: q[1]), max(part, key=lambda q: q[1])})
+    ]
 
 
 def _linear_axis(low: float, high: float, to_ticks: bool) -> _Axis:
@@ -169,7 +195,11 @@ def _linear_axis(low: float, high: float, to_ticks: bool) -> _Axis:
         begin, end = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
         low, high = begin * step, end * step
     else:
-        begin, end = math.ceil(low / step - 0.02), math.floor(high / step + 0.02)  # 2999 has a tick at 3k
+        # 2999 has a tick at 3k
+        begin, end = (
+            math.ceil(low / step - 0.02),
+            math.floor(high / step + 0.02),
+        )
     return _Axis(low, high, [k * step for k in range(begin, end + 1)])
 
 
@@ -186,4 +216,6 @@ def _log_axis(low: float, high: float) -> _Axis:
 def _tick(value: float) -> str:
     if abs(value) < 1e-12:
         return "0"
-    return f"{value:.0e}".replace("e-0", "e-") if abs(value) < 1e-3 else short(float(f"{value:.6g}"))
+    return (
+        f"{value:.0e}".replace("e-0", "e-") if abs(value) < 1e-3 else short(float(f"{value:.6g}"))
+    )

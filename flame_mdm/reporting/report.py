@@ -30,7 +30,11 @@ def write_report(folder: Path, mesh: Mesh | None = None) -> Path:
     fault: Fault | None = None
     if (folder / FAULT).exists():
         fault = read_json(folder / FAULT, Fault, "delete it to write the page without it")
-    faulty = [[f"process {b.rank}, batch {b.batch}", b.loss, ", ".join(b.ids)] for b in fault.batches] if fault else []
+    faulty = (
+        [[f"process {b.rank}, batch {b.batch}", b.loss, ", ".join(b.ids)] for b in fault.batches]
+        if fault
+        else []
+    )
     groups = {
         heading: [_chart(run, name, families) for name, families in titles.items()]
         for heading, titles in charted(run.curves).items()
@@ -84,16 +88,27 @@ def _chart(run: Run, name: str, families: list[str]) -> Markup:
     for family in families:
         if real := run.curves.get(f"{family}/{name}/real"):
             lines["real motions"] = real
-    return chart(name, lines, {family: run.curves.get(f"{family}/{name}/ci", {}) for family in families})
+    return chart(
+        name, lines, {family: run.curves.get(f"{family}/{name}/ci", {}) for family in families}
+    )
 
 
 def charted(curves: Collection[str]) -> dict[str, dict[str, list[str]]]:
     """Groups curves into charts: heading -> rest of the name (`loss`) -> families that share it (`train`, `val`)."""
     samples = "Samples for the fixed prompts"
-    groups: dict[str, dict[str, list[str]]] = {"Losses": {}, "Validation": {}, samples: {}, "Training curves": {}}
+    groups: dict[str, dict[str, list[str]]] = {
+        "Losses": {},
+        "Validation": {},
+        samples: {},
+        "Training curves": {},
+    }
     for name in curves:
         family, _, rest = name.partition("/")
-        if rest.endswith(("/ci", "/real")) or rest in ("", "epochs"):  # "": a name without a family; runs write none
+        # "": a name without a family; runs write none
+        if rest.endswith(("/ci", "/real")) or rest in (
+            "",
+            "epochs",
+        ):
             continue
         heading = {"samples": samples, "val": "Validation"}.get(family, "Training curves")
         if f"train/{rest}" in curves and rest not in COST:
@@ -105,14 +120,24 @@ def charted(curves: Collection[str]) -> dict[str, dict[str, list[str]]]:
 def _evaluation(result: Result) -> tuple[object, ...]:
     values, real = result.values or {}, result.ground_truth or {}
     rows = [
-        [labeled(name, values.get(name) or real.get(name)), printed(real.get(name)), printed(values.get(name))]
+        [
+            labeled(name, values.get(name) or real.get(name)),
+            printed(real.get(name)),
+            printed(values.get(name)),
+        ]
         for name in sorted(values | real)
     ]
     audit = "evaluator not audited"
     if result.audit:
         audit = f"audit of the evaluator: {result.audit}"
         audit += f", of {result.audit_motions} motions" if result.audit_motions else ""
-    return evaluation_title(result), f"{sampling(result)}; {audit}", marks(result), result.not_computed, rows
+    return (
+        evaluation_title(result),
+        f"{sampling(result)}; {audit}",
+        marks(result),
+        result.not_computed,
+        rows,
+    )
 
 
 def evaluation_title(result: Result) -> str:
@@ -150,7 +175,9 @@ def marks(result: Result) -> list[str]:
     reasons = ["Quick run — not for publication"] if result.quick else []
     reasons += [f"not valid: {reason}" for reason in result.invalid_because]
     changed = ", ".join(f"{name} {value}" for name, value in result.changed.items())
-    return reasons + ([f"differs from the protocol: {changed}"] if changed and not result.quick else [])
+    return reasons + (
+        [f"differs from the protocol: {changed}"] if changed and not result.quick else []
+    )
 
 
 def printed(value: Value | None) -> str:
@@ -162,7 +189,14 @@ def _provenance(facts: Provenance) -> list[list[str]]:
     return [
         ["command", " ".join(facts.command)],
         ["commit", (facts.commit or "not from a clone") + changed],
-        ["data", ", ".join(f"{k} {v}" for k, v in facts.data.model_dump(exclude_unset=True).items() if k != "actions")],
+        [
+            "data",
+            ", ".join(
+                f"{k} {v}"
+                for k, v in facts.data.model_dump(exclude_unset=True).items()
+                if k != "actions"
+            ),
+        ],
         ["device", facts.device],
         ["machine", f"{facts.machine}, Python {facts.python}"],
         ["packages", ", ".join(f"{name} {version}" for name, version in facts.packages.items())],

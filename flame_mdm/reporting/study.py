@@ -126,9 +126,20 @@ def _pairs(
         left, right = motions_a[prompt], motions_b[prompt]
         if on_left == "b":
             left, right = right, left
-        scene = [replace(left, id="the left one", text=""), replace(right, id="the right one", text="")]
+        scene = [
+            replace(left, id="the left one", text=""),
+            replace(right, id="the right one", text=""),
+        ]
         player = player_page(scene, "", columns=2, body=body)
-        items.append({"prompt": prompt[0], "a": run_a.label, "b": run_b.label, "left": on_left, "player": player})
+        items.append(
+            {
+                "prompt": prompt[0],
+                "a": run_a.label,
+                "b": run_b.label,
+                "left": on_left,
+                "player": player,
+            }
+        )
     return items
 
 
@@ -148,15 +159,21 @@ def tally(files: Sequence[Path]) -> list[Pair]:
         study, rater = answers.study, answers.rater
         if (study, rater) in answered:
             earlier = answered[study, rater]
-            raise UserError(f"{path}: {rater} also answered this page in {earlier}. Give only one of them")
+            raise UserError(
+                f"{path}: {rater} also answered this page in {earlier}. Give only one of them"
+            )
         answered[study, rater] = path
 
         for number, rating in enumerate(answers.ratings, 1):
             if rating.a == rating.b:
-                raise UserError(f"{path}: rating {number} compares {rating.a} with itself; a and b must differ")
+                raise UserError(
+                    f"{path}: rating {number} compares {rating.a} with itself; a and b must differ"
+                )
             preferred = rating.a if rating.choice == "a" else rating.b
             names = (rating.b, rating.a) if (rating.b, rating.a) in pairs else (rating.a, rating.b)
-            pair = pairs.setdefault(names, Pair(a=names[0], b=names[1], wins_a=0, wins_b=0, raters=0))
+            pair = pairs.setdefault(
+                names, Pair(a=names[0], b=names[1], wins_a=0, wins_b=0, raters=0)
+            )
             pair.wins_a += preferred == pair.a
             pair.wins_b += preferred == pair.b
             raters.setdefault(names, set()).add(rater)

@@ -19,7 +19,8 @@ Features = TypeVar("Features", np.ndarray, Tensor)
 class Frames:
     """The frames (N, D) of a data set, read in parts, as often as needed."""
 
-    arrays: Callable[[], Iterable[np.ndarray]]  # returns arrays (F, D) of any length, each time in the same order
+    # Returns arrays (F, D) of any length, each time in the same order
+    arrays: Callable[[], Iterable[np.ndarray]]
     count: int
 
     def __len__(self) -> int:
@@ -43,15 +44,19 @@ class Representation(nn.Module, ABC):
 
     mean: Tensor
     std: Tensor
-    part_of: str = ""  # name of a representation whose first features these are, so that its features can be cut
-    relative: bool = True  # whether the root moves by steps between frames, so that any window of frames is a motion
+    # Name of a representation whose first features these are, so that its features can be cut
+    part_of: str = ""
+    # Whether the root moves by steps between frames, so that any window of frames is a motion
+    relative: bool = True
     slices: Mapping[str, slice] = {}  # columns of the features by name
 
     def __init__(self, name: str, features: int, fps: float, skeleton: Skeleton):
         """`name` is saved in stores and checkpoints; features with different names are never mixed."""
         super().__init__()
         if not isinstance(fps, int | float) or not 1 <= fps <= 1000:
-            raise UserError(f"representation.fps={fps}: frames per second must be a number from 1 to 1000")
+            raise UserError(
+                f"representation.fps={fps}: frames per second must be a number from 1 to 1000"
+            )
         self.name, self.features, self.fps, self.skeleton = name, features, fps, skeleton
         self.register_buffer("mean", torch.zeros(features))
         self.register_buffer("std", torch.ones(features))
@@ -116,7 +121,9 @@ def check_finite(motion: Tensor, name: str = "motion") -> None:
         raise UserError(f"{name}: numbers in frame {frame} are not finite; leave the motion out")
 
 
-SMALLEST_STD = 1e-4  # of a group of features that is not constant; positions in KIT's units round to 3e-5
+SMALLEST_STD = (
+    1e-4  # of a group of features that is not constant; positions in KIT's units round to 3e-5
+)
 
 
 def grouped_statistics(features: Tensor | Frames, groups: Iterable[slice]) -> tuple[Tensor, Tensor]:
@@ -136,4 +143,6 @@ def moments(features: Tensor | Frames) -> tuple[Tensor, Tensor]:
     """Returns the mean (D,) of frames (N, D) and the sum (D,) of squared deviations from it, float64."""
     size, zero = 1 << 16, torch.zeros(())  # the frames of a data set would not fit in memory
     mean = sum((chunk.double().sum(0) for chunk in features.split(size)), zero) / len(features)
-    return mean, sum((chunk.double().sub_(mean).square_().sum(0) for chunk in features.split(size)), zero)
+    return mean, sum(
+        (chunk.double().sub_(mean).square_().sum(0) for chunk in features.split(size)), zero
+    )

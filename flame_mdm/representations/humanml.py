@@ -72,7 +72,9 @@ class HumanML(Representation):
             raise UserError(f"skeleton: {skeleton!r} is unknown; use one of {', '.join(SKELETONS)}")
         joints = len(SKELETONS[skeleton])
         if bone_lengths is not None and len(bone_lengths) != joints:
-            raise UserError(f"bone_lengths: {len(bone_lengths)} numbers for the {joints} joints of {skeleton}")
+            raise UserError(
+                f"bone_lengths: {len(bone_lengths)} numbers for the {joints} joints of {skeleton}"
+            )
         widths = {"turn": 1, "root_velocity": 2, "root_height": 1, "positions": 3 * (joints - 1)}
         name = f"humanml-{variant}-{skeleton}"
         if self.essential:
@@ -81,7 +83,9 @@ class HumanML(Representation):
             widths |= {"rotations": 6 * (joints - 1), "velocities": 3 * joints, "contacts": 4}
         super().__init__(name, sum(widths.values()), fps, SKELETONS[skeleton])
         ends = np.cumsum(list(widths.values())).tolist()
-        self.slices = {name: slice(end - widths[name], end) for name, end in zip(widths, ends, strict=True)}
+        self.slices = {
+            name: slice(end - widths[name], end) for name, end in zip(widths, ends, strict=True)
+        }
         self.legacy, self.bone_lengths = variant == "legacy", bone_lengths
         self.units_per_metre, self.contact_threshold = units_per_metre, contact_threshold
 
@@ -99,7 +103,9 @@ class HumanML(Representation):
         joints, heading, next_heading = joints[now], heading[now], heading[now + 1]
 
         turn = next_heading - heading
-        root_velocity = rotation.rotate_y(way[:, 0], -(next_heading if self.legacy else heading))[:, ::2]
+        root_velocity = rotation.rotate_y(way[:, 0], -(next_heading if self.legacy else heading))[
+            :, ::2
+        ]
         if self.legacy:
             turn = torch.arcsin(torch.sin(-turn / 2))
         local = joints.clone()
@@ -119,23 +125,32 @@ class HumanML(Representation):
         local = features[..., self.slices["positions"]].unflatten(-1, (-1, 3))
         turned = rotation.rotate_y(local, heading[..., None])
         ground = root * root.new_tensor([1.0, 0.0, 1.0])
-        return torch.cat([root[..., None, :], turned + ground[..., None, :]], -2) / self.units_per_metre
+        return (
+            torch.cat([root[..., None, :], turned + ground[..., None, :]], -2)
+            / self.units_per_metre
+        )
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
         """Equals MDM's `HML_LOWER_BODY_MASK` for the lower body, including the root."""
         part = self.joint_mask(joints)
         feet = part[list(self.skeleton.feet)]
         others = [part[1:].repeat_interleave(size) for size in (3, 6)]
-        return torch.cat([part[:1].expand(4), *others, part.repeat_interleave(3), feet])[: self.features]
+        return torch.cat([part[:1].expand(4), *others, part.repeat_interleave(3), feet])[
+            : self.features
+        ]
 
     def _canonical(self, motions: Sequence[Tensor]) -> tuple[Tensor, list[int]]:
         """Returns all frames (N, J, 3) of the canonical motions, float64 in the features' unit, and their lengths."""
         for number, motion in enumerate(motions):
             name = f"motion {number}" if len(motions) > 1 else "motion"
             if motion.ndim != 3 or motion.shape[1:] != (joints := len(self.skeleton), 3):
-                raise UserError(f"{name}: shape {tuple(motion.shape)}, but {self.name} takes (frames, {joints}, 3)")
+                raise UserError(
+                    f"{name}: shape {tuple(motion.shape)}, but {self.name} takes (frames, {joints}, 3)"
+                )
             if len(motion) < 3:
-                raise UserError(f"{name}: {len(motion)} frames, but encoding needs at least 3; leave the motion out")
+                raise UserError(
+                    f"{name}: {len(motion)} frames, but encoding needs at least 3; leave the motion out"
+                )
             check_finite(motion, name)
         lengths = [len(motion) for motion in motions]
         clip = torch.arange(len(motions)).repeat_interleave(torch.tensor(lengths))
@@ -147,7 +162,9 @@ class HumanML(Representation):
         floor = torch.stack([part[..., 1].min() for part in joints.split(lengths)])
         shift = torch.stack([start[:, 0, 0], floor, start[:, 0, 2]], -1)
         facing = self._facing(start)
-        return rotation.rotate_y(joints - shift[clip, None], -torch.atan2(*facing.unbind(-1))[clip, None]), lengths
+        return rotation.rotate_y(
+            joints - shift[clip, None], -torch.atan2(*facing.unbind(-1))[clip, None]
+        ), lengths
 
     def _retarget(self, joints: Tensor, first: Tensor, clip: Tensor) -> Tensor:
         """Sets the bone lengths and scales the root trajectory by the ratio of leg lengths in the first frame."""
@@ -155,15 +172,21 @@ class HumanML(Representation):
         bones = self.skeleton.bones(joints)
         leg = list(self.skeleton.leg)
         scale = target[leg].sum() / bones[first][:, leg].norm(dim=-1).sum(-1)
-        return self.skeleton.assemble(F.normalize(bones, dim=-1) * target[:, None], joints[:, 0] * scale[clip, None])
+        return self.skeleton.assemble(
+            F.normalize(bones, dim=-1) * target[:, None], joints[:, 0] * scale[clip, None]
+        )
 
     def _facing(self, joints: Tensor, hips: float = 1.0) -> Tensor:
         """Returns x and z (N, 2) of the direction hips and shoulders face; shorter if the body lies on its side.
 
         It is the cross product of the vertical and the direction to the right; `hips` is the weight of the hips.
         """
-        right_hip, left_hip, right_shoulder, left_shoulder = joints[:, list(self.skeleton.facing)].unbind(1)
-        right = F.normalize(hips * (right_hip - left_hip) + (right_shoulder - left_shoulder), dim=-1)
+        right_hip, left_hip, right_shoulder, left_shoulder = joints[
+            :, list(self.skeleton.facing)
+        ].unbind(1)
+        right = F.normalize(
+            hips * (right_hip - left_hip) + (right_shoulder - left_shoulder), dim=-1
+        )
         return torch.stack([right[:, 2], -right[:, 0]], -1)
 
     def _heading(self, joints: Tensor) -> Tensor:

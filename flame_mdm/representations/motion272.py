@@ -39,7 +39,10 @@ class Motion272(Representation):
         translation, rotations = read_pose(motion)
         if len(motion) < 2:
             raise UserError("motion: 1 frame, but encoding needs at least 2; leave the motion out")
-        axes = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dtype=torch.float64)  # z up -> y up
+        # Z up -> y up
+        axes = torch.tensor(
+            [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dtype=torch.float64
+        )
         rotations = torch.cat([(axes @ rotations[:, :1]), rotations[:, 1:22]], 1)
         translation, rotations = face_forward(translation @ axes.T, rotations)
         offsets = torch.tensor(self.offsets, dtype=torch.float64)[:22]
@@ -48,7 +51,9 @@ class Motion272(Representation):
 
     def features_of(self, joints: Tensor, rotations: Tensor) -> Tensor:
         """Returns features (F, 272) float32 of joints (F, 22, 3) and rotations (F, 22, 3, 3), y up, facing +z."""
-        joints = joints.double() - torch.stack([joints[0, 0, 0], joints[..., 1].min(), joints[0, 0, 2]])
+        joints = joints.double() - torch.stack(
+            [joints[0, 0, 0], joints[..., 1].min(), joints[0, 0, 2]]
+        )
         inverse = _to_body(rotations)
         velocity = torch.zeros(len(joints), 3, dtype=torch.float64)
         velocity[1:] = (inverse[:-1] @ joints[:, 0].diff(dim=0)[..., None])[..., 0]
@@ -59,7 +64,12 @@ class Motion272(Representation):
         moved = torch.zeros_like(local)
         moved[1:] = local.diff(dim=0)
         turned = torch.cat([(inverse @ rotations[:, 0])[:, None], rotations[:, 1:]], 1)
-        rows = [velocity[:, [0, 2]], rotation.matrix_to_rot6d(turn, "rows"), local.flatten(1), moved.flatten(1)]
+        rows = [
+            velocity[:, [0, 2]],
+            rotation.matrix_to_rot6d(turn, "rows"),
+            local.flatten(1),
+            moved.flatten(1),
+        ]
         return torch.cat([*rows, rotation.matrix_to_rot6d(turned, "rows").flatten(1)], 1).float()
 
     def rotations6d(self, features: Tensor) -> Tensor:
@@ -77,7 +87,9 @@ class Motion272(Representation):
         """Decodes features (..., F, 272) to the pelvis (..., F, 3) and SMPL's rotations (..., F, 22, 3, 3), y up."""
         inverse, ground = self._root(features)
         turned = rotation.rot6d_to_matrix(self.rotations6d(features)[..., 1:, :], "rows")
-        height = features[..., self.slices["positions"]][..., 1:2] * features.new_tensor([0.0, 1.0, 0.0])
+        height = features[..., self.slices["positions"]][..., 1:2] * features.new_tensor(
+            [0.0, 1.0, 0.0]
+        )
         root = inverse.mT[..., None, :, :] @ turned[..., :1, :, :]
         return ground + height, torch.cat([root, turned[..., 1:, :, :]], -3)
 
@@ -86,7 +98,10 @@ class Motion272(Representation):
         inverse = rotation.rot6d_to_matrix(self.rotations6d(features)[..., 0, :], "rows")
         step = 1
         while step < features.shape[-2]:  # products of all turns so far, in log2(F) steps
-            inverse = torch.cat([inverse[..., :step, :, :], inverse[..., step:, :, :] @ inverse[..., :-step, :, :]], -3)
+            inverse = torch.cat(
+                [inverse[..., :step, :, :], inverse[..., step:, :, :] @ inverse[..., :-step, :, :]],
+                -3,
+            )
             step *= 2
         x, z = features[..., self.slices["root_velocity"]].unbind(-1)
         velocity = torch.stack([x, torch.zeros_like(x), z], -1)
@@ -110,7 +125,9 @@ class Motion272(Representation):
 def face_forward(translation: Tensor, rotations: Tensor) -> tuple[Tensor, Tensor]:
     """Turns translation (F, 3) and rotations (F, J, 3, 3) about y, so that the root faces +z in the first frame."""
     turn = _to_body(rotations[:1])
-    return translation @ turn[0].T, torch.cat([(turn @ rotations[:, 0])[:, None], rotations[:, 1:]], 1)
+    return translation @ turn[0].T, torch.cat(
+        [(turn @ rotations[:, 0])[:, None], rotations[:, 1:]], 1
+    )
 
 
 def _to_body(rotations: Tensor) -> Tensor:

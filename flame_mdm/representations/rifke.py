@@ -10,7 +10,9 @@ from flame_mdm.errors import UserError
 from flame_mdm.representations import Frames, Representation, check_finite, moments, rotation
 from flame_mdm.representations.skeleton import KIT21
 
-KNEES_AND_ELBOWS = [KIT21.joints.index(f"{side}_{part}") for part in ("knee", "elbow") for side in ("left", "right")]
+KNEES_AND_ELBOWS = [
+    KIT21.joints.index(f"{side}_{part}") for part in ("knee", "elbow") for side in ("left", "right")
+]
 """Used as hips and shoulders by the published code, which applies their indices after removing the root."""
 
 
@@ -36,7 +38,9 @@ class Rifke(Representation):
     def encode(self, motion: Tensor) -> Tensor:
         """Encodes finite joints (T, 21, 3) in meters, y up, as features (T, 64) float32."""
         if motion.ndim != 3 or motion.shape[1:] != (21, 3) or not len(motion):
-            raise UserError(f"motion: shape {tuple(motion.shape)}, but {self.name} takes (frames, 21, 3)")
+            raise UserError(
+                f"motion: shape {tuple(motion.shape)}, but {self.name} takes (frames, 21, 3)"
+            )
         check_finite(motion)
         joints = motion.double() * self.units_per_metre
         joints[..., 1] -= self.floor(joints)
@@ -57,7 +61,9 @@ class Rifke(Representation):
         ground = moved - moved[..., :1, :]
         root = ground + F.pad(features[..., :1], (1, 1))
         local = rotation.rotate_y(features[..., 1:61].unflatten(-1, (20, 3)), heading[..., None])
-        return torch.cat([root[..., None, :], local + ground[..., None, :]], -2) / self.units_per_metre
+        return (
+            torch.cat([root[..., None, :], local + ground[..., None, :]], -2) / self.units_per_metre
+        )
 
     def floor(self, joints: Tensor) -> Tensor:
         """Returns the floor height of joints (T, 21, 3) in KIT's unit: a soft minimum over time of the lowest foot."""

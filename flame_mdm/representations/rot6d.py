@@ -45,7 +45,9 @@ class Rot6D(Representation):
         """Decodes features (..., F, 150) to joints (..., F, 24, 3), meters, y up (rotated 180 degrees about x)."""
         rotations = rotation.rot6d_to_matrix(self.rotations6d(features), "rows")
         translation = features[..., 144:147]
-        joints = forward_kinematics(self.skeleton, rotations, features.new_tensor(self.offsets), translation)
+        joints = forward_kinematics(
+            self.skeleton, rotations, features.new_tensor(self.offsets), translation
+        )
         return joints * joints.new_tensor([1.0, -1.0, -1.0])
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:

@@ -21,7 +21,9 @@ def axis_angle_to_quaternion(axis_angle: Tensor) -> Tensor:
     """(..., 3) axis times angle, of any length -> (..., 4)."""
     angle = torch.linalg.vector_norm(axis_angle, dim=-1, keepdim=True)
     # sinc keeps the value and the gradient exact at angle 0
-    return torch.cat([torch.cos(angle / 2), torch.sinc(angle / (2 * torch.pi)) / 2 * axis_angle], -1)
+    return torch.cat(
+        [torch.cos(angle / 2), torch.sinc(angle / (2 * torch.pi)) / 2 * axis_angle], -1
+    )
 
 
 def quaternion_to_axis_angle(quaternion: Tensor) -> Tensor:
@@ -112,13 +114,19 @@ def _degenerate(rot6d: Tensor, first: Tensor, across: Tensor) -> Tensor:
     Of parallel vectors, rounding alone determines `across`. NaN is not degenerate, so it stays NaN.
     """
     length = torch.linalg.vector_norm(rot6d[..., 3:], dim=-1, keepdim=True)
-    parallel = torch.linalg.vector_norm(across, dim=-1, keepdim=True) <= torch.finfo(rot6d.dtype).eps ** 0.5 * length
+    parallel = (
+        torch.linalg.vector_norm(across, dim=-1, keepdim=True)
+        <= torch.finfo(rot6d.dtype).eps ** 0.5 * length
+    )
     return parallel | _shorter(first) | _shorter(F.normalize(across, dim=-1))
 
 
 def _shorter(normalized: Tensor) -> Tensor:
     """Returns (..., 1) bool: whether normalized vectors (..., 3) are shorter than 1, as those of 0 are."""
-    return torch.linalg.vector_norm(normalized, dim=-1, keepdim=True) < 1 - torch.finfo(normalized.dtype).eps ** 0.5
+    return (
+        torch.linalg.vector_norm(normalized, dim=-1, keepdim=True)
+        < 1 - torch.finfo(normalized.dtype).eps ** 0.5
+    )
 
 
 def _completed(rot6d: Tensor) -> Tensor:
@@ -135,7 +143,9 @@ def _completed(rot6d: Tensor) -> Tensor:
 def matrix_to_euler(matrix: Tensor, order: str) -> Tensor:
     """(..., 3, 3) -> (..., 3), the middle angle in [-pi/2, pi/2]; in gimbal lock the third angle is 0."""
     if sorted(order) != ["X", "Y", "Z"]:
-        raise UserError(f"Euler order {order!r} is not supported; use the letters X, Y and Z once each, as in 'ZXY'")
+        raise UserError(
+            f"Euler order {order!r} is not supported; use the letters X, Y and Z once each, as in 'ZXY'"
+        )
     i, j, k = ("XYZ".index(axis) for axis in order)
     sign = 1.0 if (j - i) % 3 == 1 else -1.0
     cosine = torch.hypot(matrix[..., i, i], matrix[..., i, j])
@@ -191,7 +201,9 @@ def between(a: Tensor, b: Tensor) -> Tensor:
     For opposite directions, it is a half turn about a perpendicular axis; if a vector is 0, the identity.
     """
     a, b = torch.broadcast_tensors(_scaled(a), _scaled(b))
-    lengths = torch.linalg.vector_norm(a, dim=-1, keepdim=True) * torch.linalg.vector_norm(b, dim=-1, keepdim=True)
+    lengths = torch.linalg.vector_norm(a, dim=-1, keepdim=True) * torch.linalg.vector_norm(
+        b, dim=-1, keepdim=True
+    )
     quaternion = torch.cat([lengths + (a * b).sum(-1, keepdim=True), torch.linalg.cross(a, b)], -1)
     size = torch.linalg.vector_norm(quaternion, dim=-1, keepdim=True)
     degenerate = size <= torch.finfo(a.dtype).eps ** 0.5 * lengths
@@ -200,7 +212,9 @@ def between(a: Tensor, b: Tensor) -> Tensor:
         axis = F.normalize(torch.linalg.cross(a, basis[a.abs().argmin(-1)]), dim=-1)
         half_turn = F.pad(axis, (1, 0))
         identity = half_turn.new_tensor([1.0, 0.0, 0.0, 0.0])
-        quaternion = torch.where(degenerate, torch.where(lengths > 0, half_turn, identity), quaternion)
+        quaternion = torch.where(
+            degenerate, torch.where(lengths > 0, half_turn, identity), quaternion
+        )
         size = torch.where(degenerate, 1.0, size)
     return quaternion / size
 

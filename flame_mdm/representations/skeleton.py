@@ -12,7 +12,10 @@ from flame_mdm.errors import UserError, did_you_mean
 if TYPE_CHECKING:  # Blender has no torch
     from torch import Tensor
 
-LEG, ARM = ("hip", "knee", "ankle", "foot", "toes"), ("collar", "shoulder", "elbow", "wrist", "hand")
+LEG, ARM = (
+    ("hip", "knee", "ankle", "foot", "toes"),
+    ("collar", "shoulder", "elbow", "wrist", "hand"),
+)
 
 
 @dataclass(frozen=True)
@@ -20,13 +23,16 @@ class Skeleton:
     """A tree of joints; parents precede their children, joint 0 is the root."""
 
     name: str  # key in `SKELETONS`
-    joints: tuple[str, ...]  # names in the order of the data; the prefixes `left_` and `right_` mark the sides
+    # Names in the order of the data; the prefixes `left_` and `right_` mark the sides
+    joints: tuple[str, ...]
     parents: tuple[int, ...]  # parent of each joint, -1 for the root
     chains: tuple[tuple[int, ...], ...]  # paths followed by HumanML3D's inverse kinematics
     # (J, 3) unit direction at rest of the bone that ends in a joint, 0 for the root; from HumanML3D's `paramUtil.py`
     raw_offsets: tuple[tuple[int, int, int], ...]
-    facing: tuple[int, int, int, int]  # right hip, left hip, right shoulder, left shoulder, which define the heading
-    feet: tuple[int, ...]  # joints that touch the ground, in the order of HumanML3D's contact features
+    # Right hip, left hip, right shoulder, left shoulder, which define the heading
+    facing: tuple[int, int, int, int]
+    # Joints that touch the ground, in the order of HumanML3D's contact features
+    feet: tuple[int, ...]
     leg: tuple[int, int]  # (knee, ankle), whose bones measure the size of a body
 
     def __len__(self) -> int:
@@ -48,7 +54,9 @@ class Skeleton:
         """Index of the joint that replaces each joint in a left-right mirror image."""
         swap = {"left": "right", "right": "left"}
         sides = [name.split("_") for name in self.joints]
-        return tuple(self.joints.index("_".join([swap.get(side, side), *rest])) for side, *rest in sides)
+        return tuple(
+            self.joints.index("_".join([swap.get(side, side), *rest])) for side, *rest in sides
+        )
 
     def mirror(self, joints: Tensor) -> Tensor:
         """Returns the mirror image of joints (..., J, 3): x changes sign, left and right joints are swapped."""
@@ -66,14 +74,18 @@ class Skeleton:
         return bones.new_tensor(paths) @ bones + root[..., None, :]
 
 
-def forward_kinematics(skeleton: Skeleton, rotations: Tensor, offsets: Tensor, root: Tensor) -> Tensor:
+def forward_kinematics(
+    skeleton: Skeleton, rotations: Tensor, offsets: Tensor, root: Tensor
+) -> Tensor:
     """Computes joint positions (..., J, 3) from rotations and root (..., 3), in the unit of `offsets`. Differentiable.
 
     `rotations` (..., J, 3, 3) are relative to the parents and apply to bones that leave a joint, as in SMPL and BVH;
     `offsets` (J, 3) are positions relative to the parents in the rest pose, of which the root's is not used.
     """
     turned = global_rotations(rotations, skeleton.parents)
-    bones = (turned[..., [max(parent, 0) for parent in skeleton.parents], :, :] @ offsets[..., None])[..., 0]
+    bones = (
+        turned[..., [max(parent, 0) for parent in skeleton.parents], :, :] @ offsets[..., None]
+    )[..., 0]
     return skeleton.assemble(bones, root)
 
 
@@ -96,14 +108,62 @@ _RIGHT, _DOWN = (-1, 0, 0), (0, -1, 0)
 SMPL22 = Skeleton(
     name="smpl22",
     joints=(
-        *("pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle"),
-        *("right_ankle", "spine3", "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head"),
-        *("left_shoulder", "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist"),
+        *(
+            "pelvis",
+            "left_hip",
+            "right_hip",
+            "spine1",
+            "left_knee",
+            "right_knee",
+            "spine2",
+            "left_ankle",
+        ),
+        *(
+            "right_ankle",
+            "spine3",
+            "left_foot",
+            "right_foot",
+            "neck",
+            "left_collar",
+            "right_collar",
+            "head",
+        ),
+        *(
+            "left_shoulder",
+            "right_shoulder",
+            "left_elbow",
+            "right_elbow",
+            "left_wrist",
+            "right_wrist",
+        ),
     ),
     parents=(-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19),
-    chains=((0, 2, 5, 8, 11), (0, 1, 4, 7, 10), (0, 3, 6, 9, 12, 15), (9, 14, 17, 19, 21), (9, 13, 16, 18, 20)),
+    chains=(
+        (0, 2, 5, 8, 11),
+        (0, 1, 4, 7, 10),
+        (0, 3, 6, 9, 12, 15),
+        (9, 14, 17, 19, 21),
+        (9, 13, 16, 18, 20),
+    ),
     raw_offsets=(
-        *((0, 0, 0), _X, _RIGHT, _Y, _DOWN, _DOWN, _Y, _DOWN, _DOWN, _Y, _Z, _Z, _Y, _X, _RIGHT, _Z),
+        *(
+            (0, 0, 0),
+            _X,
+            _RIGHT,
+            _Y,
+            _DOWN,
+            _DOWN,
+            _Y,
+            _DOWN,
+            _DOWN,
+            _Y,
+            _Z,
+            _Z,
+            _Y,
+            _X,
+            _RIGHT,
+            _Z,
+        ),
         *(_DOWN, _DOWN, _DOWN, _DOWN, _DOWN, _DOWN),
     ),
     facing=(2, 1, 17, 16),
@@ -131,12 +191,36 @@ SMPL24 = Skeleton(
 KIT21 = Skeleton(
     name="kit21",
     joints=(
-        *("root", "belly", "thorax", "neck", "head", "left_shoulder", "left_elbow", "left_wrist", "right_shoulder"),
-        *("right_elbow", "right_wrist", "left_hip", "left_knee", "left_ankle", "left_foot", "left_toes"),
+        *(
+            "root",
+            "belly",
+            "thorax",
+            "neck",
+            "head",
+            "left_shoulder",
+            "left_elbow",
+            "left_wrist",
+            "right_shoulder",
+        ),
+        *(
+            "right_elbow",
+            "right_wrist",
+            "left_hip",
+            "left_knee",
+            "left_ankle",
+            "left_foot",
+            "left_toes",
+        ),
         *("right_hip", "right_knee", "right_ankle", "right_foot", "right_toes"),
     ),
     parents=(-1, 0, 1, 2, 3, 3, 5, 6, 3, 8, 9, 0, 11, 12, 13, 14, 0, 16, 17, 18, 19),
-    chains=((0, 11, 12, 13, 14, 15), (0, 16, 17, 18, 19, 20), (0, 1, 2, 3, 4), (3, 5, 6, 7), (3, 8, 9, 10)),
+    chains=(
+        (0, 11, 12, 13, 14, 15),
+        (0, 16, 17, 18, 19, 20),
+        (0, 1, 2, 3, 4),
+        (3, 5, 6, 7),
+        (3, 8, 9, 10),
+    ),
     raw_offsets=(
         *((0, 0, 0), _Y, _Y, _Y, _Y, _X, _DOWN, _DOWN, _RIGHT, _DOWN, _DOWN),
         *(_X, _DOWN, _DOWN, _Z, _Z, _RIGHT, _DOWN, _DOWN, _Z, _Z),
@@ -155,11 +239,15 @@ def part_names(skeleton: Skeleton) -> dict[str, list[int]]:
     for side in ("left", "right"):
         for limb, words in (("arm", ARM), ("leg", LEG)):
             names = {f"{side}_{word}" for word in words}
-            parts[f"{side}_{limb}"] = [joint for joint, name in enumerate(skeleton.joints) if name in names]
+            parts[f"{side}_{limb}"] = [
+                joint for joint, name in enumerate(skeleton.joints) if name in names
+            ]
     parts["arms"] = parts["left_arm"] + parts["right_arm"]
     parts["legs"] = parts["left_leg"] + parts["right_leg"]
     parts["lower_body"] = [0, *parts["legs"]]
-    parts["upper_body"] = [joint for joint in range(len(skeleton)) if joint not in parts["lower_body"]]
+    parts["upper_body"] = [
+        joint for joint in range(len(skeleton)) if joint not in parts["lower_body"]
+    ]
     return parts
 
 
@@ -170,5 +258,7 @@ def find_joints(skeleton: Skeleton, names: str | Sequence[str]) -> list[int]:
     for name in chosen:
         if not isinstance(name, str) or name not in indices:
             near = did_you_mean(str(name), indices)
-            raise UserError(f"skeleton {skeleton.name} has no joint or part '{name}'.{near} Use {', '.join(indices)}")
+            raise UserError(
+                f"skeleton {skeleton.name} has no joint or part '{name}'.{near} Use {', '.join(indices)}"
+            )
     return sorted({index for name in chosen for index in indices[name]})

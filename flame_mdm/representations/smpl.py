@@ -35,7 +35,9 @@ def read_pose(motion: Tensor) -> tuple[Tensor, Tensor]:
     """
     widths = [3 + numbers for numbers, joints in AXIS_ANGLES.items() if joints >= 24]
     if motion.ndim != 2 or not len(motion) or motion.shape[1] not in widths:
-        raise UserError(f"motion: shape {tuple(motion.shape)}, expected (frames, 3 + 3 x joints), 24, 52 or 55 joints")
+        raise UserError(
+            f"motion: shape {tuple(motion.shape)}, expected (frames, 3 + 3 x joints), 24, 52 or 55 joints"
+        )
     check_finite(motion)
     motion = motion.double()
     return motion[:, :3], rotation.axis_angle_to_matrix(motion[:, 3:75].unflatten(1, (24, 3)))
@@ -56,7 +58,9 @@ class SMPL(Representation):
 
     def encode(self, motion: Tensor) -> Tensor:
         translation, rotations = read_pose(motion)
-        return torch.cat([translation, rotation.matrix_to_rot6d(rotations, "rows").flatten(1)], 1).float()
+        return torch.cat(
+            [translation, rotation.matrix_to_rot6d(rotations, "rows").flatten(1)], 1
+        ).float()
 
     def rotations6d(self, features: Tensor) -> Tensor:
         return features[..., 3:].unflatten(-1, (24, 6))
@@ -65,7 +69,9 @@ class SMPL(Representation):
         """Decodes features (..., F, 147) to joints (..., F, 24, 3), meters, y up as in HumanML3D: (-x, z, y)."""
         rotations = rotation.rot6d_to_matrix(self.rotations6d(features), "rows")
         offsets = features.new_tensor(self.offsets)
-        joints = forward_kinematics(self.skeleton, rotations, offsets, features[..., :3] + offsets[0])
+        joints = forward_kinematics(
+            self.skeleton, rotations, offsets, features[..., :3] + offsets[0]
+        )
         return joints[..., [0, 2, 1]] * joints.new_tensor([-1.0, 1.0, 1.0])
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:

@@ -34,20 +34,25 @@ TEXT_LIMIT = 512 * MEBIBYTE
 """Maximum size of a text or JSON file. The largest known, BABEL's annotations, has 175 MiB."""
 YAML_LIMIT = MEBIBYTE // 4
 """Maximum size of a YAML file: recipes, skeletons, protocols and table specs are far smaller, and parsing is slow."""
-YAML_NODES = 100_000  # maximum number of keys and values in a YAML file after its aliases are expanded
+YAML_NODES = (
+    100_000  # maximum number of keys and values in a YAML file after its aliases are expanded
+)
 YAML_DIGITS = 20  # maximum number of characters of an integer in a YAML file; 2^63 has 19
 ARRAYS_LIMIT = 128 * MEBIBYTE
 """Total size that the arrays of a compressed file may always have. Beyond that, they may have up to `INFLATION` times
 the size of the file; motion data compresses less than 10 times."""
 INFLATION = 20
-GIT_LFS = b"version https://git-lfs.github.com/spec/"  # beginning of the file that replaces one in Git LFS
+# Beginning of the file that replaces one in Git LFS
+GIT_LFS = b"version https://git-lfs.github.com/spec/"
 POINTER_LIMIT = 1024  # size in bytes below which such files are
 
 ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError)
 """Errors that `zipfile` raises for damaged, encrypted and unusually compressed archives."""
 DIRECTORY_LIMIT = 16 * MEBIBYTE
 """Maximum size of the directory of a zip archive in bytes. Each of its entries becomes a Python object."""
-MAX_MEMBERS = 200_000  # maximum number of members of an archive; the largest known, HumanML3D, has 90,000
+MAX_MEMBERS = (
+    200_000  # maximum number of members of an archive; the largest known, HumanML3D, has 90,000
+)
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # numbers of errors of a full disk
 
 
@@ -70,7 +75,9 @@ def atomic_write(path: str | Path, *, within: str | Path | None = None) -> Itera
         check_within(path.parent, within)
     with _temporary(path) as temporary:
         if path.exists() and not (path.is_file() or path.is_dir()):
-            raise UserError(f"{path}: a pipe, a socket or a device, not a file. Choose another name")
+            raise UserError(
+                f"{path}: a pipe, a socket or a device, not a file. Choose another name"
+            )
         yield temporary
         temporary.replace(path)
 
@@ -116,7 +123,9 @@ def _temporary(path: Path) -> Iterator[Path]:
         raise UserError(str(error).replace(str(temporary), str(path))) from error
     except OSError as error:
         name = Path(str(error.filename or temporary))
-        within = name.is_relative_to(temporary) or name.is_relative_to(path) or path.is_relative_to(name)
+        within = (
+            name.is_relative_to(temporary) or name.is_relative_to(path) or path.is_relative_to(name)
+        )
         if error.errno is None or not within:
             raise
         raise UserError(f"{path}: cannot be written: {write_failure(error, path)}") from error
@@ -150,7 +159,9 @@ def write_text(path: str | Path, text: str, *, within: str | Path | None = None)
         temporary.write_text(text, encoding="utf-8")
 
 
-def write_json(path: str | Path, content: Any, indent: int | None = 2, *, within: str | Path | None = None) -> None:
+def write_json(
+    path: str | Path, content: Any, indent: int | None = 2, *, within: str | Path | None = None
+) -> None:
     """Writes a JSON file atomically, `within` as for `atomic_write`; NaN and infinity raise `ValueError`."""
     write_text(path, json.dumps(content, indent=indent, allow_nan=False) + "\n", within=within)
 
@@ -195,7 +206,9 @@ def locked(path: Path, busy: Callable[[str], object], advice: str) -> Iterator[s
                 continue
             with suppress(OSError):  # a full disk
                 file.truncate(0)
-                os.write(file.fileno(), f"process {os.getpid()} on {socket.gethostname()}\n".encode())
+                os.write(
+                    file.fileno(), f"process {os.getpid()} on {socket.gethostname()}\n".encode()
+                )
             try:
                 yield owner
             finally:
@@ -215,15 +228,25 @@ def regular_file(path: str | Path, limit: int | None = None) -> int:
         status = Path(path).stat()
     except (FileNotFoundError, NotADirectoryError):
         raise FileNotFoundError(f"{path}: no such file") from None
-    except (OSError, ValueError) as error:  # a loop of links, or a name that is too long or contains a null character
-        raise UserError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    # A loop of links, or a name that is too long or contains a null character
+    except (
+        OSError,
+        ValueError,
+    ) as error:
+        raise UserError(
+            f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}"
+        ) from error
     if not stat.S_ISREG(status.st_mode):
         kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a pipe, a socket or a device"
         raise UserError(f"{path}: {kind}, not a file")
     if limit is not None and status.st_size > limit:
-        raise UserError(f"{path}: {_size(status.st_size)}, but such a file may have at most {_size(limit)}")
+        raise UserError(
+            f"{path}: {_size(status.st_size)}, but such a file may have at most {_size(limit)}"
+        )
     if status.st_size < POINTER_LIMIT and _begins(path, GIT_LFS):
-        raise UserError(f"{path}: a Git LFS pointer instead of the file. Run `git lfs pull` in its repository")
+        raise UserError(
+            f"{path}: a Git LFS pointer instead of the file. Run `git lfs pull` in its repository"
+        )
     return status.st_size
 
 
@@ -260,7 +283,8 @@ def parse_json(text: str | bytes) -> Any:
     try:
         content = json.loads(text, parse_constant=refuse)
         if "\\u" in (text if isinstance(text, str) else text.decode()):
-            json.dumps(content, ensure_ascii=False).encode()  # a lone surrogate cannot be written again
+            # A lone surrogate cannot be written again
+            json.dumps(content, ensure_ascii=False).encode()
     except RecursionError:
         raise ValueError("nested too deeply") from None
     return content
@@ -276,7 +300,8 @@ def read_yaml(path: str | Path) -> Any:
         nodes = _nodes(yaml.compose(text, yaml.SafeLoader), {})
         if nodes > YAML_NODES:
             raise ValueError(f"more than {YAML_NODES:,} values after its aliases are expanded")
-        content = OmegaConf.create(text) if text.strip() else None  # with OmegaConf's reading of numbers
+        # With OmegaConf's reading of numbers
+        content = OmegaConf.create(text) if text.strip() else None
         return OmegaConf.to_container(content) if content is not None else None
     except Exception as error:  # YAML and OmegaConf raise many kinds of errors for invalid files
         reason = "nested too deeply" if isinstance(error, RecursionError) else first_line(error)
@@ -290,11 +315,15 @@ def _nodes(node: Any, counted: dict[int, float]) -> float:
         content = node.value if node is not None else ""
         if getattr(node, "tag", "").endswith(":int") and len(content) > YAML_DIGITS:
             # As keys, large integers could be chosen so that all have the same hash.
-            raise ValueError(f"a whole number of more than {YAML_DIGITS} digits: {content[:YAML_DIGITS]}…")
+            raise ValueError(
+                f"a whole number of more than {YAML_DIGITS} digits: {content[:YAML_DIGITS]}…"
+            )
         if isinstance(content, str):
             content.encode()  # a lone surrogate cannot be written again
         parts = [part for pair in content for part in (pair if isinstance(pair, tuple) else [pair])]
-        counted[id(node)] = 1 + sum(_nodes(part, counted) for part in parts if hasattr(part, "value"))
+        counted[id(node)] = 1 + sum(
+            _nodes(part, counted) for part in parts if hasattr(part, "value")
+        )
     return counted[id(node)]
 
 
@@ -306,7 +335,9 @@ def read_npz(
 
     with _opened(source) as (file, size), opened_zip(file) as archive:
         members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
-        members = {n: m for n, m in members.items() if n not in skip and (only is None or n in only)}
+        members = {
+            n: m for n, m in members.items() if n not in skip and (only is None or n in only)
+        }
         check_expansion(sum(member.file_size for member in members.values()), size)
         arrays = {}
         for name, member in members.items():
@@ -323,7 +354,9 @@ def read_npy(source: Path | IO[bytes], *, mmap: bool = False) -> np.ndarray:
 
     with _opened(source) as (file, size):
         count = _check_array(file, size, "the array")
-        return np.load(source if mmap and count else file, "r" if mmap and count else None, allow_pickle=False)
+        return np.load(
+            source if mmap and count else file, "r" if mmap and count else None, allow_pickle=False
+        )
 
 
 @contextmanager
@@ -339,7 +372,9 @@ def _opened(source: Path | IO[bytes]) -> Iterator[tuple[IO[bytes], int]]:
         try:
             yield source, size
         except (*ZIP_ERRORS, OSError, ValueError) as error:
-            raise UserError(f"{name}damaged, or not a file of plain arrays: {first_line(error)}") from error
+            raise UserError(
+                f"{name}damaged, or not a file of plain arrays: {first_line(error)}"
+            ) from error
 
 
 def _check_array(file: IO[bytes], size: int, name: str) -> int:
@@ -347,15 +382,25 @@ def _check_array(file: IO[bytes], size: int, name: str) -> int:
     from numpy.lib import format as npy
 
     try:
-        read_header = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}[npy.read_magic(file)]
+        read_header = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}[
+            npy.read_magic(file)
+        ]
         shape, _, dtype = read_header(file)
     except Exception as error:  # NumPy parses the header as Python
-        raise ValueError(f"{name}: not an array of format 1.0 or 2.0: {first_line(error)}") from error
+        raise ValueError(
+            f"{name}: not an array of format 1.0 or 2.0: {first_line(error)}"
+        ) from error
     if dtype.hasobject:
         raise ValueError(f"{name}: an array of Python objects, which could run code")
     count = math.prod(shape)
-    if min(shape, default=0) < 0 or file.tell() + count * dtype.itemsize != size or (not dtype.itemsize and count > 1):
-        raise ValueError(f"{name}: its header declares {shape} of {dtype}, which does not match the content")
+    if (
+        min(shape, default=0) < 0
+        or file.tell() + count * dtype.itemsize != size
+        or (not dtype.itemsize and count > 1)
+    ):
+        raise ValueError(
+            f"{name}: its header declares {shape} of {dtype}, which does not match the content"
+        )
     file.seek(0)
     return count
 
@@ -377,7 +422,9 @@ def opened_zip(file: IO[bytes]) -> Iterator[zipfile.ZipFile]:
 def check_members(count: int) -> None:
     """Raises `UserError` if an archive has too many members."""
     if count > MAX_MEMBERS:
-        raise UserError(f"more than {MAX_MEMBERS:,} files in one archive. Unpack it, and name the folder")
+        raise UserError(
+            f"more than {MAX_MEMBERS:,} files in one archive. Unpack it, and name the folder"
+        )
 
 
 class _DirectoryReader:
@@ -397,8 +444,13 @@ class _DirectoryReader:
 
 def check_member(member: zipfile.ZipInfo) -> None:
     """Refuses members of a zip archive other than deflated ones, of which alone `zipfile` limits the unpacked bytes."""
-    if member.flag_bits & 1 or member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise UserError(f"{member.filename}: encrypted, or compressed with another method than deflate")
+    if member.flag_bits & 1 or member.compress_type not in (
+        zipfile.ZIP_STORED,
+        zipfile.ZIP_DEFLATED,
+    ):
+        raise UserError(
+            f"{member.filename}: encrypted, or compressed with another method than deflate"
+        )
 
 
 def check_expansion(expanded: int, packed: int) -> None:

@@ -34,7 +34,9 @@ def check_within(path: str | Path, root: str | Path) -> None:
     """Raises `UserError` if links on the way to a path in the folder `root` lead out of that folder."""
     target = os.path.realpath(path)
     if not Path(target).is_relative_to(os.path.realpath(root)):
-        raise UserError(f"{path}: a link leads out of {root}, to {target}. Nothing is written there: remove the link")
+        raise UserError(
+            f"{path}: a link leads out of {root}, to {target}. Nothing is written there: remove the link"
+        )
 
 
 def check_tree(folder: Path) -> None:
@@ -50,7 +52,11 @@ def check_tree(folder: Path) -> None:
             if stat.S_ISLNK(status.st_mode):
                 if not WANDB_LINKS.fullmatch(path.relative_to(folder).as_posix()):
                     check_within(path, folder)
-            elif stat.S_ISFIFO(status.st_mode) or stat.S_ISBLK(status.st_mode) or stat.S_ISCHR(status.st_mode):
+            elif (
+                stat.S_ISFIFO(status.st_mode)
+                or stat.S_ISBLK(status.st_mode)
+                or stat.S_ISCHR(status.st_mode)
+            ):
                 raise UserError(f"{path}: a pipe or a device. Remove it")
             elif stat.S_ISREG(status.st_mode) and status.st_nlink > 1:
                 raise UserError(f"{path}: {SECOND_NAME}")
@@ -67,12 +73,18 @@ def open_in_place(path: Path) -> IO[str]:
         descriptor = os.open(path, flags, 0o666)
     except OSError as error:
         if path.is_symlink():
-            raise UserError(f"{path}: a link, which is not followed for writing. Remove it") from error
+            raise UserError(
+                f"{path}: a link, which is not followed for writing. Remove it"
+            ) from error
         raise
     status = os.fstat(descriptor)
     if not stat.S_ISREG(status.st_mode) or status.st_nlink > 1:
         os.close(descriptor)
-        kind = SECOND_NAME if stat.S_ISREG(status.st_mode) else "a pipe, a socket or a device, not a file. Remove it"
+        kind = (
+            SECOND_NAME
+            if stat.S_ISREG(status.st_mode)
+            else "a pipe, a socket or a device, not a file. Remove it"
+        )
         raise UserError(f"{path}: {kind}")
     return os.fdopen(descriptor, "a+", encoding="utf-8")
 
@@ -115,7 +127,11 @@ def remove_abandoned(folder: Path, path: Path | None = None, *, is_locked: bool 
     pattern = re.compile(rf"\.{stem}\.([0-9a-f]{{8}})-(\d{{1,10}})-([0-9a-f]{{16}}){suffix}")
     for entry in folder.iterdir():
         match = pattern.fullmatch(entry.name)
-        if match and match[3] not in _tokens and (is_locked or (match[1] == _machine() and not _lives(int(match[2])))):
+        if (
+            match
+            and match[3] not in _tokens
+            and (is_locked or (match[1] == _machine() and not _lives(int(match[2]))))
+        ):
             with suppress(PermissionError):  # of another user
                 _remove(entry)
 

@@ -40,8 +40,11 @@ class Edited(Motion):
 
     original: Motion  # before editing
     keep: np.ndarray  # (F, D) bool, True if this feature of this frame was to be kept
-    feature_error: float  # maximum change of kept values in normalized features; 0 if the method is exact
-    joint_error: float  # maximum distance in meters between the world positions of a kept joint before and after
+    feature_error: (
+        float  # maximum change of kept values in normalized features; 0 if the method is exact
+    )
+    # Maximum distance in meters between the world positions of a kept joint before and after
+    joint_error: float
 
 
 @dataclass(frozen=True)
@@ -111,7 +114,9 @@ def resolve_edit(
     """Finds out which features of a motion `request.editing` keeps; see `edit` for the other arguments."""
     representation, editing = model.representation, request.editing or EditRequest()
     if model.denoiser.context_frames:
-        raise UserError("this model continues frames and cannot edit. Use generate with after=, or another model")
+        raise UserError(
+            "this model continues frames and cannot edit. Use generate with after=, or another model"
+        )
     original = _original(representation, motion, fps, cut)
     length, longest = len(original.features), model.facts["max_frames"]
     if length > longest and not request.is_sequence:
@@ -135,7 +140,9 @@ def resolve_edit(
     return ResolvedEdit(resolved, original, keep, kept_joints)
 
 
-def sample_edit(model: MotionGenerator, edit: ResolvedEdit, *, stages: list[Motion] | None = None) -> list[Edited]:
+def sample_edit(
+    model: MotionGenerator, edit: ResolvedEdit, *, stages: list[Motion] | None = None
+) -> list[Edited]:
     """Samples the motions of a resolved edit, and measures how well each kept what it was to keep."""
     representation, original, request = model.representation, edit.original, edit.resolved.request
     keep, kept_joints = edit.keep.numpy(), edit.kept_joints.numpy()
@@ -150,7 +157,9 @@ def sample_edit(model: MotionGenerator, edit: ResolvedEdit, *, stages: list[Moti
         feature_error = (np.abs(motion.features - exact) / std)[keep].max(initial=0)
         if request.cleanup:
             motion = cleaned(motion, representation.contacts(motion.features))
-        joint_error = np.linalg.norm(motion.joints - original.joints, axis=-1)[kept_joints].max(initial=0)
+        joint_error = np.linalg.norm(motion.joints - original.joints, axis=-1)[kept_joints].max(
+            initial=0
+        )
         edits.append(
             Edited(
                 **vars(motion),
@@ -193,13 +202,19 @@ def _part_length(parts: Sequence[Part], length: int, fps: float) -> int:
     return rest // max(1, others)
 
 
-def kept_parts(representation: Representation, length: int, editing: EditRequest) -> tuple[Tensor, Tensor]:
+def kept_parts(
+    representation: Representation, length: int, editing: EditRequest
+) -> tuple[Tensor, Tensor]:
     """Returns which features (F, D) and joints (F, J) of each frame an edit of a motion with `length` frames keeps."""
     new_frames = _new_frames(length, representation.fps, editing)[:, None]
     if editing.joints is None:
-        return ~new_frames.expand(-1, representation.features), ~new_frames.expand(-1, len(representation.skeleton))
+        return ~new_frames.expand(-1, representation.features), ~new_frames.expand(
+            -1, len(representation.skeleton)
+        )
     joints = find_joints(representation.skeleton, editing.joints)
-    return ~(new_frames & representation.joint_features(joints)), ~(new_frames & representation.joint_mask(joints))
+    return ~(new_frames & representation.joint_features(joints)), ~(
+        new_frames & representation.joint_mask(joints)
+    )
 
 
 def _new_frames(length: int, fps: float, editing: EditRequest) -> Tensor:
@@ -220,7 +235,9 @@ def _new_frames(length: int, fps: float, editing: EditRequest) -> Tensor:
         first, last = round(begin * scale), round(end * scale)
         if not 0 <= first < last <= length:
             frames = f"{length} frames ({length / fps:g} seconds)"
-            raise UserError(f"{name}=[{begin:g}, {end:g}] is not a range of this motion, which has {frames}")
+            raise UserError(
+                f"{name}=[{begin:g}, {end:g}] is not a range of this motion, which has {frames}"
+            )
         new[first:last] = True
     return new
 
@@ -229,8 +246,12 @@ def method_options(
     process: Process, editing: EditRequest, options: SamplerOptions
 ) -> tuple[dict[str, Any], SamplerOptions]:
     """Returns the options of `Edit` for the requested method, by default that of the process, and of the sampler."""
-    possible = [name for name, method_edit in METHODS.items() if method_edit["mode"] in process.edit_modes]
-    method = editing.method or next(name for name in possible if METHODS[name]["mode"] == process.edit_modes[0])
+    possible = [
+        name for name, method_edit in METHODS.items() if method_edit["mode"] in process.edit_modes
+    ]
+    method = editing.method or next(
+        name for name in possible if METHODS[name]["mode"] == process.edit_modes[0]
+    )
     if method not in possible:
         raise UserError(
             f"method={method} is not supported by {type(process).__name__}; this model supports: {', '.join(possible)}"

@@ -86,9 +86,13 @@ def sample(
     request = resolved.request
     if model.denoiser.context_frames and (stages is not None or resolved.edit is not None):
         keyword = "edit" if stages is None else "trajectory"
-        raise UserError(f"{keyword}: this model continues frames block by block, without {keyword}. Omit it")
+        raise UserError(
+            f"{keyword}: this model continues frames block by block, without {keyword}. Omit it"
+        )
     if stages is not None and request.candidates > 1:
-        raise UserError("trajectory shows the estimates of a single motion: omit candidates or trajectory")
+        raise UserError(
+            "trajectory shows the estimates of a single motion: omit candidates or trajectory"
+        )
     rows = _rows(resolved)
     motions: list[Motion] = []
     for begin in range(0, len(rows), BATCH):
@@ -101,7 +105,9 @@ def sample(
         groups = range(0, len(motions), request.candidates)
         motions = [best(motions[first : first + request.candidates], score) for first in groups]
     if request.cleanup:
-        motions = [cleaned(motion, model.representation.contacts(motion.features)) for motion in motions]
+        motions = [
+            cleaned(motion, model.representation.contacts(motion.features)) for motion in motions
+        ]
     return motions
 
 
@@ -145,7 +151,10 @@ def _rows(resolved: ResolvedRequest) -> list[_Row]:
 
 
 def _sample(
-    model: MotionGenerator, resolved: ResolvedRequest, rows: Sequence[_Row], trajectory: list[Tensor] | None
+    model: MotionGenerator,
+    resolved: ResolvedRequest,
+    rows: Sequence[_Row],
+    trajectory: list[Tensor] | None,
 ) -> list[Motion]:
     """Samples a batch of motions."""
     if model.denoiser.context_frames:
@@ -177,7 +186,9 @@ def _sample(
     return [_decoded(model, resolved, row, features) for row, features in zip(rows, x, strict=True)]
 
 
-def _sample_streams(model: MotionGenerator, resolved: ResolvedRequest, rows: Sequence[_Row]) -> list[Motion]:
+def _sample_streams(
+    model: MotionGenerator, resolved: ResolvedRequest, rows: Sequence[_Row]
+) -> list[Motion]:
     """Samples motions as the beginnings of streams; with targets one by one, since their guidance is of one motion."""
     if resolved.targets is not None and len(rows) > 1:
         return [motion for row in rows for motion in _sample_streams(model, resolved, [row])]
@@ -201,7 +212,9 @@ def _sample_streams(model: MotionGenerator, resolved: ResolvedRequest, rows: Seq
         kind=request.kind,
         seed=request.seed,
     )
-    streams.schedules = [Schedule.of_parts(row.prompt.conditions, row.prompt.frames) for row in rows]
+    streams.schedules = [
+        Schedule.of_parts(row.prompt.conditions, row.prompt.frames) for row in rows
+    ]
     streams.targets = resolved.targets
     motions = streams.take([sum(row.prompt.frames) for row in rows])
     return [_decoded(model, resolved, row, x) for row, x in zip(rows, motions, strict=True)]
@@ -252,5 +265,9 @@ def _stages(model: MotionGenerator, trajectory: Sequence[Tensor], result: Motion
     for call in sorted({index * count // STAGES for index in range(STAGES)}):
         x = trajectory[call][0, : len(result.features)].float()
         joints = model.representation.to_joints(x.to(model.device)).cpu().numpy()
-        stages.append(replace(result, joints=joints, text=f"estimate after {call / count:.0%} of the sampling"))
+        stages.append(
+            replace(
+                result, joints=joints, text=f"estimate after {call / count:.0%} of the sampling"
+            )
+        )
     return [*stages, replace(result, text=f"result: {result.text}")]

@@ -19,8 +19,12 @@ from flame_mdm.sampler_options import SamplerOptions
 if TYPE_CHECKING:
     from flame_mdm.formats.motion import Motion
 
-MAX_SAMPLES = 10_000  # maximum number of samples per request; they are kept in memory until all are complete
-MAX_TEXT_LENGTH = 2000  # maximum number of characters of a text; captions of the data sets are far shorter
+MAX_SAMPLES = (
+    10_000  # maximum number of samples per request; they are kept in memory until all are complete
+)
+MAX_TEXT_LENGTH = (
+    2000  # maximum number of characters of a text; captions of the data sets are far shorter
+)
 TRAINED_ON = {
     "text": ("was trained on captions", 'text="a person walks"'),
     "action": ("was trained on action labels", "action=NAME"),
@@ -33,9 +37,17 @@ METHODS: dict[str, dict[str, Any]] = {
     "mfm": {"mode": "trajectory", "until": 0.2},
 }
 """Editing methods of the papers, as options of `flame_mdm.batch.Edit`."""
-REGIONS = ("in_between", "prediction", "prefix", "suffix", "interpolate")  # tasks that name the frames to resample
+# Tasks that name the frames to resample
+REGIONS = (
+    "in_between",
+    "prediction",
+    "prefix",
+    "suffix",
+    "interpolate",
+)
 
-Part = tuple[str, float | None]  # text of a part of a sequence, and its seconds if the text gives them
+# Text of a part of a sequence, and its seconds if the text gives them
+Part = tuple[str, float | None]
 WayPoints = Sequence[tuple[float, float]]  # x and z in meters
 Ranges = Sequence[float] | Sequence[Sequence[float]]
 ARRIVAL = 0.2  # seconds before the end of a motion at which the last way point of a path is reached
@@ -50,7 +62,9 @@ class EditRequest:
         "frames to resample: in_between (keeps the first and the last quarter), prediction = prefix (keeps the first "
         "quarter), suffix (keeps the last quarter), interpolate (keeps every fifth frame), or one or more [begin, end]",
     )
-    region_seconds: Ranges | None = option(None, "one or more [begin, end] in seconds, instead of region")
+    region_seconds: Ranges | None = option(
+        None, "one or more [begin, end] in seconds, instead of region"
+    )
     joints: str | Sequence[str] | None = option(
         None,
         "joints to resample: upper_body, lower_body, arms, legs, left_arm, right_arm, left_leg, right_leg, or a list "
@@ -62,8 +76,12 @@ class EditRequest:
         "as in the paper (exact); flame_code replaces it before each call of the denoiser, as in FLAME's code; mfm "
         "overwrites the early part of the flow's path. Default: mdm for diffusion, mfm for flow matching",
     )
-    until: float | None = option(None, "for mfm: flow time up to which the path is overwritten, default 0.2")
-    resample: int = option(1, "for flame and flame_code: how many times each sampling step is taken")
+    until: float | None = option(
+        None, "for mfm: flow time up to which the path is overwritten, default 0.2"
+    )
+    resample: int = option(
+        1, "for flame and flame_code: how many times each sampling step is taken"
+    )
     strength: float | None = option(
         None,
         "starts from the motion with noise added, and takes this fraction of the sampling steps, above 0 and up to 1: "
@@ -76,10 +94,14 @@ class EditRequest:
         for name, choices in (("region", REGIONS), ("method", METHODS)):
             value = getattr(self, name)
             if isinstance(value, str) and value not in choices:
-                raise UserError(f"{name}={value} is unknown.{did_you_mean(value, choices)} Use {', '.join(choices)}")
+                raise UserError(
+                    f"{name}={value} is unknown.{did_you_mean(value, choices)} Use {', '.join(choices)}"
+                )
         _ = self.ranges  # raises if they are invalid
         if self.joints is not None and not self.joints:
-            raise UserError("joints: no joint is named. Name the joints to resample, or omit joints for all of them")
+            raise UserError(
+                "joints: no joint is named. Name the joints to resample, or omit joints for all of them"
+            )
         if type(self.resample) is not int or self.resample < 1:
             raise UserError(f"resample={self.resample}: give a whole number, 1 or more")
         if self.strength is not None and not 0 < self.strength <= 1:
@@ -96,14 +118,18 @@ class EditRequest:
             return None
         listed = [value] if is_range(value) else value
         if not isinstance(listed, list | tuple) or not listed or not all(map(is_range, listed)):
-            raise UserError(f"{name}={value}: write [begin, end], or several ranges as [[begin, end], [begin, end]]")
+            raise UserError(
+                f"{name}={value}: write [begin, end], or several ranges as [[begin, end], [begin, end]]"
+            )
         return [(begin, end) for begin, end in listed]
 
     def method_options(self, method: str) -> dict[str, Any]:
         """Returns the options of `flame_mdm.batch.Edit` for a method, which must have those of this request."""
         options = METHODS[method] | {"resample": self.resample, "strength": self.strength}
         if self.resample != 1 and options["mode"] != "x_t":
-            raise UserError(f"resample={self.resample} is an option of method=flame and flame_code, not of {method}")
+            raise UserError(
+                f"resample={self.resample} is an option of method=flame and flame_code, not of {method}"
+            )
         if self.until is None:
             return options
         if options["mode"] != "trajectory":
@@ -124,7 +150,8 @@ class SamplingRequest:
     """
 
     texts: str | Sequence[str] | None = option(
-        None, 'what the person does; several actions in a row: "walks forward @3 | turns around | bows @2" (seconds)'
+        None,
+        'what the person does; several actions in a row: "walks forward @3 | turns around | bows @2" (seconds)',
     )
     actions: str | Sequence[str] | None = option(None, "a label, for models trained on labels")
     seconds: float | Sequence[float] | None = option(
@@ -132,14 +159,21 @@ class SamplingRequest:
         "length of the motion, or a list with one length per text; in a sequence, length of each part that has no "
         "seconds of its own. Default: 3, or the longest motion in training if that is shorter",
     )
-    frames: int | Sequence[int] | None = option(None, "length in frames, or a list of lengths, instead of seconds")
+    frames: int | Sequence[int] | None = option(
+        None, "length in frames, or a list of lengths, instead of seconds"
+    )
     samples: int = option(1, "motions per text or action")
     candidates: int = option(
-        1, "motions generated for each one that is kept: the best without faults, if there is one without"
+        1,
+        "motions generated for each one that is kept: the best without faults, if there is one without",
     )
     seed: int = option(0, "seed of the noise")
-    after: str | Path | Motion | None = option(None, "FILE or dataset:id: a motion that the result continues")
-    split: bool = option(True, 'sentences with several actions, "walks, then sits", become sequences, "walks | sits"')
+    after: str | Path | Motion | None = option(
+        None, "FILE or dataset:id: a motion that the result continues"
+    )
+    split: bool = option(
+        True, 'sentences with several actions, "walks, then sits", become sequences, "walks | sits"'
+    )
     loop: bool = option(False, "the last frame leads to the first one")
     targets: str | Path | Mapping[str, Any] | None = option(
         None, "a JSON file of way points, joint positions and poses to reach: docs/targets.md"
@@ -147,13 +181,17 @@ class SamplingRequest:
     path: str | WayPoints | None = option(
         None, 'way points on the floor, x,z in meters, instead of targets: "0,1 0.5,2"'
     )
-    shared_noise: bool = option(False, "the same noise for all motions: they differ by texts and lengths alone")
+    shared_noise: bool = option(
+        False, "the same noise for all motions: they differ by texts and lengths alone"
+    )
     cleanup: bool = option(False, "smooth motions, constant bone lengths, feet that do not slide")
     options: SamplerOptions = field(default_factory=SamplerOptions)
     editing: EditRequest | None = None
 
     @classmethod
-    def of(cls, function: str, keywords: Mapping[str, Any], *, editing: bool = False) -> SamplingRequest:
+    def of(
+        cls, function: str, keywords: Mapping[str, Any], *, editing: bool = False
+    ) -> SamplingRequest:
         """Returns the request of the keywords of a function, `generate` or `edit`.
 
         Raises `UserError` if a keyword is no field of this class, of `SamplerOptions` or, with `editing`, of
@@ -165,7 +203,9 @@ class SamplingRequest:
         possible = request_names | option_names | edit_names
         for keyword in keywords:
             if keyword not in possible:
-                raise UserError(f"{function} has no option {keyword}.{did_you_mean(keyword, sorted(possible))}")
+                raise UserError(
+                    f"{function} has no option {keyword}.{did_you_mean(keyword, sorted(possible))}"
+                )
 
         return cls(
             **_selected(keywords, request_names),
@@ -176,10 +216,13 @@ class SamplingRequest:
     def __post_init__(self) -> None:
         for name in ("texts", "actions", "seconds", "frames"):
             value = getattr(self, name)
-            value = value.tolist() if hasattr(value, "tolist") else value  # an array or a number of numpy
+            # An array or a number of numpy
+            value = value.tolist() if hasattr(value, "tolist") else value
             if isinstance(value, str) and name in ("texts", "actions"):
                 value = (value,)
-            object.__setattr__(self, name, tuple(value) if isinstance(value, list | tuple) else value)
+            object.__setattr__(
+                self, name, tuple(value) if isinstance(value, list | tuple) else value
+            )
         for name in ("samples", "candidates"):
             value = getattr(self, name)
             if not isinstance(value, Integral) or not 1 <= int(value) <= MAX_SAMPLES:
@@ -190,26 +233,34 @@ class SamplingRequest:
         self._check_lengths()
         if self.path is not None:
             if self.targets is not None:
-                raise UserError(f"path={self.path}: targets cannot be given with a path. Give one of the two")
+                raise UserError(
+                    f"path={self.path}: targets cannot be given with a path. Give one of the two"
+                )
             object.__setattr__(self, "path", read_path(self.path))
 
         other = "loop" if self.loop else "targets" if self.has_targets else None
         if self.after is not None and other is not None:
             name = self.after if isinstance(self.after, str | Path) else self.after.id
-            raise UserError(f"after={name}: a motion that continues another cannot have {other}. Give one of the two")
+            raise UserError(
+                f"after={name}: a motion that continues another cannot have {other}. Give one of the two"
+            )
 
         if (edit := self.editing) is not None:
             is_whole = edit.region is edit.region_seconds is edit.joints is None
             self.check_edit(edit.strength is not None and is_whole)
             if self.seconds is not None or self.frames is not None:
-                raise UserError("an edit is as long as its motion: omit seconds and frames, or give cut=[begin, end]")
+                raise UserError(
+                    "an edit is as long as its motion: omit seconds and frames, or give cut=[begin, end]"
+                )
 
     def _check_prompts(self) -> None:
         if self.texts is not None and self.actions is not None:
             raise UserError("give texts or actions, not both")
         for prompt in self.prompts:
             if not isinstance(prompt, str):
-                raise UserError(f"{self.kind}={prompt!r} is not a string. Give a string, such as {self.kind}='walk'")
+                raise UserError(
+                    f"{self.kind}={prompt!r} is not a string. Give a string, such as {self.kind}='walk'"
+                )
             check_length(prompt)
         if self.texts is not None and not all(text.strip() for text in self.prompts):
             raise UserError("empty text. Omit the text to sample without condition")
@@ -217,7 +268,9 @@ class SamplingRequest:
         copies = self.samples * self.candidates
         if len(self.prompts) * copies > MAX_SAMPLES:
             key = "samples" if self.candidates == 1 else "samples times candidates"
-            raise UserError(f"{key}={copies} of each text: at most {MAX_SAMPLES:,} motions per request")
+            raise UserError(
+                f"{key}={copies} of each text: at most {MAX_SAMPLES:,} motions per request"
+            )
         _ = self.parts  # raises if a part is invalid
 
     def _check_lengths(self) -> None:
@@ -227,23 +280,38 @@ class SamplingRequest:
         value: Any = getattr(self, name)
         if value is None:
             return
-        shown, count = f"{name}={list(value) if isinstance(value, tuple) else value}", len(self.prompts)
+        shown, count = (
+            f"{name}={list(value) if isinstance(value, tuple) else value}",
+            len(self.prompts),
+        )
         if isinstance(value, tuple) and len(value) != count:
-            raise UserError(f"{shown}: lengths: {len(value)}, prompts: {count}. Give one length, or one per prompt")
+            raise UserError(
+                f"{shown}: lengths: {len(value)}, prompts: {count}. Give one length, or one per prompt"
+            )
         for length in value if isinstance(value, tuple) else (value,):
-            if not issubclass(type(length), Real) or not abs(length) < 1e9 or (name == "frames" and length % 1):
+            if (
+                not issubclass(type(length), Real)
+                or not abs(length) < 1e9
+                or (name == "frames" and length % 1)
+            ):
                 raise UserError(f"{shown} is not a valid length")
 
     def check_edit(self, varies: bool) -> None:
         """Raises `UserError` if a request to edit a motion, or to vary all of it, asks for more than that."""
         if self.after is not None or (not varies and (self.is_sequence or self.has_targets)):
-            advice = "Variations of an entire motion (strength=0.5) may have parts, loop and targets"
-            raise UserError(f"an edit keeps a single motion: omit parts (|), after, loop and targets. {advice}")
+            advice = (
+                "Variations of an entire motion (strength=0.5) may have parts, loop and targets"
+            )
+            raise UserError(
+                f"an edit keeps a single motion: omit parts (|), after, loop and targets. {advice}"
+            )
 
     @property
     def kind(self) -> Literal["text", "action", "none"]:
         """The condition of the motions."""
-        return "text" if self.texts is not None else "action" if self.actions is not None else "none"
+        return (
+            "text" if self.texts is not None else "action" if self.actions is not None else "none"
+        )
 
     @property
     def has_targets(self) -> bool:
@@ -258,7 +326,10 @@ class SamplingRequest:
     @cached_property
     def parts(self) -> list[list[Part]]:
         """The parts of each prompt; see `read_parts`."""
-        return [[(prompt, None)] if self.kind == "none" else read_parts(prompt) for prompt in self.prompts]
+        return [
+            [(prompt, None)] if self.kind == "none" else read_parts(prompt)
+            for prompt in self.prompts
+        ]
 
     @property
     def is_sequence(self) -> bool:
@@ -269,7 +340,10 @@ class SamplingRequest:
         """Returns the length of each prompt in frames, not rounded; None where the request gives none."""
         value: Any = self.frames if self.seconds is None else self.seconds
         lengths = value if isinstance(value, tuple) else [value] * len(self.prompts)
-        return [None if length is None else length * (1.0 if self.seconds is None else fps) for length in lengths]
+        return [
+            None if length is None else length * (1.0 if self.seconds is None else fps)
+            for length in lengths
+        ]
 
 
 def _names(kind: type[Any]) -> set[str]:
@@ -303,9 +377,13 @@ def read_parts(text: str) -> list[Part]:
         except ValueError:
             seconds = math.nan
         if seconds is not None and not 0 < seconds < math.inf:
-            raise UserError(f"'{part.strip()}': the seconds of a part are a number above 0, as in 'walks forward @3'")
+            raise UserError(
+                f"'{part.strip()}': the seconds of a part are a number above 0, as in 'walks forward @3'"
+            )
         if not words.strip():
-            raise UserError(f"'{text}': part {len(parts) + 1} is empty. Say what happens in each: 'walks | sits'")
+            raise UserError(
+                f"'{text}': part {len(parts) + 1} is empty. Say what happens in each: 'walks | sits'"
+            )
         parts.append((words.strip(), seconds))
     return parts
 
@@ -335,4 +413,8 @@ def path_targets(path: WayPoints, seconds: float) -> dict[str, Any]:
     distances = list(accumulate(math.dist(*step) for step in steps))
     total = distances[-1] or 1.0
     times = [round((seconds - ARRIVAL) * distance / total, 3) for distance in distances]
-    return {"root": [{"time": time, "position": list(point)} for time, point in zip(times, path, strict=True)]}
+    return {
+        "root": [
+            {"time": time, "position": list(point)} for time, point in zip(times, path, strict=True)
+        ]
+    }

@@ -43,7 +43,8 @@ WRITERS: dict[str, Callable[[Path, RiggedClip], None]] = {
     "usdz": usd.write,
 }
 """Format -> function that writes a clip."""
-SLIDING = 200.0  # score per meter that a foot slides, relative to the score per meter of difference between poses
+# Score per meter that a foot slides, relative to the score per meter of difference between poses
+SLIDING = 200.0
 FAULTY = 0.2  # score of a frame with a fault
 
 
@@ -60,7 +61,9 @@ class MotionSet(ClosedSchema):
     """Content of a file that describes a set; docs/sampling.md explains the keys."""
 
     stand: str
-    motions: Annotated[Mapping[Annotated[str, Field(pattern=NAME)], SetMotion], Field(min_length=1, max_length=200)]
+    motions: Annotated[
+        Mapping[Annotated[str, Field(pattern=NAME)], SetMotion], Field(min_length=1, max_length=200)
+    ]
     prefix: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{0,40}$")] = ""
     format: Literal["fbx", "glb", "usda", "usdc", "usdz"] = "fbx"
     rig: str | None = "unreal"
@@ -86,10 +89,14 @@ def read_set(source: str) -> MotionSet:
 
     stand = content.motions.get(content.stand)
     if stand is None or stand.kind != "loop":
-        raise UserError(f"{path}: stand is {content.stand}, which is no motion with kind: loop. Name such a motion")
+        raise UserError(
+            f"{path}: stand is {content.stand}, which is no motion with kind: loop. Name such a motion"
+        )
     for name, motion in content.motions.items():
         if motion.kind == "turn" and not motion.degrees:
-            raise UserError(f"{path}: motions.{name} is a turn without degrees. Give degrees, 90 is to the left")
+            raise UserError(
+                f"{path}: motions.{name} is a turn without degrees. Give degrees, 90 is to the left"
+            )
     _check_rig(content, f"{path}: rig: ")
     return content
 
@@ -135,7 +142,9 @@ def make_set(model: MotionGenerator, content: MotionSet, seed: int = 0, **option
         UserError: If the model has another skeleton or cannot do what is requested, or no person stands.
     """
     if model.representation.skeleton.joints != SMPL22.joints:
-        raise UserError(f"set: the model has the skeleton {model.representation.skeleton.name}, not SMPL's 22 joints")
+        raise UserError(
+            f"set: the model has the skeleton {model.representation.skeleton.name}, not SMPL's 22 joints"
+        )
     others = [name for name in content.motions if name != content.stand]
     stand = np.zeros((0, 3))
     clips: list[Clip] = []
@@ -147,7 +156,9 @@ def make_set(model: MotionGenerator, content: MotionSet, seed: int = 0, **option
             takes = [replace(take, local=with_lengths(take.local, stand)) for take in takes]
         versions = [version for take in takes if (version := _clips(name, motion, take, stand))]
         if not versions:
-            left_out[name] = f"none of {content.candidates} motions for '{motion.text}' {_missing(motion)}"
+            left_out[name] = (
+                f"none of {content.candidates} motions for '{motion.text}' {_missing(motion)}"
+            )
             continue
         clips += min(versions, key=lambda version: version[0])[1]
         if name == content.stand:
@@ -156,7 +167,11 @@ def make_set(model: MotionGenerator, content: MotionSet, seed: int = 0, **option
 
 
 def _takes(
-    model: MotionGenerator, motion: SetMotion, content: MotionSet, seed: int, options: Mapping[str, Any]
+    model: MotionGenerator,
+    motion: SetMotion,
+    content: MotionSet,
+    seed: int,
+    options: Mapping[str, Any],
 ) -> list[GroundedMotion]:
     """Samples the candidates for a motion; of a loop, each has three repetitions and one frame more."""
     is_loop, representation = motion.kind == "loop", model.representation
@@ -183,7 +198,9 @@ def _takes(
     return takes
 
 
-def _clips(name: str, motion: SetMotion, take: GroundedMotion, stand: np.ndarray) -> tuple[float, list[Clip]] | None:
+def _clips(
+    name: str, motion: SetMotion, take: GroundedMotion, stand: np.ndarray
+) -> tuple[float, list[Clip]] | None:
     """Returns the clips of a candidate and their score, lower is better; None if it does not show the motion."""
     score = 0.0
     if motion.kind == "loop":
@@ -204,7 +221,9 @@ def _clips(name: str, motion: SetMotion, take: GroundedMotion, stand: np.ndarray
             Clip(f"{name}_{kind.capitalize()}", kind, part, motion.text)
             for kind, part in zip(kinds, parts, strict=True)
         ]
-    faulty = sum(fault.end - fault.start for clip in clips for fault in find_faults(motion_of(clip)))
+    faulty = sum(
+        fault.end - fault.start for clip in clips for fault in find_faults(motion_of(clip))
+    )
     return score + SLIDING * max(slide(clip.motion) for clip in clips) + FAULTY * faulty, clips
 
 
@@ -229,10 +248,15 @@ def rig_clips(clips: list[Clip], rig: str | None, body: Mesh | None = None) -> l
     motion = Motion(joints, fps, SMPL22)
     poses = motion.posed()
     whole = rigged(poses, "", fps, preset(rig, poses), fit_body(motion, body))
-    return [whole.part(part, clip.name, clip.motion.contacts) for part, clip in zip(frames, clips, strict=True)]
+    return [
+        whole.part(part, clip.name, clip.motion.contacts)
+        for part, clip in zip(frames, clips, strict=True)
+    ]
 
 
-def write_set(folder: Path, made: MadeSet, content: MotionSet, facts: Mapping[str, Any], body: Mesh) -> list[str]:
+def write_set(
+    folder: Path, made: MadeSet, content: MotionSet, facts: Mapping[str, Any], body: Mesh
+) -> list[str]:
     """Writes the files of a set into a folder, all or none; returns their names.
 
     Each clip is a file with the path of the root and a file in place. `set.json` describes them, `set.png` and
@@ -244,16 +268,23 @@ def write_set(folder: Path, made: MadeSet, content: MotionSet, facts: Mapping[st
         pairs = list(zip(made.clips, in_place, strict=True))
         for clip, still in ProgressBar(pairs, desc="write", unit="clip"):
             name = f"{content.prefix}{clip.name}"
-            files = {"root_motion": f"{name}.{content.format}", "in_place": f"{name}{IN_PLACE}.{content.format}"}
+            files = {
+                "root_motion": f"{name}.{content.format}",
+                "in_place": f"{name}{IN_PLACE}.{content.format}",
+            }
             moved = still.on_path(clip.motion.path, clip.motion.heading)
             for key, variant in (("root_motion", moved), ("in_place", still)):
-                WRITERS[content.format](temporary / files[key], replace(variant, name=Path(files[key]).stem))
+                WRITERS[content.format](
+                    temporary / files[key], replace(variant, name=Path(files[key]).stem)
+                )
             entries.append(_entry(clip, still, files))
         shown = [motion_of(clip) for clip in made.clips]
         contact_sheet(temporary / "set.png", shown, size=144, body=body)
         write_player(temporary / "player.html", shown, "Set of motions", body=body)
         listed = {"clips": entries, "left_out": made.left_out}
-        write_json(temporary / "set.json", {"fps": content.fps, "rig": content.rig, **facts, **listed})
+        write_json(
+            temporary / "set.json", {"fps": content.fps, "rig": content.rig, **facts, **listed}
+        )
         names = sorted(path.name for path in temporary.iterdir())
     return names
 
@@ -281,7 +312,9 @@ def _entry(clip: Clip, still: RiggedClip, files: Mapping[str, str]) -> dict[str,
         times = [None if time is None else round(time, 4) for time in gaits.passing(motion)]
         entry["passing"] = dict(zip(("left", "right"), times, strict=True))
         entry["closure"] = {"meters": round(distance, 5), "degrees": round(angle, 3)}
-    entry["planted_at_start"] = dict(zip(("left", "right"), motion.contacts[0].tolist(), strict=True))
+    entry["planted_at_start"] = dict(
+        zip(("left", "right"), motion.contacts[0].tolist(), strict=True)
+    )
     entry["contacts"] = [event._asdict() for event in contact_events(motion.contacts, motion.fps)]
     return entry
 

@@ -23,7 +23,11 @@ REQUEST_FILES = re.compile(r"motion_\d{3,}\.npz|motions\.mp4|trajectory\.png")
 
 def refuse_no_condition(model: MotionGenerator) -> None:
     """Raises the `UserError` of a command that names no condition, with examples that the model knows."""
-    examples = list(model.facts["actions"] if model.conditioned_on == "action" else model.facts.get("captions", ()))
+    examples = list(
+        model.facts["actions"]
+        if model.conditioned_on == "action"
+        else model.facts.get("captions", ())
+    )
     shown = "; ".join(examples[:: max(1, len(examples) // 5)][:5])
     key = TRAINED_ON[model.conditioned_on][1]
     raise UserError(f"say what to sample: {key}" + (f". Examples: {shown}" if shown else ""))
@@ -37,7 +41,9 @@ def default_folder(model: MotionGenerator, title: str, *request: object) -> Path
     """
     digest = hashlib.sha256(repr((title, request)).encode()).hexdigest()[:6]
     name = re.sub(r"[^\w]+", "-", title.lower()).strip("-")[:40].strip("-")
-    return Path(SAMPLES, *re.findall(r"[\w-][\w.-]*", str(model.config["experiment"])), f"{name}-{digest}")
+    return Path(
+        SAMPLES, *re.findall(r"[\w-][\w.-]*", str(model.config["experiment"])), f"{name}-{digest}"
+    )
 
 
 def summary(folder: Path, motions: Sequence[Motion], *, mp4: bool) -> str:

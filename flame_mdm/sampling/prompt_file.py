@@ -47,7 +47,9 @@ class PromptFile:
     @property
     def accepted(self) -> dict[int, str]:
         """The prompts that are not refused, by the numbers of their lines."""
-        return {number: prompt for number, prompt in self.lines.items() if number not in self.refused}
+        return {
+            number: prompt for number, prompt in self.lines.items() if number not in self.refused
+        }
 
     def refuse(self, errors: Mapping[int, UserError]) -> None:
         """Refuses prompts for errors by their positions among the accepted ones."""
@@ -61,8 +63,15 @@ class PromptFile:
         if len(lengths) != len(self.lines):
             counts = f"lengths: {len(lengths)}, prompts: {len(self.lines)}"
             raise UserError(f"{key}={list(lengths)}: {counts}. Give one length, or one per prompt")
-        return [length for number, length in zip(self.lines, lengths, strict=True) if number not in self.refused]
+        return [
+            length
+            for number, length in zip(self.lines, lengths, strict=True)
+            if number not in self.refused
+        ]
 
     def report(self) -> list[str]:
         """Returns the lines that name the refused prompts; empty if there are none."""
-        return [f"{self.path}, line {number}: {first_line(self.refused[number])}" for number in sorted(self.refused)]
+        return [
+            f"{self.path}, line {number}: {first_line(self.refused[number])}"
+            for number in sorted(self.refused)
+        ]

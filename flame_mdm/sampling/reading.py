@@ -49,14 +49,20 @@ def read_motion(
         dataset, _, clip_id = name.partition(":")
         store = Store(Path(data_root) / f"{dataset}-{representation.name}")
         if (rate := store.info["fps"]) != representation.fps:
-            raise UserError(f"{store.folder}: prepared at {rate:g} fps, but the model has {representation.fps:g}")
+            raise UserError(
+                f"{store.folder}: prepared at {rate:g} fps, but the model has {representation.fps:g}"
+            )
         clips = {clip.id: clip for clip in store.clips}
         if clip_id not in clips:
-            raise UserError(f"{store.folder} has no clip '{clip_id}'.{did_you_mean(clip_id, list(clips))}")
+            raise UserError(
+                f"{store.folder} has no clip '{clip_id}'.{did_you_mean(clip_id, list(clips))}"
+            )
         features, captions = np.array(store.motion(clips[clip_id])), clips[clip_id].captions
         motion = decoded(representation, torch.from_numpy(features), next(iter(captions), ""), name)
     else:
-        raise UserError(f"{name}: not a motion. Give a {', '.join(ENDINGS)} file, or dataset:id for a prepared clip")
+        raise UserError(
+            f"{name}: not a motion. Give a {', '.join(ENDINGS)} file, or dataset:id for a prepared clip"
+        )
     return motion if cut is None else part_of(representation, motion, cut)
 
 
@@ -70,7 +76,9 @@ def part_of(representation: Representation, motion: Motion, cut: Sequence[float]
     begin, end = (round(second * representation.fps) for second in cut)
     if not 0 <= begin < end <= len(motion.features):
         seconds, name = len(motion.features) / representation.fps, motion.id or "the motion"
-        raise UserError(f"cut=[{cut[0]:g}, {cut[1]:g}] is not a range of {name}, which lasts {seconds:g} seconds")
+        raise UserError(
+            f"cut=[{cut[0]:g}, {cut[1]:g}] is not a range of {name}, which lasts {seconds:g} seconds"
+        )
     features = torch.from_numpy(representation.rebase(motion.features[begin:end]))
     return replace(decoded(representation, features, motion.text, motion.id), notes=motion.notes)
 
@@ -78,7 +86,9 @@ def part_of(representation: Representation, motion: Motion, cut: Sequence[float]
 def with_features(representation: Representation, motion: Motion) -> Motion:
     """Returns the motion if it has features of this representation, otherwise computes them from its joints."""
     name = f"{motion.id}: " if motion.id else ""
-    if motion.representation == representation.name and math.isclose(motion.fps, representation.fps):
+    if motion.representation == representation.name and math.isclose(
+        motion.fps, representation.fps
+    ):
         shape, size = motion.features.shape, representation.features
         if shape[1:] != (size,) or not np.isfinite(motion.features).all():
             raise UserError(f"{name}features of shape {shape}, not (frames, {size}), or not finite")
@@ -88,7 +98,8 @@ def with_features(representation: Representation, motion: Motion) -> Motion:
             check_size(motion.joints, 1.0, children=True)
         raw = raw_motion(motion, representation)
         features = representation.encode(raw.values)
-        if len(features) < len(raw.values):  # one row per step between frames: a step more keeps the number of frames
+        # One row per step between frames: a step more keeps the number of frames
+        if len(features) < len(raw.values):
             step = (raw.values[-1:] - raw.values[-2:-1]) * raw.values.new_tensor([1.0, 0.0, 1.0])
             features = representation.encode(torch.cat([raw.values, raw.values[-1:] + step]))
     except ValueError as error:
@@ -100,7 +111,11 @@ def with_features(representation: Representation, motion: Motion) -> Motion:
 
 def decoded(representation: Representation, features: Tensor, text: str, name: str) -> Motion:
     """Returns the motion of features (F, D)."""
-    joints, fps, skeleton = representation.decode(features).cpu().numpy(), representation.fps, representation.skeleton
+    joints, fps, skeleton = (
+        representation.decode(features).cpu().numpy(),
+        representation.fps,
+        representation.skeleton,
+    )
     return Motion(
         joints=joints,
         fps=fps,

@@ -10,7 +10,13 @@ from torch import Tensor
 
 from flame_mdm.batch import Edit
 from flame_mdm.conditions.language.reading import Reader, Reading
-from flame_mdm.conditions.vocabulary import advice, check_known, in_parts, unknown_words, unread_words
+from flame_mdm.conditions.vocabulary import (
+    advice,
+    check_known,
+    in_parts,
+    unknown_words,
+    unread_words,
+)
 from flame_mdm.errors import UserError, shortened
 from flame_mdm.formats.motion import Motion
 from flame_mdm.generator import MotionGenerator
@@ -90,13 +96,17 @@ class ResolvedRequest:
         several = len(self.prompts) > 1
         for prompt in self.prompts:
             about = f"'{shortened(prompt.text, 60)}': " if several else ""
-            lines += [f"{about}{line}" for reading in prompt.readings for line in reading.warnings()]
+            lines += [
+                f"{about}{line}" for reading in prompt.readings for line in reading.warnings()
+            ]
         unread = (prompt for prompt in self.prompts if prompt.unknown and not prompt.readings)
         texts = dict.fromkeys(text for prompt in unread for text in prompt.conditions)
         for text in texts:
             is_only_text = len(self.prompts) == 1 and text == self.prompts[0].text
             about = "" if is_only_text else f"'{shortened(text, 60)}': "
-            lines += [f"{about}{line}" for line in advice(text, model.facts, model.condition.max_words)]
+            lines += [
+                f"{about}{line}" for line in advice(text, model.facts, model.condition.max_words)
+            ]
         return lines
 
 
@@ -136,11 +146,18 @@ def resolve(
             is_split = len(prompt.parts) > len(request.parts[number])
             text = " | ".join(texts) if is_split else request.prompts[number]
             first, *others = part_frames(
-                model, text, prompt.parts, usual_lengths[number], is_sequence=is_sequence, loop=request.loop
+                model,
+                text,
+                prompt.parts,
+                usual_lengths[number],
+                is_sequence=is_sequence,
+                loop=request.loop,
             )
             frames = (shared + first, *others)
             unknown = _unknown_words(prompt, model) if request.kind == "text" else ()
-            resolved[number] = ResolvedPrompt(text, is_split, prompt.captions, frames, texts, prompt.readings, unknown)
+            resolved[number] = ResolvedPrompt(
+                text, is_split, prompt.captions, frames, texts, prompt.readings, unknown
+            )
 
     targets = _targets(request, model, list(resolved.values()))
     for number, prompt in resolved.items():
@@ -173,7 +190,9 @@ def _check_model(request: SamplingRequest, model: MotionGenerator) -> None:
             )
     if request.kind not in ("none", model.conditioned_on):
         trained, instead = TRAINED_ON[model.conditioned_on]
-        raise UserError(f"{request.kind}={shortened(request.prompts[0], 60)}: this model {trained}. Give {instead}")
+        raise UserError(
+            f"{request.kind}={shortened(request.prompts[0], 60)}: this model {trained}. Give {instead}"
+        )
     if request.loop or request.after is not None:
         _check_windows(model)
 
@@ -187,11 +206,15 @@ def _check_windows(model: MotionGenerator) -> None:
         )
 
 
-def _parts(request: SamplingRequest, model: MotionGenerator, prompt: str, check_words: bool) -> _Parts:
+def _parts(
+    request: SamplingRequest, model: MotionGenerator, prompt: str, check_words: bool
+) -> _Parts:
     """Returns the parts of a prompt; a sentence with several actions has a part per action."""
     if request.kind == "none":
         return _Parts([(prompt, None)], (prompt,))
-    splits = request.split and model.representation.relative and "|" not in prompt and "@" not in prompt
+    splits = (
+        request.split and model.representation.relative and "|" not in prompt and "@" not in prompt
+    )
     if request.kind == "text" and check_words and Reader.fits(model.facts):
         return _checked(_read(Reader(model.facts), prompt, splits), model)
 
@@ -203,7 +226,9 @@ def _parts(request: SamplingRequest, model: MotionGenerator, prompt: str, check_
         if request.kind == "text" and check_words:
             check_known(condition, model.facts)
         if request.kind == "action" and condition not in (actions := model.facts["actions"]):
-            raise UserError(f"unknown action '{condition}'; this model knows: {', '.join(actions) or 'none'}")
+            raise UserError(
+                f"unknown action '{condition}'; this model knows: {', '.join(actions) or 'none'}"
+            )
     return _checked(_Parts(parts, tuple(condition for condition, _ in parts)), model)
 
 
@@ -222,7 +247,9 @@ def _read(reader: Reader, prompt: str, splits: bool) -> _Parts:
     parts = read_parts(prompt)
     readings = tuple(reader.read(words) for words, _ in parts)
     pairs = zip(parts, readings, strict=True)
-    captions = tuple(read.captions[0] if len(read.captions) == 1 else words for (words, _), read in pairs)
+    captions = tuple(
+        read.captions[0] if len(read.captions) == 1 else words for (words, _), read in pairs
+    )
     return _Parts(parts, captions, readings)
 
 
@@ -240,7 +267,9 @@ def _unknown_words(prompt: _Parts, model: MotionGenerator) -> tuple[str, ...]:
     return tuple(words)
 
 
-def _continued(request: SamplingRequest, model: MotionGenerator) -> tuple[Tensor | None, Edit | None, tuple[str, ...]]:
+def _continued(
+    request: SamplingRequest, model: MotionGenerator
+) -> tuple[Tensor | None, Edit | None, tuple[str, ...]]:
     """Returns the features (F, D) of the motion to continue, the edit that keeps its last frames, and its notes.
 
     These frames are generated again, so that the new frames fit to them. A model that continues frames reads them, and
@@ -259,19 +288,25 @@ def _continued(request: SamplingRequest, model: MotionGenerator) -> tuple[Tensor
     before = torch.from_numpy(motion.features)
     least = shared or model.denoiser.context_frames
     if len(before) < least:
-        raise UserError(f"after={motion.id}: {len(before)} frames are too short. Give at least {least}")
+        raise UserError(
+            f"after={motion.id}: {len(before)} frames are too short. Give at least {least}"
+        )
     if not shared:
         return before, None, notes
     ending = representation.normalize(before[-shared:].to(model.device))[None]
     return before, Edit(ending, torch.ones_like(ending, dtype=torch.bool)), notes
 
 
-def _targets(request: SamplingRequest, model: MotionGenerator, prompts: Sequence[ResolvedPrompt]) -> Targets | None:
+def _targets(
+    request: SamplingRequest, model: MotionGenerator, prompts: Sequence[ResolvedPrompt]
+) -> Targets | None:
     """Reads the targets of a request; way points of a path are reached at an even speed."""
     if request.path is not None and prompts:
         lengths = {sum(prompt.frames) for prompt in prompts}
         if len(lengths) > 1:
-            raise UserError(f"path={request.path}: motions of different lengths cannot share a path. Give one length")
+            raise UserError(
+                f"path={request.path}: motions of different lengths cannot share a path. Give one length"
+            )
         seconds = lengths.pop() / model.representation.fps
         return read_targets(model.representation, path_targets(read_path(request.path), seconds))
     return None if request.targets is None else read_targets(model.representation, request.targets)

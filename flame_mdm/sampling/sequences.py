@@ -22,7 +22,13 @@ def overlap(model: MotionGenerator) -> int:
 
 
 def part_frames(
-    model: MotionGenerator, text: str, parts: Sequence[Part], usual: float | None, *, is_sequence: bool, loop: bool
+    model: MotionGenerator,
+    text: str,
+    parts: Sequence[Part],
+    usual: float | None,
+    *,
+    is_sequence: bool,
+    loop: bool,
 ) -> list[int]:
     """Returns the number of frames of each part of a prompt.
 
@@ -60,12 +66,18 @@ def _sequence_frames(
     lengths = [round(usual if seconds is None else seconds * fps) for _, seconds in parts]
     for (name, _), length in zip(parts, lengths, strict=True):
         if length < 1:
-            raise UserError(f"'{name}': {length / fps:g} seconds are too short. Give at least {1 / fps:g}")
+            raise UserError(
+                f"'{name}': {length / fps:g} seconds are too short. Give at least {1 / fps:g}"
+            )
         if length < shared:
             short = f"a part of {length / fps:g} seconds is too short"
-            raise UserError(f"'{name}': {short}. Give at least {shared / fps:g}, which it shares with its neighbors")
+            raise UserError(
+                f"'{name}': {short}. Give at least {shared / fps:g}, which it shares with its neighbors"
+            )
     if sum(lengths) > MAX_SECONDS * fps:
-        raise UserError(f"'{text}': {sum(lengths) / fps:g} seconds are too long. Give at most {MAX_SECONDS}")
+        raise UserError(
+            f"'{text}': {sum(lengths) / fps:g} seconds are too long. Give at most {MAX_SECONDS}"
+        )
     return lengths
 
 
@@ -85,7 +97,9 @@ def windows(
     positions = [(row, first, size) for row, _, first, size in covering]
     covered = cover(positions, [sum(parts) for parts in lengths], shared, width, device)
     if request.kind == "action":
-        covered.batch.action = torch.tensor([model.facts["actions"].index(name) for name in names], device=device)
+        covered.batch.action = torch.tensor(
+            [model.facts["actions"].index(name) for name in names], device=device
+        )
     else:
         covered.batch.text = names
     return covered

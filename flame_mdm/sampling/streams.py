@@ -66,7 +66,9 @@ def stream(
     prefix, placement = starting_point(model, start)
     condition = read_text(model, text)
     chosen = SamplerOptions(**options)
-    streams = Streams(model, [f"{condition}#0"], [condition], prefix, placement, chosen, seed=seed, block=block)
+    streams = Streams(
+        model, [f"{condition}#0"], [condition], prefix, placement, chosen, seed=seed, block=block
+    )
     streams.texts[condition] = text
     return Stream(streams, cleanup=cleanup)
 
@@ -103,7 +105,9 @@ class Stream(Iterator[Motion]):
         frame = self.frames if at is None else round(at * fps)
         if frame < self.frames:
             now = self.frames / fps
-            raise UserError(f"at={at:g}: the stream is at {now:g} seconds already. Give a later time, or omit it")
+            raise UserError(
+                f"at={at:g}: the stream is at {now:g} seconds already. Give a later time, or omit it"
+            )
         condition = read_text(self._streams.model, text)
         self._streams.texts[condition] = text
         self._streams.schedules[0].add(frame, condition)
@@ -135,7 +139,9 @@ class OnlineCleanup:
         if len(self.blocks) == 1:
             return None
         middle = self.blocks[-2]
-        contacts = self.representation.contacts(np.concatenate([piece.features for piece in self.blocks]))
+        contacts = self.representation.contacts(
+            np.concatenate([piece.features for piece in self.blocks])
+        )
         joints = np.concatenate([piece.joints for piece in self.blocks])
         joints = clean_joints(joints, middle.fps, middle.skeleton, contacts)
         begin = len(joints) - len(block.joints) - len(middle.joints)
@@ -147,7 +153,13 @@ class OnlineCleanup:
             weight = np.linspace(0, 1, len(cleaned), dtype=np.float32)[:, None, None]
             cleaned = (1 - weight) * self.version + weight * cleaned
         self.version = joints[-len(block.joints) :]
-        return replace(middle, joints=cleaned, features=np.zeros((0, 0), np.float32), representation="", cleanup=True)
+        return replace(
+            middle,
+            joints=cleaned,
+            features=np.zeros((0, 0), np.float32),
+            representation="",
+            cleanup=True,
+        )
 
 
 class Schedule:
@@ -218,14 +230,18 @@ class Streams(Iterator[list[Motion]]):
         longest = model.block_frames
         self.block = longest if block is None else block
         if type(self.block) is not int or not 1 <= self.block <= longest:
-            raise UserError(f"block={block}: this model predicts {longest} frames at once. Give 1 to {longest}")
+            raise UserError(
+                f"block={block}: this model predicts {longest} frames at once. Give 1 to {longest}"
+            )
         options = options.over(model.sampler_options)
         model.process.find_sampler(options)
         self.model, self.kind = model, kind
         self.blocks = Blocks(model, ids, prefix, options, seed=seed, unconditioned=kind == "none")
         self.schedules = [Schedule(condition) for condition in conditions]
         self.frames = [0] * len(ids)
-        self.placement = Placement.origin(len(ids), prefix.device) if placement is None else placement
+        self.placement = (
+            Placement.origin(len(ids), prefix.device) if placement is None else placement
+        )
         self.texts = {condition: condition for condition in conditions}
         self.targets: Targets | None = None
         self._root = [0.0, 0.0]  # x and z in the world of the last frame of the first stream
@@ -238,7 +254,9 @@ class Streams(Iterator[list[Motion]]):
         x, joints = self._advance(kept)
         features = self.model.representation.denormalize(x.float())
         return [
-            self._motion(features[row, :count], joints[row, :count], self.texts.get(condition, condition))
+            self._motion(
+                features[row, :count], joints[row, :count], self.texts.get(condition, condition)
+            )
             for row, (count, condition) in enumerate(zip(kept, conditions, strict=True))
         ]
 
@@ -247,7 +265,9 @@ class Streams(Iterator[list[Motion]]):
         ends = [frame + length for frame, length in zip(self.frames, lengths, strict=True)]
         parts: list[list[Tensor]] = [[] for _ in ends]
         while self.frames != ends:
-            kept = [min(self._until_change(row), end - self.frames[row]) for row, end in enumerate(ends)]
+            kept = [
+                min(self._until_change(row), end - self.frames[row]) for row, end in enumerate(ends)
+            ]
             x, _ = self._advance(kept)
             for row, count in enumerate(kept):
                 parts[row].append(x[row, :count])
@@ -255,7 +275,9 @@ class Streams(Iterator[list[Motion]]):
 
     def _conditions(self) -> list[str]:
         """Returns the condition of the next block of each stream."""
-        return [schedule.at(frame) for schedule, frame in zip(self.schedules, self.frames, strict=True)]
+        return [
+            schedule.at(frame) for schedule, frame in zip(self.schedules, self.frames, strict=True)
+        ]
 
     def _until_change(self, row: int) -> int:
         """Returns the number of frames of the next block of a stream."""
@@ -267,7 +289,10 @@ class Streams(Iterator[list[Motion]]):
 
         Returns normalized features (B, P, D), and joints (B, P, J, 3) in the world, float64.
         """
-        representation, count = self.model.representation, torch.tensor(kept, device=self.model.device)
+        representation, count = (
+            self.model.representation,
+            torch.tensor(kept, device=self.model.device),
+        )
         was_training = self.model.training
         if was_training:
             self.model.eval()
@@ -282,7 +307,9 @@ class Streams(Iterator[list[Motion]]):
         after = step_after(representation, features[rows, last], joints[rows, last])
         moved = count > 0
         turn = torch.where(moved, after.turn, self.placement.turn)
-        self.placement = Placement(turn, torch.where(moved[:, None], after.shift, self.placement.shift))
+        self.placement = Placement(
+            turn, torch.where(moved[:, None], after.shift, self.placement.shift)
+        )
         self._root = joints[0, last[0], 0, [0, 2]].tolist()
         self.frames = [frame + new for frame, new in zip(self.frames, kept, strict=True)]
         return x, joints
@@ -294,7 +321,9 @@ class Streams(Iterator[list[Motion]]):
         model, placement, frames = self.model, self.placement, self.model.block_frames
         representation = model.representation
         window = self.targets.window(self.frames[0], frames, self._root)
-        edit = window.edit(representation, frames, model.device, lambda x: in_world(representation, placement, x))
+        edit = window.edit(
+            representation, frames, model.device, lambda x: in_world(representation, placement, x)
+        )
         if not (edit.keep.any() or edit.guide):
             return cond, None
         if getattr(model.denoiser, "target", None) is not None:
@@ -307,7 +336,9 @@ class Streams(Iterator[list[Motion]]):
         if self._encoded is None or self._encoded[0] != conditions:
             model, device = self.model, self.model.device
             x = torch.zeros(len(conditions), 1, model.representation.features, device=device)
-            batch = MotionBatch(x, torch.ones(len(conditions), 1, dtype=torch.bool, device=device), self.blocks.ids)
+            batch = MotionBatch(
+                x, torch.ones(len(conditions), 1, dtype=torch.bool, device=device), self.blocks.ids
+            )
             if self.kind == "text":
                 batch.text = conditions
             elif self.kind == "action":
@@ -356,10 +387,14 @@ def root_target(window: Targets, frames: int, placement: Placement) -> Tensor | 
 def check_streams(model: MotionGenerator) -> None:
     """Raises `UserError` if a model cannot stream."""
     if not model.denoiser.context_frames:
-        raise UserError("this model does not continue frames, so it has no streams. Train one, such as bandai/dip")
+        raise UserError(
+            "this model does not continue frames, so it has no streams. Train one, such as bandai/dip"
+        )
     if not model.representation.relative:
         name = model.representation.name
-        raise UserError(f"representation {name} has positions in the world, which a stream would leave. Use humanml3d")
+        raise UserError(
+            f"representation {name} has positions in the world, which a stream would leave. Use humanml3d"
+        )
 
 
 def read_text(model: MotionGenerator, text: str) -> str:
@@ -368,10 +403,14 @@ def read_text(model: MotionGenerator, text: str) -> str:
     Raises `UserError` if the text is empty or too long, or the model does not know what it says.
     """
     if not isinstance(text, str) or not text.strip():
-        raise UserError(f"text={text!r}: give a text that says what happens, such as 'a person walks'")
+        raise UserError(
+            f"text={text!r}: give a text that says what happens, such as 'a person walks'"
+        )
     check_length(text)
     if model.conditioned_on != "text":
-        raise UserError(f"text={text}: this model is conditioned on {model.conditioned_on}, not on text")
+        raise UserError(
+            f"text={text}: this model is conditioned on {model.conditioned_on}, not on text"
+        )
     if Reader.fits(model.facts):
         captions = Reader(model.facts).read(text).captions
         return captions[0] if len(captions) == 1 else text
@@ -379,7 +418,9 @@ def read_text(model: MotionGenerator, text: str) -> str:
     return text
 
 
-def starting_point(model: MotionGenerator, start: str | Path | Motion | None) -> tuple[Tensor, Placement | None]:
+def starting_point(
+    model: MotionGenerator, start: str | Path | Motion | None
+) -> tuple[Tensor, Placement | None]:
     """Returns the frames (1, C, D) that a stream continues, normalized, and the place of the frame after them.
 
     Raises `UserError` if the model cannot stream, or the motion cannot be read, or is too short.
@@ -394,7 +435,9 @@ def starting_point(model: MotionGenerator, start: str | Path | Motion | None) ->
     motion = with_features(representation, motion)
     if len(motion.features) < context:
         name = motion.id or "the motion"
-        raise UserError(f"start={name}: {len(motion.features)} frames are too short. Give at least {context}")
+        raise UserError(
+            f"start={name}: {len(motion.features)} frames are too short. Give at least {context}"
+        )
     features = torch.from_numpy(motion.features[-context:]).to(model.device)
     last = torch.from_numpy(motion.joints[-1:]).to(model.device)
     return representation.normalize(features)[None], step_after(representation, features[-1:], last)

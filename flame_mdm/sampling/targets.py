@@ -22,7 +22,9 @@ from flame_mdm.schemas import ClosedSchema, check_shape, read_json
 
 SMOOTHNESS = 0.2  # seconds over which a correction fades; see docs/targets.md
 MAX_SPEED = 8.0  # meters per second that way points may require
-REACH = 2.5  # maximum height of a joint above the floor, and its maximum distance from where the body stands, in meters
+# Maximum height of a joint above the floor, and its maximum distance from where the body stands, in
+# meters
+REACH = 2.5
 MAX_COORDINATES = 600  # maximum number of coordinates; they are solved for together in every step
 Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)] | None  # meters; None = free
 OnFloor = Annotated[Sequence[Coordinate], Field(min_length=2, max_length=2)]  # x and z
@@ -77,7 +79,8 @@ class Goal(NamedTuple):
 class PositionGuide:
     """Leads motions to positions in the world; a `flame_mdm.batch.Guide`."""
 
-    to_joints: Callable[[Tensor], Tensor]  # normalized features (..., F, D) -> joints (..., F, J, 3) in the world
+    # Normalized features (..., F, D) -> joints (..., F, J, 3) in the world
+    to_joints: Callable[[Tensor], Tensor]
     fps: float
     positions: Positions
     bones: Tensor  # (3, N) frame, parent and child of the bones that keep their lengths
@@ -89,7 +92,9 @@ class PositionGuide:
 
     def reach(self, x0_hat: Tensor) -> Tensor:
         imposed, free = torch.where(self.keep, self.poses, x0_hat), ~self.keep.expand_as(x0_hat)
-        return reach(imposed, self.to_joints, self.positions, self.bones, free, SMOOTHNESS * self.fps)
+        return reach(
+            imposed, self.to_joints, self.positions, self.bones, free, SMOOTHNESS * self.fps
+        )
 
 
 @dataclass(frozen=True)
@@ -97,7 +102,8 @@ class Targets:
     """What motions should reach."""
 
     positions: Positions  # coordinates in the world
-    poses: tuple[tuple[int, Tensor], ...]  # frames, and features (D,) in the data's units, of poses of any place
+    # Frames, and features (D,) in the data's units, of poses of any place
+    poses: tuple[tuple[int, Tensor], ...]
 
     def check_end(self, frames: int, fps: float) -> None:
         """Raises `UserError` if a motion of this number of frames ends before a target."""
@@ -115,8 +121,15 @@ class Targets:
         of the window, from where, or from the last target of the root in the window, it moves at an even speed.
         """
         end = begin + frames
-        positions, inside = self.positions, (self.positions.frames >= begin) & (self.positions.frames < end)
-        columns = [positions.frames[inside] - begin, positions.joints[inside], positions.axes[inside]]
+        positions, inside = (
+            self.positions,
+            (self.positions.frames >= begin) & (self.positions.frames < end),
+        )
+        columns = [
+            positions.frames[inside] - begin,
+            positions.joints[inside],
+            positions.axes[inside],
+        ]
         values = positions.values[inside]
         for axis, start in ((0, here[0]), (2, here[1])):
             of_root = (positions.joints == 0) & (positions.axes == axis)
@@ -130,10 +143,15 @@ class Targets:
                 since, start = int(positions.frames[last]), float(positions.values[last])
             share = (end - 1 - since) / (int(positions.frames[goal]) - since)
             entry = (frames - 1, 0, axis)
-            columns = [torch.cat([x, x.new_tensor([value])]) for x, value in zip(columns, entry, strict=True)]
+            columns = [
+                torch.cat([x, x.new_tensor([value])])
+                for x, value in zip(columns, entry, strict=True)
+            ]
             between = start + share * (float(positions.values[goal]) - start)
             values = torch.cat([values, values.new_tensor([between])])
-        poses = tuple((frame - begin, features) for frame, features in self.poses if begin <= frame < end)
+        poses = tuple(
+            (frame - begin, features) for frame, features in self.poses if begin <= frame < end
+        )
         return Targets(Positions(columns[0], columns[1], columns[2], values), poses)
 
     def edit(
@@ -151,9 +169,12 @@ class Targets:
         keep = torch.zeros_like(imposed, dtype=torch.bool)
         for frame, features in self.poses:
             imposed[0, frame] = representation.normalize(features.to(device))
-            keep[0, frame] = representation.joint_features(range(1, len(representation.skeleton))).to(device)
+            keep[0, frame] = representation.joint_features(
+                range(1, len(representation.skeleton))
+            ).to(device)
         positions = Positions(*(x.to(device) for x in vars(self.positions).values()))
-        stretched = sorted(set(self.positions.frames[self.positions.joints > 0].tolist()))  # not by moving the root
+        # Not by moving the root
+        stretched = sorted(set(self.positions.frames[self.positions.joints > 0].tolist()))
         edges = [(frame, *edge) for frame in stretched for edge in representation.skeleton.edges]
         bones = torch.tensor(edges, dtype=torch.long, device=device).reshape(-1, 3).T
         to_joints = representation.to_joints if to_joints is None else to_joints
@@ -191,7 +212,9 @@ def read_targets(representation: Representation, source: str | Path | Mapping[st
         where, frame = f"{name}: joints[{number}]", round(entry.time * fps)
         if entry.joint not in names:
             raise UserError(f"{where}: no joint '{entry.joint}'.{did_you_mean(entry.joint, names)}")
-        goals.append(Goal(where, frame, names.index(entry.joint), np.array(entry.position, dtype=float)))
+        goals.append(
+            Goal(where, frame, names.index(entry.joint), np.array(entry.position, dtype=float))
+        )
     for number, entry in enumerate(content.poses):
         where, frame = f"{name}: poses[{number}]", round(entry.time * fps)
         pose, features = _pose(representation, entry, folder, where)
@@ -206,22 +229,34 @@ def read_targets(representation: Representation, source: str | Path | Mapping[st
     positions = np.array([goal.position for goal in goals]).reshape(-1, 3)
     numbers, axes = np.nonzero(~np.isnan(positions))
     if len(numbers) > MAX_COORDINATES:
-        raise UserError(f"{name}: {len(numbers)} coordinates are too many. Give at most {MAX_COORDINATES}")
-    frames, joints = np.array([(goal.frame, goal.joint) for goal in goals], dtype=int).reshape(-1, 2)[numbers].T
+        raise UserError(
+            f"{name}: {len(numbers)} coordinates are too many. Give at most {MAX_COORDINATES}"
+        )
+    frames, joints = (
+        np.array([(goal.frame, goal.joint) for goal in goals], dtype=int).reshape(-1, 2)[numbers].T
+    )
     frames, joints, axes = (torch.from_numpy(index) for index in (frames, joints, axes))
     values = torch.from_numpy(positions[numbers, axes]).float()
     return Targets(Positions(frames, joints, axes, values), tuple(poses))
 
 
-def _pose(representation: Representation, entry: PoseTarget, folder: Path, where: str) -> tuple[np.ndarray, Tensor]:
+def _pose(
+    representation: Representation, entry: PoseTarget, folder: Path, where: str
+) -> tuple[np.ndarray, Tensor]:
     """Returns joints (J, 3) of a pose with the root at x = z = 0, and its features (D,)."""
-    motion = read_motion(representation, folder / entry.file if Path(entry.file).suffix else entry.file)
+    motion = read_motion(
+        representation, folder / entry.file if Path(entry.file).suffix else entry.file
+    )
     if entry.frame >= len(motion.joints):
-        raise UserError(f"{where}.frame={entry.frame}: {entry.file} has frames 0 to {len(motion.joints) - 1}")
+        raise UserError(
+            f"{where}.frame={entry.frame}: {entry.file} has frames 0 to {len(motion.joints) - 1}"
+        )
     pose = motion.joints[entry.frame].astype(float)
     pose[:, [0, 2]] -= pose[0, [0, 2]]
     if entry.heading is not None:
-        right_hip, left_hip, right_shoulder, left_shoulder = pose[list(representation.skeleton.facing)]
+        right_hip, left_hip, right_shoulder, left_shoulder = pose[
+            list(representation.skeleton.facing)
+        ]
         left = left_hip - right_hip + left_shoulder - right_shoulder
         turn = torch.tensor(math.radians(entry.heading) - math.atan2(-left[2], left[0]))
         pose = rotation.rotate_y(torch.from_numpy(pose), turn).numpy()
@@ -233,11 +268,15 @@ def _check_reach(goals: list[Goal], fps: float) -> None:
     for goal in sorted(goals, key=lambda goal: goal.frame):
         height, floor = goal.position[1], goal.position[[0, 2]]
         if not (np.isnan(height) or -0.1 <= height <= REACH):
-            raise UserError(f"{goal.source}: height {height:g} m is impossible. Give 0 to {REACH:g} m above the floor")
+            raise UserError(
+                f"{goal.source}: height {height:g} m is impossible. Give 0 to {REACH:g} m above the floor"
+            )
         if np.isnan(floor).any():
             continue
         distance, seconds = float(np.linalg.norm(floor - start)), (goal.frame - begin) / fps
         if distance > MAX_SPEED * seconds + REACH:
             way = f"{distance:.1f} m from {before} in {seconds:g} seconds"
-            raise UserError(f"{goal.source}: {way} is impossible. Give more time, or a nearer position")
+            raise UserError(
+                f"{goal.source}: {way} is impossible. Give more time, or a nearer position"
+            )
         before, start, begin = goal.source, floor, goal.frame

@@ -39,7 +39,15 @@ from flame_mdm.visualize import player_page
 
 SAMPLED = 300  # motions sampled from a model whose training data are not there
 COMPARED = 32  # clips with which the page compares models
-OF_BASE = ("task", "losses", "representation", "process", "condition", "denoiser")  # parts of the base's recipe
+# Parts of the base's recipe
+OF_BASE = (
+    "task",
+    "losses",
+    "representation",
+    "process",
+    "condition",
+    "denoiser",
+)
 
 
 class AdaptationTask(GeneratorTask):
@@ -90,22 +98,32 @@ def adapt(
     """
     file, out = find(base), Path(out or f"runs/adapt/{name}")
     if not re.fullmatch(r"[^\W_]+", name):
-        raise UserError(f"name={name}: give one word of letters and digits, since prompts say 'in {name} style'")
+        raise UserError(
+            f"name={name}: give one word of letters and digits, since prompts say 'in {name} style'"
+        )
     task = load_task(file, GeneratorTask)
     model = task.generator
     if "distillation" in model.config:
         raise UserError(f"{base}: a distilled model. Adapt its teacher, and distill the result")
     if model.conditioned_on != "text":
-        raise UserError(f"{base}: conditioned on {model.conditioned_on}; adapt needs a model conditioned on text")
+        raise UserError(
+            f"{base}: conditioned on {model.conditioned_on}; adapt needs a model conditioned on text"
+        )
     captions = sorted({text for note in Folder(str(source)).notes.values() for text in note.texts})
     if not captions:
-        raise UserError(f"{source}: no captions. Write what happens into NAME.txt next to each motion, or captions.csv")
+        raise UserError(
+            f"{source}: no captions. Write what happens into NAME.txt next to each motion, or captions.csv"
+        )
     if not force:
         check_clips(source, model.representation.fps)
     check_tree(out)  # the motions of `_prior` are written there before the training begins
     config = _recipe(model, captions, name, out, overrides)
-    config["base"], config["adapter"] = str(base), None if full else _about(model, captions, name, rank, file, action)
-    model.facts.pop("vocabulary", None)  # with it, texts whose words are taught here would be refused
+    config["base"], config["adapter"] = (
+        str(base),
+        None if full else _about(model, captions, name, rank, file, action),
+    )
+    # With it, texts whose words are taught here would be refused
+    model.facts.pop("vocabulary", None)
     prior = _prior(model, Path(data_root), out / "data", captions)
     config["data"]["source"] |= {"path": str(source), "prior": str(prior)}
     check(config)
@@ -119,15 +137,20 @@ def adapt(
         adapted = load_task(path if full else file, GeneratorTask, adapter=() if full else path)
         body = _comparison(name, data, task, adapted)
         write_text(out / "adaptation.html", page(f"Adaptation: {name}", body))
-        say(f"written: {path}", f"before and after: {out / 'adaptation.html'} (open in any browser)")
+        say(
+            f"written: {path}", f"before and after: {out / 'adaptation.html'} (open in any browser)"
+        )
 
     write_results()
-    if torch.distributed.is_initialized():  # the launcher ends all processes when the first one exits
+    # The launcher ends all processes when the first one exits
+    if torch.distributed.is_initialized():
         torch.distributed.barrier()
     return path
 
 
-def _about(model: MotionGenerator, captions: Sequence[str], name: str, rank: int, file: Path, action: bool) -> About:
+def _about(
+    model: MotionGenerator, captions: Sequence[str], name: str, rank: int, file: Path, action: bool
+) -> About:
     texts, seen = [styled(text, name) for text in captions], model.facts.get("vocabulary", ())
     new = [word for word in dict.fromkeys(words(" ".join(texts))) if word not in seen]
     return {
@@ -135,21 +158,31 @@ def _about(model: MotionGenerator, captions: Sequence[str], name: str, rank: int
         "action": action,
         "rank": rank,
         "words": new,
-        "rows": word_rows(model.condition, new, seen) if isinstance(model.condition, LearnedTokens) else [],
+        "rows": word_rows(model.condition, new, seen)
+        if isinstance(model.condition, LearnedTokens)
+        else [],
         "captions": texts[:20],
         "base": state_sha256(read_merged(file)["state_dict"]),
     }
 
 
-def _recipe(model: MotionGenerator, captions: Sequence[str], name: str, out: Path, overrides: Sequence[str]) -> Config:
+def _recipe(
+    model: MotionGenerator, captions: Sequence[str], name: str, out: Path, overrides: Sequence[str]
+) -> Config:
     if own := [word for word in overrides if word.partition(".")[0] in OF_BASE]:
-        raise UserError(f"{own[0]}: an adaptation keeps the {own[0].partition('.')[0]} of its base. Drop it")
+        raise UserError(
+            f"{own[0]}: an adaptation keeps the {own[0].partition('.')[0]} of its base. Drop it"
+        )
     recipe = ConfigSource(EXPERIMENTS, "adapt")  # checked by the caller, once it is complete
     config = resolve(recipe, *prepare_overrides(recipe, [quoted(f"run.dir={out}"), *overrides]))
     config |= {part: model.config[part] for part in OF_BASE if part in model.config}
     if config["task"]["_target_"] in GENERATORS:  # not a class of the user's
         config["task"] = config["task"] | {"_target_": TASK}
-    config["experiment"], config["run"]["name"], config["data"]["name"] = f"adapt/{name}", name, name
+    config["experiment"], config["run"]["name"], config["data"]["name"] = (
+        f"adapt/{name}",
+        name,
+        name,
+    )
     data, longest = model.config.get("data") or {}, model.facts["max_frames"] // 4 * 4
     config["data"]["crop"] = data.get("crop") or config["data"]["crop"] | {"max_frames": longest}
     if not any(word.startswith("optimizer.lr=") for word in overrides):
@@ -163,12 +196,20 @@ def _recipe(model: MotionGenerator, captions: Sequence[str], name: str, out: Pat
 def _prior(model: MotionGenerator, root: Path, own: Path, captions: Sequence[str]) -> Path:
     representation = model.representation
     folder = root / f"{(model.config.get('data') or {}).get('name')}-{representation.name}"
-    if (folder / "store.json").exists() and Store(folder).fingerprint == model.facts.get("fingerprint"):
+    if (folder / "store.json").exists() and Store(folder).fingerprint == model.facts.get(
+        "fingerprint"
+    ):
         return folder
     folder = own / f"prior-{representation.name}"
     if not (folder / "store.json").exists():
-        say(f"the training data of the base are not in {root}: sampling {SAMPLED} motions of it instead")
-        write_store(folder, _Samples(model, list(model.facts.get("captions", ())) or captions), representation)
+        say(
+            f"the training data of the base are not in {root}: sampling {SAMPLED} motions of it instead"
+        )
+        write_store(
+            folder,
+            _Samples(model, list(model.facts.get("captions", ())) or captions),
+            representation,
+        )
     return folder
 
 
@@ -190,7 +231,9 @@ class _Samples(MotionSource):
     def clips(self, fps: float) -> Iterator[Clip]:
         frames, encoded = self.model.facts["max_frames"], self.model.representation.name
         for first in range(0, SAMPLED, BATCH):
-            made = generate(self.model, self.captions[first : first + BATCH], frames=frames, seed=first)
+            made = generate(
+                self.model, self.captions[first : first + BATCH], frames=frames, seed=first
+            )
             for row, motion in enumerate(made, first):
                 split, name = "train" if row % 10 else "val", f"sample_{row:03d}"
                 yield Clip(name, motion.features, [motion.text], split, name, encoded=encoded)
@@ -211,12 +254,20 @@ def _comparison(name: str, data: LessonData, *tasks: GeneratorTask) -> str:
     for text, clip in list(taught.items())[:4]:
         features = torch.from_numpy(data.store.motion(clip)[: data.crop.longest()].copy())
         beside.append(decoded(before.representation, features, text, "your clip"))
-        beside += [replace(motion, id="model") for motion in generate(after, text, frames=len(features))]
+        beside += [
+            replace(motion, id="model") for motion in generate(after, text, frames=len(features))
+        ]
     rows: list[list[str]] = []
-    for what, chosen in ((f"loss on {len(own)} of your clips", own), (f"loss on {len(kept)} clips it knew", kept)):
+    for what, chosen in (
+        (f"loss on {len(own)} of your clips", own),
+        (f"loss on {len(kept)} clips it knew", kept),
+    ):
         batch = collate(data.train.__getitems__([(int(row), -1) for row in chosen]))
         with torch.no_grad():
             losses = [float(task.losses_of(batch)["loss"].mean()) for task in tasks]
         rows.append([what, *map(number, losses)])
-    players = {"prompts": player_page(pairs, "", columns=2), "clips": player_page(beside, "", columns=2)}
+    players = {
+        "prompts": player_page(pairs, "", columns=2),
+        "clips": player_page(beside, "", columns=2),
+    }
     return render("adaptation.html", name=name, rows=rows, **players)

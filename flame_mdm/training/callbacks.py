@@ -63,7 +63,9 @@ class Checkpoints(Checkpoint):
     def __init__(self, folder: str, every_n_steps: int, keep_every_n_steps: int | None = None):
         super().__init__()
         if every_n_steps < 1:
-            raise UserError(f"callbacks.checkpoints.every_n_steps={every_n_steps}: must be at least 1")
+            raise UserError(
+                f"callbacks.checkpoints.every_n_steps={every_n_steps}: must be at least 1"
+            )
         self.folder = Path(folder)
         self.every_n_steps, self.keep_every_n_steps = every_n_steps, keep_every_n_steps
         self.stop = StopRequest()
@@ -114,7 +116,9 @@ class Measurements(Callback):
         self.first = 0  # number of steps at the time `since`
         self.earlier: dict[str, float] = {}
 
-    def on_load_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+    def on_load_checkpoint(
+        self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
         self.earlier = checkpoint["facts"].get("training", {})
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -124,11 +128,15 @@ class Measurements(Callback):
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self.since, self.first = time.perf_counter(), trainer.global_step
 
-    def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+    def on_save_checkpoint(
+        self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
         if pl_module.device.type == "cuda":
             memory = torch.cuda.max_memory_allocated(pl_module.device) / 2**30
         else:
-            memory = getrusage(RUSAGE_SELF).ru_maxrss / (2**30 if sys.platform == "darwin" else 2**20)
+            memory = getrusage(RUSAGE_SELF).ru_maxrss / (
+                2**30 if sys.platform == "darwin" else 2**20
+            )
         assert isinstance(pl_module, Task)
         pl_module.facts["training"] = {
             "hours": self.earlier.get("hours", 0.0) + (time.perf_counter() - self.begin) / 3600,
@@ -139,7 +147,9 @@ class Measurements(Callback):
             "precision": trainer.precision,
         }
 
-    def on_before_optimizer_step(self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer) -> None:
+    def on_before_optimizer_step(
+        self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer
+    ) -> None:
         if (trainer.global_step + 1) % trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
             gradients = [p.grad for p in pl_module.parameters() if p.grad is not None]
             pl_module.log("train/grad_norm", get_total_norm(gradients))
@@ -156,7 +166,9 @@ class Measurements(Callback):
         pl_module.log("train/samples_per_second", samples / seconds)
         pl_module.log("train/seconds_per_step", seconds)
         if pl_module.device.type == "cuda":
-            pl_module.log("train/gpu_memory_gib", torch.cuda.max_memory_allocated(pl_module.device) / 2**30)
+            pl_module.log(
+                "train/gpu_memory_gib", torch.cuda.max_memory_allocated(pl_module.device) / 2**30
+            )
         self.since, self.first = time.perf_counter(), step
 
 
@@ -171,8 +183,12 @@ class Report(Callback):
             return
         texts = {"train/loss": "on the last batch", "val/loss": "on the validation clips"}
         values = trainer.callback_metrics
-        if losses := ", ".join(f"{values[name]:.4g} {text}" for name, text in texts.items() if name in values):
-            say(f"loss after {trainer.global_step} steps: {losses} (lower is better; comparable within a recipe only)")
+        if losses := ", ".join(
+            f"{values[name]:.4g} {text}" for name, text in texts.items() if name in values
+        ):
+            say(
+                f"loss after {trainer.global_step} steps: {losses} (lower is better; comparable within a recipe only)"
+            )
         say(f"report: {write_report(self.folder)}")
         if isinstance(pl_module, GeneratorTask):
             example = {
@@ -181,8 +197,12 @@ class Report(Callback):
                 "none": "unconditioned=true",
             }[pl_module.generator.conditioned_on]
             say(f"next: {shlex.join(['flame-mdm', 'sample', str(self.folder), example])}")
-            extractor = f"extractor={_extractor_in_package(pl_module.config, pl_module.facts) or 'none'}"
-            say(f"      {shlex.join(['flame-mdm', 'evaluate', str(self.folder), extractor, 'quick=true'])}")
+            extractor = (
+                f"extractor={_extractor_in_package(pl_module.config, pl_module.facts) or 'none'}"
+            )
+            say(
+                f"      {shlex.join(['flame-mdm', 'evaluate', str(self.folder), extractor, 'quick=true'])}"
+            )
 
 
 def _extractor_in_package(config: Config, facts: Mapping[str, Any]) -> str:
@@ -200,7 +220,9 @@ def explain_metrics(values: Values, real: Values, metrics: Mapping[str, Metric])
     for name, metric in metrics.items():
         own = {key: value for key, value in values.items() if key.partition("/")[0] == name}
         if own:
-            better = {True: " Higher is better.", False: " Lower is better.", None: ""}[metric.higher_is_better]
+            better = {True: " Higher is better.", False: " Lower is better.", None: ""}[
+                metric.higher_is_better
+            ]
             lines.append(f"{name}: {(getdoc(type(metric)) or '').partition(chr(10))[0]}{better}")
         for key, value in own.items():
             reference = f" (real motions: {number(real[key])})" if key in real else ""
@@ -231,7 +253,9 @@ class Progress(Callback):
             return
         if trainer.global_step % trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
             values = trainer.callback_metrics
-            losses = {name: f"{values[name]:.4g}" for name in ("train/loss", "val/loss") if name in values}
+            losses = {
+                name: f"{values[name]:.4g}" for name in ("train/loss", "val/loss") if name in values
+            }
             self.bar.set_postfix(losses, refresh=False)
         self.bar.update(steps)
 
@@ -266,7 +290,9 @@ class SampleMotions(Callback):
         if not seconds > 0:
             raise UserError(f"callbacks.samples.seconds={seconds}: must be greater than 0")
         self.folder, self.every_n_steps, self.seconds = Path(folder), every_n_steps, seconds
-        self.prompts = [(p, {}) if isinstance(p, str) else (p[0], dict(p[1])) for p in prompts or []]
+        self.prompts = [
+            (p, {}) if isinstance(p, str) else (p[0], dict(p[1])) for p in prompts or []
+        ]
         self.metrics, self.next = metrics or {}, every_n_steps
         self.written: tuple[int, Path, Values] = (-1, self.folder, {})
         self.notes: list[str] = []
@@ -279,7 +305,9 @@ class SampleMotions(Callback):
         self.next = trainer.global_step + self.every_n_steps
         assert isinstance(pl_module, GeneratorTask)
         actions = pl_module.facts["actions"]
-        if isinstance(pl_module.generator.condition, ActionLabels) and not set(self.texts) & set(actions):
+        if isinstance(pl_module.generator.condition, ActionLabels) and not set(self.texts) & set(
+            actions
+        ):
             # a text-to-motion recipe was overridden with condition=action, so its prompts are texts
             self.prompts = [(action, {"action": action}) for action in actions[: len(self.prompts)]]
 
@@ -296,14 +324,17 @@ class SampleMotions(Callback):
             self.write(trainer, pl_module)
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        if self.written[0] != trainer.global_step:  # the last validation may have written them already
+        # The last validation may have written them already
+        if self.written[0] != trainer.global_step:
             self.write(trainer, pl_module)
         _, folder, values = self.written
         if trainer.is_global_zero:
             real = self._measure_real(trainer.datamodule.train, pl_module) if values else {}  # type: ignore[attr-defined]
             say(*explain_metrics(values, real, self.metrics))
             say(*self.notes)
-            say(f"player: {folder / 'player.html'} (open in any browser), animation: {folder / 'motions.gif'}")
+            say(
+                f"player: {folder / 'player.html'} (open in any browser), animation: {folder / 'motions.gif'}"
+            )
 
     def write(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Samples a share of the motions on each process; the first process measures, writes and logs them."""
@@ -314,16 +345,22 @@ class SampleMotions(Callback):
         if trainer.world_size > 1:
             parts: list[Any] = [None] * trainer.world_size
             torch.distributed.all_gather_object(parts, motions)
-            motions = [motion for row in zip_longest(*parts) for motion in row if motion is not None]
+            motions = [
+                motion for row in zip_longest(*parts) for motion in row if motion is not None
+            ]
         values: Values = {}
         if trainer.is_global_zero:
             write_motions(folder, motions, {"seed": 0, "step": step, "checkpoint": ""})
             requested = [attributes for _, attributes in self.prompts]
-            values = self.measure([torch.from_numpy(motion.joints) for motion in motions], requested)
+            values = self.measure(
+                [torch.from_numpy(motion.joints) for motion in motions], requested
+            )
             for logger in trainer.loggers:
                 # Lightning logs steps from 0: the values of this validation are logged at step - 1
                 log_video(logger, "samples", folder / "motions.gif", step - 1)
-                logger.log_metrics({f"samples/{name}": value for name, value in values.items()}, step - 1)
+                logger.log_metrics(
+                    {f"samples/{name}": value for name, value in values.items()}, step - 1
+                )
         self.written = (step, folder, values)
         self.notes = degenerate_notes(motions)
 
@@ -347,13 +384,18 @@ class SampleMotions(Callback):
         """Computes all metrics of up to `REAL` training clips, which have the attributes that all prompts request."""
         assert isinstance(task, GeneratorTask)
         names = [set(requested) for _, requested in self.prompts]
-        common, all_names = (set.intersection(*names), set.union(*names)) if names else (set(), set())
+        common, all_names = (
+            (set.intersection(*names), set.union(*names)) if names else (set(), set())
+        )
         usable = [k for k, clip in enumerate(clips.clips) if common <= clip.attributes.keys()]
         chosen = usable[:: -(-len(usable) // REAL) or 1]
         representation = task.generator.representation
         features = (clips[k, -1][1][None].to(representation.mean.device) for k in chosen)
         joints = [representation.to_joints(x)[0].cpu() for x in features]
-        attributes = [{name: v for name, v in clips.clips[k].attributes.items() if name in all_names} for k in chosen]
+        attributes = [
+            {name: v for name, v in clips.clips[k].attributes.items() if name in all_names}
+            for k in chosen
+        ]
         return self.measure(joints, attributes) if chosen else {}
 
     def measure(self, motions: Sequence[Tensor], requested: Sequence[dict[str, Any]]) -> Values:
@@ -361,12 +403,23 @@ class SampleMotions(Callback):
         values: dict[str, float] = {}
         for name, metric in self.metrics.items():
             metric.reset()
-            metric.distributed_available_fn = bool  # returns False: no synchronization, this process has all motions
+            metric.distributed_available_fn = (
+                bool  # returns False: no synchronization, this process has all motions
+            )
             for key, (motion, attributes) in enumerate(zip(motions, requested, strict=True)):
                 mask = torch.ones(1, len(motion), dtype=torch.bool)
-                inputs = {"joints": motion[None], "mask": mask, "requested": [attributes], "keys": torch.tensor([key])}
-                metric.update(**{k: v for k, v in inputs.items() if k in signature(metric.update).parameters})
+                inputs = {
+                    "joints": motion[None],
+                    "mask": mask,
+                    "requested": [attributes],
+                    "keys": torch.tensor([key]),
+                }
+                metric.update(
+                    **{k: v for k, v in inputs.items() if k in signature(metric.update).parameters}
+                )
             result = metric.compute()
             parts = result if isinstance(result, dict) else {"": result}
-            values |= {f"{name}/{k}".rstrip("/"): float(v) for k, v in parts.items() if v is not None}
+            values |= {
+                f"{name}/{k}".rstrip("/"): float(v) for k, v in parts.items() if v is not None
+            }
         return values

@@ -21,9 +21,16 @@ from flame_mdm.safe_io import write_failure
 from flame_mdm.safe_io.paths import check_within, temporary_beside
 
 LAST, PREVIOUS = "last.ckpt", "previous.ckpt"
-OLDEST_LIGHTNING = Version("2.6")  # Lightning migrates checkpoints of older versions, by code that trusts them
+# Lightning migrates checkpoints of older versions, by code that trusts them
+OLDEST_LIGHTNING = Version("2.6")
 
-SCHEDULE = {"base_lrs", "_last_lr", "last_epoch", "_step_count"}  # numbers in the state of a learning rate's schedule
+# Numbers in the state of a learning rate's schedule
+SCHEDULE = {
+    "base_lrs",
+    "_last_lr",
+    "last_epoch",
+    "_step_count",
+}
 
 
 class Resumed(NamedTuple):
@@ -43,16 +50,23 @@ class AtomicCheckpoints(TorchCheckpointIO):
 
     def load_checkpoint(self, path: Any, *args: Any, **options: Any) -> dict[str, Any]:
         """Returns the content of the checkpoint that the run resumes from, as `newest` checked it."""
-        resumed, self.resumed = self.resumed, None  # it needs as much memory as the model and its optimizer
+        # It needs as much memory as the model and its optimizer
+        resumed, self.resumed = (
+            self.resumed,
+            None,
+        )
         assert resumed is not None
         return resumed.content
 
     def remove_checkpoint(self, path: Any) -> None:
         path = Path(path)
-        if path.is_file() and path.parent.resolve() == self.folder.resolve():  # after links and `..` are resolved
+        # After links and `..` are resolved
+        if path.is_file() and path.parent.resolve() == self.folder.resolve():
             path.unlink()
 
-    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
+    def save_checkpoint(
+        self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None
+    ) -> None:
         """Writes a checkpoint; raises `UserError` if that fails, as on a full disk. Earlier ones stay."""
         path = Path(path)
         check_within(path.parent, self.folder.parent)
@@ -67,7 +81,9 @@ class AtomicCheckpoints(TorchCheckpointIO):
                     path.replace(path.with_name(PREVIOUS))
                 temporary.replace(path)
         except (OSError, RuntimeError) as error:  # torch reports a failed write as either
-            reason = write_failure(error if isinstance(error, OSError) else error.__context__ or error, path)
+            reason = write_failure(
+                error if isinstance(error, OSError) else error.__context__ or error, path
+            )
             raise UserError(
                 f"{path}: the checkpoint of step {checkpoint['global_step']} cannot be written ({reason}). Earlier "
                 "checkpoints are intact: free some space, and run the same command to resume"
@@ -82,12 +98,16 @@ def newest(folder: Path) -> Resumed | None:
             content = read_checkpoint(path)
             step = content.get("global_step")
             if type(step) is not int or step < 0:
-                raise UserError(f"{path}: damaged: its global_step is {str(step)[:40]}, not a number of steps")
+                raise UserError(
+                    f"{path}: damaged: its global_step is {str(step)[:40]}, not a number of steps"
+                )
             check_weights(dict(_tensors(content, "")), path)
             _check_version(content.get("pytorch-lightning_version"), path)
         except UserError as error:
             if path == paths[-1]:
-                raise UserError(f"{error}. There is no other checkpoint. Delete {folder} to start over") from error
+                raise UserError(
+                    f"{error}. There is no other checkpoint. Delete {folder} to start over"
+                ) from error
             say(f"{error}; resuming from the previous checkpoint")
         else:
             if path.name != LAST:
@@ -134,7 +154,9 @@ def _is_alike(value: Any, usual: Any) -> bool:
     if isinstance(usual, bool) or usual is None:
         return value is None or isinstance(value, bool)
     if isinstance(usual, int | float):
-        return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+        return (
+            isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+        )
     if isinstance(usual, tuple | list):
         is_same_length = isinstance(value, tuple | list) and len(value) == len(usual)
         return is_same_length and all(map(_is_alike, value, usual))
@@ -163,7 +185,9 @@ def _check_version(version: Any, path: Path) -> None:
     except ValueError:
         supported = False
     if not supported:
-        raise UserError(f"{path}: written by version {str(version)[:40]} of Lightning, not {OLDEST_LIGHTNING} or later")
+        raise UserError(
+            f"{path}: written by version {str(version)[:40]} of Lightning, not {OLDEST_LIGHTNING} or later"
+        )
 
 
 def _tensors(content: Any, name: str) -> Iterator[tuple[str, Tensor]]:

@@ -33,7 +33,9 @@ class DistillationTask(GeneratorTask):
     kind = DistilledGenerator
 
     @classmethod
-    def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:
+    def build(
+        cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()
+    ) -> Self:
         """Builds the task of a recipe, with a text encoder that is not trained."""
         task = super().build(config, representation, actions=actions)
         task.generator.condition.requires_grad_(False)
@@ -54,16 +56,24 @@ class DistillationTask(GeneratorTask):
         try:
             path = find(name)
         except FileNotFoundError as error:
-            raise UserError(f"distillation.teacher={error}. Train it first, or name another") from error
+            raise UserError(
+                f"distillation.teacher={error}. Train it first, or name another"
+            ) from error
         teacher = read_teacher(path)
-        theirs, ours = (flatten({part: model.config[part] for part in PARTS[1:]}) for model in (teacher, self))
+        theirs, ours = (
+            flatten({part: model.config[part] for part in PARTS[1:]}) for model in (teacher, self)
+        )
         for key in sorted(theirs.keys() | ours.keys()):
             if theirs.get(key) != ours.get(key):
                 what = f"has {key}={theirs.get(key)}, but the student has {ours.get(key)}. Both need the same parts"
-                raise UserError(f"distillation.teacher={name}: {what}: use `flame-mdm distill {name}`")
+                raise UserError(
+                    f"distillation.teacher={name}: {what}: use `flame-mdm distill {name}`"
+                )
         before, now = teacher.facts.get("fingerprint"), self.facts.get("fingerprint")
         if None not in (before, now) and before != now:
-            what = f"trained on data with fingerprint {before}, but {self.facts['dataset']} has {now}"
+            what = (
+                f"trained on data with fingerprint {before}, but {self.facts['dataset']} has {now}"
+            )
             raise UserError(f"distillation.teacher={name}: {what}. Give the data of the teacher")
         self.generator.load_state_dict(teacher.state_dict())
         self.facts["teacher"] = weights_sha256(path)
@@ -77,7 +87,9 @@ class DistillationTask(GeneratorTask):
         """Raises `UserError` if the weights of the teacher have changed since the run began."""
         if checkpoint["facts"].get("teacher") != self.facts["teacher"]:
             what = "its weights have changed since this run began"
-            raise UserError(f"distillation.teacher: {what}. Restore them, or start another run with run.name=...")
+            raise UserError(
+                f"distillation.teacher: {what}. Restore them, or start another run with run.name=..."
+            )
 
     def on_fit_start(self) -> None:
         super().on_fit_start()
@@ -89,7 +101,8 @@ class DistillationTask(GeneratorTask):
         for callback in self.trainer.callbacks:  # type: ignore[attr-defined]
             if isinstance(callback, MovingAverage):
                 average = callback.averaged()
-                if not self.trainer.global_step:  # it was copied before the weights of the teacher came
+                # It was copied before the weights of the teacher came
+                if not self.trainer.global_step:
                     average.load_state_dict(self.state_dict())
                 self.target = [average.generator.denoiser]
 
@@ -97,7 +110,11 @@ class DistillationTask(GeneratorTask):
         """Does nothing: the text encoder is the teacher's."""
 
     def loss_terms(
-        self, batch: MotionBatch, cond: Condition, u: Tensor | None = None, noise: Tensor | None = None
+        self,
+        batch: MotionBatch,
+        cond: Condition,
+        u: Tensor | None = None,
+        noise: Tensor | None = None,
     ) -> dict[str, Tensor]:
         """See `GeneratorTask.loss_terms`. Validation, which gives u, is at the times of the last grid."""
         trainer, counts = self._trainer, self.config["distillation"]["intervals"]
@@ -107,15 +124,23 @@ class DistillationTask(GeneratorTask):
 
         student = self.generator
         process = student.process
-        times = torch.tensor(process.grid(counts[min(int(progress * len(counts)), len(counts) - 1)]))
+        times = torch.tensor(
+            process.grid(counts[min(int(progress * len(counts)), len(counts) - 1)])
+        )
         u = torch.rand(len(batch), device=self.device) if u is None else u
         index = (u * len(times)).long().clamp(max=len(times) - 1)
         noise = torch.randn_like(batch.x) if noise is None else noise
 
         target = student.denoiser if is_validation else self.target[0]
         teacher: Denoise = self.teacher[0]
-        if cond.null is not None and student.condition.features and self.teacher_guidance is not None:
-            teacher = classifier_free_guidance(teacher, self.teacher_guidance, student.representation.features)
+        if (
+            cond.null is not None
+            and student.condition.features
+            and self.teacher_guidance is not None
+        ):
+            teacher = classifier_free_guidance(
+                teacher, self.teacher_guidance, student.representation.features
+            )
         return consistency_terms(
             process,
             student.denoiser,
@@ -135,10 +160,14 @@ def read_teacher(path: Path) -> MotionGenerator:
     """Loads a model that can be a teacher; raises `UserError` if it predicts noise, or is a student itself."""
     teacher = load_task(path, MotionGenerator)
     if isinstance(teacher, DistilledGenerator):
-        raise UserError(f"{path}: distilled already. Give its teacher, {teacher.config['distillation']['teacher']}")
+        raise UserError(
+            f"{path}: distilled already. Give its teacher, {teacher.config['distillation']['teacher']}"
+        )
     if teacher.process.prediction == "epsilon":
         what = "predicts noise, whose clean estimate is divided by almost nothing at the noisiest times"
-        raise UserError(f"{path}: {what}. Give a model that predicts the clean motion or the velocity (MDM, MFM)")
+        raise UserError(
+            f"{path}: {what}. Give a model that predicts the clean motion or the velocity (MDM, MFM)"
+        )
     return teacher
 
 

@@ -38,14 +38,20 @@ def fit(folder: Path, config: Config) -> None:
     resumed = newest(folder / "checkpoints")
     step = resumed.step if resumed else 0
     if 0 <= config["trainer"]["max_steps"] <= step:
-        say(f"{folder}: already trained for {step} steps. Increase trainer.max_steps, or start a new run: run.name=...")
+        say(
+            f"{folder}: already trained for {step} steps. Increase trainer.max_steps, or start a new run: run.name=..."
+        )
         return
     seed_everything(config["seed"], verbose=False)
     representation = instantiate(config["representation"])
-    data: MotionDataModule = instantiate(config["data"], representation=representation, seed=config["seed"])
+    data: MotionDataModule = instantiate(
+        config["data"], representation=representation, seed=config["seed"]
+    )
     if resumed:
         _check_same_data(resumed, data)
-    task: Task = get_class(config["task"]["_target_"]).build(config, representation, actions=data.actions)
+    task: Task = get_class(config["task"]["_target_"]).build(
+        config, representation, actions=data.actions
+    )
     if isinstance(task, GeneratorTask):
         if config.get("adapter"):
             attach(task.generator, config["adapter"])
@@ -57,7 +63,8 @@ def fit(folder: Path, config: Config) -> None:
     measurements, checkpoints = Measurements(), AtomicCheckpoints(folder / "checkpoints", resumed)
     callbacks: list[Callback] = [WriteProvenance(config)]
     if config["ema"]:
-        callbacks.append(MovingAverage(**config["ema"]))  # before the callbacks that use averaged weights in validation
+        # Before the callbacks that use averaged weights in validation
+        callbacks.append(MovingAverage(**config["ema"]))
     callbacks += [instantiate(c) for c in config["callbacks"].values() if c]
     callbacks += [Progress()] if config["trainer"].get("enable_progress_bar", True) else []
     callbacks += [measurements, Report(folder)]
@@ -67,7 +74,8 @@ def fit(folder: Path, config: Config) -> None:
         # Lightning would save during a step, to a file that it then prefers to `last.ckpt`.
         plugins.append(SLURMEnvironment(auto_requeue=False))
     trainer: Trainer = instantiate(
-        config["trainer"] | {"precision": precision, "enable_progress_bar": False},  # `Progress` instead
+        config["trainer"]
+        | {"precision": precision, "enable_progress_bar": False},  # `Progress` instead
         logger=[*loggers, History(folder, step)],
         callbacks=callbacks,
         plugins=plugins,
@@ -79,18 +87,24 @@ def fit(folder: Path, config: Config) -> None:
             check_optimizers(resumed, task.make_optimizer())
         trainer.fit(task, data, ckpt_path=resumed.path if resumed else None, weights_only=True)
     except Interrupted as stop:
-        if not trainer.is_global_zero:  # the first process reports it; launchers treat any other exit code as a crash
+        # The first process reports it; launchers treat any other exit code as a crash
+        if not trainer.is_global_zero:
             return
         say(f"stopped at step {stop.step}. Run the same command to resume")
-        if stop.signum in (signal.SIGUSR1, signal.SIGUSR2) and (job := os.environ.get("SLURM_JOB_ID")):
+        if stop.signum in (signal.SIGUSR1, signal.SIGUSR2) and (
+            job := os.environ.get("SLURM_JOB_ID")
+        ):
             _requeue(job)
         raise SystemExit(128 + stop.signum) from None
     except (Exception, SystemExit) as error:
-        if trainer.strategy.launcher is not None:  # otherwise its processes wait for this one for half an hour
+        # Otherwise its processes wait for this one for half an hour
+        if trainer.strategy.launcher is not None:
             trainer.strategy.launcher.kill(signal.SIGKILL)
         if isinstance(error, SystemExit):  # a second signal
             say("stopped immediately. Run the same command to resume from the last checkpoint")
-        if explained := (data.num_workers and lost_worker(error)) or out_of_memory(error, trainer.global_step):
+        if explained := (data.num_workers and lost_worker(error)) or out_of_memory(
+            error, trainer.global_step
+        ):
             raise explained from error
         is_restoring = checkpoints.resumed is None and not measurements.begin
         if resumed and is_restoring and not isinstance(error, UserError | OSError | SystemExit):
@@ -110,7 +124,9 @@ def check_devices(trainer: Config) -> None:
         raise UserError(f"trainer.accelerator={accelerator}: {NO_GPU}. Drop it to train on the CPU")
     most = gpus if gpus and accelerator != "cpu" else cores
     if accelerator in ("gpu", "cuda", "auto") and isinstance(devices, int) and devices > most:
-        there = f"this machine has {most} " + (f"GPU{'s' * (most > 1)}" if gpus else f"CPU cores, and {NO_GPU}")
+        there = f"this machine has {most} " + (
+            f"GPU{'s' * (most > 1)}" if gpus else f"CPU cores, and {NO_GPU}"
+        )
         raise UserError(f"trainer.devices={devices}: {there}. Give at most trainer.devices={most}")
 
 
@@ -118,7 +134,10 @@ def _requeue(job: str) -> None:
     try:
         subprocess.run(["scontrol", "requeue", job], capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError) as error:
-        say(f"error: job {job} cannot be requeued: {getattr(error, 'stderr', error)}. Submit it again", error=True)
+        say(
+            f"error: job {job} cannot be requeued: {getattr(error, 'stderr', error)}. Submit it again",
+            error=True,
+        )
     else:
         say(f"job {job} was requeued")
 
@@ -142,7 +161,8 @@ def _quiet() -> None:
         ".*does not have many workers.*",
         ".*module\\(s\\) in eval mode at the start of training.*",  # a student without dropout
         ".*Checkpoint directory .* exists and is not empty.*",
-        "The dirpath has changed.*",  # the run directory was moved: the next validation decides again which is best
+        # The run directory was moved: the next validation decides again which is best
+        "The dirpath has changed.*",
         ".*sync_dist=True.*",  # the metrics are means over all processes already
     ):
         warnings.filterwarnings("ignore", message)

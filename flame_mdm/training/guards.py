@@ -39,7 +39,8 @@ def only_run(folder: Path) -> Iterator[None]:
         try:
             yield
         finally:
-            if new and not (folder / "config.yaml").exists():  # training did not start, there are only logger files
+            # Training did not start, there are only logger files
+            if new and not (folder / "config.yaml").exists():
                 shutil.rmtree(folder, ignore_errors=True)
 
 
@@ -58,14 +59,21 @@ class BadLoss(Callback):
         self.seen: list[tuple[int, int, Sequence[str], Tensor]] = []
 
     def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: MotionBatch, batch_idx: int
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        outputs: Any,
+        batch: MotionBatch,
+        batch_idx: int,
     ) -> None:
         loss = outputs["loss"] if isinstance(outputs, Mapping) else outputs
         self.seen.append((trainer.global_step, batch_idx, batch.ids, loss.detach().float()))
         if (batch_idx + 1) % trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
             self.check(trainer)
 
-    def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+    def on_save_checkpoint(
+        self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
         self.check(trainer)
 
     def check(self, trainer: Trainer) -> None:
@@ -86,7 +94,12 @@ class BadLoss(Callback):
 
     def _stop(self, trainer: Trainer, first: int, losses: Tensor) -> NoReturn:
         step, number, ids, loss = self.seen[first]
-        own = {"rank": trainer.global_rank, "batch": number, "ids": list(ids), "loss": str(float(loss))}
+        own = {
+            "rank": trainer.global_rank,
+            "batch": number,
+            "ids": list(ids),
+            "loss": str(float(loss)),
+        }
         batches: list[Any] = [own] * trainer.world_size
         if trainer.world_size > 1:
             torch.distributed.all_gather_object(batches, own)
@@ -102,9 +115,14 @@ class BadLoss(Callback):
 
 def lost_worker(error: BaseException) -> UserError | None:
     """Returns an explanation if an error means that a data loading process died, otherwise None."""
-    message = f"{error} {error.__cause__ or ''}"  # the cause, if it happens while a checkpoint is written
-    lost = re.search(r"DataLoader worker \(pid.*?\) (is killed by signal|exited unexpectedly)", message)
-    if lost is None and not isinstance(error, ConnectionError | EOFError):  # a pipe breaks before torch notices
+    message = (
+        f"{error} {error.__cause__ or ''}"  # the cause, if it happens while a checkpoint is written
+    )
+    lost = re.search(
+        r"DataLoader worker \(pid.*?\) (is killed by signal|exited unexpectedly)", message
+    )
+    # A pipe breaks before torch notices
+    if lost is None and not isinstance(error, ConnectionError | EOFError):
         return None
     return UserError(
         "a data loading process was killed, as happens when memory runs out, or ended unexpectedly. Run the same "

@@ -54,7 +54,9 @@ class TensorBoardRun(TensorBoardLogger):
 
     @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
-        super().log_metrics({name: value for name, value in metrics.items() if name != "epoch"}, step)
+        super().log_metrics(
+            {name: value for name, value in metrics.items() if name != "epoch"}, step
+        )
 
 
 class Kept(TypedDict, total=False):
@@ -70,20 +72,31 @@ class WandbRun(WandbLogger):
 
     def __init__(self, save_dir: str, **options: Any):
         self.path = Path(save_dir) / "wandb.json"
-        kept = read_json(self.path, Kept, "delete it to start a new wandb run") if self.path.exists() else {}
+        kept = (
+            read_json(self.path, Kept, "delete it to start a new wandb run")
+            if self.path.exists()
+            else {}
+        )
         step = kept.get("step")
         self.logged_step, self.rows = -1 if step is None else step, kept.get("rows", 0)
-        super().__init__(save_dir=save_dir, **{"id": kept.get("id") or secrets.token_hex(4), **options})
+        super().__init__(
+            save_dir=save_dir, **{"id": kept.get("id") or secrets.token_hex(4), **options}
+        )
         self._wandb_init.pop("anonymous")  # wandb warns about it even if it is not set
 
     @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, Any], step: int | None = None) -> None:
         if step is not None and step < self.logged_step:
             return
-        if self.experiment.step < self.rows:  # wandb restarts the row numbers of an offline part from 0
+        # Wandb restarts the row numbers of an offline part from 0
+        if self.experiment.step < self.rows:
             self.experiment.log({}, step=self.rows)
         super().log_metrics(metrics, step)
-        write_json(self.path, {"id": self.experiment.id, "step": step, "rows": self.experiment.step}, indent=None)
+        write_json(
+            self.path,
+            {"id": self.experiment.id, "step": step, "rows": self.experiment.step},
+            indent=None,
+        )
 
     @rank_zero_only
     def finalize(self, status: str) -> None:
@@ -103,10 +116,14 @@ def log_config(logger: Logger, config: Config, facts: Mapping[str, Any]) -> None
         logger.log_hyperparams({**config, "provenance": dict(facts)})
 
 
-def log_table(logger: Logger, name: str, head: Sequence[str], rows: Sequence[Sequence[Any]], step: int) -> None:
+def log_table(
+    logger: Logger, name: str, head: Sequence[str], rows: Sequence[Sequence[Any]], step: int
+) -> None:
     if isinstance(logger, TensorBoardLogger):
         lines = [head, ["---"] * len(head), *rows]
-        logger.experiment.add_text(name, "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines), step)
+        logger.experiment.add_text(
+            name, "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines), step
+        )
     elif isinstance(logger, WandbLogger):
         logger.log_table(name, columns=list(head), data=[list(row) for row in rows], step=step)
 

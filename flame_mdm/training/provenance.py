@@ -33,17 +33,29 @@ class WriteProvenance(Callback):
             return
         assert isinstance(pl_module, Task)
         folder = Path(self.config["run"]["dir"])
-        save(movable(self.config), folder / "config.yaml", head="A saved run. EXP=path/to/this/file repeats it.")
+        save(
+            movable(self.config),
+            folder / "config.yaml",
+            head="A saved run. EXP=path/to/this/file repeats it.",
+        )
         facts = environment() | {
             "device": device_name(trainer),
             "parameters": sum(p.numel() for p in pl_module.parameters() if p.requires_grad),
-            "data": {k: v for k, v in pl_module.facts.items() if k not in ("vocabulary", "verbs", "captions")},
+            "data": {
+                k: v
+                for k, v in pl_module.facts.items()
+                if k not in ("vocabulary", "verbs", "captions")
+            },
         }
         if trainer.global_step and (folder / PROVENANCE).exists():
             before: Provenance = read_json(folder / PROVENANCE, Provenance, "delete it to resume")
             kinds = {"commit": "code", "changed": "uncommitted changes", "packages": "packages"}
-            if different := [kind for name, kind in kinds.items() if getattr(before, name) != facts[name]]:
-                say(f"resuming with different {' and '.join(different)}: results may differ from an uninterrupted run")
+            if different := [
+                kind for name, kind in kinds.items() if getattr(before, name) != facts[name]
+            ]:
+                say(
+                    f"resuming with different {' and '.join(different)}: results may differ from an uninterrupted run"
+                )
         write_json(folder / PROVENANCE, facts)
         for logger in trainer.loggers:
             log_config(logger, self.config, facts)
@@ -52,16 +64,24 @@ class WriteProvenance(Callback):
         module: MotionDataModule = trainer.datamodule  # type: ignore[attr-defined]
         data, speed = module.store.info, self.config["run"].get("speed", "reference")
         size_in_millions = facts["parameters"] / 1e6
-        say(f"{self.config['experiment']}: {pl_module.describe()}, {size_in_millions:.2f} M trainable parameters")
+        say(
+            f"{self.config['experiment']}: {pl_module.describe()}, {size_in_millions:.2f} M trainable parameters"
+        )
         say(f"data: {data['dataset']} as {data['representation']}; {data['hours']} hours")
         say(*module.counts(module.store))
         say(f"device: {facts['device']}, {trainer.precision}, speed={speed}")
         if size > clips:
-            times = f"{trainer.world_size} processes x {trainer.accumulate_grad_batches} accumulated"
+            times = (
+                f"{trainer.world_size} processes x {trainer.accumulate_grad_batches} accumulated"
+            )
             lr = self.config["optimizer"].get("lr")
-            say(f"batch: {size} clips = {clips} x {times}; optimizer.lr={lr} is not scaled with the batch size")
+            say(
+                f"batch: {size} clips = {clips} x {times}; optimizer.lr={lr} is not scaled with the batch size"
+            )
         passes = trainer.max_steps * size / len(module.train)
-        say(f"steps: {trainer.global_step} to {trainer.max_steps}, {size} clips per step, {passes:.0f} epochs")
+        say(
+            f"steps: {trainer.global_step} to {trainer.max_steps}, {size} clips per step, {passes:.0f} epochs"
+        )
 
 
 def device_name(trainer: Trainer) -> str:
@@ -90,7 +110,9 @@ def environment() -> dict[str, Any]:
 def _git(*words: str) -> str | None:
     try:
         folder = Path(__file__).parent
-        result = subprocess.run(["git", *words], capture_output=True, text=True, cwd=folder, check=False)
+        result = subprocess.run(
+            ["git", *words], capture_output=True, text=True, cwd=folder, check=False
+        )
     except FileNotFoundError:  # no git on this machine
         return None
     return result.stdout.strip() if result.returncode == 0 else None

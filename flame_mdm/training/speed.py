@@ -13,7 +13,8 @@ COMPILED_FROM = 5000
 """Minimum number of training steps for which the network is compiled: shorter runs would not make up for the time."""
 PAD_MULTIPLE = 32
 """Batches of a compiled network are padded to multiples of this number of frames, since each length is compiled."""
-MOST_SHAPES = 64  # maximum number of lengths and modes for which the network is compiled; torch stops at 8 by default
+# Maximum number of lengths and modes for which the network is compiled; torch stops at 8 by default
+MOST_SHAPES = 64
 
 
 def accelerate(task: Task, data: MotionDataModule, config: Config) -> str:
@@ -29,7 +30,13 @@ def accelerate(task: Task, data: MotionDataModule, config: Config) -> str:
     trainer, supported = config["trainer"], False
     device = trainer["accelerator"]
     if device in ("auto", "gpu"):
-        device = "cuda" if torch.cuda.is_available() else "mps" if torch.backends.mps.is_available() else "cpu"
+        device = (
+            "cuda"
+            if torch.cuda.is_available()
+            else "mps"
+            if torch.backends.mps.is_available()
+            else "cpu"
+        )
     if device == "cuda":
         supported = torch.cuda.is_bf16_supported(including_emulation=False)
         if isinstance(task, GeneratorTask) and trainer["max_steps"] >= COMPILED_FROM:
@@ -76,7 +83,11 @@ class CheapDropout(nn.Module):
 
 
 def attention(
-    query: Tensor, key: Tensor, value: Tensor, attn_mask: Tensor | None = None, dropout_p: float = 0.0
+    query: Tensor,
+    key: Tensor,
+    value: Tensor,
+    attn_mask: Tensor | None = None,
+    dropout_p: float = 0.0,
 ) -> Tensor:
     """Computes `scaled_dot_product_attention` by two matrix products; ignores `dropout_p`.
 

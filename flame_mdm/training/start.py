@@ -9,8 +9,19 @@ from flame_mdm.errors import UserError, shortened
 FREE = (
     *("callbacks", "logger", "data_root", "data.root", "data.num_workers", "data.resident"),
     *("data.source.path", "data.source.workers"),
-    *("trainer.max_steps", "trainer.max_time", "trainer.devices", "trainer.num_nodes", "trainer.accelerator"),
-    *("trainer.strategy", "trainer.log_every_n_steps", "trainer.val_check_interval", "trainer.limit_val_batches"),
+    *(
+        "trainer.max_steps",
+        "trainer.max_time",
+        "trainer.devices",
+        "trainer.num_nodes",
+        "trainer.accelerator",
+    ),
+    *(
+        "trainer.strategy",
+        "trainer.log_every_n_steps",
+        "trainer.val_check_interval",
+        "trainer.limit_val_batches",
+    ),
     "trainer.enable_progress_bar",
 )
 """Keys that may differ when a run is resumed."""
@@ -42,7 +53,11 @@ def recipe_changes(config: Config) -> list[str]:
     if name not in recipes():
         return []
     recipe = flatten(movable(compose(name)))
-    model = {key: value for key, value in flatten(config).items() if not key.startswith((*FREE, "run", "seed"))}
+    model = {
+        key: value
+        for key, value in flatten(config).items()
+        if not key.startswith((*FREE, "run", "seed"))
+    }
     changed = {key: value for key, value in model.items() if value != recipe.get(key)}
     replaced = tuple(key.removesuffix("_target_") for key in changed if key.endswith("._target_"))
     return [
@@ -53,7 +68,10 @@ def recipe_changes(config: Config) -> list[str]:
 
 
 def _check_same(folder: Path, config: Config) -> None:
-    saved, requested = flatten(movable(read_saved(folder / "config.yaml"))), flatten(movable(config))
+    saved, requested = (
+        flatten(movable(read_saved(folder / "config.yaml"))),
+        flatten(movable(config)),
+    )
     differing = [
         f"{key} ({saved.get(key, 'absent')} there, {requested.get(key, 'absent')} here)"
         for key in sorted(saved.keys() | requested.keys())

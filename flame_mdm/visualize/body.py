@@ -15,9 +15,17 @@ from flame_mdm.safe_io import naming, read_npz
 
 TWISTED = {"hip": 0.4, "shoulder": 0.4, "elbow": 0.55}
 """Joints whose limb has a helper bone, and its share of the twist about the limb: the joint's own, or the wrist's."""
-HELPERS = tuple((JOINT[f"{side}_{name}"], share) for side in ("left", "right") for name, share in TWISTED.items())
+HELPERS = tuple(
+    (JOINT[f"{side}_{name}"], share)
+    for side in ("left", "right")
+    for name, share in TWISTED.items()
+)
 """Joint and share of the twist of each bone after the 22 joints."""
-ANCHORS = (*range(len(SMPL22)), *(joint for joint, _ in HELPERS))  # the joint at which each bone begins
+# The joint at which each bone begins
+ANCHORS = (
+    *range(len(SMPL22)),
+    *(joint for joint, _ in HELPERS),
+)
 MANNEQUIN = Path(__file__).with_name("mannequin.npz")
 SKIN, HAIR, SHIRT, TROUSERS, SHOES = MATERIALS = (
     *((222, 186, 160), (96, 80, 70), (132, 164, 196)),
@@ -91,11 +99,18 @@ class Mesh:
 
     def __init__(self, path: Path) -> None:
         self.stored = read_npz(path)
-        self.points, self.colors = self.stored["points"] / 20000, self.stored["colors"].astype(float)
-        self.normals = self.stored["normals"] / np.linalg.norm(self.stored["normals"], axis=1, keepdims=True)
+        self.points, self.colors = (
+            self.stored["points"] / 20000,
+            self.stored["colors"].astype(float),
+        )
+        self.normals = self.stored["normals"] / np.linalg.norm(
+            self.stored["normals"], axis=1, keepdims=True
+        )
         self.triangles, self.joints = self.stored["triangles"].astype(int), self.stored["joints"]
         self.weights = np.zeros((len(self.points), len(ANCHORS)))
-        for bone, weight in zip(self.stored["bones"].T, self.stored["weights"].T / 255, strict=True):
+        for bone, weight in zip(
+            self.stored["bones"].T, self.stored["weights"].T / 255, strict=True
+        ):
             self.weights[np.arange(len(self.points)), bone] += weight
         self.turns = self.stored["turns"][list(ANCHORS)]
         above = [max(parent, 0) for parent in SMPL22.parents]
@@ -128,10 +143,12 @@ class FittedBody:
     """A body with the bone lengths of a clip, and its motion. F frames, B = 28 bones."""
 
     mesh: Mesh
-    fit: np.ndarray  # (22, 3, 3), linear map of each joint's part of the stored mesh to the clip's proportions
+    # (22, 3, 3), linear map of each joint's part of the stored mesh to the clip's proportions
+    fit: np.ndarray
     joints: np.ndarray  # (22, 3) of the stored pose with the clip's bone lengths, pelvis at 0
     points: np.ndarray  # (V, 3) of the mesh in this pose
-    neutral: np.ndarray  # (22, 3, 3), rotation of each part of the mesh at rest: soles are flat, the head is upright
+    # (22, 3, 3), rotation of each part of the mesh at rest: soles are flat, the head is upright
+    neutral: np.ndarray
     turns: np.ndarray  # (F, B, 3, 3), rotation of each bone from the stored pose to each frame
     starts: np.ndarray  # (F, B, 3), where each bone begins: at the motion's joints, lifted
     lift: float  # height of a joint of the body above that of the motion: the thickness of the sole

@@ -13,10 +13,22 @@ from scipy.spatial.transform import Rotation
 
 from flame_mdm.errors import shortened
 from flame_mdm.safe_io import write_text
-from flame_mdm.visualize.body import ANCHORS, Figure, FittedBody, Mesh, head, mannequin, radii, sides, target
+from flame_mdm.visualize.body import (
+    ANCHORS,
+    Figure,
+    FittedBody,
+    Mesh,
+    head,
+    mannequin,
+    radii,
+    sides,
+    target,
+)
 
 
-def write_player(path: str | Path, motions: Sequence[Figure], title: str = "Motions", **options: Any) -> None:
+def write_player(
+    path: str | Path, motions: Sequence[Figure], title: str = "Motions", **options: Any
+) -> None:
     """Writes the page of `player_page`, with its options, to a file."""
     write_text(target(path, motions), player_page(motions, title, **options))
 
@@ -49,12 +61,16 @@ def player_page(
     rows = zip(motions, groups or blank, beside or blank, marks or [()] * len(motions), strict=True)
     packed = [_packed(*row, body) for row in rows]
     stored = (body or mannequin()).stored
-    arrays = {name: _base64(stored[name]) for name in ("points", "normals", "bones", "weights", "colors", "triangles")}
+    arrays = {
+        name: _base64(stored[name])
+        for name in ("points", "normals", "bones", "weights", "colors", "triangles")
+    }
     mesh = arrays | {"joints": np.round(stored["joints"], 5).ravel().tolist(), "anchors": ANCHORS}
     fitting = any(motion["body"] for motion in packed)
     content = {
         "TITLE": html.escape(shortened(title)),
-        "ABOUT": about and f"<details><summary>About these motions</summary><div>{about}</div></details>",
+        "ABOUT": about
+        and f"<details><summary>About these motions</summary><div>{about}</div></details>",
         "COLUMNS": str(columns),
         "BODY": json.dumps(mesh if fitting else None, separators=(",", ":")),
         # "<" never occurs in the data, so no caption can close the script element
@@ -65,7 +81,11 @@ def player_page(
 
 
 def _packed(
-    motion: Figure, group: str, beside: str, marks: Sequence[tuple[int, int, str, str]], mesh: Mesh | None
+    motion: Figure,
+    group: str,
+    beside: str,
+    marks: Sequence[tuple[int, int, str, str]],
+    mesh: Mesh | None,
 ) -> dict[str, Any]:
     low, high = motion.joints.min((0, 1)).astype(float), motion.joints.max((0, 1)).astype(float)
     center = (low + high) / 2
@@ -103,7 +123,9 @@ def _packed_body(body: FittedBody) -> dict[str, Any]:
     quaternions *= np.sign(np.take_along_axis(quaternions, largest[:, None], 1))
     others = quaternions[np.arange(4) != largest[:, None]].reshape(-1, 3)
     bits = np.rint(np.clip(others / 2**0.5 + 0.5, 0, 1) * 1023).astype(np.uint32)
-    packed = (largest.astype(np.uint32) << 30) | (bits[:, 0] << 20) | (bits[:, 1] << 10) | bits[:, 2]
+    packed = (
+        (largest.astype(np.uint32) << 30) | (bits[:, 0] << 20) | (bits[:, 1] << 10) | bits[:, 2]
+    )
     return {
         "fit": _base64(body.fit.astype("<f4")),
         "rest": _base64(body.joints.astype("<f4")),

@@ -19,17 +19,28 @@ from flame_mdm.visualize.body import MATERIALS, Figure, FittedBody, Mesh, head, 
 Color = tuple[int, int, int]
 SIDE_COLORS: dict[int, Color] = {1: (47, 127, 209), -1: (226, 112, 42), 0: (140, 149, 163)}
 RIM_COLORS: dict[int, Color] = {1: (26, 70, 115), -1: (124, 62, 23), 0: (77, 82, 90)}
-PAPER, GROUND, LINE, TEXT, FAINT = (255, 255, 255), (243, 245, 247), (205, 211, 219), (28, 36, 48), (102, 112, 133)
+PAPER, GROUND, LINE, TEXT, FAINT = (
+    (255, 255, 255),
+    (243, 245, 247),
+    (205, 211, 219),
+    (28, 36, 48),
+    (102, 112, 133),
+)
 SHADOW, TRAIL, CONTACT = (212, 216, 222), (122, 91, 208), (15, 157, 107)
 NEAR = 0.3  # distance from the camera in meters below which nothing is drawn
 YAW, PITCH = 0.6, 0.24  # of the camera, which is in front of the body, to the left and above
-TOWARD = np.array([math.sin(YAW) * math.cos(PITCH), math.sin(PITCH), math.cos(YAW) * math.cos(PITCH)])
+TOWARD = np.array(
+    [math.sin(YAW) * math.cos(PITCH), math.sin(PITCH), math.cos(YAW) * math.cos(PITCH)]
+)
 RIGHT = np.array([math.cos(YAW), 0, -math.sin(YAW)])
-BT709 = 1  # number of the color space of HD video, which players assume where a large video does not name one
+# Number of the color space of HD video, which players assume where a large video does not name one
+BT709 = 1
 SMOOTH = 2  # images are drawn this many times larger and then reduced
 
 
-def write_gif(path: str | Path, motions: Sequence[Figure], size: int = 256, body: Mesh | None = None) -> None:
+def write_gif(
+    path: str | Path, motions: Sequence[Figure], size: int = 256, body: Mesh | None = None
+) -> None:
     """Writes a looping animation of motions side by side, with captions below, in panels of `size` pixels.
 
     It has the highest frame rate of the motions, but at most 50 per second, the limit of the format. A motion that ends
@@ -39,7 +50,10 @@ def write_gif(path: str | Path, motions: Sequence[Figure], size: int = 256, body
     fps = max(motion.fps for motion in motions)
     fps /= math.ceil(fps / 50)
     palette = _palette()
-    images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in _video(motions, fps, size, body)]
+    images = [
+        image.quantize(palette=palette, dither=Image.Dither.NONE)
+        for image in _video(motions, fps, size, body)
+    ]
     # GIF counts in hundredths of a second: round the times, not the durations, so that errors do not add up
     times = np.rint(100 * np.arange(len(images) + 1) / fps).astype(int)
     options = {"append_images": images[1:], "duration": (10 * np.diff(times)).tolist(), "loop": 0}
@@ -47,30 +61,47 @@ def write_gif(path: str | Path, motions: Sequence[Figure], size: int = 256, body
         images[0].save(temporary, format="GIF", save_all=True, **options)
 
 
-def write_mp4(path: str | Path, motions: Sequence[Figure], size: int = 384, body: Mesh | None = None) -> None:
+def write_mp4(
+    path: str | Path, motions: Sequence[Figure], size: int = 384, body: Mesh | None = None
+) -> None:
     """Writes the animation of `write_gif` as H.264 video (yuv420p), with no limit on the frame rate."""
     path = target(path, motions)
     try:
         av = import_module("av")
     except ImportError:
-        raise UserError(f'{path}: MP4 needs the package av. Run pip install "flame-mdm[video]", or write GIF') from None
+        raise UserError(
+            f'{path}: MP4 needs the package av. Run pip install "flame-mdm[video]", or write GIF'
+        ) from None
     fps = max(motion.fps for motion in motions)
-    with atomic_write(path) as temporary, av.open(str(temporary), "w", "mp4", {"movflags": "+faststart"}) as file:
+    with (
+        atomic_write(path) as temporary,
+        av.open(str(temporary), "w", "mp4", {"movflags": "+faststart"}) as file,
+    ):
         stream = file.add_stream("libx264", Fraction(fps).limit_denominator(1001), {"crf": "20"})
         stream.thread_count = 1  # the same bytes on any number of cores
         context = stream.codec_context
         context.colorspace = context.color_primaries = context.color_trc = BT709
         for image in _video(motions, fps, size, body):
             if not context.is_open:
-                context.width, context.height = image.width // 2 * 2, image.height // 2 * 2  # H.264 needs even sizes
+                # H.264 needs even sizes
+                context.width, context.height = (
+                    image.width // 2 * 2,
+                    image.height // 2 * 2,
+                )
             pixels = np.asarray(image)[: context.height, : context.width]
-            frame = av.VideoFrame.from_ndarray(pixels).reformat(format="yuv420p", dst_colorspace=BT709)
+            frame = av.VideoFrame.from_ndarray(pixels).reformat(
+                format="yuv420p", dst_colorspace=BT709
+            )
             file.mux(stream.encode(frame))
         file.mux(stream.encode())
 
 
 def contact_sheet(
-    path: str | Path, motions: Sequence[Figure], frames: int = 6, size: int = 192, body: Mesh | None = None
+    path: str | Path,
+    motions: Sequence[Figure],
+    frames: int = 6,
+    size: int = 192,
+    body: Mesh | None = None,
 ) -> None:
     """Writes one PNG with a row per motion: `frames` poses of `size` pixels, equally spaced in time, and a caption."""
     path = target(path, motions)
@@ -79,7 +110,9 @@ def contact_sheet(
         fitted, _ = motion.try_fit(body)
         row = Image.new("RGB", (frames * size, size), PAPER)
         pen = ImageDraw.Draw(row)
-        for k, frame in enumerate(np.rint(np.linspace(0, len(motion.joints) - 1, frames)).astype(int).tolist()):
+        for k, frame in enumerate(
+            np.rint(np.linspace(0, len(motion.joints) - 1, frames)).astype(int).tolist()
+        ):
             row.paste(_figure(motion, fitted, frame, size), (k * size, 0))
             pen.text((k * size + 8, 6), f"{frame / motion.fps:.2f} s", FAINT, _font(size))
         lines = _lines(motion, fitted, row.width, size)
@@ -99,23 +132,31 @@ def thumbnail(motion: Figure, height: int = 120) -> bytes:
     frame = int(np.linalg.norm(poses - poses[0], axis=2).sum(1).argmax())
     image = _figure(motion, motion.try_fit()[0], frame, round(height / 0.92))
     left, content = (image.width - 0.7 * height) / 2, io.BytesIO()
-    image.crop((round(left), 0, round(left + 0.7 * height), height)).save(content, "WEBP", quality=85)
+    image.crop((round(left), 0, round(left + 0.7 * height), height)).save(
+        content, "WEBP", quality=85
+    )
     return content.getvalue()
 
 
 def _palette() -> Image.Image:
     """Returns one palette of all colors and their blends at smoothed edges, so that colors do not flicker."""
-    drawn = np.array([*SIDE_COLORS.values(), *RIM_COLORS.values(), LINE, TEXT, FAINT, SHADOW, TRAIL, CONTACT])
+    drawn = np.array(
+        [*SIDE_COLORS.values(), *RIM_COLORS.values(), LINE, TEXT, FAINT, SHADOW, TRAIL, CONTACT]
+    )
     light = np.linspace(0.4, 1.12, 26)[:, None]
     body = np.concatenate([np.minimum(light * color, 255) for color in MATERIALS])
     grounds = np.array([PAPER, GROUND])
     blends = [back + part * (drawn - back) for back in grounds for part in (0.25, 0.5, 0.75)]
     image = Image.new("P", (1, 1))
-    image.putpalette(np.rint(np.concatenate([grounds, drawn, *blends, body])).astype("u1").tobytes())
+    image.putpalette(
+        np.rint(np.concatenate([grounds, drawn, *blends, body])).astype("u1").tobytes()
+    )
     return image
 
 
-def _video(motions: Sequence[Figure], fps: float, size: int, mesh: Mesh | None) -> Iterator[Image.Image]:
+def _video(
+    motions: Sequence[Figure], fps: float, size: int, mesh: Mesh | None
+) -> Iterator[Image.Image]:
     """Yields images of the panels side by side, one every 1 / fps seconds, with a progress bar."""
     seconds = max(len(motion.joints) / motion.fps for motion in motions)
     columns = len(motions) if len(motions) < 4 else min(4, math.ceil(math.sqrt(len(motions))))
@@ -130,10 +171,15 @@ def _video(motions: Sequence[Figure], fps: float, size: int, mesh: Mesh | None) 
     with ThreadPoolExecutor(min(len(motions), os.cpu_count() or 1)) as pool:
         for tick in range(count):
             # past its end, a motion stays at its last frame
-            now = [min(int(tick / fps * motion.fps + 1e-6), len(motion.joints) - 1) for motion in motions]
+            now = [
+                min(int(tick / fps * motion.fps + 1e-6), len(motion.joints) - 1)
+                for motion in motions
+            ]
             panels = list(pool.map(draw, range(len(motions)), now))
             height = panels[0].height
-            image = Image.new("RGB", (columns * size, math.ceil(len(motions) / columns) * height + 3), PAPER)
+            image = Image.new(
+                "RGB", (columns * size, math.ceil(len(motions) / columns) * height + 3), PAPER
+            )
             for k, panel in enumerate(panels):
                 image.paste(panel, (k % columns * size, k // columns * height))
             done = image.width * (tick + 1) / count
@@ -153,13 +199,17 @@ def _figure(motion: Figure, body: FittedBody | None, frame: int, size: int) -> I
     pixel = size / 256 * SMOOTH
 
     ring, middle = np.linspace(0, 2 * np.pi, 49)[:, None], np.array([x, 0, z])
-    pen.polygon(_points(project(middle + 3 * np.hstack([np.cos(ring), 0 * ring, np.sin(ring)]))), GROUND)
+    pen.polygon(
+        _points(project(middle + 3 * np.hstack([np.cos(ring), 0 * ring, np.sin(ring)]))), GROUND
+    )
     for k in range(-3, 4):
         for point, along in (([round(x) + k, 0, z], [0, 0, 1]), ([x, 0, round(z) + k], [1, 0, 0])):
             inside = 9 - ((point - middle) ** 2).sum()
             if inside > 0:
                 reach = inside**0.5 * np.array(along)
-                pen.line(_points(project(np.stack([point - reach, point + reach]))), LINE, round(pixel))
+                pen.line(
+                    _points(project(np.stack([point - reach, point + reach]))), LINE, round(pixel)
+                )
 
     floor = np.array([1.0, 0.0, 1.0])
     root = motion.joints[: frame + 1, 0] * floor
@@ -172,18 +222,26 @@ def _figure(motion: Figure, body: FittedBody | None, frame: int, size: int) -> I
     for parent, joint in motion.skeleton.edges:
         _capsule(ImageDraw.Draw(dark), soft[parent], soft[joint], 0.055, 255)
     dark = dark.filter(ImageFilter.BoxBlur(size / 192))
-    if box := dark.getbbox():  # enlarged with a margin, so that its edge is the same as that of the whole image
+    # Enlarged with a margin, so that its edge is the same as that of the whole image
+    if box := dark.getbbox():
         left, top, right, bottom = max(0, box[0] - 4), max(0, box[1] - 4), box[2] + 4, box[3] + 4
-        dark = dark.crop((left, top, right, bottom)).resize((4 * (right - left), 4 * (bottom - top)))
+        dark = dark.crop((left, top, right, bottom)).resize(
+            (4 * (right - left), 4 * (bottom - top))
+        )
         image.paste(SHADOW, (4 * left, 4 * top), dark)
     if motion.contacts is not None:
         for joint in np.array(motion.skeleton.feet)[motion.contacts[frame]]:
             cx, cy, scale = shadow[joint][:3]
-            pen.ellipse((cx - 0.06 * scale, cy - 0.02 * scale, cx + 0.06 * scale, cy + 0.02 * scale), CONTACT)
+            pen.ellipse(
+                (cx - 0.06 * scale, cy - 0.02 * scale, cx + 0.06 * scale, cy + 0.02 * scale),
+                CONTACT,
+            )
     if body is not None:
         points, normals = body.skinned(frame)
         at, pixels = project(points), np.array(image)
-        _rasterize(pixels, at[:, :2], at[:, 3], _shaded(normals, body.mesh.colors), body.mesh.triangles)
+        _rasterize(
+            pixels, at[:, :2], at[:, 3], _shaded(normals, body.mesh.colors), body.mesh.triangles
+        )
         return Image.fromarray(pixels).reduce(SMOOTH)
     _draw_skeleton(pen, motion, joints, project, pixel)
     return image.reduce(SMOOTH)
@@ -197,7 +255,9 @@ def _camera(center: np.ndarray, side: int) -> Callable[[np.ndarray], np.ndarray]
         depth = np.maximum(5.0 - offset @ TOWARD, NEAR)
         scale = 2.05 * side / depth
         up = np.cross(TOWARD, RIGHT)
-        return np.stack([side / 2 + offset @ RIGHT * scale, side / 2 - offset @ up * scale, scale, depth], 1)
+        return np.stack(
+            [side / 2 + offset @ RIGHT * scale, side / 2 - offset @ up * scale, scale, depth], 1
+        )
 
     return project
 
@@ -209,7 +269,9 @@ def _shaded(normals: np.ndarray, colors: np.ndarray) -> np.ndarray:
     return np.clip(colors * (0.5 + 0.12 * normals[:, 1] + 0.52 * lit)[:, None], 0, 255)
 
 
-def _rasterize(image: np.ndarray, at: np.ndarray, depth: np.ndarray, colors: np.ndarray, triangles: np.ndarray) -> None:
+def _rasterize(
+    image: np.ndarray, at: np.ndarray, depth: np.ndarray, colors: np.ndarray, triangles: np.ndarray
+) -> None:
     """Draws triangles into an image, the nearest one at each pixel, with colors interpolated between their corners.
 
     The image is (height, width, 3) uint8; `at` (V, 2) are pixel coordinates, y down; `depth` (V,) distances from the
@@ -230,8 +292,12 @@ def _rasterize(image: np.ndarray, at: np.ndarray, depth: np.ndarray, colors: np.
     twice = np.where(seen, twice, 1)
     right, down = low + 0.5 - a.T
     table = [right * cy - down * cx, cy, -cx, down * bx - right * by, -by, bx]
-    table = np.stack([row / twice for row in table] + [wide, low[0] + low[1] * width]).astype(np.float32)
-    second, second_x, second_y, third, third_x, third_y, wide, first = np.repeat(table, count, axis=1)
+    table = np.stack([row / twice for row in table] + [wide, low[0] + low[1] * width]).astype(
+        np.float32
+    )
+    second, second_x, second_y, third, third_x, third_y, wide, first = np.repeat(
+        table, count, axis=1
+    )
     step = np.arange(len(wide)) - np.repeat(np.cumsum(count) - count, count)
     y, x = np.divmod(step.astype(np.float32), wide)
     second += x * second_x + y * second_y
@@ -279,7 +345,12 @@ def _draw_skeleton(
 
 
 def _capsule(
-    pen: ImageDraw.ImageDraw, a: np.ndarray, b: np.ndarray, radius: float, color: Color | int, grow: float = 0
+    pen: ImageDraw.ImageDraw,
+    a: np.ndarray,
+    b: np.ndarray,
+    radius: float,
+    color: Color | int,
+    grow: float = 0,
 ) -> None:
     """Draws a line with round ends of radius `radius` meters plus `grow` pixels."""
     (ax, ay, per_meter_a, *_), (bx, by, per_meter_b, *_) = a, b
@@ -296,7 +367,8 @@ def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 def _lines(motion: Figure, body: FittedBody | None, width: int, size: int) -> list[str]:
     """Returns at most three lines of a motion's caption, and one more if it is drawn as a skeleton."""
     lines, font = [""], _font(size)
-    for word in shortened(motion.text or motion.id, width).split():  # more does not fit into three lines
+    # More does not fit into three lines
+    for word in shortened(motion.text or motion.id, width).split():
         longer = f"{lines[-1]} {word}".strip()
         if font.getlength(longer) <= width - 16:
             lines[-1] = longer

@@ -36,7 +36,9 @@ def sample(
 ) -> Tensor:
     """`Process.sample` with the sampler's options as keywords; without a mask, all frames are real."""
     mask = real(noise(0)) if mask is None else mask
-    return process.sample(denoise, noise, mask, cond, SamplerOptions(**options), edit=edit, trajectory=trajectory)
+    return process.sample(
+        denoise, noise, mask, cond, SamplerOptions(**options), edit=edit, trajectory=trajectory
+    )
 
 
 def real(x: Tensor) -> Tensor:
@@ -51,7 +53,9 @@ def recorded(first: Tensor, rest: Sequence[Tensor] | Tensor = ()) -> Noise:
 
 def drawn(shape: tuple[int, ...], dtype: torch.dtype = torch.float32) -> Noise:
     """Noise that depends on the number of the draw alone."""
-    return lambda draw: torch.randn(shape, generator=torch.Generator().manual_seed(draw), dtype=dtype)
+    return lambda draw: torch.randn(
+        shape, generator=torch.Generator().manual_seed(draw), dtype=dtype
+    )
 
 
 def oracle(process: Process, x: Tensor, start: Tensor | None = None) -> Denoise:
@@ -67,7 +71,9 @@ def oracle(process: Process, x: Tensor, start: Tensor | None = None) -> Denoise:
         if start is not None and isinstance(process, FlowMatching):
             noise = start
         output = process.target(x, noise, time)
-        return torch.cat([output, torch.zeros_like(output)], -1)[..., : process.out_features(x.shape[-1])]
+        return torch.cat([output, torch.zeros_like(output)], -1)[
+            ..., : process.out_features(x.shape[-1])
+        ]
 
     return denoise
 
@@ -88,7 +94,10 @@ def linear_denoiser(A: np.ndarray, b: np.ndarray, g: float) -> Denoise:
 
     def denoise(x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
         weight, bias = torch.from_numpy(A).to(x_t), torch.from_numpy(b).to(x_t)
-        output = torch.einsum("jk,blkf->bljf", weight, x_t.unflatten(-1, (A.shape[1], b.shape[1]))) + bias
+        output = (
+            torch.einsum("jk,blkf->bljf", weight, x_t.unflatten(-1, (A.shape[1], b.shape[1])))
+            + bias
+        )
         return (output + g * t.to(x_t)[:, None, None, None] / 1000).flatten(-2)
 
     return denoise

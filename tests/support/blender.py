@@ -12,7 +12,9 @@ bpy.context.scene.render.fps = fps
 if path.endswith(".glb"):
     bpy.ops.import_scene.gltf(filepath=path)
 else:
-    bpy.ops.import_anim.bvh(filepath=path, global_scale=0.01, update_scene_fps=True, update_scene_duration=True)
+    bpy.ops.import_anim.bvh(
+        filepath=path, global_scale=0.01, update_scene_fps=True, update_scene_duration=True
+    )
 armature = next(object_ for object_ in bpy.data.objects if object_.type == "ARMATURE")
 first, last = (round(frame) for frame in armature.animation_data.action.frame_range)
 shown = []

@@ -13,7 +13,9 @@ import bpy  # pyright: ignore[reportMissingImports]
 
 package, requests, out = sys.argv[1], json.loads(Path(sys.argv[2]).read_text()), Path(sys.argv[3])
 bpy.ops.wm.read_factory_settings(use_empty=True)
-bpy.ops.extensions.package_install_files(filepath=package, repo="user_default", enable_on_install=True)
+bpy.ops.extensions.package_install_files(
+    filepath=package, repo="user_default", enable_on_install=True
+)
 scene, results = bpy.context.scene, []
 
 
@@ -29,7 +31,11 @@ def picture(frame: int) -> None:
     scene.world = bpy.data.worlds.new("world")
     scene.world.color = (0.2, 0.2, 0.2)
     scene.camera, scene.render.engine, scene.cycles.samples = camera, "CYCLES", 16
-    scene.render.resolution_x, scene.render.resolution_y, scene.render.filepath = 480, 480, str(out / "picture.png")
+    scene.render.resolution_x, scene.render.resolution_y, scene.render.filepath = (
+        480,
+        480,
+        str(out / "picture.png"),
+    )
     scene.frame_set(frame)
     bpy.ops.render.render(write_still=True)
 
@@ -39,7 +45,9 @@ for settings, fps, character in requests:
     if character:
         bpy.ops.import_scene.gltf(filepath=character)
         bpy.data.objects.remove(bpy.data.objects["Icosphere"])  # Blender's import adds it
-        armature = next(item for item in bpy.context.scene.objects if item.type == "ARMATURE" and item.children)
+        armature = next(
+            item for item in bpy.context.scene.objects if item.type == "ARMATURE" and item.children
+        )
         bpy.context.view_layer.objects.active = armature
         armature.select_set(True)
     before = len(bpy.data.objects), len(bpy.data.armatures), len(bpy.data.actions)

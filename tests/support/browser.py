@@ -21,7 +21,9 @@ CHROMIUM = shutil.which("chromium")
 
 def in_chromium(test: Callable[..., None]) -> Callable[..., None]:
     """Marks a test that drives Chromium."""
-    return pytest.mark.tools(pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")(test))
+    return pytest.mark.tools(
+        pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")(test)
+    )
 
 
 class Tab:
@@ -52,7 +54,9 @@ class Tab:
 
     def run(self, script: str) -> Any:
         """Returns the value of a JavaScript expression."""
-        answer = self.send("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
+        answer = self.send(
+            "Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True
+        )
         assert "exceptionDetails" not in answer, answer
         return answer["result"].get("value")
 
@@ -68,12 +72,20 @@ class Tab:
         self.send("Page.navigate", url=url)
 
     def size(self, width: int, height: int) -> None:
-        self.send("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+        self.send(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=1,
+            mobile=False,
+        )
 
     def type(self, selector: str, text: str) -> None:
         """Replaces the text of a field, as keys would."""
         self.wait(f"!!document.querySelector({json.dumps(selector)})")
-        self.run(f"(e => {{ e.focus(); e.select() }})(document.querySelector({json.dumps(selector)}))")
+        self.run(
+            f"(e => {{ e.focus(); e.select() }})(document.querySelector({json.dumps(selector)}))"
+        )
         self.send("Input.insertText", text=text)
 
     def click(self, selector: str) -> None:
@@ -86,7 +98,9 @@ class Tab:
             self.send("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
 
     def screenshot(self, path: Path, whole: bool = False) -> bytes:
-        data = base64.b64decode(self.send("Page.captureScreenshot", captureBeyondViewport=whole)["data"])
+        data = base64.b64decode(
+            self.send("Page.captureScreenshot", captureBeyondViewport=whole)["data"]
+        )
         path.write_bytes(data)
         return data
 
@@ -95,9 +109,22 @@ class Tab:
 def browser(profile: Path, width: int = 1280, height: int = 900) -> Iterator[Tab]:
     """Starts Chromium with an empty page."""
     assert CHROMIUM is not None
-    words = [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-dev-shm-usage"]
-    words += ["--disable-background-networking", f"--user-data-dir={profile}", "--remote-debugging-port=0"]
-    with subprocess.Popen([*words, "about:blank"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+    words = [
+        CHROMIUM,
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--no-first-run",
+        "--disable-dev-shm-usage",
+    ]
+    words += [
+        "--disable-background-networking",
+        f"--user-data-dir={profile}",
+        "--remote-debugging-port=0",
+    ]
+    with subprocess.Popen(
+        [*words, "about:blank"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    ) as process:
         try:
             port = profile / "DevToolsActivePort"
             end = time.monotonic() + 60
@@ -118,7 +145,9 @@ def _tab(port: int, width: int, height: int) -> Iterator[Tab]:
             async with session.get(f"http://127.0.0.1:{port}/json") as answer:
                 pages = [page for page in await answer.json() if page["type"] == "page"]
             if pages:
-                return session, await session.ws_connect(pages[0]["webSocketDebuggerUrl"], max_msg_size=0)
+                return session, await session.ws_connect(
+                    pages[0]["webSocketDebuggerUrl"], max_msg_size=0
+                )
 
     session, socket = loop.run_until_complete(connect())
     try:

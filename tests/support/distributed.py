@@ -37,7 +37,9 @@ class GlooPool:
                 for rank in range(self.size)
             ]
             seen = self.run(_rank_and_size)
-            assert seen == [(rank, self.size) for rank in range(self.size)], "the processes do not see one another"
+            assert seen == [(rank, self.size) for rank in range(self.size)], (
+                "the processes do not see one another"
+            )
             self.stack = stack.pop_all()
         return self
 

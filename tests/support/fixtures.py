@@ -29,7 +29,9 @@ SHARED = Path(os.environ.get("FLAME_MDM_SHARED", ROOT.parent / "shared"))
 
 Arrays = dict[str, np.ndarray]
 
-GENERATION = [name for name in recipes() if name.partition("/")[0] not in ("classifier", "motion_clip", "t2m")]
+GENERATION = [
+    name for name in recipes() if name.partition("/")[0] not in ("classifier", "motion_clip", "t2m")
+]
 """Names of the recipes of models that generate motions."""
 
 
@@ -37,7 +39,9 @@ GENERATION = [name for name in recipes() if name.partition("/")[0] not in ("clas
 def python_with(package: str, variable: str) -> str:
     """A Python that has a package: the one that an environment variable names, or this one; tests skip without it."""
     python = os.environ.get(variable, sys.executable)
-    if subprocess.run([python, "-c", f"import {package}"], capture_output=True, check=False).returncode:
+    if subprocess.run(
+        [python, "-c", f"import {package}"], capture_output=True, check=False
+    ).returncode:
         pytest.skip(f"no package {package}: set {variable} to a Python that has it")
     return python
 
@@ -70,12 +74,15 @@ def recipe(name: str) -> dict[str, Any]:
 def _digest() -> str:
     """Hash of all files that decide how a recipe is composed."""
     files = [*(ROOT / "experiments").rglob("*.yaml"), *(ROOT / "flame_mdm" / "config").glob("*.py")]
-    content = b"".join(str(path.relative_to(ROOT)).encode() + path.read_bytes() for path in sorted(files))
+    content = b"".join(
+        str(path.relative_to(ROOT)).encode() + path.read_bytes() for path in sorted(files)
+    )
     return hashlib.sha256(content).hexdigest()[:16]
 
 
 needs_third_party = pytest.mark.skipif(
-    not SHARED.is_dir(), reason=f"third-party fixtures are not redistributed and {SHARED} does not exist"
+    not SHARED.is_dir(),
+    reason=f"third-party fixtures are not redistributed and {SHARED} does not exist",
 )
 
 
@@ -98,7 +105,9 @@ def load(path: Path) -> Arrays:
 
 def tensors(arrays: Arrays) -> dict[str, torch.Tensor]:
     """The numbers of a fixture."""
-    return {key: torch.from_numpy(value) for key, value in arrays.items() if value.dtype.kind in "fi"}
+    return {
+        key: torch.from_numpy(value) for key, value in arrays.items() if value.dtype.kind in "fi"
+    }
 
 
 def meta(arrays: Arrays) -> dict:
@@ -113,7 +122,11 @@ def groups(arrays: Arrays, suffix: str) -> list[str]:
 
 def weights(arrays: Arrays, prefix: str = "state/") -> dict[str, torch.Tensor]:
     """The state dict of a fixture."""
-    return {name.removeprefix(prefix): torch.from_numpy(x) for name, x in arrays.items() if name.startswith(prefix)}
+    return {
+        name.removeprefix(prefix): torch.from_numpy(x)
+        for name, x in arrays.items()
+        if name.startswith(prefix)
+    }
 
 
 def assert_within(ours: torch.Tensor, arrays: Arrays, name: str, like: str | None = None) -> None:
@@ -122,9 +135,13 @@ def assert_within(ours: torch.Tensor, arrays: Arrays, name: str, like: str | Non
     torch.testing.assert_close(ours, torch.from_numpy(arrays[name]), atol=tolerance, rtol=0)
 
 
-def golden_cases(stem: str, cases: Iterable[str]) -> Callable[[Callable[..., None]], Callable[..., None]]:
+def golden_cases(
+    stem: str, cases: Iterable[str]
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Marks a test on each `case` of a fixture, with the fixture's name in its id."""
-    parameters = pytest.mark.parametrize("case", [pytest.param(case, id=f"{stem}-{case}") for case in cases])
+    parameters = pytest.mark.parametrize(
+        "case", [pytest.param(case, id=f"{stem}-{case}") for case in cases]
+    )
     return lambda test: pytest.mark.golden(parameters(test))
 
 

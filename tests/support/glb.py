@@ -40,7 +40,9 @@ class Glb:
         begin = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
         assert begin % 4 == 0
         width = WIDTHS[accessor["type"]]
-        array = np.frombuffer(self.binary, KINDS[accessor["componentType"]], accessor["count"] * width, begin).copy()
+        array = np.frombuffer(
+            self.binary, KINDS[accessor["componentType"]], accessor["count"] * width, begin
+        ).copy()
         array = array.reshape(-1, width)
         assert accessor.get("min", array.min(0).tolist()) == array.min(0).tolist()
         assert accessor.get("max", array.max(0).tolist()) == array.max(0).tolist()
@@ -50,7 +52,9 @@ class Glb:
         """Values of the first animation: (node, property) -> (F, K)."""
         animation = self.document["animations"][0]
         outputs = [self.array(sampler["output"]) for sampler in animation["samplers"]]
-        targets = [(channel["target"], outputs[channel["sampler"]]) for channel in animation["channels"]]
+        targets = [
+            (channel["target"], outputs[channel["sampler"]]) for channel in animation["channels"]
+        ]
         return {(target["node"], target["path"]): values for target, values in targets}
 
     def worlds(self) -> np.ndarray:
@@ -71,7 +75,10 @@ class Glb:
         for number, node in enumerate(nodes):
             if "matrix" in node:
                 local[:, number] = np.array(node["matrix"]).reshape(4, 4).T
-        worlds, waiting = local.copy(), list(self.document["scenes"][self.document.get("scene", 0)]["nodes"])
+        worlds, waiting = (
+            local.copy(),
+            list(self.document["scenes"][self.document.get("scene", 0)]["nodes"]),
+        )
         for number in waiting:
             for child in nodes[number].get("children", []):
                 worlds[:, child] = worlds[:, number] @ local[:, child]
@@ -128,11 +135,18 @@ def odd_character(path: Path, motion: Motion, turned: bool = True) -> None:
         node["translation"] = [100 * x for x in node["translation"]]
         node["name"] = "Rig Bone-" + node["name"][::-1]
     half = 0.5**0.5
-    nodes[lifted] |= {"scale": [0.01] * 3, "rotation": [half if turned else 0.0, 0, 0, half if turned else 1.0]}
+    nodes[lifted] |= {
+        "scale": [0.01] * 3,
+        "rotation": [half if turned else 0.0, 0, 0, half if turned else 1.0],
+    }
     if turned:  # a node that undoes it: the file is y up again
         nodes.append({"name": "armature", "rotation": [-half, 0, 0, half], "children": [lifted]})
-        document["scenes"][0]["nodes"] = [len(nodes) - 1 if root == lifted else root for root in roots]
-    view = document["bufferViews"][document["accessors"][document["skins"][0]["inverseBindMatrices"]]["bufferView"]]
+        document["scenes"][0]["nodes"] = [
+            len(nodes) - 1 if root == lifted else root for root in roots
+        ]
+    view = document["bufferViews"][
+        document["accessors"][document["skins"][0]["inverseBindMatrices"]]["bufferView"]
+    ]
     part = slice(view["byteOffset"], view["byteOffset"] + view["byteLength"])
     bind = np.frombuffer(data[part], "<f4").reshape(-1, 4, 4).copy()
     bind[:, :, :3] *= 100  # of columns, as matrices are stored: the mesh stays in meters
@@ -142,6 +156,8 @@ def odd_character(path: Path, motion: Motion, turned: bool = True) -> None:
 
 def write_names(path: Path, **other: str | None) -> None:
     """The file of names of `odd_character`, with other names of some joints."""
-    names = {joint: "Rig Bone-" + name[::-1] for joint, name in joint_names(presets()["unreal"]).items()}
+    names = {
+        joint: "Rig Bone-" + name[::-1] for joint, name in joint_names(presets()["unreal"]).items()
+    }
     lines = (f"{joint}: {json.dumps(name)}\n" for joint, name in {**names, **other}.items())
     path.write_text("".join(lines))

@@ -27,7 +27,11 @@ HOSTILE = "</script><img src=x onerror=alert(1)><!-- __TITLE__ \u2028 \"'&amp; &
 
 @cache
 def _clip(action: str, fps: float, size: int, seed: int) -> np.ndarray:
-    clips = (clip for clip in Synthetic(clips=size, seed=seed).clips(fps) if clip.attributes["action"] == action)
+    clips = (
+        clip
+        for clip in Synthetic(clips=size, seed=seed).clips(fps)
+        if clip.attributes["action"] == action
+    )
     return np.asarray(next(clips).motion)
 
 
@@ -37,7 +41,11 @@ def synthetic(action: str = "walk", fps: float = 20.0, size: int = 60, seed: int
 
 
 def sway(
-    frames: int = 30, fps: float = 20, skeleton: Skeleton = SMPL22, contacts: bool = False, **names: Any
+    frames: int = 30,
+    fps: float = 20,
+    skeleton: Skeleton = SMPL22,
+    contacts: bool = False,
+    **names: Any,
 ) -> Motion:
     """A figure of any skeleton that stands in its rest pose, sways and moves forward."""
     bones = 0.2 * np.array(skeleton.raw_offsets, dtype=float)
@@ -46,13 +54,21 @@ def sway(
         pose[joint] = pose[parent] + bones[joint]
     pose[:, 1] -= pose[:, 1].min()
     time = np.arange(frames)[:, None, None] / fps
-    joints = pose + np.random.default_rng(0).normal(0, 0.05, pose.shape) * np.sin(6 * time) + time * [0, 0, 1.2]
+    joints = (
+        pose
+        + np.random.default_rng(0).normal(0, 0.05, pose.shape) * np.sin(6 * time)
+        + time * [0, 0, 1.2]
+    )
     touch = np.arange(frames * len(skeleton.feet)).reshape(frames, -1) % 3 == 0
     return Motion(joints, fps, skeleton, contacts=touch if contacts else None, **names)
 
 
 def posed(
-    frames: int = 1, scale: float = 1.0, heading: ArrayLike = 0.0, root: ArrayLike | None = None, **turns: ArrayLike
+    frames: int = 1,
+    scale: float = 1.0,
+    heading: ArrayLike = 0.0,
+    root: ArrayLike | None = None,
+    **turns: ArrayLike,
 ) -> Motion:
     """SMPL's body, whose rotations are known, at 20 frames per second.
 
@@ -66,18 +82,24 @@ def posed(
     rotations = np.tile(np.eye(3), (frames, 22, 1, 1))
     for name, angles in turns.items():
         vectors = np.broadcast_to(angles, (frames, 3))
-        rotations[:, SMPL22.joints.index(name)] = Rotation.from_euler("xyz", vectors, degrees=True).as_matrix()
+        rotations[:, SMPL22.joints.index(name)] = Rotation.from_euler(
+            "xyz", vectors, degrees=True
+        ).as_matrix()
     headings = np.broadcast_to(heading, frames)[:, None] * [0.0, 1.0, 0.0]
     rotations[:, 0] = Rotation.from_rotvec(headings).as_matrix() @ rotations[:, 0]
     pelvis = np.broadcast_to([0.0, 0.955 * scale, 0.0] if root is None else root, (frames, 3))
     offsets = torch.tensor(scale * np.array(ADULT[:22]))
-    return motion_of_poses(Poses(offsets, torch.tensor(rotations), torch.tensor(np.array(pelvis))), 20)
+    return motion_of_poses(
+        Poses(offsets, torch.tensor(rotations), torch.tensor(np.array(pelvis))), 20
+    )
 
 
 def degrees(rotations: ArrayLike) -> np.ndarray:
     """The angles (...) of rotations (..., 3, 3)."""
     matrices = np.asarray(rotations)
-    return np.degrees(Rotation.from_matrix(matrices.reshape(-1, 3, 3)).magnitude()).reshape(matrices.shape[:-2])
+    return np.degrees(Rotation.from_matrix(matrices.reshape(-1, 3, 3)).magnitude()).reshape(
+        matrices.shape[:-2]
+    )
 
 
 def largest_step(rotations: ArrayLike) -> float:
@@ -128,7 +150,9 @@ class Page(HTMLParser):
 
 def unpacked(packed: dict[str, Any]) -> np.ndarray:
     """Joints (F, J, 3) of a motion in a page."""
-    quanta = np.frombuffer(base64.b64decode(packed["joints"]), "<i2").reshape(packed["frames"], -1, 3)
+    quanta = np.frombuffer(base64.b64decode(packed["joints"]), "<i2").reshape(
+        packed["frames"], -1, 3
+    )
     return packed["center"] + quanta * packed["step"]
 
 
@@ -147,4 +171,9 @@ def wander(joints: int, frames: int, seed: int) -> torch.Tensor:
 def frames_array(motion: Motion, size: int = 256) -> np.ndarray:
     """Each frame of a motion as an image, (F, size, size, 3) uint8."""
     fitted, _ = motion.try_fit()
-    return np.stack([np.asarray(render._figure(motion, fitted, frame, size)) for frame in range(len(motion.joints))])
+    return np.stack(
+        [
+            np.asarray(render._figure(motion, fitted, frame, size))
+            for frame in range(len(motion.joints))
+        ]
+    )

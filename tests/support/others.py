@@ -16,7 +16,11 @@ from support.glb import changed
 from support.motions import posed, synthetic
 
 POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n"
-TURNED = {"z": [[1, 0, 0], [0, 0, -1], [0, 1, 0]], "-y": [[1, 0, 0], [0, -1, 0], [0, 0, -1]], "y": np.eye(3)}
+TURNED = {
+    "z": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
+    "-y": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
+    "y": np.eye(3),
+}
 """Axis that points up -> rows of the rotation of joints with y up to these axes."""
 
 
@@ -49,13 +53,18 @@ def write_bvh(path: Path, motion: Motion, turn: Any = None, first: Any = None) -
     local[:, 1:] -= local[:, :1]
     frames = np.concatenate([local, np.zeros_like(local)], 2).reshape(len(local), -1)
     channels = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "XYZ")
-    tree = bvh.Bvh(SMPL22.joints, (-1, *[0] * 21), np.zeros((22, 3)), (channels,) * 22, frames, motion.fps)
+    tree = bvh.Bvh(
+        SMPL22.joints, (-1, *[0] * 21), np.zeros((22, 3)), (channels,) * 22, frames, motion.fps
+    )
     bvh.write(tree, path)
 
 
 def swapped(motion: Motion) -> np.ndarray:
     """The joints (F, 22, 3) with left and right exchanged."""
-    names = [name.replace("left", "x").replace("right", "left").replace("x", "right") for name in SMPL22.joints]
+    names = [
+        name.replace("left", "x").replace("right", "left").replace("x", "right")
+        for name in SMPL22.joints
+    ]
     return motion.joints[:, [SMPL22.joints.index(name) for name in names]]
 
 
@@ -78,7 +87,9 @@ def _with_rate_of_one_element(path: Path) -> None:
 
 
 def _halves(path: Path) -> None:
-    halves: dict[str, Any] = {name: np.asarray(values, np.float16) for name, values in amass(walk()).items()}
+    halves: dict[str, Any] = {
+        name: np.asarray(values, np.float16) for name, values in amass(walk()).items()
+    }
     np.savez(path, **halves)
 
 
@@ -141,8 +152,12 @@ COLLECTED: dict[str, Callable[[Path], object]] = {
     "f04_rotmat_216.npz": _matrices,
     "f05_json_z_up.json": _json_z_up,
     "f06_tpose_first.bvh": lambda path: _bvh(path, first=posed(1).joints[0]),
-    "f09_names_with_spaces.bvh": lambda path: _names(path, lambda name: f"Actor {name.split(':')[1]}", "mixamo"),
-    "f09_prefix_underscore.bvh": lambda path: _names(path, lambda name: f"Character1_{name.split(':')[1]}", "mixamo"),
+    "f09_names_with_spaces.bvh": lambda path: _names(
+        path, lambda name: f"Actor {name.split(':')[1]}", "mixamo"
+    ),
+    "f09_prefix_underscore.bvh": lambda path: _names(
+        path, lambda name: f"Character1_{name.split(':')[1]}", "mixamo"
+    ),
     "f09_smpl_capital.bvh": lambda path: _names(path, str.title),
     "f11_meshopt.glb": _meshopt,
     "f12_thirty_joints.npz": _thirty_joints,

@@ -14,9 +14,17 @@ PROMPTS = ("a person walks", "a person jumps", "a person <waves> & bows")
 def a_run(folder: Path, name: str = "default", **changes: Any) -> Path:
     """The folder of a run of 10 logged steps; `changes` are keys of its configuration."""
     folder.mkdir(parents=True)
-    config = {"experiment": "mine", "run": {"name": name, "dir": str(folder)}, "trainer": {"max_steps": 20}, **changes}
+    config = {
+        "experiment": "mine",
+        "run": {"name": name, "dir": str(folder)},
+        "trainer": {"max_steps": 20},
+        **changes,
+    }
     (folder / "config.yaml").write_text(json.dumps(config))
-    lines = [{"step": k, "train/loss": 2.0**-k, "val/p/fid": 3.0 + k, "val/p/fid/ci": 0.5} for k in range(10)]
+    lines = [
+        {"step": k, "train/loss": 2.0**-k, "val/p/fid": 3.0 + k, "val/p/fid/ci": 0.5}
+        for k in range(10)
+    ]
     (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     return folder
 
@@ -35,10 +43,25 @@ def motions(folder: Path, prompts: tuple[str, ...] = PROMPTS, at: float = 0.0) -
 def result(**changes: Any) -> dict[str, Any]:
     """A result of an evaluation, as far as pages read it."""
     value = {"ci": 0.25, "replications": 2, "n": 64}
-    checkpoint = {"path": "last.ckpt", "sha256": "0123456789", "sampler": "ddim", "num_inference_steps": 5}
+    checkpoint = {
+        "path": "last.ckpt",
+        "sha256": "0123456789",
+        "sampler": "ddim",
+        "num_inference_steps": 5,
+    }
     return {
-        **{"quick": False, "invalid_because": [], "changed": {}, "split": "test", "seed": 0, "device": "cpu"},
-        **{"protocol": {"name": "p", "version": 3}, "data": {"dataset": "synthetic", "fingerprint": "abc"}},
+        **{
+            "quick": False,
+            "invalid_because": [],
+            "changed": {},
+            "split": "test",
+            "seed": 0,
+            "device": "cpu",
+        },
+        **{
+            "protocol": {"name": "p", "version": 3},
+            "data": {"dataset": "synthetic", "fingerprint": "abc"},
+        },
         **{"extractor": None, "checkpoint": checkpoint | {"guidance_scale": 2.5}},
         "values": {"fid": {"mean": 4.5, **value}, "kid": {"mean": None, **value, "ci": None}},
         "ground_truth": {"fid": {"mean": 0.125, **value}},

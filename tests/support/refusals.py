@@ -53,8 +53,11 @@ class Refused:
             late = True
             raise TimeoutError
 
-        handlers = {signum: signal.signal(signum, alarm) for signum in (signal.SIGALRM, signal.SIGPROF)}
-        signal.setitimer(signal.ITIMER_PROF, self.seconds)  # of this process: other programs do not count
+        handlers = {
+            signum: signal.signal(signum, alarm) for signum in (signal.SIGALRM, signal.SIGPROF)
+        }
+        # Of this process: other programs do not count
+        signal.setitimer(signal.ITIMER_PROF, self.seconds)
         signal.alarm(WAITING * self.seconds)
         limits = resource.getrlimit(resource.RLIMIT_AS)
         if self.memory is not None:
@@ -62,7 +65,9 @@ class Refused:
         try:
             code: object = main([command, *words])
         except BaseException as error:
-            code = f"{type(error).__name__}: {error} ({traceback.extract_tb(error.__traceback__)[-1]})"
+            code = (
+                f"{type(error).__name__}: {error} ({traceback.extract_tb(error.__traceback__)[-1]})"
+            )
         finally:
             signal.setitimer(signal.ITIMER_PROF, 0)
             signal.alarm(0)
@@ -72,7 +77,9 @@ class Refused:
         out, err = self.capture.readouterr()
         changed = self._tree() ^ before
         faults = [
-            f"no end after {self.seconds} s" if late else "",  # which code that catches every exception hides
+            f"no end after {self.seconds} s"
+            if late
+            else "",  # which code that catches every exception hides
             f"it ended with {code}" if code not in (1, 2) else "",
             f"it left {sorted(map(str, changed))}" if changed else "",
             "a traceback" if "Traceback" in out + err else "",
@@ -131,7 +138,11 @@ def one_line(err: str) -> bool:
 
     What goes before an error in the middle of work are its progress bars, on lines of their own.
     """
-    lines = [line for line in err.splitlines() if line and not re.match(r"\r?(generating|preparing \w+): ", line)]
+    lines = [
+        line
+        for line in err.splitlines()
+        if line and not re.match(r"\r?(generating|preparing \w+): ", line)
+    ]
     return len(lines) == 1 and lines[0].startswith("error: ") and len(lines[0]) > len("error: ") + 8
 
 

@@ -28,7 +28,12 @@ from flame_mdm.training.distillation import DistillationTask
 SECONDS = 120
 
 TINY = [
-    *("data.source.clips=120", "data.batch_size=8", "denoiser.latent_dim=16", "denoiser.ff_size=16"),
+    *(
+        "data.source.clips=120",
+        "data.batch_size=8",
+        "denoiser.latent_dim=16",
+        "denoiser.ff_size=16",
+    ),
     *("denoiser.num_layers=1", "denoiser.num_heads=2", "process.num_train_timesteps=10"),
     *("task.num_inference_steps=5", "trainer.accelerator=cpu", "trainer.enable_progress_bar=false"),
     *("condition.features=16", "condition.pretrain_steps=10"),
@@ -40,13 +45,28 @@ TINY = [
 # SGD: Adam makes much of gradients that are 0 but for rounding.
 RUN = [
     "speed=reference",
-    *("data.batch_size=1", "ema=null", "logger=csv", "callbacks.best=null", "callbacks.checkpoints.every_n_steps=2"),
-    *("trainer.val_check_interval=2", "trainer.log_every_n_steps=2", "trainer.gradient_clip_val=0.5"),
+    *(
+        "data.batch_size=1",
+        "ema=null",
+        "logger=csv",
+        "callbacks.best=null",
+        "callbacks.checkpoints.every_n_steps=2",
+    ),
+    *(
+        "trainer.val_check_interval=2",
+        "trainer.log_every_n_steps=2",
+        "trainer.gradient_clip_val=0.5",
+    ),
     *("optimizer._target_=torch.optim.SGD", "optimizer.lr=0.05"),
 ]
 """Overrides of a run whose weights `reference` computes."""
 
-TINY_DIP = ["denoiser.latent_dim=16", "denoiser.ff_size=16", "denoiser.num_layers=1", "denoiser.num_heads=2"]
+TINY_DIP = [
+    "denoiser.latent_dim=16",
+    "denoiser.ff_size=16",
+    "denoiser.num_layers=1",
+    "denoiser.num_heads=2",
+]
 TINY_DIP += ["condition.features=16", "process.num_train_timesteps=4", "task.num_inference_steps=4"]
 """Overrides of the smallest model of `synthetic/dip`."""
 
@@ -84,7 +104,9 @@ def built(words: list[str], name: str) -> tuple[Config, MotionDataModule, Genera
     config = compose(name, words)
     torch.manual_seed(config["seed"])
     representation = instantiate(config["representation"])
-    data: MotionDataModule = instantiate(config["data"], representation=representation, seed=config["seed"])
+    data: MotionDataModule = instantiate(
+        config["data"], representation=representation, seed=config["seed"]
+    )
     data.setup("fit")
     torch.manual_seed(config["seed"])
     task: GeneratorTask = get_class(config["task"]["_target_"]).build(config, representation)
@@ -103,7 +125,11 @@ def reference(words: list[str], steps: int, name: str = "quickstart") -> dict[st
     task.log_dict = lambda *_, **__: None  # type: ignore[method-assign]
     optimizer = task.make_optimizer()
     streams = [
-        iter(TrainingBatches(data.train.lengths, data.batch_size, seed=config["seed"], first=0, rank=r, world=2))
+        iter(
+            TrainingBatches(
+                data.train.lengths, data.batch_size, seed=config["seed"], first=0, rank=r, world=2
+            )
+        )
         for r in range(2)
     ]
     for step in range(steps):

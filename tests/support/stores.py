@@ -64,7 +64,9 @@ def write_folder(
     (folder / "new_joint_vecs").mkdir(parents=True)
     (folder / "texts").mkdir()
     for number, (name, (frames, lines)) in enumerate(motions.items()):
-        features = np.tile(1000.0 * number + np.arange(frames)[:, None], (1, width)).astype(np.float32)
+        features = np.tile(1000.0 * number + np.arange(frames)[:, None], (1, width)).astype(
+            np.float32
+        )
         for copy, values in ((name, features), (f"M{name}", -features)):
             if copy == name or mirror:
                 np.save(folder / "new_joint_vecs" / f"{copy}.npy", values)
@@ -81,7 +83,9 @@ def write_words(folder: Path, words: list[str], vectors: np.ndarray) -> Path:
     """Word vectors (N, 300) under the names that Guo et al. gave their files."""
     folder.mkdir(parents=True, exist_ok=True)
     np.save(folder / "our_vab_data.npy", vectors)
-    (folder / "our_vab_idx.pkl").write_bytes(pickle.dumps({word: row for row, word in enumerate(words)}))
+    (folder / "our_vab_idx.pkl").write_bytes(
+        pickle.dumps({word: row for row, word in enumerate(words)})
+    )
     return folder
 
 
@@ -104,13 +108,21 @@ def write_humanact12(folder: Path, clips: int = 360, **columns) -> Path:
     """The pickle as ACTOR hands it out: lists of arrays of all lengths, labels in no order."""
     made = [poses(20 + 7 * (k % 15), k) for k in range(clips)]
     turns, joints = [pose for pose, _ in made], [positions for _, positions in made]
-    data = {"poses": turns, "oldposes": turns, "joints3D": joints, "y": [k % 12 for k in range(clips)]}
+    data = {
+        "poses": turns,
+        "oldposes": turns,
+        "joints3D": joints,
+        "y": [k % 12 for k in range(clips)],
+    }
     folder.mkdir()
     return written(folder / "humanact12poses.pkl", data | columns)
 
 
 VIDEOS = [
-    *(f"a{k % 40}_d0_p{subject:03d}_c1_color.avi" for k, subject in enumerate([*TRAIN_SUBJECTS, 3, 4, 118])),
+    *(
+        f"a{k % 40}_d0_p{subject:03d}_c1_color.avi"
+        for k, subject in enumerate([*TRAIN_SUBJECTS, 3, 4, 118])
+    ),
     "a3_d5_p003_c2_color.avi",
     "a3_d8_p003_c2_color.avi",
     "a3_d8_p004_c1_color.avi",
@@ -135,7 +147,9 @@ def write_uestc(folder: Path, **changed) -> Path:
     shown = [*lengths[:-2], 44, 44]
     (folder / "info" / "names.txt").write_text("\n".join(VIDEOS) + "\n")
     (folder / "info" / "num_frames_min.txt").write_text("\n".join(map(str, shown)) + "\n")
-    (folder / "info" / "action_classes.txt").write_text("".join(f"exercise-{k}\n" for k in range(40)))
+    (folder / "info" / "action_classes.txt").write_text(
+        "".join(f"exercise-{k}\n" for k in range(40))
+    )
     return folder
 
 
@@ -204,8 +218,14 @@ def write_downloads(root: Path) -> Path:
     np.savez(root / "amass" / "KIT" / "3" / "shape.npz", betas=np.zeros(16))
     for seed, gender in enumerate(("male", "female")):
         write_body(root / "bodies" / "smplh" / gender / "model.npz", seed)
-    motions = {f"{n:06d}": (1, [line("a person moves"), line("someone moves", 0.5, 1)]) for n in range(6)}
-    splits = {"train": ["000000", "000001", "000002", "000003"], "val": ["000004"], "test": ["000005"]}
+    motions = {
+        f"{n:06d}": (1, [line("a person moves"), line("someone moves", 0.5, 1)]) for n in range(6)
+    }
+    splits = {
+        "train": ["000000", "000001", "000002", "000003"],
+        "val": ["000004"],
+        "test": ["000005"],
+    }
     folder = write_folder(root / "HumanML3D" / "HumanML3D", motions, splits, 263)
     shutil.rmtree(folder / "new_joint_vecs")
     for name in ("Mean", "Std"):
@@ -234,7 +254,9 @@ def kit_walk(frames: int) -> np.ndarray:
     time = np.arange(frames)[:, None, None] / 100
     turn = 0.4 * time[..., 0]
     x, y, z = np.moveaxis(np.broadcast_to(body, (frames, 21, 3)), -1, 0)
-    turned = np.stack([np.cos(turn) * x + np.sin(turn) * z, y, np.cos(turn) * z - np.sin(turn) * x], -1)
+    turned = np.stack(
+        [np.cos(turn) * x + np.sin(turn) * z, y, np.cos(turn) * z - np.sin(turn) * x], -1
+    )
     return turned + 1000 * np.concatenate([np.sin(time), 0 * time, np.cos(time)], 2)
 
 
@@ -243,15 +265,28 @@ def write_mmm(root: Path) -> Path:
     folder = root / "kit-mmm-xyz"
     folder.mkdir()
     names = [name.split("_")[-1] for name in KIT21.joints]
-    head = ",".join(["", *(f"{number}{name}_{axis}" for number, name in enumerate(names) for axis in "xyz")])
+    head = ",".join(
+        ["", *(f"{number}{name}_{axis}" for number, name in enumerate(names) for axis in "xyz")]
+    )
     for name, frames in KIT_FRAMES.items():
-        captions = [] if name == "00005" else ["A person walks in a circle.", f"Somebody walks, take {name}."]
+        captions = (
+            []
+            if name == "00005"
+            else ["A person walks in a circle.", f"Somebody walks, take {name}."]
+        )
         (folder / f"{name}_annotations.json").write_text(json.dumps(captions))
-        (folder / f"{name}_meta.json").write_text(json.dumps({"nb_annotations": len(captions), "motion": {}}))
+        (folder / f"{name}_meta.json").write_text(
+            json.dumps({"nb_annotations": len(captions), "motion": {}})
+        )
         rows = np.column_stack([np.arange(frames), kit_walk(frames).reshape(frames, 63)])
         np.savetxt(folder / f"{name}_fke.csv", rows, "%.4f", ",", header=head, comments="")
     (root / "kit-splits").mkdir()
-    splits = {"train": sorted(KIT_FRAMES)[:5], "val": ["00006"], "test": ["00007", "00008"], "ghosh-test": ["00008"]}
+    splits = {
+        "train": sorted(KIT_FRAMES)[:5],
+        "val": ["00006"],
+        "test": ["00007", "00008"],
+        "ghosh-test": ["00008"],
+    }
     for split, listed in splits.items():
         (root / "kit-splits" / split).write_text("\n".join(listed) + "\n")
     return folder
@@ -264,7 +299,11 @@ BABEL_FILES = ("train", "extra_train", "val", "extra_val")
 
 def sequence(name: str, labels: list[dict] | None, extra: bool) -> dict:
     """One entry of a file of BABEL; `name` is the path of the motion in AMASS."""
-    annotation = None if labels is None else {"babel_lid": "x", "anntr_id": "y", "mul_act": True, "labels": labels}
+    annotation = (
+        None
+        if labels is None
+        else {"babel_lid": "x", "anntr_id": "y", "mul_act": True, "labels": labels}
+    )
     whole = {"babel_lid": "z", "labels": [label("walk", ["walk"], None, None)]}
     if extra:
         other = {"babel_lid": "x", "labels": [label("another annotator", ["jump"], 0, 9)]}
@@ -272,12 +311,24 @@ def sequence(name: str, labels: list[dict] | None, extra: bool) -> dict:
         kept = {"seq_anns": [whole], "frame_anns": annotations}
     else:
         kept = {"seq_ann": whole, "frame_ann": annotation}
-    return {"babel_sid": 0, "url": "https://", "feat_p": f"{name.split('/')[0]}/{name}", "dur": 1.0, **kept}
+    return {
+        "babel_sid": 0,
+        "url": "https://",
+        "feat_p": f"{name.split('/')[0]}/{name}",
+        "dur": 1.0,
+        **kept,
+    }
 
 
 def label(text: str, categories: list[str] | None, start: float | None, end: float | None) -> dict:
     times = {"start_t": start, "end_t": end}
-    return {"raw_label": text.upper(), "proc_label": text, "seg_id": "s", "act_cat": categories, **times}
+    return {
+        "raw_label": text.upper(),
+        "proc_label": text,
+        "seg_id": "s",
+        "act_cat": categories,
+        **times,
+    }
 
 
 def write_babel(folder: Path, sequences: dict[str, dict[str, dict]]) -> Path:
@@ -304,12 +355,18 @@ LABELS = [
 
 def small_babel(root: Path) -> tuple[Path, Path]:
     """BABEL with a few motions of 15 s in both parts, and one without frame labels."""
-    names = [f"CMU/{k:02d}/{k:02d}_01_poses.npz" for k in [*range(23), 27]]  # of the val part, 27 is for testing
+    # Of the val part, 27 is for testing
+    names = [f"CMU/{k:02d}/{k:02d}_01_poses.npz" for k in [*range(23), 27]]
     for seed, name in enumerate(names):
         write_amass(root / "amass" / name, 900, 60.0, seed)
     sequences = {
-        "train": {str(k): sequence(name, LABELS if k else None, False) for k, name in enumerate(names[:12])},
-        "extra_train": {str(k): sequence(name, LABELS[:1], True) for k, name in enumerate(names[12:14])},
+        "train": {
+            str(k): sequence(name, LABELS if k else None, False)
+            for k, name in enumerate(names[:12])
+        },
+        "extra_train": {
+            str(k): sequence(name, LABELS[:1], True) for k, name in enumerate(names[12:14])
+        },
         "val": {str(k): sequence(name, LABELS, False) for k, name in enumerate(names[14:])},
     }
     return write_babel(root / "babel", sequences), root / "amass"
@@ -329,7 +386,10 @@ TAKES = {
 }
 
 
-ROWS = [row.split() for row in (Path(__file__).parent / "bandai_skeleton.txt").read_text().splitlines()[1:]]
+ROWS = [
+    row.split()
+    for row in (Path(__file__).parent / "bandai_skeleton.txt").read_text().splitlines()[1:]
+]
 BONES = {name: np.array(offset, float) for name, _, *offset in ROWS}
 """Joint -> where it is seen from its parent, in cm."""
 
@@ -342,7 +402,9 @@ def synthetic_take(seed: int, frames: int) -> bvh.Bvh:
     phase, size = rng.uniform(0, 6, (2, 22, 3))
     axes = {name: REST.get(name, np.eye(3)) for name in ["-", *joints]}
     local = np.stack([axes[parent].T @ axes[name] for name, parent, *_ in ROWS])
-    turns = Rotation.from_euler("ZXY", (4 * size * np.sin(3 * time + phase)).reshape(-1, 3), degrees=True)
+    turns = Rotation.from_euler(
+        "ZXY", (4 * size * np.sin(3 * time + phase)).reshape(-1, 3), degrees=True
+    )
     posed = Rotation.from_matrix(np.tile(local, (frames, 1, 1))) * turns
     angles = posed.as_euler("ZXY", degrees=True).reshape(frames, -1, 3)
     values = np.concatenate([np.tile(offsets, (frames, 1, 1)), angles], 2)
@@ -352,7 +414,10 @@ def synthetic_take(seed: int, frames: int) -> bvh.Bvh:
     ends = ("Head", "Hand_L", "Hand_R", "Toes_L", "Toes_R")
     return bvh.Bvh(
         (*joints, *(f"{name}.end" for name in ends)),
-        (*(-1 if parent == "-" else joints.index(parent) for _, parent, *_ in ROWS), *map(joints.index, ends)),
+        (
+            *(-1 if parent == "-" else joints.index(parent) for _, parent, *_ in ROWS),
+            *map(joints.index, ends),
+        ),
         np.concatenate([offsets, np.zeros((5, 3))]),
         (*(channels,) * 22, *[()] * 5),
         values.reshape(frames, -1),

@@ -67,7 +67,9 @@ def known_skeletons() -> list[dict[str, str]]:
     try:
         return json.loads((FOLDER / "skeletons.json").read_text(encoding="utf-8"))
     except ValueError as error:
-        raise ValueError(f"skeletons.json is damaged ({error}). Install the extension again") from error
+        raise ValueError(
+            f"skeletons.json is damaged ({error}). Install the extension again"
+        ) from error
 
 
 def read_armature(armature):
@@ -82,7 +84,9 @@ def read_armature(armature):
     joints, missing = matched(armature.name, labels, recognized(labels, known_skeletons()))
     if missing:
         rigs = "Mixamo, Unreal, Unity, SMPL, or Rigify's metarig"
-        raise ValueError(f"{armature.name}: no bone found for {', '.join(missing)}. Use names of {rigs}")
+        raise ValueError(
+            f"{armature.name}: no bone found for {', '.join(missing)}. Use names of {rigs}"
+        )
     matrix = np.array(armature.matrix_world)
     sizes = np.linalg.svd(matrix[:3, :3], compute_uv=False)
     if np.linalg.det(matrix[:3, :3]) <= 0 or sizes[0] > 1.01 * sizes[2]:
@@ -90,12 +94,25 @@ def read_armature(armature):
     worlds = matrix @ np.array([bone.matrix_local for bone in bones])
     corners, place = [worlds[:, :3, 3]], matrix[:3, 3] * [1, 1, 0]
     for item in bpy.data.objects:
-        moved = any(modifier.type == "ARMATURE" and modifier.object == armature for modifier in item.modifiers)
+        moved = any(
+            modifier.type == "ARMATURE" and modifier.object == armature
+            for modifier in item.modifiers
+        )
         if moved and item.type == "MESH":
-            corners.append(np.array([item.matrix_world @ vertex.co for vertex in item.data.vertices]).reshape(-1, 3))
+            corners.append(
+                np.array([item.matrix_world @ vertex.co for vertex in item.data.vertices]).reshape(
+                    -1, 3
+                )
+            )
     parents = [names.index(bone.parent.name) if bone.parent else -1 for bone in bones]
-    positions, turned, lowest = worlds[:, :3, 3] - place, worlds[:, :3, :3] / sizes[1], np.concatenate(corners) - place
-    return rest_pose(armature.name, names, parents, positions, turned, joints, lowest, (0, 0, 1)), sizes[1]
+    positions, turned, lowest = (
+        worlds[:, :3, 3] - place,
+        worlds[:, :3, :3] / sizes[1],
+        np.concatenate(corners) - place,
+    )
+    return rest_pose(
+        armature.name, names, parents, positions, turned, joints, lowest, (0, 0, 1)
+    ), sizes[1]
 
 
 def new_armature(context, name: str, motion: Sampled):
@@ -117,7 +134,9 @@ def new_armature(context, name: str, motion: Sampled):
         children = [child for child, above in enumerate(SMPL22.parents) if above == joint]
         highest = max(children, key=lambda child: rest[child, 2], default=None)
         bone.head = rest[joint]
-        bone.tail = rest[joint] + (rest[joint] - rest[parent]) / 2 if highest is None else rest[highest]
+        bone.tail = (
+            rest[joint] + (rest[joint] - rest[parent]) / 2 if highest is None else rest[highest]
+        )
         bone.parent = bones[parent] if parent >= 0 else None
     bpy.ops.object.mode_set(mode="OBJECT")
     return armature
@@ -165,7 +184,9 @@ def animate(context, armature, name: str, motion: Sampled, own: bool) -> int:
             turn = quaternions[low].slerp(quaternions[low + 1], time - low)
             turn.make_compatible(last)
             bone.rotation_quaternion = last = turn
-            bone.keyframe_insert("rotation_quaternion", frame=scene.frame_start + number, group=bone.name)
+            bone.keyframe_insert(
+                "rotation_quaternion", frame=scene.frame_start + number, group=bone.name
+            )
             if moves:
                 bone.location = places[low] + (time - low) * (places[low + 1] - places[low])
                 bone.keyframe_insert("location", frame=scene.frame_start + number, group=bone.name)
@@ -187,12 +208,19 @@ def located(rig: Rig, world: np.ndarray, positions: np.ndarray, joint: int) -> n
 
 class Settings(bpy.types.PropertyGroup):
     __annotations__ = {
-        "sentence": StringProperty(name="", description="What the person does", default="a person walks forward"),
+        "sentence": StringProperty(
+            name="", description="What the person does", default="a person walks forward"
+        ),
         "seconds": FloatProperty(name="Seconds", default=3, min=0.1, step=10, precision=1),
-        "seed": IntProperty(name="Seed", description="Another seed gives another motion", default=0),
-        "in_place": BoolProperty(name="In place", description="Leave out the path of the hips over the floor"),
+        "seed": IntProperty(
+            name="Seed", description="Another seed gives another motion", default=0
+        ),
+        "in_place": BoolProperty(
+            name="In place", description="Leave out the path of the hips over the floor"
+        ),
         "onto_selected": BoolProperty(
-            name="Onto the selected armature", description="Names of Mixamo, Unreal, Unity, SMPL, or Rigify's metarig"
+            name="Onto the selected armature",
+            description="Names of Mixamo, Unreal, Unity, SMPL, or Rigify's metarig",
         ),
     }
 
@@ -223,7 +251,9 @@ class Generate(bpy.types.Operator):
         except (ValueError, OSError) as error:
             self.report({"ERROR"}, str(error))
             return False
-        self.sampled = POOL.submit(sample, self.sentence, settings.seconds, settings.seed, settings.in_place)
+        self.sampled = POOL.submit(
+            sample, self.sentence, settings.seconds, settings.seed, settings.in_place
+        )
         Generate.running = self.sampled
         return True
 
@@ -268,13 +298,20 @@ class Generate(bpy.types.Operator):
 
 
 class Sidebar(bpy.types.Panel):
-    bl_space_type, bl_region_type, bl_category, bl_label = "VIEW_3D", "UI", "Motion", "Motion from a sentence"
+    bl_space_type, bl_region_type, bl_category, bl_label = (
+        "VIEW_3D",
+        "UI",
+        "Motion",
+        "Motion from a sentence",
+    )
     bl_idname = "FLAME_MDM_PT_sidebar"
 
     def draw(self, context):
         for name in Settings.__annotations__:
             self.layout.prop(context.scene.flame_mdm, name)
-        self.layout.operator(Generate.bl_idname, text="Generate" if Generate.poll(context) else "Sampling")
+        self.layout.operator(
+            Generate.bl_idname, text="Generate" if Generate.poll(context) else "Sampling"
+        )
 
 
 CLASSES = Settings, Generate, Sidebar

@@ -55,12 +55,16 @@ class Abilities:
             named = [entry.name for entry in actions().values() if plain in entry.names]
             named = named or [mention.action for mention in understand(plain).mentions[:1]]
             listed |= dict.fromkeys(named)
-        return [action for action in listed if self.has_words(actions()[action].say.format(side=""))]
+        return [
+            action for action in listed if self.has_words(actions()[action].say.format(side=""))
+        ]
 
     @cached_property
     def is_simultaneous(self) -> bool:
         """Whether some caption of the model has two actions at the same time."""
-        marked = [text for text in self.captions if " while " in text or " at the same time" in text]
+        marked = [
+            text for text in self.captions if " while " in text or " at the same time" in text
+        ]
         return any(len(step) > 1 for text in marked for step in understand(text).steps)
 
     def has_words(self, text: str) -> bool:
@@ -86,12 +90,17 @@ class Abilities:
         if name == "count" and "steps" in actions()[action].takes:
             return False  # "takes two steps" of captions is as good as "takes a few steps"
 
-        verbs = {form for phrase in actions()[action].phrases for form in inflections(phrase.words[0])}
+        verbs = {
+            form for phrase in actions()[action].phrases for form in inflections(phrase.words[0])
+        }
         parts = WORDS_OF_VALUES.get(value, (str(value),))
         for text in self.captions:
             if any(part in text for part in parts) and verbs & set(text.lower().split()):
                 mentions = understand(text).mentions
-                if any(mention.action == action and mention.attributes.get(name) == value for mention in mentions):
+                if any(
+                    mention.action == action and mention.attributes.get(name) == value
+                    for mention in mentions
+                ):
                     return True
         return False
 

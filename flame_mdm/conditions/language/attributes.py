@@ -7,7 +7,21 @@ from flame_mdm.conditions.language.tables import ActionEntry, Value, phrases, wo
 from flame_mdm.conditions.language.tokens import Token
 
 LEFT_OR_RIGHT = ("left", "right")
-MEASURES = ("degree", "meter", "metre", "m", "second", "s", "foot", "mile", "step", "percent", "minute", "hour", "way")
+MEASURES = (
+    "degree",
+    "meter",
+    "metre",
+    "m",
+    "second",
+    "s",
+    "foot",
+    "mile",
+    "step",
+    "percent",
+    "minute",
+    "hour",
+    "way",
+)
 
 
 class Reader:
@@ -20,7 +34,9 @@ class Reader:
         verb: numbers of the tokens of the phrase for the action, whose meaning is used.
     """
 
-    def __init__(self, entry: ActionEntry, tokens: Sequence[Token], own: Sequence[int], verb: Collection[int]):
+    def __init__(
+        self, entry: ActionEntry, tokens: Sequence[Token], own: Sequence[int], verb: Collection[int]
+    ):
         self.entry, self.tokens, self.own, self.verb = entry, tokens, own, set(verb)
         self.used: set[int] = set()
         self.dropped: set[int] = set()
@@ -91,7 +107,11 @@ class Reader:
         before, after = self._word(position - 1), self._word(position + 1)
         if value in ("up", "down") and "vertical" not in self.entry.takes:
             return
-        if word in ("back", "reverse", "right", "left") and before in words_of("determiners") and word == "back":
+        if (
+            word in ("back", "reverse", "right", "left")
+            and before in words_of("determiners")
+            and word == "back"
+        ):
             return
         if value in LEFT_OR_RIGHT:
             after = self._word(position + 2) if after in words_of("determiners") else after
@@ -142,7 +162,9 @@ class Reader:
             if "step" in base_forms(following[0]):
                 self._state("count", count, number)
             return
-        if any(base in words_of("sides_of") for after in following[:2] for base in base_forms(after)):
+        if any(
+            base in words_of("sides_of") for after in following[:2] for base in base_forms(after)
+        ):
             return
         if self._names_action(position):
             self._state("count", count, number)

@@ -33,7 +33,10 @@ CONNECTORS = {
     ("meanwhile",): WHILE,
 }
 """Words that say in which order two clauses happen, the longest first."""
-AT_THE_END = {(word,) for word in ("simultaneously", "meanwhile", "at", "in", "afterwards", "afterward", "later")}
+AT_THE_END = {
+    (word,)
+    for word in ("simultaneously", "meanwhile", "at", "in", "afterwards", "afterward", "later")
+}
 """First words of connectors that may also stand at the end of the clause to which they belong."""
 NEED_SUBJECT = ("once", "as")
 """Connectors only if a subject follows: "once they have", not "jumps once"."""
@@ -76,7 +79,9 @@ def _clauses(tokens: Sequence[Token], matches: Sequence[Match]) -> Iterator[Clau
     while number < len(tokens):
         token = tokens[number]
         words = () if number in inside else _connector(tokens, number)
-        if number in inside or not (words or not token.is_word or token.word in ("and", "or", "but")):
+        if number in inside or not (
+            words or not token.is_word or token.word in ("and", "or", "but")
+        ):
             clause.numbers.append(number)
             number += 1
             continue

@@ -43,7 +43,11 @@ def find_phrases(tokens: Sequence[Token]) -> list[Match]:
 
 
 def _longest_at(tokens: Sequence[Token], start: int) -> tuple[tuple[int, ...], Phrase | None]:
-    listed = [phrase for base in base_forms(tokens[start].word) for phrase in phrases_by_first_word().get(base, ())]
+    listed = [
+        phrase
+        for base in base_forms(tokens[start].word)
+        for phrase in phrases_by_first_word().get(base, ())
+    ]
     listed.sort(key=lambda phrase: -phrase.size)
     for phrase in listed:
         used = _match(tokens, start, phrase.words)
@@ -75,12 +79,21 @@ def _match(tokens: Sequence[Token], start: int, words: Sequence[str]) -> tuple[i
 
 
 def _is_negated(tokens: Sequence[Token], number: int) -> bool:
-    return number > 0 and tokens[number - 1].word in words_of("negation") and tokens[number].word != "not"
+    return (
+        number > 0
+        and tokens[number - 1].word in words_of("negation")
+        and tokens[number].word != "not"
+    )
 
 
 def _is_weak(tokens: Sequence[Token], used: Sequence[int], phrase: Phrase) -> bool:
     """Returns whether a phrase is a general verb, such as "go", or a noun after an article, such as "the guard"."""
     if phrase.size > 1:
-        return phrase.words in {("stand", "still"), ("take", "step"), ("stand", "around"), ("stand", "there")}
+        return phrase.words in {
+            ("stand", "still"),
+            ("take", "step"),
+            ("stand", "around"),
+            ("stand", "there"),
+        }
     before = tokens[used[0] - 1].word if used[0] else ""
     return phrase.words[0] in words_of("weak") or before in words_of("determiners")

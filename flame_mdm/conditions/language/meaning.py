@@ -74,7 +74,11 @@ def _action_vectors() -> tuple[list[str], np.ndarray, np.ndarray]:
     names = list(actions())
     rows, vectors = [], []
     for row, entry in enumerate(actions().values()):
-        single = [phrase.words[0] for phrase in entry.phrases if phrase.size == 1 and phrase.words[0] not in weak]
+        single = [
+            phrase.words[0]
+            for phrase in entry.phrases
+            if phrase.size == 1 and phrase.words[0] not in weak
+        ]
         listed = [vector for word in single if (vector := table.vector(word)) is not None]
         if not listed and (vector := table.mean(list(entry.phrases[0].words))) is not None:
             listed = [vector]

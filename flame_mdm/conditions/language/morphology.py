@@ -54,7 +54,12 @@ def inflections(verb: str) -> tuple[str, ...]:
 
 def _doubles(verb: str) -> bool:
     """Returns whether the last consonant of a verb may be doubled: hop, hopping."""
-    return len(verb) > 2 and verb[-1] not in f"{VOWELS}wxy" and verb[-2] in VOWELS and verb[-3] not in VOWELS
+    return (
+        len(verb) > 2
+        and verb[-1] not in f"{VOWELS}wxy"
+        and verb[-2] in VOWELS
+        and verb[-3] not in VOWELS
+    )
 
 
 @cache

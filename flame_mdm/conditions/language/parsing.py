@@ -10,7 +10,13 @@ from flame_mdm.conditions.language.matching import Match, find_phrases
 from flame_mdm.conditions.language.meaning import SIMILAR, is_thing, nearest_actions, nearest_to
 from flame_mdm.conditions.language.morphology import base_forms
 from flame_mdm.conditions.language.tables import Phrase, actions, phrases, word_values, words_of
-from flame_mdm.conditions.language.tokens import Token, corrected, corrected_to_action, is_foreign, tokenize
+from flame_mdm.conditions.language.tokens import (
+    Token,
+    corrected,
+    corrected_to_action,
+    is_foreign,
+    tokenize,
+)
 from flame_mdm.conditions.language.understanding import Mention, Step, Understanding
 
 NEAREST = 3  # number of actions to choose from if none is understood
@@ -26,7 +32,11 @@ def understand(text: str) -> Understanding:
     tokens = corrected(typed)
     matches = find_phrases(tokens)
     if not matches:
-        free = [number for number, token in enumerate(tokens) if token.is_word and not is_explained(token.word)]
+        free = [
+            number
+            for number, token in enumerate(tokens)
+            if token.is_word and not is_explained(token.word)
+        ]
         tokens = corrected_to_action(tokens, free)
         matches = find_phrases(tokens)
 
@@ -175,7 +185,12 @@ class _Sentence:
         self.verbs.add(match.first)
         first, last = self.tokens[match.first], self.tokens[match.last]
         return Mention(
-            match.phrase.action, stated, self._words(numbers), first.start, last.end, self.typed.get(match.first, "")
+            match.phrase.action,
+            stated,
+            self._words(numbers),
+            first.start,
+            last.end,
+            self.typed.get(match.first, ""),
         )
 
     def _again(self, clause: Clause, steps: Sequence[Step]) -> list[Step]:
@@ -190,7 +205,13 @@ class _Sentence:
             return []
         verb = self.text[before.start : before.end]
         words = f"{verb} {self._words(clause.numbers)}"
-        return [(Mention(before.action, {**before.attributes, **stated}, words, before.start, before.end),)]
+        return [
+            (
+                Mention(
+                    before.action, {**before.attributes, **stated}, words, before.start, before.end
+                ),
+            )
+        ]
 
     def _is_manner(self, clause: Clause, steps: Sequence[Step]) -> bool:
         """Returns whether a clause says what happens during the one before: "stands still, waving"."""
@@ -201,7 +222,9 @@ class _Sentence:
         preceded = [number for number in clause.numbers if number < clause.matches[0].first]
         if preceded or not verb.word.endswith("ing"):
             return False
-        return before.action == "idle" or not self.text[before.start : before.end].lower().endswith("ing")
+        return before.action == "idle" or not self.text[before.start : before.end].lower().endswith(
+            "ing"
+        )
 
     def _words(self, numbers: Sequence[int]) -> str:
         """Returns the words of a clause, as typed."""

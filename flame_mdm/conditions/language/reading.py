@@ -39,7 +39,9 @@ class Reading:
         """Returns what was understood in one line: "walks forward, then waves twice"."""
         if not self.steps:
             return self.texts[0]
-        return ", then ".join(" + ".join(predicate(mention) for mention in step) for step in self.steps)
+        return ", then ".join(
+            " + ".join(predicate(mention) for mention in step) for step in self.steps
+        )
 
     def warnings(self) -> list[str]:
         """Returns lines about what is sampled differently from what the sentence says."""
@@ -60,7 +62,11 @@ class Reader:
     @staticmethod
     def fits(facts: Mapping[str, Any]) -> bool:
         """Returns whether a model, of these facts, has captions of single actions."""
-        return bool(facts.get("verbs")) and bool(facts.get("actions")) and bool(facts.get("vocabulary"))
+        return (
+            bool(facts.get("verbs"))
+            and bool(facts.get("actions"))
+            and bool(facts.get("vocabulary"))
+        )
 
     def read(self, text: str) -> Reading:
         """Returns a sentence as the model reads it.
@@ -79,7 +85,9 @@ class Reader:
         if not understood.steps:
             if understood.unknown and self.abilities.has_words(" ".join(understood.unknown)):
                 return as_typed
-            raise NotUnderstood(f"{shown}: no word says what happens", self.abilities.nearest(understood))
+            raise NotUnderstood(
+                f"{shown}: no word says what happens", self.abilities.nearest(understood)
+            )
 
         try:
             return self._read_steps(understood, shown, style)
@@ -90,19 +98,32 @@ class Reader:
 
     def _read_steps(self, understood: Understanding, shown: str, style: str) -> Reading:
         """Returns the actions of a sentence as captions; raises `NotUnderstood` if the model lacks one."""
-        notes = _Notes([f"'{typed}' is read as '{word}'" for typed, word in understood.corrected.items()])
+        notes = _Notes(
+            [f"'{typed}' is read as '{word}'" for typed, word in understood.corrected.items()]
+        )
         notes.ignored += understood.unknown
         steps: list[Step] = []
         texts: list[str] = []
         for step in _joined(understood.steps, self.abilities.actions):
             read = tuple(self._mention(mention, shown, notes) for mention in step)
-            parts = [part for one in self._possible(read, notes) for part in self._repeated(one, notes)]
+            parts = [
+                part for one in self._possible(read, notes) for part in self._repeated(one, notes)
+            ]
             steps += parts
-            texts += [read[0].text] if len(parts) == len(step) == 1 else [caption(part) for part in parts]
+            texts += (
+                [read[0].text]
+                if len(parts) == len(step) == 1
+                else [caption(part) for part in parts]
+            )
 
         special = {word.lower() for word in understood.unknown} & self.abilities.vocabulary
-        captions = [f"{_caption(step, words, special)}{style}" for step, words in zip(steps, texts, strict=True)]
-        ignored = tuple(word for word in dict.fromkeys(notes.ignored) if word.lower() not in special)
+        captions = [
+            f"{_caption(step, words, special)}{style}"
+            for step, words in zip(steps, texts, strict=True)
+        ]
+        ignored = tuple(
+            word for word in dict.fromkeys(notes.ignored) if word.lower() not in special
+        )
         changes = tuple(dict.fromkeys(notes.changes))
         return Reading(understood, tuple(steps), tuple(captions), tuple(texts), changes, ignored)
 
@@ -110,8 +131,12 @@ class Reader:
         """Returns a mention of an action that the model knows, with the attributes that it knows."""
         action, attributes = self._known_action(mention)
         if action is None:
-            nearest = [caption((Mention(name),)) for name in self.abilities.ranked(mention.action)[:3]]
-            raise NotUnderstood(f"{shown}: the model does not know '{predicate(Mention(mention.action))}'", nearest)
+            nearest = [
+                caption((Mention(name),)) for name in self.abilities.ranked(mention.action)[:3]
+            ]
+            raise NotUnderstood(
+                f"{shown}: the model does not know '{predicate(Mention(mention.action))}'", nearest
+            )
 
         if mention.typed:
             notes.changes.append(f"'{mention.typed}' is read as '{predicate(Mention(action))}'")
@@ -126,7 +151,8 @@ class Reader:
                 continue
             value = mention.attributes[name]
             takes = actions()[action].takes
-            is_repetition = name == "count" and name in takes and "steps" not in takes  # see `_repeated`
+            # See `_repeated`
+            is_repetition = name == "count" and name in takes and "steps" not in takes
             if is_repetition or (name in takes and self.abilities.supports(action, name, value)):
                 stated[name] = value
             elif name not in attributes and (name, value) != ("speed", "normal"):
@@ -149,7 +175,9 @@ class Reader:
         if len(distinct) == 1 or self.abilities.is_simultaneous:
             return [distinct]
         both = " and ".join(f"'{predicate(mention)}'" for mention in distinct)
-        notes.changes.append(f"the model cannot do {both} at the same time: they are sampled one after the other")
+        notes.changes.append(
+            f"the model cannot do {both} at the same time: they are sampled one after the other"
+        )
         return [(mention,) for mention in distinct]
 
     def _repeated(self, step: Step, notes: "_Notes") -> list[Step]:
@@ -166,7 +194,9 @@ class Reader:
         repeats: list[int] = []
         while (missing := int(count) - sum(repeats)) > 0:
             repeats.append(next(n for n in [*counts, missing] if n <= missing))
-        notes.changes.append(f"{attribute_words('count', count)} is sampled as {' + '.join(map(str, repeats))}")
+        notes.changes.append(
+            f"{attribute_words('count', count)} is sampled as {' + '.join(map(str, repeats))}"
+        )
         return [(mention.stating(count=n),) for n in repeats]
 
 
@@ -175,7 +205,11 @@ class NotUnderstood(UserError):
 
     def __init__(self, message: str, nearest: Sequence[str]):
         suggested = " or ".join(f"'{text}'" for text in nearest)
-        super().__init__(f"{message}. Nearest in meaning: {suggested}" if nearest else f"{message}. Name an action")
+        super().__init__(
+            f"{message}. Nearest in meaning: {suggested}"
+            if nearest
+            else f"{message}. Name an action"
+        )
         self.message = message
         self.nearest = tuple(nearest)
 
@@ -190,7 +224,11 @@ class _Notes:
 
 def _joined(steps: Sequence[Step], names: Sequence[str]) -> list[Step]:
     """Returns the steps with pairs that the model knows as one action: "stretches both arms and leans to the left"."""
-    pairs = {entry.joins: entry.name for entry in actions().values() if entry.joins and entry.name in names}
+    pairs = {
+        entry.joins: entry.name
+        for entry in actions().values()
+        if entry.joins and entry.name in names
+    }
     joined: list[Step] = []
     for step in steps:
         before = joined[-1] if joined else ()
@@ -198,7 +236,11 @@ def _joined(steps: Sequence[Step], names: Sequence[str]) -> list[Step]:
         if pair in pairs and len(before) == 1:
             text = f"{before[0].text} and {step[0].text}"
             attributes = {**before[0].attributes, **step[0].attributes}
-            taken = {name: value for name, value in attributes.items() if name in actions()[pairs[pair]].takes}
+            taken = {
+                name: value
+                for name, value in attributes.items()
+                if name in actions()[pairs[pair]].takes
+            }
             joined[-1] = (replace(step[0], action=pairs[pair], attributes=taken, text=text),)
         else:
             joined.append(step)

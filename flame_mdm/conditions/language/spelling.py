@@ -6,7 +6,21 @@ from flame_mdm.conditions.language.morphology import inflections
 from flame_mdm.conditions.language.tables import GAP, actions, phrases, words_of
 
 NEVER_CORRECTED = 2  # maximum length of words that are too short to be recognized as another word
-FREQUENT = ("a", "the", "with", "and", "then", "to", "left", "right", "person", "man", "woman", "forward", "times")
+FREQUENT = (
+    "a",
+    "the",
+    "with",
+    "and",
+    "then",
+    "to",
+    "left",
+    "right",
+    "person",
+    "man",
+    "woman",
+    "forward",
+    "times",
+)
 
 
 def distance(first: str, second: str, most: int) -> int:
@@ -52,7 +66,9 @@ def corrections(word: str) -> tuple[str, ...]:
 @cache
 def action_words() -> frozenset[str]:
     """Returns the forms of all words in the phrases for actions."""
-    bases = {word for entry in actions().values() for phrase in entry.phrases for word in phrase.words}
+    bases = {
+        word for entry in actions().values() for phrase in entry.phrases for word in phrase.words
+    }
     return frozenset(form for base in bases - {GAP} for form in inflections(base))
 
 
@@ -65,5 +81,7 @@ def _correct_words() -> tuple[str, ...]:
         listed |= frozenset(tables[key])
     for key in ("direction", "speed"):
         listed |= frozenset(word for words in tables[key].values() for word in words.split())
-    nouns = {form for word in words_of("body") | words_of("objects") for form in inflections(word)[:2]}
+    nouns = {
+        form for word in words_of("body") | words_of("objects") for form in inflections(word)[:2]
+    }
     return tuple(dict.fromkeys([*FREQUENT, *sorted(action_words()), *sorted(listed | nouns)]))

@@ -14,7 +14,9 @@ from flame_mdm.conditions.language.vectors import word_table
 
 TOKEN = re.compile(r"(?:anti|counter)[- ]?clockwise|\d+|[^\W\d_]+|[.,;:!?|\n]", re.IGNORECASE)
 HYPHEN = re.compile("[- ]")
-RARE = 12_000  # rank in frequency from which a real word may be a typo of an action, in a sentence without an action
+# Rank in frequency from which a real word may be a typo of an action, in a sentence without an
+# action
+RARE = 12_000
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,10 @@ class Token:
 def tokenize(text: str) -> list[Token]:
     """Returns the words and punctuation marks of a sentence, as typed."""
     matches = TOKEN.finditer(text)
-    return [Token(match[0], HYPHEN.sub("", match[0].lower()), match.start(), match.end()) for match in matches]
+    return [
+        Token(match[0], HYPHEN.sub("", match[0].lower()), match.start(), match.end())
+        for match in matches
+    ]
 
 
 def is_known(word: str) -> bool:
@@ -69,12 +74,16 @@ def is_foreign(tokens: Sequence[Token]) -> bool:
         return False
     listed = [word in _listed() for word in words]
     typical = max(([word in marks for word in words] for marks in _foreign().values()), key=sum)
-    foreign = [is_typical and not is_listed for is_typical, is_listed in zip(typical, listed, strict=True)]
+    foreign = [
+        is_typical and not is_listed for is_typical, is_listed in zip(typical, listed, strict=True)
+    ]
     accents = [not word.isascii() for word in words]
     if not any(foreign) and not any(accents):
         return False
     marks = zip(words, foreign, accents, strict=True)
-    english = [is_english(word) for word, is_marked, is_accented in marks if not (is_marked or is_accented)]
+    english = [
+        is_english(word) for word, is_marked, is_accented in marks if not (is_marked or is_accented)
+    ]
     return sum(english) * 2 < len(words)
 
 
@@ -82,12 +91,19 @@ def is_english(word: str) -> bool:
     """Returns whether a word is in the tables, in any form, frequent, or a typo of a word in the tables."""
     rank = word_table().rank(word)
     is_frequent = rank is not None and rank < RARE
-    return is_frequent or any(form in _listed() for form in base_forms(word)) or bool(corrections(word))
+    return (
+        is_frequent
+        or any(form in _listed() for form in base_forms(word))
+        or bool(corrections(word))
+    )
 
 
 def corrected(tokens: Sequence[Token]) -> list[Token]:
     """Returns the tokens with words that are not English replaced by what they are a typo of, if it is clear."""
-    return [_corrected(token) if token.is_word and not is_known(token.word) else token for token in tokens]
+    return [
+        _corrected(token) if token.is_word and not is_known(token.word) else token
+        for token in tokens
+    ]
 
 
 def corrected_to_action(tokens: Sequence[Token], free: Collection[int]) -> list[Token]:
@@ -103,7 +119,11 @@ def corrected_to_action(tokens: Sequence[Token], free: Collection[int]) -> list[
         meant = nearest_actions(token.word)
         if meant and meant[0][1] >= SIMILAR:
             continue
-        near = [word for word in sorted(action_words()) if len(word) > 2 and distance(token.word, word, 1) == 1]
+        near = [
+            word
+            for word in sorted(action_words())
+            if len(word) > 2 and distance(token.word, word, 1) == 1
+        ]
         starts = [word for word in near if word[0] == token.word[0]]
         if starts:
             return [*tokens[:number], _read_as(token, starts[0]), *tokens[number + 1 :]]
@@ -126,7 +146,12 @@ def _read_as(token: Token, word: str) -> Token:
 def _listed() -> frozenset[str]:
     """Returns the words of all tables, with the forms of verbs and nouns."""
     tables = phrases()
-    words = set(action_words()) | set(tables["numbers"]) | set(tables["times"]) | set(tables["speed_again"])
+    words = (
+        set(action_words())
+        | set(tables["numbers"])
+        | set(tables["times"])
+        | set(tables["speed_again"])
+    )
     for key in ("direction", "speed"):
         words |= set(word_values(key))
     for key in ("people", "function", "objects", "body"):

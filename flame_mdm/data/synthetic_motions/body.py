@@ -10,10 +10,24 @@ from collections.abc import Sequence
 import numpy as np
 
 # Offsets from the parent in meters, standing with hanging arms, facing +z; x for the left side, mirrored on the right.
-HIP, SPINE1, SPINE2, SPINE3 = (0.075, -0.075, 0.0), (0.0, 0.131, -0.015), (0.0, 0.142, 0.0), (0.0, 0.057, 0.01)
-NECK, HEAD, COLLAR, SHOULDER = (0.0, 0.217, -0.02), (0.0, 0.085, 0.058), (0.072, 0.119, -0.01), (0.125, -0.02, -0.01)
+HIP, SPINE1, SPINE2, SPINE3 = (
+    (0.075, -0.075, 0.0),
+    (0.0, 0.131, -0.015),
+    (0.0, 0.142, 0.0),
+    (0.0, 0.057, 0.01),
+)
+NECK, HEAD, COLLAR, SHOULDER = (
+    (0.0, 0.217, -0.02),
+    (0.0, 0.085, 0.058),
+    (0.072, 0.119, -0.01),
+    (0.125, -0.02, -0.01),
+)
 THIGH, SHIN, UPPER_ARM, FOREARM = 0.393, 0.429, 0.260, 0.268
-ANKLE_HEIGHT, FOOT = 0.06, (0.0, -0.06, 0.134)  # a flat foot: the ankle at 6 cm, the toe joint on the floor
+# A flat foot: the ankle at 6 cm, the toe joint on the floor
+ANKLE_HEIGHT, FOOT = (
+    0.06,
+    (0.0, -0.06, 0.134),
+)
 STAND = 0.97  # target height of the pelvis in meters, which standing legs just do not reach
 
 LEFT, RIGHT = 0, 1
@@ -51,7 +65,9 @@ class Body:
     Angles are in radians. The first axis of feet and arms is the side: 0 = left, 1 = right.
     """
 
-    def __init__(self, rng: np.random.Generator, t: np.ndarray, width: float | Sequence[float] | None = None):
+    def __init__(
+        self, rng: np.random.Generator, t: np.ndarray, width: float | Sequence[float] | None = None
+    ):
         """`width` is half the distance between the feet in meters, or its range; None = that of a relaxed stance."""
         self.t = t
         half = rng.uniform(width[0], width[1]) if isinstance(width, Sequence) else width
@@ -59,10 +75,14 @@ class Body:
         self.heading = np.zeros(len(t))
         self.pelvis = self._drift(rng, 0.015, 3)  # pitch forward, yaw to the left, roll to the left
         self.spine = self._drift(rng, 0.025, 3)
-        self.spine[0] += 0.018 * np.sin(2 * np.pi * (rng.uniform(0.22, 0.32) * t + rng.random())) + rng.normal(0, 0.03)
+        self.spine[0] += 0.018 * np.sin(
+            2 * np.pi * (rng.uniform(0.22, 0.32) * t + rng.random())
+        ) + rng.normal(0, 0.03)
         self.head = self._drift(rng, 0.08, 3) * np.array([[0.5], [1], [1]])
         self.arms = self._drift(rng, 0.05, 2, 4)  # forward, sideways, turned outward, elbow
-        self.arms += np.array([rng.normal(0.03, 0.05), rng.uniform(0.14, 0.24), -0.4, rng.uniform(0.2, 0.4)])[:, None]
+        self.arms += np.array(
+            [rng.normal(0.03, 0.05), rng.uniform(0.14, 0.24), -0.4, rng.uniform(0.2, 0.4)]
+        )[:, None]
         self.shoulders = np.zeros((2, len(t)))  # the girdle raised, beyond its rise with the arm
         self.reaches: list[tuple[int, np.ndarray, np.ndarray, str]] = []
 
@@ -89,7 +109,11 @@ class Body:
             self.arms[side, angle] += weight * (target - self.arms[side, angle])
 
     def reach(
-        self, side: int, weight: np.ndarray, target: Sequence[float | np.ndarray] | np.ndarray, frame: str = "world"
+        self,
+        side: int,
+        weight: np.ndarray,
+        target: Sequence[float | np.ndarray] | np.ndarray,
+        frame: str = "world",
     ) -> None:
         """Draws a wrist by `weight` (F,) from where the arm's angles put it to a point (3,) or (F, 3) in meters.
 
@@ -134,17 +158,25 @@ class Body:
             out[:, joint] = out[:, parent] + bone @ np.array(offset)
             bone = bone @ step
         out[:, 12] = out[:, 9] + bone @ np.array(NECK)
-        head = bone @ rotation(1, self.head[1]) @ rotation(0, self.head[0]) @ rotation(2, -self.head[2])
+        head = (
+            bone
+            @ rotation(1, self.head[1])
+            @ rotation(0, self.head[0])
+            @ rotation(2, -self.head[2])
+        )
         out[:, 15] = out[:, 12] + head @ np.array(HEAD)
 
         down = np.array([0.0, -1.0, 0.0])
         for side, sign in enumerate(SIGN):
             forward, sideways, outward, elbow = self.arms[side]
             arm = rotation(2, sign * sideways) @ rotation(0, -forward) @ rotation(1, sign * outward)
-            lift = 0.2 * (1 + (arm @ down)[:, 1]) + self.shoulders[side]  # the shoulder girdle rises with the arm
+            # The shoulder girdle rises with the arm
+            lift = 0.2 * (1 + (arm @ down)[:, 1]) + self.shoulders[side]
             collar = bone @ rotation(2, sign * lift)
             out[:, 13 + side] = out[:, 9] + bone @ np.array([sign * COLLAR[0], *COLLAR[1:]])
-            out[:, 16 + side] = out[:, 13 + side] + collar @ np.array([sign * SHOULDER[0], *SHOULDER[1:]])
+            out[:, 16 + side] = out[:, 13 + side] + collar @ np.array(
+                [sign * SHOULDER[0], *SHOULDER[1:]]
+            )
             arm = bone @ arm
             out[:, 18 + side] = out[:, 16 + side] + arm @ down * UPPER_ARM
             out[:, 20 + side] = out[:, 18 + side] + arm @ rotation(0, -elbow) @ down * FOREARM
@@ -154,7 +186,12 @@ class Body:
             origin, axes = frames[frame]
             goal = wrist + weight * (origin + (axes @ target[..., None])[..., 0] - wrist)
             # Elbows point outward and, of an upright body, backward rather than forward.
-            toward = elbow - shoulder + 0.1 * SIGN[side] * bone[..., 0] - 0.25 * bone[:, 1, 1:2] * bone[..., 2]
+            toward = (
+                elbow
+                - shoulder
+                + 0.1 * SIGN[side] * bone[..., 0]
+                - 0.25 * bone[:, 1, 1:2] * bone[..., 2]
+            )
             out[:, 18 + side], out[:, 20 + side] = bent(shoulder, goal, UPPER_ARM, FOREARM, toward)
         return out
 
@@ -179,7 +216,13 @@ def beat(t: np.ndarray, frequency: float, phase: float = 0.0) -> np.ndarray:
 
 
 def step(
-    body: Body, side: int, start: float, end: float, by: Sequence[float], lift: float = 0.09, heel: float = 0.3
+    body: Body,
+    side: int,
+    start: float,
+    end: float,
+    by: Sequence[float],
+    lift: float = 0.09,
+    heel: float = 0.3,
 ) -> None:
     """Moves a foot by (x, y, z) in meters between two times; the heel, at the angle `heel`, leaves the floor first.
 
@@ -188,8 +231,12 @@ def step(
     s = np.clip((body.t - start) / (end - start), 0, 1)
     across, up = ease(s, 0.25 if by[1] else 0.08, 0.96), ease(s, 0.02, 0.7)
     foot = body.ankles[side]
-    foot += np.stack([across * by[0], up * by[1] + lift * np.sin(np.pi * s) ** 1.5, across * by[2]], 1)
-    body.foot_pitch[side] += heel * pulse(body.t, start - 0.15, start + 0.03, start + 0.03, end - 0.03)
+    foot += np.stack(
+        [across * by[0], up * by[1] + lift * np.sin(np.pi * s) ** 1.5, across * by[2]], 1
+    )
+    body.foot_pitch[side] += heel * pulse(
+        body.t, start - 0.15, start + 0.03, start + 0.03, end - 0.03
+    )
 
 
 def follow_feet(body: Body) -> None:
@@ -204,7 +251,9 @@ def flight(t: np.ndarray, start: float, seconds: float) -> np.ndarray:
     return 9.81 / 8 * seconds**2 * 4 * s * (1 - s)
 
 
-def events(rng: np.random.Generator, t: np.ndarray, count: int, slowest: float) -> list[tuple[float, float]]:
+def events(
+    rng: np.random.Generator, t: np.ndarray, count: int, slowest: float
+) -> list[tuple[float, float]]:
     """Returns (start, seconds) of `count` repetitions of equal duration at a random time inside the clip."""
     seconds = min(rng.uniform(0.85, 1.0) * slowest, (t[-1] - 0.3) / count)
     start = rng.uniform(0.1, max(0.15, min(0.4, t[-1] - 0.15 - seconds * count)))

@@ -2,7 +2,17 @@
 
 import numpy as np
 
-from flame_mdm.data.synthetic_motions.body import SIDES, SIGN, Attributes, Body, beat, ease, follow_feet, pulse, step
+from flame_mdm.data.synthetic_motions.body import (
+    SIDES,
+    SIGN,
+    Attributes,
+    Body,
+    beat,
+    ease,
+    follow_feet,
+    pulse,
+    step,
+)
 from flame_mdm.data.synthetic_motions.gestures import lie
 
 
@@ -51,7 +61,9 @@ def dodge(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attrib
 def duck(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
     """Drops into a crouch with the hands over the head, and rises again."""
     start = rng.uniform(0.25, 0.55)
-    down = pulse(t, start, start + rng.uniform(0.3, 0.4), start + rng.uniform(0.7, 0.9), t[-1] - 0.1)
+    down = pulse(
+        t, start, start + rng.uniform(0.3, 0.4), start + rng.uniform(0.7, 0.9), t[-1] - 0.1
+    )
     body.position[:, 1] -= rng.uniform(0.36, 0.44) * down
     body.position[:, 2] -= 0.12 * down
     body.pelvis[0] += 0.4 * down
@@ -101,7 +113,9 @@ def slash(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attrib
     """Raises a sword beside the head, steps forward, and cuts down across the body."""
     (side,) = SIDES[str(requested["side"])]
     sign, stretch = SIGN[side], min(1.1, t[-1] / 2.3)
-    a, b, c, d, e, f = rng.uniform(0.05, 0.15) + stretch * np.array([0.0, 0.65, 0.8, 1.08, 1.3, 1.95])
+    a, b, c, d, e, f = rng.uniform(0.05, 0.15) + stretch * np.array(
+        [0.0, 0.65, 0.8, 1.08, 1.3, 1.95]
+    )
     back, cut = pulse(t, a, b, c, d), pulse(t, c, d, e, f)
     ready = pulse(t, a, b, e, f)
     swing = ease(t, c, d)
@@ -122,7 +136,12 @@ def slash(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attrib
 def fall(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
     """Loses balance, drops backward to the floor, and stays on the back: lying down, faster."""
     start, end = rng.uniform(0.15, 0.3), rng.uniform(1.35, 1.5)
-    lie(body, rng, t[-1] * np.interp(t, [0, start, start + 0.5, end, t[-1]], [0, 0.03, 0.4, 0.97, 1]), requested)
+    lie(
+        body,
+        rng,
+        t[-1] * np.interp(t, [0, start, start + 0.5, end, t[-1]], [0, 0.03, 0.4, 0.97, 1]),
+        requested,
+    )
     flail = pulse(t, 0.05, start + 0.2, start + 0.3, start + 0.6)
     for side in (0, 1):
         body.move_arm(side, flail, (1.2, 0.8, 0.0, 0.4))

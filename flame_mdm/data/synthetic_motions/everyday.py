@@ -48,7 +48,8 @@ def point(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attrib
     start = rng.uniform(0.1, 0.3)
     out = pulse(t, start, start + rng.uniform(0.45, 0.6), t[-1] - 0.55, t[-1])
     aside = rng.uniform(-0.1, 0.35)
-    bent = body.pelvis[0] + body.spine[0]  # of a trunk that leans: the arm points ahead, not at the floor
+    # Of a trunk that leans: the arm points ahead, not at the floor
+    bent = body.pelvis[0] + body.spine[0]
     body.move_arm(side, out, (rng.uniform(1.4, 1.6) + bent, aside, -0.4, 0.06))
     body.spine[1] -= 0.2 * SIGN[side] * out
     body.head[1] += (0.2 + 0.5 * aside) * SIGN[side] * out
@@ -168,7 +169,9 @@ def wipe(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
     on = hold(rng, t)
     turn = 2 * np.pi * frequency * t
     body.move_arm(side, on, (1.3, 0.25, -0.3, 0.9))
-    hand = np.stack([sign * 0.12 + 0.15 * np.sin(turn), 0.16 + 0.13 * np.cos(turn), 0.39 + 0 * t], 1)
+    hand = np.stack(
+        [sign * 0.12 + 0.15 * np.sin(turn), 0.16 + 0.13 * np.cos(turn), 0.39 + 0 * t], 1
+    )
     body.reach(side, on, hand, "chest")
     body.spine[1] += 0.08 * on * np.sin(turn) - 0.1 * sign * on
     body.spine[0] += 0.06 * on
@@ -180,7 +183,9 @@ def knock(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attrib
     sign, count = SIGN[side], int(requested["count"])
     period, first = rng.uniform(0.38, 0.44), rng.uniform(0.55, 0.65)
     ready = pulse(t, 0.08, first, first + period * count, first + period * count + 0.5)
-    strike = sum(pulse(t, s, s + 0.17, s + 0.19, s + 0.36) for s in first + period * np.arange(count))
+    strike = sum(
+        pulse(t, s, s + 0.17, s + 0.19, s + 0.36) for s in first + period * np.arange(count)
+    )
     body.move_arm(side, ready, (0.9, 0.2, -0.2, 1.9))
     hand = np.stack([sign * 0.13 + 0 * t, 0.13 - 0.01 * strike, 0.24 + 0.15 * strike], 1)
     body.reach(side, ready, hand, "chest")
@@ -210,7 +215,9 @@ def cross_arms(body: Body, rng: np.random.Generator, t: np.ndarray, requested: A
     body.spine[0] -= 0.04 * on
 
 
-def hands_on_hips(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+def hands_on_hips(
+    body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes
+) -> None:
     on = ease(t, rng.uniform(0.05, 0.2), rng.uniform(0.7, 0.9))
     for side, sign in enumerate(SIGN):
         body.move_arm(side, on, (-0.35, 0.75, -0.6, 1.6))
@@ -242,7 +249,10 @@ def talk(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
     """Speaks with both hands in front of the body."""
     on = hold(rng, t)
     for side, sign in enumerate(SIGN):
-        slow, quick = beat(t, rng.uniform(0.5, 0.8), rng.random()), beat(t, rng.uniform(1.2, 1.7), rng.random())
+        slow, quick = (
+            beat(t, rng.uniform(0.5, 0.8), rng.random()),
+            beat(t, rng.uniform(1.2, 1.7), rng.random()),
+        )
         body.move_arm(side, on, (0.35, 0.3, 0.0, 1.5))
         hand = np.stack([sign * (0.2 + 0.06 * slow), -0.14 + 0.06 * quick, 0.27 + 0.04 * slow], 1)
         body.reach(side, on, hand, "chest")

@@ -2,7 +2,17 @@
 
 import numpy as np
 
-from flame_mdm.data.synthetic_motions.body import FOOT, SIDES, SIGN, Attributes, Body, ease, events, flight, pulse
+from flame_mdm.data.synthetic_motions.body import (
+    FOOT,
+    SIDES,
+    SIGN,
+    Attributes,
+    Body,
+    ease,
+    events,
+    flight,
+    pulse,
+)
 
 LYING_HEEL = 1.35  # angle of a foot that stands on its toes behind the body, in radians
 
@@ -40,7 +50,9 @@ def lean(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
     body.head[2] += 0.1 * sign * aside
 
 
-def jumping_jacks(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+def jumping_jacks(
+    body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes
+) -> None:
     """Jumps the feet apart while the arms swing overhead, and back together."""
     wide = rng.uniform(0.2, 0.26)
     for start, seconds in events(rng, t, int(requested["count"]), 1.05):
@@ -49,7 +61,10 @@ def jumping_jacks(body: Body, rng: np.random.Generator, t: np.ndarray, requested
         apart = ease(t, out, out + air) - ease(t, back, back + air)
         height = flight(t, out, air) + flight(t, back, air)
         dip = sum(pulse(t, at - 0.12, at, at, at + 0.02) for at in (out, back))
-        land = sum(pulse(t, at + air - 0.02, at + air + 0.06, at + air + 0.06, at + air + 0.18) for at in (out, back))
+        land = sum(
+            pulse(t, at + air - 0.02, at + air + 0.06, at + air + 0.06, at + air + 0.18)
+            for at in (out, back)
+        )
         body.position[:, 1] += height - 0.06 * dip - 0.05 * land
         body.ankles[..., 1] += height
         body.ankles[..., 0] += wide * SIGN[:, None] * apart
@@ -62,7 +77,10 @@ def jumping_jacks(body: Body, rng: np.random.Generator, t: np.ndarray, requested
 
 def push_ups(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
     """Lowers the straight body between the hands and pushes it up again; begins and ends in a plank."""
-    down = sum(pulse(t, s, s + 0.42 * d, s + 0.5 * d, s + d) for s, d in events(rng, t, int(requested["count"]), 1.2))
+    down = sum(
+        pulse(t, s, s + 0.42 * d, s + 0.5 * d, s + d)
+        for s, d in events(rng, t, int(requested["count"]), 1.2)
+    )
     slope = 0.27 - rng.uniform(0.17, 0.2) * down  # of the line from the feet to the shoulders
     body.foot_pitch += LYING_HEEL
     body.foot_yaw *= 0.2

@@ -2,7 +2,18 @@
 
 import numpy as np
 
-from flame_mdm.data.synthetic_motions.body import HIP, SHIN, SIDES, SIGN, THIGH, Attributes, Body, ease, events, pulse
+from flame_mdm.data.synthetic_motions.body import (
+    HIP,
+    SHIN,
+    SIDES,
+    SIGN,
+    THIGH,
+    Attributes,
+    Body,
+    ease,
+    events,
+    pulse,
+)
 
 CHAIR = 0.54  # height of the pelvis on a chair whose seat is 45 cm high
 
@@ -13,7 +24,12 @@ def wave(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
     swing = 2 * np.pi * rng.uniform(1.4, 1.7) * (t - start)
     forward, sideways, size = rng.uniform(0.2, 0.5), rng.uniform(1.3, 1.7), rng.uniform(0.45, 0.6)
     for side in SIDES[str(requested["side"])]:
-        pose = (forward, sideways + 0.1 * np.sin(swing), np.pi / 2, rng.uniform(1.3, 1.5) + size * np.sin(swing))
+        pose = (
+            forward,
+            sideways + 0.1 * np.sin(swing),
+            np.pi / 2,
+            rng.uniform(1.3, 1.5) + size * np.sin(swing),
+        )
         body.move_arm(side, weight, pose)
         body.spine[2] -= 0.03 * SIGN[side] * weight
 
@@ -64,7 +80,9 @@ def throw(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attrib
     step = ease(t, at[1] - 0.3, at[2] + 0.05)
     body.ankles[other, :, 2] += rng.uniform(0.25, 0.32) * step
     body.ankles[other, :, 1] += 0.4 * step * (1 - step)
-    body.position[:, 2] += 0.2 * ease(t, at[1] - 0.2, at[3]) - 0.06 * pulse(t, at[0], at[1], at[1], at[3])
+    body.position[:, 2] += 0.2 * ease(t, at[1] - 0.2, at[3]) - 0.06 * pulse(
+        t, at[0], at[1], at[1], at[3]
+    )
     body.foot_pitch[side] += 0.25 * ease(t, at[2], at[3])
 
 
@@ -72,7 +90,10 @@ def clap(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
     claps = events(rng, t, int(requested["count"]), 0.85)
     first, last = claps[0][0], claps[-1][0] + claps[-1][1]
     ready = pulse(t, first - 0.1, first + 0.3, last - 0.2, last + 0.35)
-    open_ = ready - sum(pulse(t, s + 0.35 * d, s + 0.62 * d, s + 0.7 * d, s + d) for s, d in claps) * ready
+    open_ = (
+        ready
+        - sum(pulse(t, s + 0.35 * d, s + 0.62 * d, s + 0.7 * d, s + d) for s, d in claps) * ready
+    )
     height, ahead, wide = rng.uniform(-0.12, 0.0), rng.uniform(0.28, 0.33), rng.uniform(0.2, 0.26)
     for side, sign in enumerate(SIGN):
         body.move_arm(side, ready, (0.55, 0.3, -0.4, 1.4))
@@ -86,7 +107,9 @@ def salute(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attri
     start = rng.uniform(0.1, 0.3)
     up = pulse(t, start, start + rng.uniform(0.45, 0.6), t[-1] - 0.6, t[-1])
     body.move_arm(side, up, (0.5, 1.2, 0.3, 2.2))
-    body.reach(side, up, (SIGN[side] * rng.uniform(0.15, 0.17), rng.uniform(0.02, 0.05), 0.09), "head")
+    body.reach(
+        side, up, (SIGN[side] * rng.uniform(0.15, 0.17), rng.uniform(0.02, 0.05), 0.09), "head"
+    )
     body.spine[0] -= 0.05 * up
 
 
@@ -118,7 +141,9 @@ def jump(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
         body.foot_pitch += 0.6 * pulse(t, up - 0.1, up, land - 0.05, land + 0.08)
         body.spine[0] += 0.45 * crouch + 0.25 * absorb
         body.pelvis[0] += 0.2 * crouch + 0.1 * absorb
-        body.arms[:, 0] += reach * pulse(t, up - 0.15, up + 0.15, up + 0.15, land + 0.2) - 0.7 * crouch
+        body.arms[:, 0] += (
+            reach * pulse(t, up - 0.15, up + 0.15, up + 0.15, land + 0.2) - 0.7 * crouch
+        )
 
 
 def leap(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
@@ -157,13 +182,19 @@ def kick(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
         back = pulse(t, at[0], at[1], at[1], at[3])
         out = pulse(t, at[1], at[3], at[4], at[6])
         hip = high * out - 0.4 * back
-        knee = 0.2 + 1.3 * pulse(t, at[0], at[2], at[2], at[3]) + 0.9 * pulse(t, at[4], at[5], at[5], at[6])
+        knee = (
+            0.2
+            + 1.3 * pulse(t, at[0], at[2], at[2], at[3])
+            + 0.9 * pulse(t, at[4], at[5], at[5], at[6])
+        )
         free = pulse(t, at[0], at[1], at[5], at[6])
         root = body.position + np.array([SIGN[side] * HIP[0], HIP[1], HIP[2]])
         zero = np.zeros_like(hip)
         thigh = np.stack([zero, -np.cos(hip), np.sin(hip)], -1)
         shin = np.stack([zero, -np.cos(hip - knee), np.sin(hip - knee)], -1)
-        body.ankles[side] += free[:, None] * (root + THIGH * thigh + SHIN * shin - body.ankles[side])
+        body.ankles[side] += free[:, None] * (
+            root + THIGH * thigh + SHIN * shin - body.ankles[side]
+        )
         body.foot_pitch[side] += 0.4 * back + 0.3 * free - 0.8 * out
         body.pelvis[0] -= 0.15 * out
         body.spine[0] += 0.1 * out
@@ -223,23 +254,36 @@ def seat(body: Body, seated: np.ndarray, bent: np.ndarray) -> None:
     for side, sign in enumerate(SIGN):
         body.move_arm(side, seated, (0.55, 0.25, -0.7, 0.8))
         body.move_arm(side, bent, (1.4, 0.15, -0.3, 0.5))
-        thigh = np.stack([sign * 0.15 + 0 * seated, 0.63 + 0 * seated, -0.18 + body.ankles[side, :, 2]], 1)
+        thigh = np.stack(
+            [sign * 0.15 + 0 * seated, 0.63 + 0 * seated, -0.18 + body.ankles[side, :, 2]], 1
+        )
         body.reach(side, seated**3, thigh)
 
 
 def sit(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
     start, seconds = rng.uniform(0.1, 0.25), rng.uniform(1.25, 1.5)
     end = start + seconds
-    seat(body, ease(t, start, end), pulse(t, start, start + 0.5 * seconds, start + 0.6 * seconds, end + 0.25))
+    seat(
+        body,
+        ease(t, start, end),
+        pulse(t, start, start + 0.5 * seconds, start + 0.6 * seconds, end + 0.25),
+    )
 
 
 def rise(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
     start, seconds = rng.uniform(0.35, 0.5), rng.uniform(1.25, 1.45)
     end = start + seconds
-    seat(body, 1 - ease(t, start + 0.1, end), pulse(t, start - 0.3, start + 0.4 * seconds, start + 0.5 * seconds, end))
+    seat(
+        body,
+        1 - ease(t, start + 0.1, end),
+        pulse(t, start - 0.3, start + 0.4 * seconds, start + 0.5 * seconds, end),
+    )
     for path in (body.position, *body.ankles):
         path[:, 2] += 0.36
-    body.reaches = [(side, weight, goal + np.array([0, 0, 0.36]), frame) for side, weight, goal, frame in body.reaches]
+    body.reaches = [
+        (side, weight, goal + np.array([0, 0, 0.36]), frame)
+        for side, weight, goal, frame in body.reaches
+    ]
 
 
 def lie(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:

@@ -5,7 +5,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flame_mdm.data.synthetic_motions.body import FOOT, LEFT, RIGHT, SIGN, Attributes, Body, ease, pulse
+from flame_mdm.data.synthetic_motions.body import (
+    FOOT,
+    LEFT,
+    RIGHT,
+    SIGN,
+    Attributes,
+    Body,
+    ease,
+    pulse,
+)
 
 Path = Callable[[np.ndarray, float], tuple[np.ndarray, np.ndarray, np.ndarray]]
 """Share (N,) of a way of some meters -> x (N,), z (N,) and heading (N,) there."""
@@ -16,7 +25,9 @@ class Gait:
     """Parameters of steps, in seconds, meters and radians."""
 
     step: float  # time from one footprint to the next, about
-    swing: float  # time of a foot in the air, in steps; above 1, both feet leave the ground in between
+    swing: (
+        float  # time of a foot in the air, in steps; above 1, both feet leave the ground in between
+    )
     lift: float  # height of the foot in mid-swing
     heel_off: float  # angle of the heel when the foot leaves the floor
     toe_up: float  # angle of the toes when the foot comes down; negative: the toes come down first
@@ -26,7 +37,9 @@ class Gait:
     behind: float = 0.0  # how much farther back the feet come down than they stand
 
 
-def walk_along(body: Body, rng: np.random.Generator, gait: Gait, speed: float, path: Path, first: int) -> np.ndarray:
+def walk_along(
+    body: Body, rng: np.random.Generator, gait: Gait, speed: float, path: Path, first: int
+) -> np.ndarray:
     """Moves the pelvis at `speed`, in m/s, along a path, and places the feet on either side of it, `first` first.
 
     Returns (F,) how far the right foot is in front of the left one, in meters, relative to the heading of the pelvis.
@@ -66,7 +79,9 @@ def walk_along(body: Body, rng: np.random.Generator, gait: Gait, speed: float, p
         px, pz, yaw = (float(v[0]) for v in at(np.array([down + stance / 2])))
         across, along = gait.width * SIGN[side], back - run * gait.behind
         sin, cos = np.sin(yaw), np.cos(yaw)
-        goal = np.array([px + across * cos + along * sin, pz - across * sin + along * cos, yaw + yaw0[side]])
+        goal = np.array(
+            [px + across * cos + along * sin, pz - across * sin + along * cos, yaw + yaw0[side]]
+        )
         s = np.clip((t - lift_off) / swing, 0, 1)
         share = ease(s, 0.08, 0.96)
         distance = np.hypot(*(goal - prints[side])[:2])
@@ -83,7 +98,10 @@ def walk_along(body: Body, rng: np.random.Generator, gait: Gait, speed: float, p
         body.foot_pitch[side] += size * (gait.heel_off * heel_up - gait.toe_up * toe_up)
         prints[side] = goal
 
-    forward, left = np.array([np.sin(heading), np.cos(heading)]), np.array([np.cos(heading), -np.sin(heading)])
+    forward, left = (
+        np.array([np.sin(heading), np.cos(heading)]),
+        np.array([np.cos(heading), -np.sin(heading)]),
+    )
     body.position[:, [0, 2]] += (0.025 * (raised[1] - raised[0]) * left).T
     apart = body.ankles[1][:, [0, 2]] - body.ankles[0][:, [0, 2]]
     return (apart.T * forward).sum(0)
@@ -98,14 +116,18 @@ def walk(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
     sign = 1 if direction in ("left", "counterclockwise") else -1
     if direction in ("left", "right"):
         speed, first = rng.uniform(0.45, 0.6), LEFT if sign > 0 else RIGHT
-        walk_along(body, rng, Gait(0.46, 0.82, 0.15, 0.25, 0.05, 0.16), speed, straight(sign, 0), first)
+        walk_along(
+            body, rng, Gait(0.46, 0.82, 0.15, 0.25, 0.05, 0.16), speed, straight(sign, 0), first
+        )
         return
     if direction == "backward":
         speed = rng.uniform(0.6, 0.9)
         gait = Gait(0.54, 0.78, 0.12, -0.2, -0.4, rng.uniform(0.08, 0.1))
         apart = walk_along(body, rng, gait, speed, straight(0, -1), RIGHT)
     elif direction == "forward":
-        low, high = {"slow": (0.5, 0.7), "normal": (1.0, 1.25), "fast": (1.55, 1.8)}[str(requested["speed"])]
+        low, high = {"slow": (0.5, 0.7), "normal": (1.0, 1.25), "fast": (1.55, 1.8)}[
+            str(requested["speed"])
+        ]
         speed = rng.uniform(low, high)
         step = np.interp(speed, [0.5, 1.2, 1.8], [0.66, 0.52, 0.42]) * rng.uniform(0.95, 1.05)
         lift, sink = rng.uniform(0.1, 0.13), 0.02 + 0.01 * speed
@@ -122,15 +144,28 @@ def walk(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
             return radius * (1 - np.cos(angle)), radius * np.sin(angle), angle
 
         gait = Gait(0.5, 0.82, 0.11, 0.6, 0.25, 0.085)
-        apart = walk_along(body, rng, gait, rng.uniform(1.0, 1.2), circle, LEFT if sign > 0 else RIGHT)
+        apart = walk_along(
+            body, rng, gait, rng.uniform(1.0, 1.2), circle, LEFT if sign > 0 else RIGHT
+        )
     swing_arms(body, apart, rng.uniform(0.5, 0.75))
 
 
 def run(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    gait = Gait(rng.uniform(0.34, 0.38), 1.3, rng.uniform(0.2, 0.26), 1.1, 0.15, 0.07, 0.06, 0.035, behind=0.12)
+    gait = Gait(
+        rng.uniform(0.34, 0.38),
+        1.3,
+        rng.uniform(0.2, 0.26),
+        1.1,
+        0.15,
+        0.07,
+        0.06,
+        0.035,
+        behind=0.12,
+    )
     apart = walk_along(body, rng, gait, rng.uniform(2.4, 3.0), straight(0, 1), RIGHT)
     speed = np.gradient(body.position[:, 2], t)
-    body.pelvis[0] += 0.025 * speed + 0.015 * np.gradient(speed, t)  # leans forward to speed up, and back to stop
+    # Leans forward to speed up, and back to stop
+    body.pelvis[0] += 0.025 * speed + 0.015 * np.gradient(speed, t)
     body.spine[0] += 0.05 * speed
     for side in (0, 1):
         body.move_arm(side, np.clip(speed / 1.5, 0, 1), (-0.1, 0.3, -0.15, rng.uniform(1.4, 1.7)))
@@ -151,7 +186,9 @@ def turn(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
     low, high = (160, 195) if requested["amount"] == "half" else (75, 110)
     angle = sign * np.radians(rng.uniform(low, high))
     gait = Gait(0.36, 0.82, 0.09, 0.3, 0.0, 0.1)
-    walk_along(body, rng, gait, 1.0, lambda s, _: (0 * s, 0 * s, angle * s), LEFT if sign > 0 else RIGHT)
+    walk_along(
+        body, rng, gait, 1.0, lambda s, _: (0 * s, 0 * s, angle * s), LEFT if sign > 0 else RIGHT
+    )
     ahead = np.gradient(body.heading, t)
     body.head[1] += 0.2 * ahead  # the head looks in the direction of the turn
     body.spine[1] += 0.08 * ahead
@@ -174,7 +211,11 @@ def dance(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attrib
         body.ankles[side, :, 1] += 0.1 * light
         body.ankles[side, :, 2] += 0.08 * light
         body.foot_pitch[side] += 0.35 * light
-        body.move_arm(side, going, (high + 0.6 * sign * swing, 0.35 + 0.25 * bounce, -0.1, 1.5 + 0.4 * sign * swing))
+        body.move_arm(
+            side,
+            going,
+            (high + 0.6 * sign * swing, 0.35 + 0.25 * bounce, -0.1, 1.5 + 0.4 * sign * swing),
+        )
 
 
 def crawl(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:

@@ -19,7 +19,11 @@ from flame_mdm.data.synthetic_motions.body import (
 )
 from flame_mdm.data.synthetic_motions.locomotion import Gait, straight, swing_arms, walk_along
 
-RUNG, LADDER = 0.3, 0.36  # distance between rungs, and distance of the ladder from the pelvis, in meters
+# Distance between rungs, and distance of the ladder from the pelvis, in meters
+RUNG, LADDER = (
+    0.3,
+    0.36,
+)
 RISE, TREAD = 0.17, 0.29  # height and depth of a stair in meters
 
 
@@ -55,7 +59,8 @@ def limp(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
     sign = SIGN[side]
     gait = Gait(rng.uniform(0.52, 0.6), 0.82, 0.12, 0.35, 0.1, 0.09)
     apart = walk_along(body, rng, gait, rng.uniform(0.5, 0.7), straight(0, 1), 1 - side)
-    loaded = np.clip((body.ankles[1 - side, :, 1] - ANKLE_HEIGHT) / 0.12, 0, 1)  # stands on the sore leg
+    # Stands on the sore leg
+    loaded = np.clip((body.ankles[1 - side, :, 1] - ANKLE_HEIGHT) / 0.12, 0, 1)
     sore = body.ankles[side, :, 1]
     sore += 0.6 * (ANKLE_HEIGHT - sore)
     body.foot_pitch[side] *= 0.4
@@ -100,7 +105,9 @@ def march(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attrib
         body.arms[side, 0] += 1.3 * sign * apart
 
 
-def march_in_place(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+def march_in_place(
+    body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes
+) -> None:
     wave, going = _tread(body, rng.uniform(0.95, 1.1), 0.3, 0.05)
     body.spine[0] -= 0.06
     for side, sign in enumerate(SIGN):
@@ -108,7 +115,9 @@ def march_in_place(body: Body, rng: np.random.Generator, t: np.ndarray, requeste
         body.arms[side, 3] += 0.3 * going
 
 
-def run_in_place(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+def run_in_place(
+    body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes
+) -> None:
     frequency = rng.uniform(1.45, 1.65)
     wave, going = _tread(body, frequency, rng.uniform(0.24, 0.3), -0.1)
     body.position[:, 1] += going * 0.035 * np.sin(2 * np.pi * frequency * t) ** 2
@@ -117,7 +126,9 @@ def run_in_place(body: Body, rng: np.random.Generator, t: np.ndarray, requested:
         body.move_arm(side, going, (0.1 - 0.65 * sign * wave, 0.25, -0.2, 1.6 - 0.25 * sign * wave))
 
 
-def _tread(body: Body, frequency: float, lift: float, ahead: float) -> tuple[np.ndarray, np.ndarray]:
+def _tread(
+    body: Body, frequency: float, lift: float, ahead: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Lifts the feet in turn on the spot, the left one first, by `lift` meters, and moves them `ahead` in the air.
 
     Returns (F,) a wave that is 1 with the left and -1 with the right foot up, and whether the body is moving.
@@ -188,14 +199,18 @@ def pull(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
         body.reach(side, effort, hand, "chest")
 
 
-def climb_ladder(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+def climb_ladder(
+    body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes
+) -> None:
     """Climbs a ladder in front of the body: each hand moves with the opposite foot, by two rungs."""
     seconds, start = rng.uniform(0.5, 0.6), rng.uniform(0.05, 0.15)
     steps = int((t[-1] - 0.1 - start) / seconds)
     seconds = (t[-1] - 0.1 - start) / steps
     onto = LADDER - FOOT[2] - 0.02 - body.ankles[:, 0, 2]  # toes on the rung
     hands = np.array([1.42, 1.42 + RUNG])
-    paths = [np.repeat([[0.17 * sign, hands[side], LADDER]], len(t), 0) for side, sign in enumerate(SIGN)]
+    paths = [
+        np.repeat([[0.17 * sign, hands[side], LADDER]], len(t), 0) for side, sign in enumerate(SIGN)
+    ]
     for number in range(steps):
         side, begin = number % 2, start + number * seconds
         rungs = RUNG if number == 0 else 2 * RUNG
@@ -215,7 +230,9 @@ def climb_ladder(body: Body, rng: np.random.Generator, t: np.ndarray, requested:
         body.reach(side, np.ones_like(t), paths[side])
 
 
-def climb_stairs(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+def climb_stairs(
+    body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes
+) -> None:
     """Goes up stairs, one foot on each; the last step brings the feet side by side."""
     start, seconds = rng.uniform(0.05, 0.15), rng.uniform(0.5, 0.6)
     steps = int((t[-1] - 0.1 - start) / seconds)
@@ -252,7 +269,11 @@ def stumble(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attr
     body.spine[0] += 0.55 * falls
     body.head[0] -= 0.35 * falls
     for side in (0, 1):
-        body.move_arm(side, pulse(t, trip, trip + 0.22 + 0.08 * side, trip + 0.45, trip + 1.0), (1.7, 0.6, 0.0, 0.5))
+        body.move_arm(
+            side,
+            pulse(t, trip, trip + 0.22 + 0.08 * side, trip + 0.45, trip + 1.0),
+            (1.7, 0.6, 0.0, 0.5),
+        )
 
 
 def skip(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
@@ -269,7 +290,9 @@ def spin(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
     sign = 1 if requested["direction"] == "left" else -1
     angle = sign * np.radians(rng.uniform(340, 375))
     gait = Gait(rng.uniform(0.26, 0.3), 0.82, 0.07, 0.3, 0.0, 0.1)
-    walk_along(body, rng, gait, 1.0, lambda s, _: (0 * s, 0 * s, angle * s), LEFT if sign > 0 else RIGHT)
+    walk_along(
+        body, rng, gait, 1.0, lambda s, _: (0 * s, 0 * s, angle * s), LEFT if sign > 0 else RIGHT
+    )
     out = pulse(t, 0.05, 0.5, t[-1] - 0.6, t[-1])
     for side in (0, 1):
         body.move_arm(side, out, (0.3, rng.uniform(0.9, 1.3), 0.2, 0.5))

@@ -19,21 +19,37 @@ from flame_mdm.reporting.plots import Histogram
 from flame_mdm.reporting.study import Ratings
 from flame_mdm.reporting.tables.format import Cell, Line, Part, Table, ranks
 from flame_mdm.reporting.tables.settings import settings_table
-from flame_mdm.reporting.tables.specs import ABOUT, PUBLISHED, SWEPT, Figure, Lengths, evaluations, load_mapping
+from flame_mdm.reporting.tables.specs import (
+    ABOUT,
+    PUBLISHED,
+    SWEPT,
+    Figure,
+    Lengths,
+    evaluations,
+    load_mapping,
+)
 from flame_mdm.runs import made_by
 from flame_mdm.schemas import read_json
 
 NOT_VALID = "NOT VALID"  # state of a row that is shown, but not ranked
-PUBLISHED_SPLIT = "published split: test clips are also used for training, or there are no validation clips"
+PUBLISHED_SPLIT = (
+    "published split: test clips are also used for training, or there are no validation clips"
+)
 FORCED = "forced: real motions do not have the values that the protocol expects"
 
 
 def build(name: str, spec: Config, results: Path) -> Table:
     """Builds the table of a spec from existing results and published numbers; `UserError` if they do not match."""
-    published = _published(PUBLISHED, PUBLISHED.stat().st_mtime_ns).get(name, {}) if PUBLISHED.exists() else {}
+    published = (
+        _published(PUBLISHED, PUBLISHED.stat().st_mtime_ns).get(name, {})
+        if PUBLISHED.exists()
+        else {}
+    )
     unknown = published.keys() - spec["parts"].keys()
     if unknown:
-        raise UserError(f"{PUBLISHED}: {name} has parts that are not in its spec: {', '.join(sorted(unknown))}")
+        raise UserError(
+            f"{PUBLISHED}: {name} has parts that are not in its spec: {', '.join(sorted(unknown))}"
+        )
     table = Table(name, spec["title"], [], spec.get("notes", []))
     for part_name, part in spec["parts"].items():
         if "recipes" in part:
@@ -44,7 +60,9 @@ def build(name: str, spec: Config, results: Path) -> Table:
             built = _ratings(part_name, Path(part["ratings"]), published.get(part_name))
         else:
             built = _measured(part_name, part, published.get(part_name), results)
-        built.figures = [Figure(**figure) for figure in spec.get("figures", []) if figure["part"] == part_name]
+        built.figures = [
+            Figure(**figure) for figure in spec.get("figures", []) if figure["part"] == part_name
+        ]
         table.parts.append(built)
     return table
 
@@ -62,7 +80,8 @@ def _measured(name: str, part: Config, reported: Config | None, results: Path) -
     lines: list[Line] = []
     truths: dict[str, Line] = {}
     missing: list[tuple[str, str]] = []
-    measured_under: dict[str, dict[str, None]] = {}  # columns of each footnote, where rows have several footnotes
+    # Columns of each footnote, where rows have several footnotes
+    measured_under: dict[str, dict[str, None]] = {}
     shows_multimodality = any(value.startswith("multimodality") for value in values)
     for row, needed in evaluations(part):
         paths = [evaluation.path(results) for evaluation in needed]
@@ -73,13 +92,19 @@ def _measured(name: str, part: Config, reported: Config | None, results: Path) -
             line.state = next(iter(needed[0].absent), "not evaluated")
         for evaluation, result in zip(needed, read, strict=True):
             if result is None:
-                commands = [made_by(path) for path in evaluation.absent.values()] or ["make tables evaluates it"]
+                commands = [made_by(path) for path in evaluation.absent.values()] or [
+                    "make tables evaluates it"
+                ]
                 missing += [(line.label, command) for command in commands]
-        timed = {path for path, value in zip(paths, values, strict=True) if value == "seconds_per_sample"}
+        timed = {
+            path for path, value in zip(paths, values, strict=True) if value == "seconds_per_sample"
+        }
         letters: dict[str, str] = {}  # by column
         for label, path, result in zip(columns, paths, read, strict=True):
             if result is not None:
-                letters[label] = _letter(_conditions(result, path in timed, shows_multimodality), conditions)
+                letters[label] = _letter(
+                    _conditions(result, path in timed, shows_multimodality), conditions
+                )
         line.marks = ",".join(dict.fromkeys(letters.values()))
         if len(set(letters.values())) > 1:
             for label, letter in letters.items():
@@ -121,9 +146,13 @@ def _condition_notes(
     """
     notes = []
     for facts in conditions:
-        different = [text or f"no {name}" for name, text in facts.items() if text != conditions[0][name]]
+        different = [
+            text or f"no {name}" for name, text in facts.items() if text != conditions[0][name]
+        ]
         text = (
-            f"as a, but {'; '.join(different)}" if 0 < len(different) <= 3 else "; ".join(filter(None, facts.values()))
+            f"as a, but {'; '.join(different)}"
+            if 0 < len(different) <= 3
+            else "; ".join(filter(None, facts.values()))
         )
         letter = _letter(facts, conditions)
         if letter in columns:
@@ -132,19 +161,32 @@ def _condition_notes(
     return notes
 
 
-def _warnings(lines: Sequence[Line], values: Sequence[str], columns: Sequence[str]) -> list[tuple[str, str]]:
+def _warnings(
+    lines: Sequence[Line], values: Sequence[str], columns: Sequence[str]
+) -> list[tuple[str, str]]:
     """Returns the footnotes on invalid rows, on the choice of checkpoints, and on columns whose distances are 0."""
     invalid = [(line.label, line.facts.get("not valid because")) for line in lines]
     texts = [(label, f"NOT VALID: {reason}") for label, reason in invalid if reason]
     for line in lines:
         kind, _, name = line.facts.get("chosen by", "").partition(" ")
         if kind in ("best", "none:"):
-            chosen = f"best checkpoint by {name}" if kind == "best" else f"{name} checkpoint, not chosen by validation"
+            chosen = (
+                f"best checkpoint by {name}"
+                if kind == "best"
+                else f"{name} checkpoint, not chosen by validation"
+            )
             texts.append((line.label, chosen))
     reals = [zip(columns, values, line.cells, strict=True) for line in lines if line.kind == "real"]
-    zero = {label for cells in reals for label, value, cell in cells if value == "fid" and cell and cell.value == 0}
+    zero = {
+        label
+        for cells in reals
+        for label, value, cell in cells
+        if value == "fid" and cell and cell.value == 0
+    }
     why = "clips are taken whole, so that both draws of real motions, which are compared, are the same"
-    return _by_text(texts) + [("", f"{label} of real motions is 0 by construction: {why}") for label in sorted(zero)]
+    return _by_text(texts) + [
+        ("", f"{label} of real motions is 0 by construction: {why}") for label in sorted(zero)
+    ]
 
 
 def _by_text(lines: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
@@ -179,7 +221,9 @@ def _conditions(result: Result, timed: bool, shows_multimodality: bool) -> dict[
         "data": f"{result.split} split of {data.dataset} (fingerprint {data.fingerprint})",
         "limits": "{} to {} frames".format(*data.frames) if data.frames else "",
         "metrics": _numbers(result),
-        "time": f"timed in batches of {cost.batch_size or 0:g} on {result.device}" if timed and cost else "",
+        "time": f"timed in batches of {cost.batch_size or 0:g} on {result.device}"
+        if timed and cost
+        else "",
         "seed": f"seed {result.seed}",
         "extractor": f"extractor sha256 {extractor.sha256[:12]}" if extractor else "no extractor",
         "audit": f"audit {card}" if card else "not audited",
@@ -202,7 +246,9 @@ def _numbers(result: Result) -> str:
     first = values[0]  # later ones may have fewer motions
     count = first.n if first.n is not None else " + ".join(map(str, first.n_per_replication))
     text = f"N = {count}, {first.replications} replications"
-    real = next((value.n for value in (result.ground_truth or {}).values() if value and value.n), None)
+    real = next(
+        (value.n for value in (result.ground_truth or {}).values() if value and value.n), None
+    )
     if real is not None and real != first.n:
         text += f" (real motions: N = {real})"
     sets = next((value.n_real for value in values if value.n_real is not None), None)
@@ -217,11 +263,16 @@ def _left_out(excluded: Mapping[str, int]) -> str:
 
 
 def _line(
-    row: Mapping[str, Any], results: Sequence[Result | None], values: Sequence[str], files: Sequence[str]
+    row: Mapping[str, Any],
+    results: Sequence[Result | None],
+    values: Sequence[str],
+    files: Sequence[str],
 ) -> Line:
     cells = [_cell(result, value, row) for result, value in zip(results, values, strict=True)]
     line = Line(row["label"], "measured", cells)
-    line.options = {name: float(row[name]) for name in SWEPT if isinstance(row.get(name), int | float)}
+    line.options = {
+        name: float(row[name]) for name in SWEPT if isinstance(row.get(name), int | float)
+    }
     first = next((result for result in results if result is not None), None)
     if first is None:
         return line
@@ -229,14 +280,19 @@ def _line(
         value = _about(result, name) if result is not None and name in ABOUT else None
         if isinstance(value, int | float):
             line.options.setdefault(name, float(value))
-    reasons = list(dict.fromkeys(reason for r in results if r is not None for reason in r.invalid_because))
+    reasons = list(
+        dict.fromkeys(reason for r in results if r is not None for reason in r.invalid_because)
+    )
     line.state = NOT_VALID if reasons else "QUICK" if first.quick else ""
     checkpoint = first.checkpoint
 
     def fact(name: str) -> str:
         return _text(getattr(checkpoint, name, None))
 
-    sampler = [fact("sampler"), *(f"{name} {fact(name)}" for name in ("eta", "spacing") if fact(name))]
+    sampler = [
+        fact("sampler"),
+        *(f"{name} {fact(name)}" for name in ("eta", "spacing") if fact(name)),
+    ]
     weights = {True: "averaged", False: "raw", None: ""}
     line.facts = {
         "checkpoint sha256": (checkpoint.sha256 if checkpoint else first.samples_sha256 or "")[:16],
@@ -258,7 +314,9 @@ def _line(
         "device of training": fact("training_device"),
         "peak memory of training, GiB": fact("training_memory_gib"),
         "computed from": first.origin[:16],
-        "result": " ".join(dict.fromkeys(file for r, file in zip(results, files, strict=True) if r is not None)),
+        "result": " ".join(
+            dict.fromkeys(file for r, file in zip(results, files, strict=True) if r is not None)
+        ),
         "not valid because": "; ".join(reasons),
     }
     return line
@@ -283,7 +341,9 @@ def _text(value: Any) -> str:
 
 def _about(result: Result, name: str) -> Any:
     checkpoint, cost = result.checkpoint, result.cost
-    facts: dict[str, Any] = dict(checkpoint or ()) | (checkpoint.edit if checkpoint else {}) | dict(cost or ())
+    facts: dict[str, Any] = (
+        dict(checkpoint or ()) | (checkpoint.edit if checkpoint else {}) | dict(cost or ())
+    )
     value = facts.get(name)
     return value / 1e6 if name == "parameters" and value is not None else value
 
@@ -294,7 +354,11 @@ def _cell(result: Result | None, value: str, row: Mapping[str, Any]) -> Cell | N
     fact = row.get(value) if result is None else _about(result, value)
     if fact is None:
         return None
-    return Cell(f"{float(fact):,g}", float(fact)) if isinstance(fact, int | float) else Cell(_text(fact))
+    return (
+        Cell(f"{float(fact):,g}", float(fact))
+        if isinstance(fact, int | float)
+        else Cell(_text(fact))
+    )
 
 
 def _entry(values: Mapping[str, Value | None] | None, name: str) -> Cell | None:
@@ -310,16 +374,26 @@ def _print_cells(lines: Sequence[Line], columns: int) -> None:
     Settings with at most one decimal keep their text. Numbers that would round to zero show two significant digits.
     """
     for index in range(columns):
-        cells = [c for line in lines if not line.kind.startswith("reported") and (c := line.cells[index]) is not None]
+        cells = [
+            c
+            for line in lines
+            if not line.kind.startswith("reported") and (c := line.cells[index]) is not None
+        ]
         numbers = [abs(cell.value) for cell in cells if cell.value is not None]
         largest = max(numbers, default=0.0) or 1.0
         decimals = 3 if 0.1 <= largest < 10 else min(max(2 - math.floor(math.log10(largest)), 1), 6)
-        short = all(cell.value == round(cell.value, 1) for cell in cells if cell.value is not None and cell.ci is None)
+        short = all(
+            cell.value == round(cell.value, 1)
+            for cell in cells
+            if cell.value is not None and cell.ci is None
+        )
         for cell in cells:
             if cell.value is not None and not (cell.ci is None and cell.text and short):
                 small = 0 < abs(cell.value) < 10**-decimals
                 digits = 1 - math.floor(math.log10(abs(cell.value))) if small else decimals
-                cell.text = f"{cell.value:.{digits}f}" + (f" ±{cell.ci:.{digits}f}" if cell.ci is not None else "")
+                cell.text = f"{cell.value:.{digits}f}" + (
+                    f" ±{cell.ci:.{digits}f}" if cell.ci is not None else ""
+                )
 
 
 def _rank(lines: Sequence[Line], columns: Mapping[str, str]) -> None:
@@ -327,7 +401,9 @@ def _rank(lines: Sequence[Line], columns: Mapping[str, str]) -> None:
     for kind, real in (("measured", "real"), ("reported", "reported real")):
         for marks in {line.marks for line in lines}:
             same = [x for x in lines if x.marks == marks]
-            rows = [x for x in same if x.kind == kind and not x.state and not x.facts.get("baseline")]
+            rows = [
+                x for x in same if x.kind == kind and not x.state and not x.facts.get("baseline")
+            ]
             truths = [x for x in same if x.kind == real]
             if kind == "reported" and not truths:  # from a source that does not report real motions
                 truths = [x for x in lines if x.kind == real]
@@ -348,11 +424,16 @@ def _reported(
     for row in reported["rows"]:
         unknown = row["values"].keys() - columns.keys()
         if unknown:
-            raise UserError(f"{PUBLISHED}: {part}, {row['label']}: no column is called {', '.join(sorted(unknown))}")
+            raise UserError(
+                f"{PUBLISHED}: {part}, {row['label']}: no column is called {', '.join(sorted(unknown))}"
+            )
         source, evaluator = (row.get(key) or reported[key] for key in ("source", "evaluator"))
         text = f"as reported: {source}; measured with {evaluator}"
         mark = notes.setdefault(text, "†" * (len(notes) + 1))
-        cells = [Cell(str(v), _leading(str(v))) if (v := row["values"].get(c)) is not None else None for c in columns]
+        cells = [
+            Cell(str(v), _leading(str(v))) if (v := row["values"].get(c)) is not None else None
+            for c in columns
+        ]
         line = Line(row["label"], "reported real" if row.get("real") else "reported", cells, mark)
         for value, cell in zip(values, cells, strict=True):
             if value in ABOUT and cell is not None and cell.value is not None:
@@ -369,7 +450,14 @@ def _leading(text: str) -> float | None:
 
 
 def _lengths(name: str, part: Config, results: Path) -> Part:
-    formats = {"motions": ",", "hours": ".2f", "shortest": "d", "median": "d", "mean": ".1f", "longest": "d"}
+    formats = {
+        "motions": ",",
+        "hours": ".2f",
+        "shortest": "d",
+        "median": "d",
+        "mean": ".1f",
+        "longest": "d",
+    }
     lines, histograms = [], {}
     notes = [("", "lengths are in frames, at the frame rate of each data set")]
     for dataset in part["lengths"]:
@@ -377,16 +465,30 @@ def _lengths(name: str, part: Config, results: Path) -> Part:
         if not path.exists():
             lines.append(Line(dataset, "measured", [None] * len(formats), state="not prepared"))
             continue
-        counted: Lengths = read_json(path, Lengths, "delete it; `flame-mdm tables` then counts again")
+        counted: Lengths = read_json(
+            path, Lengths, "delete it; `flame-mdm tables` then counts again"
+        )
         lengths, count, total = sorted(counted.lengths), len(counted.lengths), sum(counted.lengths)
-        numbers = [count, total / counted.fps / 3600, lengths[0], lengths[count // 2], total / count, lengths[-1]]
-        cells = [Cell(format(x, style), float(x)) for x, style in zip(numbers, formats.values(), strict=True)]
+        numbers = [
+            count,
+            total / counted.fps / 3600,
+            lengths[0],
+            lengths[count // 2],
+            total / count,
+            lengths[-1],
+        ]
+        cells = [
+            Cell(format(x, style), float(x))
+            for x, style in zip(numbers, formats.values(), strict=True)
+        ]
         facts = {"fingerprint": counted.fingerprint, "frames per second": _text(float(counted.fps))}
         lines.append(Line(dataset, "measured", [*cells], facts=facts))
         if counted.excluded:
             notes.append(("", f"{dataset}; {_left_out(counted.excluded)}"))
         step = max(1, math.ceil(lengths[-1] / 40))
-        histograms[dataset] = Histogram(step, np.bincount([length // step for length in lengths]).tolist())
+        histograms[dataset] = Histogram(
+            step, np.bincount([length // step for length in lengths]).tolist()
+        )
     return Part(name, dict.fromkeys(formats, "none"), lines, notes, histograms=histograms)
 
 
@@ -394,11 +496,18 @@ def _ratings(name: str, path: Path, reported: Config | None) -> Part:
     """Builds the table of a user study: how often people preferred one model to another."""
     columns = {"Preferred": "none", "votes": "none", "raters": "none"}
     lines: list[Line] = []
-    notes = [("", f'{path} is missing. make compare RUNS="a b" RATE=true writes a page for rating motions')]
+    notes = [
+        (
+            "",
+            f'{path} is missing. make compare RUNS="a b" RATE=true writes a page for rating motions',
+        )
+    ]
 
     if path.exists():
         notes = [("", "share of votes, with its 95 % interval (Wilson 1927)")]
-        ratings: Ratings = read_json(path, Ratings, "run `flame-mdm compare ratings=...` to count again")
+        ratings: Ratings = read_json(
+            path, Ratings, "run `flame-mdm compare ratings=...` to count again"
+        )
         for pair in ratings.pairs:
             share, low, high = pair.share
             preferred = Cell(f"{share:.1%} [{low:.1%}, {high:.1%}]", share)

@@ -30,7 +30,12 @@ KINDS = {
 }
 NO_RESULTS = ("NOT VALID", "QUICK")  # states of rows whose values must not be mistaken for results
 CARD = re.compile(r"(?<=\baudit )([\w./-]+\.html)")  # paths of audit cards in footnotes
-SHARED = ("checkpoint sha256", "recipe", "sampler")  # facts that rows listed together as sources have in common
+# Facts that rows listed together as sources have in common
+SHARED = (
+    "checkpoint sha256",
+    "recipe",
+    "sampler",
+)
 
 
 @dataclass
@@ -63,10 +68,12 @@ class Part:
     name: str
     columns: dict[str, str]  # label -> which values are better, a key of `ARROWS`
     lines: list[Line]
-    notes: list[tuple[str, str]] = field(default_factory=list)  # mark, which may be empty, and text of each footnote
+    # Mark, which may be empty, and text of each footnote
+    notes: list[tuple[str, str]] = field(default_factory=list)
     figures: list[Figure] = field(default_factory=list)
     histograms: dict[str, Histogram] = field(default_factory=dict)
-    drawn: list[tuple[str, Markup | None]] = field(default_factory=list)  # name and SVG of figures, set by `write`
+    # Name and SVG of figures, set by `write`
+    drawn: list[tuple[str, Markup | None]] = field(default_factory=list)
 
 
 @dataclass
@@ -87,14 +94,26 @@ def write(table: Table, out: Path) -> None:
         drawn = [draw(part, figure) for figure in part.figures]
         for title, histogram in part.histograms.items():
             drawn.append(svg(title, [Panel(histogram, "frames", shortened(title, 40))]))
-        slug = re.sub(r"[^a-z0-9]+", "-", f"-{part.name.lower()}").rstrip("-") if len(table.parts) > 1 else ""
+        slug = (
+            re.sub(r"[^a-z0-9]+", "-", f"-{part.name.lower()}").rstrip("-")
+            if len(table.parts) > 1
+            else ""
+        )
         numbers = range(1, len(drawn) + 1) if len(drawn) > 1 else [""]
-        part.drawn = [(f"{table.name}{slug}-figure{n}", plot) for n, plot in zip(numbers, drawn, strict=False)]
+        part.drawn = [
+            (f"{table.name}{slug}-figure{n}", plot) for n, plot in zip(numbers, drawn, strict=False)
+        ]
         for name, plot in part.drawn:
             if plot:
                 style = (TEMPLATES / "plot.css").read_text(encoding="utf-8")
-                write_text(out / f"{name}.svg", str(plot).replace(">", f"><style>{style}</style>", 1))
-    texts = {"md": rendered(table, "md"), "tex": rendered(table, "tex"), "csv": comma_separated(table)}
+                write_text(
+                    out / f"{name}.svg", str(plot).replace(">", f"><style>{style}</style>", 1)
+                )
+    texts = {
+        "md": rendered(table, "md"),
+        "tex": rendered(table, "tex"),
+        "csv": comma_separated(table),
+    }
     for suffix, text in (texts | {"html": page(table.title, rendered(table, "html"))}).items():
         write_text(out / f"{table.name}.{suffix}", text)
 
@@ -126,13 +145,22 @@ def _unranked(table: Table) -> str:
 def _linked(table: Table, text: str) -> list[tuple[str, str]]:
     """Splits a footnote into texts and their links; "" = no link, also to a card that is not on this machine."""
     return [
-        (part, Path(os.path.relpath(part, table.folder)).as_posix() if i % 2 and Path(part).exists() else "")
+        (
+            part,
+            Path(os.path.relpath(part, table.folder)).as_posix()
+            if i % 2 and Path(part).exists()
+            else "",
+        )
         for i, part in enumerate(CARD.split(text))
     ]
 
 
 def _blocks(part: Part) -> list[tuple[str, list[Line]]]:
-    return [(title, rows) for kind, title in KINDS.items() if (rows := [x for x in part.lines if x.kind == kind])]
+    return [
+        (title, rows)
+        for kind, title in KINDS.items()
+        if (rows := [x for x in part.lines if x.kind == kind])
+    ]
 
 
 def _label(line: Line) -> str:
@@ -152,28 +180,53 @@ def _sources(table: Table) -> list[str]:
             some = list(group)
             values = {name: [line.facts[name] for line in some] for name in some[0].facts}
             joined = {
-                n: texts[:1] if len(set(texts)) == 1 else [t or "–" for t in texts] for n, texts in values.items()
+                n: texts[:1] if len(set(texts)) == 1 else [t or "–" for t in texts]
+                for n, texts in values.items()
             }
-            facts = ", ".join(f"{name} {' / '.join(texts)}" for name, texts in joined.items() if any(values[name]))
+            facts = ", ".join(
+                f"{name} {' / '.join(texts)}" for name, texts in joined.items() if any(values[name])
+            )
             prefix = f"{part.name}: " if len(table.parts) > 1 else ""
-            rows.append(f"{prefix}{' / '.join(dict.fromkeys(line.label for line in some))}: {facts}")
+            rows.append(
+                f"{prefix}{' / '.join(dict.fromkeys(line.label for line in some))}: {facts}"
+            )
     return rows
 
 
 def _tex(text: str) -> str:
-    special = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "–": "--"}
-    special |= {"±": r"$\pm$", "†": r"$\dagger$", "≥": r"$\geq$", "×": r"$\times$", "λ": r"$\lambda$", "β": r"$\beta$"}
-    special |= {c: "\\" + c for c in "&%$#_{}"} | {"[": "{[}", "]": "{]}"}  # brackets after \\\\ are its option
+    special = {
+        "\\": r"\textbackslash{}",
+        "~": r"\textasciitilde{}",
+        "^": r"\textasciicircum{}",
+        "–": "--",
+    }
+    special |= {
+        "±": r"$\pm$",
+        "†": r"$\dagger$",
+        "≥": r"$\geq$",
+        "×": r"$\times$",
+        "λ": r"$\lambda$",
+        "β": r"$\beta$",
+    }
+    # Brackets after \\\\ are its option
+    special |= {c: "\\" + c for c in "&%$#_{}"} | {
+        "[": "{[}",
+        "]": "{]}",
+    }
     return one_line(text).translate(str.maketrans(special))
 
 
 def comma_separated(table: Table) -> str:
     """Returns the table as CSV: for each row, the number, interval and place of each cell, and its provenance."""
-    facts = list(dict.fromkeys(name for part in table.parts for line in part.lines for name in line.facts))
+    facts = list(
+        dict.fromkeys(name for part in table.parts for line in part.lines for name in line.facts)
+    )
     columns = list(dict.fromkeys(name for part in table.parts for name in part.columns))
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    head = [x for c in columns for x in (c, f"{c}: printed", f"{c}: 95 % interval, half", f"{c}: place")]
+    head = [
+        x for c in columns for x in (c, f"{c}: printed", f"{c}: 95 % interval, half", f"{c}: place")
+    ]
     writer.writerow([_inert(x) for x in ("part", "row", "kind", "state", "marks", *head, *facts)])
     for part in table.parts:
         for line in part.lines:
@@ -228,7 +281,9 @@ def _series(part: Part, figure: Figure, column: str) -> tuple[list[Series], list
         name = shortened(one_line(label), 60) + (", reported" if reported else "")
         xy = [(x, y) for x, y, _ in sorted(points)]
         spread = {x: ci for x, _, ci in points if ci}
-        series.append(Series(name, xy, spread, "dots" if figure.points else "dashed" if reported else "line"))
+        series.append(
+            Series(name, xy, spread, "dots" if figure.points else "dashed" if reported else "line")
+        )
     return series, levels
 
 
@@ -237,9 +292,17 @@ def ranks(values: Sequence[float | None], better: str, real: float | None) -> li
 
     `better` is higher, lower, real (closest to the value `real` of real motions) or none; a missing value is None.
     """
-    if better == "none" or sum(v is not None for v in values) < 2 or (better == "real" and real is None):
+    if (
+        better == "none"
+        or sum(v is not None for v in values) < 2
+        or (better == "real" and real is None)
+    ):
         return [0] * len(values)
-    distances = {"higher": lambda v: -v, "lower": lambda v: v, "real": lambda v: abs(v - (real or 0.0))}
+    distances = {
+        "higher": lambda v: -v,
+        "lower": lambda v: v,
+        "real": lambda v: abs(v - (real or 0.0)),
+    }
     badness = [None if v is None else distances[better](v) for v in values]
     best = sorted({bad for bad in badness if bad is not None})[:2]
     return [best.index(bad) + 1 if bad in best else 0 for bad in badness]

@@ -45,7 +45,9 @@ def _sizes(config: Config) -> dict[str, float]:
     out_features = instantiate(config["process"]).out_features(features)
     sizes = {"in_features": features, "out_features": out_features}
     with torch.device("meta"):
-        denoiser = instantiate(config["denoiser"], **sizes, cond_features=config["condition"].get("features", 0))
+        denoiser = instantiate(
+            config["denoiser"], **sizes, cond_features=config["condition"].get("features", 0)
+        )
     return {"features": features, "parameters": sum(p.numel() for p in denoiser.parameters()) / 1e6}
 
 
@@ -63,7 +65,9 @@ def settings_table(name: str, part: Config, reported: Config | None) -> Part:
     """Builds a table of hyperparameters. The rows are keys or recipes, whichever are more."""
     for key in part["keys"].values():
         if key not in HYPERPARAMETERS:
-            raise UserError(f"part {name}: no setting is called '{key}'.{did_you_mean(key, HYPERPARAMETERS)}")
+            raise UserError(
+                f"part {name}: no setting is called '{key}'.{did_you_mean(key, HYPERPARAMETERS)}"
+            )
     recipes = {label: hyperparameters(recipe) for label, recipe in part["recipes"].items()}
     printed = {row["label"]: row["values"] for row in reported["rows"]} if reported else {}
     ours: dict[tuple[str, str], Cell | None] = {}
@@ -85,5 +89,8 @@ def settings_table(name: str, part: Config, reported: Config | None) -> Part:
                     line.cells.append(cells[line.label, column])
     notes = [("", f"{label}: recipe {recipe}") for label, recipe in part["recipes"].items()]
     if reported:
-        notes += [("", f"reported: {reported['source']}"), *(("", note) for note in reported.get("notes", []))]
+        notes += [
+            ("", f"reported: {reported['source']}"),
+            *(("", note) for note in reported.get("notes", [])),
+        ]
     return Part(name, dict.fromkeys(heads, "none"), lines, notes)

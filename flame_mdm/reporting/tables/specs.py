@@ -20,8 +20,18 @@ from flame_mdm.schemas import ClosedSchema, Int, Number, Schema, check_shape
 SPECS = EXPERIMENTS / "tables"
 PUBLISHED = SPECS / "published.yaml"
 LABELS: dict[str, dict[str, str]] = read_yaml(Path(__file__).with_name("labels.yaml"))
-ABOUT = LABELS["values"]  # labels of the values that a column may show besides metrics, and of the x-axes of figures
-SWEPT = ("sampler", "num_inference_steps", "eta", "spacing", "guidance_scale", "until", "strength", "batch_size")
+# Labels of the values that a column may show besides metrics, and of the x-axes of figures
+ABOUT = LABELS["values"]
+SWEPT = (
+    "sampler",
+    "num_inference_steps",
+    "eta",
+    "spacing",
+    "guidance_scale",
+    "until",
+    "strength",
+    "batch_size",
+)
 """Options of a row that may be lists; each value makes one row."""
 MOST_ROWS, MOST_COLUMNS, MOST_FIGURES = 1_000, 100, 100
 """Limits of a table: rows after expanding lists of options, columns, and plots. Tables of papers have about 20 rows."""
@@ -70,7 +80,9 @@ class RowSpec(Options):
     def _overrides(cls, row: Any) -> Any:
         for key in row if isinstance(row, dict) else ():
             if "." in str(key) and not re.fullmatch(r"data(\.(?!_)\w+)+", str(key)):
-                raise ValueError(f"{key}: only keys of the data can be overridden, such as data.crop.max_frames")
+                raise ValueError(
+                    f"{key}: only keys of the data can be overridden, such as data.crop.max_frames"
+                )
         return row
 
     @model_validator(mode="after")
@@ -98,7 +110,10 @@ class PartSpec(Options):
         kinds = [{"columns", "rows"}, {"recipes", "keys"}, {"lengths"}, {"ratings"}]
         if sum(kind <= self.model_fields_set for kind in kinds) != 1:
             raise ValueError("needs columns and rows, or recipes and keys, or lengths, or ratings")
-        options = [[len(as_list(getattr(row, n))) for n in SWEPT if n in row.model_fields_set] for row in self.rows]
+        options = [
+            [len(as_list(getattr(row, n))) for n in SWEPT if n in row.model_fields_set]
+            for row in self.rows
+        ]
         _at_most("rows", sum(map(math.prod, options)), MOST_ROWS)
         if self.rows and not self.protocol:
             raise ValueError("needs a protocol")
@@ -133,7 +148,9 @@ class Spec(ClosedSchema):
         for figure in self.figures:
             part = self.parts.get(figure.part)
             if part is None or figure.x not in ABOUT:
-                raise ValueError(f"a figure needs a part of the table and x, one of {', '.join(ABOUT)}")
+                raise ValueError(
+                    f"a figure needs a part of the table and x, one of {', '.join(ABOUT)}"
+                )
             for column in figure.y:
                 if column not in part.columns:
                     raise ValueError(f"figure: y={column} is not a column of {figure.part}")
@@ -159,7 +176,9 @@ def load_spec(name: str) -> Config:
     path = Path(name) if name.endswith((".yaml", ".yml")) else SPECS / f"{name}.yaml"
     if not path.is_file() or path == PUBLISHED:
         names = spec_names()
-        raise UserError(f"no table is called '{name}'.{did_you_mean(name, names)} There are: {', '.join(names)}")
+        raise UserError(
+            f"no table is called '{name}'.{did_you_mean(name, names)} There are: {', '.join(names)}"
+        )
     spec = load_mapping(path)
     try:
         check_shape(spec, Spec)
@@ -170,7 +189,9 @@ def load_spec(name: str) -> Config:
 
 def _at_most(what: str, count: int, most: int) -> None:
     if count > most:
-        raise UserError(f"{what}: {count:,} exceed the limit of {most:,} per table. Split it into several tables")
+        raise UserError(
+            f"{what}: {count:,} exceed the limit of {most:,} per table. Split it into several tables"
+        )
 
 
 def load_mapping(path: Path) -> Config:
@@ -192,7 +213,9 @@ class Evaluation:
         """Returns the path of the result, a function of the keys alone, so that tables share results."""
         digest = hashlib.sha256(json.dumps(dict(self.keys), sort_keys=True).encode()).hexdigest()
         what = self.keys.get("baseline") or self.keys.get("ckpt") or self.keys["from_samples"]
-        name = re.sub(r"^runs-|-checkpoints-|-ckpt$|-default", "-", re.sub(r"[^A-Za-z0-9]+", "-", str(what))).strip("-")
+        name = re.sub(
+            r"^runs-|-checkpoints-|-ckpt$|-default", "-", re.sub(r"[^A-Za-z0-9]+", "-", str(what))
+        ).strip("-")
         name = re.sub(r"-+", "-", name)[-60:]
         return results / Path(str(self.keys["protocol"])).stem / f"{name}-{digest[:10]}.json"
 
@@ -201,7 +224,9 @@ class Evaluation:
         """Files that do not exist, by what is missing: "no checkpoint"."""
         files = {"no checkpoint": "ckpt", "no samples": "from_samples", "no extractor": "extractor"}
         paths = {what: str(self.keys.get(key) or "none") for what, key in files.items()}
-        return {what: path for what, path in paths.items() if path != "none" and not Path(path).exists()}
+        return {
+            what: path for what, path in paths.items() if path != "none" and not Path(path).exists()
+        }
 
 
 def evaluations(part: Mapping[str, Any]) -> Iterator[tuple[dict[str, Any], list[Evaluation]]]:
@@ -220,7 +245,9 @@ def evaluations(part: Mapping[str, Any]) -> Iterator[tuple[dict[str, Any], list[
             yield single, [_evaluation(part, single, column) for column in part["columns"].values()]
 
 
-def _evaluation(part: Mapping[str, Any], row: Mapping[str, Any], column: Mapping[str, Any]) -> Evaluation:
+def _evaluation(
+    part: Mapping[str, Any], row: Mapping[str, Any], column: Mapping[str, Any]
+) -> Evaluation:
     keys = {name: row[name] for name in row if name not in ("label", "note")}
     for level in (part, row, column):
         keys |= {name: level[name] for name in Options.model_fields if name in level}

@@ -53,10 +53,34 @@ def load(
     adapter: Paths = (),
     strength: float | Sequence[float] = 1.0,
 ) -> MotionGenerator:
-    """Loads a trained model for sampling; `source` and `which` as for `find`, errors as for `find` and `load_task`.
+    """Loads a trained model for sampling.
 
-    `adapter` are files that `flame_mdm.adapt` wrote for this model, `strength` that of each, or of all: 0 = the model
-    without them, 1 = as trained.
+    The model is in evaluation mode, with averaged weights if its recipe averages them. No data set and no training code
+    is needed.
+
+    Args:
+        source: a run directory; a .ckpt or .safetensors file; a folder with one .safetensors file; the name of a model
+            in this package, such as "quickstart"; or "user/name[@revision]" on the Hugging Face hub. An existing path
+            comes first.
+        device: device of the weights, such as "cuda".
+        which: the checkpoint of a run directory, "last" or "best". Files have only one.
+        adapter: one or several files that `flame_mdm.adapt` wrote for this model. Default: none.
+        strength: strength of all adapters, or one number per adapter. 0 is the model without the adapter, 1 the model
+            as it was adapted.
+
+    Returns:
+        The model, an argument of `flame_mdm.generate`, `edit` and `stream`.
+
+    Raises:
+        FileNotFoundError: If there is no such file or checkpoint.
+        UserError: If the file is damaged or holds no motion generator, its weights do not match its recipe, the model
+            cannot be downloaded, an adapter belongs to another model, or the machine has no such device.
+
+    Example:
+        >>> import flame_mdm
+        >>> model = flame_mdm.load("quickstart")
+        >>> model.describe(), model.conditioned_on
+        ('MDMEncoder', 'text')
     """
     return load_task(
         find(source, which), MotionGenerator, device, adapter=adapter, strength=strength
@@ -68,8 +92,15 @@ def load_task(
 ) -> Trained:
     """Loads the task of a .ckpt or .safetensors file in evaluation mode, with averaged weights if its recipe has them.
 
-    `kind` is the expected class of the task, `adapted` adapter and strength, as for `load`. Raises `UserError` if the
-    file is damaged, holds another kind of task, or its weights do not match its recipe.
+    Args:
+        path: the file.
+        kind: the expected class of the task.
+        device: device of the weights.
+        adapted: the keywords `adapter` and `strength` of `load`.
+
+    Raises:
+        UserError: If the file is damaged or holds another kind of task, its weights do not match its recipe, or the
+            machine has no such device.
     """
     check_device(device)
     checkpoint = read_merged(path, **adapted)

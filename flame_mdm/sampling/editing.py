@@ -32,18 +32,25 @@ MFM_STEPS = 25
 
 @dataclass(eq=False, repr=False, kw_only=True)
 class Edited(Motion):
-    """An edited motion, of which a part was kept.
+    """An edited motion, with its original and how well the kept part was kept.
 
     The joint error can be large although features are kept: they are relative to the root, so a kept part continues
     from where a resampled part ends.
+
+    Example:
+        >>> import flame_mdm
+        >>> from flame_mdm.sampling.editing import Edited
+        >>> issubclass(Edited, flame_mdm.Motion)  # it is saved and shown like other motions
+        True
     """
 
-    original: Motion  # before editing
-    keep: np.ndarray  # (F, D) bool, True if this feature of this frame was to be kept
-    feature_error: (
-        float  # maximum change of kept values in normalized features; 0 if the method is exact
-    )
-    # Maximum distance in meters between the world positions of a kept joint before and after
+    #: The motion before editing.
+    original: Motion
+    #: (F, D) bool, True = this feature of this frame was to be kept.
+    keep: np.ndarray
+    #: Maximum change of the kept values, in normalized features; 0 if the method is exact.
+    feature_error: float
+    #: Maximum distance in meters between the world positions of a kept joint before and after.
     joint_error: float
 
 
@@ -74,7 +81,10 @@ def edit(
     stages: list[Motion] | None = None,
     **keywords: Unpack[EditKeywords],
 ) -> list[Edited]:
-    """Resamples part of a motion: `joints` in `region`, each by default all; with `strength`, as a variation of it.
+    """Resamples part of a motion and keeps the rest, without additional training.
+
+    The `joints` in the frames of `region` are resampled; either is by default all of them. With `strength`, the result
+    is a variation of the motion instead of a new one.
 
     Args:
         model: the model, from `flame_mdm.load`.
@@ -84,20 +94,31 @@ def edit(
             given.
         fps: frames per second of an array or an .npy file; for other files, it overrides the rate in the file.
         cut: [begin, end] in seconds of the part of the motion to use. Default: all of it.
-        stages: list that gets the clean estimates along the sampling, as in `flame_mdm.generate`.
-        keywords: what is resampled: `region` or `region_seconds`, `joints`, and `strength`; how: `method`, `until`,
-            and `resample`; and keywords of `flame_mdm.generate`, such as `samples` (1), `seed` (0) and
-            `guidance_scale`. `flame_mdm.sampling.motion_request.EditRequest` describes the first ones. `cleanup` also
-            changes the kept part, by millimeters as a rule; `joint_error` says by how much.
+        stages: list that gets the clean estimates along the sampling of the first motion, at equal intervals, and that
+            motion itself.
+        keywords: `region` or `region_seconds`, `joints` and `strength` say what is resampled; `method`, `until` and
+            `resample` say how (`flame_mdm.sampling.motion_request.EditRequest` describes these seven). The keywords of
+            `flame_mdm.generate` also apply, such as `samples` (1), `seed` (0) and `guidance_scale`. `cleanup` also
+            changes the kept part, by millimeters as a rule; `Edited.joint_error` says by how much.
 
     Returns:
-        One edited motion per sample, `samples` for each text: all samples of the first text, in the order of their
-        numbers, then those of the second text, and so on. The original is not among them, but in their attribute
-        `original`.
+        One edited motion per sample, `samples` for each text: all samples of the first text in the order of their
+        numbers, then all samples of the second text, and so on. The original is not in the list; it is the attribute
+        `original` of each edited motion.
 
     Raises:
         UserError: If the request is invalid, the process does not support the method, or the motion cannot be read or
             is longer than the motions in training.
+
+    Example:
+        >>> import flame_mdm
+        >>> model = flame_mdm.load("quickstart")
+        >>> walk = flame_mdm.generate(model, "a person walks", frames=20, num_inference_steps=2)[0]
+        >>> edited = flame_mdm.edit(
+        ...     model, walk, "a person waves", joints="left_arm", num_inference_steps=2
+        ... )[0]
+        >>> edited.joints.shape, edited.feature_error < 1e-3  # all other joints are kept
+        ((20, 22, 3), True)
     """
     request = SamplingRequest.of("edit", {"texts": texts, **keywords}, editing=True)
     return sample_edit(model, resolve_edit(request, model, motion, fps=fps, cut=cut), stages=stages)
@@ -111,7 +132,10 @@ def resolve_edit(
     fps: float | None = None,
     cut: Sequence[float] | None = None,
 ) -> ResolvedEdit:
-    """Finds out which features of a motion `request.editing` keeps; see `edit` for the other arguments."""
+    """Reads the motion and finds out which of its features `request.editing` keeps.
+
+    `motion`, `fps` and `cut` are arguments of `edit`, which also lists the errors.
+    """
     representation, editing = model.representation, request.editing or EditRequest()
     if model.denoiser.context_frames:
         raise UserError(

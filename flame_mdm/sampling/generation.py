@@ -47,8 +47,8 @@ def generate(
     Args:
         model: the model, from `flame_mdm.load`.
         texts: what the person does; one text or several.
-        score: function that scores the `candidates` without faults; the highest score is kept. Default: the number of
-            faulty frames decides.
+        score: function that scores the `candidates` without faults; the highest score is kept. Default: the candidate
+            with the fewest faulty frames is kept.
         edit: part of a motion of the same length to keep in every sample, with `known` and `keep` (1, F, D).
         stages: list that gets the clean estimates along the sampling of the first motion, at equal intervals, and that
             motion itself (MFM, figure 5).
@@ -60,12 +60,22 @@ def generate(
             describe them.
 
     Returns:
-        One motion per sample, `samples` for each text: all samples of the first text, in the order of their numbers,
-        then those of the second text, and so on.
+        One motion per sample, `samples` for each text: all samples of the first text in the order of their numbers,
+        then all samples of the second text, and so on.
 
     Raises:
         UserError: If the request is invalid, the model cannot do what is requested, or knows no word of a text that
             says what happens.
+
+    Example:
+        >>> import flame_mdm
+        >>> model = flame_mdm.load("quickstart")
+        >>> texts = ["a person walks", "a person waves"]
+        >>> motions = flame_mdm.generate(model, texts, frames=20, samples=2, num_inference_steps=2)
+        >>> [motion.text for motion in motions]
+        ['a person walks', 'a person walks', 'a person waves', 'a person waves']
+        >>> motions[0].joints.shape  # frames, joints, (x, y, z) in meters; y is up
+        (20, 22, 3)
     """
     request = SamplingRequest.of("generate", {"texts": texts, **keywords})
     if edit is not None:

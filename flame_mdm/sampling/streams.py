@@ -47,13 +47,13 @@ def stream(
     Args:
         model: a model that continues frames (DiP), from `flame_mdm.load`.
         text: what the person does at first.
-        start: the motion to continue, of which the last frames count: a motion, a file, or "dataset:id", a clip of a
-            prepared data set. Default: a person who stands still.
+        start: the motion to continue: a motion, a file, or "dataset:id", a clip of a prepared data set. Only its last
+            frames count. Default: a person who stands still.
         seed: seed of the noise.
         block: number of frames per block, up to what the model predicts at once. Shorter blocks react sooner to a new
             text, and cost more per second of motion. Default: what the model predicts at once.
-        cleanup: smooth motions, constant bone lengths, feet that do not slide. Each block is returned when the one
-            after it is computed, which it must fit.
+        cleanup: smooth motions, constant bone lengths, feet that do not slide. A block is returned after the next block
+            was computed, because it must fit that block.
         options: `guidance_scale`, `sampler`, `num_inference_steps`, `eta` and `spacing`; default: the model's.
 
     Returns:
@@ -62,6 +62,14 @@ def stream(
     Raises:
         UserError: If the model does not continue frames, knows no word of the text that says what happens, or the
             motion to continue cannot be read or is too short.
+
+    Example:
+        >>> import flame_mdm
+        >>> stream = flame_mdm.stream(dip, "a person walks", block=8)  # dip: a model like synthetic/dip
+        >>> block = next(stream)
+        >>> stream.change("a person turns left")  # from the next block on
+        >>> len(block.joints), next(stream).text
+        (8, 'a person turns left')
     """
     prefix, placement = starting_point(model, start)
     condition = read_text(model, text)
@@ -74,10 +82,18 @@ def stream(
 
 
 class Stream(Iterator[Motion]):
-    """A motion without an end: an iterator of blocks, each a `Motion` placed in the world after the one before.
+    """A motion without an end, from `flame_mdm.stream`: an iterator of blocks, whose text may change at any time.
 
-    A block is computed when it is asked for; with `cleanup`, the block after it, too. The same texts at the same times
-    and the same seed give the same motion.
+    Each block is a `Motion`, placed in the world after the block before. A block is computed when it is asked for; with
+    `cleanup`, the block after it is computed, too. The same texts at the same times and the same seed give the same
+    motion.
+
+    Example:
+        >>> import itertools, flame_mdm
+        >>> stream = flame_mdm.stream(dip, "a person walks", seed=1)  # dip: a model like synthetic/dip
+        >>> blocks = list(itertools.islice(stream, 2))
+        >>> stream.frames == len(blocks[0].joints) + len(blocks[1].joints)
+        True
     """
 
     def __init__(self, streams: Streams, *, cleanup: bool = False):
@@ -96,10 +112,16 @@ class Stream(Iterator[Motion]):
         return self._streams.texts[condition]
 
     def change(self, text: str, at: float | None = None) -> None:
-        """Changes the text from a time in seconds of the stream on; default: from the next block on.
+        """Changes the text from the next block on, or from a given time on.
 
-        A block ends early if the text changes in the middle of it. Blocks that were computed do not change. Raises
-        `UserError` if the model knows no word of the text that says what happens, or the time is over.
+        A block ends early if the text changes in the middle of it. Blocks that were computed do not change.
+
+        Args:
+            text: what the person does then.
+            at: time in seconds since the start of the stream. Default: the end of the blocks so far.
+
+        Raises:
+            UserError: If the model knows no word of the text that says what happens, or the time has passed.
         """
         fps = self._streams.model.representation.fps
         frame = self.frames if at is None else round(at * fps)

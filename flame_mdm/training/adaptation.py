@@ -83,18 +83,37 @@ def adapt(
 ) -> Path:
     """Teaches a text-conditioned model the motions in a folder; resumes an interrupted run.
 
+    The model is trained on the user's clips and on clips of its own data, so that it does not forget those. Prompts ask
+    for the new motions with "in NAME style". `docs/own-motion.md` is the guide.
+
     Args:
-        base: as for `flame_mdm.load`.
-        source: folder of motions with captions, for which prompts ask with "in NAME style".
-        out: run directory; default runs/adapt/NAME.
+        base: the model to adapt: a run directory, a .ckpt or .safetensors file, the name of a model in this package, or
+            "user/name[@revision]" on the Hugging Face hub.
+        source: folder of motions with captions.
+        name: name of the style, one word of letters and digits.
+        out: run directory. Default: runs/adapt/NAME.
         action: the clips show an action that the model does not know, instead of a style.
         full: train all weights; the result is a model file instead of an adapter.
         force: accept clips that drift upward or float.
-        rank: of the changes of the weights; more for motions far from what the model knows.
-        data_root: folder of the prepared data sets; without the base's, 300 motions are sampled from the base.
+        rank: rank of the changes of the weights, 1 or more; more for motions far from what the model knows.
+        data_root: folder of the prepared data sets. If it lacks the data set of the base, 300 motions are sampled from
+            the base instead.
         overrides: overrides of `experiments/adapt.yaml`, such as "trainer.max_steps=2000".
 
-    Returns the adapter or model file, OUT/NAME.safetensors. OUT/adaptation.html compares motions before and after.
+    Returns:
+        Path of the adapter, or with `full` of the model file: OUT/NAME.safetensors. The page OUT/adaptation.html
+        compares motions before and after.
+
+    Raises:
+        FileNotFoundError: If there is no such model or folder.
+        UserError: If the name is not one word, the model is distilled or not conditioned on text, the folder has no
+            captions, or its clips drift or float.
+
+    Example:
+        >>> import flame_mdm
+        >>> path = flame_mdm.adapt("quickstart", "my_clips", "limp")  # doctest: +SKIP
+        >>> model = flame_mdm.load("quickstart", adapter=path)  # doctest: +SKIP
+        >>> flame_mdm.generate(model, "a person walks in limp style")[0].save("limp.glb")  # doctest: +SKIP
     """
     file, out = find(base), Path(out or f"runs/adapt/{name}")
     if not re.fullmatch(r"[^\W_]+", name):

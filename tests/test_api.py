@@ -1,0 +1,47 @@
+"""Examples of docstrings run and print what they say, one test per public class or function."""
+
+import doctest
+from collections.abc import Iterator
+from functools import cache
+from importlib import import_module
+from typing import Any
+
+import pytest
+import torch
+from support.runs import TINY_DIP, untrained
+
+MODULES = [
+    "flame_mdm.checkpoints.loading",
+    "flame_mdm.sampling.editing",
+    "flame_mdm.sampling.generation",
+    "flame_mdm.sampling.streams",
+    "flame_mdm.training.adaptation",
+]
+
+
+def examples() -> Iterator[Any]:
+    """Yields the examples of each docstring of the modules, as test cases."""
+    finder = doctest.DocTestFinder(exclude_empty=True)
+    for name in MODULES:
+        for test in finder.find(import_module(name), name):
+            if test.examples:
+                yield pytest.param(test, id=test.name)
+
+
+@cache
+def dip() -> Any:
+    """A tiny model that continues frames, with random weights."""
+    return untrained(TINY_DIP, max_frames=60, name="synthetic/dip")
+
+
+@pytest.mark.parametrize("test", examples())
+def test_the_example_of_a_docstring_prints_what_it_says(test: doctest.DocTest):
+    torch.manual_seed(0)
+    if any("dip" in example.source for example in test.examples):
+        test.globs["dip"] = dip()
+    failures: list[str] = []
+    runner = doctest.DocTestRunner(
+        optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE | doctest.FAIL_FAST
+    )
+    runner.run(test, out=failures.append)
+    assert not failures, "".join(failures)

@@ -301,11 +301,11 @@ class _Measure:
             rows["paired"] = torch.from_numpy(self.inputs[STORED]["features"])
             rows["paired_text"] = self._encoded(self.real_texts)
         prefix = f"{name}/"
-        own = {
+        named = {
             key: values for key, values in inputs.items() if key == name or key.startswith(prefix)
         }
         return rows | {
-            key.removeprefix(name).removeprefix("/"): values for key, values in own.items()
+            key.removeprefix(name).removeprefix("/"): values for key, values in named.items()
         }
 
     def _encoded(self, texts: Sequence[Text]) -> Tensor:

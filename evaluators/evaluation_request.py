@@ -88,28 +88,30 @@ class EvaluationRequest(EvaluationKeys):
     @classmethod
     def of(cls, config: Config) -> EvaluationRequest:
         kinds = (cls, SamplerOptions)
-        own, options = (
+        keywords, options = (
             {key.name: config[key.name] for key in fields(kind) if key.name in config}
             for kind in kinds
         )
-        return cls(**own, options=SamplerOptions(**options))
+        return cls(**keywords, options=SamplerOptions(**options))
 
     def __post_init__(self) -> None:
         _ = self.editing  # checks its keys
-        what = [
+        subjects = [
             name for name in ("ckpt", "from_samples", "baseline") if getattr(self, name) is not None
         ]
-        if len(what) != 1:
+        if len(subjects) != 1:
             raise UserError(
                 "give exactly one of ckpt=FILE, from_samples=FOLDER and baseline=NAME, such as shuffled"
             )
-        if what != ["ckpt"] and not self.data:
-            raise UserError(f"{what[0]} needs a data set. Add data=NAME, such as data=humanml3d")
-        if what != ["ckpt"] and self.protocol is None:
+        if subjects != ["ckpt"] and not self.data:
             raise UserError(
-                f"{what[0]} needs a protocol. Add protocol=NAME, such as protocol=text_to_motion"
+                f"{subjects[0]} needs a data set. Add data=NAME, such as data=humanml3d"
             )
-        if what == ["from_samples"] and (self.quick or self.samples or self.replications):
+        if subjects != ["ckpt"] and self.protocol is None:
+            raise UserError(
+                f"{subjects[0]} needs a protocol. Add protocol=NAME, such as protocol=text_to_motion"
+            )
+        if subjects == ["from_samples"] and (self.quick or self.samples or self.replications):
             raise UserError(
                 "from_samples evaluates all motions of the files. Remove quick, samples and replications"
             )

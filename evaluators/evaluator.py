@@ -202,9 +202,13 @@ class Evaluator:
         generator = np.random.default_rng(key("bootstrap", seed))
         drawn: list[dict[str, float | None]] = []
         for _ in ProgressBar(range(resamples), desc="bootstrap", unit=" sets"):
-            own, other = (torch.from_numpy(generator.integers(n, size=n)) for n in (count, others))
+            rows, real_rows = (
+                torch.from_numpy(generator.integers(n, size=n)) for n in (count, others)
+            )
             values = {
-                name: partial(metric.drawn_value, own, other) if name in usable else metric.compute
+                name: partial(metric.drawn_value, rows, real_rows)
+                if name in usable
+                else metric.compute
                 for name, metric in metrics.items()
             }
             drawn.append(_values(values, metrics)[0])

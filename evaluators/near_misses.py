@@ -23,10 +23,10 @@ def near_misses(clips: Sequence[Entry]) -> list[dict[str, list[str]]]:
     """
     stated = [_stated(clip) for clip in clips]
     captions: dict[_Stated, set[str]] = {}
-    for own, clip in zip(stated, clips, strict=True):
-        captions.setdefault(own, set()).update(clip.captions)
-    contradicting = {own: _contradicting(own, captions) for own in captions}
-    return [contradicting[own] for own in stated]
+    for attributes, clip in zip(stated, clips, strict=True):
+        captions.setdefault(attributes, set()).update(clip.captions)
+    contradicting = {attributes: _contradicting(attributes, captions) for attributes in captions}
+    return [contradicting[attributes] for attributes in stated]
 
 
 def _stated(clip: Entry) -> _Stated:
@@ -45,8 +45,8 @@ def _stated(clip: Entry) -> _Stated:
     return frozenset(stated.items())
 
 
-def _contradicting(own: _Stated, captions: dict[_Stated, set[str]]) -> dict[str, list[str]]:
-    mine = dict(own)
+def _contradicting(clip: _Stated, captions: dict[_Stated, set[str]]) -> dict[str, list[str]]:
+    mine = dict(clip)
     wrong: dict[str, set[str]] = {}
     for attributes, texts in captions.items():
         other = dict(attributes)
@@ -54,5 +54,5 @@ def _contradicting(own: _Stated, captions: dict[_Stated, set[str]]) -> dict[str,
             continue
         differing = [name for name in mine.keys() & other.keys() if mine[name] != other[name]]
         if len(differing) == 1 and other[differing[0]] != UNSAID:
-            wrong.setdefault(differing[0], set()).update(texts - captions[own])
+            wrong.setdefault(differing[0], set()).update(texts - captions[clip])
     return {name: sorted(texts) for name, texts in sorted(wrong.items()) if texts}

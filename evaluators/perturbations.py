@@ -66,9 +66,9 @@ def resize(joints: Joints, percent: float) -> Joints:
 def pop(joints: Joints, centimeters: float, draws: Draws, *, last: bool = False) -> Joints:
     """Displaces the whole body in one random inner frame, or in the last frame, in a random direction."""
     frame = int(draws.integers(1, len(joints) - 1))
-    way = draws.standard_normal(3)
+    direction = draws.standard_normal(3)
     popped = joints.copy()
-    popped[-1 if last else frame] += centimeters / 100 * way / np.linalg.norm(way)
+    popped[-1 if last else frame] += centimeters / 100 * direction / np.linalg.norm(direction)
     return popped
 
 
@@ -80,9 +80,12 @@ def draw_in(joints: Joints, centimeters: float) -> Joints:
     changed, neck = joints.copy(), joints[:, names.index("neck")]
     for side in ("left", "right"):
         elbow, wrist = (names.index(f"{side}_{name}") for name in ("elbow", "wrist"))
-        way = joints[:, 0] + 0.4 * (neck - joints[:, 0]) - joints[:, wrist]
-        way *= np.minimum(1, centimeters / 100 / np.linalg.norm(way, axis=-1, keepdims=True))
-        changed[:, wrist], changed[:, elbow] = joints[:, wrist] + way, joints[:, elbow] + way / 2
+        shift = joints[:, 0] + 0.4 * (neck - joints[:, 0]) - joints[:, wrist]
+        shift *= np.minimum(1, centimeters / 100 / np.linalg.norm(shift, axis=-1, keepdims=True))
+        changed[:, wrist], changed[:, elbow] = (
+            joints[:, wrist] + shift,
+            joints[:, elbow] + shift / 2,
+        )
     return changed
 
 

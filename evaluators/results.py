@@ -181,10 +181,10 @@ def _overlaps(request: EvaluationRequest, plan: Plan) -> list[str]:
     evaluated, extractor, reasons = plan.data.store.fingerprint, plan.extractor, []
     trained = {"training data": plan.model.facts.get("fingerprint") if plan.model else None}
     trained["training data of the extractor"] = extractor.fingerprint if extractor else None
-    for what, fingerprint in trained.items():
+    for origin, fingerprint in trained.items():
         if fingerprint and fingerprint != evaluated:
             reasons.append(
-                f"{what} {fingerprint} and evaluated data {evaluated} differ: splits may overlap"
+                f"{origin} {fingerprint} and evaluated data {evaluated} differ: splits may overlap"
             )
     if extractor is not None and extractor.fingerprint == evaluated and request.split == "train":
         reasons.append("the extractor was trained on the evaluated split, train")
@@ -248,5 +248,5 @@ def _cell(value: Value | None, usual: str) -> str:
     if value is None or value.mean is None:
         return "-"
     half = f" +- {value.half:.2g}" if value.half is not None else ""
-    own = f" ({value.counts})" if value.n is not None and value.counts != usual else ""
-    return f"{value.mean:.4g}{half}{own}"
+    counts = f" ({value.counts})" if value.n is not None and value.counts != usual else ""
+    return f"{value.mean:.4g}{half}{counts}"

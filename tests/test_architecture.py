@@ -493,6 +493,7 @@ def test_a_call_that_reads_is_not_taken_for_one_that_writes(call):
 
 
 FILLERS = {"found", "each", "given", "known", "wanted", "place", "places", "told", "asked"}
+FILLERS |= {"own", "what", "how", "made", "way"}
 """Names that do not say what a value holds."""
 KEPT = {"flame_mdm.batch": ["known: filler name"]}
 """`Edit.known`, the name of the kept part in the papers on inpainting."""

@@ -77,18 +77,22 @@ class OwnExtractor(Extractor, Generic[TrainedTask]):
         self.fingerprint = self.task.facts.get("fingerprint")
 
     def check(self, representation: Representation, dataset: str) -> None:
-        own, learned = self.task.representation, self.task.facts.get("dataset", dataset)
+        trained, learned = self.task.representation, self.task.facts.get("dataset", dataset)
         if not self.reads(representation) or learned != dataset:
             raise UserError(
-                f"extractor {self.path}: trained on {own.name} of {learned} at {own.fps:g} frames per second, but the "
-                f"motions are {representation.name} of {dataset} at {representation.fps:g}. Train one with make train "
-                f"EXP={self.recipes}/..."
+                f"extractor {self.path}: trained on {trained.name} of {learned} at {trained.fps:g} frames per second, "
+                f"but the motions are {representation.name} of {dataset} at {representation.fps:g}. Train one with "
+                f"make train EXP={self.recipes}/..."
             )
 
     def reads(self, other: Representation) -> bool:
         """Returns whether the network reads motions in a representation."""
-        own = self.task.representation
-        return (own.name, own.fps, own.features) == (other.name, other.fps, other.features)
+        trained = self.task.representation
+        return (trained.name, trained.fps, trained.features) == (
+            other.name,
+            other.fps,
+            other.features,
+        )
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
         return {"features": self.task(features, mask)}
@@ -134,12 +138,10 @@ class OwnT2MExtractor(OwnExtractor[T2MTask]):
 
     def reads(self, other: Representation) -> bool:
         """Returns whether the network reads motions in a representation, also if it sees only their common part."""
-        own = self.task.representation
-        part = (other.part_of, other.fps) == (
-            own.name,
-            own.fps,
-        ) and self.task.network.used <= other.features
-        return part or super().reads(other)
+        trained = self.task.representation
+        is_part = (other.part_of, other.fps) == (trained.name, trained.fps)
+        reads_part = is_part and self.task.network.used <= other.features
+        return reads_part or super().reads(other)
 
     def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
         return self.task.text(

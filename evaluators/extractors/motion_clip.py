@@ -117,14 +117,14 @@ def info_nce(
     """
     motion, text = F.normalize(motion, dim=-1), F.normalize(text, dim=-1)
     motions, texts = _of_all_processes(motion), _of_all_processes(text)
-    own = torch.arange(len(motion), device=motion.device)
+    matching = torch.arange(len(motion), device=motion.device)
     if len(motions) > len(motion):
-        own = own + torch.distributed.get_rank() * len(motion)
+        matching = matching + torch.distributed.get_rank() * len(motion)
     scale = logit_scale.exp()
     of_motion, of_text = scale * motion @ texts.T, scale * text @ motions.T
     if meaning is not None:
         same = (meaning[:, None] == _of_all_processes(meaning)).any(-1)
-        same[torch.arange(len(own)), own] = False
+        same[torch.arange(len(matching)), matching] = False
         of_motion, of_text = (
             of_motion.masked_fill(same, -torch.inf),
             of_text.masked_fill(same, -torch.inf),
@@ -133,7 +133,7 @@ def info_nce(
         of_motion = torch.cat(
             [of_motion, scale * (F.normalize(wrong_text, dim=-1) @ motion[..., None])[..., 0]], 1
         )
-    return (F.cross_entropy(of_motion, own) + F.cross_entropy(of_text, own)) / 2
+    return (F.cross_entropy(of_motion, matching) + F.cross_entropy(of_text, matching)) / 2
 
 
 def _of_all_processes(x: Tensor) -> Tensor:

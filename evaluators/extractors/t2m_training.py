@@ -68,8 +68,8 @@ def matching_loss(
     column; None = only its own.
     """
     count = len(motion)
-    own = torch.arange(count, device=motion.device)
-    previous = (own[:, None] - 1 - own[: count - 1]) % count
+    rows = torch.arange(count, device=motion.device)
+    previous = (rows[:, None] - 1 - rows[: count - 1]) % count
     wrong = (
         torch.ones_like(previous, dtype=torch.bool) if fits is None else ~fits.gather(1, previous)
     )

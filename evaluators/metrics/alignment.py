@@ -19,15 +19,17 @@ def equally_weighted(values: Tensor) -> Tensor:
     return torch.stack([values, torch.ones(len(values), dtype=values.dtype)], 1)
 
 
-def retrieval_ranks(queries: Tensor, candidates: Tensor, pools: Tensor, own: Tensor) -> Tensor:
+def retrieval_ranks(queries: Tensor, candidates: Tensor, pools: Tensor, correct: Tensor) -> Tensor:
     """Returns (N,) how many candidates are closer than the correct one, or equally close and earlier in the pool.
 
-    `pools` (N, P) are the indices of the candidates (M, E) of each query (N, E), `own` (N,) is the position of the
+    `pools` (N, P) are the indices of the candidates (M, E) of each query (N, E), `correct` (N,) is the position of the
     correct one in each pool.
     """
-    pools, own = pools.to(queries.device), own.to(queries.device)
+    pools, correct = pools.to(queries.device), correct.to(queries.device)
     ranks = []
-    for query, pool, right in zip(queries.split(16), pools.split(16), own.split(16), strict=True):
+    for query, pool, right in zip(
+        queries.split(16), pools.split(16), correct.split(16), strict=True
+    ):
         distance = torch.linalg.vector_norm(query[:, None] - candidates[pool], dim=-1)
         at = distance.gather(1, right[:, None])
         earlier = torch.arange(pool.shape[1], device=pool.device) < right[:, None]
@@ -56,17 +58,17 @@ class RPrecision(SampleMetric):
         """Returns the rank (N,) of the correct candidate for each query, 0 = first."""
         raise NotImplementedError
 
-    def in_random_pools(self, distance: Tensor, own: Tensor) -> dict[str, Tensor]:
+    def in_random_pools(self, distance: Tensor, correct: Tensor) -> dict[str, Tensor]:
         """Returns how probable it is that the correct candidate is among the k nearest of a random pool, by query.
 
         Args:
             distance: (N, M) from queries to candidates.
-            own: (N,) index of the correct candidate of each query.
+            correct: (N,) index of the correct candidate of each query.
         """
         others = distance.shape[1] - 1
         if others + 1 < self.pool:
             raise UserError(f"{others + 1} candidates are fewer than a pool of {self.pool}")
-        at = distance.gather(1, own[:, None])
+        at = distance.gather(1, correct[:, None])
         closer = (distance < at).sum(1) + ((distance == at).sum(1) - 1) // 2
         probable = {
             f"top{k}": hypergeom.cdf(k - 1, others, closer.numpy(), self.pool - 1) for k in TOP
@@ -87,23 +89,25 @@ class TextsForMotion(RPrecision):
 
     def ranks(self, generated: Tensor, text: Tensor, text_keys: Tensor) -> Tensor:
         generator = np.random.default_rng(self.seed)
-        _, first, own = np.unique(text_keys.cpu().numpy(), return_index=True, return_inverse=True)
+        _, first, correct = np.unique(
+            text_keys.cpu().numpy(), return_index=True, return_inverse=True
+        )
         self.need(len(first), self.pool, "different captions")
         others = self.pool - 1
-        drawn = np.stack([generator.choice(len(first) - 1, others, replace=False) for _ in own])
-        pools = np.concatenate([drawn + (drawn >= own[:, None]), own[:, None]], 1)
-        position = generator.integers(self.pool, size=len(own))
-        rows = np.arange(len(own))
-        pools[rows, others], pools[rows, position] = pools[rows, position], own
+        drawn = np.stack([generator.choice(len(first) - 1, others, replace=False) for _ in correct])
+        pools = np.concatenate([drawn + (drawn >= correct[:, None]), correct[:, None]], 1)
+        position = generator.integers(self.pool, size=len(correct))
+        rows = np.arange(len(correct))
+        pools[rows, others], pools[rows, position] = pools[rows, position], correct
         return retrieval_ranks(
             generated, text[first], torch.from_numpy(pools), torch.from_numpy(position)
         )
 
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
         keys = rows["text_keys"].numpy()
-        _, first, own = np.unique(keys, return_index=True, return_inverse=True)
+        _, first, correct = np.unique(keys, return_index=True, return_inverse=True)
         return self.in_random_pools(
-            distances(rows["generated"], rows["text"][first]), torch.from_numpy(own)
+            distances(rows["generated"], rows["text"][first]), torch.from_numpy(correct)
         )
 
 

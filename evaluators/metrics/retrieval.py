@@ -53,19 +53,19 @@ def whole_set_retrieval(similarity: Tensor, correct: Tensor | None = None) -> di
     The rank is that of the best pair that is `correct` (N, N) bool, symmetric; None = the diagonal.
     """
     values: dict[str, float] = {}
-    for way, table in (("t2m", similarity), ("m2t", similarity.T)):
+    for direction, table in (("t2m", similarity), ("m2t", similarity.T)):
         rank = best_ranks(
             table, torch.eye(len(table), dtype=torch.bool) if correct is None else correct
         )
-        values |= {f"{way}_top{k}": (rank < k).double().mean().item() for k in TMR_TOP}
-        values[f"{way}_median"] = rank.double().quantile(0.5).item() + 1
+        values |= {f"{direction}_top{k}": (rank < k).double().mean().item() for k in TMR_TOP}
+        values[f"{direction}_median"] = rank.double().quantile(0.5).item() + 1
     return values
 
 
 def best_ranks(similarity: Tensor, correct: Tensor) -> Tensor:
     """Returns the rank (N,) of the best correct candidate, 0 = first; equal similarities (N, M) share a mean rank."""
-    own = similarity.where(correct, -torch.inf).amax(1, keepdim=True)
-    return (similarity > own).sum(1) + ((similarity == own).sum(1) - 1) / 2
+    best = similarity.where(correct, -torch.inf).amax(1, keepdim=True)
+    return (similarity > best).sum(1) + ((similarity == best).sum(1) - 1) / 2
 
 
 class CaptionMetric(SampleMetric):
@@ -182,9 +182,9 @@ class TMRRetrieval(CaptionMetric):
     """
 
     names = tuple(
-        f"{protocol}_{way}_{value}"
+        f"{protocol}_{direction}_{value}"
         for protocol in ("all", "threshold", "dissimilar", "batches")
-        for way in ("t2m", "m2t")
+        for direction in ("t2m", "m2t")
         for value in (*(f"top{k}" for k in TMR_TOP), "median")
     )
     summary = None

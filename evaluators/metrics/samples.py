@@ -181,10 +181,10 @@ class SampleMetric(Declared, Metric):
     def error(self, message: str) -> UserError:
         return UserError(f"{type(self).__name__}: {message}")
 
-    def need(self, count: int, least: int, what: str) -> None:
+    def need(self, count: int, least: int, noun: str) -> None:
         """Raises `UserError` if `count` is less than `least`."""
         if count < least:
-            raise self.error(f"got {count} {what}, needs at least {least}")
+            raise self.error(f"got {count} {noun}, needs at least {least}")
 
     def real_frames(self, joints: Tensor, mask: Tensor) -> list[Tensor]:
         """Splits joints (B, F, J, 3) with mask (B, F) into motions (F, J, 3), whose sums are the same in every batch.

@@ -111,11 +111,11 @@ def attach(model: MotionGenerator, about: About) -> None:
 
 def copy_weights(model: MotionGenerator, base: str | Path) -> None:
     """Copies the weights of a base, as for `find`, to a model, to which changes may be attached."""
-    own = model.state_dict()
+    state = model.state_dict()
     for name, value in read_merged(find(base))["state_dict"].items():
-        own[name if name in own else name.removesuffix(".weight") + ORIGINAL] = value
+        state[name if name in state else name.removesuffix(".weight") + ORIGINAL] = value
     try:
-        model.load_state_dict(own)
+        model.load_state_dict(state)
     except RuntimeError as error:
         raise UserError(
             f"base={base}: its weights do not fit the recipe: {first_line(error)}"
@@ -155,12 +155,12 @@ def read_merged(
     }
     if (trained := config.pop("adapter", None)) and (changes := _changes(state)):
         _merge(plain, changes, check_shape(trained, About)["rows"], 1.0, path)
-    own = state_sha256(plain) if paths else ""
+    base = state_sha256(plain) if paths else ""
     for file, weight in zip(paths, strengths, strict=True):
         about, changes = _read(Path(file))
-        if about["base"] != own:
+        if about["base"] != base:
             raise UserError(
-                f"adapter={file}: made for the weights {about['base'][:12]}, not {own[:12]}. Give its base"
+                f"adapter={file}: made for the weights {about['base'][:12]}, not {base[:12]}. Give its base"
             )
         _merge(plain, changes, about["rows"], weight, file)
         for key, more in (("vocabulary", about["words"]), ("captions", about["captions"])):

@@ -58,11 +58,11 @@ def push(
         raise UserError(f"{repository}: not a repository name. Write user/name")
     folder = Path(folder)
     _check_written(folder)
-    with atomic_folder(folder) as made:
-        file = export(source, made / FILE)
+    with atomic_folder(folder) as temporary:
+        file = export(source, temporary / FILE)
         model = read_model_file(file)
-        save(model["config"], made / "config.yaml", head=WRITTEN["config.yaml"])
-        write_text(made / "README.md", card(model, repository, sha256(file)))
+        save(model["config"], temporary / "config.yaml", head=WRITTEN["config.yaml"])
+        write_text(temporary / "README.md", card(model, repository, sha256(file)))
     if upload:
         from huggingface_hub import HfApi
 

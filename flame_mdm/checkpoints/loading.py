@@ -150,9 +150,9 @@ def _build(checkpoint: dict[str, Any], kind: type[Trained]) -> Trained:
     if not issubclass(model_class, kind):
         noun = getattr(model_class, "noun", model_class.__name__)
         raise UserError(f"holds {noun}, not {kind.noun}. Give another checkpoint")
-    own = all(target.startswith(("flame_mdm.", "evaluators.")) for target in targets)
+    is_builtin = all(target.startswith(("flame_mdm.", "evaluators.")) for target in targets)
     with ExitStack() as stack:
-        if own:
+        if is_builtin:
             stack.enter_context(torch.device("meta"))
             stack.enter_context(_CallLimit(20_000 + 50 * len(state)))
         representation = instantiate(config["representation"])
@@ -161,10 +161,10 @@ def _build(checkpoint: dict[str, Any], kind: type[Trained]) -> Trained:
     kinds = {name: value.dtype for name, value in model.state_dict().items()}
     state = {name: value.to(kinds.get(name, value.dtype)) for name, value in state.items()}
     try:
-        model.load_state_dict(state, strict=True, assign=own)
+        model.load_state_dict(state, strict=True, assign=is_builtin)
     except RuntimeError as error:
-        what = str(error).splitlines()[1].strip()
-        raise UserError(f"the weights do not match the recipe saved with them: {what}") from error
+        reason = str(error).splitlines()[1].strip()
+        raise UserError(f"the weights do not match the recipe saved with them: {reason}") from error
     model.steps = checkpoint.get("global_step", (checkpoint.get("origin") or {}).get("steps"))
     return model
 

@@ -44,8 +44,10 @@ def find(source: str | Path, which: Which = "last") -> Path:
         return Path(hf_hub_download(match[1], FILE, revision=match[2]))
     # The client raises many kinds: no network, no such repository, no permission ...
     except Exception as error:
-        what = f"no such file or folder, and {FILE} of a model with this name cannot be downloaded from the hub"
-        raise UserError(f"{source}: {what}: {first_line(error)}") from error
+        raise UserError(
+            f"{source}: no such file or folder, and {FILE} of a model with this name cannot be downloaded from the "
+            f"hub: {first_line(error)}"
+        ) from error
 
 
 def _find_in_folder(folder: Path, which: Which) -> Path:

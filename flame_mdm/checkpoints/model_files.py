@@ -80,9 +80,9 @@ def read_safetensors(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
 def check_format(path: Path, number: Any) -> None:
     """Raises `UserError` for a format other than `FORMAT`; version 0.1 wrote 1 or, in checkpoints, None."""
     if number in (1, None):
-        what = "written by version 0.1 of flame_mdm, whose files this version does not read"
         raise UserError(
-            f"{path}: {what}. Train or import the model again, or use it with version 0.1"
+            f"{path}: written by version 0.1 of flame_mdm, whose files this version does not read. Train or import "
+            "the model again, or use it with version 0.1"
         )
     if number != FORMAT:
         raise UserError(
@@ -151,8 +151,10 @@ class _Metadata(TypedDict):
 def checked(path: Path, content: Any) -> dict[str, Any]:
     """Returns the content of a checkpoint or model file if it is a recipe of plain values, metadata and weights."""
     if not isinstance(content, dict) or not {"config", "facts", "state_dict"} <= content.keys():
-        what = "not a checkpoint of this framework: it holds no recipe"
-        raise UserError(f"{path}: {what}. Import released checkpoints with `flame-mdm import`")
+        raise UserError(
+            f"{path}: not a checkpoint of this framework: it holds no recipe. Import released checkpoints with "
+            "`flame-mdm import`"
+        )
     metadata = {
         name: content[name]
         for name in ("config", "facts", "origin", "global_step")
@@ -245,11 +247,11 @@ def weights_sha256(path: Path) -> str:
 
 def without_own_paths(config: Mapping[str, Any]) -> dict[str, Any]:
     """Returns a recipe with default paths of data and run instead of absolute paths on this machine."""
-    own = {
+    defaults = {
         config.get("data_root"): "data",
         config.get("run", {}).get("dir"): f"runs/{config['experiment']}/default",
     }
     moves = {
-        folder: other for folder, other in own.items() if folder and Path(folder).is_absolute()
+        folder: other for folder, other in defaults.items() if folder and Path(folder).is_absolute()
     }
     return moved(dict(config), moves)

@@ -167,9 +167,9 @@ def sampling_plan(process: Process, options: SamplerOptions) -> list[list[float]
     """
     plans = [np.array(_plan(process, options, variance)) for variance in (0.0, 1.0)]
     if not np.array_equal(plans[0], plans[1]):
-        what = "draws noise with the learned variance of this model, which the graph does not have"
         raise UserError(
-            f"sampler={options.sampler} {what}. Set task.sampler to ddim or dpm_solver_pp_2m"
+            f"sampler={options.sampler} draws noise with the learned variance of this model, which the graph does not "
+            "have. Set task.sampler to ddim or dpm_solver_pp_2m"
         )
     return plans[0].tolist()
 
@@ -228,8 +228,10 @@ class Call(nn.Module):
         super().__init__()
         self.condition, self.denoiser = model.condition, model.denoiser
         if model.conditioned_on == "text" and not isinstance(self.condition, LearnedTokens):
-            what = f"{type(self.condition).__name__}: a language model is not exported to ONNX"
-            raise UserError(f"{what}. Export a model with condition=learned, action or none")
+            raise UserError(
+                f"{type(self.condition).__name__}: a language model is not exported to ONNX. Export a model with "
+                "condition=learned, action or none"
+            )
         self.features = model.representation.features
         self.scale = model.sampler_options.guidance_scale if model.condition.features else None
 
@@ -295,17 +297,17 @@ def graphs(model: MotionGenerator) -> list[Graph]:
         inputs["condition"] = torch.tensor([0, len(model.facts["actions"]) - 1])
         dimensions["condition"] = {0: batch}
     to_joints = Function(representation.to_joints)
-    made = [Graph("denoiser", Call(model), inputs, dimensions, ["output"])]
-    made += [Graph("joints", to_joints, {"x": x}, {"x": {0: batch, 1: frames}}, ["joints"])]
+    graphs = [Graph("denoiser", Call(model), inputs, dimensions, ["output"])]
+    graphs += [Graph("joints", to_joints, {"x": x}, {"x": {0: batch, 1: frames}}, ["joints"])]
     if representation.skeleton.name == SMPL22.name:
         solver = Function(partial(solve_checked, fps=representation.fps))
         joints = {
             "joints": representation.to_joints(x[0]) + torch.randn(x.shape[1], len(SMPL22), 3)
         }
-        made.append(
+        graphs.append(
             Graph("poses", solver, joints, {"joints": {0: frames}}, ["offsets", "quaternions"])
         )
-    return made
+    return graphs
 
 
 def write_graph(graph: Graph, path: Path, half: bool) -> None:

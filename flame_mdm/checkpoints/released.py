@@ -292,8 +292,8 @@ def import_released(
             else f"cannot build the model: {type(error).__name__}: "
         )
         raise UserError(f"{file}: {kind_of_error}{first_line(error)}") from error
-    made = f"released by the authors of {kind.upper()}"
-    origin = {"made": made, "file": file.name, "sha256": sha256(file), "averaged": averaged}
+    author = f"released by the authors of {kind.upper()}"
+    origin = {"made": author, "file": file.name, "sha256": sha256(file), "averaged": averaged}
     return write_model_file(
         out, model.state_dict(), config=model.config, facts=model.facts, origin=origin
     )
@@ -317,9 +317,9 @@ def _model(
         expected = f"{representation.features} of {representation.name}, the representation of data set {dataset}"
         raise ValueError(f"released weights: have {width} features, but not the {expected}")
     if (stats is not None) != (dataset in NORMALIZED):
-        what, advice = ("normalized", "Give") if stats is None else ("not normalized", "Leave out")
+        state, advice = ("normalized", "Give") if stats is None else ("not normalized", "Leave out")
         raise ValueError(
-            f"features of {dataset} are {what}. {advice} stats=FOLDER with Mean.npy and Std.npy"
+            f"features of {dataset} are {state}. {advice} stats=FOLDER with Mean.npy and Std.npy"
         )
     for name in ("mean", "std") if stats is not None else ():
         file = f"{name.capitalize()}.npy"
@@ -330,8 +330,9 @@ def _model(
             and bool((abs(value) < float("inf")).all())
         )
         if not numbers or (name == "std" and (value <= 0).any()):
-            what = f"shape {tuple(value.shape)}, expected ({width},) finite numbers, positive in Std.npy"
-            raise ValueError(f"{file}: {what}")
+            raise ValueError(
+                f"{file}: shape {tuple(value.shape)}, expected ({width},) finite numbers, positive in Std.npy"
+            )
         extra[f"representation.{name}"] = torch.from_numpy(value).float()
     model = MotionGenerator.build(config, representation, actions=facts["actions"])
     model.add_facts(facts)

@@ -112,8 +112,10 @@ def _check_known(options: Mapping[Any, Any], read: Any, table: Config, prefix: s
         if name in table["neutral"]:
             neutral = table["neutral"][name]
             if value is not None and not _equal(value, neutral):
-                what = f"changes the model in a way that is not imported; known is {neutral}"
-                raise ValueError(f"{shown}: {what}. Import a model without it")
+                raise ValueError(
+                    f"{shown}: changes the model in a way that is not imported; known is {neutral}. Import a model "
+                    "without it"
+                )
         elif value is not None and name not in read and name not in table["unused"]:
             raise ValueError(
                 f"{shown}: an unknown option, which may change the network. Import a model without it"

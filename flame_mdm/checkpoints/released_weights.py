@@ -41,8 +41,10 @@ def read_released(
         unsafe = re.search(r"Unsupported global: GLOBAL (\S+)", str(error))
         if unsafe is None:
             raise UserError(f"{path}: damaged, or not a PyTorch file. Download it again") from error
-        what = f"holds Python objects ({unsafe[1]}) besides the weights, and reading them can run any code"
-        raise UserError(f"{path}: {what}. {advice}") from error
+        raise UserError(
+            f"{path}: holds Python objects ({unsafe[1]}) besides the weights, and reading them can run any "
+            f"code. {advice}"
+        ) from error
     if not isinstance(content, Mapping):
         raise UserError(
             f"{path}: holds a {type(content).__name__}, not the weights of a released model"
@@ -133,8 +135,10 @@ def load_strictly(
     try:
         network.load_state_dict(state, strict=True, assign=assign)
     except RuntimeError as error:
-        what = str(error).splitlines()[1].strip()
-        raise UserError(f"{source}: not the weights of {type(network).__name__}: {what}") from error
+        reason = str(error).splitlines()[1].strip()
+        raise UserError(
+            f"{source}: not the weights of {type(network).__name__}: {reason}"
+        ) from error
     return network.eval()
 
 

@@ -22,7 +22,7 @@ def read_torch(path: Path) -> Any:
 
     check_torch(path)
     check_keys(path)
-    with naming(path, Exception, what="damaged, or not a file of plain values and tensors: "):
+    with naming(path, Exception, prefix="damaged, or not a file of plain values and tensors: "):
         return torch.load(path, map_location="cpu", weights_only=True)
 
 
@@ -32,7 +32,7 @@ def check_torch(path: Path) -> None:
     if not _is_archive(path):
         return
     damage = naming(
-        path, *ZIP_ERRORS, OSError, ValueError, what="damaged, or not a file of torch.save: "
+        path, *ZIP_ERRORS, OSError, ValueError, prefix="damaged, or not a file of torch.save: "
     )
     with damage, path.open("rb") as file, opened_zip(file) as archive:
         members = archive.infolist()
@@ -55,7 +55,7 @@ def check_keys(path: Path) -> None:
     refuses, because PyTorch stops there, too, and says which.
     """
     regular_file(path)
-    damage = naming(path, Exception, what="damaged, or not a file of plain values and tensors: ")
+    damage = naming(path, Exception, prefix="damaged, or not a file of plain values and tensors: ")
     with damage, path.open("rb") as file:
         if not _is_archive(path):
             for _ in range(LEGACY_PICKLES):

@@ -42,9 +42,9 @@ def main(settings: AdaptSettings) -> None:
 
     from flame_mdm.training.adaptation import adapt
 
-    own = {
+    keywords = {
         name: value
         for name, value in vars(settings).items()
         if name not in ("ckpt", "which", "composed")
     }
-    adapt(file, overrides=settings.composed, **own)
+    adapt(file, overrides=settings.composed, **keywords)

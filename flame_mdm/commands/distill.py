@@ -68,7 +68,7 @@ def student_recipe(settings: DistillSettings) -> Config:
         os.environ.get("FLAME_MDM_DATA", recipe["data_root"]),
     )
     steps = max(1, round(SHARE_OF_STEPS * teacher.steps))
-    own: Config = {
+    changes: Config = {
         "experiment": name,
         "data_root": root,
         "data": {"root": root},
@@ -81,7 +81,7 @@ def student_recipe(settings: DistillSettings) -> Config:
         "distillation": {"teacher": str(file)},
     }
     if samples := recipe["callbacks"].get("samples"):
-        own["callbacks"] = {"samples": {"every_n_steps": min(steps, samples["every_n_steps"])}}
+        changes["callbacks"] = {"samples": {"every_n_steps": min(steps, samples["every_n_steps"])}}
     shared = read_yaml(EXPERIMENTS / "distillation" / "consistency.yaml")
-    merged: Any = OmegaConf.to_container(OmegaConf.merge(movable(recipe), shared, own))
+    merged: Any = OmegaConf.to_container(OmegaConf.merge(movable(recipe), shared, changes))
     return merged

@@ -237,8 +237,8 @@ def _sample_set(settings: SampleSettings, source: str) -> None:
     from flame_mdm.sampling.output import SAMPLES, default_folder
 
     options = {entry.name: getattr(settings, entry.name) for entry in fields(SamplerOptions)}
-    made = make_set(loaded.model, content, settings.seed, **options)
-    say(*(f"left out: {name}: {reason}" for name, reason in made.left_out.items()))
+    clips = make_set(loaded.model, content, settings.seed, **options)
+    say(*(f"left out: {name}: {reason}" for name, reason in clips.left_out.items()))
     if settings.out is None:
         general = (
             content.model_dump(),
@@ -252,9 +252,9 @@ def _sample_set(settings: SampleSettings, source: str) -> None:
         folder = Path(settings.out)
     check_within(folder, settings.out or SAMPLES)
     facts = {"set": Path(source).stem, "seed": settings.seed, "checkpoint": loaded.sha256}
-    write_set(folder, made, content, facts, loaded.body)
+    write_set(folder, clips, content, facts, loaded.body)
     say(
-        f"{len(made.clips)} clips, each with its path and in place: {folder / 'player.html'}, set.png, set.json"
+        f"{len(clips.clips)} clips, each with its path and in place: {folder / 'player.html'}, set.png, set.json"
     )
 
 

@@ -165,10 +165,10 @@ def _help(kind: type[Any]) -> list[str]:
     """Returns the usage of a command, and its keys with their defaults and help texts."""
     lines = [*cleandoc(kind.__doc__ or "").splitlines(), "", "Keys, with their defaults:"]
     objects = getattr(kind, "OBJECTS", ())
-    own = [vars(base).get("__annotations__", {}) for base in kind.__mro__]
+    annotations = [vars(base).get("__annotations__", {}) for base in kind.__mro__]
     keys = [entry for entry in fields(kind) if "help" in entry.metadata]
     ranks = {
-        entry.name: next(rank for rank, names in enumerate(own) if entry.name in names)
+        entry.name: next(rank for rank, names in enumerate(annotations) if entry.name in names)
         for entry in keys
     }
     for entry in sorted(keys, key=lambda entry: (entry.name not in objects[:1], ranks[entry.name])):

@@ -143,9 +143,9 @@ class LessonData(MotionDataModule):
         return [np.flatnonzero(~is_kept), np.flatnonzero(is_kept)]
 
     def counts(self, store: Store) -> list[str]:
-        own, kept = map(len, self.halves())
+        taught, kept = map(len, self.halves())
         return [
-            f"clips: {own} of {self.source.name}, mirrored copies included; {kept} of what the model knows"
+            f"clips: {taught} of {self.source.name}, mirrored copies included; {kept} of what the model knows"
         ]
 
     def training_batches(self, **of_process: int) -> Sampler[list[Draw]]:

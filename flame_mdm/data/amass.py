@@ -83,7 +83,7 @@ def key_of(path: str) -> str | None:
 def read(file: Path | bytes, name: str) -> Recording:
     """Reads a recording, whose numbers must be finite; `name` is used in error messages."""
     names = ("poses", "trans", "betas", "gender", "mocap_framerate")
-    with naming(name, ValueError), naming(name, KeyError, what=f"{RELEASE}: it lacks "):
+    with naming(name, ValueError), naming(name, KeyError, prefix=f"{RELEASE}: it lacks "):
         data = read_npz(io.BytesIO(file) if isinstance(file, bytes) else file, only=names)
         poses, translation, betas, gender, rate = (data[key] for key in names)
         if (

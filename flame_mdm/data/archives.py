@@ -46,7 +46,7 @@ def members(path: Path, is_wanted: Callable[[str], bool]) -> Iterator[tuple[str,
         unpack: Any = next(
             (opener for magic, opener in _UNPACKERS.items() if head.startswith(magic)), None
         )
-        with naming(path, *_DAMAGE, what="damaged archive, download it again: "):
+        with naming(path, *_DAMAGE, prefix="damaged archive, download it again: "):
             if head.startswith(b"PK") or zipfile.is_zipfile(path):
                 yield from _zip_members(file, size, is_wanted)
                 return
@@ -69,7 +69,7 @@ def as_folder(path: Path, owner: object, is_wanted: Callable[[str], bool]) -> Pa
     for name, content in members(path, is_wanted):
         if ".." in PurePosixPath(name).parts or PurePosixPath(name).is_absolute():
             raise UserError(f"{path}: {name[:80]} leads out of the archive")
-        with naming(path, OSError, ValueError, what="cannot be unpacked: "):
+        with naming(path, OSError, ValueError, prefix="cannot be unpacked: "):
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_bytes(content)
     while len(inside := list(folder.iterdir())) == 1 and inside[0].is_dir():

@@ -155,7 +155,7 @@ class Babel(MotionSource):
         data = read_json(required(path, GET_IT))
         key = "frame_anns" if path.stem.startswith("extra_") else "frame_ann"
         errors = (AttributeError, KeyError, TypeError, IndexError, ValueError)
-        with naming(path, *errors, what="not in the layout of BABEL v1.0: "):
+        with naming(path, *errors, prefix="not in the layout of BABEL v1.0: "):
             for sequence in data.values():
                 annotation = (
                     sequence[key][0] if key == "frame_anns" and sequence[key] else sequence[key]

@@ -34,7 +34,8 @@ from flame_mdm.safe_io import read_yaml
 
 _MAP = LAYOUTS["Bandai-Namco"].map
 JOINTS = {
-    name: own if isinstance(own := _MAP[name], str) else next(iter(own)) for name in SMPL22.joints
+    name: joint if isinstance(joint := _MAP[name], str) else next(iter(joint))
+    for name in SMPL22.joints
 }
 """The joint of the files for each joint of SMPL, in the order of SMPL; spine1 lies between Hips and Spine."""
 
@@ -247,7 +248,9 @@ def captions(content: str, style: str, side: str) -> list[str]:
     """Returns four descriptions in the style of HumanML3D."""
     contents, styles = WORDS["contents"], WORDS["styles"]
     phrases = zip(contents[re.sub("left|right", "{side}", content)], styles[style], strict=True)
-    filled = (phrase.format(side=side, other=swap_sides(side), how=how) for phrase, how in phrases)
+    filled = (
+        phrase.format(side=side, other=swap_sides(side), how=manner) for phrase, manner in phrases
+    )
     return [" ".join(caption.split()).replace(" ,", ",") for caption in filled]
 
 

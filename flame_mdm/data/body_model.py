@@ -22,7 +22,7 @@ def load_offsets(path: Path) -> tuple[tuple[float, float, float], ...]:
     `path` is SMPL's .pkl from https://smpl.is.tue.mpg.de, of which no code runs, or an .npz with the same arrays.
     """
     with naming(
-        path, KeyError, TypeError, IndexError, ValueError, what="not a SMPL model of 24 joints: "
+        path, KeyError, TypeError, IndexError, ValueError, prefix="not a SMPL model of 24 joints: "
     ):
         if path.suffix == ".npz":
             model: Any = read_npz(path, only=ARRAYS)
@@ -85,7 +85,12 @@ def load_body(folder: Path, gender: str) -> Body:
         get_it = "download the extended SMPL+H model from https://mano.is.tue.mpg.de"
         raise FileNotFoundError(f"{folder}: contains neither {' nor '.join(names)}; {get_it}")
     with naming(
-        path, KeyError, TypeError, IndexError, ValueError, what="not a SMPL+H model of 52 joints: "
+        path,
+        KeyError,
+        TypeError,
+        IndexError,
+        ValueError,
+        prefix="not a SMPL+H model of 52 joints: ",
     ):
         regressor, template, tree, directions = (
             read_npz(path, only=ARRAYS)[name] for name in ARRAYS

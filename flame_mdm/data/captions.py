@@ -25,7 +25,7 @@ def table_rows(
     rows = csv.DictReader(
         io.StringIO(read_text(path).removeprefix("\ufeff"), newline=""), strict=True
     )
-    with naming(path, csv.Error, what="damaged: "):
+    with naming(path, csv.Error, prefix="damaged: "):
         names = list(rows.fieldnames or ())
         if "id" not in names or len(names) > len(set(names) & set(columns)):
             raise UserError(

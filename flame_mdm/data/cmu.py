@@ -206,7 +206,7 @@ class CMU(MotionSource):
             KeyError,
             TypeError,
             ValueError,
-            what="not KIT-ML's captions of AMASS: ",
+            prefix="not KIT-ML's captions of AMASS: ",
         ):
             return [
                 (
@@ -380,7 +380,10 @@ def _part_in_table(cells: Mapping[str, str]) -> _Part:
         raise UserError(f"id {trial!r} is not the name of a recording, such as 02_01")
     first, last = 0, None
     with naming(
-        f"begin {begin!r}, end {end!r}", ValueError, OverflowError, what="not numbers of seconds: "
+        f"begin {begin!r}, end {end!r}",
+        ValueError,
+        OverflowError,
+        prefix="not numbers of seconds: ",
     ):
         first = round(float(begin) * FPS) if begin else 0
         last = round(float(end) * FPS) if end else None
@@ -410,7 +413,7 @@ def _test_captions(path: Path) -> dict[str, list[Description]]:
     """Returns captions by name of a JSON list of test captions; `segment` is the part described, in seconds."""
     texts: defaultdict[str, list[Description]] = defaultdict(list)
     with naming(
-        path, KeyError, TypeError, ValueError, what="not a list of captions of HumanML3D: "
+        path, KeyError, TypeError, ValueError, prefix="not a list of captions of HumanML3D: "
     ):
         for entry in read_json(path):
             begin, end = map(float, entry["segment"] or (0, 0))

@@ -209,8 +209,10 @@ class MotionDataModule(LightningDataModule):
             if n and not used[split]:
                 advice.append(f"all {split} clips are too short: lower data.crop.min_frames")
             elif not used[split]:
-                own = " Add a `split` column to captions.csv" if self.source.named_by_recipe else ""
-                advice.append(f"no {split} clips.{own}")
+                remedy = (
+                    " Add a `split` column to captions.csv" if self.source.named_by_recipe else ""
+                )
+                advice.append(f"no {split} clips.{remedy}")
         if not store.info["actions"] and not any(clip.captions for clip in store.clips):
             advice.append(
                 "no captions: add captions.csv and prepare with force=true, or train with condition=none"

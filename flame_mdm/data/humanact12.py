@@ -73,7 +73,7 @@ class HumanAct12(MotionSource):
             zip(*read_lists(path, "poses", "joints3D", "y"), strict=True)
         ):
             with naming(
-                f"{path}: clip {number}", *NO_NUMBERS, what="does not consist of numbers: "
+                f"{path}: clip {number}", *NO_NUMBERS, prefix="does not consist of numbers: "
             ):
                 pose, joint, label = (
                     np.asarray(poses, np.float32),

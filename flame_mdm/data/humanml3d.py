@@ -53,7 +53,7 @@ def read_index(path: Path) -> list[IndexedClip]:
     required(path, "it is index.csv of https://github.com/EricGuo5513/HumanML3D")
     rows = []
     with naming(
-        path, csv.Error, KeyError, TypeError, ValueError, what="not HumanML3D's index of clips: "
+        path, csv.Error, KeyError, TypeError, ValueError, prefix="not HumanML3D's index of clips: "
     ):
         for line in csv.DictReader(read_text(path).splitlines()):
             source, name = line["source_path"], PurePosixPath(line["new_name"]).stem
@@ -140,8 +140,8 @@ class HumanML3D(T2MFolder):
         return next((candidate for candidate in candidates if candidate.exists()), candidates[0])
 
     def _todo(self) -> list[IndexedClip]:
-        made = self._motions()
-        return [row for row in self.rows if not {row.name, f"M{row.name}"} <= made]
+        created = self._motions()
+        return [row for row in self.rows if not {row.name, f"M{row.name}"} <= created]
 
     def _bodies(self) -> dict[str, Body]:
         if not self.body_models:
@@ -324,7 +324,7 @@ class HumanML3DSMPL(MotionSource):
                 continue
             errors = (KeyError, TypeError, ValueError, IndexError)
             with naming(
-                path, *errors, what=f"{row.key} lacks poses (F, 72) or joints3D (F, 24, 3): "
+                path, *errors, prefix=f"{row.key} lacks poses (F, 72) or joints3D (F, 24, 3): "
             ):
                 poses = np.asarray(entry["poses"], np.float32)
                 motion = np.concatenate(

@@ -139,7 +139,7 @@ def _recording(task: tuple[Path, int]) -> np.ndarray:
 def read_joints(path: Path, step: int = 8) -> np.ndarray:
     """Reads joints (F, 21, 3) float32 in meters, y up, of every `step`-th frame; KIT's unit is about 1/640 m."""
     lines = read_text(path).splitlines()[1::step]
-    with naming(path, ValueError, what="damaged, exclude it by its number: "):
+    with naming(path, ValueError, prefix="damaged, exclude it by its number: "):
         rows = np.loadtxt(lines, delimiter=",", ndmin=2)
         if rows.shape[1] != 64 or not len(rows) or not np.isfinite(rows).all():
             raise UserError(

@@ -190,8 +190,8 @@ def write_store(folder: Path, source: MotionSource, representation: Representati
         remove_abandoned(folder.parent)
         if before or not (folder / "store.json").exists():
             replaced = _replaceable(folder)
-            with atomic_folder(folder, within=folder.parent) as made:
-                _write(made, source, representation, total)
+            with atomic_folder(folder, within=folder.parent) as temporary:
+                _write(temporary, source, representation, total)
                 for file in replaced:
                     file.unlink()
     return Store(folder)
@@ -402,8 +402,9 @@ def _intact(path: Path) -> Iterator[Path]:
     try:
         yield path
     except (OSError, ValueError, KeyError) as error:
-        what = f"{path}: damaged: {first_line(error)}"
-        raise UserError(f"{what}. Delete {path.parent} and prepare the data set again") from error
+        raise UserError(
+            f"{path}: damaged: {first_line(error)}. Delete {path.parent} and prepare the data set again"
+        ) from error
 
 
 def _entries(path: Path, frames: int, actions: int) -> list[Entry]:

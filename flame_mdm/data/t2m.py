@@ -62,7 +62,7 @@ def parse(text: str, where: str) -> list[Description]:
             with naming(
                 f"{where}, line {number}",
                 ValueError,
-                what=f"not caption#words#from#to: {line[:60]!r}: ",
+                prefix=f"not caption#words#from#to: {line[:60]!r}: ",
             ):
                 caption, tokens, *tags = line.rsplit("#", 3)
                 begin, end = (0.0 if math.isnan(float(tag)) else float(tag) for tag in tags)

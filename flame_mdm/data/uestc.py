@@ -160,7 +160,7 @@ class UESTC(MotionSource):
             raise UserError(f"{path.parent}: {sizes}")
         self.leave_out("videos of view 8, side 2", count - len(self.used))
         for video in self.used:
-            with naming(f"{path}: {video.id}", *NO_NUMBERS, what="does not consist of numbers: "):
+            with naming(f"{path}: {video.id}", *NO_NUMBERS, prefix="does not consist of numbers: "):
                 pose, joint, camera = (
                     np.asarray(column[video.index], np.float64) for column in columns
                 )

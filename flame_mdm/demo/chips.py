@@ -49,11 +49,11 @@ def _step(
             """Returns the text of the form with a changed action."""
             words = caption((*step[:position], changed, *step[position + 1 :]))
             rows = [
-                (words if row == number else own, seconds)
-                for row, (own, seconds) in enumerate(parts)
+                (words if row == number else phrase, seconds)
+                for row, (phrase, seconds) in enumerate(parts)
             ]
             return " | ".join(
-                own if seconds is None else f"{own} @{seconds:g}" for own, seconds in rows
+                phrase if seconds is None else f"{phrase} @{seconds:g}" for phrase, seconds in rows
             )
 
         others = [mention.action, *(name for name in abilities.actions if name != mention.action)]

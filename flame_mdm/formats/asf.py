@@ -76,12 +76,14 @@ def read(path: Path, fps: float | None) -> Bvh:
 
 def skeleton_of(path: Path) -> Path:
     """Returns the ASF file next to an AMC file: that of its name, of its subject (02.asf), or the only one."""
-    own = (path.with_suffix(".asf"), path.with_name(path.stem.partition("_")[0] + ".asf"))
+    candidates = (path.with_suffix(".asf"), path.with_name(path.stem.partition("_")[0] + ".asf"))
     files = sorted(path.parent.glob("*.asf"))
-    chosen = next((file for file in own if file.exists()), files[0] if len(files) == 1 else None)
+    chosen = next(
+        (file for file in candidates if file.exists()), files[0] if len(files) == 1 else None
+    )
     if chosen is None:
         raise UserError(
-            f"{path}: no skeleton {own[1].name} next to it; AMC files need their ASF file"
+            f"{path}: no skeleton {candidates[1].name} next to it; AMC files need their ASF file"
         )
     return chosen
 

@@ -231,8 +231,8 @@ class Lines:
                 self.line, self.row = number, words
                 yield words
 
-    def fail(self, what: str) -> NoReturn:
-        raise UserError(f"{self.name}, line {self.line}: {what}")
+    def fail(self, fault: str) -> NoReturn:
+        raise UserError(f"{self.name}, line {self.line}: {fault}")
 
     def word(self, expected: str = "") -> str:
         """Returns the next word of the hierarchy; it must be `expected` (case-insensitive) if that is not empty."""

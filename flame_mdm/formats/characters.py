@@ -207,9 +207,9 @@ def identify(path: Path, names: Mapping[int, str]) -> dict[str, int]:
             f"{listed}: {names[numbers[twice]]} is listed for {twice} and for another joint. Remove one"
         )
     if missing:
-        own = {joint: f" {json.dumps(names[number])}" for joint, number in numbers.items()}
+        listed_names = {joint: f" {json.dumps(names[number])}" for joint, number in numbers.items()}
         template = [f"# Joints of {path.name}: {', '.join(names.values())}"]
-        template += [f"{joint}:{own.get(joint, '')}" for joint in JOINT]
+        template += [f"{joint}:{listed_names.get(joint, '')}" for joint in JOINT]
         raise UnknownJoints(
             f"{path}: no joint found for {', '.join(missing)}. Write the names of the joints into {listed}, as in the "
             "lines above; only spine, neck, head, collars and feet may stay empty",
@@ -232,7 +232,7 @@ def _listed(
                 f"{listed}: {joint} is no joint of SMPL.{did_you_mean(str(joint), JOINT)}"
             )
         if name is not None:
-            candidates[joint] = [number for number, own in names.items() if own == name]
+            candidates[joint] = [number for number, label in names.items() if label == name]
             if not candidates[joint]:
                 similar = did_you_mean(str(name), names.values())
                 raise UserError(f"{listed}: {joint}: {path} has no joint {name}.{similar}")

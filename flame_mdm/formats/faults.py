@@ -196,11 +196,11 @@ def depths(joints: np.ndarray, names: Sequence[str], side: str) -> tuple[np.ndar
     lengths = [float(np.median(np.linalg.norm(end - start, axis=-1))) for start, end in bones]
     sizes = np.multiply([TRUNK, THIGH, THIGH], lengths)
     depth = np.stack(
-        [size - np.linalg.norm(way, axis=-1) for size, way in zip(sizes, away, strict=True)]
+        [size - np.linalg.norm(vector, axis=-1) for size, vector in zip(sizes, away, strict=True)]
     )
     deepest = depth.argmax(0)[None]
-    way = np.take_along_axis(np.stack(away), deepest[..., None], 0)[0]
-    return np.take_along_axis(depth, deepest, 0)[0], unit(way)
+    outward = np.take_along_axis(np.stack(away), deepest[..., None], 0)[0]
+    return np.take_along_axis(depth, deepest, 0)[0], unit(outward)
 
 
 def _away(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:

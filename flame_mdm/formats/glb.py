@@ -235,17 +235,17 @@ def _skins(parts: _Document, data: bytes, rank: Sequence[int]) -> tuple[Skin, ..
     """Returns the skins; `rank` converts indices of the document to numbers of nodes."""
     corners: list[list[np.ndarray]] = [[np.zeros((0, 3))] for _ in parts.skins]
     for node in (node for node in parts.nodes if min(node.mesh, node.skin) >= 0):
-        own = _item(corners, node.skin, "skin")
-        own += [
+        boxes = _item(corners, node.skin, "skin")
+        boxes += [
             _corners(parts, primitive)
             for primitive in _item(parts.meshes, node.mesh, "mesh").primitives
         ]
         if sum(map(len, corners)) > MAX_ITEMS:
             raise ValueError(f"more than {MAX_ITEMS:,} parts of meshes with a skin")
     skins = []
-    for skin, own in zip(parts.skins, corners, strict=True):
+    for skin, boxes in zip(parts.skins, corners, strict=True):
         joints = [_item(rank, joint, "joint of a skin") for joint in skin.joints]
-        skins.append(Skin(joints, _binds(parts, skin, data), np.concatenate(own)))
+        skins.append(Skin(joints, _binds(parts, skin, data), np.concatenate(boxes)))
     return tuple(skins)
 
 
@@ -357,9 +357,9 @@ class Binary:
 
     def save(self, path: Path, document: dict[str, Any]) -> None:
         """Writes a .glb file with this binary part; adds the accessors, the views and the buffer to the document."""
-        own, *others = document.get("buffers") or [{}]
+        binary, *others = document.get("buffers") or [{}]
         document |= {"accessors": self.accessors, "bufferViews": self.views}
-        document["buffers"] = [{**own, "byteLength": len(self.data)}, *others]
+        document["buffers"] = [{**binary, "byteLength": len(self.data)}, *others]
         head = json.dumps(document, separators=(",", ":")).encode()
         head += b" " * (-len(head) % 4)
         chunks = (

@@ -148,24 +148,24 @@ class Motion(PosedFigure):
         if character is not None:
             if not isinstance(character, Character | BvhCharacter):
                 character = characters.read(character)
-            what = _write_character(self, path, character)
+            summary = _write_character(self, path, character)
         elif ending == ".bvh":
-            what = _write_bvh(self, path, rest_pose, rig)
+            summary = _write_bvh(self, path, rest_pose, rig)
         elif ending == ".vrma":
-            what = _write_vrma(self, path)
+            summary = _write_vrma(self, path)
         elif ending in RIGGED:
-            what = _write_rigged(self, path, rig, body, root_motion)
+            summary = _write_rigged(self, path, rig, body, root_motion)
         elif ending == ".npz":
-            what = _write_npz(self, path, facts)
+            summary = _write_npz(self, path, facts)
         elif ending == ".json":
-            what = _write_json(self, path)
+            summary = _write_json(self, path)
         elif ending == ".npy":
             with atomic_write(path) as temporary:
                 np.save(temporary, self.joints)
-            what = f"joints {self.joints.shape} in meters, y up; the file does not contain the frame rate"
+            summary = f"joints {self.joints.shape} in meters, y up; the file does not contain the frame rate"
         else:
-            what = _write_video(self, path, body)
-        return f"{path}: {len(self.joints)} frames at {self.fps:g} per second, {what}"
+            summary = _write_video(self, path, body)
+        return f"{path}: {len(self.joints)} frames at {self.fps:g} per second, {summary}"
 
     def resampled(self, fps: float) -> "Motion":
         """Returns this motion at another frame rate, over the same time.
@@ -246,7 +246,7 @@ def _write_npz(motion: Motion, path: Path, facts: dict[str, Any]) -> str:
     }
     if not motion.features.size:
         del content["features"], content["representation"]
-    what = f"{len(motion.skeleton)} joints in meters, y up"
+    summary = f"{len(motion.skeleton)} joints in meters, y up"
     if motion.poses is not None:
         turns, translation = amass_parameters(motion.poses)
         # Hands at rest
@@ -261,10 +261,10 @@ def _write_npz(motion: Motion, path: Path, facts: dict[str, Any]) -> str:
             "pose_body": turns[:, 3:],
             "mocap_frame_rate": motion.fps,
         }
-        what += "; also in AMASS's format: SMPL+H poses in axis-angle, meters, z up, bone lengths of SMPL's body"
+        summary += "; also in AMASS's format: SMPL+H poses in axis-angle, meters, z up, bone lengths of SMPL's body"
     with atomic_write(path) as temporary:
         np.savez_compressed(temporary, **content, **facts)
-    return what
+    return summary
 
 
 def _write_bvh(motion: Motion, path: Path, rest_pose: bool, rig: str | None) -> str:
@@ -371,11 +371,11 @@ def _write_video(motion: Motion, path: Path, body: Mesh | None) -> str:
     _, reason = motion.try_fit(body)
     if path.suffix.lower() == ".mp4":
         write_mp4(path, [motion], body=body)
-        what = "H.264 video"
+        summary = "H.264 video"
     else:
         write_gif(path, [motion], body=body)
-        what = "animated GIF of at most 50 frames per second"
-    return what + (reason and f"; without a body: {reason}")
+        summary = "animated GIF of at most 50 frames per second"
+    return summary + (reason and f"; without a body: {reason}")
 
 
 def _error(motion: Motion, poses: Poses) -> str:

@@ -204,8 +204,8 @@ def _clothes(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
     colors = weights @ table
     figure, head = mannequin(), weights[:, JOINT["head"]] > 0.5
     usual = figure.points[figure.weights[:, JOINT["head"]] > 0.5]
-    own = points[head]
-    alike = usual.min(0) + (own - own.min(0)) / np.ptp(own, 0) * np.ptp(usual, 0)
+    skull = points[head]
+    alike = usual.min(0) + (skull - skull.min(0)) / np.ptp(skull, 0) * np.ptp(usual, 0)
     colors[head] += smooth(-0.006, 0.006, hairline(alike))[:, None] * (
         np.array(HAIR) - colors[head]
     )

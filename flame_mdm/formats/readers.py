@@ -196,8 +196,8 @@ def _of_tree(
         notes.append(f"{people} people in the file (ROOT): the first one is read")
 
     if standard is not None:
-        tree, own = standard(tree)
-        fields = own or fields
+        tree, standard_fields = standard(tree)
+        fields = standard_fields or fields
     layout, names = tree_layout(tree, fields)
     if (
         standard is None

@@ -33,8 +33,8 @@ def joint_names(skeleton: Mapping[str, Any]) -> dict[str, str]:
     """Returns SMPL's joints -> names of the joints of a skeleton in `rigs.yaml`, without prefix."""
     names = {}
     for part, side, mark in _parts(skeleton):
-        own = {joint: name for name, joint in skeleton[part].items() if isinstance(joint, str)}
-        names |= {side + joint: name.replace("*", mark) for joint, name in own.items()}
+        bones = {joint: name for name, joint in skeleton[part].items() if isinstance(joint, str)}
+        names |= {side + joint: name.replace("*", mark) for joint, name in bones.items()}
     return names
 
 

@@ -265,12 +265,12 @@ def follow(
     lowest = joints[..., 1].min()
     joints[..., 1] -= lowest if abs(lowest) <= GROUND else 0
     legs = [offsets[JOINT[f"{s}_{name}"]] for s in SIDES for name in ("knee", "ankle")]
-    own = [
+    leg_bones = [
         character.position(f"{s}_{b}") - character.position(f"{s}_{a}")
         for s in SIDES
         for a, b in LEGS
     ]
-    scale = float(np.linalg.norm(own, axis=1).sum() / np.linalg.norm(legs, axis=1).sum())
+    scale = float(np.linalg.norm(leg_bones, axis=1).sum() / np.linalg.norm(legs, axis=1).sum())
     # heights of the ankles above the floor while the feet are flat
     flat = {s: (neutral[JOINT[f"{s}_ankle"]].T @ offsets[JOINT[f"{s}_foot"]])[1] for s in SIDES}
     higher = {

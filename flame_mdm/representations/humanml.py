@@ -99,11 +99,11 @@ class HumanML(Representation):
         heading = torch.cat([self._heading(clip) for clip in joints.split(lengths)])
         last = torch.tensor(lengths).cumsum(0) - 1
         now = torch.ones(len(joints), dtype=torch.bool).index_fill(0, last, False).nonzero()[:, 0]
-        way = joints[now + 1] - joints[now]
+        step = joints[now + 1] - joints[now]
         joints, heading, next_heading = joints[now], heading[now], heading[now + 1]
 
         turn = next_heading - heading
-        root_velocity = rotation.rotate_y(way[:, 0], -(next_heading if self.legacy else heading))[
+        root_velocity = rotation.rotate_y(step[:, 0], -(next_heading if self.legacy else heading))[
             :, ::2
         ]
         if self.legacy:
@@ -112,8 +112,8 @@ class HumanML(Representation):
         local[..., ::2] -= joints[:, :1, ::2]
         local = rotation.rotate_y(local, -heading[:, None])
         rotations = self._rotations(joints if self.legacy else local, heading)
-        velocities = rotation.rotate_y(way, -heading[:, None])
-        contacts = way[:, list(self.skeleton.feet)].square().sum(-1) < self.contact_threshold
+        velocities = rotation.rotate_y(step, -heading[:, None])
+        contacts = step[:, list(self.skeleton.feet)].square().sum(-1) < self.contact_threshold
         features = [turn[:, None], root_velocity, joints[:, 0, 1:2]]
         features += [local[:, 1:].flatten(1), rotations.flatten(1), velocities.flatten(1), contacts]
         rows = torch.cat([part.float() for part in features], 1)[:, : self.features].contiguous()
@@ -219,7 +219,7 @@ class HumanML(Representation):
         turn = F.pad(features[..., :-1, 0].cumsum(-1), (1, 0))
         heading = -2 * turn if self.legacy else turn
         x, z = features[..., :-1, self.slices["root_velocity"]].unbind(-1)
-        way = torch.stack([x, torch.zeros_like(x), z], -1)
-        way = rotation.rotate_y(way, heading[..., 1:] if self.legacy else heading[..., :-1])
-        ground = F.pad(way.cumsum(-2), (0, 0, 1, 0))
+        step = torch.stack([x, torch.zeros_like(x), z], -1)
+        step = rotation.rotate_y(step, heading[..., 1:] if self.legacy else heading[..., :-1])
+        ground = F.pad(step.cumsum(-2), (0, 0, 1, 0))
         return heading, torch.stack([ground[..., 0], features[..., 3], ground[..., 2]], -1)

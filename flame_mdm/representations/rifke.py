@@ -49,15 +49,15 @@ class Rifke(Representation):
         ground = root * root.new_tensor([1.0, 0.0, 1.0])
         local = rotation.rotate_y(others - ground[:, None], -heading[:, None])
         turn = F.pad(heading.diff(), (1, 0))
-        way = rotation.rotate_y(F.pad(root.diff(dim=0), (0, 0, 1, 0)), -heading)
-        return torch.cat([root[:, 1:2], local.flatten(1), turn[:, None], way[:, ::2]], 1).float()
+        step = rotation.rotate_y(F.pad(root.diff(dim=0), (0, 0, 1, 0)), -heading)
+        return torch.cat([root[:, 1:2], local.flatten(1), turn[:, None], step[:, ::2]], 1).float()
 
     def decode(self, features: Tensor) -> Tensor:
         """Decodes (..., T, 64) to joints (..., T, 21, 3) in meters, the first root at 0, facing +z. Differentiable."""
-        turned, way = features[..., 61].cumsum(-1), features[..., 62:]
+        turned, step = features[..., 61].cumsum(-1), features[..., 62:]
         heading = turned - turned[..., :1]
-        way = torch.stack([way[..., 0], torch.zeros_like(heading), way[..., 1]], -1)
-        moved = rotation.rotate_y(way, heading).cumsum(-2)
+        step = torch.stack([step[..., 0], torch.zeros_like(heading), step[..., 1]], -1)
+        moved = rotation.rotate_y(step, heading).cumsum(-2)
         ground = moved - moved[..., :1, :]
         root = ground + F.pad(features[..., :1], (1, 1))
         local = rotation.rotate_y(features[..., 1:61].unflatten(-1, (20, 3)), heading[..., None])

@@ -143,12 +143,12 @@ def write_failure(error: BaseException, path: Path) -> str:
 @contextmanager
 def made_folder(folder: Path) -> Iterator[None]:
     """Creates a folder and its parents; those created here are removed at the end if they are empty."""
-    made = [part for part in (folder, *folder.parents) if not part.exists()]
+    created = [part for part in (folder, *folder.parents) if not part.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         yield
     finally:
-        for part in made:
+        for part in created:
             with suppress(OSError):  # it is not empty
                 part.rmdir()
 
@@ -167,7 +167,7 @@ def write_json(
 
 
 @contextmanager
-def naming(name: object, *errors: type[Exception], what: str = "") -> Iterator[None]:
+def naming(name: object, *errors: type[Exception], prefix: str = "") -> Iterator[None]:
     """Adds the name of a file to every `UserError` that does not contain it, and turns `errors` into such errors."""
     try:
         yield
@@ -176,7 +176,7 @@ def naming(name: object, *errors: type[Exception], what: str = "") -> Iterator[N
             raise
         raise UserError(f"{name}: {first_line(error)}") from error
     except errors as error:
-        raise UserError(f"{name}: {what}{first_line(error)}") from error
+        raise UserError(f"{name}: {prefix}{first_line(error)}") from error
 
 
 @contextmanager
@@ -262,15 +262,15 @@ def _begins(path: str | Path, content: bytes) -> bool:
 def read_text(path: str | Path, limit: int = TEXT_LIMIT) -> str:
     regular_file(path, limit)
     with (
-        naming(path, UnicodeDecodeError, what="not a UTF-8 text file: "),
-        naming(path, OSError, what="cannot be read: "),
+        naming(path, UnicodeDecodeError, prefix="not a UTF-8 text file: "),
+        naming(path, OSError, prefix="cannot be read: "),
     ):
         return Path(path).read_text(encoding="utf-8")
 
 
 def read_json(path: str | Path, limit: int = TEXT_LIMIT) -> Any:
     """Returns the content of a JSON file without NaN, infinity and lone surrogates."""
-    with naming(path, ValueError, what="not a JSON file: "):
+    with naming(path, ValueError, prefix="not a JSON file: "):
         return parse_json(read_text(path, limit))
 
 

@@ -255,17 +255,17 @@ def rig_clips(clips: list[Clip], rig: str | None, body: Mesh | None = None) -> l
 
 
 def write_set(
-    folder: Path, made: MadeSet, content: MotionSet, facts: Mapping[str, Any], body: Mesh
+    folder: Path, clips: MadeSet, content: MotionSet, facts: Mapping[str, Any], body: Mesh
 ) -> list[str]:
     """Writes the files of a set into a folder, all or none; returns their names.
 
     Each clip is a file with the path of the root and a file in place. `set.json` describes them, `set.png` and
     `player.html` show them.
     """
-    in_place = rig_clips(made.clips, content.rig, body)
+    in_place = rig_clips(clips.clips, content.rig, body)
     entries = []
     with atomic_folder(folder) as temporary:
-        pairs = list(zip(made.clips, in_place, strict=True))
+        pairs = list(zip(clips.clips, in_place, strict=True))
         for clip, still in ProgressBar(pairs, desc="write", unit="clip"):
             name = f"{content.prefix}{clip.name}"
             files = {
@@ -278,10 +278,10 @@ def write_set(
                     temporary / files[key], replace(variant, name=Path(files[key]).stem)
                 )
             entries.append(_entry(clip, still, files))
-        shown = [motion_of(clip) for clip in made.clips]
+        shown = [motion_of(clip) for clip in clips.clips]
         contact_sheet(temporary / "set.png", shown, size=144, body=body)
         write_player(temporary / "player.html", shown, "Set of motions", body=body)
-        listed = {"clips": entries, "left_out": made.left_out}
+        listed = {"clips": entries, "left_out": clips.left_out}
         write_json(
             temporary / "set.json", {"fps": content.fps, "rig": content.rig, **facts, **listed}
         )

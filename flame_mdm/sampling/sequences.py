@@ -90,7 +90,7 @@ def windows(
     """Returns the windows of several sequences, by text or action and frames of each part."""
     longest, shared, device = model.facts["max_frames"], overlap(model), model.device
     spans_of = [spans(parts, longest, shared, request.loop) for parts in lengths]
-    covering = [(row, *span) for row, own in enumerate(spans_of) for span in own]
+    covering = [(row, *span) for row, parts in enumerate(spans_of) for span in parts]
     names = [conditions[row][part] for row, part, _, _ in covering]
     # A denoiser that attends to its padding sees as many frames as in training.
     width = max(size for *_, size in covering) if model.denoiser.mask_padding else longest

@@ -275,8 +275,8 @@ def _check_reach(goals: list[Goal], fps: float) -> None:
             continue
         distance, seconds = float(np.linalg.norm(floor - start)), (goal.frame - begin) / fps
         if distance > MAX_SPEED * seconds + REACH:
-            way = f"{distance:.1f} m from {before} in {seconds:g} seconds"
             raise UserError(
-                f"{goal.source}: {way} is impossible. Give more time, or a nearer position"
+                f"{goal.source}: {distance:.1f} m from {before} in {seconds:g} seconds is impossible. Give more time, "
+                "or a nearer position"
             )
         before, start, begin = goal.source, floor, goal.frame

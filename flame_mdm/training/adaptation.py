@@ -188,9 +188,9 @@ def _about(
 def _recipe(
     model: MotionGenerator, captions: Sequence[str], name: str, out: Path, overrides: Sequence[str]
 ) -> Config:
-    if own := [word for word in overrides if word.partition(".")[0] in OF_BASE]:
+    if fixed := [word for word in overrides if word.partition(".")[0] in OF_BASE]:
         raise UserError(
-            f"{own[0]}: an adaptation keeps the {own[0].partition('.')[0]} of its base. Drop it"
+            f"{fixed[0]}: an adaptation keeps the {fixed[0].partition('.')[0]} of its base. Drop it"
         )
     recipe = ConfigSource(EXPERIMENTS, "adapt")  # checked by the caller, once it is complete
     config = resolve(recipe, *prepare_overrides(recipe, [quoted(f"run.dir={out}"), *overrides]))
@@ -212,14 +212,14 @@ def _recipe(
     return config
 
 
-def _prior(model: MotionGenerator, root: Path, own: Path, captions: Sequence[str]) -> Path:
+def _prior(model: MotionGenerator, root: Path, out: Path, captions: Sequence[str]) -> Path:
     representation = model.representation
     folder = root / f"{(model.config.get('data') or {}).get('name')}-{representation.name}"
     if (folder / "store.json").exists() and Store(folder).fingerprint == model.facts.get(
         "fingerprint"
     ):
         return folder
-    folder = own / f"prior-{representation.name}"
+    folder = out / f"prior-{representation.name}"
     if not (folder / "store.json").exists():
         say(
             f"the training data of the base are not in {root}: sampling {SAMPLED} motions of it instead"
@@ -250,10 +250,10 @@ class _Samples(MotionSource):
     def clips(self, fps: float) -> Iterator[Clip]:
         frames, encoded = self.model.facts["max_frames"], self.model.representation.name
         for first in range(0, SAMPLED, BATCH):
-            made = generate(
+            motions = generate(
                 self.model, self.captions[first : first + BATCH], frames=frames, seed=first
             )
-            for row, motion in enumerate(made, first):
+            for row, motion in enumerate(motions, first):
                 split, name = "train" if row % 10 else "val", f"sample_{row:03d}"
                 yield Clip(name, motion.features, [motion.text], split, name, encoded=encoded)
 
@@ -263,8 +263,10 @@ def _comparison(name: str, data: LessonData, *tasks: GeneratorTask) -> str:
     data.setup("fit")
     before, after = (task.generator for task in tasks)
     clips = data.train.clips
-    own, kept = (rows[:: -(-len(rows) // COMPARED)] for rows in data.halves())
-    plain, taught = ({clips[row].captions[0]: clips[row] for row in rows} for rows in (kept, own))
+    lesson, kept = (rows[:: -(-len(rows) // COMPARED)] for rows in data.halves())
+    plain, taught = (
+        {clips[row].captions[0]: clips[row] for row in rows} for rows in (kept, lesson)
+    )
     texts = [*list(taught)[:3], *(styled(text, name) for text in list(plain)[:3]), *list(plain)[:3]]
     pairs: list[Motion] = []
     for old, new in zip(generate(before, texts), generate(after, texts), strict=True):
@@ -277,14 +279,14 @@ def _comparison(name: str, data: LessonData, *tasks: GeneratorTask) -> str:
             replace(motion, id="model") for motion in generate(after, text, frames=len(features))
         ]
     rows: list[list[str]] = []
-    for what, chosen in (
-        (f"loss on {len(own)} of your clips", own),
+    for label, chosen in (
+        (f"loss on {len(lesson)} of your clips", lesson),
         (f"loss on {len(kept)} clips it knew", kept),
     ):
         batch = collate(data.train.__getitems__([(int(row), -1) for row in chosen]))
         with torch.no_grad():
             losses = [float(task.losses_of(batch)["loss"].mean()) for task in tasks]
-        rows.append([what, *map(number, losses)])
+        rows.append([label, *map(number, losses)])
     players = {
         "prompts": player_page(pairs, "", columns=2),
         "clips": player_page(beside, "", columns=2),

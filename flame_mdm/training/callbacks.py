@@ -218,13 +218,13 @@ def explain_metrics(values: Values, real: Values, metrics: Mapping[str, Metric])
     """Returns lines that explain metrics by their docstrings, with their values next to those of real motions."""
     lines = []
     for name, metric in metrics.items():
-        own = {key: value for key, value in values.items() if key.partition("/")[0] == name}
-        if own:
+        shown = {key: value for key, value in values.items() if key.partition("/")[0] == name}
+        if shown:
             better = {True: " Higher is better.", False: " Lower is better.", None: ""}[
                 metric.higher_is_better
             ]
             lines.append(f"{name}: {(getdoc(type(metric)) or '').partition(chr(10))[0]}{better}")
-        for key, value in own.items():
+        for key, value in shown.items():
             reference = f" (real motions: {number(real[key])})" if key in real else ""
             lines.append(f"  {key}: {number(value)}{reference}")
     return lines

@@ -65,16 +65,16 @@ class DistillationTask(GeneratorTask):
         )
         for key in sorted(theirs.keys() | ours.keys()):
             if theirs.get(key) != ours.get(key):
-                what = f"has {key}={theirs.get(key)}, but the student has {ours.get(key)}. Both need the same parts"
                 raise UserError(
-                    f"distillation.teacher={name}: {what}: use `flame-mdm distill {name}`"
+                    f"distillation.teacher={name}: has {key}={theirs.get(key)}, but the student has {ours.get(key)}. "
+                    f"Both need the same parts: use `flame-mdm distill {name}`"
                 )
         before, now = teacher.facts.get("fingerprint"), self.facts.get("fingerprint")
         if None not in (before, now) and before != now:
-            what = (
-                f"trained on data with fingerprint {before}, but {self.facts['dataset']} has {now}"
+            raise UserError(
+                f"distillation.teacher={name}: trained on data with fingerprint {before}, but {self.facts['dataset']} "
+                f"has {now}. Give the data of the teacher"
             )
-            raise UserError(f"distillation.teacher={name}: {what}. Give the data of the teacher")
         self.generator.load_state_dict(teacher.state_dict())
         self.facts["teacher"] = weights_sha256(path)
         scale = options["guidance_scale"]
@@ -86,9 +86,9 @@ class DistillationTask(GeneratorTask):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Raises `UserError` if the weights of the teacher have changed since the run began."""
         if checkpoint["facts"].get("teacher") != self.facts["teacher"]:
-            what = "its weights have changed since this run began"
             raise UserError(
-                f"distillation.teacher: {what}. Restore them, or start another run with run.name=..."
+                "distillation.teacher: its weights have changed since this run began. Restore them, or start another "
+                "run with run.name=..."
             )
 
     def on_fit_start(self) -> None:
@@ -164,9 +164,9 @@ def read_teacher(path: Path) -> MotionGenerator:
             f"{path}: distilled already. Give its teacher, {teacher.config['distillation']['teacher']}"
         )
     if teacher.process.prediction == "epsilon":
-        what = "predicts noise, whose clean estimate is divided by almost nothing at the noisiest times"
         raise UserError(
-            f"{path}: {what}. Give a model that predicts the clean motion or the velocity (MDM, MFM)"
+            f"{path}: predicts noise, whose clean estimate is divided by almost nothing at the noisiest times. Give a "
+            "model that predicts the clean motion or the velocity (MDM, MFM)"
         )
     return teacher
 

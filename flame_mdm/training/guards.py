@@ -80,11 +80,11 @@ class BadLoss(Callback):
         """Raises `UserError` if a loss since the last check is bad, on all processes at the same step."""
         if not self.seen:
             return
-        own = torch.stack([loss for *_, loss in self.seen])
-        parts = [own]
+        recent = torch.stack([loss for *_, loss in self.seen])
+        parts = [recent]
         if trainer.world_size > 1:
-            parts = [torch.empty_like(own) for _ in range(trainer.world_size)]
-            torch.distributed.all_gather(parts, own)
+            parts = [torch.empty_like(recent) for _ in range(trainer.world_size)]
+            torch.distributed.all_gather(parts, recent)
         losses = torch.stack(parts).cpu()  # (processes, steps)
         bad = (~losses.isfinite() | (losses > self.factor * self.usual)).any(0)
         if bad.any():
@@ -94,15 +94,15 @@ class BadLoss(Callback):
 
     def _stop(self, trainer: Trainer, first: int, losses: Tensor) -> NoReturn:
         step, number, ids, loss = self.seen[first]
-        own = {
+        batch = {
             "rank": trainer.global_rank,
             "batch": number,
             "ids": list(ids),
             "loss": str(float(loss)),
         }
-        batches: list[Any] = [own] * trainer.world_size
+        batches: list[Any] = [batch] * trainer.world_size
         if trainer.world_size > 1:
-            torch.distributed.all_gather_object(batches, own)
+            torch.distributed.all_gather_object(batches, batch)
         if trainer.is_global_zero:
             write_json(self.path, {"step": step, "usual_loss": str(self.usual), "batches": batches})
         typical = f" (typical: {self.usual:.3g})" if self.usual < float("inf") else ""

@@ -134,7 +134,7 @@ def mannequin() -> Mesh:
 
 def read_body(name: str) -> Mesh:
     """Returns the mannequin, or the body in a file; raises `UserError` if the file is damaged."""
-    with naming(name, KeyError, ValueError, IndexError, what="not a body: "):
+    with naming(name, KeyError, ValueError, IndexError, prefix="not a body: "):
         return mannequin() if name == "mannequin" else Mesh(Path(name))
 
 

@@ -162,7 +162,7 @@ def _video(
     columns = len(motions) if len(motions) < 4 else min(4, math.ceil(math.sqrt(len(motions))))
     bodies = [motion.try_fit(mesh)[0] for motion in motions]
     lines = [_lines(motion, body, size, size) for motion, body in zip(motions, bodies, strict=True)]
-    captions = [_caption(own, size, max(map(len, lines)), size) for own in lines]
+    captions = [_caption(text, size, max(map(len, lines)), size) for text in lines]
     count = max(1, math.ceil(seconds * fps - 1e-6))
 
     def draw(k: int, frame: int) -> Image.Image:

@@ -35,9 +35,13 @@ class Reader:
     """
 
     def __init__(
-        self, entry: ActionEntry, tokens: Sequence[Token], own: Sequence[int], verb: Collection[int]
+        self,
+        entry: ActionEntry,
+        tokens: Sequence[Token],
+        numbers: Sequence[int],
+        verb: Collection[int],
     ):
-        self.entry, self.tokens, self.own, self.verb = entry, tokens, own, set(verb)
+        self.entry, self.tokens, self.numbers, self.verb = entry, tokens, numbers, set(verb)
         self.used: set[int] = set()
         self.dropped: set[int] = set()
         self.attributes: dict[str, Value] = {}
@@ -47,7 +51,7 @@ class Reader:
 
         `used` has the tokens that state one, `dropped` those of attributes that the action does not take.
         """
-        for position, number in enumerate(self.own):
+        for position, number in enumerate(self.numbers):
             word = self.tokens[number].word
             if word in (*LEFT_OR_RIGHT, "both") or word in ("hands", "arms", "fists"):
                 self._read_side(position, number)
@@ -60,7 +64,7 @@ class Reader:
 
     def _word(self, position: int) -> str:
         """Returns the word at a position in the clause; "" outside of it."""
-        return self.tokens[self.own[position]].word if 0 <= position < len(self.own) else ""
+        return self.tokens[self.numbers[position]].word if 0 <= position < len(self.numbers) else ""
 
     def _state(self, name: str, value: Value, *numbers: int) -> None:
         self.attributes[name] = value
@@ -103,7 +107,7 @@ class Reader:
         value = word_values("direction").get(word)
         if value is None or number in self.used:
             return
-        position = self.own.index(number)
+        position = self.numbers.index(number)
         before, after = self._word(position - 1), self._word(position + 1)
         if value in ("up", "down") and "vertical" not in self.entry.takes:
             return
@@ -146,7 +150,7 @@ class Reader:
                 self._state("count", tables["times"][word], number)
             return
         if word == "x" and self._word(position + 1).isdigit():
-            self._state("count", int(self._word(position + 1)), number, self.own[position + 1])
+            self._state("count", int(self._word(position + 1)), number, self.numbers[position + 1])
             return
         count = int(word) if word.isdigit() and len(word) < 4 else tables["numbers"].get(word)
         if word in ("a", "an", "the") or (word == "couple" and self._word(position + 1) == "of"):
@@ -176,13 +180,17 @@ class Reader:
 
     def _names_action(self, position: int) -> bool:
         """Returns whether the verb of the clause is a noun that follows a number: "five quick push-ups"."""
-        ahead = [self.own[position + step] for step in (1, 2, 3) if position + step < len(self.own)]
+        ahead = [
+            self.numbers[position + step]
+            for step in (1, 2, 3)
+            if position + step < len(self.numbers)
+        ]
         return any(number in self.verb for number in ahead)
 
     def _read_turn(self) -> None:
         if "amount" not in self.entry.takes:
             return
-        words = [self.tokens[number].word for number in self.own]
+        words = [self.tokens[number].word for number in self.numbers]
         if "180" in words or "half" in words or ("around" in words and "look" not in words):
             self.attributes["amount"] = "half"
         elif "quarter" in words or "90" in words:

@@ -187,10 +187,10 @@ def load_spec(name: str) -> Config:
     return spec
 
 
-def _at_most(what: str, count: int, most: int) -> None:
+def _at_most(noun: str, count: int, most: int) -> None:
     if count > most:
         raise UserError(
-            f"{what}: {count:,} exceed the limit of {most:,} per table. Split it into several tables"
+            f"{noun}: {count:,} exceed the limit of {most:,} per table. Split it into several tables"
         )
 
 
@@ -212,9 +212,11 @@ class Evaluation:
     def path(self, results: Path) -> Path:
         """Returns the path of the result, a function of the keys alone, so that tables share results."""
         digest = hashlib.sha256(json.dumps(dict(self.keys), sort_keys=True).encode()).hexdigest()
-        what = self.keys.get("baseline") or self.keys.get("ckpt") or self.keys["from_samples"]
+        subject = self.keys.get("baseline") or self.keys.get("ckpt") or self.keys["from_samples"]
         name = re.sub(
-            r"^runs-|-checkpoints-|-ckpt$|-default", "-", re.sub(r"[^A-Za-z0-9]+", "-", str(what))
+            r"^runs-|-checkpoints-|-ckpt$|-default",
+            "-",
+            re.sub(r"[^A-Za-z0-9]+", "-", str(subject)),
         ).strip("-")
         name = re.sub(r"-+", "-", name)[-60:]
         return results / Path(str(self.keys["protocol"])).stem / f"{name}-{digest[:10]}.json"
@@ -223,9 +225,11 @@ class Evaluation:
     def absent(self) -> dict[str, str]:
         """Files that do not exist, by what is missing: "no checkpoint"."""
         files = {"no checkpoint": "ckpt", "no samples": "from_samples", "no extractor": "extractor"}
-        paths = {what: str(self.keys.get(key) or "none") for what, key in files.items()}
+        paths = {reason: str(self.keys.get(key) or "none") for reason, key in files.items()}
         return {
-            what: path for what, path in paths.items() if path != "none" and not Path(path).exists()
+            reason: path
+            for reason, path in paths.items()
+            if path != "none" and not Path(path).exists()
         }
 
 

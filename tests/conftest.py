@@ -1,5 +1,6 @@
 """Shared by all tests: one thread, no network, and a tiny experiment."""
 
+import math
 import os
 
 os.environ["HF_HUB_OFFLINE"] = "1"  # before transformers is imported
@@ -19,8 +20,11 @@ from support.refusals import Refused
 from support.runs import TINY
 
 from flame_mdm.__main__ import main
+from flame_mdm.data import parallel
 
 torch.set_num_threads(1)
+# Tests run on all cores: more processes would only import torch again
+parallel.PATIENCE = math.inf
 settings.register_profile("repeatable", derandomize=True, deadline=None)
 settings.load_profile("repeatable")  # the same examples on every machine
 

@@ -14,7 +14,7 @@ import pytest
 import torch
 from support.fixtures import ROOT
 from support.refusals import one_error
-from support.runs import RUN, TWO, alarm, finish, free_port, reference, spawn
+from support.runs import RUN, TWO, alarm, ended, finish, forked, free_port, reference, spawn
 from torchmetrics import MeanMetric
 
 from flame_mdm.__main__ import main
@@ -31,9 +31,10 @@ from flame_mdm.task import GeneratorTask
 @pytest.mark.slow
 def test_two_processes_are_one_with_both_batches(tiny, tmp_path):
     """Launched by Lightning."""
-    words = [*tiny, *RUN, f"data_root={tmp_path / 'data'}"]
+    words = [*tiny, *RUN, f"data_root={tmp_path / 'data'}", "data.source.workers=1"]
     ours = ["callbacks.samples.every_n_steps=2", "trainer.max_steps=4"]
-    code, out, err = finish(spawn(["flame_mdm", "train", "quickstart", *words, *TWO, *ours]))
+    line = ["flame_mdm", "train", "quickstart", *words, *TWO, *ours]
+    code, out, err = ended(forked(tmp_path, line), tmp_path)
     assert code == 0, err
     assert (
         "batch: 2 clips = 1 x 2 processes x 1 accumulated; optimizer.lr=0.05 is not scaled with the batch"

@@ -23,7 +23,6 @@ from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.commands import train
 from flame_mdm.config import guarded
-from flame_mdm.data import parallel
 from flame_mdm.data.datamodule import Clips
 from flame_mdm.data.store import Store
 from flame_mdm.data.synthetic import Synthetic
@@ -158,7 +157,6 @@ def prepare(folder: Path, log: Path) -> None:
         return original(self, fps)
 
     original, Synthetic.clips = Synthetic.clips, clips  # type: ignore[method-assign]
-    parallel.PATIENCE = 1e9  # a slow machine would start processes, which this daemon may not
     with log.open("w", buffering=1) as file, redirect_stdout(file), redirect_stderr(file):
         code = main(
             ["prepare", "data=synthetic", "data.source.clips=100", f"data_root={folder / 'data'}"]

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from support.runs import TINY, finish, spawn
+from support.runs import TINY, ended, forked
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torchmetrics import MeanMetric
 
@@ -193,12 +193,13 @@ def test_a_finished_run_says_so_another_configuration_is_refused_and_a_saved_one
     "signum", [pytest.param(signal.SIGINT, marks=pytest.mark.robustness), signal.SIGTERM]
 )
 def test_a_signal_stops_at_the_end_of_a_step_and_the_run_goes_on(tiny, signum, tmp_path):
-    process = spawn(["flame_mdm", "train", "quickstart", *tiny, *STEPS, "trainer.max_steps=100000"])
+    words = ["train", "quickstart", *tiny, *STEPS, "trainer.max_steps=100000"]
+    process = forked(tmp_path, ["flame_mdm", *words])
     checkpoint = tmp_path / "run" / "checkpoints" / "last.ckpt"
-    while not checkpoint.exists() and process.poll() is None:
+    while not checkpoint.exists() and process.is_alive():
         time.sleep(0.05)
-    process.send_signal(signum)
-    code, out, err = finish(process)
+    os.kill(cast(int, process.pid), signum)
+    code, out, err = ended(process, tmp_path)
     assert code == 128 + signum, err
     assert "Traceback" not in err
     step = read_checkpoint(checkpoint)["global_step"]

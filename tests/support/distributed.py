@@ -22,7 +22,8 @@ SECONDS = 120
 class GlooPool:
     """A process group on this machine, which runs functions of test modules. Use as a context manager.
 
-    Each process computes with one thread, as the tests do.
+    Each process computes with one thread, as the tests do. The processes are forks of this one, since importing
+    torch and the package again takes most of the time of a test.
     """
 
     def __init__(self, size: int = 2):
@@ -31,9 +32,9 @@ class GlooPool:
     def __enter__(self) -> Self:
         with ExitStack() as stack:
             url = f"file://{stack.enter_context(tempfile.TemporaryDirectory())}/rendezvous"
-            spawn = multiprocessing.get_context("spawn")
+            fork = multiprocessing.get_context("fork")
             self.ranks = [
-                stack.enter_context(ProcessPoolExecutor(1, spawn, _join, (rank, self.size, url)))
+                stack.enter_context(ProcessPoolExecutor(1, fork, _join, (rank, self.size, url)))
                 for rank in range(self.size)
             ]
             seen = self.run(_rank_and_size)

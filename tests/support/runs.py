@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
+import runpy
 import signal
 import socket
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
 from multiprocessing import active_children
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -187,6 +190,38 @@ def finish(process: subprocess.Popen[str]) -> tuple[int, str, str]:
         out, err = process.communicate()
         pytest.fail(f"the processes hang\n{out}\n{err}")
     return process.returncode, out, err
+
+
+def forked(folder: Path, words: list[str]) -> BaseProcess:
+    """Starts `python -m words` as a fork of this process, which has imported all already.
+
+    What it prints is in the files `out` and `err` of the folder, also what its children print.
+    """
+    process = multiprocessing.get_context("fork").Process(target=_module, args=(folder, words))
+    process.start()
+    return process
+
+
+def _module(folder: Path, words: list[str]) -> None:
+    os.environ |= {"OMP_NUM_THREADS": "1", "GLOO_SOCKET_IFNAME": "lo"}
+    warnings.simplefilter("default")
+    sys.argv = words
+    with ExitStack() as stack:
+        for number, name, redirect in ((1, "out", redirect_stdout), (2, "err", redirect_stderr)):
+            file = stack.enter_context((folder / name).open("w", buffering=1))
+            os.dup2(file.fileno(), number)
+            stack.enter_context(redirect(file))
+        runpy.run_module(words[0], run_name="__main__", alter_sys=True)
+
+
+def ended(process: BaseProcess, folder: Path) -> tuple[int | None, str, str]:
+    """Exit code and what was printed of a process that `forked` started; one that hangs fails the test."""
+    process.join(SECONDS)
+    out, err = ((folder / name).read_text() for name in ("out", "err"))
+    if process.is_alive():
+        process.kill()
+        pytest.fail(f"the process hangs\n{out}\n{err}")
+    return process.exitcode, out, err
 
 
 def no_children(before: list[BaseProcess]) -> bool:

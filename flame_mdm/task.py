@@ -211,8 +211,10 @@ class GeneratorTask(Task):
                 f"data.crop: a sample of {shortest} frames has none after a prefix of {context}. {advice}"
             )
         if self.generator.conditioned_on == "text":
-            captions = (caption for clip in data.train.clips for caption in clip.captions)
-            self.add_facts(vocabulary(captions, share=data.source.captions_may_be_shared))
+            clips, may_share = data.train.clips, data.source.may_share_captions
+            captions = [text for clip in clips for text in clip.captions]
+            shared = [text for clip in clips if may_share(clip.license) for text in clip.captions]
+            self.add_facts(vocabulary(captions, shared or None))
             if data.source.verbs:
                 self.add_facts({"verbs": list(data.source.verbs)})
         if self.compiles:

@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from flame_mdm.data.bandai import Bandai
+from flame_mdm.data.cmu import CMU
 from flame_mdm.data.folder import MOST_COPIES, Folder
 from flame_mdm.data.mixture import Mixture
 from flame_mdm.data.store import write_store
@@ -118,3 +120,16 @@ def test_a_recipe_of_a_mixture_is_checked_at_the_command_line():
         Mixture({"synthetic": Synthetic(clips=1)}, use="sale")  # pyright: ignore[reportArgumentType]
     with pytest.raises(UserError, match="at least one data set"):
         Mixture({})
+
+
+def test_a_mixture_shares_the_captions_of_clips_whose_license_allows_any_use(people: Path):
+    source = mixture(people)
+    shared = {license: source.may_share_captions(license) for license in ("MIT", "CMU", "", "NC")}
+    assert shared == {"MIT": True, "CMU": True, "": False, "NC": False}
+
+
+def test_the_version_of_a_mixture_follows_the_versions_of_its_parts():
+    """A store of a mixture must be prepared again if one of its data sets is read in another way."""
+    versions = Synthetic.version, Folder.version, CMU.version, Bandai.version
+    message = "increase Mixture.version, then these numbers"
+    assert (versions, Mixture.version) == ((1, 2, 2, 1), 1), message

@@ -300,16 +300,16 @@ def test_a_vocabulary_holds_every_word_once_and_captions_only_if_they_may_be_sha
         {word for caption in facts["captions"] for word in vocabulary.words(caption)}
     )
     assert "walks" in facts["vocabulary"]
-    kept = vocabulary.vocabulary([*CAPTIONS, *CAPTIONS], share=False)
+    kept = vocabulary.vocabulary([*CAPTIONS, *CAPTIONS])
     assert kept == {"vocabulary": sorted(set(" ".join(CAPTIONS).lower().replace(".", "").split()))}
-    assert vocabulary.vocabulary(CAPTIONS, share=True)["captions"] == sorted(CAPTIONS)
+    assert vocabulary.vocabulary(CAPTIONS, CAPTIONS)["captions"] == sorted(CAPTIONS)
     many = [f"caption {number:05d}" for number in range(3 * vocabulary.MAX_CAPTIONS)]
-    assert vocabulary.vocabulary(many, share=True)["captions"] == many[::3]
-    assert vocabulary.vocabulary([], share=True) == {"vocabulary": [], "captions": []}
+    assert vocabulary.vocabulary(many, many)["captions"] == many[::3]
+    assert vocabulary.vocabulary([], []) == {"vocabulary": [], "captions": []}
 
 
 def test_unseen_and_unread_words_are_named_once_with_one_suggestion():
-    facts = vocabulary.vocabulary(CAPTIONS, share=True)
+    facts = vocabulary.vocabulary(CAPTIONS, CAPTIONS)
     # Walks; function words
     assert vocabulary.advice("A person WAVES, with the hand! They were walking", facts) == []
     (line,) = vocabulary.advice("a person dances the flamenco and dances with the left foot", facts)

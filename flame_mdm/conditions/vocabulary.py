@@ -66,17 +66,25 @@ def hashed(word: str, buckets: int) -> tuple[int, int]:
     return number % buckets, number // buckets % buckets
 
 
-def vocabulary(captions: Iterable[str], *, share: bool) -> dict[str, list[str]]:
-    """Returns what a checkpoint keeps of the training captions: "vocabulary", all words, sorted.
+def vocabulary(
+    captions: Iterable[str], shared: Iterable[str] | None = None
+) -> dict[str, list[str]]:
+    """Returns what a checkpoint keeps of the training captions.
 
-    If the license allows to `share` them, also "captions", up to `MAX_CAPTIONS`, evenly spaced.
+    Args:
+        captions: all captions of the training clips.
+        shared: those captions that a checkpoint may contain by the license of their data; None = no captions may be.
+
+    Returns:
+        "vocabulary", all words of the captions, sorted, and, unless `shared` is None, "captions": up to
+        `MAX_CAPTIONS` of `shared`, evenly spaced in their sorted list.
     """
-    distinct = sorted(set(captions))
-    kept = {"vocabulary": sorted({word for caption in distinct for word in words(caption)})}
-    if share:
+    facts = {"vocabulary": sorted({word for caption in set(captions) for word in words(caption)})}
+    if shared is not None:
+        distinct = sorted(set(shared))
         count = min(len(distinct), MAX_CAPTIONS)
-        kept["captions"] = [distinct[number * len(distinct) // count] for number in range(count)]
-    return kept
+        facts["captions"] = [distinct[number * len(distinct) // count] for number in range(count)]
+    return facts
 
 
 def known_form(word: str, seen: Collection[str]) -> str | None:

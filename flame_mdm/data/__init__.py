@@ -107,6 +107,10 @@ class MotionSource(ABC):
         """Returns a line if files were added or changed after they were prepared as the file `store`."""
         return []
 
+    def may_share_captions(self, license: str) -> bool:
+        """Returns whether a checkpoint may contain the captions of a clip with this license of its own, or ""."""
+        return self.captions_may_be_shared
+
     def licenses(self) -> set[str]:
         """Returns the licenses of all motions, without reading motions; "" stands for an unknown license."""
         return {self.license}

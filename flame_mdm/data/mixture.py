@@ -31,6 +31,8 @@ class Mixture(MotionSource):
 
     name = "mixture"
     named_by_recipe = True
+    # Increase it with the version of any data set, whose motions are then read differently here, too
+    version = 1
 
     def __init__(self, parts: Mapping[str, MotionSource], use: Use = "any"):
         if not parts:
@@ -38,7 +40,6 @@ class Mixture(MotionSource):
         if use not in ("any", "research"):
             raise UserError(f"data.source.use={use!s:.40}: give any or research")
         self.parts, self.use = dict(parts), use
-        self.captions_may_be_shared = all(part.captions_may_be_shared for part in parts.values())
         self.verbs = tuple(sorted({verb for part in parts.values() for verb in part.verbs}))
         self.options = {
             "use": use,
@@ -51,6 +52,10 @@ class Mixture(MotionSource):
 
     def licenses(self) -> set[str]:
         return {license for part in self.parts.values() for license in part.licenses()}
+
+    def may_share_captions(self, license: str) -> bool:
+        """Returns whether the license allows any use of the clip, and so of its captions."""
+        return known_licenses().get(license, {}).get("use") == "any"
 
     def check_licenses(self) -> None:
         """Raises `UserError` if a license forbids the use that the recipe states."""

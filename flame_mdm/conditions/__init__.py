@@ -12,29 +12,63 @@ from flame_mdm.batch import Condition, MotionBatch
 
 
 class ConditionEncoder(nn.Module, ABC):
-    """Encodes the text or action of a batch as a `Condition`, including the null condition."""
+    """Encodes the text or action of a batch as a `Condition`, including the null condition: base class of encoders.
 
+    Example:
+        >>> class WordCount(ConditionEncoder):  # an encoder that counts the words of a caption
+        ...     features = 1
+        ...     def forward(self, batch):
+        ...         pooled = torch.tensor([[float(len(text.split()))] for text in batch.text])
+        ...         null = Condition(torch.zeros(1, 1), torch.zeros(1, 0, 1), None)
+        ...         return Condition(pooled, pooled[:, None][:, :0], None, null)
+        >>> x = torch.zeros(1, 5, 3)
+        >>> batch = MotionBatch(x, x[..., 0] == 0, ["clip"], text=["a person walks"])
+        >>> WordCount()(batch).pooled.tolist()
+        [[3.0]]
+    """
+
+    #: C, the width of the condition; 0 = unconditioned.
     features: int
-    """C, the width of the condition; 0 = unconditioned."""
+    #: What it encodes: captions ("text") or class labels ("action").
     reads: Literal["text", "action"] = "text"
-    """What it encodes."""
+    #: Maximum number of words per caption; None if the encoder does not count words.
     max_words: int | None = None
-    """Maximum number of words per caption, where the encoder counts words."""
+    #: Words of the training captions; None until they are known.
     seen: Collection[str] | None = None
-    """Words of the training captions, once they are known."""
 
     @abstractmethod
     def forward(self, batch: MotionBatch) -> Condition:
-        """Encodes the conditions of a batch, on the device of `batch.x`; raises `ValueError` if it has none."""
+        """Encodes the conditions of a batch.
+
+        Args:
+            batch: captions in `batch.text`, or labels in `batch.action`.
+
+        Returns:
+            The condition on the device of `batch.x`, with its null.
+
+        Raises:
+            UserError: If the batch has no captions or labels.
+        """
 
     def pretrain(self, groups: Sequence[Sequence[str]], seed: int) -> None:
-        """Trains the encoder on captions alone, if it can, before the first step; `groups` are captions of a clip."""
+        """Trains the encoder on captions alone, before the first training step. By default, does nothing.
+
+        Args:
+            groups: captions of each clip.
+            seed: seed of all random draws.
+        """
 
     def precompute(self, captions: Sequence[str], folder: Path) -> None:
-        """Fills the encoder's cache on disk, if it has one, for these captions. Called in one process only."""
+        """Fills the encoder's cache on disk for these captions. By default, does nothing.
+
+        Called in one process only.
+        """
 
     def load_cache(self, captions: Sequence[str], folder: Path) -> int:
-        """Opens the cache of `precompute`, in every process; returns its bytes, or raises `UserError` if damaged."""
+        """Opens the cache of `precompute` in every process, and returns its bytes; 0 without a cache.
+
+        Raises `UserError` if the cache is damaged.
+        """
         return 0
 
     def move_cache(self, device: torch.device) -> None:
@@ -42,11 +76,18 @@ class ConditionEncoder(nn.Module, ABC):
 
 
 class Unconditional(ConditionEncoder):
-    """No condition: vectors and tokens of width 0, which are also the null."""
+    """No condition: vectors and tokens of width 0, which are also the null.
+
+    Example:
+        >>> x = torch.zeros(2, 5, 3)
+        >>> Unconditional()(MotionBatch(x, x[..., 0] == 0, ["a", "b"])).pooled.shape
+        torch.Size([2, 0])
+    """
 
     features = 0
 
     def forward(self, batch: MotionBatch) -> Condition:
+        """Returns an empty condition for each motion."""
         x, mask = batch.x, batch.mask
         null = Condition(x.new_zeros(1, 0), x.new_zeros(1, 0, 0), mask.new_zeros(1, 0))
         return Condition(x[:, 0, :0], x[:, :0, :0], mask[:, :0], null)

@@ -11,13 +11,28 @@ from flame_mdm.errors import UserError
 class ActionLabels(ConditionEncoder):
     """One learned vector per class, initialized from N(0, 1); the null is the zero vector.
 
-    As in Tevet et al. 2023 (MDM), section 3. The only token repeats the pooled vector, for denoisers that read tokens.
+    As in Tevet et al. 2023 (MDM), section 3. The only token repeats the pooled vector, for
+    denoisers that read tokens.
+
+    Args:
+        features: C, the width of the vectors.
+        num_actions: number of labels in the data set.
+
+    Raises:
+        UserError: If there are no labels.
+
+    Example:
+        >>> encoder = ActionLabels(features=4, num_actions=3)
+        >>> x = torch.zeros(2, 5, 3)
+        >>> batch = MotionBatch(x, x[..., 0] == 0, ["a", "b"], action=torch.tensor([0, 2]))
+        >>> cond = encoder(batch)
+        >>> torch.equal(cond.pooled, encoder.table[[0, 2]]), cond.null.pooled.tolist()
+        (True, [[0.0, 0.0, 0.0, 0.0]])
     """
 
     reads = "action"
 
     def __init__(self, features: int, num_actions: int):
-        """`features` (C) is the width of the vectors; `num_actions` is the number of labels in the data set."""
         super().__init__()
         if num_actions < 1:
             raise UserError(
@@ -27,6 +42,7 @@ class ActionLabels(ConditionEncoder):
         self.table = nn.Parameter(torch.randn(num_actions, features))
 
     def forward(self, batch: MotionBatch) -> Condition:
+        """Returns the vectors of the labels `batch.action` (B,); raises `UserError` if there are none."""
         if batch.action is None:
             raise UserError(
                 "condition=action needs action labels, and this batch has none: choose data with labels"

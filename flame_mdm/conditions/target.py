@@ -1,9 +1,10 @@
 """Target conditions: where joints should be at the end of a motion (Tevet et al. 2025, "CLoSD", section 3.1).
 
-A target (B, 8, 4) has a slot for each name in `SLOTS`: x, y, z, and 1 = requested or 0 = free; free slots are 0.
-Positions are in meters, in the frame of reference of the predicted frames: the root of the first one is at x = z = 0
-and faces +z; y is the height above the floor. "traj" is the pelvis on the floor, y = 0. The x of "heading" is the
-direction that hips and shoulders face, in radians: 0 = +z, positive to +x.
+A target (B, 8, 4) has a slot for each name in `SLOTS`: x, y, z, and 1 = requested or 0 = free;
+free slots are 0. Positions are in meters, in the frame of reference of the predicted frames: the
+root of the first one is at x = z = 0 and faces +z; y is the height above the floor. "traj" is the
+pelvis on the floor, y = 0. The x of "heading" is the direction that hips and shoulders face, in
+radians: 0 = +z, positive to +x.
 """
 
 import math
@@ -31,14 +32,26 @@ class TargetConditions:
     Args:
         joints: names of the joints of the skeleton, in the order of its positions.
         facing: numbers of right hip, left hip, right shoulder and left shoulder.
-        choices: sets of slots; each training motion draws one of them, with equal probability. An empty set is the
-            target that requests nothing, which is not the same as none.
+        choices: sets of slots; each training motion draws one of them, with equal probability. An
+            empty set is the target that requests nothing, which is not the same as none.
         drop_prob: probability that a training motion has no target.
         weight: weight of the error in the loss.
-        heading_modulo_pi: the error of the heading is taken modulo pi, as in MDM's code, so that facing backwards costs
-            nothing.
+        heading_modulo_pi: the error of the heading is taken modulo pi, as in MDM's code, so that
+            facing backwards costs nothing.
 
-    Raises `UserError` if the skeleton lacks a joint, or a choice is unknown.
+    Raises:
+        UserError: If the skeleton lacks a joint, a choice is unknown, or the probability is not
+            in [0, 1].
+
+    Example:
+        >>> from flame_mdm.representations.skeleton import SMPL22
+        >>> targets = TargetConditions(SMPL22.joints, SMPL22.facing, choices=[["left_wrist"]])
+        >>> motion = torch.randn(1, 5, 22, 3)
+        >>> target = targets.draw(motion, torch.tensor([0.5]))
+        >>> torch.equal(target[0, SLOTS.index("left_wrist"), :3], motion[0, -1, 20])
+        True
+        >>> targets.error(motion, target).item()
+        0.0
     """
 
     def __init__(
@@ -88,8 +101,8 @@ class TargetConditions:
     def error(self, joints: Tensor, target: Tensor, lengths: Tensor | None = None) -> Tensor:
         """Returns the weighted error (B,) of predicted motions (B, F, J, 3); 0 for targets that request nothing.
 
-        That is the mean squared error of the requested coordinates in square meters, and the squared error of the
-        heading in square radians.
+        The error is the mean squared error of the requested coordinates in square meters, plus
+        the squared error of the heading in square radians.
         """
         predicted, values, valid = self.locations(joints, lengths), target[..., :3], target[..., 3:]
         counted = valid * COORDINATES.to(target)

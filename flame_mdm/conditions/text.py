@@ -29,25 +29,43 @@ CAPTIONS_AT_ONCE = 64
 class PretrainedText(ConditionEncoder):
     """CLIP, RoBERTa, sentence-BERT, DistilBERT or T5 from the transformers library.
 
-    A frozen language model is not part of the state dict or the parameters, and is loaded only for a caption that is
-    not in the cache. Its tokens are always rounded to float16, with and without the cache.
+    A frozen language model is not part of the state dict or the parameters, and is loaded only
+    for a caption that is not in the cache. Its tokens are always rounded to float16, with and
+    without the cache.
 
     Args:
         model: name on the Hugging Face hub, or a folder.
         features: C, width of the model's outputs.
-        max_tokens: maximum number of word pieces per caption, including special ones; the rest is truncated.
-        pooling: "projection" is CLIP's projected text embedding, not normalized; "mean" is over the real tokens,
-            including special ones (Reimers & Gurevych 2019); "pooler" is tanh of a linear map of the first token, as in
-            BERT. RoBERTa is published without such a map, so transformers draws a new one each time; FLAME was trained
-            with one such draw. Here it is drawn with a fixed seed, and a released checkpoint can replace it.
+        max_tokens: maximum number of word pieces per caption, including special ones; the rest is
+            truncated.
+        pooling: "projection" is CLIP's projected text embedding, not normalized; "mean" is over
+            the real tokens, including special ones (Reimers & Gurevych 2019); "pooler" is tanh of
+            a linear map of the first token, as in BERT. RoBERTa is published without such a map,
+            so transformers draws a new one each time; FLAME was trained with one such draw. Here
+            it is drawn with a fixed seed, and a released checkpoint can replace it.
         revision: commit on the hub, 40 hex digits; required for models from the hub.
-        package: installed Python package whose folder `model` contains the files, instead of the hub.
-        sha256: hash of the package's model.safetensors, checked before loading; required with `package`.
+        package: installed Python package whose folder `model` contains the files, instead of the
+            hub.
+        sha256: hash of the package's model.safetensors, checked before loading; required with
+            `package`.
         normalize: scale the pooled vector to length 1.
         tokens: return the last hidden states as tokens; otherwise there are 0 tokens.
-        attend_padding: pad every caption to `max_tokens` and treat the padding as real, as FLAME and MFM do.
-        encode_null: the null is the encoded "" (FLAME); otherwise zeros with the sample's token mask (MDM).
+        attend_padding: pad every caption to `max_tokens` and treat the padding as real, as FLAME
+            and MFM do.
+        encode_null: the null is the encoded "" (FLAME); otherwise zeros with the sample's token
+            mask (MDM).
         freeze: False fine-tunes the language model together with the motion model.
+
+    Raises:
+        UserError: When a caption is encoded, if the model is not pinned, its file is not the
+            published one, or its width is not `features`.
+        FileNotFoundError: When a caption is encoded, if the model is neither in the cache nor can
+            be downloaded.
+
+    Example:
+        >>> encoder = PretrainedText("openai/clip-vit-base-patch32", 512, 22, "projection")
+        >>> encoder.features, sum(p.numel() for p in encoder.parameters())  # not loaded yet, and frozen
+        (512, 0)
     """
 
     pooler_weight: Tensor
@@ -99,6 +117,7 @@ class PretrainedText(ConditionEncoder):
                     self.register_parameter(f"pooler_{name}", nn.Parameter(value))
 
     def forward(self, batch: MotionBatch) -> Condition:
+        """Returns the encoded captions; raises `UserError` if the batch has none."""
         if batch.text is None:
             name = self._pretrained.model
             raise UserError(
@@ -117,6 +136,7 @@ class PretrainedText(ConditionEncoder):
         return Condition(pooled, tokens, token_mask, null)
 
     def precompute(self, captions: Sequence[str], folder: Path) -> None:
+        """Encodes the captions with a frozen model and writes them to a file in `folder`, unless it is there."""
         if not self.freeze:
             return
         if (path := self._cache_path(captions, folder)).exists():
@@ -133,12 +153,14 @@ class PretrainedText(ConditionEncoder):
         del self._pretrained.network  # frees its memory
 
     def load_cache(self, captions: Sequence[str], folder: Path) -> int:
+        """Opens the file of `precompute` and returns its bytes; raises `UserError` if it is missing or damaged."""
         if not self.freeze:
             return 0
         self._cache = EncodedCaptions.open(self._cache_path(captions, folder))
         return self._cache.pooled.nbytes + self._cache.tokens.nbytes
 
     def move_cache(self, device: torch.device) -> None:
+        """Moves the opened encodings to a device."""
         if self._cache is not None:
             self._cache.pooled, self._cache.tokens = (
                 self._cache.pooled.to(device),
@@ -185,7 +207,7 @@ class PretrainedText(ConditionEncoder):
         if first.shape[1] != self.features or hidden.shape[2] != self.features:
             widths = f"vectors of width {first.shape[1]} and tokens of width {hidden.shape[2]}"
             raise UserError(
-                f"condition.features={self.features}: set it to that of the text encoder, which has {widths}"
+                f"condition.features={self.features}: set it to the width of the text encoder, which has {widths}"
             )
         token_mask = torch.ones_like(mask) if self.attend_padding else mask
         size = hidden.shape[1] if self.tokens else 0
@@ -226,12 +248,14 @@ class Pretrained:
 
     @cached_property
     def tokenizer(self):
+        """The tokenizer of the model."""
         from transformers import AutoTokenizer
 
         return self._load(AutoTokenizer)
 
     @cached_property
     def network(self) -> nn.Module:
+        """The frozen network, in evaluation mode."""
         return self.load_network().eval().requires_grad_(False)
 
     def load_network(self) -> nn.Module:
@@ -311,7 +335,8 @@ class Pretrained:
 class EncodedCaptions:
     """Outputs of a language model: vectors (N, C) float32 and tokens (T, C) float16 of N captions.
 
-    The tokens of caption n are those from `offsets[n]` to `offsets[n + 1]`. Arrays read from a file are memory-mapped.
+    Caption n has the tokens `offsets[n]` to `offsets[n + 1]` (exclusive). Arrays read from a file
+    are memory-mapped.
     """
 
     def __init__(self, captions: Sequence[str], pooled: Tensor, tokens: Tensor, offsets: Tensor):
@@ -334,6 +359,7 @@ class EncodedCaptions:
             raise UserError(f"{path} is damaged ({error})") from error
 
     def save(self, path: Path) -> None:
+        """Writes the content to a .safetensors file."""
         arrays = {
             "pooled": self.pooled,
             "tokens": self.tokens,

@@ -13,7 +13,8 @@ from flame_mdm.errors import UserError
 from flame_mdm.progress import ProgressBar
 from flame_mdm.seeds import key, seed_generator
 
-PAIRS, TEMPERATURE = 64, 0.1  # of the contrastive loss
+# Clips per step of the contrastive loss, and the temperature of its softmax
+PAIRS, TEMPERATURE = 64, 0.1
 
 START = "<start>"
 """Inserted before every caption, so that the empty caption also has a token; no caption contains this word."""
@@ -22,20 +23,32 @@ START = "<start>"
 class LearnedTokens(ConditionEncoder):
     """Hashed words, learned positions and one transformer layer; the null is one learned vector.
 
-    A word is the sum of two rows of the table, selected by its hash, see `vocabulary.hashed`. Words that the training
-    captions do not contain are replaced by a form that they do contain (walked, walks), or dropped: their vectors are
-    random. Samples with the same caption share its dropout, since it is encoded once. Linear layers skip the padding.
+    A word is the sum of two rows of the table, selected by its hash, see `vocabulary.hashed`.
+    Words that the training captions do not contain are replaced by a form that they do contain
+    (walked, walks), or dropped: their vectors are random. Samples with the same caption share its
+    dropout, since it is encoded once. Linear layers skip the padding.
 
-    The pooled vector is the mean of the tokens, and the null token is the null vector, so that all parameters receive
-    gradients whether a denoiser reads the pooled vector or the tokens.
+    The pooled vector is the mean of the tokens, and the null token is the null vector, so that
+    all parameters receive gradients whether a denoiser reads the pooled vector or the tokens.
 
     Args:
         features: C, the width of the tokens and of the pooled vector.
         buckets: rows of the word table.
         max_words: maximum number of words per caption; the rest is dropped.
-        heads: attention heads; divides `features`.
-        dropout: of the transformer layer.
+        heads: number of attention heads; divides `features`.
+        dropout: probability of dropout in the transformer layer.
         pretrain_steps: number of steps of `pretrain`.
+
+    Raises:
+        UserError: If a size is below 1.
+
+    Example:
+        >>> encoder = LearnedTokens(features=8, buckets=64, heads=2).eval()
+        >>> x = torch.zeros(2, 5, 3)
+        >>> captions = ["a person walks", "a person waves slowly"]
+        >>> cond = encoder(MotionBatch(x, x[..., 0] == 0, ["a", "b"], text=captions))
+        >>> cond.pooled.shape, cond.token_mask.sum(1).tolist()  # a start token and the words
+        (torch.Size([2, 8]), [4, 5])
     """
 
     def __init__(
@@ -81,10 +94,11 @@ class LearnedTokens(ConditionEncoder):
         return [vocabulary.hashed(word, self.buckets) for word in [START, *words[: self.max_words]]]
 
     def pretrain(self, groups: Sequence[Sequence[str]], seed: int) -> None:
-        """Draws pooled vectors of captions of the same clip together, and those of other clips apart.
+        """Draws the pooled vectors of captions of the same clip together, and the vectors of different clips apart.
 
-        Each step compares two captions each of `PAIRS` clips (Gao et al. 2021, "SimCSE", equation 1). The loss of the
-        motions alone teaches a small model many words slowly. Clips with a single caption are not used.
+        Each step compares two captions each of `PAIRS` clips (Gao et al. 2021, "SimCSE", equation
+        1). The loss of the motions alone teaches a small model many words slowly. Clips with a
+        single caption are not used.
         """
         groups, device = (
             [captions for captions in groups if len(set(captions)) > 1],
@@ -113,6 +127,7 @@ class LearnedTokens(ConditionEncoder):
             optimizer.step()
 
     def forward(self, batch: MotionBatch) -> Condition:
+        """Returns the encoded captions; raises `UserError` if the batch has none."""
         if batch.text is None:
             raise UserError(
                 "condition=learned: this batch has no captions. Add some, or choose another condition"
@@ -140,7 +155,8 @@ class LearnedTokens(ConditionEncoder):
     def _encode(self, rows: Tensor, index: Tensor, token_mask: Tensor) -> Tensor:
         """Encodes captions as (N, S, C), 0 past their ends; padding takes part only in attention.
 
-        `rows` (T, 2) of the table are of all real tokens, and `index` (T,) has their places in `token_mask` (N, S).
+        `rows` (T, 2) of the table are of all real tokens, and `index` (T,) has their places in
+        `token_mask` (N, S).
         """
 
         def pad(y: Tensor) -> Tensor:

@@ -12,7 +12,8 @@ from flame_mdm.conditions.language.tokens import is_known
 from flame_mdm.errors import UserError, shortened
 
 WORD = re.compile(r"[^\W_]+")
-MAX_CAPTIONS = 1000  # maximum number of training captions that a checkpoint keeps
+# Maximum number of training captions that a checkpoint keeps
+MAX_CAPTIONS = 1000
 FUNCTION_WORDS = frozenset(
     WORD.findall(
         "a an the this that some one and or then of to in on at by with from for as is are was were be been it its s t "
@@ -20,7 +21,7 @@ FUNCTION_WORDS = frozenset(
         "boy girl guy lady someone somebody will"
     )
 )
-"""Words that do not tell what happens; a text of these alone says nothing, and none of them is worth a warning."""
+"""Words that do not tell what happens. A text of only these words says nothing; unknown ones cause no warning."""
 NUMBERS = frozenset(
     [
         "zero",
@@ -58,10 +59,12 @@ def words(text: str) -> list[str]:
 def hashed(word: str, buckets: int) -> tuple[int, int]:
     """Returns the two rows of a table of `buckets` word vectors whose sum is the vector of a word.
 
-    They are two parts of its hash (Svenstrup et al. 2017, "Hash embeddings"), so that two words are confused only if
-    both parts collide. The hash (CRC-32) is the same on every machine.
+    The rows are two parts of the word's hash (Svenstrup et al. 2017, "Hash embeddings"), so that
+    two words are confused only if both parts collide. The hash (CRC-32) is the same on every
+    machine.
     """
-    # Not two hashes of the word with different prefixes: CRC is linear, so both would collide together.
+    # Not two hashes of the word with different prefixes: CRC is linear, so both would collide
+    # together.
     number = zlib.crc32(word.encode())
     return number % buckets, number // buckets % buckets
 
@@ -94,7 +97,7 @@ def known_form(word: str, seen: Collection[str]) -> str | None:
     if word in NUMBERS:  # "four" is no form of "fours"
         return None
     stems = [word.removesuffix(suffix) for suffix in SUFFIXES if word.endswith(suffix)]
-    # Waving, hopping
+    # The stem of "waving" is "wave", of "hopping" "hop".
     stems += [stem[:-1] for stem in stems if len(stem) > 3 and stem[-1] in f"e{stem[-2]}"]
     forms = (
         stem + ending
@@ -106,9 +109,13 @@ def known_form(word: str, seen: Collection[str]) -> str | None:
 
 
 def advice(text: str, facts: Mapping[str, Any], max_words: int | None = None) -> list[str]:
-    """Returns lines about words of a prompt that a model, of these facts, has never seen in training or does not read.
+    """Returns lines about words of a prompt that a model has never seen in training or does not read.
 
-    Imported models have no vocabulary, so their words are not checked; `max_words` None = no limit.
+    Args:
+        text: the prompt.
+        facts: facts of the model. Imported models have no vocabulary, so words are not checked
+            for them.
+        max_words: maximum number of words that the model reads; None = no limit.
     """
     lines = []
     if unknown := unknown_words(text, facts):
@@ -137,7 +144,7 @@ def unread_words(text: str, max_words: int | None) -> list[str]:
 
 
 def unknown_words(text: str, facts: Mapping[str, Any]) -> list[str]:
-    """Returns the content words of a text of which a model, of these facts, knows no form."""
+    """Returns the content words of a text that a model with these facts does not know in any form."""
     seen = facts.get("vocabulary")
     return (
         [] if seen is None else [word for word in _content(text) if known_form(word, seen) is None]
@@ -145,10 +152,11 @@ def unknown_words(text: str, facts: Mapping[str, Any]) -> list[str]:
 
 
 def _suggested(text: str, facts: Mapping[str, Any]) -> str:
-    """Returns " Did you mean '...'?": the text with the known words that are meant, or the nearest training caption.
+    """Returns " Did you mean '...'?": the text with known words for unknown ones, or the nearest training caption.
 
-    A word is meant if the unknown word is no English word and is spelled alike, or if it has a similar meaning; never
-    because an English word is spelled alike (shelf, she). A caption is near if it has a content word of the text.
+    Words that are not English are replaced by known words with a similar spelling, English words
+    only by known words with a similar meaning (never "shelf" by "she"). A caption is near if it
+    has a content word of the text.
     """
     fixed = text.lower()
     for word in (unknown := unknown_words(text, facts)):
@@ -175,9 +183,14 @@ def _meant(word: str, vocabulary: Collection[str]) -> str | None:
 def in_parts(text: str, verbs: Collection[str]) -> list[str]:
     """Splits a sentence with several actions: "walks, turns left and waves. Then she sits" has four parts.
 
-    It is split at ends of sentences and at "then"; if `verbs`, all known forms, are given, also at commas followed by a
-    verb, and in such an enumeration at "and" followed by one. "Raises both hands and waves" is one action. Parts
-    without a verb belong to their neighbor; "in limp style" at the end, which adapters teach, to all.
+    A text is split at ends of sentences and at "then". With `verbs`, it is also split at commas
+    followed by a verb and, in such an enumeration, at "and" followed by a verb; "raises both
+    hands and waves" is one action. Parts without a verb belong to their neighbor. "In limp style"
+    at the end, which adapters teach, belongs to all parts.
+
+    Args:
+        text: the sentence.
+        verbs: all forms of the known verbs.
     """
     comma, also = _before_verb(tuple(verbs))
     parts: list[str] = []
@@ -219,7 +232,7 @@ def _before_verb(verbs: tuple[str, ...]) -> tuple[re.Pattern[str], re.Pattern[st
 
 
 def plainest(captions: Iterable[str]) -> list[str]:
-    """Returns captions, those about "a person" first, and the shortest of them first."""
+    """Returns captions in order: captions about "a person" come first, shorter captions before longer ones."""
     return sorted(
         captions, key=lambda caption: (not caption.startswith("a person "), len(caption), caption)
     )

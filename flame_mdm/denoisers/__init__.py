@@ -8,21 +8,39 @@ from flame_mdm.batch import Condition
 
 
 class Denoiser(nn.Module, ABC):
-    """A network (x_t, t, mask, cond) -> prediction.
+    """A network that predicts the target of a process from a noisy motion: base class of all denoisers.
 
-    The first arguments of subclasses are `in_features` (D), `out_features` (D, or 2D with a learned variance) and
-    `cond_features` (C; 0 = unconditioned), which `task.build` passes; the others come from the configuration:
-    `latent_dim`, the width of the layers; `ff_size`, the hidden width of feed-forward layers; `num_heads` of attention;
-    `dropout` after the positions and inside the layers; `project_condition`, False to add the condition to the time
-    without projection, as MDM does with action embeddings.
+    Subclasses take the following arguments, as far as they use them. `Parts.build` passes the
+    first three, which depend on other parts; the others come from the configuration.
+
+    Args:
+        in_features: D, the number of features of a frame.
+        out_features: D, or 2D with a learned variance.
+        cond_features: C, the width of the condition; 0 = unconditioned.
+        latent_dim: width of the layers.
+        ff_size: hidden width of the feed-forward layers.
+        num_layers: number of layers.
+        num_heads: number of attention heads; divides `latent_dim`.
+        dropout: probability in [0, 1) of dropout after the positions and inside the layers.
+        project_condition: False adds the condition to the time without projection, as MDM does
+            with action embeddings; C must then be `latent_dim`.
+
+    Example:
+        >>> import torch
+        >>> class Mean(Denoiser):  # a denoiser that sees a motion as its mean
+        ...     def forward(self, x_t, t, mask, cond):
+        ...         return x_t.mean(1, keepdim=True).expand_as(x_t)
+        >>> x_t, mask = torch.ones(2, 5, 3), torch.ones(2, 5, dtype=torch.bool)
+        >>> Mean()(x_t, torch.zeros(2), mask, Condition(x_t[:, 0], x_t[:, :0], None)).shape
+        torch.Size([2, 5, 3])
     """
 
+    #: Whether padding has no influence on real frames. A network that attends to padding (False)
+    #: is sampled at the padded length of its training.
     mask_padding: bool = True
-    """Whether padding has no influence on real frames. A network that attends to it (False) is sampled at the padded
-    length of its training."""
 
+    #: Number of clean frames before the motion that the network reads in `Condition.prefix`.
     context_frames: int = 0
-    """Number of clean frames before the motion that the network reads in `Condition.prefix`."""
 
     @abstractmethod
     def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
@@ -35,6 +53,6 @@ class Denoiser(nn.Module, ABC):
             cond: the condition, in which dropped samples are already replaced by nulls.
 
         Raises:
-            UserError: If a motion is too long for the network, condition tokens are missing or too many, or the
-                prefix is not `context_frames` long.
+            UserError: If a motion is too long for the network, condition tokens are missing or
+                too many, or the prefix is not `context_frames` long.
         """

@@ -12,17 +12,37 @@ from flame_mdm.errors import UserError
 
 
 class FLAME(Denoiser):
-    """Transformer decoder over [ML, TS, CLS, frame 1, frame 2, ...] with cross-attention to [ML, TS, CLS, text tokens].
+    """Transformer decoder over the frames with cross-attention to the text; the network of FLAME.
 
-    ML embeds the length of the motion, TS is the sinusoid of the time, CLS the projected pooled condition.
-    The output of frames past the end of a motion is 0.
+    Its input is [ML, TS, CLS, frame 1, frame 2, ...], its memory [ML, TS, CLS, text tokens]. ML
+    embeds the length of the motion, TS is the sinusoid of the time, CLS the projected pooled
+    condition. The output of frames past the end of a motion is 0.
 
     Args:
+        in_features: D.
+        out_features: D, or 2D with a learned variance.
+        cond_features: C; 0 = unconditioned.
+        latent_dim: width of the layers.
+        ff_size: hidden width of the feed-forward layers.
+        num_layers: number of layers.
+        num_heads: number of attention heads; divides `latent_dim`.
+        dropout: probability of dropout inside the layers.
         max_frames: maximum length of a motion that ML can embed.
         length_token: False omits ML (table 4, first row).
-        cross_attention: False gives a transformer encoder over ML, TS, CLS and frames (table 4, first two rows).
-        condition_frames: also add TS and CLS to every frame: a small network follows the text after fewer steps.
-        length_unit: ML embeds the length rounded down to a multiple of this, the unit of the windows in training.
+        cross_attention: False gives a transformer encoder over ML, TS, CLS and frames (table 4,
+            first two rows).
+        condition_frames: also add TS and CLS to every frame: a small network follows the text
+            after fewer steps.
+        length_unit: ML embeds the length rounded down to a multiple of this, the unit of the
+            windows in training.
+
+    Example:
+        >>> denoiser = FLAME(
+        ...     6, 6, 4, latent_dim=8, ff_size=8, num_layers=1, num_heads=2, dropout=0.0, max_frames=20
+        ... )
+        >>> cond = Condition(torch.ones(2, 4), torch.ones(2, 3, 4), torch.ones(2, 3) > 0)
+        >>> denoiser(torch.ones(2, 5, 6), torch.zeros(2), torch.ones(2, 5) > 0, cond).shape
+        torch.Size([2, 5, 6])
     """
 
     def __init__(
@@ -50,8 +70,8 @@ class FLAME(Denoiser):
             condition_frames,
             length_unit,
         )
-        # A table of max_frames rows is enough for the lengths 1 to max_frames: row 0, which the authors' code never
-        # reads, is used for the longest motion.
+        # A table of max_frames rows is enough for the lengths 1 to max_frames: row 0, which the
+        # authors' code never reads, is used for the longest motion.
         self.length_embedding = nn.Embedding(max_frames, latent_dim) if length_token else None
         self.input = nn.Linear(in_features, latent_dim)
         self.pooled_projection = nn.Linear(cond_features, latent_dim) if cond_features else None
@@ -64,6 +84,7 @@ class FLAME(Denoiser):
         self.output = nn.Linear(latent_dim, out_features)
 
     def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
+        """See `Denoiser.forward`. Raises `UserError` if a motion is longer than `max_frames`."""
         x = self.input(x_t)
         prefix = [cosine_first_sinusoid(t, x.shape[-1]).to(x_t.dtype)]
         if self.length_embedding is not None:

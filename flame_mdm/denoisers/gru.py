@@ -14,8 +14,22 @@ class MDMGRU(Denoiser):
     It runs forward in time, so that padding at the end does not affect real frames.
 
     Args:
-        recur_over_batch: recurs from sample to sample instead of from frame to frame, as MDM's released code does
-            because of swapped axes. Only for reproduction: results then depend on the order of the batch.
+        in_features: D.
+        out_features: D, or 2D with a learned variance.
+        cond_features: C; 0 = unconditioned.
+        latent_dim: width of the layers.
+        num_layers: number of layers of the GRU.
+        dropout: probability of dropout after the positions.
+        project_condition: False adds the condition to the time without projection.
+        recur_over_batch: recurs from sample to sample instead of from frame to frame, as MDM's
+            released code does because of swapped axes. Only for reproduction: results then depend
+            on the order of the batch.
+
+    Example:
+        >>> denoiser = MDMGRU(6, 6, 4, latent_dim=8, num_layers=1, dropout=0.0)
+        >>> cond = Condition(torch.ones(2, 4), torch.ones(2, 0, 4), None)
+        >>> denoiser(torch.ones(2, 5, 6), torch.zeros(2), torch.ones(2, 5) > 0, cond).shape
+        torch.Size([2, 5, 6])
     """
 
     def __init__(
@@ -38,6 +52,7 @@ class MDMGRU(Denoiser):
         self.output = nn.Linear(latent_dim, out_features)
 
     def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
+        """See `Denoiser.forward`."""
         frames = x_t.shape[1]
         token = self.condition(t, cond.pooled)[:, None].expand(-1, frames, -1)
         x = self.input(torch.cat([x_t, token], -1))

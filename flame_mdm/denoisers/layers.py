@@ -13,7 +13,8 @@ from flame_mdm.errors import UserError
 def sinusoid(position: Tensor, features: int) -> Tensor:
     """Returns sines in even and cosines in odd of the (N, features) channels (Vaswani et al. 2017, section 3.5).
 
-    Computed in float32 for any precision of the network, as in the training of the released weights.
+    Computed in float32 for any precision of the network, as in the training of the released
+    weights.
     """
     channel = torch.arange(0, features, 2, device=position.device, dtype=torch.float32)
     angle = position.float()[:, None] * torch.exp(channel * (-math.log(10000.0) / features))
@@ -28,7 +29,8 @@ def with_prefix(mask: Tensor, prefix: int) -> Tensor:
 class Attention(nn.Module):
     """Multi-head attention of x to itself or to a memory (Vaswani et al. 2017, section 3.2.2).
 
-    Query, key and value share one matrix (3C, C), as in released weights, so that self-attention projects once.
+    Query, key and value share one matrix (3C, C), as in released weights, so that self-attention
+    projects once.
     """
 
     def __init__(self, features: int, num_heads: int, dropout: float):
@@ -94,6 +96,7 @@ class TransformerLayer(nn.Module):
     def forward(
         self, x: Tensor, mask: Tensor | None, memory: Tensor | None, memory_mask: Tensor | None
     ) -> Tensor:
+        """Transforms x (B, N, C), with memory (B, S, C) for cross-attention; masks (B, N), (B, S), None = all real."""
         x = self.self_norm(x + self.dropout(self.self_attention(x, mask)))
         if self.cross_attention is not None and self.cross_norm is not None:
             x = self.cross_norm(x + self.dropout(self.cross_attention(x, memory_mask, memory)))
@@ -131,9 +134,11 @@ class Transformer(nn.Module):
 
 
 class TimeAndCondition(nn.Module):
-    """z_tk of MDM (Tevet et al. 2023, section 3): the sinusoid of the time after two linear layers, plus the condition.
+    """z_tk of MDM (Tevet et al. 2023, section 3): the sinusoid of the time after two linear
+    layers, plus the condition.
 
-    The null condition is a zero vector *before* the projection, so that only the projection's bias remains.
+    The null condition is a zero vector *before* the projection, so that only the projection's
+    bias remains.
     """
 
     def __init__(self, features: int, cond_features: int, project_condition: bool):

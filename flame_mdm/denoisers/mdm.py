@@ -13,15 +13,31 @@ from flame_mdm.errors import UserError
 
 
 class MDMEncoder(Denoiser):
-    """Transformer encoder over [time + condition, frame 1, frame 2, ...]; the network of MDM and of MFM.
+    """Transformer encoder over [time + condition, frame 1, frame 2, ...]; the network of MDM and MFM.
 
     Args:
-        max_tokens: 0 = the pooled condition is added to the time. Otherwise the maximum number of condition tokens
-            between the time and the frames (MFM with T5: 30); frames keep their positions if there are fewer.
-        mask_padding: False lets frames attend to the padding, as the released models of MDM and MFM do: they are
-            sampled at the padded length of their training and cropped.
-        condition_frames: also add time + condition (with `max_tokens`, the time) to every frame: a small network
-            follows the text after fewer steps.
+        in_features: D.
+        out_features: D, or 2D with a learned variance.
+        cond_features: C; 0 = unconditioned.
+        latent_dim: width of the layers.
+        ff_size: hidden width of the feed-forward layers.
+        num_layers: number of layers.
+        num_heads: number of attention heads; divides `latent_dim`.
+        dropout: probability of dropout after the positions and inside the layers.
+        project_condition: False adds the condition to the time without projection.
+        max_tokens: 0 = the pooled condition is added to the time. Otherwise the maximum number of
+            condition tokens between the time and the frames (MFM with T5: 30); frames keep their
+            positions if there are fewer.
+        mask_padding: False lets frames attend to the padding, as the released models of MDM and
+            MFM do: they are sampled at the padded length of their training and cropped.
+        condition_frames: also add time + condition (with `max_tokens`, the time) to every frame:
+            a small network follows the text after fewer steps.
+
+    Example:
+        >>> denoiser = MDMEncoder(6, 6, 4, latent_dim=8, ff_size=8, num_layers=1, num_heads=2, dropout=0.0)
+        >>> cond = Condition(torch.ones(2, 4), torch.ones(2, 0, 4), None)
+        >>> denoiser(torch.ones(2, 5, 6), torch.zeros(2), torch.ones(2, 5) > 0, cond).shape
+        torch.Size([2, 5, 6])
     """
 
     def __init__(
@@ -53,6 +69,7 @@ class MDMEncoder(Denoiser):
         self.output = nn.Linear(latent_dim, out_features)
 
     def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
+        """See `Denoiser.forward`. Raises `UserError` if there are no tokens for `max_tokens`, or more than that."""
         token_mask = mask[:, :0]
         if self.max_tokens:
             tokens, token_mask = condition_tokens(cond)
@@ -67,7 +84,7 @@ class MDMEncoder(Denoiser):
             prefix = self.condition(t, cond.pooled)[:, None]
         size = prefix.shape[1]
         positions = torch.arange(1 + self.max_tokens + x_t.shape[1], device=x_t.device)
-        # Frames keep theirs
+        # Frames keep their positions if there are fewer tokens than `max_tokens`.
         positions = torch.cat([positions[:size], positions[1 + self.max_tokens :]])
         frames = self.input(x_t)
         x = torch.cat([prefix, frames + prefix[:, :1] if self.condition_frames else frames], 1)
@@ -78,20 +95,47 @@ class MDMEncoder(Denoiser):
 
 
 class MDMDecoder(Denoiser):
-    """Transformer decoder over the frames, with time + condition as cross-attention memory; the network of MDM and DiP.
+    """Transformer decoder over the frames, with time + condition as cross-attention memory; the
+    network of MDM and DiP.
 
-    With `context_frames`, clean frames precede the noisy ones, as in DiP (Tevet et al. 2025, "CLoSD", section 3.1).
-    Nothing but their positions marks them as clean, and their outputs are dropped.
+    With `context_frames`, clean frames precede the noisy ones, as in DiP (Tevet et al. 2025,
+    "CLoSD", section 3.1). Nothing but their positions marks them as clean, and their outputs are
+    dropped.
 
     Args:
-        input_token: token before the frames: "condition" is time + condition, as in the paper's "+ input token" and the
-            released model; "time" is the time alone, as in MDM's code since February 2025.
-        token_memory: memory of all condition tokens, with the time added to each, as MDM with DistilBERT.
-        memory: how the time enters the memory of all tokens: "add" to each of them, or "concat" as a token before them.
-        mask_padding: False lets frames attend to the padding, as the released models without `mask_frames` do.
+        in_features: D.
+        out_features: D, or 2D with a learned variance.
+        cond_features: C; 0 = unconditioned.
+        latent_dim: width of the layers.
+        ff_size: hidden width of the feed-forward layers.
+        num_layers: number of layers.
+        num_heads: number of attention heads; divides `latent_dim`.
+        dropout: probability of dropout after the positions and inside the layers.
+        project_condition: False adds the condition to the time without projection.
+        input_token: token before the frames: "condition" is time + condition, as in the paper's
+            "+ input token" and the released model; "time" is the time alone, as in MDM's code
+            since February 2025.
+        token_memory: memory of all condition tokens, with the time added to each, as in MDM with
+            DistilBERT.
+        memory: how the time enters the memory of all tokens: "add" to each of them, or "concat"
+            as a token before them.
+        mask_padding: False lets frames attend to the padding, as the released models without
+            `mask_frames` do.
         context_frames: number of clean frames before the motion, in `Condition.prefix`.
-        target_encoder: network that embeds `Condition.target`, which is added to the time; "none" ignores targets.
+        target_encoder: network that embeds `Condition.target`, which is added to the time; "none"
+            ignores targets.
         target_layers: number of hidden layers of the target encoders "single" and "split".
+
+    Raises:
+        UserError: If arguments contradict each other.
+
+    Example:
+        >>> denoiser = MDMDecoder(
+        ...     6, 6, 4, latent_dim=8, ff_size=8, num_layers=1, num_heads=2, dropout=0.0, context_frames=3
+        ... )
+        >>> cond = Condition(torch.ones(2, 4), torch.ones(2, 0, 4), None, prefix=torch.ones(2, 3, 6))
+        >>> denoiser(torch.ones(2, 5, 6), torch.zeros(2), torch.ones(2, 5) > 0, cond).shape
+        torch.Size([2, 5, 6])
     """
 
     def __init__(
@@ -141,6 +185,7 @@ class MDMDecoder(Denoiser):
         self.output = nn.Linear(latent_dim, out_features)
 
     def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
+        """See `Denoiser.forward`. Raises `UserError` if the prefix or the tokens are missing or of the wrong size."""
         time = self.condition.time(t)
         if self.target is not None:
             time = time + self.target(cond).to(time)

@@ -11,13 +11,21 @@ from torch import Tensor, nn
 from flame_mdm.batch import Condition
 from flame_mdm.errors import UserError
 
+# Slots of a target: six joints, the place on the floor and the heading, see
+# `flame_mdm.conditions.target`
 SLOTS = 8
 
 
 class TargetEncoder(nn.Module, ABC):
     """Embeds the target of a condition as (B, features); without a target, the embedding is 0.
 
-    A target without requested joints is not the same: its embedding has the biases of the network.
+    A target that requests no joint is not the same as no target: its embedding has the biases of
+    the network.
+
+    Example:
+        >>> encoder = SingleTarget(features=16, layers=1)
+        >>> encoder(Condition(torch.ones(2, 4), torch.ones(2, 0, 4), None, target=torch.zeros(2, 8, 4))).shape
+        torch.Size([2, 16])
     """
 
     @abstractmethod
@@ -40,6 +48,7 @@ class SingleTarget(TargetEncoder):
         self.network = perceptron(4 * SLOTS, features, layers)
 
     def embed(self, target: Tensor) -> Tensor:
+        """Embeds targets (B, 8, 4) as (B, features)."""
         return self.network(target.flatten(1))
 
 
@@ -57,6 +66,7 @@ class SplitTarget(TargetEncoder):
         )
 
     def embed(self, target: Tensor) -> Tensor:
+        """Embeds targets (B, 8, 4) as (B, features)."""
         return torch.cat(
             [network(target[:, slot]) for slot, network in enumerate(self.networks)], -1
         )
@@ -65,8 +75,8 @@ class SplitTarget(TargetEncoder):
 class MultiTarget(TargetEncoder):
     """One network per slot; the outputs of requested slots are summed with learned weights.
 
-    The weights are divided by their sum over all slots, as in the authors' code, where the sum may be near 0. `layers`
-    has no effect.
+    The weights are divided by their sum over all slots, as in the authors' code, where the sum
+    may be near 0. `layers` has no effect.
     """
 
     def __init__(self, features: int, layers: int):
@@ -75,6 +85,7 @@ class MultiTarget(TargetEncoder):
         self.weights = nn.Parameter(torch.randn(SLOTS))
 
     def embed(self, target: Tensor) -> Tensor:
+        """Embeds targets (B, 8, 4) as (B, features)."""
         position, requested = target[..., :3], target[..., 3:]
         embedded = torch.stack(
             [network(position[:, slot]) for slot, network in enumerate(self.networks)], 1

@@ -1,7 +1,8 @@
 """The U-Net of the Human Motion Diffusion Model (Tevet et al. 2023, "MDM", section 4.1), whose code is not public.
 
-The paper specifies convolutions over time, joints as channels, 23.47 M parameters. The rest follows the network of DDPM
-(Ho et al. 2020, appendix B) with the scale-and-shift injection of Dhariwal and Nichol 2021.
+The paper specifies convolutions over time, joints as channels, 23.47 M parameters. The rest
+follows the network of DDPM (Ho et al. 2020, appendix B) with the scale-and-shift injection of
+Dhariwal and Nichol 2021.
 """
 
 from collections.abc import Sequence
@@ -18,14 +19,27 @@ from flame_mdm.errors import UserError
 
 
 class MDMUNet(Denoiser):
-    """U-Net over time with the features of a frame as channels, for any length; padding does not affect real frames.
+    """U-Net over time with the features of a frame as channels, for motions of any length.
 
-    Padded frames are zeroed before every convolution, as if the motion ended there, and excluded from the statistics of
-    the norms. A frame of a coarser level is real if the first of its two finer frames is.
+    Padding does not affect real frames: padded frames are zeroed before every convolution, as if
+    the motion ended there, and excluded from the statistics of the norms. A frame of a coarser
+    level is real if the first of its two finer frames is real.
 
     Args:
+        in_features: D.
+        out_features: D, or 2D with a learned variance.
+        cond_features: C; 0 = unconditioned.
+        latent_dim: width of the embedded time and condition.
         channels: width of each level; each level has half the frame rate of the previous one.
-        num_groups: groups of the group norms; divides all widths.
+        num_groups: number of groups of the group norms; divides all widths.
+        dropout: probability of dropout inside the blocks.
+        project_condition: False adds the condition to the time without projection.
+
+    Example:
+        >>> denoiser = MDMUNet(6, 6, 4, latent_dim=8, channels=[8, 16], num_groups=4, dropout=0.0)
+        >>> cond = Condition(torch.ones(2, 4), torch.ones(2, 0, 4), None)
+        >>> denoiser(torch.ones(2, 5, 6), torch.zeros(2), torch.ones(2, 5) > 0, cond).shape
+        torch.Size([2, 5, 6])
     """
 
     def __init__(
@@ -56,6 +70,7 @@ class MDMUNet(Denoiser):
         self.output = nn.Conv1d(channels[0], out_features, 3, padding=1)
 
     def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
+        """See `Denoiser.forward`."""
         token = functional.silu(self.condition(t, cond.pooled))
         masks = [mask[:, None, :: 2**level].to(x_t.dtype) for level in range(len(self.down))]
         x = self.input(x_t.transpose(1, 2) * masks[0])

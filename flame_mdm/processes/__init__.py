@@ -17,19 +17,35 @@ Auxiliary = Callable[[Tensor, Tensor, Tensor], dict[str, Tensor]]
 
 
 class Process(nn.Module, ABC):
-    """A path between noise and data. Only the process interprets t; the denoiser just embeds it."""
+    """A path between noise and data: base class of Gaussian diffusion and flow matching.
 
+    A process corrupts motions in training, says what the denoiser predicts, and samples motions
+    from noise. Only the process interprets the time t; the denoiser just embeds it. B is the
+    batch size, F the number of frames, D the number of features.
+
+    Example:
+        >>> import torch
+        >>> from flame_mdm.processes.flow_matching import FlowMatching
+        >>> process = FlowMatching()
+        >>> x, noise, t = torch.ones(1, 4, 2), torch.zeros(1, 4, 2), torch.tensor([0.25])
+        >>> x_t = process.corrupt(x, noise, t)
+        >>> x_t[0, 0].tolist()
+        [0.25, 0.25]
+        >>> torch.allclose(process.to_x0(process.target(x, noise, t), x_t, t), x)
+        True
+    """
+
+    #: What the denoiser returns: "x0" (the clean motion), "epsilon" (the noise) or "velocity".
     prediction: str
-    """What the denoiser returns: x0, epsilon (the noise) or velocity."""
 
+    #: Modes of `Edit` that sampling supports; the first is the authors'.
     edit_modes: Sequence[str] = ()
-    """Modes of `Edit` that sampling supports; the first is the authors'."""
 
+    #: Samplers by name.
     samplers: Mapping[str, Sampler] = {}
-    """Samplers by name."""
 
+    #: Whether losses are averaged over the padded length, with noise 0 in the padding.
     average_padding: bool = False
-    """Whether losses are averaged over the padded length, with noise 0 in the padding."""
 
     @abstractmethod
     def out_features(self, features: int) -> int:
@@ -76,9 +92,21 @@ class Process(nn.Module, ABC):
         noise: Tensor | None = None,
         auxiliary: Auxiliary | None = None,
     ) -> dict[str, Tensor]:
-        """Returns training losses (B,) per sample: those of `terms` and of `auxiliary`, and "loss", their sum.
+        """Computes the training losses of a batch.
 
-        Times t (B,) and noise (B, F, D) are drawn from torch's default generator if not given.
+        Args:
+            denoise: the denoiser.
+            x: (B, F, D) normalized clean motion.
+            mask: (B, F) bool, True = real frame.
+            cond: conditions of the batch.
+            t: (B,) times. Default: drawn from torch's default generator.
+            noise: (B, F, D). Default: drawn from torch's default generator.
+            auxiliary: further losses of the clean estimate, such as
+                `flame_mdm.losses.MotionLosses`.
+
+        Returns:
+            Losses (B,) per sample by name: the losses of `terms`, the losses of `auxiliary`, and
+            "loss", their sum.
         """
         if t is None:
             t = self.training_times(torch.rand(len(x), device=x.device))
@@ -97,7 +125,9 @@ class Process(nn.Module, ABC):
     def terms(
         self, output: Tensor, x: Tensor, noise: Tensor, x_t: Tensor, t: Tensor, mask: Tensor
     ) -> dict[str, Tensor]:
-        """Returns the losses (B,) of the denoiser's output over the frames of the mask: "mse", that of the target."""
+        """Returns the losses (B,) of the denoiser's output over the frames of the mask: "mse",
+        the error of the target.
+        """
         return {"mse": masked_mse(output, self.target(x, noise, t), mask)}
 
     @abstractmethod
@@ -112,15 +142,27 @@ class Process(nn.Module, ABC):
         edit: Edit | None = None,
         trajectory: list[Tensor] | None = None,
     ) -> Tensor:
-        """Samples normalized motion (B, F, D) from noise; frames past the end of a motion are 0.
+        """Samples normalized motion from noise.
 
-        Draw 0 of the noise is the start. The guidance scale of the options is ignored: `denoise` is guided or not. The
-        clean estimate (B, F, D) of each call is appended to `trajectory`. Raises `UserError` if the process does not
-        support the sampler, the number of steps or the edit, or the sampler does not have one of the options.
+        Args:
+            denoise: the denoiser, guided or not; `options.guidance_scale` is ignored.
+            noise: returns draw 0, 1, 2, ... of the noise, (B, F, D); sampling starts from draw 0.
+            mask: (B, F) bool, True = real frame.
+            cond: conditions of the batch.
+            options: the sampler, its number of steps and its options.
+            edit: part of a motion to keep.
+            trajectory: list that gets the clean estimate (B, F, D) of each call of the denoiser.
+
+        Returns:
+            Normalized motion (B, F, D); frames past the end of a motion are 0.
+
+        Raises:
+            UserError: If the process does not support the sampler, the number of steps or the
+                edit, or the sampler does not have one of the options.
         """
 
     def find_sampler(self, options: SamplerOptions) -> Sampler:
-        """Returns the requested sampler; raises `UserError` if there is none, or it has not one of the options."""
+        """Returns the requested sampler; raises `UserError` if there is none, or it lacks one of the options."""
         name = options.sampler
         if name is None or name not in self.samplers:
             raise UserError(
@@ -136,7 +178,9 @@ class Process(nn.Module, ABC):
         return self.samplers[name]
 
     def check_edit(self, edit: Edit, mask: Tensor, options: SamplerOptions) -> None:
-        """Raises `UserError` if process or sampler cannot make an edit, or its shape is not that of the motions."""
+        """Raises `UserError` if process or sampler cannot make an edit, or its shape differs from
+        the motions' shape.
+        """
         if edit.mode not in self.edit_modes:
             modes = ", ".join(self.edit_modes)
             raise UserError(

@@ -17,26 +17,52 @@ from flame_mdm.sampler_options import SamplerOptions
 
 
 class GaussianDiffusion(Process):
-    """Gaussian diffusion over T steps. t is the step 0 ... T - 1 as a float, passed unchanged to the denoiser.
+    """Gaussian diffusion over T steps, the process of MDM and FLAME (Ho et al. 2020).
+
+    The time t is the step 0 ... T - 1 as a float, which the denoiser gets unchanged. x_t =
+    sqrt(ab) x + sqrt(1 - ab) noise, where ab, "alpha bar", comes from the schedule.
 
     Args:
         num_train_timesteps: T.
-        schedule: name of the noise schedule.
-        prediction: first D channels of the denoiser's output: the clean motion, the noise, or the velocity
-            sqrt(ab) noise - sqrt(1 - ab) x (Salimans and Ho 2022).
-        variance: of the reverse process: that of the posterior, beta, or learned between the two, from a second set of
-            D channels (Nichol and Dhariwal 2021, eq. 15).
-        vlb_weight: lambda in L_simple + lambda L_vlb (FLAME, eq. 4 and 15), if the variance is learned. L_vlb, a sum
-            over T steps, is T times the term of one step: 0.001 at T = 1000 (Nichol and Dhariwal) is 1 in FLAME's code.
-        average_padding: average losses over the padded length with noise 0 in the padding, as in FLAME's code, so
-            that short motions have less weight. The denoiser must return 0 there.
+        schedule: name of the noise schedule, "cosine" or "linear".
+        prediction: first D channels of the denoiser's output: the clean motion, the noise, or the
+            velocity sqrt(ab) noise - sqrt(1 - ab) x (Salimans and Ho 2022).
+        variance: variance of the reverse process. "fixed_small": the variance of the posterior;
+            "fixed_large": beta; "learned_range": learned between the two, from a second set of D
+            channels (Nichol and Dhariwal 2021, eq. 15).
+        vlb_weight: lambda in L_simple + lambda L_vlb (FLAME, eq. 4 and 15), if the variance is
+            learned. L_vlb, a sum over T steps, is T times the term of one step: 0.001 at T = 1000
+            (Nichol and Dhariwal) is 1 in FLAME's code.
+        average_padding: average losses over the padded length with noise 0 in the padding, as in
+            FLAME's code, so that short motions have less weight. The denoiser must return 0
+            there.
         clip_x0: clamp the clean estimate to [-1, 1] in sampling, as in FLAME's code.
         timestep_sampling: how training steps are drawn (FLAME, tables 6 and 7).
-        skip: only with prediction epsilon: the noise is sqrt(1 - ab) x_t + sqrt(ab) times the output (Karras et al.
-            2022, eq. 7, for data of variance 1). The output is then a velocity, trained with the error of the noise:
-            the network need not carry its input, and the clean estimate divides nothing by the signal.
-        min_snr: weight of a step's squared error is that of min(SNR, min_snr) on the clean motion (Hang et al.
-            2023, eq. 4, there 5). None = 1, whatever is predicted.
+        skip: only with prediction epsilon: the noise is sqrt(1 - ab) x_t + sqrt(ab) times the
+            output (Karras et al. 2022, eq. 7, for data of variance 1). The output is then a
+            velocity, trained with the error of the noise: the network need not carry its input,
+            and the clean estimate divides nothing by the signal.
+        min_snr: weights each step's squared error as if the clean motion was predicted with
+            weight min(SNR, min_snr) (Hang et al. 2023, eq. 4; they use 5). None = weight 1,
+            whatever is predicted.
+
+    Raises:
+        UserError: If T is out of range, `skip` is combined with another prediction, or `min_snr`
+            is not above 0.
+
+    Example:
+        >>> import torch
+        >>> from flame_mdm.batch import Condition
+        >>> from flame_mdm.sampler_options import SamplerOptions
+        >>> process = GaussianDiffusion(num_train_timesteps=50)
+        >>> x, mask = torch.ones(1, 4, 2), torch.ones(1, 4, dtype=torch.bool)
+        >>> cond = Condition(x[:, 0], x[:, :0], None)
+        >>> def oracle(x_t, t, mask, cond):  # a denoiser that knows the motion
+        ...     return x
+        >>> noise = lambda draw: torch.randn(1, 4, 2)
+        >>> options = SamplerOptions(sampler="ddim", num_inference_steps=5)
+        >>> process.sample(oracle, noise, mask, cond, options)[0, 0].tolist()
+        [1.0, 1.0]
     """
 
     edit_modes = ("x0", "x_t")
@@ -66,15 +92,19 @@ class GaussianDiffusion(Process):
         self.average_padding, self.clip_x0 = average_padding, clip_x0
 
     def out_features(self, features: int) -> int:
+        """Returns D, or 2D if the variance is learned."""
         return 2 * features if self.variance == "learned_range" else features
 
     def training_times(self, u: Tensor) -> Tensor:
+        """Returns uniform steps (B,) from 0 to T - 1 for uniform numbers (B,) in (0, 1)."""
         return (u * len(self.schedule)).floor().clamp(max=len(self.schedule) - 1)
 
     def corrupt(self, x: Tensor, noise: Tensor, t: Tensor) -> Tensor:
+        """Returns x_t (B, F, D) at steps t (B,) (Ho et al. 2020, eq. 4)."""
         return self.schedule.corrupt(x, noise, t)
 
     def target(self, x: Tensor, noise: Tensor, t: Tensor) -> Tensor:
+        """Returns what the denoiser should predict (B, F, D): the clean motion, the noise or the velocity."""
         if self.prediction == "x0":
             return x
         if self.prediction == "epsilon" and not self.skip:
@@ -92,6 +122,7 @@ class GaussianDiffusion(Process):
         return signal * x_t - noise * output
 
     def grid(self, count: int) -> list[float]:
+        """Returns `count` steps, at most T, from T - 1 down to one interval before the data."""
         total = len(self.schedule)
         count = min(count, total)
         return [float(round(total * k / count) - 1) for k in range(count, 0, -1)]
@@ -100,6 +131,7 @@ class GaussianDiffusion(Process):
         self, output: Tensor, x_t: Tensor, i: Tensor | int, schedule: Schedule
     ) -> Tensor | float:
         """Returns the log-variance of x_{t-1} at step i of `schedule`: a number, (B, 1, 1), or (B, F, D) if learned."""
+        # A learned variance is interpolated between its two bounds, in the logarithm.
         small = schedule.factor("posterior_log_variance", i, x_t)
         if self.variance == "fixed_small":
             return small
@@ -112,7 +144,7 @@ class GaussianDiffusion(Process):
         self, output: Tensor, x: Tensor, noise: Tensor, x_t: Tensor, t: Tensor, mask: Tensor
     ) -> dict[str, Tensor]:
         """Returns the losses "mse" (FLAME, eq. 3) and, if the variance is learned, "vlb"."""
-        # With the skip, an error in the output is that in the noise divided by the signal.
+        # With the skip, an error in the output is the error in the noise divided by the signal.
         scale = self.schedule.at("signal", t, x) if self.skip else 1.0
         error = masked_mse(
             scale * output[..., : x.shape[-1]], scale * self.target(x, noise, t), mask
@@ -133,7 +165,8 @@ class GaussianDiffusion(Process):
         snr = (
             (self.schedule.at("signal", t, t) / self.schedule.at("noise", t, t)).square().flatten()
         )
-        # A squared error of 1 in the clean motion is one of SNR in the noise, and of SNR + 1 in the velocity.
+        # A squared error of 1 in the clean motion is one of SNR in the noise, and of SNR + 1 in
+        # the velocity.
         return (
             snr.clamp(max=self.min_snr)
             / {"x0": 1.0, "epsilon": snr, "velocity": snr + 1}[self.prediction]
@@ -142,8 +175,8 @@ class GaussianDiffusion(Process):
     def vlb(self, output: Tensor, x: Tensor, x_t: Tensor, t: Tensor) -> Tensor:
         """Returns terms of the variational bound (B, F, D) at steps t (B,), in nats (Ho et al. 2020, eq. 5).
 
-        Only the variance receives a gradient (Nichol and Dhariwal 2021, section 3.1). The term of step 0 is the
-        divergence with the clipped posterior variance, as in FLAME's code.
+        Only the variance receives a gradient (Nichol and Dhariwal 2021, section 3.1). The term of
+        step 0 is the divergence with the clipped posterior variance, as in FLAME's code.
         """
         real = self.schedule.posterior_mean(x, x_t, t)
         mean = self.schedule.posterior_mean(self.to_x0(output, x_t, t).detach(), x_t, t)
@@ -167,8 +200,9 @@ class GaussianDiffusion(Process):
     ) -> Tensor:
         """See `Process.sample`. The denoiser is called once per step; draws of noise are numbered in order of use.
 
-        The steps are 2 to T steps placed by `options.spacing`, or the steps themselves in increasing order; those of
-        "consistency" are 1 to T steps of `grid`. An edit of mode "x0" reproduces the kept part exactly.
+        `options.num_inference_steps` is a number from 2 to T, of steps placed by
+        `options.spacing`, or the steps themselves in increasing order. The sampler "consistency"
+        takes 1 to T steps of `grid`. An edit of mode "x0" reproduces the kept part exactly.
         """
         sampler, steps = self.find_sampler(options), self._steps(options)
         if edit is not None:

@@ -13,17 +13,41 @@ from flame_mdm.sampler_options import SamplerOptions
 
 
 class FlowMatching(Process):
-    """Straight path from noise at t = 0 to motion at t = 1; the denoiser predicts its velocity and is passed 1000 t.
+    """Straight path from noise at t = 0 to motion at t = 1, the process of MFM (Lipman et al. 2023; Hu et al. 2023).
+
+    The denoiser predicts the velocity of the path, or the clean motion. It gets the time 1000 t.
+    With s = `sigma_min`, x_t = t x + (1 - (1 - s) t) noise, and the velocity is x - (1 - s)
+    noise.
 
     Args:
         sigma_min: standard deviation of the noise left at t = 1 (Lipman et al. 2023, eq. 20-23).
-        prediction: output of the denoiser: the velocity of the path (MFM), or the clean motion, from which the
-            velocity is computed. A network narrower than the motion cannot represent the noise in the velocity.
-        time_distribution: distribution of training times: uniform on [0, 1), or the logistic of a normal variable,
-            which favors the middle (Esser et al. 2024, eq. 19).
-        quantize_time: pass floor(1000 t), a row of the time table, to the denoiser, as in MFM's code.
-        odeint_grid: use float32 multiples of 1 / N as times, like torchdiffeq's Euler steps in MFM's code. For some
-            N, a time is one row of the table lower than with N equal steps (never for 10, 20 or 30).
+        prediction: output of the denoiser: the velocity of the path (MFM), or the clean motion,
+            from which the velocity is computed. A network narrower than the motion cannot
+            represent the noise in the velocity.
+        time_distribution: distribution of training times: uniform on [0, 1), or the logistic of a
+            normal variable, which favors the middle (Esser et al. 2024, eq. 19).
+        quantize_time: pass floor(1000 t), a row of the time table, to the denoiser, as in MFM's
+            code.
+        odeint_grid: use float32 multiples of 1 / N as times, like torchdiffeq's Euler steps in
+            MFM's code. For some N, a time is one row of the table lower than with N equal steps
+            (never for 10, 20 or 30).
+
+    Raises:
+        UserError: If `sigma_min` is not in [0, 1).
+
+    Example:
+        >>> import torch
+        >>> from flame_mdm.batch import Condition
+        >>> from flame_mdm.sampler_options import SamplerOptions
+        >>> process = FlowMatching(prediction="x0")
+        >>> x, mask = torch.ones(1, 4, 2), torch.ones(1, 4, dtype=torch.bool)
+        >>> cond = Condition(x[:, 0], x[:, :0], None)
+        >>> def oracle(x_t, t, mask, cond):  # a denoiser that knows the motion
+        ...     return x
+        >>> options = SamplerOptions(sampler="euler", num_inference_steps=4)
+        >>> motion = process.sample(oracle, lambda draw: torch.randn(1, 4, 2), mask, cond, options)
+        >>> torch.allclose(motion, x, atol=1e-3)  # up to sigma_min
+        True
     """
 
     edit_modes = ("trajectory", "x0")
@@ -48,12 +72,15 @@ class FlowMatching(Process):
         self.quantize_time, self.odeint_grid = quantize_time, odeint_grid
 
     def out_features(self, features: int) -> int:
+        """Returns D."""
         return features
 
     def training_times(self, u: Tensor) -> Tensor:
+        """Returns times (B,) in (0, 1) of `time_distribution` for uniform numbers (B,) in (0, 1)."""
         return u if self.time_distribution == "uniform" else torch.special.ndtri(u).sigmoid()
 
     def corrupt(self, x: Tensor, noise: Tensor, t: Tensor) -> Tensor:
+        """Returns x_t (B, F, D) at times t (B,) (Lipman et al. 2023, eq. 22)."""
         t = t[:, None, None]
         return t * x + (1 - (1 - self.sigma_min) * t) * noise
 
@@ -79,6 +106,7 @@ class FlowMatching(Process):
         return [i / count for i in range(count + 1)]
 
     def grid(self, count: int) -> list[float]:
+        """Returns `count` evenly spaced times, from 0 to one interval before 1."""
         return self.times(count)[:-1]
 
     def sample(
@@ -94,9 +122,10 @@ class FlowMatching(Process):
     ) -> Tensor:
         """See `Process.sample`. Takes N >= 1 equal steps; "dopri5" chooses its own. Only "consistency" adds noise.
 
-        An edit of mode "trajectory" replaces the kept part before each step at a time <= `until` by the straight path
-        from its noise to the known motion (MFM, algorithm 1); after that, the model moves it freely. Mode "x0"
-        overwrites the clean estimate of every call, which reproduces the kept part exactly.
+        An edit of mode "trajectory" replaces the kept part before each step at a time <= `until`
+        by the straight path from its noise to the known motion (MFM, algorithm 1); after that,
+        the model moves it freely. Mode "x0" overwrites the clean estimate of every call, which
+        reproduces the kept part exactly.
         """
         sampler, count = self.find_sampler(options), options.num_inference_steps
         if not isinstance(count, int):

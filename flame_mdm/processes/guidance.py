@@ -10,10 +10,12 @@ from torch import Tensor
 from flame_mdm.batch import Condition, Denoise
 from flame_mdm.losses import bone_lengths
 
-STEERING_STEPS = 2  # gradient steps before each step of the sampler
+# Gradient steps before each step of the sampler
+STEERING_STEPS = 2
 STEERING_LIMIT = 0.02
-"""Maximum length of such a step, as RMS over normalized features. With longer ones, x_t is unlike noisy motions of the
-training where the denoiser depends on it only weakly: in one trial, arms grew by a third."""
+"""Maximum length of a gradient step, as RMS over normalized features. After longer steps, x_t is
+unlike the noisy motions of the training wherever the denoiser depends on x_t only weakly: in one
+trial, arms grew by a third."""
 CLOSE, MOST_STEPS = 0.005, 8
 """Largest error in meters that ends the search for a motion that reaches positions, and its maximum number of steps."""
 RELAXATION = 1e-3
@@ -23,17 +25,33 @@ RELAXATION = 1e-3
 def classifier_free_guidance(denoise: Denoise, scale: float | Tensor, features: int) -> Denoise:
     """Returns a denoiser guided by its unconditional prediction: null + scale * (cond - null), with batch size 2B.
 
-    Ho and Salimans 2021, with w = scale - 1, in the form of MDM and FLAME (eq. 5), where 1 means no guidance.
+    Ho and Salimans 2021, with w = scale - 1, in the form of MDM and FLAME (eq. 5), where 1 means
+    no guidance.
 
     Args:
         denoise: the denoiser; its condition must have a null.
-        scale: guidance scale, one number or one per sample (B,). For the number 1, `denoise` itself is returned.
-        features: D. Channels from D on (a learned variance) are not guided: those of the conditional half are returned.
+        scale: guidance scale, one number or one per sample (B,). For the number 1, `denoise`
+            itself is returned.
+        features: D. Channels from D on, a learned variance, are not guided; they come from the
+            conditional half.
+
+    Returns:
+        A function with the arguments and the result of `denoise`.
+
+    Example:
+        >>> null = Condition(torch.zeros(1, 1), torch.zeros(1, 0, 1), None)
+        >>> cond = Condition(torch.ones(1, 1), torch.zeros(1, 0, 1), None, null)
+        >>> def denoise(x_t, t, mask, cond):
+        ...     return cond.pooled[:, None].expand_as(x_t)
+        >>> guided = classifier_free_guidance(denoise, 2.5, features=3)
+        >>> guided(torch.zeros(1, 1, 3), torch.zeros(1), torch.ones(1, 1) > 0, cond).tolist()
+        [[[2.5, 2.5, 2.5]]]
     """
     if not isinstance(scale, Tensor) and scale == 1:
         return denoise
     strength = scale[:, None, None] if isinstance(scale, Tensor) else scale
-    # One doubled mask and condition per sampling run, so that a denoiser can cache what it computes from them.
+    # One doubled mask and condition per sampling run, so that a denoiser can cache what it
+    # computes from them.
     seen: tuple[Tensor, Condition] | None = None
     doubled: tuple[Tensor, Condition]
 
@@ -53,7 +71,14 @@ def classifier_free_guidance(denoise: Denoise, scale: float | Tensor, features: 
 
 @dataclass
 class Positions:
-    """M coordinates of joints in the world: `values` (M,) in meters, at `frames`, `joints` and `axes` (M,) int64."""
+    """M coordinates of joints in the world, which a motion should reach.
+
+    Attributes:
+        frames: (M,) int64, numbers of the frames.
+        joints: (M,) int64, numbers of the joints.
+        axes: (M,) int64, 0 = x, 1 = y, 2 = z.
+        values: (M,) the coordinates in meters.
+    """
 
     frames: Tensor
     joints: Tensor
@@ -71,11 +96,21 @@ def steer(
     to_joints: Callable[[Tensor], Tensor],
     positions: Positions,
 ) -> Tensor:
-    """Returns noisy motions (B, F, D) whose `clean` estimates are nearer to positions in the world.
+    """Leads noisy motions toward positions in the world; the entire body adapts, since the denoiser decides how.
 
-    Steps along the gradient through the denoiser (Chung et al. 2023, "Diffusion posterior sampling"), of Polyak's
-    length up to `STEERING_LIMIT`. The entire body adapts, since the denoiser decides how.
+    Steps along the gradient through the denoiser (Chung et al. 2023, "Diffusion posterior
+    sampling"), of Polyak's length up to `STEERING_LIMIT`.
+
+    Args:
+        clean: returns the clean estimate (B, F, D) of a noisy motion.
+        x_t: (B, F, D) noisy motions.
+        to_joints: converts normalized features (B, F, D) to joints (B, F, J, 3) in meters.
+        positions: the positions.
+
+    Returns:
+        Noisy motions (B, F, D) whose clean estimates are nearer to the positions.
     """
+    # Polyak's step: along the gradient, a linear loss would be 0 after the distance loss / slope.
     for _ in range(STEERING_STEPS):
         with torch.enable_grad():
             x = x_t.detach().requires_grad_()
@@ -95,18 +130,30 @@ def reach(
     free: Tensor,
     smoothness: float,
 ) -> Tensor:
-    """Returns the motions nearest to `x` (B, F, D) whose joints reach positions in the world.
+    """Returns the motions nearest to `x` whose joints reach positions in the world.
 
-    Gauss-Newton steps: of all changes that lead to the positions, the smallest one in normalized features, where
-    changes are smooth in time: their covariance between frames is that of a Gaussian process. Bones get their median
-    lengths in the frames of the positions, where they are part of the conditions, and keep theirs in the frames around,
-    where a change of half the size would shorten a bone that turns.
+    Each Gauss-Newton step takes the smallest change of the normalized features that reaches the
+    positions, under a Gaussian-process prior that keeps the change smooth in time. In the frames
+    of the positions, bone lengths are constraints, too: their medians over the motion.
+    Neighboring frames receive only part of the change, which would shorten turning bones; their
+    lengths are restored afterward.
 
     Args:
-        bones: (3, N) int64: frame, parent and child of bones that the change could stretch; all bones of a frame.
-        free: (B, F, D) bool, features that may change.
+        x: (B, F, D) normalized motions.
+        to_joints: converts normalized features (F, D) to joints (F, J, 3) in meters.
+        positions: the positions.
+        bones: (3, N) int64: frame, parent and child of bones that the change could stretch; all
+            bones of a frame.
+        free: (B, F, D) bool, True = this feature may change.
         smoothness: standard deviation in frames of the Gaussian process.
+
+    Returns:
+        Normalized motions (B, F, D). Positions are reached up to `CLOSE` meters, if `MOST_STEPS`
+        steps suffice.
     """
+    # The prior's covariance K between frames is a Gaussian kernel. With the Jacobian A of the
+    # constraints and their error e, the smallest change is K A^T (A K A^T)^-1 e: `smooth` is A K,
+    # `gram` is A K A^T.
     offset = torch.arange(-int(3 * smoothness), int(3 * smoothness) + 1, device=x.device)
     kernel = torch.exp(-0.5 * (offset / smoothness) ** 2)
     frames, edges = bones[0], bones[1:].T
@@ -154,6 +201,7 @@ def _with_bones(
     free: Tensor,
 ) -> Tensor:
     """Returns the nearest motion (F, D) whose bones `edges` (N, 2) have `lengths` (F, N) in each frame."""
+    # Gauss-Newton steps as in `reach`, for each frame on its own: A^T (A A^T)^-1 e.
 
     def lengths_of(frame: Tensor) -> Tensor:
         return bone_lengths(to_joints(frame[None])[0], edges)

@@ -1,8 +1,8 @@
 """Samplers: one plain function each, which takes one step from noise towards motion, and what each of them supports.
 
-Diffusion samplers descend numbers i of steps of a `Schedule`; they get the clean motion and the log-variance at step i
-from `estimate`. ODE solvers follow a velocity field. Coefficients and times are Python numbers, so that no step waits
-for the device.
+Diffusion samplers descend numbers i of steps of a `Schedule`; they get the clean motion and the
+log-variance at step i from `estimate`. ODE solvers follow a velocity field. Coefficients and
+times are Python numbers, so that no step waits for the device.
 """
 
 import math
@@ -24,15 +24,22 @@ Velocity = Callable[[Tensor, float | Tensor], Tensor]  # (x (B, F, D), time t) -
 
 @dataclass(frozen=True)
 class Sampler:
-    """A sampler and what it can do."""
+    """A sampler: the function that takes one step, and what the sampler can do.
 
-    # of a diffusion: (x_t, `Descent`, step i) -> x_{t-1}. Of a flow: (x, `Flow`, time, next time) -> x at the next time
+    Example:
+        >>> DIFFUSION_SAMPLERS["ddim"].options
+        ('spacing', 'eta')
+    """
+
+    #: Takes one step. In a diffusion: (x_t, `Descent`, step i) -> x_{t-1}. In a flow: (x, `Flow`,
+    #: time, next time) -> x at the next time.
     step: Callable[..., Tensor]
-    # fields of `SamplerOptions` that it has besides guidance_scale, sampler and num_inference_steps
+    #: Fields of `SamplerOptions` that it has besides guidance_scale, sampler and
+    #: num_inference_steps.
     options: tuple[str, ...] = ()
-    # edits that it cannot make: modes of `Edit`, or "resample"
+    #: Edits that it cannot make: modes of `Edit`, or "resample".
     unsupported: tuple[str, ...] = ()
-    # whether it chooses its own steps, so that one call goes from noise to motion
+    #: Whether it chooses its own steps, so that one call goes from noise to motion.
     adaptive: bool = False
 
 
@@ -40,24 +47,50 @@ class Sampler:
 class Descent:
     """A run of a diffusion sampler."""
 
-    estimate: Estimate  # calls the denoiser
-    schedule: Schedule  # of the sampling steps
-    draws: Iterator[Tensor]  # noise, in order of use
-    options: SamplerOptions  # of the sampler
-    last: Tensor | None = None  # clean estimate of the step before, for samplers that use it
+    #: Calls the denoiser.
+    estimate: Estimate
+    #: Schedule of the sampling steps.
+    schedule: Schedule
+    #: Noise (B, F, D), in order of use.
+    draws: Iterator[Tensor]
+    #: Options of the sampler.
+    options: SamplerOptions
+    #: Clean estimate of the step before, for samplers that use it.
+    last: Tensor | None = None
 
 
 @dataclass
 class Flow:
     """A run of a flow sampler."""
 
-    velocity: Velocity  # calls the denoiser
-    draws: Iterator[Tensor]  # noise, in order of use
-    sigma_min: float  # standard deviation of the noise left at the end
+    #: Calls the denoiser.
+    velocity: Velocity
+    #: Noise (B, F, D), in order of use.
+    draws: Iterator[Tensor]
+    #: Standard deviation of the noise left at the end.
+    sigma_min: float
 
 
 def ancestral(x: Tensor, run: Descent, i: int) -> Tensor:
-    """Draws x_{t-1} from the learned reverse process (Ho et al. 2020, algorithm 2); the last one is its mean."""
+    """Draws x_{t-1} from the learned reverse process; the last step returns its mean.
+
+    Ho et al. 2020, algorithm 2.
+
+    Args:
+        x: (B, F, D) noisy motion at step i.
+        run: the run, whose clean estimate and variance define the step.
+        i: the step, N - 1 ... 0.
+
+    Returns:
+        Noisy motion (B, F, D) at step i - 1.
+
+    Example:
+        >>> from flame_mdm.processes.schedules import build_schedule
+        >>> draws = iter([torch.zeros(1, 1, 2)])
+        >>> run = Descent(lambda x, i: (x, -5.0), build_schedule("cosine", 10), draws, SamplerOptions())
+        >>> ancestral(torch.ones(1, 1, 2), run, 5).shape
+        torch.Size([1, 1, 2])
+    """
     x0_hat, log_variance = run.estimate(x, i)
     mean = run.schedule.posterior_mean(x0_hat, x, i)
     if i == 0:
@@ -69,7 +102,27 @@ def ancestral(x: Tensor, run: Descent, i: int) -> Tensor:
 
 
 def ddim(x: Tensor, run: Descent, i: int) -> Tensor:
-    """Non-Markovian sampling (Song et al. 2021, eq. 12 and 16): at eta = 0 deterministic, at 1 as `ancestral`."""
+    """Takes a step of DDIM, deterministic at eta = 0 (the default) and as random as `ancestral` at eta = 1.
+
+    Non-Markovian sampling of Song et al. 2021, eq. 12 and 16.
+
+    Args:
+        x: (B, F, D) noisy motion at step i.
+        run: the run; its options give eta, 0 to 1.
+        i: the step, N - 1 ... 0.
+
+    Returns:
+        Noisy motion (B, F, D) at step i - 1.
+
+    Example:
+        >>> from flame_mdm.processes.schedules import build_schedule
+        >>> schedule = build_schedule("cosine", 10)
+        >>> run = Descent(lambda x, i: (torch.ones_like(x), 0.0), schedule, iter([]), SamplerOptions())
+        >>> ddim(torch.zeros(1, 1, 2), run, 0).tolist()  # the last step ends in the clean estimate
+        [[[1.0, 1.0]]]
+    """
+    # The clean estimate implies the noise in x; the step keeps the part of this noise that the
+    # next level needs, and replaces the rest by new noise of the given variance.
     schedule, eta = run.schedule, run.options.eta or 0.0
     x0_hat, _ = run.estimate(x, i)
     epsilon = (x - schedule.number("signal", i) * x0_hat) / schedule.number("noise", i)
@@ -81,10 +134,32 @@ def ddim(x: Tensor, run: Descent, i: int) -> Tensor:
 
 
 def dpm_solver_pp_2m(x: Tensor, run: Descent, i: int) -> Tensor:
-    """DPM-Solver++ (2M), a deterministic multistep solver (Lu et al. 2022b, algorithm 2).
+    """Takes a step of DPM-Solver++ (2M), a deterministic multistep solver of order 2 with one call per step.
 
-    The first step is of first order, since there is no history; the last one returns the clean estimate.
+    Lu et al. 2022b, algorithm 2. The first step is of first order, since there is no history; the
+    last step returns the clean estimate.
+
+    Args:
+        x: (B, F, D) noisy motion at step i.
+        run: the run, which remembers the clean estimate for the next step.
+        i: the step, N - 1 ... 0.
+
+    Returns:
+        Noisy motion (B, F, D) at step i - 1.
+
+    Example:
+        >>> from flame_mdm.processes.schedules import build_schedule
+        >>> schedule = build_schedule("cosine", 10)
+        >>> run = Descent(lambda x, i: (torch.ones_like(x), 0.0), schedule, iter([]), SamplerOptions())
+        >>> x = torch.zeros(1, 1, 2)
+        >>> for i in reversed(range(10)):
+        ...     x = dpm_solver_pp_2m(x, run, i)
+        >>> x.tolist()
+        [[[1.0, 1.0]]]
     """
+    # In the half logarithm of the signal-to-noise ratio as time, the linear part of the equation
+    # is solved exactly. The clean estimate, which remains under the integral, is extrapolated
+    # from this step and the step before.
     schedule, last = run.schedule, run.last
     x0_hat, _ = run.estimate(x, i)
     run.last = x0_hat
@@ -101,7 +176,25 @@ def dpm_solver_pp_2m(x: Tensor, run: Descent, i: int) -> Tensor:
 
 
 def consistency(x: Tensor, run: Descent, i: int) -> Tensor:
-    """Estimates the clean motion, and adds new noise of the next step (Song et al. 2023, algorithm 1)."""
+    """Estimates the clean motion and adds new noise for the next step, as distilled models are sampled.
+
+    Song et al. 2023, "Consistency Models", algorithm 1.
+
+    Args:
+        x: (B, F, D) noisy motion at step i.
+        run: the run.
+        i: the step, N - 1 ... 0.
+
+    Returns:
+        Noisy motion (B, F, D) at step i - 1, or the clean estimate after step 0.
+
+    Example:
+        >>> from flame_mdm.processes.schedules import build_schedule
+        >>> schedule = build_schedule("cosine", 10)
+        >>> run = Descent(lambda x, i: (x / 2, 0.0), schedule, iter([]), SamplerOptions())
+        >>> consistency(torch.ones(1, 1, 2), run, 0).tolist()
+        [[[0.5, 0.5]]]
+    """
     x0_hat, _ = run.estimate(x, i)
     return run.schedule.corrupt(x0_hat, next(run.draws), i - 1) if i else x0_hat
 
@@ -109,10 +202,23 @@ def consistency(x: Tensor, run: Descent, i: int) -> Tensor:
 def blended(
     sampler: Sampler, x: Tensor, run: Descent, steps: Sequence[int], edit: Edit, start: Tensor
 ) -> Tensor:
-    """Takes `steps` and replaces the kept part of each noisy motion by the known motion, as noisy as the rest.
+    """Samples with an edit of mode "x_t": the known motion, as noisy as the rest, replaces the
+    kept part at each step.
 
-    With the blend "after", the kept part of the first x_t has the noise of the `start`, as if blended after a step
-    before. RePaint (Lugmayr et al. 2022, algorithm 1) repeats each step after adding its noise again.
+    With the blend "after", the kept part of the first x_t has the noise of the start, as if a
+    step had been blended before. RePaint (Lugmayr et al. 2022, algorithm 1) repeats each step
+    after adding its noise again.
+
+    Args:
+        sampler: a sampler of diffusion.
+        x: (B, F, D) noisy motion at the first step.
+        run: the run.
+        steps: the steps to take, from noisy to clean.
+        edit: the part to keep, how to blend it, and how often to repeat each step.
+        start: (B, F, D) noise that sampling started from.
+
+    Returns:
+        Normalized motion (B, F, D).
     """
     schedule, draws = run.schedule, run.draws
     if edit.blend == "after":
@@ -140,25 +246,85 @@ DIFFUSION_SAMPLERS = {
 
 
 def euler(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
-    """Order 1, one call per step."""
+    """Takes a step of Euler's method: order 1, one call of the denoiser per step.
+
+    Args:
+        x: (B, F, D) motion at time t.
+        run: the run.
+        t: time of x, in [0, 1).
+        end: time of the result, in (0, 1].
+
+    Returns:
+        Motion (B, F, D) at time `end`.
+
+    Example:
+        >>> run = Flow(lambda x, t: torch.full_like(x, 2.0), iter([]), 0.0)
+        >>> euler(torch.zeros(1, 1, 2), run, 0.0, 0.5).tolist()
+        [[[1.0, 1.0]]]
+    """
     return x + (end - t) * run.velocity(x, t)
 
 
 def midpoint(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
-    """Order 2, two calls per step."""
+    """Takes a step of the midpoint method: order 2, two calls of the denoiser per step.
+
+    Args:
+        x: (B, F, D) motion at time t.
+        run: the run.
+        t: time of x, in [0, 1).
+        end: time of the result, in (0, 1].
+
+    Returns:
+        Motion (B, F, D) at time `end`.
+
+    Example:
+        >>> run = Flow(lambda x, t: torch.full_like(x, 2 * t), iter([]), 0.0)
+        >>> midpoint(torch.zeros(1, 1, 2), run, 0.0, 1.0).tolist()  # the integral of 2 t
+        [[[1.0, 1.0]]]
+    """
     dt = end - t
     return x + dt * run.velocity(x + dt / 2 * run.velocity(x, t), t + dt / 2)
 
 
 def heun(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
-    """Order 2, two calls per step: the trapezoid with an Euler predictor."""
+    """Takes a step of Heun's method, the trapezoid with an Euler predictor: order 2, two calls per step.
+
+    Args:
+        x: (B, F, D) motion at time t.
+        run: the run.
+        t: time of x, in [0, 1).
+        end: time of the result, in (0, 1].
+
+    Returns:
+        Motion (B, F, D) at time `end`.
+
+    Example:
+        >>> run = Flow(lambda x, t: torch.full_like(x, 2 * t), iter([]), 0.0)
+        >>> heun(torch.zeros(1, 1, 2), run, 0.0, 1.0).tolist()  # the integral of 2 t
+        [[[1.0, 1.0]]]
+    """
     dt = end - t
     first = run.velocity(x, t)
     return x + dt / 2 * (first + run.velocity(x + dt * first, t + dt))
 
 
 def rk4(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
-    """Order 4, four calls per step: Kutta's 3/8 rule, also called rk4 in torchdiffeq."""
+    """Takes a step of Kutta's 3/8 rule, also called rk4 in torchdiffeq: order 4, four calls per step.
+
+    Args:
+        x: (B, F, D) motion at time t.
+        run: the run.
+        t: time of x, in [0, 1).
+        end: time of the result, in (0, 1].
+
+    Returns:
+        Motion (B, F, D) at time `end`.
+
+    Example:
+        >>> run = Flow(lambda x, t: torch.full_like(x, 4 * t**3), iter([]), 0.0)
+        >>> [round(value, 5) for value in rk4(torch.zeros(1, 1, 2), run, 0.0, 1.0).flatten().tolist()]
+        [1.0, 1.0]
+    """
     dt = end - t
     k1 = run.velocity(x, t)
     k2 = run.velocity(x + dt / 3 * k1, t + dt / 3)
@@ -168,10 +334,25 @@ def rk4(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
 
 
 def dopri5(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
-    """Adaptive steps of order 5 (Dormand and Prince 1980), rtol = atol = 1e-5, as MFM.
+    """Integrates with adaptive steps of order 5 (Dormand and Prince 1980), rtol = atol = 1e-5, as in MFM.
 
-    The error is measured over the entire batch, so a motion depends on the rest of its batch, up to the tolerance. The
-    last step may go beyond the last time; the solver then interpolates back.
+    The error is measured over the entire batch, so a motion depends on the rest of its batch, up
+    to the tolerance. The last step may go beyond the last time; the solver then interpolates
+    back.
+
+    Args:
+        x: (B, F, D) motion at time t.
+        run: the run.
+        t: time of x, in [0, 1).
+        end: time of the result, in (0, 1].
+
+    Returns:
+        Motion (B, F, D) at time `end`.
+
+    Example:
+        >>> run = Flow(lambda x, t: torch.ones_like(x) * 2 * t, iter([]), 0.0)
+        >>> [round(value, 4) for value in dopri5(torch.zeros(1, 1, 2), run, 0.0, 1.0).flatten().tolist()]
+        [1.0, 1.0]
     """
     ends = torch.tensor([t, end], dtype=x.dtype, device=x.device)
     from torchdiffeq import odeint  # here, because it imports much of scipy
@@ -182,7 +363,22 @@ def dopri5(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
 
 
 def consistency_flow(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
-    """As `consistency`: goes straight to the data, and adds new noise of the next time."""
+    """Goes straight to the data and adds new noise for the next time: `consistency` for flows.
+
+    Args:
+        x: (B, F, D) motion at time t.
+        run: the run.
+        t: time of x, in [0, 1).
+        end: time of the result, in (0, 1].
+
+    Returns:
+        Motion (B, F, D) at time `end`.
+
+    Example:
+        >>> run = Flow(lambda x, t: torch.full_like(x, 2.0), iter([]), 0.0)
+        >>> consistency_flow(torch.zeros(1, 1, 2), run, 0.5, 1.0).tolist()
+        [[[1.0, 1.0]]]
+    """
     shrink = 1 - run.sigma_min
     x0_hat = (1 - shrink * t) * run.velocity(x, t) + shrink * x
     return end * x0_hat + (1 - shrink * end) * next(run.draws) if end < 1 else x0_hat

@@ -10,7 +10,14 @@ from flame_mdm.sampler_options import MAX_STEPS
 
 
 def cosine_betas(num_train_timesteps: int) -> Tensor:
-    """Returns noise variances (T,) float64 of Nichol and Dhariwal 2021, eq. 17, clipped at 0.999."""
+    """Returns noise variances (T,) float64 of the cosine schedule, clipped at 0.999 (Nichol and
+    Dhariwal 2021, eq. 17).
+
+    Example:
+        >>> betas = cosine_betas(1000)
+        >>> betas.shape, f"{betas[0]:.6f}", f"{betas[-1]:.3f}"
+        (torch.Size([1000]), '0.000041', '0.999')
+    """
 
     def alpha_bar(t: float) -> float:
         return math.cos((t + 0.008) / 1.008 * math.pi / 2) ** 2
@@ -27,7 +34,12 @@ def cosine_betas(num_train_timesteps: int) -> Tensor:
 def linear_betas(num_train_timesteps: int) -> Tensor:
     """Returns noise variances (T,) float64 of Ho et al. 2020, section 4: 1e-4 to 0.02 at T = 1000.
 
-    For other T they are scaled by 1000 / T to end at the same noise, as in guided-diffusion, and clipped at 0.999.
+    For other T, they are scaled by 1000 / T to end at the same noise, as in guided-diffusion, and
+    clipped at 0.999.
+
+    Example:
+        >>> [round(beta, 5) for beta in linear_betas(1000)[[0, -1]].tolist()]
+        [0.0001, 0.02]
     """
     scale = 1000 / num_train_timesteps
     betas = torch.linspace(
@@ -39,16 +51,26 @@ def linear_betas(num_train_timesteps: int) -> Tensor:
 class Schedule:
     """Coefficients of a Gaussian diffusion, by step i = 0 (least noise) to N - 1.
 
-    Tables are float64 on the CPU and rounded once, when used. They are not buffers, because casting or moving a model
-    (bfloat16, MPS) must not round them. Formulas: Ho et al. 2020, eq. 4 and 7.
+    Tables are float64 on the CPU and rounded once, when used. They are not buffers, because
+    casting or moving a model (bfloat16, MPS) must not round them. Formulas: Ho et al. 2020, eq. 4
+    and 7.
+
+    Args:
+        betas: (N,) float64, variances of the noise that each step adds.
+
+    Example:
+        >>> schedule = Schedule(cosine_betas(1000)).respace([0, 499, 999])
+        >>> len(schedule), round(schedule.number("signal", 1) ** 2 + schedule.number("noise", 1) ** 2, 9)
+        (3, 1.0)
     """
 
     def __init__(self, betas: Tensor):
-        """Computes the tables from the variances (N,) float64 of the noise steps."""
+        """Computes the tables."""
         alphas_cumprod = (1 - betas).cumprod(0)
         previous = torch.cat([betas.new_ones(1), alphas_cumprod[:-1]])
         posterior_variance = betas * (1 - previous) / (1 - alphas_cumprod)
-        # The posterior of step 0 has variance 0: its logarithm is that of step 1 (Nichol and Dhariwal 2021).
+        # The posterior of step 0 has variance 0; the logarithm of step 1 replaces its infinite
+        # logarithm (Nichol and Dhariwal 2021).
         clipped = torch.cat([posterior_variance[:2][-1:], posterior_variance[1:]])
         self.tables = {
             "betas": betas,
@@ -106,7 +128,19 @@ class Schedule:
 
 
 def build_schedule(name: str, num_train_timesteps: int) -> Schedule:
-    """Returns the schedule "cosine" or "linear" with 2 to `MAX_STEPS` steps."""
+    """Returns a noise schedule by name.
+
+    Args:
+        name: "cosine" or "linear".
+        num_train_timesteps: T, 2 to `MAX_STEPS`.
+
+    Raises:
+        UserError: If the number of steps is out of range.
+
+    Example:
+        >>> len(build_schedule("linear", 50))
+        50
+    """
     if not 2 <= num_train_timesteps <= MAX_STEPS:
         raise UserError(
             f"num_train_timesteps is {num_train_timesteps}: a diffusion has 2 to {MAX_STEPS:,} steps"
@@ -117,11 +151,25 @@ def build_schedule(name: str, num_train_timesteps: int) -> Schedule:
 def timesteps(
     num_train_timesteps: int, num_inference_steps: int, spacing: str = "linspace"
 ) -> list[int]:
-    """Returns N = `num_inference_steps` increasing sampling steps from 0 ... T - 1.
+    """Selects the training steps that sampling visits.
 
-    "linspace" includes both ends and rounds half to even ("N" in the code of MDM and FLAME, after Nichol and Dhariwal
-    2021). "stride" counts from 0 with the smallest integer stride that gives N steps, so that the noisiest step may be
-    well below T - 1 ("ddimN" there, after Song et al. 2021). Raises `UserError` if nothing gives N steps.
+    Args:
+        num_train_timesteps: T.
+        num_inference_steps: N, 1 to T.
+        spacing: "linspace" includes both ends and rounds half to even ("N" in the code of MDM and
+            FLAME, after Nichol and Dhariwal 2021). "stride" counts from 0 with the smallest
+            integer stride that gives N steps, so that the noisiest step may be well below T - 1
+            ("ddimN" in their code, after Song et al. 2021).
+
+    Returns:
+        N increasing steps from 0 ... T - 1.
+
+    Raises:
+        UserError: If N is out of range, or no stride gives N steps.
+
+    Example:
+        >>> timesteps(1000, 5), timesteps(1000, 5, "stride")
+        ([0, 250, 500, 749, 999], [0, 200, 400, 600, 800])
     """
     total, count = num_train_timesteps, num_inference_steps
     if not 1 <= count <= total:
@@ -136,7 +184,8 @@ def timesteps(
             f"no stride gives {count} of {total} steps: choose another number or spacing=linspace"
         )
     stride = (total - 1) / (count - 1) if count > 1 else 1.0
-    # A running sum, not i * stride: its rounding decides ties, and the released models were sampled at those steps.
+    # A running sum, not i * stride: its rounding decides ties, and the released models were
+    # sampled at those steps.
     steps, position = [], 0.0
     for _ in range(count):
         steps.append(round(position))

@@ -1,8 +1,9 @@
 """Long motions from overlapping windows: a wrapper with the same interface as the denoiser.
 
-At each sampling step, the denoiser sees all windows of a motion in one batch, each with its own condition, and their
-outputs are averaged where windows overlap (Bar-Tal et al. 2023, "MultiDiffusion"; Zhang et al. 2023, "DiffCollage").
-Outputs are affine in the clean estimate for equal x_t and t, so this blends the clean estimates.
+At each sampling step, the denoiser sees all windows of a motion in one batch, each with its own
+condition, and their outputs are averaged where windows overlap (Bar-Tal et al. 2023,
+"MultiDiffusion"; Zhang et al. 2023, "DiffCollage"). Outputs are affine in the clean estimate for
+equal x_t and t, so this blends the clean estimates.
 """
 
 from collections.abc import Sequence
@@ -18,14 +19,27 @@ from flame_mdm.batch import Condition, Denoise, MotionBatch, length_mask
 class Windows:
     """W windows of at most L frames that cover B motions."""
 
-    batch: MotionBatch  # conditions and masks (W, L) of the windows; its `x` has no features
-    rows: Tensor  # (W,) int64, the motion of each window
-    frames: Tensor  # (W, L) int64, the frame of the motion at each frame of a window
-    weights: Tensor  # (W, L), 0 past the end of a window; they sum to 1 at each frame of a motion
+    #: Conditions and masks (W, L) of the windows; its `x` has no features.
+    batch: MotionBatch
+    #: (W,) int64, the motion of each window.
+    rows: Tensor
+    #: (W, L) int64, the frame of the motion at each frame of a window.
+    frames: Tensor
+    #: (W, L), 0 past the end of a window; they sum to 1 at each frame of a motion.
+    weights: Tensor
 
 
 def blended(denoise: Denoise, windows: Windows) -> Denoise:
-    """Returns a denoiser of entire motions (B, F, D), which gets the conditions of the windows and blends outputs."""
+    """Returns a denoiser of entire motions, which are longer than the motions in training.
+
+    Args:
+        denoise: denoiser of the windows.
+        windows: the windows; see `cover`.
+
+    Returns:
+        A function (x_t (B, F, D), t (B,), mask (B, F), cond of W windows) -> blended output (B,
+        F, out_features).
+    """
 
     def blend(x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
         rows = windows.rows[:, None]
@@ -42,10 +56,23 @@ def blended(denoise: Denoise, windows: Windows) -> Denoise:
 def spans(
     lengths: Sequence[int], longest: int, overlap: int, loop: bool = False
 ) -> list[tuple[int, int, int]]:
-    """Covers the consecutive parts of a motion with windows: part, first frame and number of frames of each.
+    """Covers the consecutive parts of a motion with windows.
 
-    The windows of a part reach half the overlap, an even number, into its neighbors. A part that does not fit into one
-    window of at most `longest` frames gets several. In a loop, windows begin before frame 0.
+    The windows of a part reach half the overlap into its neighbors. A part that does not fit into
+    one window gets several.
+
+    Args:
+        lengths: number of frames of each part.
+        longest: maximum number of frames of a window.
+        overlap: number of frames that neighboring windows share, an even number.
+        loop: whether the first part follows the last one; windows may then begin before frame 0.
+
+    Returns:
+        Part, first frame and number of frames of each window.
+
+    Example:
+        >>> spans([10, 10], longest=16, overlap=4)
+        [(0, 0, 12), (1, 8, 12)]
     """
     total, begin, windows = sum(lengths), 0, []
     for part, length in enumerate(lengths):
@@ -68,10 +95,23 @@ def cover(
     width: int,
     device: torch.device,
 ) -> Windows:
-    """Returns windows, without conditions, by motion, first frame and length of each.
+    """Returns the frames and weights of windows, without conditions.
 
-    The weight of a window rises over the overlap at its start and falls over the one at its end. Past its end, it holds
-    the frames that follow in the motion, which has one of `totals` frames; its first frame follows the last.
+    The weight of a window rises over the overlap at its start and falls over the overlap at its
+    end. Past its end, a window holds the frames that follow in the motion; after the last frame
+    of a motion comes the first.
+
+    Args:
+        windows: motion, first frame and number of frames of each of the W windows.
+        totals: number of frames of each motion.
+        overlap: number of frames over which a weight rises or falls.
+        width: L, the padded length of the windows.
+        device: device of the result.
+
+    Example:
+        >>> windows = cover([(0, 0, 12), (0, 8, 12)], [20], 4, 12, torch.device("cpu"))
+        >>> windows.weights[0, 8:].add(windows.weights[1, :4]).tolist()
+        [1.0, 1.0, 1.0, 1.0]
     """
     rows, first, size = torch.tensor(windows, device=device).T
     mask, position = length_mask(size, width), torch.arange(width, device=device)

@@ -37,7 +37,7 @@ class Abilities:
     """Actions and attributes of a model whose captions name one of a list of actions each.
 
     Args:
-        facts: of the model: "actions", "vocabulary", and "captions" if it has them.
+        facts: facts of the model: "actions", "vocabulary" and, if it has them, "captions".
     """
 
     def __init__(self, facts: Mapping[str, Any]):
@@ -115,7 +115,7 @@ class Abilities:
         return {name: values for name, values in listed.items() if values}
 
     def ranked(self, action: str) -> list[str]:
-        """Returns the actions that the model knows, those with the nearest meanings first."""
+        """Returns the actions that the model knows, ordered by how near their meaning is."""
         return sorted(self.actions, key=lambda other: -similarity(action, other))
 
     def nearest(self, understood: Understanding) -> list[str]:

@@ -49,7 +49,8 @@ class Reader:
     def read(self) -> dict[str, Value]:
         """Returns the attributes that the clause states and the action takes.
 
-        `used` has the tokens that state one, `dropped` those of attributes that the action does not take.
+        Afterward, `used` has the tokens that state such attributes. `dropped` has the tokens that
+        state attributes which the action does not take.
         """
         for position, number in enumerate(self.numbers):
             word = self.tokens[number].word

@@ -7,12 +7,19 @@ from flame_mdm.conditions.language.morphology import base_forms
 from flame_mdm.conditions.language.tables import GAP, Phrase, phrases_by_first_word, words_of
 from flame_mdm.conditions.language.tokens import Token
 
-LONGEST_GAP = 4  # maximum number of words for a gap in a phrase
+# Maximum number of words for a gap in a phrase
+LONGEST_GAP = 4
 
 
 @dataclass(frozen=True)
 class Match:
-    """A phrase for an action at the tokens `used`; `is_weak`: no action of its own next to another one."""
+    """A phrase for an action, found in a sentence.
+
+    Attributes:
+        phrase: the phrase.
+        used: numbers of its tokens in the sentence, increasing.
+        is_weak: whether it is no action if the sentence has another one, such as "go".
+    """
 
     phrase: Phrase
     used: tuple[int, ...]
@@ -20,10 +27,12 @@ class Match:
 
     @property
     def first(self) -> int:
+        """Number of the first token."""
         return self.used[0]
 
     @property
     def last(self) -> int:
+        """Number of the last token."""
         return self.used[-1]
 
 

@@ -19,7 +19,8 @@ from flame_mdm.conditions.language.tokens import (
 )
 from flame_mdm.conditions.language.understanding import Mention, Step, Understanding
 
-NEAREST = 3  # number of actions to choose from if none is understood
+# Number of actions to choose from if none is understood
+NEAREST = 3
 
 
 @lru_cache(4096)

@@ -12,7 +12,8 @@ from flame_mdm.conditions.language.wording import attribute_words, caption, pred
 from flame_mdm.errors import UserError, shortened
 
 ATTRIBUTES = ("direction", "amount", "speed", "count", "side")
-LONGEST_COUNT = 12  # repetitions that are sampled as several parts, at most
+# Maximum number of repetitions that are sampled as several parts
+LONGEST_COUNT = 12
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ class Reader:
     """Reads sentences for a model whose captions name one of a list of actions each.
 
     Args:
-        facts: of the model: "actions", "vocabulary", and "captions" if it has them.
+        facts: facts of the model: "actions", "vocabulary" and, if it has them, "captions".
     """
 
     def __init__(self, facts: Mapping[str, Any]):
@@ -61,7 +62,7 @@ class Reader:
 
     @staticmethod
     def fits(facts: Mapping[str, Any]) -> bool:
-        """Returns whether a model, of these facts, has captions of single actions."""
+        """Returns whether a model with these facts has captions of single actions."""
         return (
             bool(facts.get("verbs"))
             and bool(facts.get("actions"))
@@ -71,10 +72,13 @@ class Reader:
     def read(self, text: str) -> Reading:
         """Returns a sentence as the model reads it.
 
-        It stays as it is if it is one of the training captions of the model and names an action that the model does not
-        list, or if no table has its words and the model knows all of them.
+        Two kinds of sentences are not changed: training captions of the model that name an action
+        which the model does not list, and sentences whose words are in no table but are all known
+        to the model.
 
-        Raises `UserError` if it is not English, or names an action that the model does not know.
+        Raises:
+            UserError: If the sentence is not English, or names an action that the model does not
+                know.
         """
         sentence, style = _without_style(text)
         understood = understand(sentence)
@@ -151,7 +155,7 @@ class Reader:
                 continue
             value = mention.attributes[name]
             takes = actions()[action].takes
-            # See `_repeated`
+            # `_repeated` splits counts that the model does not know.
             is_repetition = name == "count" and name in takes and "steps" not in takes
             if is_repetition or (name in takes and self.abilities.supports(action, name, value)):
                 stated[name] = value

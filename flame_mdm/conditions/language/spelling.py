@@ -5,7 +5,8 @@ from functools import cache
 from flame_mdm.conditions.language.morphology import inflections
 from flame_mdm.conditions.language.tables import GAP, actions, phrases, words_of
 
-NEVER_CORRECTED = 2  # maximum length of words that are too short to be recognized as another word
+# Maximum length of words that are too short to be recognized as another word
+NEVER_CORRECTED = 2
 FREQUENT = (
     "a",
     "the",
@@ -27,7 +28,13 @@ def distance(first: str, second: str, most: int) -> int:
     """Returns the number of letters inserted, removed, replaced or swapped with a neighbor; above `most`, most + 1.
 
     Optimal string alignment distance (Damerau 1964; Levenshtein 1966).
+
+    Example:
+        >>> distance("wlak", "walk", most=2), distance("dance", "walk", most=2)
+        (1, 3)
     """
+    # Dynamic programming over prefixes: `row` has the distances of first[:i] from all prefixes of
+    # the second word. Only the last two rows are needed, since a swap looks back by two letters.
     if abs(len(first) - len(second)) > most:
         return most + 1
     before: list[int] = []
@@ -48,7 +55,8 @@ def distance(first: str, second: str, most: int) -> int:
 def corrections(word: str) -> tuple[str, ...]:
     """Returns the words of the tables that a misspelled word may mean, all equally near; () if none is near.
 
-    A word of four letters or fewer has one wrong letter at most, a longer one two. A number has no typo.
+    A word of up to four letters may have one wrong letter, a longer word two. Numbers are not
+    corrected.
     """
     if len(word) <= NEVER_CORRECTED or any(char.isdigit() for char in word):
         return ()
@@ -56,7 +64,8 @@ def corrections(word: str) -> tuple[str, ...]:
     near: dict[int, list[str]] = {}
     for other in _correct_words():
         if len(other) > NEVER_CORRECTED and (far := distance(word, other, most)) <= most:
-            # wrong first letters and replaced letters are rarer than missing, added and swapped ones
+            # wrong first letters and replaced letters are rarer than missing, added and swapped
+            # ones
             begins_otherwise = sorted(other[:2]) != sorted(word[:2]) and other[0] != word[0]
             has_replaced = len(other) == len(word) and sorted(other) != sorted(word)
             near.setdefault(2 * far + begins_otherwise + has_replaced, []).append(other)
@@ -74,7 +83,7 @@ def action_words() -> frozenset[str]:
 
 @cache
 def _correct_words() -> tuple[str, ...]:
-    """Returns the words that a typo may mean; those of an action first."""
+    """Returns the words that a typo may mean: frequent words, then words for actions, then all others."""
     tables = phrases()
     listed = words_of("body") | words_of("people") | words_of("function") | words_of("objects")
     for key in ("numbers", "times"):

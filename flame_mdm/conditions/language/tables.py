@@ -14,7 +14,13 @@ GAP = "..."
 
 @dataclass(frozen=True)
 class Phrase:
-    """Words for an action, as base forms; `GAP` stands for up to four words. It may state attributes."""
+    """Words for an action.
+
+    Attributes:
+        words: base forms; `GAP` stands for up to four words.
+        action: name of the action.
+        attributes: attributes that the phrase states.
+    """
 
     words: tuple[str, ...]
     action: str
@@ -73,7 +79,7 @@ def actions() -> dict[str, ActionEntry]:
 
 @cache
 def phrases_by_first_word() -> dict[str, list[Phrase]]:
-    """Returns the phrases for actions by their first words, those of most words first."""
+    """Returns the phrases for actions by their first words, the longest phrases first."""
     listed_at: dict[str, list[Phrase]] = {}
     for entry in actions().values():
         for phrase in entry.phrases:

@@ -36,6 +36,7 @@ class Token:
 
     @property
     def is_word(self) -> bool:
+        """Whether it is a word, and not a punctuation mark."""
         return self.typed[0].isalnum()
 
     def has_form(self, *bases: str) -> bool:
@@ -63,8 +64,9 @@ def is_known(word: str) -> bool:
 def is_foreign(tokens: Sequence[Token]) -> bool:
     """Returns whether a sentence is in another language than English.
 
-    It is if most letters are not Latin, or fewer than half of its words are English and one is a word of a language in
-    `phrases.yaml`, but no English one, or has an accent.
+    A sentence is foreign if most of its letters are not Latin. It is also foreign if fewer than
+    half of its words are English, and one of them has an accent or is a word of a language in
+    `phrases.yaml` without being English.
     """
     words = [token.word for token in tokens if token.is_word]
     letters = [char for word in words for char in word if char.isalpha()]
@@ -99,7 +101,7 @@ def is_english(word: str) -> bool:
 
 
 def corrected(tokens: Sequence[Token]) -> list[Token]:
-    """Returns the tokens with words that are not English replaced by what they are a typo of, if it is clear."""
+    """Returns the tokens with typos corrected: unknown words for which few similar words come into question."""
     return [
         _corrected(token) if token.is_word and not is_known(token.word) else token
         for token in tokens
@@ -107,9 +109,13 @@ def corrected(tokens: Sequence[Token]) -> list[Token]:
 
 
 def corrected_to_action(tokens: Sequence[Token], free: Collection[int]) -> list[Token]:
-    """Returns the tokens with one rare word, of those in `free`, replaced by an action that differs in one letter.
+    """Returns the tokens with one rare word replaced by an action that differs in one letter.
 
-    For sentences in which no action is understood: "doge to the left".
+    This is for sentences in which no action is understood: "doge to the left".
+
+    Args:
+        tokens: tokens of the sentence.
+        free: numbers of the words that may be replaced.
     """
     for number in free:
         token = tokens[number]

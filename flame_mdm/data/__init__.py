@@ -1,6 +1,7 @@
 """Data sets: reading published releases, packing them into stores, and serving training batches."""
 
 import hashlib
+import math
 import re
 from abc import ABC, abstractmethod
 from collections import Counter
@@ -27,25 +28,28 @@ class Clip:
     """One motion that a data set yields to be written into a store."""
 
     id: str  # unique name; a mirrored copy is named `M` + the name of its original
-    # input of the representation, at its frame rate; for joint-based representations the joint positions (F, J, 3) in
-    # meters, y up, in the joint order of its skeleton
+    # Input of the representation, at its frame rate. Representations of joints take positions
+    # (F, J, 3) in meters, y up, in the joint order of the skeleton.
     motion: np.ndarray
     # Descriptions of the motion, each complete; empty for data sets with action labels only
     captions: list[str]
     split: Split  # mirrored copies and cuts of a take belong to the split of that take
     source: str  # the take the clip comes from; clips of one source are never in two splits
     action: int | None = None  # index into the data set's `actions`, or None
-    # exact facts about the motion, such as side, count and direction, or tagged words; values that JSON can hold
+    # Exact facts about the motion, such as side, count and direction, or tagged words. The values
+    # are such that JSON can hold them.
     attributes: Mapping[str, Any] = field(default_factory=dict)
-    # if the release contains features, the name of the representation that `motion` (F, D) is in; the features are
-    # stored unchanged. If empty, `motion` is raw.
+    # Name of a representation if the release contains its features: `motion` (F, D) is then stored
+    # unchanged. Empty if `motion` is raw.
     encoded: str = ""
-    # (first, length): the clip is this cut of its motion. Consecutive clips with the identical array object share its
-    # frames in the store. Only for representations with one row per frame.
+    # (first, length): the clip is this cut of its motion. Consecutive clips that hold the same array
+    # object share its frames in the store. Only for representations with one row per frame.
     window: tuple[int, int] | None = None
-    # (F', J, 3) joints in meters at the frame rate of the recording, for protocols that compare at it
+    # Joints (F', J, 3) in meters at the frame rate of the recording, for protocols that compare
+    # motions at that rate.
     reference: np.ndarray | None = None
-    # Of this motion, an identifier such as "MIT"; empty if the data set has one license for all
+    # License of this motion, an identifier such as "MIT". Empty if the data set has one license for
+    # all motions.
     license: str = ""
 
 
@@ -53,28 +57,28 @@ class MotionSource(ABC):
     """A data set in the form in which it is published."""
 
     name: str
-    named_by_recipe: bool = (
-        False  # whether its name is `data.name` of the recipe: the files are the user's own
-    )
+    # Whether the data set takes its name from `data.name` of the recipe: the files are the user's.
+    named_by_recipe: bool = False
     options: Mapping[str, Any] = {}
-    """Arguments of the constructor that define the data, as JSON values; not those that say where files are and how to
-    read them. They are saved in the store, and commands compare them with the recipe's."""
+    """Arguments of the constructor that define the data, as JSON values. Paths and numbers of workers are
+    not among them. They are saved in the store, and commands compare them with those in the recipe."""
     actions: tuple[str, ...] = ()  # names of the action labels, in the order of their numbers
-    # All forms of the verbs in the captions, at which sentences are split, or none
+    # All forms of the verbs in the captions, at which sentences are split into actions. Empty if
+    # sentences are not split.
     verbs: tuple[str, ...] = ()
     license: str = ""
     """License of all motions, a key of `licenses.yaml` such as "MIT"; empty if unknown, or if clips have their own."""
-    captions_may_be_shared: bool = (
-        False  # whether the license allows checkpoints to contain captions
-    )
+    # Whether the license allows checkpoints to contain captions.
+    captions_may_be_shared: bool = False
     published_split: bool = False
     """Whether the split is the one used in papers although it tests on clips seen in training or leaves no validation
     clips. Saved in the store and in every result."""
     version: int = 1
-    """Version of the way in which motions are read, part of the fingerprint: a store of another one is not used."""
+    """Version of the code that reads the motions. It is part of the fingerprint, and stores of another version
+    are not used."""
     failures: Sequence[str] = ()
-    """Lines about motions that could not be read and are not prepared, complete once `clips` is exhausted; the user
-    should correct them, so that commands end with exit code 1."""
+    """Lines about motions that could not be read and are left out, complete once `clips` is exhausted. Commands
+    then end with exit code 1, since the user should correct the files."""
     workers: int = 0  # processes that read and encode; 0 = one per core, 1 = this process only
     exclude: Collection[str] = ()  # names to leave out
 
@@ -89,14 +93,19 @@ class MotionSource(ABC):
             self.excluded[reason] += count
 
     def not_excluded(self, named: Mapping[str, Value], path: Path) -> dict[str, Value]:
-        """Returns the values of names that `exclude` lacks; counts the others, or raises `UserError` if it has more."""
+        """Removes the names in `exclude` from a mapping and counts them.
+
+        Raises `UserError` if `exclude` has a name that the mapping lacks.
+        """
         if unknown := set(self.exclude) - named.keys():
             raise UserError(f"data.source.exclude: {path} has no {some(unknown)}")
         self.leave_out("motions by data.source.exclude", len(self.exclude))
         return {name: value for name, value in named.items() if name not in self.exclude}
 
     def counts(self) -> Mapping[str, float]:
-        """Returns the figures of the raw data under the names of `published.yaml`; saved once `clips` is exhausted."""
+        """Returns figures of the raw data under the names of `published.yaml`; saved once `clips`
+        is exhausted.
+        """
         return {}
 
     def findings(self) -> list[str]:
@@ -124,11 +133,15 @@ class MotionSource(ABC):
         """
 
     def failure_lines(self) -> list[str]:
-        """Returns lines to print about `failures`, none if there are none."""
+        """Returns the lines to print about `failures`."""
         return [f"error: {failure}" for failure in self.failures]
 
     def check(self, fps: float) -> list[str]:
-        """Returns lines to print about the files that are present and missing, at `fps`; prepares nothing."""
+        """Returns lines to print about the files that are present or missing, at `fps` frames per
+        second.
+
+        Prepares nothing.
+        """
         return [f"{self.name}: {self.count()} clips can be prepared"]
 
     def suit(self, representation: "Representation") -> None:  # noqa: B027 (most sources yield one kind of motion)
@@ -143,7 +156,9 @@ class MotionSource(ABC):
         """Yields all clips at `fps` frames per second, always in the same order; raises the errors of `count`."""
 
     def check_fps(self, fps: float, published: float) -> None:
-        """Raises `UserError` if a set that is not resampled is requested at another frame rate."""
+        """Raises `UserError` if `fps` is not the `published` frame rate of a data set that is
+        never resampled.
+        """
         if fps != published:
             raise UserError(
                 f"{self.name} has {published:g} frames per second, not {fps:g}: set representation.fps"
@@ -151,35 +166,45 @@ class MotionSource(ABC):
 
 
 def required(path: Path, get_it: str) -> Path:
-    """Returns a path; raises `FileNotFoundError`, which says how to get the data set, if nothing is there."""
+    """Returns `path`; raises `FileNotFoundError` with the advice `get_it` if nothing is there."""
     if not path.exists():
         raise FileNotFoundError(f"{path}: not found; {get_it}")
     return path
 
 
 def some(names: Iterable[str]) -> str:
-    """Returns the first five names, sorted, and the number of the others."""
+    """Returns the first five of the sorted names, and how many others there are."""
     first = sorted(names)
     return ", ".join(first[:5]) + (f" and {len(first) - 5} more" if len(first) > 5 else "")
 
 
 def name_hash(name: str) -> int:
-    """Returns 160 bits that are a function of a name on any machine."""
+    """Returns 160 bits that depend on the name alone, so that draws by name are equal on any
+    machine.
+    """
     return int(hashlib.sha1(name.encode()).hexdigest(), 16)
 
 
 def hashed_split(name: str, val: int, test: int) -> Split:
-    """Holds out `val` and `test` percent of all names by a hash of the name, so that adding names moves no others."""
+    """Returns a split that depends on the name alone, so that adding names moves no other name.
+
+    Args:
+        name: name of a motion or of its source.
+        val: percent of all names that are held out for validation.
+        test: percent of all names that are held out for testing.
+    """
     share = (name_hash(name) >> 128) % 100
     return "train" if share < 100 - val - test else "val" if share < 100 - test else "test"
 
 
 def split_blocks(name: str, clips: int, size: int, *, val: float, test: float) -> dict[int, Split]:
-    """Returns the split of each block of `size` consecutive clips, which may look alike, drawn by a hash of `name`.
+    """Returns the split of each block of `size` consecutive clips, drawn by a hash of `name`.
 
-    `val` and `test` are shares of the blocks, at least one block each.
+    Neighboring clips may look alike, so that a block is never divided between splits. `val` and
+    `test` are shares of the blocks; each gets at least one block.
     """
-    blocks = sorted(range(-(-clips // size)), key=lambda block: name_hash(f"{name}_{block}"))
+    count = math.ceil(clips / size)
+    blocks = sorted(range(count), key=lambda block: name_hash(f"{name}_{block}"))
     tested, validated = (max(1, round(share * len(blocks))) for share in (test, val))
     counts: dict[Split, int] = {"test": tested, "val": validated, "train": len(blocks)}
     return dict(
@@ -200,7 +225,10 @@ def swap_sides(text: str) -> str:
 
 
 def mirrored(clip: Clip, motion: np.ndarray, actions: Sequence[str]) -> Clip:
-    """Returns the mirror image of a clip, given its motion: sides are swapped in captions, action and attributes."""
+    """Returns the mirror image of a clip; `motion` is its mirrored motion.
+
+    Left and right are swapped in the captions, the action and the attributes.
+    """
     action = None if clip.action is None else swap_sides(actions[clip.action])
     return replace(
         clip,

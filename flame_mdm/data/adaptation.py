@@ -1,4 +1,6 @@
-"""Data of an adaptation: a few clips of the user, and clips of what the model knows, half of each batch."""
+"""Data of an adaptation: each batch holds clips of the user and clips of what the model knows,
+half and half.
+"""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -10,6 +12,7 @@ import numpy as np
 from scipy.ndimage import minimum_filter1d
 from torch.utils.data import Sampler
 
+from flame_mdm.batch import ceil_div
 from flame_mdm.data import Clip, MotionSource, some
 from flame_mdm.data.crops import Draw
 from flame_mdm.data.datamodule import MotionDataModule, TrainingBatches
@@ -18,9 +21,11 @@ from flame_mdm.data.store import Entry, Store
 from flame_mdm.errors import UserError, say
 from flame_mdm.representations import Representation
 
-DRIFT, FLOAT = 0.05, 0.1
-"""Limits in meters of a clip: rise of its floor from the first to the last second, and median height above it."""
-# Maximum number of kept clips of what the model knows, evenly spaced in its data
+DRIFT = 0.05
+"""Maximum rise of the floor, in meters, from the first to the last second of a clip."""
+FLOAT = 0.1
+"""Maximum median height of the body above the floor, in meters."""
+# Maximum number of clips per split that keep what the model knows. They are evenly spaced in its data.
 PRIOR = {
     "train": 2000,
     "val": 64,
@@ -29,9 +34,17 @@ KEPT = "prior/"  # beginning of the names of these clips
 
 
 class Lesson(MotionSource):
-    """Clips of a folder, mirrored too, for training unless a table says otherwise, and clips of a store, `prior`.
+    """Clips of the user's folder, with mirrored copies, and clips of a store of what the model
+    knows.
 
-    All are normalized as those of the store. Captions in the folder become "CAPTION in NAME style".
+    All clips of the folder are for training unless its table says otherwise. They are normalized
+    with the statistics of the store. A caption in the folder becomes "CAPTION in NAME style".
+
+    Args:
+        path: the user's folder of motions.
+        prior: folder of the store of what the model knows.
+        motion: "joints" for representations of joint positions, "smpl" for representations of
+            rotations.
     """
 
     named_by_recipe = True
@@ -42,47 +55,58 @@ class Lesson(MotionSource):
 
     @cached_property
     def store(self) -> Store:
+        """The store of what the model knows."""
         return Store(self.prior)
 
     def kept(self) -> list[Entry]:
-        clips = {
-            split: [clip for clip in self.store.clips if clip.split == split] for split in PRIOR
-        }
-        return [
-            clip for split, of in clips.items() for clip in of[:: -(-len(of) // PRIOR[split]) or 1]
-        ]
+        """Returns the clips that keep what the model knows, at most `PRIOR` per split."""
+        kept: list[Entry] = []
+        for split, most in PRIOR.items():
+            clips = [clip for clip in self.store.clips if clip.split == split]
+            step = max(1, ceil_div(len(clips), most))
+            kept += clips[::step]
+        return kept
 
     def count(self) -> int:
+        """Returns the number of clips; puts the user's clips into training unless their table
+        names a split.
+        """
         self.folder.splits = {
             name: note.split or "train" for name, note in self.folder.notes.items()
         }
         return self.folder.count() + len(self.kept())
 
     def suit(self, representation: Representation) -> None:
+        """Fits the user's clips to a representation; the clips of the store are features already."""
         self.folder.suit(representation)
 
     def statistics(self) -> tuple[np.ndarray, np.ndarray]:
+        """Returns mean and std (D,) of the store, which the model was trained with."""
         return self.store.mean, self.store.std
 
     def clips(self, fps: float) -> Iterator[Clip]:
+        """Yields the user's clips with their style in the captions, then the clips of the store.
+
+        Raises `UserError` if any motion of the user cannot be read: of a few clips, none is left
+        out.
+        """
         for clip in self.folder.clips(fps):
             yield replace(clip, captions=[styled(caption, self.name) for caption in clip.captions])
-        self.folder.require_all()  # of a few clips, none is left out
+        self.folder.require_all()
+        encoded = self.store.info["representation"]
         for entry in self.kept():
-            features, name, encoded = (
-                self.store.motion(entry),
-                KEPT + entry.id,
-                self.store.info["representation"],
-            )
+            name, features = KEPT + entry.id, self.store.motion(entry)
             yield Clip(name, features, entry.captions, entry.split, name, encoded=encoded)
 
 
 def styled(caption: str, name: str) -> str:
+    """Returns the caption that a clip of the style `name` has in training."""
     return f"{caption.rstrip(' .')} in {name} style"
 
 
 def check_clips(path: str | Path, fps: float) -> None:
-    """Raises `UserError` if motions in a folder cannot be read, their floor rises, or their bodies float above it.
+    """Raises `UserError` if a motion in a folder cannot be read, its floor rises, or its body
+    floats.
 
     Prints the skeletons of the motions, and what was left out of them.
     """
@@ -99,24 +123,31 @@ def check_clips(path: str | Path, fps: float) -> None:
 
 
 def fault_of(joints: np.ndarray, fps: float) -> str:
-    """Returns how far the floor of a clip (F, J, 3) rises, or the body floats; "" within `DRIFT` and `FLOAT`.
+    """Returns how far the floor of a clip rises or its body floats; "" within `DRIFT` and
+    `FLOAT`.
 
-    The floor at a time is the lowest joint within a second around it, which is longer than a jump; height 0 is that of
-    the lowest joint of the clip.
+    Args:
+        joints: (F, J, 3) in meters, y up.
+        fps: frames per second.
     """
+    # The floor at a time is the lowest joint within a second around it. A jump is shorter than that,
+    # so that it does not lift the floor. Height 0 is the lowest joint of the whole clip.
     floor = minimum_filter1d(joints[..., 1].min(1), round(fps), mode="nearest")
     rise, height = floor[-1] - floor[0], np.median(floor) - floor.min()
     if rise > DRIFT:
         return f"drifts upward by {100 * rise:.0f} cm (limit {100 * DRIFT:.0f})"
-    return (
-        f"floats {100 * height:.0f} cm above the floor (limit {100 * FLOAT:.0f})"
-        if height > FLOAT
-        else ""
-    )
+    if height > FLOAT:
+        return f"floats {100 * height:.0f} cm above the floor (limit {100 * FLOAT:.0f})"
+    return ""
 
 
 class LessonBatches(Sampler[list[Draw]]):
-    """Joins the batches of streams, each of the clips with some indices."""
+    """Joins the batches of several streams into one.
+
+    Args:
+        rows: for each stream, the indices of its clips in the data set.
+        streams: batches of indices into these rows.
+    """
 
     def __init__(self, rows: list[np.ndarray], streams: list[TrainingBatches]):
         self.rows, self.streams = rows, streams
@@ -124,17 +155,19 @@ class LessonBatches(Sampler[list[Draw]]):
     def __iter__(self) -> Iterator[list[Draw]]:
         for parts in zip(*self.streams, strict=True):
             yield [
-                (int(r[index]), n)
-                for r, part in zip(self.rows, parts, strict=True)
-                for index, n in part
+                (int(rows[index]), number)
+                for rows, part in zip(self.rows, parts, strict=True)
+                for index, number in part
             ]
 
 
 class LessonData(MotionDataModule):
-    """Serves a `Lesson`: half of each batch is of the user's clips, half of what the model knows."""
+    """Serves a `Lesson`: one half of each batch shows the user's clips, the other half what the
+    model knows.
+    """
 
     def halves(self) -> list[np.ndarray]:
-        """Returns the indices of the user's training clips, and of the others."""
+        """Returns the indices of the user's training clips, and the indices of the others."""
         is_kept = np.array([clip.id.startswith(KEPT) for clip in self.train.clips])
         if is_kept.all():
             raise UserError(
@@ -143,14 +176,18 @@ class LessonData(MotionDataModule):
         return [np.flatnonzero(~is_kept), np.flatnonzero(is_kept)]
 
     def counts(self, store: Store) -> list[str]:
+        """Returns a line with the numbers of training clips of both halves."""
         taught, kept = map(len, self.halves())
         return [
             f"clips: {taught} of {self.source.name}, mirrored copies included; {kept} of what the model knows"
         ]
 
     def training_batches(self, **of_process: int) -> Sampler[list[Draw]]:
-        rows, few = self.halves(), self.batch_size // 2
-        sizes = zip(rows, (self.batch_size - few, few), strict=True)
-        return LessonBatches(
-            rows, [TrainingBatches(self.train.lengths[r], size, **of_process) for r, size in sizes]
-        )
+        """Returns the endless batches of a process; see `MotionDataModule.training_batches`."""
+        halves, smaller = self.halves(), self.batch_size // 2
+        sizes = (self.batch_size - smaller, smaller)
+        streams = [
+            TrainingBatches(self.train.lengths[rows], size, **of_process)
+            for rows, size in zip(halves, sizes, strict=True)
+        ]
+        return LessonBatches(halves, streams)

@@ -1,6 +1,7 @@
-"""Reader of AMASS (SMPL+H G release): downloaded archives or unpacked folders, and joints from the body parameters.
+"""Reader of AMASS (SMPL+H G release), from the downloaded archives or from unpacked folders.
 
-Mahmood et al., "AMASS: Archive of Motion Capture as Surface Shapes", ICCV 2019; license at amass.is.tue.mpg.de.
+Mahmood et al., "AMASS: Archive of Motion Capture as Surface Shapes", ICCV 2019; license at
+amass.is.tue.mpg.de.
 """
 
 from __future__ import annotations
@@ -41,7 +42,15 @@ _BY_NAME = {_plain(alias): name for name, aliases in SUBSETS.items() for alias i
 
 
 class Recording(NamedTuple):
-    """One AMASS file: poses (F, 156), axis-angle of SMPL+H's 52 joints, and translation (F, 3) in meters, z up."""
+    """One AMASS file.
+
+    Args:
+        poses: (F, 156), axis-angle vectors of SMPL+H's 52 joints.
+        translation: (F, 3) in meters, z up.
+        betas: shape of the body.
+        gender: "male", "female" or "neutral".
+        fps: frames per second.
+    """
 
     poses: np.ndarray
     translation: np.ndarray
@@ -50,7 +59,11 @@ class Recording(NamedTuple):
     fps: float
 
     def every(self, fps: float) -> Recording:
-        """Returns every int(self.fps / fps)-th frame, as HumanML3D and FLAME do: at 59.94 or 250 Hz, about `fps`."""
+        """Returns every int(self.fps / fps)-th frame, as HumanML3D and FLAME do.
+
+        Recordings at 59.94 or 250 Hz then have about `fps` frames per second. Raises `UserError`
+        if the recording is slower than `fps`.
+        """
         step = int(self.fps / fps)
         if step < 1:
             raise UserError(
@@ -59,18 +72,23 @@ class Recording(NamedTuple):
         return self.cut(slice(None, None, step))
 
     def cut(self, frames: slice) -> Recording:
+        """Returns the frames of a slice, with the same body."""
         return self._replace(poses=self.poses[frames], translation=self.translation[frames])
 
     def parameters(self) -> np.ndarray:
-        """Returns (F, 75) float32: translation, and rotations of the 24 joints that FLAME uses."""
+        """Returns (F, 75) float32: translation, and axis-angle vectors of the 24 joints that
+        FLAME uses.
+        """
         return np.concatenate([self.translation, self.poses[:, :72]], 1).astype(np.float32)
 
 
 def key_of(path: str) -> str | None:
-    """Returns the key of a recording, such as `BioMotionLab_NTroje/rub001/0000_x_poses`, or None outside a subset.
+    """Returns the key of a recording, such as `BioMotionLab_NTroje/rub001/0000_x_poses`; None
+    outside a subset.
 
-    All names of a subset give the same key, in index files, archives and folders, nested or not. Case is ignored, and
-    spaces are underscores, as in later releases. Files of the SMPL-X release have the keys of SMPL+H.
+    All names of a subset give the same key, in index files, archives and folders, nested or not.
+    Case is ignored, and spaces are underscores, as in later releases. A file of the SMPL-X
+    release has the key of the SMPL+H file.
     """
     whole = PurePosixPath(path).with_suffix("")
     for folder in whole.parents:
@@ -81,7 +99,15 @@ def key_of(path: str) -> str | None:
 
 
 def read(file: Path | bytes, name: str) -> Recording:
-    """Reads a recording, whose numbers must be finite; `name` is used in error messages."""
+    """Reads a recording.
+
+    Args:
+        file: path or content of the .npz file.
+        name: name of the file in error messages.
+
+    Raises:
+        UserError: if the file is not a motion of the SMPL+H G release, or a number is not finite.
+    """
     names = ("poses", "trans", "betas", "gender", "mocap_framerate")
     with naming(name, ValueError), naming(name, KeyError, prefix=f"{RELEASE}: it lacks "):
         data = read_npz(io.BytesIO(file) if isinstance(file, bytes) else file, only=names)
@@ -120,7 +146,7 @@ class Amass:
 
     @cached_property
     def archives(self) -> dict[str, Path]:
-        """Subset -> its archive, recognized by file name."""
+        """Subset -> its archive, recognized by the file name."""
         paths = ((path, ARCHIVE.fullmatch(path.name)) for path in sorted(self.root.rglob("*.tar*")))
         return {
             subset: path
@@ -129,7 +155,9 @@ class Amass:
         }
 
     def missing(self, keys: Collection[str]) -> list[str]:
-        """Returns one line per subset with missing recordings; archives are not opened, so not checked."""
+        """Returns one line per subset with missing recordings. Archives are not opened, so that
+        their contents are not checked.
+        """
         lines = []
         for subset, of_subset in groupby(sorted(keys), _subset_of):
             members = list(of_subset)
@@ -141,6 +169,7 @@ class Amass:
         return lines
 
     def check(self, keys: Collection[str]) -> None:
+        """Raises `FileNotFoundError` if recordings are missing; see `missing`."""
         if absent := self.missing(keys):
             raise FileNotFoundError(f"{self.root}: {'; '.join(absent)}")
 
@@ -150,9 +179,18 @@ class Amass:
         function: Callable[[Argument, Recording], Result],
         workers: int = 0,
     ) -> Iterator[tuple[str, Result]]:
-        """Yields (key, `function(arguments[key], recording)`), sorted; both are picklable, for worker processes."""
+        """Applies a function to recordings in worker processes and yields (key, result), sorted
+        by key.
+
+        Args:
+            arguments: key of each recording -> argument of the function. Keys and arguments must
+                be picklable.
+            function: called as `function(argument, recording)`; must be picklable.
+            workers: number of processes; 0 = one per core.
+        """
         self.check(arguments)
-        # A recording or an archive, and arguments
+        # A task is a single recording or, for subsets that are not unpacked, a whole archive, which
+        # can only be read from its beginning.
         tasks: list[tuple[Path, dict[str, Argument]]] = []
         for subset, keys in groupby(sorted(arguments), _subset_of):
             of_subset = {key: arguments[key] for key in keys}
@@ -160,7 +198,7 @@ class Amass:
                 tasks += [(self.files[key], {key: argument}) for key, argument in of_subset.items()]
             else:
                 tasks.append((self.archives[subset], of_subset))
-        # An archive takes minutes: this process must not begin with one alone.
+        # An archive takes minutes, so that this process must not work on one before the others start.
         for results in in_order(
             partial(_run, function), tasks, min(workers or cores(), len(tasks))
         ):

@@ -26,7 +26,8 @@ from flame_mdm.safe_io import (
 
 MEMBER_LIMIT = 512 * MEBIBYTE
 """Maximum size of one unpacked member in bytes. Motions, captions and arrays are far smaller."""
-HEADER_LIMIT = MEBIBYTE // 16  # maximum size in bytes of a header that describes the next member
+HEADER_LIMIT = MEBIBYTE // 16
+"""Maximum size in bytes of a tar header that describes the next member."""
 _UNPACKERS = {b"\x1f\x8b": gzip.open, b"BZ": bz2.open, b"\xfd7zXZ": lzma.open}
 _HEADERS = (tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.SOLARIS_XHDTYPE, tarfile.GNUTYPE_LONGNAME)
 _HEADERS += (tarfile.GNUTYPE_LONGLINK,)
@@ -36,8 +37,10 @@ _DAMAGE = (*ZIP_ERRORS, tarfile.TarError, lzma.LZMAError, OSError, ValueError)
 def members(path: Path, is_wanted: Callable[[str], bool]) -> Iterator[tuple[str, bytes]]:
     """Yields names and contents of the wanted files in a zip or tar archive.
 
-    Raises `UserError` if it is damaged, expands disproportionately or has too many members, or if one of the wanted
-    files is a link, sparse or encrypted.
+    Raises:
+        UserError: if the archive is damaged, expands disproportionately or has too many members,
+            or if a
+            wanted file is a link, sparse or encrypted.
     """
     size = regular_file(path)
     with path.open("rb") as file:
@@ -55,9 +58,11 @@ def members(path: Path, is_wanted: Callable[[str], bool]) -> Iterator[tuple[str,
 
 
 def as_folder(path: Path, owner: object, is_wanted: Callable[[str], bool]) -> Path:
-    """Returns a folder unchanged; unpacks the `members` of an archive into one that is removed together with `owner`.
+    """Returns a folder for a path: the folder itself, or a temporary one with the `members` of an
+    archive.
 
-    Returns the deepest folder that contains them all; also raises `UserError` if a name leads out.
+    The temporary folder is removed together with `owner`. Returns the deepest folder that
+    contains all members. Also raises `UserError` if the name of a member leads out of the folder.
     """
     if not path.is_file():
         return path
@@ -86,7 +91,7 @@ def _zip_members(
             name = info.filename
             if not name:  # `zipfile` cuts names at a null character
                 raise UserError("a file without a name")
-            # MacOS keeps attributes there
+            # macOS adds a folder __MACOSX with attributes of the files.
             if not info.is_dir() and "__MACOSX" not in name and is_wanted(name):
                 check_member(info)
                 _check_size(name, info.file_size)
@@ -124,7 +129,7 @@ def _check_size(name: str, size: int) -> None:
 
 
 class _Member(tarfile.TarInfo):
-    """A tar member that rejects large headers and sparse files before it reads them."""
+    """A tar member that refuses large headers and sparse files before their content is read."""
 
     def _proc_member(self, archive: tarfile.TarFile) -> Any:
         if self.type == tarfile.GNUTYPE_SPARSE:
@@ -138,16 +143,20 @@ class _Member(tarfile.TarInfo):
 
 
 class _Bounded:
-    """The unpacked content of a compressed file of `packed` bytes, limited in size."""
+    """Reader of the unpacked content of a compressed file of `packed` bytes; refuses implausibly
+    much content.
+    """
 
     def __init__(self, file: IO[bytes], packed: int):
         self.file, self.packed, self.total, self.ended = file, packed, 0, 0
 
     def read(self, size: int) -> bytes:
+        """Returns up to `size` bytes; raises `EOFError` if a reader goes on past the end."""
         data = self.file.read(size)
         self.total += len(data)
         self.ended += not data
-        if self.ended > 2:  # tarfile would go on to the end of a member that declares any size
+        # Without this, tarfile reads on until the end of a member, whose header may declare any size.
+        if self.ended > 2:
             raise EOFError("it ends too early")
         check_expansion(self.total, self.packed)
         return data

@@ -1,7 +1,7 @@
 """BABEL: time-stamped action labels on the motions of AMASS, cut into clips as FLAME does.
 
-Punnakkal et al., "BABEL: Bodies, Action and Behavior with English Labels", CVPR 2021; Kim et al. (FLAME), AAAI 2023,
-appendix "BABEL". `docs/babel.md` describes the set.
+Punnakkal et al., "BABEL: Bodies, Action and Behavior with English Labels", CVPR 2021; Kim et al.
+(FLAME), AAAI 2023, appendix "BABEL". `docs/babel.md` describes the set.
 """
 
 import math
@@ -24,7 +24,7 @@ LENGTH, STRIDE = 128, 10  # frames of a clip, and between the windows of a label
 Segment = tuple[str, list[str] | None, float | None, float | None]  # words, categories, start, end
 GET_IT = "BABEL v1.0 is published at https://babel.is.tue.mpg.de: unpack it, then run `make prepare SOURCE=/path/to/it`"
 
-# Extra: only the first annotator's labels
+# Files of each part. In the files called extra, only the labels of the first annotator are used.
 PARTS = {
     "train": ("train", "extra_train"),
     "val": ("val", "extra_val"),
@@ -36,7 +36,7 @@ class Label(NamedTuple):
 
     motion: str  # key of the AMASS recording, as returned by `amass.key_of`
     text: str
-    start: float | None  # seconds, like the end; None if BABEL does not give them
+    start: float | None  # seconds, like `end`; None if BABEL gives no times
     end: float | None
     kind: Literal["words", "category"]  # the annotator's words or the category of the action
 
@@ -51,14 +51,22 @@ class Window(NamedTuple):
 
 
 class Babel(MotionSource):
-    """Clips of `LENGTH` frames, as raw motions of the SMPL representations, in AMASS's coordinates.
+    """Clips of `LENGTH` frames, as raw motions of the SMPL representations, in AMASS's
+    coordinates.
 
-    A longer label gives one window every `STRIDE` frames. A shorter one is extended past its end, or left out if the
-    motion ends before. A label covers frames floor(20 start) to floor(20 end) - 1, as in FLAME's code.
+    A label covers frames floor(20 start) to floor(20 end) - 1, as in FLAME's code. A label longer
+    than a clip gives one window every `STRIDE` frames. A shorter label is extended past its end;
+    it is left out if the motion ends before.
 
-    Both splits train on BABEL's entire train part and test on 20 % of its val part: ours on 20 % of the motions, so
-    that no motion is in two splits, FLAME's on every fifth clip, so that overlapping windows are in both val and test.
-    `path` is the folder of BABEL v1.0, `amass` that of AMASS's SMPL+H G release, as archives or unpacked.
+    Both splits train on BABEL's entire train part and test on 20 % of its val part. Our split
+    draws 20 % of the motions, so that no motion is in two splits. FLAME's split takes every fifth
+    clip, so that overlapping windows are in both val and test.
+
+    Args:
+        path: folder of BABEL v1.0.
+        amass: folder of AMASS's SMPL+H G release, as archives or unpacked.
+        published_split: whether to use FLAME's split.
+        workers: number of processes; 0 = one per core.
     """
 
     name = "babel"
@@ -73,13 +81,16 @@ class Babel(MotionSource):
         self.options = {"published_split": published_split}
 
     def counts(self) -> dict[str, int]:
+        """Returns the number of labels in the files."""
         files = (self.path / f"{name}.json" for part in PARTS for name in PARTS[part])
         return {"labels": sum(1 for file in files for _ in self._annotations(file))}
 
     def count(self) -> int:
+        """Returns the number of clips; reads the labels and measures the motions."""
         return len(self.windows)
 
     def clips(self, fps: float) -> Iterator[Clip]:
+        """Yields the clips, motion by motion, with the attributes `motion`, `start` and `label`."""
         self.check_fps(fps, FPS)
         windows: defaultdict[str, list[Window]] = defaultdict(list)
         for window in self.windows:
@@ -89,13 +100,12 @@ class Babel(MotionSource):
                 source = id_ if self.published_split else key
                 attributes = {"motion": key, "start": start, "label": label.kind}
                 yield Clip(
-                    id_,
-                    motion,
-                    [label.text],
-                    split,
-                    source,
-                    None,
-                    attributes,
+                    id=id_,
+                    motion=motion,
+                    captions=[label.text],
+                    split=split,
+                    source=source,
+                    attributes=attributes,
                     window=(start, LENGTH),
                 )
 
@@ -113,35 +123,29 @@ class Babel(MotionSource):
             number = 0
             for label in labels[part]:
                 starts, reason = _starts(label, lengths[label.motion])
-                if (
-                    starts
-                    and part == "val"
-                    and label.motion in trained
-                    and not self.published_split
-                ):
+                is_trained = part == "val" and label.motion in trained
+                if starts and is_trained and not self.published_split:
                     reason = "labels of the val part on motions of the train part"
                 if reason:
                     self.leave_out(reason)
                 else:
                     for n, start in enumerate(starts, number):
-                        windows.append(
-                            Window(
-                                f"{part}_{n:06d}", self._split(part, n, label.motion), start, label
-                            )
-                        )
+                        split = self._split(part, n, label.motion)
+                        windows.append(Window(f"{part}_{n:06d}", split, start, label))
                 number += len(starts)
         return windows
 
     def labels(self, part: str) -> list[Label]:
-        """Returns the labels of a part in FLAME's order: for each file the annotators' words, then the categories.
+        """Returns the labels of a part ("train" or "val") in FLAME's order.
 
-        Empty labels and repeated labels (same text, motion, start and end) are dropped.
+        For each file, the words of the annotators come first, then the categories. Empty and
+        repeated labels (same text, motion, start and end) are dropped.
         """
         labels = []
         for name in PARTS[part]:
             words, categories = [], []
             for motion, (text, kinds, start, end) in self._annotations(self.path / f"{name}.json"):
-                # FLAME's code drops the words if the list of categories is empty
+                # FLAME's code drops the words of a label whose list of categories is empty.
                 if kinds is None or kinds:
                     words.append(Label(motion, text, start, end, "words"))
                 categories += [Label(motion, kind, start, end, "category") for kind in kinds or ()]
@@ -176,7 +180,9 @@ class Babel(MotionSource):
 
 
 def _segment(label: dict[str, Any]) -> Segment:
-    """Returns the fields of a label that are used; raises `TypeError` if one is of another kind."""
+    """Returns the fields of a label that are used; raises `TypeError` if a field has another
+    type.
+    """
     text, kinds, times = label["proc_label"], label["act_cat"], (label["start_t"], label["end_t"])
     are_texts = all(isinstance(value, str | None) for value in (text, *(kinds or ())))
     if not are_texts or not all(time is None or -1e6 < time < 1e6 for time in times):
@@ -185,7 +191,9 @@ def _segment(label: dict[str, Any]) -> Segment:
 
 
 def _starts(label: Label, frames: int) -> tuple[range, str]:
-    """Returns the first frame of each clip of a label in a motion of `frames` frames, or why there are none."""
+    """Returns the first frame of each clip of a label in a motion of `frames` frames, or why
+    there is none.
+    """
     none = range(0)
     if label.text == "transition":
         return none, "transitions"

@@ -44,14 +44,18 @@ _TOES = np.array([np.sin(0.153), 0.0, np.cos(0.153)])  # where SMPL's left foot 
 
 
 def _axes(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Returns orthonormal columns: the direction of x, the part of y perpendicular to x, and their cross product."""
+    """Returns orthonormal columns: the direction of x, the part of y that is perpendicular to x,
+    and their cross product.
+    """
     first = x / np.linalg.norm(x)
     third = np.cross(first, y) / np.linalg.norm(np.cross(first, y))
     return np.stack([first, np.cross(third, first), third], 1)
 
 
 def _limb(name: str, bone: Sequence[float] | np.ndarray, y: np.ndarray) -> dict[str, np.ndarray]:
-    """Returns the axes of the left and right joint; the right axes are mirrored, so its bone is on -x."""
+    """Returns the axes of a joint of the left limb and, mirrored, of the right limb, whose bone
+    lies on -x.
+    """
     left = _axes(np.asarray(bone), y)
     return {f"{name}_L": left, f"{name}_R": np.diag([1.0, -1.0, -1.0]) @ left}
 
@@ -60,9 +64,10 @@ def _sloping(degrees: float) -> np.ndarray:
     return np.cos(np.radians(degrees)) * _TOES - np.sin(np.radians(degrees)) * _UP
 
 
-# Directions of each joint's local axes (columns) when the body is in SMPL's rest pose, in which all rotations of SMPL
-# are the identity: standing straight, feet flat, arms out, palms down. The bones of arms and legs lie on x and have the
-# directions of SMPL's rest pose; knees and elbows bend about y. `docs/bandai.md` explains how the axes were measured.
+# Directions of each joint's local axes (columns) when the body is in SMPL's rest pose: standing straight,
+# feet flat, arms out, palms down. In this pose, all rotations of SMPL are the identity. The bones of arms
+# and legs lie on x and have the directions of SMPL's rest pose; knees and elbows bend about y.
+# `docs/bandai.md` explains how the axes were measured.
 REST = {
     "Hips": _axes(_UP, -_LEFT),
     **dict.fromkeys(("Spine", "Chest", "Neck", "Head"), _axes(_UP, _FORWARD)),
@@ -75,14 +80,15 @@ REST = {
     **_limb("Foot", _sloping(39.8), np.cross(_UP, _TOES)),
     **_limb("Toes", _sloping(23.0), np.cross(_UP, _TOES)),
 }
-# y up <-> AMASS's z up: (-x, z, y), so that motions look the same after the SMPL representation decodes them.
+# Swaps y up and AMASS's z up: (-x, z, y). The SMPL representation swaps them again when it decodes.
 AXES = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
 
 WORDS = read_yaml(Path(__file__).with_suffix(".yaml"))  # contents, styles and captions
 CONTENTS_1, STYLES_1 = tuple(WORDS["dataset_1"]["contents"]), tuple(WORDS["dataset_1"]["styles"])
 STYLES_2 = tuple(WORDS["dataset_2"]["styles"])
 TAKES_2: dict[str, list[int]] = WORDS["dataset_2"]["takes"]
-"""Published takes of data set 2, by content and STYLES_2: the split must not depend on which files are present."""
+"""Numbers of published takes of data set 2 by content, in the order of `STYLES_2`. Splits are drawn from these
+numbers, so that they do not depend on which files are present."""
 
 WRONG_SIDE, SIDES = WORDS["wrong_side"], WORDS["sides"]
 HELD_OUT = frozenset(
@@ -100,7 +106,10 @@ FILE = re.compile(r"dataset-([12])_([^_]+)_([^_]+)_(\d+)\.bvh")
 
 
 class Take(NamedTuple):
-    """One BVH file; `content` is the action performed, which differs from the file name for takes in `WRONG_SIDE`."""
+    """One BVH file.
+
+    `content` is the action that the actor performs. It differs from the file name for the takes in `WRONG_SIDE`.
+    """
 
     file: Path
     dataset: int
@@ -113,11 +122,17 @@ class Bandai(MotionSource):
     """Both data sets on SMPL's skeleton, with captions generated from content and style.
 
     Args:
-        path: a clone of the original repository, any folder above the BVH files, or an archive of one.
-        motion: "joints" for representations of joint positions, "smpl" for those of SMPL's rotations.
-        mirror: yield a mirrored copy after each clip of the training split.
-        split: "takes" holds out takes of combinations of content and style that training sees; "compositional"
-            holds out the combinations `HELD_OUT`, whose contents and styles training sees only in others.
+        path: a clone of the original repository, any folder above the BVH files, or an archive of
+            one.
+        motion: "joints" for representations of joint positions, "smpl" for representations of
+            rotations.
+        mirror: whether a mirrored copy follows each clip of the training split.
+        workers: number of processes; 0 = one per core.
+        exclude: file names, without extension, of takes to leave out.
+        split: "takes" holds out takes of combinations of content and style that training sees.
+            "compositional" holds out the combinations `HELD_OUT`: training sees their contents
+                and styles
+            only in other combinations.
     """
 
     name = "bandai"
@@ -144,23 +159,28 @@ class Bandai(MotionSource):
         }
 
     def count(self) -> int:
+        """Returns the number of takes and mirrored copies."""
         return sum(1 + (self.mirror and take.split == "train") for take in self.takes)
 
     def counts(self) -> dict[str, int]:
+        """Returns the numbers of takes, together and per data set."""
         one, two = ([take.dataset for take in self.takes].count(number) for number in (1, 2))
         return {"takes": one + two, "takes of data set 1": one, "takes of data set 2": two}
 
     def clips(self, fps: float) -> Iterator[Clip]:
+        """Yields each take, in training followed by its mirrored copy.
+
+        The attributes are content, style, dataset and, if a side moves, side.
+        """
         convert_one = partial(convert, fps=fps, kind=self.motion)
         motions = in_order(convert_one, [take.file for take in self.takes], self.workers)
         for take, motion in zip(self.takes, motions, strict=True):
             side, name = side_of(take.content), take.file.stem
             attributes = {"content": take.content, "style": take.style, "dataset": take.dataset}
-            attributes |= {"side": side} if side else {}
-            texts, action = (
-                captions(take.content, take.style, side),
-                self.actions.index(take.content),
-            )
+            if side:
+                attributes["side"] = side
+            texts = captions(take.content, take.style, side)
+            action = self.actions.index(take.content)
             clip = Clip(name, motion, texts, take.split, name, action, attributes)
             yield clip
             if self.mirror and take.split == "train":
@@ -189,7 +209,16 @@ class Bandai(MotionSource):
 
 
 def convert(file: Path, fps: float, kind: str = "joints") -> np.ndarray:
-    """Converts a BVH file to joints (F, 22, 3) float32 in meters, y up, or to the motion of `smpl_motion`, at `fps`."""
+    """Converts a BVH file to joints (F, 22, 3) float32 in meters, y up, or to an SMPL motion.
+
+    Args:
+        file: the BVH file.
+        fps: frames per second of the result.
+        kind: "joints", or "smpl" for the motion (F, 75) of `smpl_motion`.
+
+    Raises:
+        UserError: if the file has another skeleton, or a joint jumps.
+    """
     recording = read_recording(file, fps, standard=_standard)
     if recording.doubts.jump:
         raise UserError(f"{file}: {recording.doubts.jump}")
@@ -207,13 +236,19 @@ def _standard(tree: bvh.Bvh) -> tuple[bvh.Bvh, dict[str, Any]]:
 
 
 def smpl_motion(skeleton: bvh.Bvh, rotations: np.ndarray, translations: np.ndarray) -> np.ndarray:
-    """Converts a take to (F, 75) float32 in AMASS's axes, z up: pelvis in meters, axis-angle vectors of 24 joints.
+    """Converts a take to an SMPL motion (F, 75) float32 in AMASS's axes, z up.
 
-    SMPL's parent of a joint is the parent in the file, except for spine1, which lies between two joints of the file and
-    rotates with the pelvis. So a rotation of SMPL is that of the file in the axes of the rest pose:
-    B_parent R B_joint^-1. `rotations` and `translations` (F, J, ...), in centimeters, are in the frame of the parent.
-    Hands (22 and 23) do not rotate.
+    A frame holds the position of the pelvis in meters and the axis-angle vectors of 24 joints.
+    The hands (22 and 23) do not rotate.
+
+    Args:
+        skeleton: skeleton of the file.
+        rotations: (F, J, 3, 3), each in the frame of the parent joint.
+        translations: (F, J, 3) in centimeters, each in the frame of the parent joint.
     """
+    # A joint of SMPL has the same parent as in the file, except spine1: it lies between two joints of the
+    # file and rotates with the pelvis. So a rotation R of the file only needs the axes B of the rest pose
+    # to become a rotation of SMPL: B_parent R B_joint^-1.
     positions, turned = bvh.forward_kinematics(skeleton.parents, rotations, translations)
     local = np.tile(np.eye(3), (len(rotations), 24, 1, 1))
     hips = skeleton.joints.index("Hips")
@@ -239,13 +274,15 @@ def mirror(motion: np.ndarray) -> np.ndarray:
 
 
 def side_of(content: str) -> str:
-    """Returns the side that moves or is moved to: left, right, both, or "" if a content has none."""
+    """Returns the side that moves or that the body moves to: left, right or both; "" if a content
+    has none.
+    """
     named = re.search("left|right|both", content)
     return named[0] if named else SIDES.get(content, "")
 
 
 def captions(content: str, style: str, side: str) -> list[str]:
-    """Returns four descriptions in the style of HumanML3D."""
+    """Returns four captions of a take, worded like the captions of HumanML3D."""
     contents, styles = WORDS["contents"], WORDS["styles"]
     phrases = zip(contents[re.sub("left|right", "{side}", content)], styles[style], strict=True)
     filled = (
@@ -255,12 +292,14 @@ def captions(content: str, style: str, side: str) -> list[str]:
 
 
 def split_of(dataset: int, content: str, style: str, number: int, rule: str = "takes") -> Split:
-    """Returns the split of a take, determined by its name.
+    """Returns the split of a take, which depends on its name alone.
 
-    With the rule "compositional", the combinations `HELD_OUT` are the test split, and other test takes are used for
-    training. Neighboring takes look alike, so blocks of five go to one split. Data set 1 has a single take of most
-    combinations, so there each combination goes to one split. The normal takes of walk-turn-left and -right overlap in
-    time across names and are all used for training.
+    Neighboring takes look alike, so that blocks of five stay in one split. Data set 1 has a
+    single take of most combinations, so that a whole combination goes to one split. The normal
+    takes of walk-turn-left and -right overlap in time across names and are all used for training.
+
+    With the rule "compositional", the combinations `HELD_OUT` are the test split, and takes that
+    the rule "takes" tests on are used for training.
     """
     if rule == "compositional":
         if (content, style) in HELD_OUT:
@@ -292,5 +331,7 @@ def _take(file: Path, rule: str) -> Take:
 
 
 def prompts() -> list[str]:
-    """Returns fixed prompts worded like the captions; recipes of this data set use them for dashboard samples."""
+    """Returns fixed prompts worded like the captions. The recipes of this data set show samples
+    for them.
+    """
     return WORDS["prompts"]

@@ -17,9 +17,14 @@ ARRAYS = ("J_regressor", "v_template", "kintree_table", "shapedirs")
 
 
 def load_offsets(path: Path) -> tuple[tuple[float, float, float], ...]:
-    """Returns the positions of SMPL's 24 joints relative to their parents in the rest pose of the mean shape, meters.
+    """Returns the positions of SMPL's 24 joints relative to their parents, in meters.
 
-    `path` is SMPL's .pkl from https://smpl.is.tue.mpg.de, of which no code runs, or an .npz with the same arrays.
+    The body is the mean shape in the rest pose.
+
+    Args:
+        path: SMPL's .pkl from https://smpl.is.tue.mpg.de, of which no code is run, or an .npz
+            file with the
+            same arrays.
     """
     with naming(
         path, KeyError, TypeError, IndexError, ValueError, prefix="not a SMPL model of 24 joints: "
@@ -42,7 +47,9 @@ def load_offsets(path: Path) -> tuple[tuple[float, float, float], ...]:
 def _rest_joints(
     regressor: Any, vertices: Any, tree: Any, joints: int, parents: tuple[int, ...]
 ) -> np.ndarray:
-    """Returns rest joints (J, 3) of a model of `joints` joints, of which the first ones have these parents."""
+    """Returns the rest joints (J, 3) of a model; raises `ValueError` if its first joints do not
+    have `parents`.
+    """
     regressor, vertices = np.asarray(regressor, np.float64), np.asarray(vertices, np.float64)
     numbers = np.asarray(tree)[0, 1 : len(parents)].tolist()
     if (
@@ -60,13 +67,20 @@ def _rest_joints(
 
 
 class Body(NamedTuple):
-    """Rest joints of SMPL+H (the first 22), meters: `rest` (22, 3) of the mean shape, `shape` (22, 3, 10) per beta."""
+    """The first 22 rest joints of SMPL+H as a function of the shape, in meters.
+
+    Args:
+        rest: (22, 3), joints of the mean shape.
+        shape: (22, 3, 10), displacement of the joints per beta.
+    """
 
     rest: torch.Tensor
     shape: torch.Tensor
 
     def joints(self, recording: Recording) -> np.ndarray:
-        """Returns joints (F, 22, 3) float64 in meters, y up as in HumanML3D: AMASS's (-x, z, y)."""
+        """Returns joints (F, 22, 3) float64 of a recording in meters, y up as in HumanML3D:
+        AMASS's (-x, z, y).
+        """
         betas = torch.from_numpy(recording.betas[:10].astype(np.float64))
         rest = self.rest + self.shape[..., : len(betas)] @ betas
         poses = torch.from_numpy(recording.poses[:, :66].astype(np.float64)).unflatten(1, (22, 3))
@@ -77,7 +91,11 @@ class Body(NamedTuple):
 
 
 def load_body(folder: Path, gender: str) -> Body:
-    """Loads `male/model.npz` or `SMPLH_MALE.npz` of the extended SMPL+H model, in the folder or its folder `smplh`."""
+    """Loads the extended SMPL+H model of a gender.
+
+    The file is `male/model.npz` or `SMPLH_MALE.npz` (for "male"), in the folder or in its folder
+    `smplh`.
+    """
     names = (f"{gender}/model.npz", f"SMPLH_{gender.upper()}.npz")
     candidates = [folder / inner / name for inner in ("", "smplh") for name in names]
     path = next((path for path in candidates if path.is_file()), None)

@@ -18,9 +18,10 @@ SPLITTABLE = 10  # number of motions from which on each split has at least one
 def table_rows(
     path: Path, columns: Collection[str] = COLUMNS
 ) -> Iterator[tuple[str, dict[str, str]]]:
-    """Yields file and line, for errors, and the cells by column of each row of a table of captions.
+    """Yields the rows of a table of captions: file and line, for errors, and the cells by column.
 
-    Raises `UserError` if the table is damaged, or has other `columns` than these, of which only `id` is required.
+    Raises `UserError` if the table is damaged, has no column `id`, or has a column that is not in
+    `columns`.
     """
     rows = csv.DictReader(
         io.StringIO(read_text(path).removeprefix("\ufeff"), newline=""), strict=True
@@ -41,7 +42,7 @@ def table_rows(
 
 
 def known_split(split: str) -> Split:
-    """Returns the name of a split in a table; raises `UserError` if there is no such split."""
+    """Returns `split` if it is the name of a split; raises `UserError` otherwise."""
     for name in SPLITS:
         if split == name:
             return name
@@ -51,14 +52,16 @@ def known_split(split: str) -> Split:
 def drawn_splits(
     sources: Mapping[str, str], stated: Mapping[str, Split | None]
 ) -> dict[str, Split]:
-    """Returns the split of each motion: the stated one, else one drawn by a hash of the source.
+    """Returns the split of each motion: the split in the table, else one drawn by a hash of the
+    source.
 
-    An empty training split, and in a set of `SPLITTABLE` or more motions any empty split, gets the source with the
-    highest hash from the split with the most sources. All motions of a source stay in one split.
+    All motions of a source stay in one split. If no motion is drawn for training, the source with
+    the highest hash moves there from the split with the most sources. With `SPLITTABLE` or more
+    motions, val and test are filled in the same manner.
 
     Args:
         sources: name of each motion -> its source.
-        stated: name of each motion -> its split in the table; None = none.
+        stated: name of each motion -> its split in the table, or None.
     """
     of_sources: dict[str, Split] = {sources[name]: split for name, split in stated.items() if split}
     free = sorted(set(sources.values()) - set(of_sources))

@@ -49,6 +49,7 @@ def updates(network: nn.Module) -> dict[str, Callable[[], object]]:
 
 
 def measure(settings: Settings) -> Section:
+    """Times the moving average of weights and returns the section of the page."""
     rounds = 1 if settings.quick else 100
     rows: list[Row] = []
     faster: dict[str, float] = {}

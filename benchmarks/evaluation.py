@@ -41,12 +41,15 @@ class Stub(Extractor):
         self.table = torch.randn(len(captions), WIDTH)
 
     def check(self, representation: Any, dataset: str) -> None:
+        """Accepts all motions."""
         pass
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
+        """Returns the first `WIDTH` numbers of two frames as features."""
         return {"features": features[:, :2].flatten(1)[:, :WIDTH]}
 
     def texts(self, captions: Sequence[str], tokens: Any) -> Tensor:
+        """Returns a row of random numbers per caption."""
         return self.table[[self.rows[caption] for caption in captions]]
 
 
@@ -98,6 +101,7 @@ class Identity(nn.Module):
     num_features = WIDTH
 
     def forward(self, features: Tensor) -> Tensor:
+        """Returns the features unchanged."""
         return features
 
 
@@ -128,6 +132,7 @@ def fid(motions: int, rounds: int) -> list[Row]:
 
 
 def measure(settings: Settings) -> Section:
+    """Times an evaluation without its extractor and returns the section of the page."""
     motions, rounds = (40, 1) if settings.quick else (4600, 3)
     torch.manual_seed(0)
     clips = random_clips(motions)

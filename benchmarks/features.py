@@ -74,6 +74,7 @@ def loop(joints: np.ndarray, heading: np.ndarray) -> np.ndarray:
 
 
 def measure(settings: Settings) -> Section:
+    """Times the encoding of features and returns the section of the page."""
     rounds = 1 if settings.quick else 15
     torch.set_num_threads(1)
     motions = [motion(seed) for seed in range(CLIPS)]

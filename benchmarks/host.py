@@ -55,6 +55,7 @@ class Clock(Callback):
         self.times: list[float] = []
 
     def on_train_batch_end(self, *_: Any) -> None:
+        """Keeps the time of the thread after each step."""
         self.times.append(time.thread_time())
 
     def median(self) -> float:
@@ -75,6 +76,7 @@ def built(folder: Path) -> tuple[list[MotionBatch], GeneratorTask]:
 
 
 def loss_of(task: GeneratorTask, batch: MotionBatch) -> Tensor:
+    """Returns the loss of a batch, computed without Lightning."""
     model = task.generator
     cond = model.condition(batch)
     return model.process.loss(model.denoiser, batch.x, batch.mask, cond, auxiliary=task.losses)[
@@ -94,11 +96,13 @@ class Bare(LightningModule):
         )
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
+        """Returns and logs the loss."""
         loss = loss_of(self.task[0], batch)
         self.log("loss", loss, batch_size=len(batch))
         return loss
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
+        """Returns the optimizer of the recipe."""
         return self.task[0].make_optimizer()
 
 
@@ -191,6 +195,7 @@ def parts(steps: int, folder: Path) -> dict[str, float]:
 
 
 def measure(settings: Settings) -> Section:
+    """Times the framework's share of a step and returns the section of the page."""
     steps, rounds = (12, 1) if settings.quick else (150, 10)
     warnings.filterwarnings("ignore")
     torch.set_num_threads(1)

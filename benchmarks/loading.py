@@ -46,12 +46,14 @@ def training(features: int) -> Callable[[MotionBatch], None]:
 
 
 def batches_of(data: MotionDataModule, resident: bool, workers: int = 0) -> Iterator[MotionBatch]:
+    """Returns the training batches of a data set, kept on the device or loaded by workers."""
     data.resident, data.num_workers = resident, workers
     data.setup("fit")
     return iter(data.train_dataloader())
 
 
 def measure(settings: Settings) -> Section:
+    """Times the batches of a data set and returns the section of the page."""
     clips, count, rounds = (100, 3, 1) if settings.quick else (1000, 20, 10)
     torch.manual_seed(0)
     torch.set_num_threads(1)

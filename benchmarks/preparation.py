@@ -40,6 +40,7 @@ class Peaks(threading.Thread):
         self.done = threading.Event()
 
     def run(self) -> None:
+        """Keeps the largest memory of this process and of its children until `done` is set."""
         while not self.done.wait(0.5):
             workers = [private(child.pid or 0) for child in multiprocessing.active_children()]
             self.main = max(self.main, private(multiprocessing.current_process().pid or 0))
@@ -71,6 +72,9 @@ def prepare(clips: int) -> None:
 
 
 def measure(settings: Settings) -> Section:
+    """Measures memory and time of the preparation of large data sets and returns the section of
+    the page.
+    """
     rows: list[Row] = []
     growth: list[tuple[float, float]] = []
     for size in [2000] if settings.quick else [250_000, 1_000_000]:

@@ -75,6 +75,7 @@ def interval(sample: Sequence[float]) -> tuple[float, float]:
 
 
 def measure(settings: Settings) -> Section:
+    """Compares the metrics of runs that differ in speed only and returns the section of the page."""
     folder = Path(settings.runs or ".")
     tables: dict[str, list[Row]] = {}
     differing: list[str] = []

@@ -77,6 +77,7 @@ def inputs(batch: int, size: Size) -> tuple[Tensor, Tensor, Condition]:
 
 
 def options(sampler: str, steps: int) -> SamplerOptions:
+    """Returns the options of a sampler with a number of steps."""
     return SamplerOptions(sampler=sampler, num_inference_steps=steps)
 
 
@@ -192,6 +193,7 @@ def loops(size: Size) -> list[Row]:
 
 @torch.no_grad()
 def measure(settings: Settings) -> Section:
+    """Times samplers and returns the section of the page."""
     torch.manual_seed(0)
     size = Size(settings.device)
     if settings.quick:

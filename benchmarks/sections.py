@@ -39,6 +39,7 @@ class Settings:
 
 
 def section(title: str, text: str, summary: str, tables: Mapping[str, Sequence[Row]]) -> Section:
+    """Returns the content of a section of the page."""
     return {
         "title": title,
         "text": " ".join(text.split()),
@@ -84,6 +85,7 @@ def body(content: Section) -> str:
 
 
 def show(content: Section) -> None:
+    """Prints a section and its summary."""
     print(f"{body(content)}\n\n{content['summary']}")
 
 

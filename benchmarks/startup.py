@@ -64,12 +64,14 @@ def run(folder: Path, *words: str) -> None:
 
 
 def minimal_work(folder: Path, command: str, numbers: itertools.count) -> None:
+    """Runs a command with as little work as possible."""
     words, varying = WORK[command]
     number = next(numbers)
     run(folder, "-m", "flame_mdm", command, *words, *(word.format(number) for word in varying))
 
 
 def measure(settings: Settings) -> Section:
+    """Times the start of commands and returns the section of the page."""
     commands = ["sample"] if settings.quick else list(WORK)
     rounds = 1 if settings.quick else 3
     with tempfile.TemporaryDirectory() as temporary:

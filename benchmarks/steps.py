@@ -68,6 +68,7 @@ class Peer(nn.Module):
         self.token, self.dropout = nn.Linear(512, width), nn.Dropout(0.1)
 
     def forward(self, x: Tensor, mask: Tensor, cond: Tensor) -> Tensor:
+        """Returns the network's output for a batch in the layout of the authors' code."""
         tokens = self.dropout(torch.cat([self.token(cond)[None], self.input(x.transpose(0, 1))]))
         padding = ~torch.cat([mask.new_ones(len(mask), 1), mask], 1)
         return self.output(self.encoder(tokens, src_key_padding_mask=padding))[1:].transpose(0, 1)
@@ -88,6 +89,7 @@ def peer_step(width: int, layers: int, device: str) -> Callable[[MotionBatch], N
 
 
 def build_task(config: dict[str, Any]) -> GeneratorTask:
+    """Returns the task of a recipe."""
     return GeneratorTask.build(config, instantiate(config["representation"]))
 
 
@@ -115,6 +117,7 @@ def recipe_step(
 
 
 def batch_of(lengths: np.ndarray, frames: int, device: str) -> MotionBatch:
+    """Returns a random batch with these lengths, padded to `frames`."""
     mask = torch.arange(frames) < torch.from_numpy(lengths)[:, None]
     x = torch.randn(len(lengths), frames, WIDTH) * mask[..., None]
     return MotionBatch(x.to(device), mask.to(device), [str(i) for i in range(len(lengths))])
@@ -238,6 +241,7 @@ def summary(rows: Sequence[Row]) -> str:
 
 
 def measure(settings: Settings) -> Section:
+    """Times training steps and returns the section of the page."""
     warnings.filterwarnings("ignore")
     torch.manual_seed(0)
     torch.set_float32_matmul_precision("high")  # as in training

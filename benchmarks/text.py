@@ -23,6 +23,7 @@ PARTS = [
 
 
 def measure(settings: Settings) -> Section:
+    """Times text encoders with and without cached embeddings and returns the section of the page."""
     size, rounds = (2, 1) if settings.quick else (64, ROUNDS)
     condition = compose("quickstart", ["condition=minilm_offline"])["condition"]
     live, cached = (instantiate(condition | {"tokens": True}) for _ in range(2))

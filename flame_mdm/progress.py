@@ -28,6 +28,7 @@ class ProgressBar(tqdm):
             yield item
 
     def update(self, n: float | None = 1) -> bool | None:
+        """Advances the bar by `n`; first raises the exception of a received signal."""
         raise_received()
         return super().update(n)
 

@@ -97,6 +97,7 @@ class Run:
 
     @property
     def samples(self) -> Path | None:
+        """Folder of the samples of the last step, None if there are none."""
         folders = [path.parent for path in self.folder.glob("samples/step_*/motion_000.npz")]
         return max(
             (path for path in folders if path.name.removeprefix("step_").isdecimal()), default=None
@@ -112,6 +113,7 @@ class Run:
 
 
 def check_run(folder: Path) -> None:
+    """Raises `UserError` if a folder is not the directory of a run."""
     if not (folder / CONFIG).exists():
         raise UserError(
             f"{folder}: contains no {CONFIG}; give a run directory, such as runs/synthetic/mdm/default"

@@ -65,14 +65,19 @@ class StopRequest:
         self.handlers: dict[int, Any] = {}
 
     def install(self) -> None:
+        """Replaces the handlers of the signals by `note`."""
         self.handlers = {signum: signal.signal(signum, self.note) for signum in self.SIGNALS}
 
     def restore(self) -> None:
+        """Restores the handlers that `install` replaced."""
         for signum, handler in self.handlers.items():
             signal.signal(signum, handler)
         self.handlers = {}
 
     def note(self, signum: int, frame: FrameType | None) -> None:
+        """Notes a signal, so that training stops after the step. A second Ctrl-C ends the process
+        at once.
+        """
         repeated = self.signum == signum and time.monotonic() > self.time + 1
         if self.signum and (signum == signal.SIGINT or (signum == signal.SIGTERM and repeated)):
             kill_children()

@@ -69,6 +69,7 @@ class Change(nn.Module):
         self.dropped = nn.ParameterDict({} if is_kept else parts)
 
     def forward(self, weight: Tensor) -> Tensor:
+        """Returns `weight` with all changes added."""
         return changed(weight, dict((*self.kept.items(), *self.dropped.items())), self.rows)
 
 

@@ -218,10 +218,12 @@ def write_model_file(
 
 
 def content_sha256(text: str, state: Mapping[str, Tensor]) -> str:
+    """Returns a hash of the metadata `text` and the weights of a model file."""
     return hashlib.sha256(f"{text}\n{state_sha256(state)}".encode()).hexdigest()
 
 
 def state_sha256(state: Mapping[str, Tensor]) -> str:
+    """Returns a hash of names, types, shapes and values of tensors, in the order of their names."""
     import torch
 
     digest = hashlib.sha256()

@@ -135,17 +135,23 @@ class Probe:
         self.records: list[tuple[Tensor, int, list[float]]] = []
 
     def unit(self, number: int) -> Tensor:
+        """Returns the unit vector (1, 1, 2 * calls + 1) of a quantity: a draw of noise, or a
+        clean estimate.
+        """
         return functional.one_hot(torch.tensor(number), 2 * self.calls + 1).double()[None, None]
 
     def noise(self, draw: int) -> Tensor:
+        """Returns a unit vector in place of a draw of noise, and counts the draws."""
         self.draws = draw + 1
         return self.unit(draw)
 
     def denoise(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
+        """Returns a constant in place of the denoiser's output, and keeps the time of the call."""
         self.time = float(t[0])
         return x_t.new_full((1, 1, self.process.out_features(x_t.shape[-1])), self.output)
 
     def steer(self, clean: Callable[[Tensor], Tensor], x_t: Tensor) -> Tensor:
+        """Records the coefficients p and q of a call from two inputs of almost nothing."""
         if len(self.records) == self.calls:
             raise UserError("it chooses its own steps")
         row = []
@@ -156,6 +162,7 @@ class Probe:
         return x_t
 
     def reach(self, x0_hat: Tensor) -> Tensor:
+        """Returns the unit vector of a clean estimate in place of the estimate."""
         return self.unit(self.calls + len(self.records))
 
 
@@ -243,6 +250,16 @@ class Call(nn.Module):
         condition: Tensor | None = None,
         counts: Tensor | None = None,
     ) -> Tensor:
+        """Returns the guided output (B, F, features) of the denoiser.
+
+        Args:
+            x_t: (B, F, D), noisy motion.
+            t: (B,), times in units of the denoiser's table.
+            lengths: (B,), frames of each motion.
+            condition: (B, S) tokens of texts, or (B,) numbers of actions; None for an
+                unconditional model.
+            counts: (B,), tokens of each text.
+        """
         mask = length_mask(lengths, x_t.shape[1])
         if (
             isinstance(self.condition, LearnedTokens)

@@ -174,6 +174,7 @@ def read_file(path: Path, most: int) -> bytes:
 
 
 def first_line(error: Exception) -> str:
+    """Returns the first line of an error's message, or its type if it has none."""
     lines = str(error).strip().splitlines()
     return lines[0] if lines else type(error).__name__
 

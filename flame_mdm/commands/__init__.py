@@ -30,6 +30,7 @@ STORE = "store.json"
 
 
 def usual_data_root() -> str:
+    """Returns the folder of prepared data sets: FLAME_MDM_DATA, or `data`."""
     return os.environ.get("FLAME_MDM_DATA", "data")
 
 
@@ -69,6 +70,7 @@ def model_source(key: str, source: str) -> None:
 
 
 def body_name(key: str, body: str) -> None:
+    """Raises `UserError` if `body` is neither mannequin, nor Anny, nor a file."""
     if body.split()[:1] not in (["mannequin"], ["anny"]) and not Path(body).is_file():
         raise UserError(
             f'{key}={body}: no such file. Use mannequin, a file, or Anny: {key}="anny age=0.9"'
@@ -76,6 +78,7 @@ def body_name(key: str, body: str) -> None:
 
 
 def device_name(key: str, device: str) -> None:
+    """Raises `UserError` if `device` is not a name such as cpu or cuda:1."""
     if not re.fullmatch(r"cpu|mps|xpu|cuda(:\d+)?", device):
         near = did_you_mean(device, ["cpu", "cuda"])
         raise UserError(f"{key}={device}: unknown.{near} Give cpu, cuda or cuda:NUMBER")
@@ -90,6 +93,7 @@ def video(key: str, requested: bool) -> None:
 
 
 def above_zero(key: str, number: int) -> None:
+    """Raises `UserError` if `number` is less than 1."""
     if number < 1:
         raise UserError(f"{key}={number}: must be at least 1")
 
@@ -120,6 +124,7 @@ class AdaptedSettings(ModelSettings):
     )
 
     def adapters(self) -> dict[str, Any]:
+        """Returns the keywords of `flame_mdm.load` for adapters."""
         return {"adapter": self.adapter or (), "strength": self.adapter_strength}
 
 

@@ -38,6 +38,7 @@ class AdaptSettings(ModelSettings):
 
 
 def main(settings: AdaptSettings) -> None:
+    """Trains an adapter and writes it."""
     file = settings.model_file()
 
     from flame_mdm.training.adaptation import adapt

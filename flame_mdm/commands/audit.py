@@ -42,6 +42,7 @@ class AuditSettings(DataSettings):
 
 
 def main(settings: AuditSettings) -> None:
+    """Audits an extractor or metrics, or compares two audits, and writes the cards."""
     out = Path(settings.out)
     if settings.cards is not None:
         if len(settings.cards) > 2:

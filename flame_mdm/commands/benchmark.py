@@ -38,6 +38,7 @@ class BenchmarkSettings:
 
 
 def main(settings: BenchmarkSettings) -> None:
+    """Prepares, trains, evaluates and tabulates all models of a benchmark."""
     names = sorted(path.stem for path in (EXPERIMENTS / "benchmark").glob("*.yaml"))
     if settings.exp not in names:
         raise UserError(f"no benchmark is called '{settings.exp}'. Available: {', '.join(names)}")

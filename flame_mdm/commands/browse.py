@@ -36,6 +36,7 @@ class BrowseSettings(BodySettings, DataSettings):
 
 
 def main(settings: BrowseSettings) -> None:
+    """Writes a page of motions of a prepared data set."""
     node = settings.data_node(settings.source)
 
     from flame_mdm.data.store import Store

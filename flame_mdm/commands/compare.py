@@ -68,6 +68,7 @@ class CompareSettings(BodySettings):
 
 
 def main(settings: CompareSettings) -> None:
+    """Writes a page that compares runs, or counts the ratings of a user study."""
     if (settings.runs is None) == (settings.ratings is None):
         raise UserError(
             'give either runs="A B" to compare runs, or ratings="x.json y.json" to count ratings'

@@ -46,6 +46,7 @@ class ConvertSettings(BodySettings, WritingSettings, FileSettings):
 
 
 def main(settings: ConvertSettings) -> None:
+    """Converts a motion file or a folder of motion files."""
     path, out = Path(settings.motion), Path(settings.out)
     if path.is_dir():
         targets = _targets(settings, path, out)

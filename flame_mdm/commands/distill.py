@@ -41,6 +41,7 @@ class DistillSettings(ModelSettings):
 
 
 def main(settings: DistillSettings) -> None:
+    """Writes the recipe of a student, and trains it."""
     recipe = student_recipe(settings)
     folder = Path(recipe["run"]["dir"])
     path, new = folder / RECIPE, not folder.exists()
@@ -54,6 +55,11 @@ def main(settings: DistillSettings) -> None:
 
 
 def student_recipe(settings: DistillSettings) -> Config:
+    """Returns the recipe of a student: the recipe of its teacher with the changes of a
+    distillation.
+
+    Raises `UserError` if the model was not trained by this framework.
+    """
     file = settings.model_file()
     from flame_mdm.training.distillation import read_teacher
 

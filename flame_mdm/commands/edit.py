@@ -35,6 +35,7 @@ class EditSettings(OutputSettings, EditRequest, FileSettings):
 
 
 def main(settings: EditSettings) -> None:
+    """Edits a motion file and writes the results."""
     request = settings.request()
 
     from flame_mdm.sampling.editing import resolve_edit, sample_edit

@@ -36,6 +36,7 @@ class EvaluateSettings(EvaluationKeys, SamplerOptions, DataSettings, ModelSettin
 
 
 def main(settings: EvaluateSettings) -> None:
+    """Evaluates a model, a folder of motions or a baseline, and writes the result."""
     nodes = settings.nodes if settings.data is not None else {"data": None, "representation": None}
     request = EvaluationRequest.of(vars(settings) | nodes)
     if settings.ckpt is not None:

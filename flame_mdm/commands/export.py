@@ -25,6 +25,7 @@ class ExportSettings(AdaptedSettings):
 
 
 def main(settings: ExportSettings) -> None:
+    """Writes a model as a single file, or as ONNX graphs."""
     file = settings.model_file()
     if settings.format == "onnx":
         from flame_mdm.checkpoints.onnx_export import export_onnx as export

@@ -27,6 +27,7 @@ class PrepareSettings(DataSettings):
 
 
 def main(settings: PrepareSettings) -> None:
+    """Writes the store of a data set, or checks its files, and prints the report."""
     node = settings.data_node(settings.source)
 
     from flame_mdm.data.store import write_store

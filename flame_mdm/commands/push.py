@@ -24,6 +24,7 @@ class PushSettings(ModelSettings):
 
 
 def main(settings: PushSettings) -> None:
+    """Uploads a model with its card to the Hugging Face hub."""
     file = settings.model_file()
     from flame_mdm.checkpoints.hub import push
 

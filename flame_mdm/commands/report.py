@@ -24,6 +24,7 @@ class ReportSettings(BodySettings):
 
 
 def main(settings: ReportSettings) -> None:
+    """Writes the page of each run."""
     for folder in settings.runs:
         check_run(Path(folder))
     from flame_mdm.formats.people import load_body

@@ -140,6 +140,7 @@ class SampleSettings(OutputSettings, WritingSettings):
         )
 
     def conditions(self) -> list[str]:
+        """Returns the keys that say which motions are requested, a file of prompts included."""
         return [*super().conditions(), *(["prompts"] if self.prompts is not None else [])]
 
     def request_for(self, prompts: PromptFile | None) -> SamplingRequest:
@@ -167,6 +168,7 @@ class SampleSettings(OutputSettings, WritingSettings):
 
 
 def main(settings: SampleSettings) -> None:
+    """Samples motions for texts, a file of prompts or a set, and writes them."""
     settings.check_output()
     if settings.set is not None:
         _sample_set(settings, settings.set)

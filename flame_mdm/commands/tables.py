@@ -48,6 +48,7 @@ class TablesSettings:
 
 
 def main(settings: TablesSettings) -> None:
+    """Evaluates missing rows of tables and writes the tables."""
     names = settings.table or spec_names()
     specs = {Path(name).stem: load_spec(name) for name in names}
     results = Path(settings.results)

@@ -116,6 +116,11 @@ def _options(group: str) -> list[str]:
 
 
 def find_recipe(name: str) -> ConfigSource:
+    """Returns where the recipe of an experiment is: a .yaml file, or a name such as
+    `humanml3d/mdm`.
+
+    Raises `UserError` for a name or file that does not exist.
+    """
     if name.endswith((".yaml", ".yml")):
         path = Path(name).resolve()
         if not path.is_file():
@@ -149,6 +154,9 @@ def quoted(word: str) -> str:
 
 
 def parse(overrides: Sequence[str]) -> list[Override]:
+    """Parses overrides in Hydra's grammar; raises `UserError` with advice if one cannot be
+    parsed.
+    """
     try:
         return OverridesParser.create().parse_overrides(list(overrides))
     except HydraException as error:

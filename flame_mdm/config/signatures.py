@@ -211,6 +211,7 @@ def check_same_kinds(base: Config, config: Config, path: str = "") -> None:
 def walk(
     node: Any, path: tuple[str, ...] = ()
 ) -> Iterator[tuple[tuple[str, ...], Mapping[str, Any]]]:
+    """Yields the path and the content of each mapping in a configuration, itself first."""
     if isinstance(node, Mapping):
         yield path, node
         for name, child in node.items():

@@ -132,10 +132,12 @@ class CMU(MotionSource):
 
     @cached_property
     def path(self) -> Path:
+        """Folder of the recordings; an archive is unpacked into a temporary one."""
         return archives.as_folder(self.archive, self, lambda name: name.lower().endswith(SUFFIXES))
 
     @property
     def captions(self) -> Path:
+        """Folder of the captions."""
         return self.path if self._captions is None else Path(self._captions)
 
     @cached_property
@@ -264,6 +266,9 @@ class CMU(MotionSource):
         return captioned
 
     def count(self) -> int:
+        """Returns the number of clips. Recordings are not read: their lengths follow from the
+        captions.
+        """
         items = [item for items in self.items.values() for item in items]
         ends = {id_: round(seconds * FPS) for id_, _, _, seconds in self.kit}
         frames = [(item.end or ends.get(item.id, UNKNOWN)) - item.start - 1 for item in items]
@@ -305,9 +310,11 @@ class CMU(MotionSource):
             raise UserError(f"{self.path}: no recording can be read; {self._errors[0]}")
 
     def counts(self) -> Mapping[str, float]:
+        """Returns the numbers of clips and captions of HumanML3D that were read."""
         return self._counts
 
     def findings(self) -> list[str]:
+        """Returns a line per recording that cannot be read."""
         return [f"left out: {error}" for error in self._errors]
 
 

@@ -67,6 +67,7 @@ class Units(Crop):
             )
 
     def draw(self, frames: Any, below: Below | None) -> tuple[Any, Any]:
+        """Returns first frames, drawn uniformly, and lengths that are multiples of `unit`."""
         length = np.minimum(frames, self.max_frames) // self.unit * self.unit
         if below is None:
             return np.zeros_like(length), length
@@ -82,6 +83,7 @@ class Whole(Crop):
     max_frames: int = 471
 
     def draw(self, frames: Any, below: Below | None) -> tuple[Any, Any]:
+        """Returns frame 0, and the length of the clip up to `max_frames`."""
         length = np.minimum(frames, self.max_frames)
         return np.zeros_like(length), length
 
@@ -97,9 +99,11 @@ class Fixed(Crop):
     min_frames: int = 1
 
     def longest(self) -> int:
+        """Returns the number of frames, which all samples have."""
         return self.frames
 
     def draw(self, frames: Any, below: Below | None) -> tuple[Any, Any]:
+        """Returns first frames, drawn uniformly, and always the same length."""
         spare = np.maximum(0, frames - self.frames - 1)
         first = np.zeros_like(spare) if below is None else below(spare + 1)
         return first, np.full_like(spare, self.frames)

@@ -110,6 +110,9 @@ class Folder(MotionSource):
         )
 
     def suit(self, representation: Representation) -> None:
+        """Makes `clips` yield raw motions of a representation; raises `UserError` if `motion`
+        does not fit it.
+        """
         name, needs_rotations = (
             representation.name,
             isinstance(representation, SMPL | Rot6D | Motion272),
@@ -123,12 +126,14 @@ class Folder(MotionSource):
         self._representation = representation
 
     def count(self) -> int:
+        """Returns the number of clips, with repeated and mirrored copies."""
         images = sum(
             self.copies[name] for name in self.files if self.mirror and self.splits[name] == "train"
         )
         return sum(self.copies.values()) + images
 
     def licenses(self) -> set[str]:
+        """Returns the licenses in the table, and `license` if the table leaves one out."""
         return {note.license or self.license for note in self.notes.values()}
 
     @cached_property
@@ -210,6 +215,7 @@ class Folder(MotionSource):
         ]
 
     def failure_lines(self) -> list[str]:
+        """Returns a line per motion that cannot be prepared, and their number."""
         if not self.failures:
             return []
         summary = f"error: {len(self.failures)} of {len(self.files)} motions of {self.path} cannot be prepared"
@@ -246,6 +252,7 @@ class Folder(MotionSource):
         return self.not_excluded(dict(sorted(files.items())), self.path)
 
     def changed(self, store: Path) -> list[str]:
+        """Returns a line if files in the folder are newer than the file `store`."""
         when = store.stat().st_mtime
         files = [
             path for path in self.path.rglob("*") if path.is_file() and path.stat().st_mtime > when

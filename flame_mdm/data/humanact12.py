@@ -46,9 +46,11 @@ class HumanAct12(MotionSource):
         self.options = {"published_split": published_split}
 
     def count(self) -> int:
+        """Returns the number of clips in the file."""
         return len(self._motions)
 
     def clips(self, fps: float) -> Iterator[Clip]:
+        """Yields the clips in the order of the file; they have actions, but no captions."""
         self.check_fps(fps, FPS)
         clips, seen = Counter(action for _, action in self._motions), Counter[int]()
         blocks = {

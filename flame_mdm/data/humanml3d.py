@@ -28,7 +28,10 @@ FPS = 20
 
 
 class IndexedClip(NamedTuple):
-    """A clip in `index.csv`: frames `start` to `end` of a recording at 20 fps; `key` is that of `key_of`."""
+    """A clip in `index.csv`: frames `start` to `end` of a recording at 20 fps.
+
+    `key` names the recording as `amass.key_of` does, or the file of a clip of HumanAct12.
+    """
 
     name: str
     key: str
@@ -50,6 +53,9 @@ class IndexedClip(NamedTuple):
 
 
 def read_index(path: Path) -> list[IndexedClip]:
+    """Reads `index.csv`; raises `UserError` if the file has another layout or names an unknown
+    recording.
+    """
     required(path, "it is index.csv of https://github.com/EricGuo5513/HumanML3D")
     rows = []
     with naming(
@@ -110,11 +116,15 @@ class HumanML3D(T2MFolder):
         self.options = {**self.options, "bone_lengths": bone_lengths and list(bone_lengths)}
 
     def count(self) -> int:
+        """Returns the number of clips; creates missing motions from AMASS first, if `amass` is
+        set.
+        """
         if self.amass:
             self._make(self.amass)
         return super().count()
 
     def check(self, fps: float) -> list[str]:
+        """Returns how many motions are created, and a line per missing input of the others."""
         if not self.amass:
             return super().check(fps)
         todo = self._todo()
@@ -123,6 +133,7 @@ class HumanML3D(T2MFolder):
 
     @cached_property
     def rows(self) -> list[IndexedClip]:
+        """The clips of `index.csv` that are not excluded."""
         return [
             row for row in read_index(self._beside("index.csv")) if row.name not in self.exclude
         ]
@@ -300,10 +311,14 @@ class HumanML3DSMPL(MotionSource):
         return used
 
     def count(self) -> int:
+        """Returns the number of clips, one per caption; raises `FileNotFoundError` if recordings
+        are missing.
+        """
         self.amass.check(by_recording(self.rows))
         return sum(len(self.folder.texts[row.name]) for row in self.rows)
 
     def clips(self, fps: float) -> Iterator[Clip]:
+        """Yields the clips of AMASS, then the clips of HumanAct12."""
         self.check_fps(fps, FPS)
         from_amass = by_recording(self.rows)
         for key, motions in self.amass.map(from_amass, _parameters, self.workers):

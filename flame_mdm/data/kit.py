@@ -93,9 +93,11 @@ class KITTemos(MotionSource):
         return {name: -(-count // 8) for name, count in rows.items()}
 
     def count(self) -> int:
+        """Returns the number of motions with a caption and a permitted length."""
         return sum(self._fits(name) for name in self.frames)
 
     def clips(self, fps: float) -> Iterator[Clip]:
+        """Yields one clip per motion; a test clip has all frames of its recording as `reference`."""
         self.check_fps(fps, 12.5)
         for name, split in self.names.items():
             if name not in self.texts:
@@ -121,6 +123,7 @@ class KITTemos(MotionSource):
             yield clip
 
     def counts(self) -> dict[str, int]:
+        """Returns the numbers of motions, captions and names per split."""
         texts = sum(len(read_json(path)) for path in self.path.glob("*_annotations.json"))
         splits = list(read_splits(self.splits, "", self.get_it).values())
         counts = {split: splits.count(split) for split in SPLITS} | {

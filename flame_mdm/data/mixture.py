@@ -47,10 +47,14 @@ class Mixture(MotionSource):
         }
 
     def count(self) -> int:
+        """Returns the number of clips of all parts; raises `UserError` if a license forbids the
+        use.
+        """
         self.check_licenses()
         return sum(part.count() for part in self.parts.values())
 
     def licenses(self) -> set[str]:
+        """Returns the licenses of all parts."""
         return {license for part in self.parts.values() for license in part.licenses()}
 
     def may_share_captions(self, license: str) -> bool:
@@ -87,18 +91,23 @@ class Mixture(MotionSource):
         self.failures = [line for part in self.parts.values() for line in part.failures]
 
     def findings(self) -> list[str]:
+        """Returns the findings of each part, with its name."""
         return [f"{name}: {line}" for name, part in self.parts.items() for line in part.findings()]
 
     def failure_lines(self) -> list[str]:
+        """Returns the failures of all parts."""
         return [line for part in self.parts.values() for line in part.failure_lines()]
 
     def changed(self, store: Path) -> list[str]:
+        """Returns a line per part whose files changed since."""
         return [line for part in self.parts.values() for line in part.changed(store)]
 
     def suit(self, representation: Representation) -> None:
+        """Fits each part to a representation."""
         for part in self.parts.values():
             part.suit(representation)
 
     def check(self, fps: float) -> list[str]:
+        """Checks the licenses and returns the lines of all parts."""
         self.check_licenses()
         return [line for part in self.parts.values() for line in part.check(fps)]

@@ -232,9 +232,11 @@ class Synthetic(MotionSource):
             )
 
     def count(self) -> int:
+        """Returns the requested number of clips."""
         return self.size
 
     def clips(self, fps: float) -> Iterator[Clip]:
+        """Yields clips 0, 1, 2, ... at `fps` frames per second."""
         return in_order(partial(self.clip, fps=fps), range(self.size), self.workers)
 
     def clip(self, index: int, fps: float) -> Clip:

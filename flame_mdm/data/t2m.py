@@ -135,6 +135,7 @@ class T2MFolder(MotionSource):
 
     @cached_property
     def names(self) -> dict[str, Split]:
+        """Name of each motion that is not excluded -> its split."""
         return self.not_excluded(read_splits(self.path, ".txt", self.get_it), self.path)
 
     @cached_property
@@ -163,6 +164,7 @@ class T2MFolder(MotionSource):
         return {name: len(self._load(name, mmap=True)) for name in names}
 
     def count(self) -> int:
+        """Returns the number of items; raises `UserError` if Mean.npy or Std.npy is damaged."""
         total = sum(
             len(cuts(name, length, self.texts[name], self.shortest))
             for name, length in self.frames.items()

@@ -117,18 +117,26 @@ class UESTC(MotionSource):
         return tuple(self._lines("action_classes.txt"))
 
     def count(self) -> int:
+        """Returns the number of videos, including the few that turn out to be too short when they
+        are read.
+        """
         return len(self.used)  # including the few that are left out when their poses are read
 
     def counts(self) -> dict[str, int]:
+        """Returns the numbers of videos and subjects."""
         return {"videos": len(self.videos), "subjects": len({video.subject for video in self.used})}
 
     @cached_property
     def poses(self) -> Path:
+        """The file of the poses."""
         return find(self.path, "vibe_cache_refined.pkl")
 
     @cached_property
     def videos(self) -> list[Video]:
-        videos = []  # in the order of the file of poses
+        """All videos, in the order of the file of poses; raises `UserError` if a name cannot be
+        read.
+        """
+        videos = []
         for index, name in enumerate(self._lines("names.txt")):
             match = NAME.fullmatch(name)
             if match is None or int(match[2]) >= len(self.actions):
@@ -151,6 +159,7 @@ class UESTC(MotionSource):
         ).splitlines()
 
     def clips(self, fps: float) -> Iterator[Clip]:
+        """Yields the clips that are long enough, with the attributes subject, view and side."""
         self.check_fps(fps, FPS)
         path, count = self.poses, len(self.videos)
         columns = read_lists(path, "pose", "joints3d", "orig_cam")
@@ -186,6 +195,7 @@ class UESTC(MotionSource):
             )
 
     def split(self, subject: int) -> Split:
+        """Returns the split of a subject."""
         if subject not in TRAIN_SUBJECTS:
             return "test"
         ranked = sorted(TRAIN_SUBJECTS, key=lambda s: name_hash(f"uestc_p{s:03d}"))

@@ -70,23 +70,28 @@ class Connection(H11Protocol):
         self._make_room(others, self.limits.total)
 
     def connection_lost(self, exc: Exception | None) -> None:
+        """Stops the timers of a connection that has ended."""
         self._stop_timers()
         super().connection_lost(exc)
 
     def handle_events(self) -> None:
+        """Handles received data and starts or stops the timers, depending on what is awaited."""
         super().handle_events()
         self._watch()
 
     def on_response_complete(self) -> None:
+        """Waits for the next request once a response is complete."""
         super().on_response_complete()
         self._watch()
 
     def pause_writing(self) -> None:
+        """Starts the timer that ends a connection whose client does not read."""
         super().pause_writing()
         # The client does not read: closing would wait for it, too.
         self.stall = self.loop.call_later(self.limits.stall_seconds, self.transport.abort)
 
     def resume_writing(self) -> None:
+        """Stops this timer: the client reads again."""
         super().resume_writing()
         if self.stall is not None:
             self.stall.cancel()

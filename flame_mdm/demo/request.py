@@ -128,6 +128,9 @@ class DemoRequest(BaseModel):
         return steps
 
     def python(self, kind: str, device: str) -> str:
+        """Returns Python code that makes the same motions; `kind` is the kind of condition of the
+        model.
+        """
         model, _, adapter = self.model.partition(PLUS)
         options = ("" if device == "cpu" else f", {device!r}") + (
             f", adapter={adapter!r}" if adapter else ""

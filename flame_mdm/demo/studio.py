@@ -47,6 +47,9 @@ class Studio:
         self.model(sources[0])
 
     def model(self, name: str) -> MotionGenerator:
+        """Returns a model by its name on the page, loaded at its first use; raises `UserError`
+        for other names.
+        """
         if name not in self.files:
             near = did_you_mean(name, self.files)
             raise UserError(

@@ -232,6 +232,7 @@ class Lines:
                 yield words
 
     def fail(self, fault: str) -> NoReturn:
+        """Raises `UserError` that names the file and the current line."""
         raise UserError(f"{self.name}, line {self.line}: {fault}")
 
     def word(self, expected: str = "") -> str:

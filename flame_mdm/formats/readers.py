@@ -74,6 +74,7 @@ class Doubts:
 
     @property
     def lines(self) -> list[str]:
+        """The doubts as lines to print."""
         return [line for line in (self.lying, self.jump) if line]
 
 

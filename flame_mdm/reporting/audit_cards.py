@@ -87,6 +87,7 @@ class ListedCard(ClosedSchema):
     data: Data
 
     def cited(self, folder: Path) -> CitedCard:
+        """Returns the card as results cite it, with the path of its page in `folder`."""
         return CitedCard(folder / f"{self.name}.html", self.motions, self.split, self.data)
 
 
@@ -137,6 +138,7 @@ def card_of(data: Data, sha256: str | None) -> CitedCard | None:
 
 
 def read_card(path: Path) -> AuditCard:
+    """Reads the JSON of a card; raises `UserError` if an older version wrote it or it is damaged."""
     return read_json(path, AuditCard, "run `flame-mdm audit` again")
 
 

@@ -53,6 +53,7 @@ def choose(families: Sequence[list[Entry]], most: int) -> list[list[Entry]]:
 
 
 def motion(store: Store, representation: Representation, clip: Entry) -> Motion:
+    """Returns the first `SECONDS` of a clip as a motion that stands on the floor."""
     shown = round(SECONDS * representation.fps)
     joints = representation.decode(torch.from_numpy(store.motion(clip)[:shown].copy())).numpy()
     below = joints[..., 1].min()
@@ -74,6 +75,7 @@ def write_page(
     title: str,
     body: Mesh | None,
 ) -> None:
+    """Writes a player of clips, grouped by split; a mirrored copy is next to its original."""
     write_player(
         path,
         [motion(store, representation, clip) for clip in clips],
@@ -132,6 +134,7 @@ def write_clips(
 
 
 def describe(store: Store) -> Markup:
+    """Returns a table of the contents of a store as HTML."""
     info, fps = store.info, store.info["fps"]
     splits = {
         name: [clip for clip in store.clips if clip.split == name]

@@ -59,6 +59,7 @@ def write_report(folder: Path, mesh: Mesh | None = None) -> Path:
 
 
 def last(curve: Curve) -> float | None:
+    """Returns the value of the last step of a curve; None for an empty curve."""
     return curve[max(curve)] if curve else None
 
 
@@ -141,6 +142,7 @@ def _evaluation(result: Result) -> tuple[object, ...]:
 
 
 def evaluation_title(result: Result) -> str:
+    """Returns the heading of a result: protocol, data, split and extractor."""
     measured = f", extractor {result.extractor.sha256[:8]}" if result.extractor else ""
     protocol, data = result.protocol, result.data
     return f"{protocol.name} version {protocol.version}, {data.dataset} {result.split}{measured}"
@@ -152,6 +154,9 @@ def labeled(name: str, value: Value | None) -> str:
 
 
 def sampling(result: Result) -> str:
+    """Returns how the motions of a result were made: checkpoint or baseline, and options of the
+    sampler.
+    """
     checkpoint = result.checkpoint
     words = [f"baseline {result.baseline}" if result.baseline else "motions from other systems"]
     if checkpoint is not None:
@@ -181,6 +186,7 @@ def marks(result: Result) -> list[str]:
 
 
 def printed(value: Value | None) -> str:
+    """Returns a value with its interval as text, – if there is none."""
     return interval(value.mean, value.half) if value else "–"
 
 

@@ -57,6 +57,7 @@ class Pair(Schema):
 
     @property
     def votes(self) -> int:
+        """Number of ratings that prefer one of the two runs."""
         return self.wins_a + self.wins_b
 
     @property

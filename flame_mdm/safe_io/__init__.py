@@ -260,6 +260,7 @@ def _begins(path: str | Path, content: bytes) -> bool:
 
 
 def read_text(path: str | Path, limit: int = TEXT_LIMIT) -> str:
+    """Returns a UTF-8 text file of at most `limit` bytes; raises `UserError` otherwise."""
     regular_file(path, limit)
     with (
         naming(path, UnicodeDecodeError, prefix="not a UTF-8 text file: "),

@@ -88,9 +88,15 @@ class PositionGuide:
     keep: Tensor  # and where
 
     def steer(self, clean: Callable[[Tensor], Tensor], x_t: Tensor) -> Tensor:
+        """Returns the noisy motion `x_t`, changed such that its clean estimate approaches the
+        positions.
+        """
         return steer(clean, x_t, self.to_joints, self.positions)
 
     def reach(self, x0_hat: Tensor) -> Tensor:
+        """Returns a clean estimate (B, F, D) that reaches the positions and keeps the poses at
+        targets.
+        """
         imposed, free = torch.where(self.keep, self.poses, x0_hat), ~self.keep.expand_as(x0_hat)
         return reach(
             imposed, self.to_joints, self.positions, self.bones, free, SMOOTHNESS * self.fps

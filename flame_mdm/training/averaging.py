@@ -50,6 +50,9 @@ class MovingAverage(WeightAveraging):
         return self._average_model.module
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Collects the parameters of model and average, once, since looking them up takes time in
+        each step.
+        """
         self.averages = [p.detach() for p in self.averaged().parameters()]
         self.weights = [p.detach() for p in pl_module.parameters()]
         for copy, module in zip(self.averaged().modules(), pl_module.modules(), strict=True):
@@ -64,6 +67,7 @@ class MovingAverage(WeightAveraging):
             self.begun = True
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        """Updates the average after an optimizer step."""
         step = trainer.global_step
         if step <= self._latest_update_step or step % self.update_every_n_steps:
             return

@@ -73,10 +73,12 @@ class Checkpoints(Checkpoint):
         self.step = -1
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Begins to note signals."""
         self.step = trainer.global_step
         self.stop.install()
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        """Saves a checkpoint if it is due, or if any process received a signal, and then stops."""
         if trainer.global_step == self.step:  # gradients are still being accumulated
             return
         self.step = trainer.global_step
@@ -96,9 +98,11 @@ class Checkpoints(Checkpoint):
             raise Interrupted(signum, self.step)
 
     def on_train_end(self, *_: Any) -> None:
+        """Restores the handlers of signals."""
         self.stop.restore()
 
     def on_exception(self, *_: Any) -> None:
+        """Restores the handlers of signals."""
         self.on_train_end()
 
 
@@ -119,18 +123,22 @@ class Measurements(Callback):
     def on_load_checkpoint(
         self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
     ) -> None:
+        """Continues the sums of the run before it was interrupted."""
         self.earlier = checkpoint["facts"].get("training", {})
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Starts the clocks."""
         self.begin = self.since = time.perf_counter()
         self.first = trainer.global_step
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Restarts the clock of the speed, which leaves out validation."""
         self.since, self.first = time.perf_counter(), trainer.global_step
 
     def on_save_checkpoint(
         self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
     ) -> None:
+        """Adds duration and peak memory so far to the facts in the checkpoint."""
         if pl_module.device.type == "cuda":
             memory = torch.cuda.max_memory_allocated(pl_module.device) / 2**30
         else:
@@ -150,12 +158,14 @@ class Measurements(Callback):
     def on_before_optimizer_step(
         self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer
     ) -> None:
+        """Logs the norm of the gradients."""
         if (trainer.global_step + 1) % trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
             gradients = [p.grad for p in pl_module.parameters() if p.grad is not None]
             pl_module.log("train/grad_norm", get_total_norm(gradients))
             pl_module.log("train/lr", optimizer.param_groups[0]["lr"])
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        """Logs steps and clips per second."""
         step, steps = trainer.global_step, trainer.global_step - self.first
         if step % trainer.log_every_n_steps or not steps:  # type: ignore[attr-defined]  # or gradients are accumulated
             return
@@ -179,6 +189,7 @@ class Report(Callback):
         self.folder = folder
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Prints the final values and what to run next."""
         if not trainer.is_global_zero:
             return
         texts = {"train/loss": "on the last batch", "val/loss": "on the validation clips"}
@@ -236,6 +247,7 @@ class Progress(Callback):
     bar: ProgressBar | None = None
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Shows the bar, at the current step of a resumed run."""
         self.bar = ProgressBar(
             desc="training",
             initial=trainer.global_step,
@@ -247,6 +259,7 @@ class Progress(Callback):
         )
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        """Advances the bar and shows the last values."""
         assert self.bar is not None
         steps = trainer.global_step - self.bar.n
         if self.bar.disable or not steps:  # or gradients are still being accumulated
@@ -260,10 +273,12 @@ class Progress(Callback):
         self.bar.update(steps)
 
     def on_train_end(self, *_: Any) -> None:
+        """Closes the bar."""
         if self.bar is not None:
             self.bar.close()
 
     def on_exception(self, *_: Any) -> None:
+        """Closes the bar."""
         self.on_train_end()
 
 
@@ -299,9 +314,11 @@ class SampleMotions(Callback):
 
     @property
     def texts(self) -> list[str]:
+        """Texts of the prompts."""
         return [text for text, _ in self.prompts]
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Plans the first samples, and chooses the conditions of models without text."""
         self.next = trainer.global_step + self.every_n_steps
         assert isinstance(pl_module, GeneratorTask)
         actions = pl_module.facts["actions"]
@@ -312,10 +329,12 @@ class SampleMotions(Callback):
             self.prompts = [(action, {"action": action}) for action in actions[: len(self.prompts)]]
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        """Writes samples if they are due and no validation will do so."""
         if not len(trainer.datamodule.val):  # type: ignore[attr-defined]  # a data set without validation clips
             self._write_if_due(trainer, pl_module)
 
     def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Writes samples if they are due."""
         self._write_if_due(trainer, pl_module)
 
     def _write_if_due(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -324,6 +343,7 @@ class SampleMotions(Callback):
             self.write(trainer, pl_module)
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Writes the samples of the final model and prints their metrics next to real motions."""
         # The last validation may have written them already
         if self.written[0] != trainer.global_step:
             self.write(trainer, pl_module)

@@ -59,6 +59,7 @@ class AtomicCheckpoints(TorchCheckpointIO):
         return resumed.content
 
     def remove_checkpoint(self, path: Any) -> None:
+        """Removes a checkpoint, but only from the folder of this run."""
         path = Path(path)
         # After links and `..` are resolved
         if path.is_file() and path.parent.resolve() == self.folder.resolve():

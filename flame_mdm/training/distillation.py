@@ -46,6 +46,7 @@ class DistillationTask(GeneratorTask):
         return super().train(False)
 
     def setup(self, stage: str) -> None:
+        """Loads the teacher and starts from its weights."""
         super().setup(stage)
         self.start_from_teacher()
 
@@ -92,6 +93,7 @@ class DistillationTask(GeneratorTask):
             )
 
     def on_fit_start(self) -> None:
+        """Moves the teacher, which is not a submodule, to the device."""
         super().on_fit_start()
         self.teacher[0].to(self.device)
 

@@ -66,6 +66,7 @@ class BadLoss(Callback):
         batch: MotionBatch,
         batch_idx: int,
     ) -> None:
+        """Keeps the loss of the batch on its device, and checks all kept losses now and then."""
         loss = outputs["loss"] if isinstance(outputs, Mapping) else outputs
         self.seen.append((trainer.global_step, batch_idx, batch.ids, loss.detach().float()))
         if (batch_idx + 1) % trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
@@ -74,6 +75,7 @@ class BadLoss(Callback):
     def on_save_checkpoint(
         self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
     ) -> None:
+        """Checks the losses first, so that no checkpoint holds weights after a bad loss."""
         self.check(trainer)
 
     def check(self, trainer: Trainer) -> None:

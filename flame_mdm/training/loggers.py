@@ -29,10 +29,12 @@ class History(Logger):
 
     @property
     def name(self) -> str:
+        """Name of the logger in Lightning."""
         return "history"
 
     @property
     def version(self) -> str:
+        """No version: all parts of a run share one file."""
         return ""
 
     @rank_zero_only
@@ -41,6 +43,7 @@ class History(Logger):
 
     @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
+        """Appends a line of metrics; first drops lines after the step at which a run is resumed."""
         if not self.begun:
             kept = [line for line in records(self.path) if line["step"] <= self.step]
             write_text(self.path, "".join(json.dumps(line) + "\n" for line in kept))
@@ -54,6 +57,7 @@ class TensorBoardRun(TensorBoardLogger):
 
     @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
+        """Logs metrics without the epoch, which endless batches do not have."""
         super().log_metrics(
             {name: value for name, value in metrics.items() if name != "epoch"}, step
         )
@@ -86,6 +90,7 @@ class WandbRun(WandbLogger):
 
     @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, Any], step: int | None = None) -> None:
+        """Logs metrics; skips steps that an earlier part of a resumed run logged already."""
         if step is not None and step < self.logged_step:
             return
         # Wandb restarts the row numbers of an offline part from 0
@@ -108,6 +113,7 @@ class WandbRun(WandbLogger):
 
 
 def log_config(logger: Logger, config: Config, facts: Mapping[str, Any]) -> None:
+    """Logs the recipe and the provenance of a run."""
     if isinstance(logger, TensorBoardLogger):
         for name, content in (("config", config), ("provenance", facts)):
             text = OmegaConf.to_yaml(OmegaConf.create(dict(content)))
@@ -119,6 +125,7 @@ def log_config(logger: Logger, config: Config, facts: Mapping[str, Any]) -> None
 def log_table(
     logger: Logger, name: str, head: Sequence[str], rows: Sequence[Sequence[Any]], step: int
 ) -> None:
+    """Logs a table under a name at a step."""
     if isinstance(logger, TensorBoardLogger):
         lines = [head, ["---"] * len(head), *rows]
         logger.experiment.add_text(
@@ -129,6 +136,7 @@ def log_table(
 
 
 def log_video(logger: Logger, name: str, gif: Path, step: int) -> None:
+    """Logs an animated GIF under a name at a step."""
     if isinstance(logger, TensorBoardLogger):
         from PIL import Image
         from tensorboard.compat.proto.summary_pb2 import Summary  # type: ignore[attr-defined]

@@ -74,6 +74,7 @@ def sides(skeleton: Skeleton) -> list[int]:
 
 
 def head(skeleton: Skeleton) -> int | None:
+    """Returns the number of the head joint, None if the skeleton has none."""
     return skeleton.joints.index("head") if "head" in skeleton.joints else None
 
 
@@ -129,6 +130,7 @@ def largest_weights(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @cache
 def mannequin() -> Mesh:
+    """Returns the body of the package."""
     return Mesh(MANNEQUIN)
 
 

@@ -32,6 +32,7 @@ def idle(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
 
 
 def look_around(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+    """Turns the head to one side, then to the other."""
     first, a = rng.choice(SIGN), rng.uniform(0.05, 0.15)
     b, c, d = a + (t[-1] - a) * np.array([0.25, 0.62, 0.98])
     one = pulse(t, a, b, b + 0.15, b + 0.55)
@@ -44,6 +45,7 @@ def look_around(body: Body, rng: np.random.Generator, t: np.ndarray, requested: 
 
 
 def point(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+    """Points ahead with a straight arm."""
     (side,) = SIDES[str(requested["side"])]
     start = rng.uniform(0.1, 0.3)
     out = pulse(t, start, start + rng.uniform(0.45, 0.6), t[-1] - 0.55, t[-1])
@@ -65,6 +67,7 @@ def beckon(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attri
 
 
 def shrug(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+    """Raises both shoulders with bent, open forearms, and tilts the head."""
     start, seconds = rng.uniform(0.2, 0.5), rng.uniform(0.35, 0.5)
     up = pulse(t, start, start + seconds, start + seconds + rng.uniform(0.3, 0.6), t[-1] - 0.2)
     body.shoulders += 0.55 * up
@@ -86,6 +89,7 @@ def celebrate(body: Body, rng: np.random.Generator, t: np.ndarray, requested: At
 
 
 def pray(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+    """Joins the hands in front of the chest and bows the head."""
     together = ease(t, rng.uniform(0.05, 0.2), rng.uniform(0.7, 0.9))
     height = rng.uniform(-0.06, 0.02)
     for side, sign in enumerate(SIGN):
@@ -125,6 +129,7 @@ def laugh(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attrib
 
 
 def drink(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+    """Leads a hand to the mouth and tips the head back."""
     (side,) = SIDES[str(requested["side"])]
     start = rng.uniform(0.05, 0.2)
     up = pulse(t, start, start + rng.uniform(0.65, 0.8), t[-1] - 0.75, t[-1] - 0.05)
@@ -208,6 +213,7 @@ def guitar(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attri
 
 
 def cross_arms(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+    """Crosses the forearms in front of the chest."""
     on = ease(t, rng.uniform(0.05, 0.2), rng.uniform(0.75, 0.95))
     for side, sign in enumerate(SIGN):
         body.move_arm(side, on, (0.35, 0.3, -0.6, 1.8))
@@ -218,6 +224,7 @@ def cross_arms(body: Body, rng: np.random.Generator, t: np.ndarray, requested: A
 def hands_on_hips(
     body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes
 ) -> None:
+    """Rests both hands on the hips, with the elbows out."""
     on = ease(t, rng.uniform(0.05, 0.2), rng.uniform(0.7, 0.9))
     for side, sign in enumerate(SIGN):
         body.move_arm(side, on, (-0.35, 0.75, -0.6, 1.6))
@@ -238,6 +245,7 @@ def touch_head(body: Body, rng: np.random.Generator, t: np.ndarray, requested: A
 
 
 def touch_face(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+    """Leads a hand to the cheek and holds it there."""
     (side,) = SIDES[str(requested["side"])]
     sign, on = SIGN[side], hold(rng, t, 0.65)
     body.move_arm(side, on, (0.8, 0.25, -0.4, 2.2))
@@ -261,6 +269,7 @@ def talk(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
 
 
 def stay_seated(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+    """Sits during the whole clip and looks aside once."""
     seat(body, np.ones_like(t), np.zeros_like(t))
     body.head[1] += rng.uniform(-0.4, 0.4) * pulse(t, 0.3, 0.9, 1.4, 2.0)
 

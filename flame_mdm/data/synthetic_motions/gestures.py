@@ -19,6 +19,7 @@ CHAIR = 0.54  # height of the pelvis on a chair whose seat is 45 cm high
 
 
 def wave(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+    """Raises one arm or both and swings the forearms."""
     start, end = rng.uniform(0.1, 0.3), t[-1]
     weight = pulse(t, start, start + 0.5, end - 0.45, end + 0.05)
     swing = 2 * np.pi * rng.uniform(1.4, 1.7) * (t - start)
@@ -35,6 +36,7 @@ def wave(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
 
 
 def raise_arms(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+    """Raises one arm or both over the head, along the front or along the side."""
     start = rng.uniform(0.15, 0.5)
     weight = ease(t, start, start + rng.uniform(0.7, 1.0))
     over_front, high = rng.random() < 0.5, rng.uniform(2.7, 3.0)
@@ -45,6 +47,7 @@ def raise_arms(body: Body, rng: np.random.Generator, t: np.ndarray, requested: A
 
 
 def punch(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+    """Punches ahead from a guard, as often as `count`."""
     (side,) = SIDES[str(requested["side"])]
     body.ankles[..., 2] += rng.uniform(0.04, 0.1) * rng.choice([-1, 1]) * SIGN[:, None]
     body.position[:, 1] -= 0.03
@@ -87,6 +90,7 @@ def throw(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attrib
 
 
 def clap(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+    """Claps in front of the chest, as often as `count`."""
     claps = events(rng, t, int(requested["count"]), 0.85)
     first, last = claps[0][0], claps[-1][0] + claps[-1][1]
     ready = pulse(t, first - 0.1, first + 0.3, last - 0.2, last + 0.35)
@@ -114,6 +118,7 @@ def salute(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attri
 
 
 def nod(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+    """Lowers and lifts the head, as often as `count`."""
     deep = rng.uniform(0.8, 0.95)
     for start, seconds in events(rng, t, int(requested["count"]), 0.9):
         down = pulse(t, start, start + 0.4 * seconds, start + 0.5 * seconds, start + 0.9 * seconds)
@@ -126,6 +131,7 @@ def stand(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attrib
 
 
 def jump(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+    """Crouches, jumps and lands, as often as `count`."""
     depth, reach = rng.uniform(0.16, 0.24), rng.uniform(0.8, 1.6)
     for start, seconds in events(rng, t, int(requested["count"]), 1.05):
         up = start + 0.4 * seconds
@@ -168,6 +174,7 @@ def leap(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
 
 
 def kick(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+    """Kicks ahead with one leg, as often as `count`, on the other."""
     (side,) = SIDES[str(requested["side"])]
     high = rng.uniform(1.15, 1.45)
     kicks = events(rng, t, int(requested["count"]), 1.25)
@@ -204,6 +211,7 @@ def kick(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
 
 
 def squat(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+    """Squats with the arms ahead, as often as `count`."""
     depth, reach = rng.uniform(0.34, 0.44), rng.uniform(1.0, 1.9)
     for start, seconds in events(rng, t, int(requested["count"]), 1.9):
         down = pulse(t, start, start + 0.45 * seconds, start + 0.5 * seconds, start + seconds)
@@ -216,6 +224,7 @@ def squat(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attrib
 
 
 def bow(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+    """Bends the trunk forward and straightens up."""
     start, end = rng.uniform(0.15, 0.35), t[-1] - rng.uniform(0.1, 0.25)
     middle, half = (start + end) / 2, rng.uniform(0.1, 0.25)
     down = pulse(t, start, middle - half, middle + half, end)
@@ -261,6 +270,7 @@ def seat(body: Body, seated: np.ndarray, bent: np.ndarray) -> None:
 
 
 def sit(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+    """Sits down on a seat that is not shown."""
     start, seconds = rng.uniform(0.1, 0.25), rng.uniform(1.25, 1.5)
     end = start + seconds
     seat(
@@ -271,6 +281,7 @@ def sit(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribut
 
 
 def rise(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+    """Stands up from a seat that is not shown."""
     start, seconds = rng.uniform(0.35, 0.5), rng.uniform(1.25, 1.45)
     end = start + seconds
     seat(

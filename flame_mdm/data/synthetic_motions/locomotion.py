@@ -108,10 +108,12 @@ def walk_along(
 
 
 def straight(x: float, z: float) -> Path:
+    """Returns a path in the direction (x, z); its length is the distance."""
     return lambda share, length: (x * share * length, z * share * length, 0 * share)
 
 
 def walk(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+    """Walks straight ahead, backward, sideways or along a circle."""
     direction = requested["direction"]
     sign = 1 if direction in ("left", "counterclockwise") else -1
     if direction in ("left", "right"):
@@ -151,6 +153,7 @@ def walk(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
 
 
 def run(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+    """Runs straight ahead."""
     gait = Gait(
         rng.uniform(0.34, 0.38),
         1.3,
@@ -182,6 +185,7 @@ def swing_arms(body: Body, apart: np.ndarray, size: float) -> None:
 
 
 def turn(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+    """Turns in place by a quarter or a half, with small steps."""
     sign = 1 if requested["direction"] == "left" else -1
     low, high = (160, 195) if requested["amount"] == "half" else (75, 110)
     angle = sign * np.radians(rng.uniform(low, high))

@@ -42,6 +42,7 @@ def sneak(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attrib
 
 
 def crouch_walk(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
+    """Walks with deeply bent knees."""
     gait = Gait(rng.uniform(0.46, 0.54), 0.8, 0.1, 0.4, 0.0, 0.11, 0.0)
     body.position[:, 1] -= rng.uniform(0.27, 0.33)
     apart = walk_along(body, rng, gait, rng.uniform(0.65, 0.9), straight(0, 1), RIGHT)
@@ -108,6 +109,7 @@ def march(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attrib
 def march_in_place(
     body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes
 ) -> None:
+    """Marches in place with high knees and swinging arms."""
     wave, going = _tread(body, rng.uniform(0.95, 1.1), 0.3, 0.05)
     body.spine[0] -= 0.06
     for side, sign in enumerate(SIGN):
@@ -118,6 +120,7 @@ def march_in_place(
 def run_in_place(
     body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes
 ) -> None:
+    """Runs in place, with both feet in the air between steps."""
     frequency = rng.uniform(1.45, 1.65)
     wave, going = _tread(body, frequency, rng.uniform(0.24, 0.3), -0.1)
     body.position[:, 1] += going * 0.035 * np.sin(2 * np.pi * frequency * t) ** 2

@@ -121,6 +121,7 @@ class PartSpec(Options):
 
 
 def as_list(value: Any) -> list[Any]:
+    """Returns a list unchanged, and any other value as a list with one item."""
     return value if isinstance(value, list) else [value]
 
 
@@ -167,6 +168,7 @@ class Lengths(Schema):
 
 
 def spec_names() -> list[str]:
+    """Returns the names of the tables of this project, sorted by name and by the numbers in it."""
     names = [path.stem for path in SPECS.glob("*.yaml") if path != PUBLISHED]
     return sorted(names, key=lambda name: re.sub(r"\d+", lambda number: number[0].zfill(3), name))
 
@@ -195,6 +197,7 @@ def _at_most(noun: str, count: int, most: int) -> None:
 
 
 def load_mapping(path: Path) -> Config:
+    """Reads a YAML file that contains one mapping of plain values; raises `UserError` otherwise."""
     content = read_yaml(path)
     if not isinstance(content, dict):
         raise UserError(f"{path}: not a mapping")

@@ -42,7 +42,6 @@ class Stub(Extractor):
 
     def check(self, representation: Any, dataset: str) -> None:
         """Accepts all motions."""
-        pass
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
         """Returns the first `WIDTH` numbers of two frames as features."""

@@ -57,6 +57,9 @@ class Connection(H11Protocol):
         self.stall: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Watches a new connection, and ends the idlest ones if there are too many, of its
+        network or of all.
+        """
         super().connection_made(transport)
         self.network = _network(self.client[0]) if self.client else None
         self._watch()

@@ -50,9 +50,7 @@ class MovingAverage(WeightAveraging):
         return self._average_model.module
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Collects the parameters of model and average, once, since looking them up takes time in
-        each step.
-        """
+        """Collects the parameters of model and average once: looking them up takes time."""
         self.averages = [p.detach() for p in self.averaged().parameters()]
         self.weights = [p.detach() for p in pl_module.parameters()]
         for copy, module in zip(self.averaged().modules(), pl_module.modules(), strict=True):

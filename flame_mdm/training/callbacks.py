@@ -189,7 +189,7 @@ class Report(Callback):
         self.folder = folder
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Prints the final values and what to run next."""
+        """Prints the last losses, writes the report, and prints which commands to run next."""
         if not trainer.is_global_zero:
             return
         texts = {"train/loss": "on the last batch", "val/loss": "on the validation clips"}

@@ -100,7 +100,7 @@ def measure(settings: Settings) -> Section:
     return section(
         "Preparation of a data set",
         f"""`make prepare` with synthetic clips of about {FRAMES_PER_CLIP} frames, one worker per core. Seconds are
-        those of all processes together, in processor time. Memory is the maximum during the run.""",
+        the processor time of all processes together. Memory is the maximum during the run.""",
         f"One core prepares {rows[-1]['clips per second and core']:,.0f} clips per second; the memory grows by "
         f"{per_frame:.0f} bytes per frame.",
         {"sizes": rows},

@@ -115,7 +115,7 @@ def render(sections: dict[str, Any]) -> str:
 
 
 def _position(name: str) -> tuple[int, bool]:
-    """Returns the place of a section on the page: that of its script, with the GPU after the CPU."""
+    """Returns the position of a section on the page: in the order of the scripts, the CPU before the GPU."""
     scripts = [*SECTIONS, *ON_REQUEST]
     return scripts.index(name.removesuffix("_cuda")), name.endswith("_cuda")
 

@@ -216,7 +216,7 @@ def measure(settings: Settings) -> Section:
         "Sampling",
         f"""MDM's encoder with {sum(p.numel() for p in encoder.parameters()):,} parameters, motions of {size.frames}
         frames of {FEATURES} features, on {size.device}, guidance {GUIDANCE} (two rows per motion in one call).
-        Latency and throughput are those of the ancestral sampler, with noise; "distilled" is the sampler of
+        Latency and throughput are measured with the ancestral sampler, with noise; "distilled" is the sampler of
         distilled models, without guidance; the samplers have {BATCH} motions per batch; the loops alone run without
         a network, at batch 1. Medians of {size.rounds} alternating rounds.""",
         f"With 10 steps, one motion takes {1000 * ten['1']:.0f} ms, and batches of 64 give "

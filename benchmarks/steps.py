@@ -1,6 +1,6 @@
 """Training steps in both speeds, compared to the authors' step and to plain PyTorch: `python benchmarks/steps.py`.
 
-The full-size step is that of humanml3d/mdm with lengths as in HumanML3D. The authors' step, from a clone of their
+The full-size step is a step of humanml3d/mdm with lengths as in HumanML3D. The authors' step, from a clone of their
 code, and a plain PyTorch loop, which trains `nn.TransformerEncoder` of the same size, take the same clips, padded
 to 196 frames as in the published codes. Then follow a step of every network in its size for CPU runs, and on the
 CPU the quickstart by the complete framework. All take turns in one run.
@@ -258,13 +258,13 @@ def measure(settings: Settings) -> Section:
         tables["quickstart"] = quickstart(60, 4, 1) if quick else quickstart(600, 150, 2)
 
     authors = (
-        "The authors' step is that of their code without CLIP, whose features are zeros. "
+        "The authors' step runs their code without CLIP, whose features are zeros. "
         if settings.mdm_repo
         else "The authors' code was not measured in this run. "
     )
     return section(
         "Training steps",
-        f"""The full-size step is that of `humanml3d/mdm` (8 layers of 512, dropout 0.1), {batches}. Lengths are
+        f"""The full-size step is a step of `humanml3d/mdm` (8 layers of 512, dropout 0.1), {batches}. Lengths are
         uniform from 40 to 196 frames, in units of 4, as a stand-in for HumanML3D's, and batches are drawn by the
         framework's sampler. {authors}Plain PyTorch trains `nn.TransformerEncoder` with AdamW on the same clips,
         padded to 196 frames as in the published codes, in float32. All alternate on each of {BATCHES} batches,

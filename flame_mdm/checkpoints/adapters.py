@@ -111,7 +111,10 @@ def attach(model: MotionGenerator, about: About) -> None:
 
 
 def copy_weights(model: MotionGenerator, base: str | Path) -> None:
-    """Copies the weights of a base, as for `find`, to a model, to which changes may be attached."""
+    """Copies the weights of a base to a model, which may have changes attached.
+
+    `base` is a path or name, as `find` takes it.
+    """
     state = model.state_dict()
     for name, value in read_merged(find(base))["state_dict"].items():
         state[name if name in state else name.removesuffix(".weight") + ORIGINAL] = value

@@ -28,10 +28,17 @@ OTHERS = "not overwritten, since it was not written by push. Choose another fold
 
 
 def export(source: str | Path, out: str | Path, *, half: bool = False, **adapted: Any) -> Path:
-    """Writes the model of a checkpoint, with its adapters, to a file as for `write_model_file`; returns its path.
+    """Writes the model of a checkpoint as a single .safetensors file and returns its path.
 
-    `half` writes the weight matrices in half precision, but not vectors, such as the statistics of the features. Loaded
-    models compute in single precision either way. Errors are as for `flame_mdm.load`.
+    Args:
+        source: what `flame_mdm.load` takes.
+        out: path of the file.
+        half: whether weight matrices are stored in half precision. Vectors, such as the
+            statistics of the
+            features, keep single precision, and loaded models always compute in single precision.
+        adapted: adapters to merge into the weights, and their strengths, as in `flame_mdm.load`.
+
+    Raises the errors of `flame_mdm.load`.
     """
     source = find(source)
     checkpoint = read_merged(source, **adapted)

@@ -243,7 +243,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def weights_sha256(path: Path) -> str:
-    """Returns the sha256 of the weights in a file; that of a checkpoint and its model file are the same."""
+    """Returns the sha256 of the weights in a file, equal for a checkpoint and its model file."""
     return state_sha256(read_checkpoint(path)["state_dict"])
 
 

@@ -32,9 +32,10 @@ from flame_mdm.safe_io import atomic_folder, sha256, write_json
 from flame_mdm.sampler_options import SamplerOptions
 
 RUNNER = Path(__file__).with_name("runner.py")
-# Maximum difference between the outputs of a graph and of PyTorch, relative to the largest output
+# Maximum difference between the outputs of a graph and of PyTorch, relative to the largest output. Float32
+# arithmetic in another order of operations differs by about 1e-6.
 TOLERANCE = 1e-4
-# Their graphs have as many frames as the longest motion: shorter ones are padded
+# Networks whose ONNX graphs need a fixed number of frames: shorter motions are padded to the longest one.
 FIXED_LENGTH = (
     MDMGRU,
     MDMUNet,
@@ -43,11 +44,20 @@ TINY = 1e-6  # probe of `to_x0` that no clipping of the clean estimate changes
 
 
 def export_onnx(source: str | Path, out: str | Path, *, half: bool = False, **adapted: Any) -> Path:
-    """Writes a model as a folder that `runner.py` in it samples from, with numpy and onnxruntime alone.
+    """Writes a model as a folder of ONNX graphs that need numpy and onnxruntime alone.
 
-    docs/export.md describes its files. `half` stores weight matrices in half precision. Source, adapters and errors are
-    as for `flame_mdm.load`; raises `UserError` also if a part cannot be exported, or a graph does not compute what
-    PyTorch does.
+    The folder contains `runner.py`, which samples from the graphs. docs/export.md describes the
+    files.
+
+    Args:
+        source: what `flame_mdm.load` takes.
+        out: the folder.
+        half: whether weight matrices are stored in half precision.
+        adapted: adapters to merge into the weights, and their strengths, as in `flame_mdm.load`.
+
+    Raises:
+        UserError: also if a part cannot be exported, or a graph does not compute what PyTorch
+            does.
     """
     try:
         import onnxruntime  # noqa: F401
@@ -91,19 +101,17 @@ def description(model: MotionGenerator) -> dict[str, Any]:
         else {}
     )
     content = {
-        **{
-            "format": FORMAT,
-            "experiment": model.config["experiment"],
-            "reads": model.conditioned_on,
-            **words,
-        },
-        **{key: list(facts.get(key, ())) for key in ("actions", "vocabulary", "captions")},
+        "format": FORMAT,
+        "experiment": model.config["experiment"],
+        "reads": model.conditioned_on,
+        **words,
+        "actions": list(facts.get("actions", ())),
+        "vocabulary": list(facts.get("vocabulary", ())),
+        "captions": list(facts.get("captions", ())),
         "function_words": sorted(FUNCTION_WORDS),
-        **{
-            "features": representation.features,
-            "fps": representation.fps,
-            "max_frames": facts["max_frames"],
-        },
+        "features": representation.features,
+        "fps": representation.fps,
+        "max_frames": facts["max_frames"],
         "padded_frames": facts["max_frames"] if padded else 0,
         "skeleton": {"joints": skeleton.joints, "parents": skeleton.parents, "feet": skeleton.feet},
         "clip_x0": bool(getattr(model.process, "clip_x0", False)),
@@ -124,19 +132,23 @@ def description(model: MotionGenerator) -> dict[str, Any]:
 class Probe:
     """Denoiser, noise and `Guide` that record how a sampler combines noise and clean estimates.
 
-    Noise number n is unit vector n, clean estimate number k is unit vector `calls` + 1 + k, so that every noisy motion
-    (1, 1, 2 `calls` + 1) lists its coefficients. `variance` is the network's output for a learned variance.
+    `variance` is the network's output for a learned variance.
     """
 
+    # All exported samplers are linear: each noisy motion is a weighted sum of draws of noise and of clean
+    # estimates. So the sampler is run once on unit vectors instead of motions. Draw number n is unit vector
+    # n, and clean estimate number k is unit vector `calls` + 1 + k. A noisy motion (1, 1, 2 `calls` + 1) of
+    # this run then lists its weights, and `_plan` solves for the four numbers of each step. This works for
+    # any sampler without a formula of its own here.
     def __init__(self, process: Process, calls: int, variance: float):
         self.process, self.calls, self.variance, self.output = process, calls, variance, variance
         self.time, self.draws = 0.0, 0
-        # x_t, draws before, (t, p, q) of each call
+        # For each call: x_t, the number of draws before it, and (t, p, q).
         self.records: list[tuple[Tensor, int, list[float]]] = []
 
     def unit(self, number: int) -> Tensor:
-        """Returns the unit vector (1, 1, 2 * calls + 1) of a quantity: a draw of noise, or a
-        clean estimate.
+        """Returns the unit vector (1, 1, 2 * calls + 1) of a draw of noise or of a clean
+        estimate.
         """
         return functional.one_hot(torch.tensor(number), 2 * self.calls + 1).double()[None, None]
 
@@ -154,6 +166,7 @@ class Probe:
         """Records the coefficients p and q of a call from two inputs of almost nothing."""
         if len(self.records) == self.calls:
             raise UserError("it chooses its own steps")
+        # The clean estimate is p x + q y. With an output y = 0, it shows p; with x = 0, it shows q.
         row = []
         for self.output, x in ((0.0, x_t * 0 + TINY), (TINY, x_t * 0)):
             row.append(float(clean(x)[0, 0, 0]) / TINY)
@@ -167,10 +180,12 @@ class Probe:
 
 
 def sampling_plan(process: Process, options: SamplerOptions) -> list[list[float]]:
-    """Returns the sampling loop as rows of 7 numbers (t, p, q, a, b, c, d), one for each call of the denoiser.
+    """Returns the sampling loop as rows of 7 numbers (t, p, q, a, b, c, d), one for each call of
+    the denoiser.
 
-    A call at time t, as the denoiser gets it, with output y gives the clean estimate x0 = p x + q y. Then x <- a x + b
-    x0 + c x0' + d noise, with the clean estimate x0' of the call before. Raises `UserError` for other samplers.
+    The denoiser is called at time t and returns y, which gives the clean estimate x0 = p x + q y.
+    The next noisy motion is a x + b x0 + c x0' + d noise, with the clean estimate x0' of the call
+    before. Raises `UserError` for samplers that are not of this form.
     """
     plans = [np.array(_plan(process, options, variance)) for variance in (0.0, 1.0)]
     if not np.array_equal(plans[0], plans[1]):
@@ -195,12 +210,14 @@ def _plan(process: Process, options: SamplerOptions, variance: float) -> list[li
     rows = []
     for number, (x_t, draws, row) in enumerate(probe.records):
         after, drawn, _ = (*probe.records, (end, probe.draws, []))[number + 1]
-        last = probe.unit(probe.calls + number) * (number > 0)
+        # The step must be a combination of these four: noisy motion, clean estimate, the estimate before
+        # it and fresh noise. What the step does not have is a column of zeros.
+        nothing = torch.zeros_like(x_t)
         columns = [
             x_t,
             probe.unit(probe.calls + 1 + number),
-            last,
-            probe.unit(draws) * (drawn > draws),
+            probe.unit(probe.calls + number) if number > 0 else nothing,
+            probe.unit(draws) if drawn > draws else nothing,
         ]
         matrix = torch.cat(columns, 1)[0].T.numpy()
         solution = np.linalg.lstsq(matrix, after.numpy().ravel())[0]

@@ -56,10 +56,15 @@ class Released(NamedTuple):
 
 
 def import_mdm(state: Mapping[str, Tensor], args: Options, *, time_token: bool = False) -> Released:
-    """Converts an encoder, decoder, decoder + token or GRU of MDM or MFM, for text (CLIP, DistilBERT), actions or none.
+    """Converts a model of MDM or MFM: encoder, decoder, decoder with token, or GRU; text, actions
+    or nothing.
 
-    `state` is that of `released_state`; sizes are read from the weights. `time_token` says whether the decoder's input
-    token is the time alone, as in the code since February 2025. The released model with an input token is older.
+    Args:
+        state: weights, as `released_state` returns them. Sizes are read from their shapes.
+        args: options of the authors' code.
+        time_token: whether the decoder's input token is the time alone, as in the code since
+            February 2025.
+            The released model with an input token is older.
     """
     network, stack, layer = NETWORKS[args.arch]
     dropped = ("sequence_pos_encoder.pe", "embed_timestep.sequence_pos_encoder.pe", "clip_model.")

@@ -91,7 +91,7 @@ def released_state(checkpoint: Mapping[str, Any], *, ema: bool = True) -> dict[s
 def layer_names(
     state: Mapping[str, Tensor], stack: str, layer: Mapping[str, str]
 ) -> tuple[dict[str, str], int]:
-    """Returns the prefixes of all layers of a torch transformer -> those of ours, and the number of layers."""
+    """Returns prefix of each layer of a torch transformer -> prefix of our layer, and the number of layers."""
     count = sum(
         key.startswith(f"{stack}.layers.") and key.endswith(".norm1.weight") for key in state
     )

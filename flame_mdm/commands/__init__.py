@@ -139,7 +139,7 @@ class FileSettings:
         None, "meters per length unit of the file; default 0.01 for most .bvh, 1 for .npy"
     )
     up: str | None = option(
-        None, "axis of the file that points up: y, z or -y; default that of skeleton.yaml, or y"
+        None, "axis of the file that points up: y, z or -y; default: from skeleton.yaml, or y"
     )
     animation: str | None = option(
         None, "name or number of an animation in an .fbx or .glb file; default: the first"
@@ -167,7 +167,7 @@ class WritingSettings:
     root_motion: bool = option(
         False, "true = the root of rig=unreal or soma follows the hips on the floor"
     )
-    resample: float | None = option(None, "frames per second of OUT; default: those of the motion")
+    resample: float | None = option(None, "frames per second of OUT; default: as in the motion")
     character: str | None = option(
         None, "your own .glb with a skin, or .bvh, to move: docs/characters.md", existing
     )

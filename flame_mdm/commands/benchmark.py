@@ -30,7 +30,9 @@ class BenchmarkSettings:
     OBJECTS: ClassVar = ("exp",)
     exp: str = required("a file in experiments/benchmark")
     out: str | None = option(None, "folder; default runs/benchmark/<exp>")
-    device: str | None = option(None, "device and batch_size: as for make evaluate")
+    device: str | None = option(
+        None, "device of the evaluations, such as cpu or cuda; default: cuda if there is one"
+    )
     batch_size: int = option(64, "motions at once")
     data_root: str = option(
         "", "folder of the prepared data sets; default: the checkpoint's, or FLAME_MDM_DATA"

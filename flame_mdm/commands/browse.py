@@ -16,7 +16,7 @@ class BrowseSettings(BodySettings, DataSettings):
     """usage: flame-mdm browse data=NAME [source=PATH] [split=train] [search="waves left"] [clips=200] [out=FILE.html]
            flame-mdm browse data=NAME split=test clips=10 motions=FOLDER
 
-    NAME is a data set, as for `prepare`; of your own motions, data=folder data.name=NAME.
+    NAME is a data set that `prepare` takes; for your own motions, data=folder data.name=NAME.
     Writes a single web page that opens from disk. It shows clips of a data set with their captions, mirrored copies
     next to their originals, a search field, a choice of splits, and statistics. motions=FOLDER also writes the shown
     clips as motion files, to compare generated motions with them.

@@ -40,7 +40,7 @@ class CompareSettings(BodySettings):
     Compares runs side by side on one page: configuration differences, curves, evaluations and motions for the same
     prompts. If the runs have results of the same protocol, data and extractor, prints the difference of each metric
     with its 95 % interval, and whether it is shown.
-    A run may also be a FOLDER of motion files, such as real motions (`browse motions=FOLDER`) or those of another
+    A run may also be a FOLDER of motion files, such as real motions (`browse motions=FOLDER`) or motions of another
     program. The runs are then sampled for the captions of its motions, at their lengths.
     rate=true writes a blind user study instead: a page that asks which of two motions fits a text better. ratings=
     counts the answers.
@@ -61,7 +61,7 @@ class CompareSettings(BodySettings):
     )
     seed: int = option(0, "seed of sampling, and of the order in which motions are rated")
     rate: bool = option(
-        False, "write a rating page: motions of the first run against those of each other run"
+        False, "write a rating page: motions of the first run against motions of each other run"
     )
     ratings: list[str] | None = option(None, "files saved by the rating page, to be counted")
     out: str | None = option(None, "default runs/compare.html, runs/rate.html or runs/ratings.json")

@@ -18,7 +18,8 @@ class DemoSettings:
 
     OBJECTS: ClassVar = ("ckpt",)
     ckpt: list[str] = option(
-        lambda: ["quickstart"], "one or more models, separated by spaces, as for sample"
+        lambda: ["quickstart"],
+        "one or more models, separated by spaces: names, files, runs or hub ids",
     )
     adapter: list[str] = option(
         list, "adapters of the first model to choose from, separated by spaces"

@@ -37,7 +37,9 @@ class TablesSettings:
     evaluate: bool = option(True, "evaluate what is missing; false = render existing results only")
     out: str = option("runs/tables", "folder of the tables")
     results: str = option("runs/results", "folder of the results")
-    device: str | None = option(None, "this and the next two: as for make evaluate")
+    device: str | None = option(
+        None, "device of the evaluations, such as cpu or cuda; default: cuda if there is one"
+    )
     batch_size: int = option(64, "motions at once")
     force: bool = option(
         False, "generate even if real motions miss the values that the protocol expects"

@@ -108,7 +108,7 @@ def movable(config: Config) -> Config:
 
 
 def moved(node: Any, folders: Mapping[str, str]) -> Any:
-    """Returns a configuration whose paths in a folder are in another one, that of `folders`."""
+    """Returns a configuration with moved paths; `folders` maps old to new folders."""
     if isinstance(node, dict):
         return {name: moved(value, folders) for name, value in node.items()}
     folder = next(

@@ -72,9 +72,10 @@ class ConfigSource(NamedTuple):
 def prepare_overrides(
     recipe: ConfigSource, overrides: Sequence[str], first: Sequence[str] = ()
 ) -> tuple[list[str], Config]:
-    """Checks overrides, except `first`, and prepares them for Hydra; also returns the recipe before those of keys.
+    """Checks the overrides (not those in `first`) and prepares them for Hydra.
 
-    Keys that the recipe lacks but a `_target_` accepts get a `++`. Without overrides, the second value is empty.
+    Keys that the recipe lacks but a `_target_` accepts get a `++`. Also returns the recipe with
+    its groups chosen, before single keys are overridden; {} without overrides.
     """
     parsed = parse(overrides)
     _check_groups(parsed, recipe)
@@ -104,7 +105,7 @@ def first_choice(override: Override) -> str:
 
 
 def choices(override: Override) -> list[str]:
-    """Returns the values of an override as text: one, or those of a sweep."""
+    """Returns the values of an override as text: one value, or all values of a sweep."""
     value = override.value()
     if isinstance(value, Glob):
         return value.filter(_options(override.key_or_group)) or [str(value)]

@@ -87,7 +87,8 @@ class MotionDataModule(LightningDataModule):
 
     Args:
         representation: encodes the clips; receives the statistics of the store.
-        root, name: folder of all prepared data sets, and name of that of this one.
+        root: folder of all prepared data sets.
+        name: name of the data set, which begins the name of its folder in `root`.
         batch_size: clips per process and step.
         num_workers: number of loading processes; 0 loads in the training process.
         crop: rule for the frames of a sample and the minimum length of a clip.
@@ -276,7 +277,7 @@ class MotionDataModule(LightningDataModule):
         )
 
     def training_batches(self, **of_process: int) -> Sampler[list[Draw]]:
-        """Returns the endless batches of a process; the arguments are those of `TrainingBatches`."""
+        """Returns the endless batches of a process; see `TrainingBatches` for the arguments."""
         return TrainingBatches(self.train.lengths, self.batch_size, **of_process)
 
     def val_dataloader(self) -> Loader:

@@ -61,8 +61,8 @@ class Folder(MotionSource):
 
     Args:
         path: the folder; motions may be in subfolders.
-        motion: "joints" for representations of joint positions; "smpl" for those of SMPL's rotations, which
-            AMASS files contain; they are fitted to the joints of other files.
+        motion: "joints" for representations of joint positions; "smpl" for representations of SMPL's
+            rotations, which AMASS files contain. They are fitted to the joints of other files.
         mirror: yield a mirrored copy after each clip of the training split; joints only.
         exclude: motions to leave out, by their path in the folder without extension.
         balance: training clips of an action that has fewer than this many, mirrored copies included, are repeated
@@ -288,13 +288,16 @@ class Folder(MotionSource):
 
     @cached_property
     def splits(self) -> dict[str, Split]:
-        """Split of each motion: that of the table, else drawn as in `drawn_splits`."""
+        """Split of each motion: from the table, else drawn as in `drawn_splits`."""
         sources = {name: note.source or name for name, note in self.notes.items()}
         return drawn_splits(sources, {name: note.split for name, note in self.notes.items()})
 
 
 def _check_upright(folder: Path, uprights: Mapping[str, Sequence[float]]) -> None:
-    """Raises `UserError` if the body lies in most motions of a layout; `uprights` are those of `Recording`."""
+    """Raises `UserError` if the body lies in most motions of a layout.
+
+    `uprights`: layout -> `upright` of each motion, see `Doubts`.
+    """
     for layout, values in uprights.items():
         if np.median(values) < LYING:
             raise UserError(
@@ -324,7 +327,7 @@ def _animations(name: str, path: Path) -> Iterator[tuple[str, MotionFile]]:
 
 
 def _read_table(path: Path, notes: dict[str, Note], exclude: Collection[str]) -> None:
-    """Adds the rows of a table, but those of motions in `exclude`, to the notes of the motions."""
+    """Adds the rows of a table to the notes of the motions, without motions in `exclude`."""
     for where, cells in table_rows(path):
         with naming(where):
             if cells["id"] not in exclude:

@@ -80,14 +80,20 @@ def by_recording(rows: Iterable[IndexedClip]) -> dict[str, list[IndexedClip]]:
 
 
 class HumanML3D(T2MFolder):
-    """The processed folder with 263 features.
+    """The processed folder with 263 features (Guo et al., CVPR 2022).
 
     Args:
-        path, exclude: as for `T2MFolder`; the folder must contain texts and splits.
-        amass: folder of AMASS's SMPL+H G archives, packed or unpacked, from which missing motions are created. This
-            also takes `index.csv` and HumanAct12's joints, `pose_data/humanact12.zip`, in the folder or next to it.
+        path: the folder, which must contain texts and splits.
+        exclude: names of motions to leave out; a mirrored copy has its own name.
+        amass: folder of AMASS's SMPL+H G archives, packed or unpacked, from which missing motions
+            are
+            created. This also takes `index.csv` and HumanAct12's joints,
+                `pose_data/humanact12.zip`, in the
+            folder or next to it.
         body_models: folder of the extended SMPL+H model.
-        bone_lengths: 22 bone lengths, in meters, of the skeleton that all motions are retargeted to.
+        bone_lengths: 22 bone lengths, in meters, of the skeleton that all motions are retargeted
+            to.
+        workers: number of processes; 0 = one per core.
     """
 
     name = "humanml3d"
@@ -263,16 +269,22 @@ def _read_joints(path: Path) -> np.ndarray:
 
 
 class HumanML3DSMPL(MotionSource):
-    """FLAME's form of the data set (Kim et al., AAAI 2023): SMPL parameters, whole clips, one clip per caption.
+    """FLAME's form of the data set (Kim et al., AAAI 2023): SMPL parameters, whole clips, one
+    clip per caption.
 
-    As in FLAME's code, there are no mirrored copies, no limits of length and no cuts: a caption of a part is used for
-    the whole motion. Clips are named NAME#0, NAME#1 ... Unlike there, the frames trimmed from the start of five subsets
-    are taken into account, so that motion and caption match.
+    As in FLAME's code, there are no mirrored copies, no limits of length and no cuts: a caption
+    of a part is used for the whole motion. Clips are named NAME#0, NAME#1 ... Unlike in FLAME's
+    code, the frames that were trimmed from the start of five subsets are taken into account, so
+    that motion and caption match.
 
     Args:
-        path, amass: as for `HumanML3D`; no motions are needed.
-        humanact12: FLAME's `humanact12_processed.pkl`; without it, the clips of HumanAct12 are left out.
-        published_split: train on the validation clips as well (FLAME's "final"); none are left for validation.
+        path: folder of HumanML3D with texts, splits and `index.csv`; no motions are needed.
+        amass: folder of AMASS's SMPL+H G archives, packed or unpacked.
+        humanact12: FLAME's `humanact12_processed.pkl`; without it, the clips of HumanAct12 are
+            left out.
+        published_split: train on the validation clips as well (FLAME's "final"); none are left
+            for
+            validation.
     """
 
     name = "humanml3d-smpl"

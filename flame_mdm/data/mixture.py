@@ -76,7 +76,7 @@ class Mixture(MotionSource):
                 )
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        """Yields the clips of each part; their actions are those of all parts together."""
+        """Yields the clips of each part; equal names of actions get one number in all parts."""
         self.check_licenses()
         names: dict[str, int] = {}
         for part in self.parts.values():

@@ -14,10 +14,10 @@ from flame_mdm.data.crops import Clips, Draw
 from flame_mdm.data.store import Store
 from flame_mdm.representations import Representation
 
-# data.resident=auto: data sets that take at most 1 / SHARE of the free memory of the device are
-# kept there
+# With data.resident=auto, a data set is kept on the device if it takes at most 1 / SHARE of the memory that
+# is free there: the rest is for the model and its activations.
 SHARE = 4
-CHUNK = 1 << 16
+CHUNK = 1 << 16  # frames that are copied at once, so that the copy takes little memory
 
 
 def free_memory(device: torch.device) -> int:
@@ -41,7 +41,10 @@ def free_memory(device: torch.device) -> int:
 
 
 def resident_features(store: Store, representation: Representation, device: torch.device) -> Tensor:
-    """Returns all frames of a store (N, D) on a device, normalized unless cuts are adapted, and one more of zeros."""
+    """Returns the frames of a store on a device, (N + 1, D); the last row is zeros, for padding.
+
+    Frames are normalized here unless the representation adapts cuts, which are normalized later.
+    """
     features = torch.empty(len(store.features) + 1, store.features.shape[1], device=device)
     mean, std = store.mean.astype(np.float32), store.std.astype(np.float32)
     for begin in range(0, len(store.features), CHUNK):
@@ -53,14 +56,20 @@ def resident_features(store: Store, representation: Representation, device: torc
 
 
 def adapts_cuts(representation: Representation) -> bool:
-    """Returns whether a representation has its own `rebase`."""
+    """Returns whether a representation changes the features of a cut of a motion (see `rebase`)."""
     return type(representation).rebase is not Representation.rebase
 
 
 class ResidentLoader:
-    """Batches of a split, equal bit for bit to those of the data loader, gathered from features on the device.
+    """Loads the batches of a split by gathering features on the device.
 
-    `features` (N + 1, D) are those of `resident_features`; batches are padded to multiples of `multiple` frames.
+    The batches are equal, bit for bit, to the batches of the data loader.
+
+    Args:
+        clips: clips of the split.
+        batches: draws of each batch.
+        features: (N + 1, D), see `resident_features`.
+        multiple: batches are padded to multiples of this number of frames.
     """
 
     def __init__(
@@ -77,7 +86,8 @@ class ResidentLoader:
         )
 
     def __len__(self) -> int:
-        return len(self.batches)  # type: ignore[arg-type]  # those of training have none
+        # Batches of training are endless and have no length.
+        return len(self.batches)  # type: ignore[arg-type]
 
     def __iter__(self) -> Iterator[MotionBatch]:
         return map(self._batch, self.batches)

@@ -268,8 +268,8 @@ def _pack(
 ) -> tuple[list[Entry], int]:
     """Writes the features and references of the data set `name` clip by clip; returns its clips and number of frames.
 
-    Consecutive clips with the same motion share its frames. Raises `UserError` if a clip exceeds its motion, or its id
-    or split contradicts that of another clip.
+    Consecutive clips with the same motion share its frames. Raises `UserError` if a clip exceeds its motion, has
+    the id of another clip, or is in another split than a clip of its source.
     """
     entries: dict[str, Entry] = {}
     split_of: dict[str, Split] = {}  # by source

@@ -30,13 +30,11 @@ from flame_mdm.safe_io import read_yaml
 
 MIN_SECONDS, MAX_SECONDS = 2.0, 3.0  # durations of clips
 CAPTIONS = 8  # captions per clip
-# Shares of clips of all actions that show two at once, or a part of a cycle
-SIMULTANEOUS, CYCLIC = (
-    0.08,
-    0.04,
-)
+SIMULTANEOUS = 0.08  # share of the clips that show two actions at once, with actions="all"
+CYCLIC = 0.04  # share of the clips that show a part of a cycle, such as two steps of a walk
 MARGIN = 1.0  # seconds before and after a part of a cycle, in which the body starts and stops
-# Share of the training clips whose captions leave out attributes; those of val and test state all
+# Share of the training clips whose captions leave out attributes. Captions of val and test state all of
+# them, so that every attribute can be measured.
 PARTIAL = 0.25
 ALWAYS = ("action", "while")  # attributes that each caption states
 UNSAID = {"speed": "normal", "amount": "quarter"}  # values that a caption need not state
@@ -134,7 +132,7 @@ def _sentence(rng: np.random.Generator, attributes: Attributes) -> tuple[str, se
 
 
 def _template(rng: np.random.Generator, attributes: Attributes) -> str:
-    """Returns a template of the captions, of two actions at once with those of each in its place."""
+    """Returns a template of the captions; for two actions at once, with the templates of both inserted."""
     grammar = content()
     if "while" not in attributes:
         return _one(rng, _entry(grammar["captions"], attributes))

@@ -31,7 +31,7 @@ MAX_FIELDS = 50  # of a query string
 MAX_WAY_POINTS, FAR = 16, 20.0  # a path: way points, and meters along x and z
 PLUS = " + "  # between the names of a model and of its adapter
 PLAIN = r"^[^\x00-\x1f\x7f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]*$"
-"""Text without control characters, those of writing direction included."""
+"""Text without control characters, including characters that change the direction of writing."""
 
 Text = Annotated[str, StringConstraints(strip_whitespace=True, max_length=MAX_TEXT, pattern=PLAIN)]
 Samples = Annotated[int, Field(ge=1, le=MAX_SAMPLES)]
@@ -70,7 +70,7 @@ class DemoEdit(BaseModel):
 
 
 class DemoRequest(BaseModel):
-    """Everything that determines the motions that the demo shows; keys are those of `flame-mdm sample`."""
+    """Everything that determines the motions that the demo shows; the keys have the names of `flame-mdm sample`."""
 
     model_config = RULES
     model: str = "quickstart"

@@ -35,7 +35,10 @@ FORMATS = {
 
 
 class Studio:
-    """Makes the motions of requests, with no other models than `sources`, as for `load`, or "MODEL + ADAPTER"."""
+    """Makes the motions of requests with the models `sources`, and with no others.
+
+    A source is what `load` takes, or "MODEL + ADAPTER".
+    """
 
     def __init__(self, sources: Sequence[str], device: str):
         self.device = device
@@ -115,7 +118,7 @@ class Studio:
         return _cleaned(model, motions) if cleanup else motions
 
     def understood(self, request: DemoRequest) -> DemoRequest:
-        """Returns the request with a sentence of several actions as a sequence; errors as for `generate`."""
+        """Returns the request with a sentence of several actions as a sequence; raises the errors of `generate`."""
         if not request.text or (model := self.model(request.model)).conditioned_on != "text":
             return request
         check_length(request)

@@ -75,7 +75,11 @@ def read(path: Path, fps: float | None) -> Bvh:
 
 
 def skeleton_of(path: Path) -> Path:
-    """Returns the ASF file next to an AMC file: that of its name, of its subject (02.asf), or the only one."""
+    """Returns the ASF file of an AMC file, in the same folder.
+
+    It has the name of the file, the name of its subject (02.asf), or is the only ASF file. Raises
+    `UserError` if there is none.
+    """
     candidates = (path.with_suffix(".asf"), path.with_name(path.stem.partition("_")[0] + ".asf"))
     files = sorted(path.parent.glob("*.asf"))
     chosen = next(

@@ -16,9 +16,12 @@ from flame_mdm.visualize.body import ANCHORS, HELPERS, Figure, FittedBody, Mesh,
 
 TRUNK = {"pelvis": 0.0, "spine1": 0.35, "spine2": 0.75, "spine3": 1.0}
 """Joints of the trunk -> how much their width follows the shoulders rather than the hips."""
-WIDER = (0.8, 1.25)  # limits of the width of hips and shoulders relative to that of the limbs
+# Limits of the factor of hips and shoulders, relative to the factor of the limbs: a clip's joints may lie
+# elsewhere in the flesh than the mesh's, and must not make the trunk too thin or too wide.
+WIDER = (0.8, 1.25)
 LONGER = (0.4, 2.5)  # limits of the length of a limb relative to the mesh's
-TALLER = (0.6, 1.6)  # limits of the length of other parts relative to that of the limbs
+# Limits of the factor of the other parts' lengths, relative to the factor of the limbs.
+TALLER = (0.6, 1.6)
 ORTHONORMAL = 0.1  # largest error of the products of two rows of a rotation matrix
 LIMBS = tuple(
     JOINT[f"{side}_{name}"]
@@ -98,7 +101,7 @@ def local_rotations(body: FittedBody) -> np.ndarray:
 
 
 def proportions(body: Mesh, offsets: np.ndarray) -> tuple[np.ndarray, float]:
-    """Returns the map (22, 3, 3) of each part of a body to a clip's `offsets` (22, 3) at rest, and that of widths."""
+    """Returns the linear map (22, 3, 3) of each part to a clip's `offsets` (22, 3) at rest, and the map of widths."""
     lengths, usual = np.linalg.norm(offsets, axis=1), np.linalg.norm(body.rest, axis=1)
     ratio = np.divide(lengths, usual, out=np.ones_like(lengths), where=usual > 0)
     for joint in LIMBS:
@@ -143,7 +146,7 @@ def _check_rotations(world: np.ndarray) -> None:
 
 
 def _with_helpers(world: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-    """Appends the rotations of the helper bones to those of the joints (F, 22, 3, 3)."""
+    """Appends the rotations of the helper bones to the rotations of the joints (F, 22, 3, 3)."""
     helpers = []
     for joint, share in HELPERS:
         child = SMPL22.parents.index(joint)

@@ -43,7 +43,7 @@ class BvhCharacter(RestPose):
 
 
 def read(path: str | Path) -> Character | BvhCharacter:
-    """Reads a character. Names of joints are those of a known skeleton, or are in a `.yaml` file of the same name.
+    """Reads a character. Its joints have the names of a known skeleton, or of a `.yaml` file with the same name.
 
     Raises `UserError` if the file is damaged, or has no skin (.glb), no known joints (`UnknownJoints`) or no usable
     rest pose.

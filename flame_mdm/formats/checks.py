@@ -31,7 +31,7 @@ _LIMBS = (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle"))
 
 
 def check_body(joints: np.ndarray, layout: Layout) -> None:
-    """Raises `UserError` if joints (F, 22, 3) are not those of a person: wrong size, or feet of no length or backwards.
+    """Raises `UserError` if joints (F, 22, 3) are no person: wrong size, or feet of no length or backwards.
 
     The `layout` of the file has its unit, its axis that points up, and whether the body may be a child's. The advice on
     the size also names the axis if the body lies, so that one correction of the file is enough.

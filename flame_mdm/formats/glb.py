@@ -72,7 +72,7 @@ class _Node(_Object):
     scale: Vector = [1, 1, 1]
 
     def local(self) -> np.ndarray:
-        """Returns the matrix (4, 4) from the node's coordinates to those of its parent."""
+        """Returns the matrix (4, 4) from the node's coordinates to its parent's."""
         if self.matrix is not None:
             return np.array(self.matrix, float).reshape(4, 4).T
         matrix = np.eye(4)
@@ -170,8 +170,8 @@ class Glb:
     nodes: tuple[int, ...]  # index of each node in the document
     names: tuple[str, ...]  # name of each node
     parents: tuple[int, ...]  # number of each node's parent, -1 for a root
-    locals: np.ndarray  # (N, 4, 4), coordinates of each node to those of its parent
-    worlds: np.ndarray  # (N, 4, 4), coordinates of each node to those of the world
+    locals: np.ndarray  # (N, 4, 4), from each node's coordinates to its parent's
+    worlds: np.ndarray  # (N, 4, 4), from each node's coordinates to the world's
     skins: tuple[Skin, ...]  # skins of meshes
 
 

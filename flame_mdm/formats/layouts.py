@@ -53,7 +53,7 @@ class Layout(BaseModel):
     """Mapping from the joints of files to the 22 joints of SMPL, in meters, y up; the keys of `skeleton.yaml`."""
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
-    # For SMPL's joints, those of the files
+    # Name of each of SMPL's joints -> name of the joint in the files.
     map: dict[str, Source] = {joint: joint for joint in SMPL22.joints}
     joints: list[str] = []  # names of the joints of arrays, in order; BVH files contain their own
     unit: Annotated[FiniteFloat, Field(gt=0)] = 1.0  # meters per unit of length in the files
@@ -62,7 +62,7 @@ class Layout(BaseModel):
         None  # of files that do not contain it
     )
     mirrored: bool = False  # the files contain mirrored motion; the sign of x is changed
-    children: bool = False  # the bodies may be those of children
+    children: bool = False  # whether children may be among the bodies
     _name: str = PrivateAttr("own map")
     _bones: dict[str, str] = PrivateAttr(default_factory=dict)
 
@@ -296,7 +296,7 @@ def skeleton_file(path: Path) -> Path | None:
 
 
 def find_skeleton(path: Path, up: str | None = None) -> dict[str, Any]:
-    """Returns the fields of `Layout` for a file: those of its `skeleton_file`, overridden by `up` (y, z or -y)."""
+    """Returns the fields of `Layout` in the `skeleton_file` of a file, overridden by `up` (y, z or -y)."""
     if up is not None and up not in UP:
         raise UserError(f"up={up}: the axis that points up is one of {', '.join(UP)}")
     file = skeleton_file(path)
@@ -400,7 +400,7 @@ def check_order(joints: np.ndarray, count: int, skeleton: str) -> None:
     """Raises `UserError` if an array of joints was taken for another skeleton, because of their number alone.
 
     Args:
-        joints: (F, 22, 3) of SMPL, mapped from the array as if its joints were those of the skeleton.
+        joints: (F, 22, 3) of SMPL, mapped as if the array had the joints of the skeleton.
         count: number of joints of the array.
         skeleton: name of the skeleton.
 

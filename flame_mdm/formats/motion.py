@@ -379,7 +379,7 @@ def _write_video(motion: Motion, path: Path, body: Mesh | None) -> str:
 
 
 def _error(motion: Motion, poses: Poses) -> str:
-    """Describes the distance between joints with constant bone lengths and those of the motion."""
+    """Describes how far joints with constant bone lengths are from the joints of the motion."""
     off = np.linalg.norm(poses.joints().numpy() - motion.joints[:, : len(SMPL22)], axis=-1)
     mean, most = 1000 * off.mean(), 1000 * off.max()
     return f"constant bone lengths; mean joint error {mean:.2g} mm, max {most:.2g} mm"

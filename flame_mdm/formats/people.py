@@ -1,7 +1,7 @@
 """Bodies by name: the mannequin, the body in a file, and people of all shapes made by Anny (`body="anny age=0.9"`).
 
 Brégier et al., "Human Mesh Modeling for Anny Body", 2026, https://arxiv.org/abs/2511.03589: (c) 2025 NAVER Corp.,
-Apache-2.0; its shapes and weights are those of MakeHuman and MPFB2, CC0. Topologies of SMPL and SMPL-X, which Anny
+Apache-2.0; its shapes and weights come from MakeHuman and MPFB2, CC0. Topologies of SMPL and SMPL-X, which Anny
 downloads and which are not free for commercial use, are never built.
 """
 
@@ -199,7 +199,7 @@ def _turns(joints: np.ndarray) -> np.ndarray:
 
 
 def _clothes(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Returns colors (V, 3), 0 to 255, by the joint that a vertex follows; hair as that of the mannequin."""
+    """Returns colors (V, 3), 0 to 255, by the joint that a vertex follows, with the mannequin's hair."""
     table = np.array([CLOTHES.get(name.split("_")[-1], SHIRT) for name in SMPL22.joints], float)
     colors = weights @ table
     figure, head = mannequin(), weights[:, JOINT["head"]] > 0.5
@@ -231,7 +231,7 @@ def with_helpers(points: np.ndarray, weights: np.ndarray, joints: np.ndarray) ->
     """Returns weights (V, 28): the upper part of limbs moves to helper bones, which turn less about the limb.
 
     The forearm is the other way round: its lower half moves to a bone that takes part in the twist of the wrist.
-    `joints` (22, 3) are those of the mesh.
+    `joints` (22, 3) are the joints of the mesh.
     """
     columns = []
     for joint, _ in HELPERS:

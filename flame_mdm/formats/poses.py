@@ -18,7 +18,7 @@ CHILDREN = tuple(
 )
 PELVIS, SPINE3 = 0, 9
 ALIKE = ((0,), (1, 2), (3,), (4, 5), (6,), (7, 8), (9,), (12,), (13, 14), (16, 17), (18, 19))
-"""Joints with children, from the root outward; those of both sides together."""
+"""Joints with children, from the root outward, left and right joints together."""
 # Joints between pelvis and chest -> fraction of the rotation from pelvis to chest
 SPINE = {
     3: 1 / 3,
@@ -65,7 +65,8 @@ def solve(joints: Tensor, fps: float) -> Poses:
     twist of a bone about its own axis: thighs and upper arms are twisted so that knees and elbows bend like hinges, the
     spine twists evenly from pelvis to chest, and all other joints, also head, hands and toes, follow their parent.
 
-    Joints (F, 22, 3) are those of `SMPL22` in meters, y up. Raises `UserError` if not, or if a bone has no length.
+    `joints` (F, 22, 3) have the order of `SMPL22`, in meters, y up. Raises `UserError` if they have another
+    shape, or if a bone has no length.
     """
     if joints.ndim != 3 or not len(joints) or joints.shape[1:] != (len(SMPL22), 3):
         raise UserError(

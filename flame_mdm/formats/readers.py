@@ -54,7 +54,8 @@ PELVIS = (0.0, -0.223, 0.028)
 """Pelvis of SMPL's template in meters: a body is there at translation 0, in the axes of the file, however it turns."""
 
 Standard = Callable[[Bvh], tuple[Bvh, Mapping[str, Any]]]
-"""A change of the tree of a published data set; returns it with fields of `Layout`, none for those of the file."""
+"""A change of the tree of a published data set. Returns the tree and fields of `Layout`; without fields, the
+layout follows from the file."""
 
 
 @dataclass(frozen=True)
@@ -116,8 +117,8 @@ def read(
         fps: frames per second, overrides the rate in the file; .npy and .amc files have none.
         unit: meters per unit of length in the file, not for files with SMPL's rotations, such as AMASS.
         up: the axis of the file that points up: y, z or -y.
-        resample_to: target frame rate, None = that of the file. Rotations are interpolated on the sphere, joints and
-            translations with cubic splines.
+        resample_to: target frame rate, None = the rate of the file. Rotations are interpolated on the
+            sphere, joints and translations with cubic splines.
         animation: name or number, from 1, of an animation in an FBX or GLB file; None = the first one.
 
     Returns the motion; its `notes` say what was left out or looks wrong. Raises `FileNotFoundError`, or `UserError` if
@@ -137,7 +138,7 @@ def read_recording(
     as_smpl: bool = False,
     standard: Standard | None = None,
 ) -> Recording:
-    """Reads and checks a motion; arguments and errors are those of `read`.
+    """Reads and checks a motion; see `read` for arguments and errors.
 
     `as_smpl` maps all arrays to SMPL's 22 joints, otherwise KIT-ML's 21 joints and SMPL's hands are kept. `standard`
     changes the tree of a published data set, whose root is then resampled linearly, as published.
@@ -375,7 +376,7 @@ def _of_ours(
 
 
 def _rate(data: Mapping[str, Any], rate: float | None, fields: Mapping[str, Any]) -> float:
-    """Returns the frame rate of arrays: that of the command, of the file, or of skeleton.yaml."""
+    """Returns the frame rate of arrays, from the command, from the file, or from skeleton.yaml, in this order."""
     rate = data.get("fps", fields.get("fps")) if rate is None else rate
     if rate is None:
         raise UserError(

@@ -37,7 +37,7 @@ class Rig:
     turns: np.ndarray  # (J, 3, 3), rotations of the joints in the world
     # For each joint, the index of the joint of SMPL whose rotation it takes, or -1
     sources: tuple[int, ...]
-    # (J, 3, 3), rotations of these joints in the world while SMPL's are those of its rest pose
+    # (J, 3, 3), rotations of these joints in the world while SMPL is in its rest pose
     neutral: np.ndarray
     orders: tuple[str, ...]  # of the Euler angles of each joint in BVH files
     unit: float = CENTIMETER  # meters per unit of length in BVH files
@@ -136,9 +136,7 @@ def matched(
 class RestPose:
     """A character's skeleton in its rest pose, y up, facing +z, in its own unit."""
 
-    rig: (
-        Rig  # the skeleton; its neutral rotations are those of `fitted`, which depend on the motion
-    )
+    rig: Rig  # the skeleton; `fitted` replaces its neutral rotations by ones that depend on the motion
     map: Mapping[str, int]  # SMPL's joint -> index of the character's
     floor: float  # height of the lowest point in the rest pose
 

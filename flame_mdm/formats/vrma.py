@@ -25,7 +25,9 @@ LIMBS = {"shoulder": (1, 0, 0), "elbow": (1, 0, 0), "hip": (0, -1, 0), "knee": (
 
 
 def rest_rig(poses: Poses) -> Rig:
-    """Returns VRM's humanoid in its T-pose, with the bone lengths of a body; all local axes are those of the world."""
+    """Returns VRM's humanoid in its T-pose, with the bone lengths of a body; its axes are the
+    axes of the world.
+    """
     names = {joint: bone for bone, joint in HUMANOID.items()}
     offsets = poses.offsets.numpy().copy()
     neutral = np.tile(np.eye(3), (len(SMPL22), 1, 1))

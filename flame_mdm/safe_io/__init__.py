@@ -50,9 +50,8 @@ ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, Run
 """Errors that `zipfile` raises for damaged, encrypted and unusually compressed archives."""
 DIRECTORY_LIMIT = 16 * MEBIBYTE
 """Maximum size of the directory of a zip archive in bytes. Each of its entries becomes a Python object."""
-MAX_MEMBERS = (
-    200_000  # maximum number of members of an archive; the largest known, HumanML3D, has 90,000
-)
+# Maximum number of members of an archive. HumanML3D, the largest data set in archives, has 90,000.
+MAX_MEMBERS = 200_000
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # numbers of errors of a full disk
 
 
@@ -84,9 +83,12 @@ def atomic_write(path: str | Path, *, within: str | Path | None = None) -> Itera
 
 @contextmanager
 def atomic_folder(path: str | Path, *, within: str | Path | None = None) -> Iterator[Path]:
-    """Does the same for a folder; if it exists, the new files replace those of the same name, and others are kept.
+    """Yields a temporary folder whose files are moved to the folder `path` at the end, all or
+    none.
 
-    Temporary folders that killed processes left behind are removed.
+    If `path` exists, files of the same names are replaced and other files are kept. Temporary
+    folders that killed processes left behind are removed. `within` is the folder that links must
+    not leave; see `atomic_write` for the errors.
     """
     path = Path(path)
     if within is not None:
@@ -154,7 +156,7 @@ def made_folder(folder: Path) -> Iterator[None]:
 
 
 def write_text(path: str | Path, text: str, *, within: str | Path | None = None) -> None:
-    """Writes a text file atomically; `within` as for `atomic_write`."""
+    """Writes a UTF-8 text file atomically. `within` is the folder that links must not leave."""
     with atomic_write(path, within=within) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
@@ -162,7 +164,10 @@ def write_text(path: str | Path, text: str, *, within: str | Path | None = None)
 def write_json(
     path: str | Path, content: Any, indent: int | None = 2, *, within: str | Path | None = None
 ) -> None:
-    """Writes a JSON file atomically, `within` as for `atomic_write`; NaN and infinity raise `ValueError`."""
+    """Writes a JSON file atomically. NaN and infinity raise `ValueError`.
+
+    `within` is the folder that links must not leave.
+    """
     write_text(path, json.dumps(content, indent=indent, allow_nan=False) + "\n", within=within)
 
 
@@ -331,7 +336,17 @@ def _nodes(node: Any, counted: dict[int, float]) -> float:
 def read_npz(
     source: Path | IO[bytes], *, skip: Collection[str] = (), only: Collection[str] | None = None
 ) -> dict[str, np.ndarray]:
-    """Returns the arrays of an .npz file, or seekable open file, by name; refuses objects and excessive sizes."""
+    """Returns the arrays of an .npz file, or of a seekable open file, by name.
+
+    Args:
+        source: the file.
+        skip: names of arrays that are not read.
+        only: names of the arrays that are read; None = all.
+
+    Raises:
+        UserError: if the file is damaged, contains objects, or is larger than the limits of this
+            module.
+    """
     from numpy.lib import format as npy
 
     with _opened(source) as (file, size), opened_zip(file) as archive:
@@ -350,7 +365,11 @@ def read_npz(
 
 
 def read_npy(source: Path | IO[bytes], *, mmap: bool = False) -> np.ndarray:
-    """Returns the array of an .npy file; errors as for `read_npz`. `mmap` maps it read-only; requires a path."""
+    """Returns the array of an .npy file; `mmap` maps it read-only and requires a path.
+
+    Raises `UserError` if the file is damaged, contains objects, or is larger than the limits of
+    this module.
+    """
     import numpy as np
 
     with _opened(source) as (file, size):

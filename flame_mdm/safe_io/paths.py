@@ -117,8 +117,8 @@ def remove_abandoned(folder: Path, path: Path | None = None, *, is_locked: bool 
     Args:
         folder: folder of the temporary files and folders.
         path: only those written for this file or folder; None = for any.
-        is_locked: whether this process holds the lock under which alone such files are written. Then those of processes
-            on other machines are removed, too. Otherwise they stay, because they may be alive.
+        is_locked: whether this process holds the lock that writers of such files need. Then the files of
+            processes on other machines are removed, too. Otherwise they stay: these processes may be alive.
     """
     if not folder.is_dir():
         return

@@ -269,7 +269,7 @@ def _new_frames(length: int, fps: float, editing: EditRequest) -> Tensor:
 def method_options(
     process: Process, editing: EditRequest, options: SamplerOptions
 ) -> tuple[dict[str, Any], SamplerOptions]:
-    """Returns the options of `Edit` for the requested method, by default that of the process, and of the sampler."""
+    """Returns the options of `Edit` and of the sampler, for the requested method or for the method of the process."""
     possible = [
         name for name, method_edit in METHODS.items() if method_edit["mode"] in process.edit_modes
     ]

@@ -149,7 +149,7 @@ class _Row:
 
 
 def _rows(resolved: ResolvedRequest) -> list[_Row]:
-    """Returns the motions to sample, those of the first prompt first."""
+    """Returns the motions to sample, beginning with the motions of the first prompt."""
     copies = resolved.request.samples * resolved.request.candidates
     counts: Counter[str] = Counter()
     rows = []

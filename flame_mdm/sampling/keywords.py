@@ -41,7 +41,7 @@ class SamplingKeywords(SamplerKeywords, total=False):
 
 
 class EditKeywords(SamplingKeywords, total=False):
-    """Fields of `flame_mdm.sampling.motion_request.EditRequest`, and those of `SamplingKeywords`."""
+    """Fields of `flame_mdm.sampling.motion_request.EditRequest`, besides `SamplingKeywords`."""
 
     region: str | Ranges | None
     region_seconds: Ranges | None

@@ -124,7 +124,10 @@ class EditRequest:
         return [(begin, end) for begin, end in listed]
 
     def method_options(self, method: str) -> dict[str, Any]:
-        """Returns the options of `flame_mdm.batch.Edit` for a method, which must have those of this request."""
+        """Returns the options of `flame_mdm.batch.Edit` for a method.
+
+        Raises `UserError` if this request has options that the method lacks.
+        """
         options = METHODS[method] | {"resample": self.resample, "strength": self.strength}
         if self.resample != 1 and options["mode"] != "x_t":
             raise UserError(

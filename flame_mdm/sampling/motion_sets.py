@@ -136,7 +136,7 @@ def make_set(model: MotionGenerator, content: MotionSet, seed: int = 0, **option
         model: a model of SMPL's 22 joints that samples texts in windows.
         content: the set.
         seed: seed of the noise.
-        options: how the motions are sampled, as for `generate`.
+        options: how the motions are sampled, as in `generate`.
 
     Raises:
         UserError: If the model has another skeleton or cannot do what is requested, or no person stands.

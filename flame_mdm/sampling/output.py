@@ -34,10 +34,12 @@ def refuse_no_condition(model: MotionGenerator) -> None:
 
 
 def default_folder(model: MotionGenerator, title: str, *request: object) -> Path:
-    """Returns `samples/<experiment>/<title>-<hash>`; the hash is that of the title and of everything in `request`.
+    """Returns `samples/<experiment>/<title>-<hash>`, where the hash covers the title and all of
+    `request`.
 
-    Requests for different motions thus go to different folders, also where the file system ignores case. The folder is
-    within `SAMPLES`, whatever an untrusted checkpoint calls its experiment.
+    Requests for different motions thus go to different folders, also where the file system
+    ignores case. The folder is within `SAMPLES`, whatever an untrusted checkpoint calls its
+    experiment.
     """
     digest = hashlib.sha256(repr((title, request)).encode()).hexdigest()[:6]
     name = re.sub(r"[^\w]+", "-", title.lower()).strip("-")[:40].strip("-")

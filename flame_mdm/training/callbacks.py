@@ -226,7 +226,7 @@ def _extractor_in_package(config: Config, facts: Mapping[str, Any]) -> str:
 
 
 def explain_metrics(values: Values, real: Values, metrics: Mapping[str, Metric]) -> list[str]:
-    """Returns lines that explain metrics by their docstrings, with their values next to those of real motions."""
+    """Returns lines that explain metrics by their docstrings, with values of generated and real motions."""
     lines = []
     for name, metric in metrics.items():
         shown = {key: value for key, value in values.items() if key.partition("/")[0] == name}
@@ -286,7 +286,7 @@ class SampleMotions(Callback):
     """Samples fixed prompts with fixed noise: writes files to the run directory and logs a video.
 
     Args:
-        folder: folder of the samples; those of a step are in a subfolder, such as `step_0001000`.
+        folder: folder of the samples. Samples of a step are in a subfolder such as `step_0001000`.
         every_n_steps: minimum number of steps between samples, which are drawn at validation and after training.
         prompts: texts, action names, or (text, requested attributes) pairs; None = `UNCONDITIONED` motions. If a model
             is conditioned on actions and no prompt is one of them, its first actions are used instead.

@@ -7,24 +7,26 @@ from flame_mdm.config import Config, compose, flatten, movable, read_saved, reci
 from flame_mdm.errors import UserError, shortened
 
 FREE = (
-    *("callbacks", "logger", "data_root", "data.root", "data.num_workers", "data.resident"),
-    *("data.source.path", "data.source.workers"),
-    *(
-        "trainer.max_steps",
-        "trainer.max_time",
-        "trainer.devices",
-        "trainer.num_nodes",
-        "trainer.accelerator",
-    ),
-    *(
-        "trainer.strategy",
-        "trainer.log_every_n_steps",
-        "trainer.val_check_interval",
-        "trainer.limit_val_batches",
-    ),
+    "callbacks",
+    "logger",
+    "data_root",
+    "data.root",
+    "data.num_workers",
+    "data.resident",
+    "data.source.path",
+    "data.source.workers",
+    "trainer.max_steps",
+    "trainer.max_time",
+    "trainer.devices",
+    "trainer.num_nodes",
+    "trainer.accelerator",
+    "trainer.strategy",
+    "trainer.log_every_n_steps",
+    "trainer.val_check_interval",
+    "trainer.limit_val_batches",
     "trainer.enable_progress_bar",
 )
-"""Keys that may differ when a run is resumed."""
+"""Keys that may differ when a run is resumed: they change neither the model nor its training."""
 
 
 def train(config: Config) -> None:
@@ -43,11 +45,13 @@ def train(config: Config) -> None:
 
 
 def recipe_changes(config: Config) -> list[str]:
-    """Returns "key=value" of the keys in which a model's configuration differs from the recipe that it names.
+    """Returns "key=value" of the keys in which a model's configuration differs from the recipe
+    that it names.
 
-    Keys that may differ when a run is resumed, the seed, and keys that the configuration lacks, as those of other
-    versions do, are not compared. If the class of a part differs, its other keys are left out. Recipes that are not in
-    `experiments/` have no changes.
+    Keys that may differ when a run is resumed and the seed are not compared. Neither are keys
+    that the configuration lacks, because another version wrote it. If the class of a part
+    differs, the other keys of this part are left out. A recipe that is not in `experiments/` has
+    no changes.
     """
     name = config.get("experiment")
     if name not in recipes():

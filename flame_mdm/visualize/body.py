@@ -153,7 +153,9 @@ class FittedBody:
     neutral: np.ndarray
     turns: np.ndarray  # (F, B, 3, 3), rotation of each bone from the stored pose to each frame
     starts: np.ndarray  # (F, B, 3), where each bone begins: at the motion's joints, lifted
-    lift: float  # height of a joint of the body above that of the motion: the thickness of the sole
+    lift: (
+        float  # height in meters of the body's joints above the motion's: the thickness of the sole
+    )
 
     def skinned(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
         """Returns vertices and normals (V, 3) of a frame, by linear blend skinning."""

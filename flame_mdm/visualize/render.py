@@ -222,7 +222,7 @@ def _figure(motion: Figure, body: FittedBody | None, frame: int, size: int) -> I
     for parent, joint in motion.skeleton.edges:
         _capsule(ImageDraw.Draw(dark), soft[parent], soft[joint], 0.055, 255)
     dark = dark.filter(ImageFilter.BoxBlur(size / 192))
-    # Enlarged with a margin, so that its edge is the same as that of the whole image
+    # The part is enlarged with a margin, so that it has the same edge as if the whole image were enlarged.
     if box := dark.getbbox():
         left, top, right, bottom = max(0, box[0] - 4), max(0, box[1] - 4), box[2] + 4, box[3] + 4
         dark = dark.crop((left, top, right, bottom)).resize(

@@ -68,7 +68,7 @@ class Body:
     def __init__(
         self, rng: np.random.Generator, t: np.ndarray, width: float | Sequence[float] | None = None
     ):
-        """`width` is half the distance between the feet in meters, or its range; None = that of a relaxed stance."""
+        """`width` is half the distance between the feet in meters, or its range; None = as in a relaxed stance."""
         self.t = t
         half = rng.uniform(width[0], width[1]) if isinstance(width, Sequence) else width
         self.position = np.zeros((len(t), 3))

@@ -46,7 +46,8 @@ def walk_along(
     """
     t, start = body.t, rng.uniform(0.08, 0.18)
     seconds = t[-1] - rng.uniform(0.06, 0.16) - start  # until the last foot is down
-    landing = min(gait.swing, 0.82)  # the last steps are those of a walk
+    # A run ends with the steps of a walk, whose feet never leave the ground together.
+    landing = min(gait.swing, 0.82)
     count = max(1, round(seconds / gait.step - landing))
     gait = replace(gait, step=seconds / (count + landing))
     halt = start + (count + 0.5 * landing) * gait.step

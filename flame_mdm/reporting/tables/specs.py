@@ -58,7 +58,7 @@ class ColumnSpec(Options):
 
 
 class RowSpec(Options):
-    """A row: a model or baseline, and its sampling options; dotted keys override those of the data."""
+    """A row: a model or baseline, and its sampling options. Dotted keys override options of the data."""
 
     label: str
     note: str = ""

@@ -54,11 +54,11 @@ def walk_along(
     fine = np.arange(0, t[-1] + 3, 0.01)
     ramp = min(0.2 + 0.17 * speed, (halt - start + 0.1) / 2)
     pace = pulse(fine, start - 0.1, start - 0.1 + ramp, halt - ramp, halt)
-    distance = np.cumsum(pace) - pace
-    length = speed * 0.01 * distance[-1]
+    progress = np.cumsum(pace) - pace
+    length = speed * 0.01 * progress[-1]
 
     def at(time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return path(np.interp(time, fine, distance / distance[-1]), length)
+        return path(np.interp(time, fine, progress / progress[-1]), length)
 
     x, z, heading = at(t)
     sway, yaw0 = body.position[:, [0, 2]].copy(), body.foot_yaw[:, 0].copy()

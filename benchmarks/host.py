@@ -89,7 +89,7 @@ class Bare(LightningModule):
 
     def __init__(self, task: GeneratorTask):
         super().__init__()
-        # In a list, so that its parameters are not registered twice
+        # The task is in a list, so that its parameters are not registered twice.
         self.denoiser, self.task = (
             task.generator.denoiser,
             [task],

@@ -76,7 +76,7 @@ def measure(settings: Settings) -> Section:
     rounds = 1 if settings.quick else 3
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        # Also prepares the data
+        # The training also prepares the data for the other commands.
         run(folder, "-m", "flame_mdm", "train", "quickstart", *TINY, "run.dir=first")
 
         turns: dict[str, Callable[[], object]] = {TORCH: partial(run, folder, "-c", "import torch")}

@@ -216,7 +216,7 @@ def quickstart(clips: int, steps: int, rounds: int) -> list[Row]:
             folder = Path(tempfile.mkdtemp(dir=name))
             fit(folder, compose("quickstart", [*words, f"run.dir={folder}", f"speed={speed}"]))
             history = read_history(folder)["train/seconds_per_step"]
-            # The first warm up
+            # The first steps warm up and do not count.
             times[speed] += [value for step, value in history.items() if step >= steps // 3]
 
     medians = {speed: statistics.median(taken) for speed, taken in times.items()}

@@ -93,7 +93,7 @@ class StopRequest:
 
 def kill_children() -> None:
     """Kills all child processes, including suspended ones, for which Python would wait forever."""
-    # Otherwise, torch's handler raises an error for each of them
+    # torch's handler would raise an error for each worker that ends.
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     for process in active_children():
         process.kill()

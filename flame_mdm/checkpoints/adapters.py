@@ -43,7 +43,8 @@ if TYPE_CHECKING:
     from flame_mdm.generator import MotionGenerator
 
 ORIGINAL, CHANGE = ".parametrizations.weight.original", ".parametrizations.weight.0."
-# Factor of the vectors of words, which have farther to go than weights: the rows are from N(0, 1)
+# Factor of the learned vectors of words. Rows of the word table are drawn from N(0, 1), so that
+# vectors have farther to go than changes of weights.
 FARTHER = 10.0
 Paths = str | Path | Sequence[str | Path]  # one file, or several
 

@@ -51,7 +51,7 @@ def find(source: str | Path, which: Which = "last") -> Path:
 
 
 def _find_in_folder(folder: Path, which: Which) -> Path:
-    # Half-written
+    # Files whose names begin with a dot are still being written.
     weights = [
         file for file in sorted(folder.glob("*.safetensors")) if not file.name.startswith(".")
     ]

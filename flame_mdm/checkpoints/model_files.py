@@ -189,7 +189,7 @@ def check_weights(weights: Mapping[Any, Any], path: Path) -> None:
             raise UserError(
                 f"{path}: damaged: its weights are not dense tensors of real numbers by name: {shown}"
             )
-    # 2: shared
+    # Two names may share one tensor. Only one of them is in the file then.
     if (
         sum(value.numel() * value.element_size() for value in weights.values())
         > 2 * path.stat().st_size

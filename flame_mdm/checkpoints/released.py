@@ -175,7 +175,8 @@ def _flame_recipe(released: Released) -> tuple[Config, dict[str, Any]]:
     )
     config["task"] |= {"cond_drop_prob": 0.25, "guidance_scale": 8.0}
     config["optimizer"] |= {"weight_decay": 0.0}
-    # The authors' table has one row more than the number of lengths
+    # The authors' table of positions has one row more than the longest motion has frames: it
+    # begins with the time token.
     longest = released.options["max_frames"] - 1
     return config, {
         "actions": [],

@@ -18,7 +18,7 @@ from flame_mdm.schemas import Number, Schema, check_shape
 # JSON is read as YAML 1.1, in which 2e-2 is a text
 YamlNumber = Annotated[float, BeforeValidator(lambda x: float(x) if isinstance(x, str) else x)]
 
-# The name of an enumeration's value
+# Options may be written as the name of an enumeration's value, in any case.
 LowerCase = BeforeValidator(lambda x: x.lower() if isinstance(x, str) else x)
 
 

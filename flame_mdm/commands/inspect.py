@@ -52,7 +52,7 @@ class InspectSettings(BodySettings, FileSettings, DataSettings):
         name = self.motion
         if not (Path(name).suffix or Path(name).exists() or "/" in name):  # not a file: a data set
             is_prepared = any(Path(self.data_root).glob(f"{escape(name)}-*/{STORE}"))
-            # Own motions under their name
+            # A prepared data set without a recipe of its name was made from the user's folder.
             if is_prepared and not (EXPERIMENTS / "data" / f"{name}.yaml").exists():
                 object.__setattr__(self, "data", "folder")
                 object.__setattr__(self, "composed", (*self.composed, f"data.name={name}"))
@@ -151,7 +151,7 @@ def _clips(settings: InspectSettings) -> tuple[str, int, Iterator[Motion]]:
 
     representation = instantiate(settings.nodes["representation"])
     data = instantiate(settings.nodes["data"], representation=representation)
-    # Own data are inspected as they were prepared
+    # The user's motions are inspected as they were prepared.
     if (data.folder / STORE).exists() and data.source.named_by_recipe:
         info = Store(data.folder).info
         data.source.options, data.source.version = info.get("source", {}), info.get("version", 1)

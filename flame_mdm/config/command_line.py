@@ -156,7 +156,7 @@ def with_keys(kind: type[Any], words: Sequence[str]) -> list[str]:
 
 
 def _is_object(word: str) -> bool:
-    # Which may contain "="
+    # The path of an existing file may contain "=" and is still an object, not a key.
     is_path = "/" in word.partition("=")[0] and len(word) < 1000 and Path(word).exists()
     return not word.startswith("-") and ("=" not in word or is_path)
 

@@ -87,7 +87,7 @@ def check_top_level(config: Config) -> None:
             if name not in legal:
                 raise UserError(f"unknown config key '{key}.{name}'. Available: {', '.join(legal)}")
             check_kind(f"{key}.{name}", value, legal[name])
-    # A recipe may have keys of its own, to which others refer
+    # A recipe may define additional keys that other keys refer to.
     for key in config.keys() - TOP_LEVEL.keys():
         if near := difflib.get_close_matches(str(key), TOP_LEVEL, 1, 0.75):
             raise UserError(f"unknown config key '{key}'. Did you mean {near[0]}?")
@@ -97,7 +97,7 @@ def check_kind(key: str, value: Any, annotation: str) -> None:
     """Raises `UserError` if the annotation of a parameter rules out a value. Unknown annotations allow any value."""
     required = []
     kinds = _alternatives(ast.parse(annotation or "Any", mode="eval").body)
-    # No configuration holds a tensor
+    # Configurations hold no tensors, so that a union with Tensor is checked without it.
     for kind in [kind for kind in kinds if _name(kind) != "Tensor"]:
         description = _mismatch(value, kind)
         if not description:
@@ -110,7 +110,7 @@ def check_kind(key: str, value: Any, annotation: str) -> None:
 def _alternatives(annotation: ast.expr) -> list[ast.expr]:
     if isinstance(annotation, ast.BinOp):
         return [*_alternatives(annotation.left), *_alternatives(annotation.right)]
-    # A forward reference
+    # A string is a forward reference: the annotation is parsed from it.
     if isinstance(annotation, ast.Constant) and isinstance(annotation.value, str):
         return _alternatives(ast.parse(annotation.value, mode="eval").body)
     if isinstance(annotation, ast.Subscript):

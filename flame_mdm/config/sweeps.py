@@ -96,7 +96,8 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
         code = start(
             composition.compose(name, [*task, quoted(f"run.dir={hydra.runtime.output_dir}")]), task
         )
-        # A signal ends the whole sweep; a launched job counts as failed
+        # After a signal, the whole sweep ends. A failed job ends it only if a launcher ran the
+        # job.
         if code > 128 or (launcher and code):
             raise SystemExit(code)
 

@@ -33,7 +33,7 @@ from flame_mdm.safe_io import naming, read_json, read_yaml
 
 FACTS: dict[str, Any] = read_yaml(Path(__file__).with_suffix(".yaml"))
 FILE = re.compile(r"(\d{2,3}_\d{2,3})\.(amc|bvh)", re.IGNORECASE)
-# Files that are read of an archive
+# Endings of the files that are unpacked from an archive.
 SUFFIXES = (
     ".amc",
     ".asf",
@@ -48,7 +48,7 @@ RATES = (120.0, 60.0)  # frame rates of the recordings, the usual one first
 SLACK = 0.05  # seconds, one frame at 20 fps, by which durations may differ
 SHORTEST = 40  # rows of features of a clip, as in HumanML3D
 BLENDED = 3  # frames after the T-pose of a Daz-friendly file that are blended with it
-# Of a table of captions of one's own
+# Columns of a table of the user's captions.
 COLUMNS = (
     "id",
     "begin",
@@ -61,7 +61,7 @@ COLUMNS = (
 UNKNOWN = (
     1000  # frames of a recording whose length is not known before it is read: more than `SHORTEST`
 )
-# Arguments of `decide_rate` that the captions give
+# The arguments `seconds`, `last` and `is_sixty` of `decide_rate`.
 Evidence = tuple[float | None, int | None, bool]
 MAP = {**LAYOUTS["CMU ASF"].map, "pelvis": "pelvis", "neck": "upperneck", "head": "face"}
 _HIP, _KNEE, _ANKLE, _HEAD = (
@@ -494,7 +494,7 @@ def standardize(tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
     above = tree.parents[tree.joints.index("head")]
     face = bone["head"] + [0, 0, scale * _HEAD[2]]
     tree = _added(tree, pelvis=("root", pelvis), face=(tree.joints[above], face))
-    # The Daz figure has one bone from the lower neck to the head
+    # The Daz figure has one bone from the lower neck to the head, which is divided in the middle.
     if "upperneck" not in tree.joints:
         tree = _added(tree, upperneck=(tree.joints[above], bone["head"] / 2))
     return tree, {"map": MAP, "unit": unit}

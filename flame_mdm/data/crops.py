@@ -17,11 +17,11 @@ from flame_mdm.errors import UserError
 from flame_mdm.representations import Representation
 from flame_mdm.seeds import integers, key
 
-# (index of a clip, number of the batch that it is drawn for; -1 in evaluation)
+# Index of a clip, and the number of the batch that it is drawn for, which is -1 in evaluation.
 Draw = tuple[int, int]
-# (id, x (F, D), caption, action), input of `collate`
+# Id, features x (F, D), caption and action of a clip: the input of `collate`.
 Sample = tuple[str, Tensor, str | None, int | None]
-# Draws integers from 0 up to, and not including, its argument: one, or (B,)
+# Draws integers from 0 up to, and not including, its argument: a number, or (B,) numbers.
 Below = Callable[[Any], Any]
 
 

@@ -29,7 +29,8 @@ from flame_mdm.representations import Representation
 MAX_FRAMES = (
     100_000  # maximum number of frames of a sample; one hour at 20 frames per second has 72,000
 )
-# Of a data set: part of the name of its folder, which must not leave `root` or be hidden
+# Permitted name of a data set. It begins the name of a folder, which must neither leave `root`
+# nor be hidden.
 NAME = r"\w[\w .-]*"
 Loader = DataLoader[Sample] | ResidentLoader
 

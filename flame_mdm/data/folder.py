@@ -102,7 +102,7 @@ class Folder(MotionSource):
             self.options["balance"] = balance
         if license:
             self.options["license"] = license
-        # Of the motions read so far, by layout
+        # How upright the bodies of the motions read so far are, by layout.
         self._uprights: defaultdict[str, list[float]] = defaultdict(list)
         self._notes: Counter[str] = Counter()  # lines about the motions read so far
         self._representation: Representation | None = (

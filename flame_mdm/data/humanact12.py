@@ -23,8 +23,8 @@ NO_NUMBERS = (
     ValueError,
     OverflowError,
 )
-# Number of consecutive clips in the file that go to one split together: they may be cut from one
-# recording
+# Consecutive clips in the file may be cut from one recording, so that this many go to one split
+# together.
 BLOCK = 10
 
 

@@ -312,7 +312,7 @@ class HumanML3DSMPL(MotionSource):
             lacking = f"{len(absent)} clips have no text, such as {absent[0]}"
             raise FileNotFoundError(f"{self.folder.path}: {lacking}; unpack texts.zip again")
         used = [row for row in rows if self.humanact12 or not row.humanact12]
-        # Without mirrored copies
+        # Only originals are counted: mirrored copies are not used.
         listed = sum(not name.startswith("M") for name in self.folder.names)
         excluded = sum(not name.startswith("M") for name in self.folder.exclude)
         self.leave_out("motions by data.source.exclude", excluded)

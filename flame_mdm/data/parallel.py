@@ -19,7 +19,8 @@ from flame_mdm.signals import ignore_interrupts
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
-# Seconds of work before processes are started if their number is not given; starting takes as long
+# Seconds of work before processes are started, if their number is not given. Starting them takes
+# about as long.
 PATIENCE = 2.0
 
 
@@ -81,7 +82,7 @@ def _shared_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
     pool.users += 1
     try:
         yield pool.executor
-    # An error or Ctrl-C must not wait for tasks that may take half an hour
+    # After an error or Ctrl-C, the workers are killed: their tasks may take half an hour.
     except BaseException as error:
         if isinstance(error, GeneratorExit) and pool.users > 1:  # the others still need the pool
             raise

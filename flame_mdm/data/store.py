@@ -101,7 +101,8 @@ class Store:
         with _intact(contents):
             self.info: dict[str, Any] = read_json(contents)
             check_shape(self.info, Contents)
-        # In results: equal for equal clips and options anywhere
+        # The fingerprint is part of results. It is equal for equal clips and options on any
+        # machine.
         self.fingerprint: str = self.info["fingerprint"]
         self._check("clips.jsonl", "statistics.npz")
         frames, width = self.info["shape"]
@@ -185,7 +186,8 @@ def write_store(folder: Path, source: MotionSource, representation: Representati
     lock = folder.with_name(folder.name + ".lock")
     waiting = f"{folder}: another process is preparing it; waiting"
     with locked(lock, lambda _: say(waiting), "prepare in one process at a time"):
-        # Also of a process that is just ending
+        # This process holds the lock, so that files of a process that is just ending are removed,
+        # too.
         remove_abandoned(folder.parent, folder, is_locked=True)
         remove_abandoned(folder.parent)
         if before or not (folder / "store.json").exists():
@@ -281,7 +283,8 @@ def _pack(
             if clip.motion is not motion:
                 motion, begin = clip.motion, frames
                 frames += len(values)
-                # Through a memory map, a full disk would kill the process (SIGBUS)
+                # Written through the file: through a memory map, a full disk would kill the
+                # process (SIGBUS).
                 packed.write(values.tobytes())
             first, length = clip.window or (0, len(values))
             if first < 0 or length < 1 or first + length > len(values):
@@ -409,7 +412,7 @@ def _intact(path: Path) -> Iterator[Path]:
 
 def _entries(path: Path, frames: int, actions: int) -> list[Entry]:
     clips: list[Entry] = []
-    # Not splitlines: captions may contain other separators
+    # Lines are read from the file. `splitlines` would also split at separators within captions.
     with (
         _intact(path),
         path.open(encoding="utf-8") as lines,

@@ -84,7 +84,8 @@ def draw_captions(
     }
     captions: list[str] = []
     stated = everything
-    # The first caption that leaves something out decides what is left out
+    # The first caption that leaves out attributes decides which ones all captions of the clip
+    # leave out.
     for _ in range(30 if incomplete else 0):
         caption, said = _sentence(rng, attributes)
         if said != everything:
@@ -246,7 +247,7 @@ class Synthetic(MotionSource):
         seconds = rng.uniform(max(MIN_SECONDS, repeating, ACTIONS[action].seconds), MAX_SECONDS)
         name = f"synthetic_{'all_' if self.everything else ''}{self.seed}_{index:06d}"
         split = hashed_split(name, val=5, test=10)
-        # So that motions do not depend on the grammar
+        # Words have their own generator, so that a change of the grammar changes no motion.
         words = np.random.default_rng((self.seed, index, 1))
         incomplete = split == "train" and words.random() < PARTIAL
         texts, stated = draw_captions(words, attributes, CAPTIONS, incomplete)

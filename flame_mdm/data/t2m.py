@@ -216,7 +216,7 @@ class T2MFolder(MotionSource):
 
     def _motions(self) -> set[str]:
         files = (self.path / "new_joint_vecs").glob("*.npy")
-        # Unfinished, of a killed process
+        # A name that begins with a dot is an unfinished file of a killed process.
         return {path.stem for path in files if not path.name.startswith(".")}
 
     def _load(self, name: str, mmap: bool = False) -> np.ndarray:

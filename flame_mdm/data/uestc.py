@@ -79,7 +79,7 @@ TRAIN_SUBJECTS = (
 VAL_SUBJECTS = 5  # number of training subjects that our split uses for validation
 MIN_FRAMES = 45  # minimum length of a training clip: three quarters of 60
 ROOT = 8  # index of the middle of the hips among VIBE's 49 joints, which ACTOR uses as the root
-# Camera in pixels that ACTOR assumes, since VIBE estimates only a scale
+# Focal length and image size in pixels that ACTOR assumes, since VIBE estimates only a scale.
 FOCAL_LENGTH, IMAGE_SIZE = (
     500.0,
     540.0,

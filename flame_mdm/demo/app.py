@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-# Read when gradio is imported
+# gradio reads these variables when it is imported.
 os.environ |= {
     "GRADIO_ANALYTICS_ENABLED": "False",
     "HF_HUB_DISABLE_TELEMETRY": "1",
@@ -32,7 +32,7 @@ from flame_mdm.errors import UserError, first_line, one_line, say
 
 # Open pages that gradio remembers; it keeps half a megabyte for each, and the page needs none of it
 SESSIONS = 64
-# Motion files that are written at the same time, and those that wait for it
+# Numbers of motion files that may be written, and that may wait to be written, at a time.
 WRITERS, WAITING_FILES = (
     2,
     32,
@@ -113,7 +113,7 @@ def web_app(studio: Studio, hosts: Collection[str] = ()) -> Guard:
         finally:
             waiting -= 1
         words = "-".join(re.findall(r"[a-z0-9]+", request.text.lower()))[:60]
-        # The name of one of the rigs, as a file was written
+        # The rig is part of the name of the file.
         rig = f"-{options['rig']}" if options.get("rig") else ""
         name = f"{words or 'motion'}-{int(number) + 1}{rig}{extension}"
         headers = {"Content-Disposition": f'attachment; filename="{name}"'}

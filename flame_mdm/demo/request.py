@@ -18,7 +18,7 @@ from pydantic import (
 from flame_mdm.errors import UserError, did_you_mean, one_line, shortened
 from flame_mdm.sampling.motion_request import path_targets, read_parts, read_path
 
-# Limits of a request
+# Limits of one request, so that no visitor occupies the machine for minutes.
 MAX_TEXT, MAX_SECONDS, MAX_SAMPLES, MAX_STEPS, MAX_EDITS = (
     300,
     30,
@@ -122,7 +122,8 @@ class DemoRequest(BaseModel):
                 )
             else:
                 steps.append((part.motion, keywords(part, part.text, **editing)))
-        # Cleanup moves the root off the way points, by 0.3 m in one example
+        # Cleanup is left out with a path: it moves the root off the way points, by 0.3 m in one
+        # example.
         if self.cleanup and not self.path:
             steps[-1][1]["cleanup"] = True
         return steps

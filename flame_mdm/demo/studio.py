@@ -63,7 +63,8 @@ class Studio:
             model = load(self.files[name], self.device, adapter=[adapter] if adapter else ())
             if model.conditioned_on == "text" and Reader.fits(model.facts):
                 reader = self._readers[name] = Reader(model.facts)
-                # So that the first answer does not wait for its tables
+                # The tables of the language are read now, so that the first answer does not wait
+                # for them.
                 for action in reader.abilities.actions:
                     reader.abilities.choices(action)
             self._models[name] = model

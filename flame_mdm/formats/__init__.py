@@ -10,7 +10,7 @@ ENDINGS = (".npz", ".bvh", *SCENES, ".amc", ".json", ".npy")  # of motion files 
 TREES = (".bvh", ".amc")  # of those that contain a tree of joints and their rotations
 USD = (".usda", ".usdc", ".usdz")  # Universal Scene Description
 RIGGED = (".bvh", ".glb", ".fbx", *USD)  # of files that can have the skeleton of another program
-# Of the files that `Motion.save` writes
+# Endings of the files that `Motion.save` writes.
 WRITTEN = (
     *RIGGED,
     ".vrma",

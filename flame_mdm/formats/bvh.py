@@ -32,7 +32,7 @@ LARGEST = 1e9  # largest number that is read, and largest sum of the numbers in 
 class Bvh:
     """A skeleton and its motion. J joints, F frames, C channels; lengths in the file's unit."""
 
-    # J names; the end site of a joint is a joint without channels, `NAME.end`
+    # J names. The end site of a joint is a joint without channels, called `NAME.end`.
     joints: tuple[str, ...]
     parents: tuple[int, ...]  # index of each joint's parent, smaller than its own; -1 for a root
     offsets: np.ndarray  # (J, 3) float64, rest position of each joint in its parent's frame

@@ -104,7 +104,7 @@ def _part(
     uvs = np.zeros((0, 2))
     if "TEXCOORD_0" in attributes:
         uvs = glb.numbers(file, attributes["TEXCOORD_0"], "VEC2")
-        # GlTF counts from the upper edge of the image
+        # glTF counts v from the upper edge of the image.
         uvs = np.stack([uvs[:, 0], 1 - uvs[:, 1]], 1)
 
     if bound is None or "JOINTS_0" not in attributes:

@@ -9,14 +9,17 @@ LYING = 0.3  # mean vertical component of the direction of the trunk below which
 STANDING = 0.7  # the same, above which it would stand with another axis up
 FASTEST = 15.0  # m/s of the pelvis, above which a file is damaged; sprinters reach 12
 AVERAGED = 0.05  # seconds over which the speed of the pelvis is averaged
-# M/s of an ankle relative to the pelvis, above which a leg has flipped; the fastest kicks reach 20
+# Speed of an ankle relative to the pelvis, in m/s, above which a leg has flipped between frames.
+# The fastest kicks reach 20.
 KICK = 30.0
 UNDER = 0.02  # depth in meters below the floor at which the file's body is called smaller
 
-# Seconds from a rest pose in front of a motion to the motion; some conversions blend a few frames
+# Seconds from a rest pose in front of a motion to the motion: some conversions blend a few
+# frames.
 BLEND = 0.04
 CALM = 8  # number of the following frames with which the first steps are compared
-# Meters from the rest pose to the motion, and how much longer than the following steps
+# Length in meters of the step from a rest pose to the motion, and its ratio to the steps that
+# follow.
 JUMP = (
     0.15,
     3.0,

@@ -68,7 +68,7 @@ def cleanup(
     else:
         contact = np.clip(2 * contacts[:-1, [skeleton.feet.index(toe) for toe in toes]] - 0.5, 0, 1)
     for chain, weight in zip(skeleton.chains[:2], contact.T, strict=True):
-        # Over the ground, fades out between contacts
+        # Over the ground, the shift of a foot fades out between its contacts.
         toe, shift = (
             motion[:, chain[-1]],
             np.zeros((len(motion), 3)),

@@ -9,7 +9,8 @@ from scipy.ndimage import binary_opening
 
 from flame_mdm.formats.motion import Motion
 
-# Height in meters above the floor, y = 0, below which a toe joint touches it; also of foot skating
+# Height in meters above the floor, y = 0, below which a toe joint touches it. Foot skating uses
+# it, too.
 LOW = 0.05
 STANDSTILL = (
     0.2  # speed of the root in m/s below which the body does not jump, except for 0.04 s at the top
@@ -49,8 +50,8 @@ LIMITS = {
     "frozen": (0.02, "m/s", "no joint moves faster than 2 cm/s for a second or more"),
 }
 """Fault -> limit, its unit, and what it is. docs/motion-faults.md has the share of real clips that each flags."""
-# Distance from the wrist to the middle of the hand, which continues the forearm, relative to the
-# forearm
+# Distance from the wrist to the middle of the hand, relative to the forearm. The hand is taken to
+# continue the forearm.
 PALM = 0.3
 TRUNK = 0.18  # radius of the trunk from front to back, relative to its length from pelvis to neck
 WIDTH = 1.4  # width of the trunk relative to its depth
@@ -87,7 +88,7 @@ def find_faults(motion: Motion) -> list[Fault]:
     low = joints[:, toes, 1] < LOW
     travel = np.linalg.norm(np.diff(joints[:, toes][..., [0, 2]], axis=0), axis=-1) * fps
     slides[:-1, toes] = travel * (low[1:] & low[:-1])
-    # Distances from the middle of the neighbors in time, as accelerations
+    # An acceleration: the distance of a joint from the middle between its neighbors in time.
     jumps = np.zeros(joints.shape[:2])
     jumps[1:-1] = np.linalg.norm(np.diff(joints, n=2, axis=0), axis=-1) * fps**2
     floats = [
@@ -169,7 +170,8 @@ def _bends(joints: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.nda
                 toes = unit(joints[:, names.index(f"{side}_foot")] - lower)
                 front = toes - (toes * b).sum(-1, keepdims=True) * b
                 tilt = np.degrees(np.arcsin(np.clip(-(a * unit(front)).sum(-1), -1, 1)))
-                # A pointed foot has no front
+                # The front of a foot that points straight down is undefined, so that such frames
+                # do not count.
                 forward = (tilt > limit) & (np.linalg.norm(front, axis=-1) > 0.5)
                 flags[:, at] |= forward
                 worst[:, at] = np.where(forward, tilt, worst[:, at])

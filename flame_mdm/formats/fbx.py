@@ -29,7 +29,7 @@ MAX_DEPTH = 32  # maximum nesting of records; programs write about 8
 MAX_RECORDS = 1_000_000  # maximum number of records of a file
 MAX_NAME = 255  # the length of a name is stored in one byte
 
-# Type code -> format of the number
+# Code of the type of a number -> its format.
 SCALARS = {
     "Y": "<h",
     "C": "<?",
@@ -38,7 +38,7 @@ SCALARS = {
     "D": "<d",
     "L": "<q",
 }
-# Type code -> type of the items
+# Code of the type of an array -> type of its items.
 ARRAYS = {
     "f": "<f4",
     "d": "<f8",
@@ -204,7 +204,7 @@ class _Reader:
             raise ValueError(f"arrays of more than {EXPANDED_LIMIT // MEBIBYTE} MiB")
         if encoding == 1:
             unpacker = zlib.decompressobj()
-            # One byte more, to notice arrays that are too long
+            # One byte more than declared is unpacked, to notice arrays that are too long.
             packed = unpacker.decompress(packed, size + 1)
         elif encoding != 0:
             raise ValueError(f"unknown encoding {encoding} of an array")

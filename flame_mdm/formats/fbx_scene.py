@@ -206,7 +206,8 @@ class _Scene:
         if len(self.models) > MAX_MODELS:
             raise ValueError(f"more than {MAX_MODELS} models")
 
-        # Id -> ids connected to it, and the property
+        # Id of an object -> ids of the objects connected to it, and the property that each is
+        # connected to.
         self.below: dict[int, list[tuple[int, str]]] = defaultdict(list)
         for record in connections.all("C"):
             if len(record.properties) < 3:

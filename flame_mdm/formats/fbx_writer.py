@@ -21,14 +21,14 @@ from flame_mdm.formats.rigged import Material, RiggedClip, Skin
 
 PER_METER = 100  # the files are in centimeters
 CUSTOM_RATE = 14  # `TimeMode` of a rate in `CustomFrameRate`
-# Equal files for equal motions; readers check the time against `FileId`
+# A fixed time, so that equal motions give equal files. Readers check it against `FileId`.
 CREATED = "1970-01-01 10:00:00:000"
 FILE_ID = bytes.fromhex("28b32aebb624ccc2bfc8b02aa92bfcf1")
 EULER = "ZYX"  # R = Rz Ry Rx, the order that FBX calls eEulerXYZ
-# Interpolation and tangents of a key, as Blender and the SDK write them
+# Flags of a key: linear interpolation and its tangents, as Blender and the SDK write them.
 LINEAR_KEY = 0x4 | 0x100 | 0x2000 | 0x4000
-# Meters by which a root is moved back: Blender keeps a pelvis in place that is at the tail of its
-# root
+# Meters by which a root is moved back. Blender does not move a pelvis that is exactly at the tail
+# of its root.
 ROOT_BACK = 1e-4
 AXES = ("X", "Y", "Z")
 HELD_KEY = 0x2  # a value that is held until the next key
@@ -61,7 +61,8 @@ class _Writer:
         for skin in clip.skins:
             poses |= self._mesh(skin, bones, materials)
         if poses and clip.root >= 0:
-            # three.js takes its place from the bind pose
+            # three.js takes the position of the root from the bind pose, so that it moves there,
+            # too.
             poses[bones[clip.root]][2, 3] -= PER_METER * ROOT_BACK
         if poses:
             self._bind_pose(poses)

@@ -34,7 +34,8 @@ MARGIN = 0.15  # seconds of standing that are kept before a start and after a st
 FADE = 0.5  # seconds in which the first or the last pose of a clip changes into the motion
 OVERSHOOT = (0.6, 1.6)  # smallest and largest turn relative to the requested one
 PART = 0.5  # shortest start and stop in seconds
-# Meters and degrees; a loop that moves less from repetition to repetition stays in its place
+# Meters and degrees from one repetition of a loop to the next. A loop that moves less stays in
+# place.
 STILL = (
     0.1,
     10.0,

@@ -21,7 +21,7 @@ from flame_mdm.representations import rotation
 from flame_mdm.safe_io import MEBIBYTE, atomic_write, parse_json, regular_file
 
 UNSIGNED_BYTE, UNSIGNED_SHORT, FLOAT = 5121, 5123, 5126
-# Integers that mean 1, if normalized
+# Type of integers -> the integer that means 1 if the accessor is normalized.
 WHOLE = {
     5120: 127,
     UNSIGNED_BYTE: 255,
@@ -39,7 +39,7 @@ COMPONENTS = {
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}  # numbers per item
 KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 LIMIT = 512 * MEBIBYTE  # maximum size of a file that is read
-# Maximum size of its JSON part, which takes many times its size in memory
+# Maximum size of the JSON part in bytes. Parsed, it takes many times as much memory.
 DOCUMENT_LIMIT = 16 * MEBIBYTE
 MAX_NODES, MAX_ITEMS = 4096, 65_536  # maximum number of nodes, and of all other items of one list
 LARGEST = 1e9  # largest coordinate or matrix entry that is read
@@ -47,7 +47,7 @@ HARMLESS = re.compile(r"KHR_(materials|texture|lights|mesh|draco)_|EXT_texture_|
 """Required extensions that change neither nodes, skins nor bounds: a character is read, and written with them."""
 
 Item = TypeVar("Item")
-# Into another list, or a number of bytes; -1 if it is missing
+# Index into another list, or number of bytes. A missing index is -1.
 Index = Annotated[int, Field(ge=0, lt=2**40)]
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
 Items = Annotated[list[Item], Field(max_length=MAX_ITEMS), FailFast()]

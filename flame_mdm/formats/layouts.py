@@ -36,7 +36,8 @@ CHILD = 0.25  # shortest leg of a child in meters, at about one year
 FOOT = 0.02  # shortest foot in meters, ankle to toes
 # Ratio of the left and right bones of limbs above which joints are not in the assumed order
 UNEQUAL = 1.5
-# Standard deviation of the bones of limbs over their mean length, above which the same holds
+# Standard deviation of the lengths of limbs over their mean, above which joints are not in the
+# assumed order either.
 CHANGING = 0.25
 LIMBS = (("hip", "knee"), ("knee", "ankle"), ("shoulder", "elbow"), ("elbow", "wrist"))
 SIDES = ("left_", "right_")  # prefixes of SMPL's joints
@@ -45,7 +46,7 @@ UNITS = {  # in meters
     **{"the unit of CMU's recordings": 0.0564444},
 }
 
-# A joint, or weights of a mean of joints
+# A joint of the file, or the weights of a mean of several joints.
 Source = str | Annotated[dict[str, FiniteFloat], Field(min_length=1)]
 
 
@@ -366,8 +367,8 @@ def _usual_unit(leg: float, unit: float) -> str:
     return f"The file has no usual unit; {usual:.3g} gives the usual legs of {USUAL_LEG:g} m"
 
 
-# Share of the frames in which the toes of both feet point backwards, above which sides are
-# exchanged
+# Share of the frames in which the toes of both feet point backward. Above it, left and right are
+# exchanged.
 BACKWARDS = 0.25
 
 

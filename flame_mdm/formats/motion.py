@@ -213,7 +213,7 @@ class Motion(PosedFigure):
         if hasattr(ipython, "kernel"):  # a notebook, not a terminal
             style = "width:100%;height:560px;border:0"
             frame = f'<iframe sandbox="allow-scripts allow-downloads" style="{style}" srcdoc="{escape(page)}"></iframe>'
-            # It warns of a bare iframe
+            # IPython warns of a bare iframe, so that it is wrapped in a division.
             return import_module("IPython.display").HTML(f"<div>{frame}</div>")
         path = Path(tempfile.mkdtemp(prefix="flame_mdm_")) / "motion.html"
         write_text(path, page)
@@ -249,7 +249,7 @@ def _write_npz(motion: Motion, path: Path, facts: dict[str, Any]) -> str:
     summary = f"{len(motion.skeleton)} joints in meters, y up"
     if motion.poses is not None:
         turns, translation = amass_parameters(motion.poses)
-        # Hands at rest
+        # AMASS has 52 joints. The 30 joints of the hands are at rest.
         content |= {
             "poses": np.pad(turns, ((0, 0), (0, 90))),
             "trans": translation,

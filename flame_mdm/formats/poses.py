@@ -29,8 +29,8 @@ BENDS = {1: -1.0, 2: -1.0, 16: 1.0, 17: 1.0}
 STRAIGHT = 0.15
 """Sine of the bend of a knee or elbow at which bend and parent's rotation have the same weight for the limb's twist.
 Weights are squared, so that a clear bend dominates."""
-# Weight of the foot relative to the shin in the twist of a thigh: it determines the twist of a
-# straight leg
+# Weight of the foot relative to the shin in the twist of a thigh. The shin tells nothing of the
+# twist while the leg is straight.
 FOOT = 0.3
 # Seconds over which bends are averaged, so that an arm does not spin while it is nearly straight
 SMOOTH = 0.1

@@ -40,9 +40,9 @@ from flame_mdm.representations.skeleton import SKELETONS, SMPL22, Skeleton
 from flame_mdm.representations.smpl import ADULT
 from flame_mdm.safe_io import naming, regular_file
 
-# Of the action data sets: y down to y up
+# Rotation from the camera's axes of the action data sets, y down, to y up.
 CAMERA_AXES = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))
-# With SMPL's rotations -> number of features
+# Representations with SMPL's rotations -> number of features.
 ROTATED = {
     "smpl147": 147,
     "rot6d-25": 150,
@@ -268,7 +268,7 @@ def _of_joints(
     stated = {key: data[key] for key in ("up", "unit") if key in data}
     fields = _checked(fields | stated | said)
     names = tuple(data.get("names", ()))
-    # The skeleton follows from the number of joints
+    # Without names, the skeleton follows from the number of joints.
     is_counted = not names and not {"joints", "map"} & fields.keys()
     if (
         names

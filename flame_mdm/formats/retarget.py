@@ -79,7 +79,7 @@ def preset(name: str | None, poses: Poses) -> Rig:
             label = label.replace("*", mark)
             if isinstance(source, str):
                 joint = JOINT[side + source]
-                # Continues the bone before it
+                # A joint without a child continues the bone before it.
                 end = SMPL22.parents.index(joint) if joint in SMPL22.parents else joint
                 local = _axes(data.get("axes", {}), part, source, offsets[end], side == "right_")
                 joints.append(
@@ -123,7 +123,7 @@ def _axes(axes: dict[str, Any], part: str, joint: str, bone: np.ndarray, right: 
     """Returns the local axes (3, 3) in a T-pose of a joint whose bone has the direction `bone`."""
     flip = np.array([-1, 1, 1]) if right else np.ones(3)
     matrix, columns = np.eye(3), []
-    # Two of them, of the left side
+    # Axes are listed for two directions, and for the left side only.
     for axis, direction in axes.get(joint, axes.get(part, {})).items():
         toward = np.array(DIRECTIONS[direction], float) if direction in DIRECTIONS else bone * flip
         for column in columns:

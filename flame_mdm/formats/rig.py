@@ -18,8 +18,8 @@ LIMBS = {"hip": "knee", "knee": "ankle", "shoulder": "elbow", "elbow": "wrist"}
 SPINE = ("spine1", "spine2", "spine3")
 TILT = 45  # degrees between trunk and vertical at which a rest pose is refused
 SNAP = 8  # largest angle in degrees between the facing direction and an axis that it is taken for
-# Minimum sine of the bend of an elbow or knee in the rest pose from which the twist of the limb is
-# read
+# Minimum sine of the bend of an elbow or knee in the rest pose. The twist of a straighter limb
+# cannot be read.
 BEND = 0.15
 GROUND = 0.1  # largest height in meters at which the lowest joint of a clip counts as on the floor
 # Distance of the knee from the line of the leg, in thighs, at which bend and thigh weigh the same

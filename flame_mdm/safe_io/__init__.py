@@ -233,7 +233,7 @@ def regular_file(path: str | Path, limit: int | None = None) -> int:
         status = Path(path).stat()
     except (FileNotFoundError, NotADirectoryError):
         raise FileNotFoundError(f"{path}: no such file") from None
-    # A loop of links, or a name that is too long or contains a null character
+    # Raised for a loop of links, and for names that are too long or contain a null character.
     except (
         OSError,
         ValueError,
@@ -289,7 +289,7 @@ def parse_json(text: str | bytes) -> Any:
     try:
         content = json.loads(text, parse_constant=refuse)
         if "\\u" in (text if isinstance(text, str) else text.decode()):
-            # A lone surrogate cannot be written again
+            # Fails for a lone surrogate, which could not be written again.
             json.dumps(content, ensure_ascii=False).encode()
     except RecursionError:
         raise ValueError("nested too deeply") from None
@@ -306,7 +306,7 @@ def read_yaml(path: str | Path) -> Any:
         nodes = _nodes(yaml.compose(text, yaml.SafeLoader), {})
         if nodes > YAML_NODES:
             raise ValueError(f"more than {YAML_NODES:,} values after its aliases are expanded")
-        # With OmegaConf's reading of numbers
+        # OmegaConf reads numbers such as 1e-4, which YAML 1.1 takes for text.
         content = OmegaConf.create(text) if text.strip() else None
         return OmegaConf.to_container(content) if content is not None else None
     except Exception as error:  # YAML and OmegaConf raise many kinds of errors for invalid files

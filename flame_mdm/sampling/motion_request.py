@@ -219,7 +219,7 @@ class SamplingRequest:
     def __post_init__(self) -> None:
         for name in ("texts", "actions", "seconds", "frames"):
             value = getattr(self, name)
-            # An array or a number of numpy
+            # Arrays and numbers of numpy become lists and numbers.
             value = value.tolist() if hasattr(value, "tolist") else value
             if isinstance(value, str) and name in ("texts", "actions"):
                 value = (value,)

@@ -98,7 +98,8 @@ def with_features(representation: Representation, motion: Motion) -> Motion:
             check_size(motion.joints, 1.0, children=True)
         raw = raw_motion(motion, representation)
         features = representation.encode(raw.values)
-        # One row per step between frames: a step more keeps the number of frames
+        # Some representations have one row per step between frames. Another step keeps the number
+        # of frames.
         if len(features) < len(raw.values):
             step = (raw.values[-1:] - raw.values[-2:-1]) * raw.values.new_tensor([1.0, 0.0, 1.0])
             features = representation.encode(torch.cat([raw.values, raw.values[-1:] + step]))

@@ -22,8 +22,7 @@ from flame_mdm.schemas import ClosedSchema, check_shape, read_json
 
 SMOOTHNESS = 0.2  # seconds over which a correction fades; see docs/targets.md
 MAX_SPEED = 8.0  # meters per second that way points may require
-# Maximum height of a joint above the floor, and its maximum distance from where the body stands, in
-# meters
+# Meters that a joint can be above the floor, and away from the point where the body stands.
 REACH = 2.5
 MAX_COORDINATES = 600  # maximum number of coordinates; they are solved for together in every step
 Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)] | None  # meters; None = free
@@ -108,7 +107,8 @@ class Targets:
     """What motions should reach."""
 
     positions: Positions  # coordinates in the world
-    # Frames, and features (D,) in the data's units, of poses of any place
+    # Frames of poses, and their features (D,) in the units of the data. Poses have no fixed
+    # position.
     poses: tuple[tuple[int, Tensor], ...]
 
     def check_end(self, frames: int, fps: float) -> None:
@@ -179,7 +179,7 @@ class Targets:
                 range(1, len(representation.skeleton))
             ).to(device)
         positions = Positions(*(x.to(device) for x in vars(self.positions).values()))
-        # Not by moving the root
+        # Joints that are reached by stretching the body and not by moving the root.
         stretched = sorted(set(self.positions.frames[self.positions.joints > 0].tolist()))
         edges = [(frame, *edge) for frame in stretched for edge in representation.skeleton.edges]
         bones = torch.tensor(edges, dtype=torch.long, device=device).reshape(-1, 3).T

@@ -39,7 +39,7 @@ from flame_mdm.visualize import player_page
 
 SAMPLED = 300  # motions sampled from a model whose training data are not there
 COMPARED = 32  # clips with which the page compares models
-# Parts of the base's recipe
+# Parts that are taken from the recipe of the base.
 OF_BASE = (
     "task",
     "losses",
@@ -141,7 +141,7 @@ def adapt(
         str(base),
         None if full else _about(model, captions, name, rank, file, action),
     )
-    # With it, texts whose words are taught here would be refused
+    # With a vocabulary, the model would refuse texts whose words are taught here.
     model.facts.pop("vocabulary", None)
     prior = _prior(model, Path(data_root), out / "data", captions)
     config["data"]["source"] |= {"path": str(source), "prior": str(prior)}
@@ -161,7 +161,7 @@ def adapt(
         )
 
     write_results()
-    # The launcher ends all processes when the first one exits
+    # All processes wait here: the launcher ends them when the first one exits.
     if torch.distributed.is_initialized():
         torch.distributed.barrier()
     return path

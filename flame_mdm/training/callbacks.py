@@ -344,7 +344,7 @@ class SampleMotions(Callback):
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Writes the samples of the final model and prints their metrics next to real motions."""
-        # The last validation may have written them already
+        # The last validation may have written the samples of this step already.
         if self.written[0] != trainer.global_step:
             self.write(trainer, pl_module)
         _, folder, values = self.written

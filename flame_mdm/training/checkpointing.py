@@ -21,7 +21,8 @@ from flame_mdm.safe_io import write_failure
 from flame_mdm.safe_io.paths import check_within, temporary_beside
 
 LAST, PREVIOUS = "last.ckpt", "previous.ckpt"
-# Lightning migrates checkpoints of older versions, by code that trusts them
+# Checkpoints of older versions of Lightning are refused: Lightning migrates them with code that
+# trusts their content.
 OLDEST_LIGHTNING = Version("2.6")
 
 # Numbers in the state of a learning rate's schedule
@@ -50,7 +51,7 @@ class AtomicCheckpoints(TorchCheckpointIO):
 
     def load_checkpoint(self, path: Any, *args: Any, **options: Any) -> dict[str, Any]:
         """Returns the content of the checkpoint that the run resumes from, as `newest` checked it."""
-        # It needs as much memory as the model and its optimizer
+        # The checkpoint is let go: it takes as much memory as the model and its optimizer.
         resumed, self.resumed = (
             self.resumed,
             None,
@@ -61,7 +62,7 @@ class AtomicCheckpoints(TorchCheckpointIO):
     def remove_checkpoint(self, path: Any) -> None:
         """Removes a checkpoint, but only from the folder of this run."""
         path = Path(path)
-        # After links and `..` are resolved
+        # Paths are compared after links and `..` are resolved.
         if path.is_file() and path.parent.resolve() == self.folder.resolve():
             path.unlink()
 

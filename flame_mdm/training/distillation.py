@@ -103,7 +103,7 @@ class DistillationTask(GeneratorTask):
         for callback in self.trainer.callbacks:  # type: ignore[attr-defined]
             if isinstance(callback, MovingAverage):
                 average = callback.averaged()
-                # It was copied before the weights of the teacher came
+                # The average was copied before the weights of the teacher were loaded.
                 if not self.trainer.global_step:
                     average.load_state_dict(self.state_dict())
                 self.target = [average.generator.denoiser]

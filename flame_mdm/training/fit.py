@@ -63,7 +63,7 @@ def fit(folder: Path, config: Config) -> None:
     measurements, checkpoints = Measurements(), AtomicCheckpoints(folder / "checkpoints", resumed)
     callbacks: list[Callback] = [WriteProvenance(config)]
     if config["ema"]:
-        # Before the callbacks that use averaged weights in validation
+        # Added before the callbacks that use the averaged weights in validation.
         callbacks.append(MovingAverage(**config["ema"]))
     callbacks += [instantiate(c) for c in config["callbacks"].values() if c]
     callbacks += [Progress()] if config["trainer"].get("enable_progress_bar", True) else []
@@ -87,7 +87,7 @@ def fit(folder: Path, config: Config) -> None:
             check_optimizers(resumed, task.make_optimizer())
         trainer.fit(task, data, ckpt_path=resumed.path if resumed else None, weights_only=True)
     except Interrupted as stop:
-        # The first process reports it; launchers treat any other exit code as a crash
+        # The first process reports the error. Launchers treat any other exit code as a crash.
         if not trainer.is_global_zero:
             return
         say(f"stopped at step {stop.step}. Run the same command to resume")
@@ -97,7 +97,7 @@ def fit(folder: Path, config: Config) -> None:
             _requeue(job)
         raise SystemExit(128 + stop.signum) from None
     except (Exception, SystemExit) as error:
-        # Otherwise its processes wait for this one for half an hour
+        # Without this, the other processes wait for this one for half an hour.
         if trainer.strategy.launcher is not None:
             trainer.strategy.launcher.kill(signal.SIGKILL)
         if isinstance(error, SystemExit):  # a second signal
@@ -161,7 +161,8 @@ def _quiet() -> None:
         ".*does not have many workers.*",
         ".*module\\(s\\) in eval mode at the start of training.*",  # a student without dropout
         ".*Checkpoint directory .* exists and is not empty.*",
-        # The run directory was moved: the next validation decides again which is best
+        # Lightning warns if the run directory was moved. The next validation decides again which
+        # checkpoint is best.
         "The dirpath has changed.*",
         ".*sync_dist=True.*",  # the metrics are means over all processes already
     ):

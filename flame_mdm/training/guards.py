@@ -39,7 +39,8 @@ def only_run(folder: Path) -> Iterator[None]:
         try:
             yield
         finally:
-            # Training did not start, there are only logger files
+            # Without a configuration, training never started, and the folder holds only files of
+            # loggers.
             if new and not (folder / "config.yaml").exists():
                 shutil.rmtree(folder, ignore_errors=True)
 
@@ -123,7 +124,7 @@ def lost_worker(error: BaseException) -> UserError | None:
     lost = re.search(
         r"DataLoader worker \(pid.*?\) (is killed by signal|exited unexpectedly)", message
     )
-    # A pipe breaks before torch notices
+    # A pipe of a data loader breaks before torch notices that its worker has died.
     if lost is None and not isinstance(error, ConnectionError | EOFError):
         return None
     return UserError(

@@ -93,7 +93,7 @@ class WandbRun(WandbLogger):
         """Logs metrics; skips steps that an earlier part of a resumed run logged already."""
         if step is not None and step < self.logged_step:
             return
-        # Wandb restarts the row numbers of an offline part from 0
+        # W&B numbers the rows of an offline part from 0 again.
         if self.experiment.step < self.rows:
             self.experiment.log({}, step=self.rows)
         super().log_metrics(metrics, step)

@@ -83,7 +83,7 @@ def write_mp4(
         context.colorspace = context.color_primaries = context.color_trc = BT709
         for image in _video(motions, fps, size, body):
             if not context.is_open:
-                # H.264 needs even sizes
+                # H.264 needs even widths and heights.
                 context.width, context.height = (
                     image.width // 2 * 2,
                     image.height // 2 * 2,
@@ -367,7 +367,7 @@ def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 def _lines(motion: Figure, body: FittedBody | None, width: int, size: int) -> list[str]:
     """Returns at most three lines of a motion's caption, and one more if it is drawn as a skeleton."""
     lines, font = [""], _font(size)
-    # More does not fit into three lines
+    # The caption has room for three lines.
     for word in shortened(motion.text or motion.id, width).split():
         longer = f"{lines[-1]} {word}".strip()
         if font.getlength(longer) <= width - 16:

@@ -170,7 +170,7 @@ class Body:
         for side, sign in enumerate(SIGN):
             forward, sideways, outward, elbow = self.arms[side]
             arm = rotation(2, sign * sideways) @ rotation(0, -forward) @ rotation(1, sign * outward)
-            # The shoulder girdle rises with the arm
+            # The shoulder girdle rises with the arm, as in people.
             lift = 0.2 * (1 + (arm @ down)[:, 1]) + self.shoulders[side]
             collar = bone @ rotation(2, sign * lift)
             out[:, 13 + side] = out[:, 9] + bone @ np.array([sign * COLLAR[0], *COLLAR[1:]])

@@ -50,7 +50,7 @@ def point(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attrib
     start = rng.uniform(0.1, 0.3)
     out = pulse(t, start, start + rng.uniform(0.45, 0.6), t[-1] - 0.55, t[-1])
     aside = rng.uniform(-0.1, 0.35)
-    # Of a trunk that leans: the arm points ahead, not at the floor
+    # The lean of the trunk is taken off the arm, so that it points ahead and not at the floor.
     bent = body.pelvis[0] + body.spine[0]
     body.move_arm(side, out, (rng.uniform(1.4, 1.6) + bent, aside, -0.4, 0.06))
     body.spine[1] -= 0.2 * SIGN[side] * out

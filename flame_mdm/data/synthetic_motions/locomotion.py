@@ -168,7 +168,7 @@ def run(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribut
     )
     apart = walk_along(body, rng, gait, rng.uniform(2.4, 3.0), straight(0, 1), RIGHT)
     speed = np.gradient(body.position[:, 2], t)
-    # Leans forward to speed up, and back to stop
+    # The body leans forward to speed up, and back to stop.
     body.pelvis[0] += 0.025 * speed + 0.015 * np.gradient(speed, t)
     body.spine[0] += 0.05 * speed
     for side in (0, 1):

@@ -60,7 +60,7 @@ def limp(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
     sign = SIGN[side]
     gait = Gait(rng.uniform(0.52, 0.6), 0.82, 0.12, 0.35, 0.1, 0.09)
     apart = walk_along(body, rng, gait, rng.uniform(0.5, 0.7), straight(0, 1), 1 - side)
-    # Stands on the sore leg
+    # The weight is on the sore leg while the other foot is in the air.
     loaded = np.clip((body.ankles[1 - side, :, 1] - ANKLE_HEIGHT) / 0.12, 0, 1)
     sore = body.ankles[side, :, 1]
     sore += 0.6 * (ANKLE_HEIGHT - sore)

@@ -208,7 +208,7 @@ def _tex(text: str) -> str:
         "λ": r"$\lambda$",
         "β": r"$\beta$",
     }
-    # Brackets after \\\\ are its option
+    # LaTeX reads brackets after \\ as its option, so that they are put into braces.
     special |= {c: "\\" + c for c in "&%$#_{}"} | {
         "[": "{[}",
         "]": "{]}",

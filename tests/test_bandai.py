@@ -87,7 +87,7 @@ def test_bones_keep_their_length_and_joints_their_position(tiny):
         expected = (
             take.positions()[::3, [take.joints.index(name) for name in JOINTS.values()]] / 100
         )
-        # Spine1 lies between pelvis and spine2
+        # The files have no spine1, which lies between pelvis and spine2.
         expected[:, 3] = 0.6 * expected[:, 0] + 0.4 * expected[:, 6]
         np.testing.assert_allclose(motion[::2][: len(expected)], expected, atol=1e-6)
 

@@ -100,7 +100,7 @@ def test_the_nearest_triangle_is_drawn_and_pictures_show_the_body_in_its_clothes
     assert (image[2:18, 2:18] == [10, 20, 30]).all()
     assert (image[:, :2] == 255).all()
     assert (image[18:] == 255).all()
-    # Seen from inside
+    # This side is seen from inside.
     render._rasterize(image, at, np.repeat([3.0, 0.5], 4), colors, triangles[:, ::-1])
     assert (image[2:18, 2:18] == [10, 20, 30]).all()
     # pictures show the body in its clothes

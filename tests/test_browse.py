@@ -24,7 +24,7 @@ def entry(name: str, split: str = "train", *captions: str) -> Entry:
 
 
 def test_clips_are_found_by_words_and_split_with_their_mirrored_copies():
-    # No clip is called arch
+    # No clip matches the search for arch.
     entries = [
         *(entry("Ma", "train", "waves the left hand"), entry("a", "train", "waves the right hand")),
         *(
@@ -84,7 +84,7 @@ def test_a_page_shows_every_clip_and_its_texts_as_text(store, tmp_path):
     page = page_of(store, tmp_path / "p.html")
     assert page.tags.count("script") == 3
     assert not {"img", "link", "iframe"} & set(page.tags)
-    # Title, heading, data set, what was left out, actions
+    # The hostile text is in title, heading, data set, reasons and actions.
     assert " ".join(page.texts.values()).count(HOSTILE) >= 5
     assert [m["id"] for m in page.motions] == [*(f"{k}{HOSTILE}" for k in range(4)), f"M3{HOSTILE}"]
     assert [m["group"] for m in page.motions] == ["val", "train", "train", "train", "train"]

@@ -129,7 +129,7 @@ PAIRS = [(process, "learned") for process in PROCESSES] + [("x0", "action"), ("x
 @each_denoiser
 def test_trains_and_samples(denoiser, process, condition, monkeypatch):
     task, motions = build(denoiser, process, condition), batch()
-    # Reads tokens in place of the pooled vector
+    # Such a denoiser reads tokens instead of the pooled vector.
     if condition == "none" and DENOISERS[denoiser].get("max_tokens"):
         with pytest.raises(
             ValueError, match="needs condition tokens, but the condition encoder has none"

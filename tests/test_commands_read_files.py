@@ -140,7 +140,7 @@ def test_a_character_that_is_compressed_is_refused(tmp_path: Path, capsys):
         assert "it requires EXT_meshopt_compression" in capsys.readouterr().err
 
 
-# What check says and its exit code; the motions that `convert` writes and its exit code
+# Words and exit code of the check, then the motions that `convert` writes and its exit code.
 FOLDERS = {
     "f02_folder": ("2 clips can be prepared", 0, ["a", "b"], 0),
     "f07_check_rc": (

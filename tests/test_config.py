@@ -183,7 +183,7 @@ def test_a_recipe_file_may_have_keys_of_its_own_to_which_others_refer(tmp_path):
 @pytest.mark.parametrize("name", [name for name in dir(torch.optim) if is_optimizer(name)])
 def test_each_argument_of_an_optimizer_of_a_wrong_type_is_named_with_its_value(name):
     target = f"torch.optim.{name}"
-    # The latter are texts
+    # The arguments that are left out are texts.
     for key in parameters(target) - {
         "params",
         "line_search_fn",
@@ -256,14 +256,14 @@ UNTRUSTED = [
     ),
     *("torch.utils.collect_env.run", "lightning.pytorch.Trainer"),
     *("flame_mdm.config.run", "flame_mdm.data.restricted_pickle.read"),  # functions
-    # What a trusted module imports
+    # Names that a trusted module imports.
     *(
         "flame_mdm.data.store.shutil.rmtree",
         "flame_mdm.data.store.Path",
     ),
     *("flame_mdm.task.torch.load", "flame_mdm.denoisers.mdm"),
     "flame_mdm.training.callbacks.Checkpoints",  # writes files
-    # Of another part
+    # Classes of another part.
     *(
         "flame_mdm.conditions.text.PretrainedText",
         "evaluators.extractors.MotionCLIPExtractor",

@@ -59,7 +59,7 @@ def test_any_features_decode_to_rotations_and_to_motions_that_can_be_written(
     motion = decoded(representation, features(kind, representation.features), kind, kind)
     assert np.isfinite(motion.joints).all()
     refusals = saved(motion, tmp_path)
-    # Its joints are features of their own, and all are at one point
+    # Joints are features of this representation, and here all of them are at one point.
     if make is Motion272 and kind != "signs":
         assert len(refusals) == 3
         assert {message.partition(",")[0] for message in refusals} == {

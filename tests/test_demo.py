@@ -228,7 +228,7 @@ NORMAL = (
 class Server(NamedTuple):
     address: str
     process: int
-    # What a demo in the same process, which is not served, says about itself
+    # Facts about a demo in the same process that is not served.
     inside: dict[str, Any]
 
 

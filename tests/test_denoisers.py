@@ -106,7 +106,7 @@ def test_dropped_condition_is_the_null_and_time_is_continuous(path: Path) -> Non
 def test_paper_sizes() -> None:
     sizes = {"mdm_encoder": 17_880_327, "mdm_decoder": 26_293_511, "mdm_decoder_token": 26_293_511}
     sizes |= {"dip": 26_424_583, "dip_target": 26_704_135}
-    # U-Net: 23.47M in the paper
+    # The paper states 23.47M for the U-Net.
     sizes |= {
         "mdm_gru": 4_472_071,
         "mdm_unet": 23_565_959,

@@ -120,7 +120,7 @@ def test_data_is_prepared_once_and_no_process_is_without_a_validation_batch(tiny
     representation = instantiate(config["representation"])
     data = instantiate(config["data"], representation=representation, seed=0)
     for part in (data, GeneratorTask.build(config, representation)):
-        # By which Lightning asks the first process of the first machine
+        # With this value, Lightning asks only the first process of the first machine.
         assert part.prepare_data_per_node is False
     data.prepare_data()
     data.setup("fit")
@@ -155,7 +155,7 @@ def test_a_slurm_job_that_runs_out_of_time_is_requeued_and_ends_as_if_it_had_not
         os.pathsep
     )
     programs = os.pathsep.join([str(ROOT / "tests" / "support" / "slurm"), os.environ["PATH"]])
-    # Has SLURM as far as submitit needs it
+    # A stand-in for SLURM, with the commands that submitit needs.
     cluster = {
         "CLUSTER": str(tmp_path),
         "PYTHONPATH": path,

@@ -114,7 +114,7 @@ def is_composed(program: str, command: str, words: Sequence[str]) -> bool:
         f"flame_mdm.commands.{'import_released' if command == 'import' else command}"
     ).main
     with pytest.MonkeyPatch.context() as patch:
-        # Runs the jobs of a sweep
+        # This function runs the jobs of a sweep.
         patch.setattr(sweeps, "hydra_main", lambda **_: lambda _: lambda: None)
         if program == "make":
             if not all("=" in word for word in words):
@@ -270,7 +270,7 @@ def test_the_notebook_runs(tmp_path):
     assert all(text in "".join(outputs) for text in ("<iframe", "60 frames at 20 per second"))
     assert {path.name for path in tmp_path.iterdir()} == {"walk.glb", "walk.bvh", "samples.html"}
     printed = [output for output in outputs if "'stderr'" in output]
-    # A widget that tqdm names
+    # tqdm warns of a widget that is not installed.
     assert [output for output in printed if "IProgress" not in output] == []
 
 
@@ -309,5 +309,5 @@ def test_the_site_is_built_without_warnings_and_every_page_is_within_three_click
     goals = {"sampling", "demo", "own-data", "humanml3d-to-table", "tables", "api", "recipes"}
     assert {clicks[tmp_path / f"{goal}.html"] for goal in goals} == {1}
     start = (tmp_path / "index.html").read_text()
-    # A first motion, without any click
+    # The page shows how to sample a first motion without any click.
     assert "flame-mdm sample quickstart" in re.sub("<[^>]+>", "", start)

@@ -363,7 +363,7 @@ def again(rows: Rows, indices: np.ndarray) -> Rows:
 
 def test_a_bootstrap_measures_each_motion_as_often_as_it_is_drawn(runs):
     evaluation = runs.evaluation(features=True)
-    # Ill-conditioned
+    # Ill-conditioned metrics are left out of the exact comparison.
     metrics = {
         name: metric for name, metric in evaluation.protocol.metrics.items() if name != "mid"
     }

@@ -219,7 +219,7 @@ def test_features_that_are_rotations_of_smpl_are_exported_and_those_of_humanml_a
         np.testing.assert_allclose(made.posed().joints(), joints[:, :22], atol=1e-5)
         made.save(tmp_path / "b.npz")
         again = np.load(tmp_path / "b.npz")["poses"]
-        # All but the root, whose world differs
+        # All rotations but the root's, whose world differs, are kept.
         np.testing.assert_allclose(again[:, 3:66], raw[:, 6:69], atol=1e-5)
     for name, features in (("a", np.zeros((160, 263))), ("b", np.full((160, 263), 7.0))):
         arrays = {

@@ -331,7 +331,7 @@ def test_convert_and_edit_read_files_as_prepare_does(tmp_path: Path, monkeypatch
         "it lies"
     )
     np.savez("mine/made.npz", joints=WALK, fps=30, text="a person walks")
-    # Made here: in meters, y up
+    # The file was made here, in meters, y up.
     np.testing.assert_allclose(read("mine/made.npz").joints, WALK, atol=1e-6)
 
 

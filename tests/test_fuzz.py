@@ -218,7 +218,7 @@ def test_damaged_motions(refused, bad):
     ]
     for suffix, whole in (("npz", {"joints": FOUR, "fps": 20.0}), ("npy", FOUR)):
         damaged = list(mangled(written(whole), 24, 5))
-        # Cut: zip files may begin anywhere
+        # One case is left out: zip files may begin anywhere.
         cases += [(suffix, data) for data in (*damaged[:5], *damaged[6::3])]
     for suffix, data in cases:
         (bad / f"bad.{suffix}").write_bytes(data)

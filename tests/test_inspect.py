@@ -76,7 +76,7 @@ def test_faults_are_found_where_they_are():
             lambda joints: float_(joints, 15, 1.0),
             {("skating", k, *span) for k in feet for span in ((0, 29), (45, 79))},
         ),
-        # In front of the knee
+        # The point is in front of the knee.
         (
             place("left_hip", "left_hip", (0, 0, 0.3)),
             {("limit", "left_knee", 30, 40)},

@@ -112,7 +112,7 @@ def test_the_protocol_compares_with_the_recordings_of_520_clips_at_100_fps(mmm, 
     assert evaluated(mmm, out, "reconstruction_kit") == 0
     result = json.loads(out.read_text())
     assert (result["protocol"]["name"], result["protocol"]["version"]) == ("reconstruction_kit", 2)
-    # Of 00008, the only clip in ghosh-test
+    # Motion 00008 is the only clip in ghosh-test.
     recording = torch.from_numpy(kit_walk(161)).float().double()
     motion = Rifke().decode(Rifke().encode(recording[::8] / 640)) * 640
     times = np.arange(161) / 8

@@ -132,7 +132,7 @@ def test_action_metrics_equal_the_authors(case: str):
     first, second = tensor(f"{case}/mm_pairs").T
     labels = tensor(f"{case}/labels")
     assert torch.equal(labels[first], labels[second])
-    # Theirs divides by classes without motions too
+    # The authors' code also divides by classes without motions.
     share = len(labels.unique()) / int(array(f"{case}/num_labels"))
     expected = float(array(f"{case}/multimodality"))
     assert pair_distance(features[first], features[second]) * share == pytest.approx(
@@ -162,7 +162,7 @@ def test_intervals_accuracy_unconstrained_diversity_precision_recall_and_retriev
     )
     assert value == pytest.approx(float(array("uncond/diversity")), rel=1e-5)
     fake, real = tensor("pr/gen"), tensor("pr/real")
-    # The larger set is cut
+    # The larger set is cut to the size of the smaller one.
     order = {
         "keys": torch.arange(len(fake)),
         "real_keys": torch.arange(len(real)),
@@ -228,8 +228,8 @@ def test_mid_equals_the_authors(case: str):
         theirs[option] = float(array(f"{case}/{option}"))
     if len(real) > real.shape[1] + text.shape[1]:
         assert ours == pytest.approx(theirs, rel=1e-6)
-    # The log-determinant of the joint covariance is noise, there and here, but the same with other
-    # motions
+    # The log-determinant of the joint covariance is noise in both implementations. It cancels in the
+    # difference between two sets of motions.
     else:
         (a, b), (c, d) = (x.values() for x in (ours, theirs))
         assert b - a == pytest.approx(d - c, rel=1e-6)

@@ -189,7 +189,7 @@ def test_padding_and_company_do_not_change_features(roughness):
     for row, length in enumerate(lengths.tolist()):
         alone = clip(x[row : row + 1, :length], torch.ones(1, length, dtype=torch.bool))
         torch.testing.assert_close(alone[0], together[row], atol=1e-5, rtol=1e-5)
-    # Padded beyond the table of lengths
+    # The batch is padded beyond the table of lengths.
     clip(torch.zeros(1, 25, 7), length_mask(torch.tensor([20]), 25))
     with pytest.raises(UserError, match=r"21 frames, but this motion-CLIP takes at most 20"):
         clip(torch.zeros(1, 21, 7), length_mask(torch.tensor([21])))

@@ -140,7 +140,7 @@ def test_numbers_that_are_not_finite_are_damage(tmp_path: Path, capsys: pytest.C
     features = np.load(file)
     features[entry.start + 3, 5] = np.nan
     np.save(file, features)
-    # Whoever changed it may do that
+    # Somebody who changes the features may also change their hash.
     store.info["sha256"]["features.npy"] = sha256(file.read_bytes()).hexdigest()
     (store.folder / "store.json").write_text(json.dumps(store.info))
     assert main(["prepare", *SYNTHETIC, f"data_root={tmp_path}", "verify=true"]) == 1

@@ -116,7 +116,8 @@ def test_corruption_posterior_and_variational_bound(case, dtype):
     assert_golden(GAUSSIAN, "pw/x_t", x_t)
     assert_golden(GAUSSIAN, "pw/q_posterior_mean", process.schedule.posterior_mean(x, x_t, t))
     key, arrays = f"pw/vb_{case}", GAUSSIAN
-    # Guided-diffusion has bits, and at step 0 the likelihood of a pixel: not for motion
+    # guided-diffusion computes bits and, at step 0, the likelihood of a pixel. Neither is for
+    # motion.
     if "guided" in case:
         output, later = pointwise_output(x_t, learned=True), t > 0
         bound = masked_mean(process.vlb(output, x, x_t, t), mask)[later] / math.log(2)

@@ -90,7 +90,7 @@ def test_mbench_equals_the_authors(case: str):
         np.testing.assert_array_equal(parts, MBENCH[f"aux/{case}/floating_parts"])
     ours = MBenchQuality(20.0).measure(motion)
     for name, theirs in MBENCH_NAMES.items():
-        # Without a value where the code fails
+        # The fixture has no value where the authors' code fails.
         expected = float(MBENCH.get(f"f64/{case}/{theirs}", math.nan))
         assert float(ours[name]) == pytest.approx(expected, rel=1e-8, abs=1e-8, nan_ok=True), name
 

@@ -316,7 +316,7 @@ def test_flame_features_and_action_features_of_consecutive_skipped_and_all_frame
     cases = [re.fullmatch(r"a2m/(|rc_|full_)inp_(\w+)", key) for key in file]
     for kind, number in [case.groups() for case in cases if case]:
         motion = torch.cat([file[f"a2m/joints3d_{number}"][:, 0], file[f"a2m/pose72_{number}"]], 1)
-        # (25, 6, F) -> (F, 150)
+        # From (25, 6, F) to (F, 150).
         expected = file[f"a2m/{kind}inp_{number}"].permute(2, 0, 1).flatten(1)
         if kind == "":
             start = max(int(file[f"a2m/shift_draw_{number}"][2]), 0)

@@ -125,7 +125,7 @@ def test_local_axes_are_those_of_the_skeleton_and_rotations_those_of_the_source(
         np.testing.assert_allclose(np.linalg.det(rig.neutral), 1)
     rig = preset("soma", kick.posed())
     left, right = (rig.neutral[rig.joints.index(f"{side}Shin")] for side in ("Left", "Right"))
-    # Opposite to the mirrored
+    # The right knee turns in the direction opposite to the mirrored left knee.
     np.testing.assert_allclose(right, -np.diag([-1, 1, 1]) @ left, atol=0.1)
     # every joint has the rotation of its counterpart, also where positions do not show it
     poses = kick.posed()
@@ -170,7 +170,7 @@ def test_a_character_with_odd_names_scale_and_rest_pose(kick: Motion, tmp_path: 
     before = Glb(hero).document
     assert all(file.document[part] == before[part] for part in ("meshes", "materials", "skins"))
     for side in SIDES:
-        # It faces +z, as the motion does
+        # The character faces +z, as the motion does.
         assert np.median((at[f"{side}_foot"] - at[f"{side}_ankle"])[standing, 2]) > 0
     world = characters.moved(characters.read(hero), kick)[0]
     # No limb flips

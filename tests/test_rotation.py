@@ -38,7 +38,7 @@ def test_conversions_are_the_authors(stem: str):
         same(rotation.matrix_to_rot6d(matrix, "rows").float(), file["conv/rot6d_rows"], 2e-6)
         same(rotation.matrix_to_rot6d(matrix, "columns").float(), file["conv/rot6d_cols"], 2e-6)
         actual = rotation.quaternion_to_matrix(rotation.matrix_to_quaternion(matrix))
-        # It loses digits near a half turn
+        # The variant with copysign loses digits near a half turn.
         for key, atol in (
             ("p3d072", 2e-6),
             ("p3dhead", 2e-6),

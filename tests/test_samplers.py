@@ -65,7 +65,7 @@ def test_mdm_loop(case, dtype):
     assert not options.keys() - supported, f"{case}: options that the product does not have"
     x_T, steps = motions(GAUSSIAN["loop/x_T"], dtype), spaced(total, section)
     draws = [motions(noise, dtype) for noise in GAUSSIAN[f"loop/{case}/noise"]]
-    # Of the steps, not of the start
+    # This concerns the noise of the steps, not of the start.
     if options.get("const_noise") or options.get("const") or "const_noise" in case:
         draws = [noise[:1].expand_as(noise) for noise in draws]
     named = re.search(r"skip(\d+)", case)  # how many of the noisiest steps a loop leaves out
@@ -383,7 +383,7 @@ def test_order_of_diffusion_solvers():
 MIXING = linear_denoiser(np.array([[0.3, -0.2], [0.1, 0.4]]), np.array([[0.2], [-0.1]]), 0.3)
 
 
-# Theirs, under numpy 2
+# The authors' code warns under numpy 2.
 @pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")
 @pytest.mark.parametrize(
     ("ours", "name"), [("x0", "sample"), ("epsilon", "epsilon"), ("velocity", "v_prediction")]
@@ -403,7 +403,7 @@ def test_dpm_solver_agrees_with_diffusers(ours, name):
         output = MIXING(theirs, torch.tensor([float(t)]), real(theirs), NO_CONDITION)
         theirs = scheduler.step(output, t, theirs, return_dict=False)[0]
     ours = sample(process, MIXING, noise, sampler="dpm_solver_pp_2m", num_inference_steps=steps)
-    # Theirs computes alpha products in float32
+    # The authors' code computes products of alphas in float32.
     torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-4)
 
 
@@ -450,7 +450,7 @@ def test_kept_parts_are_met_exactly_and_seen_by_the_rest(build, sampler):
         # The denoiser sees the kept part, so the rest follows it downwards.
         assert edited[~keep].mean() < free[~keep].mean() - 0.05
         nothing = sampled(build(), edit=Edit(known, torch.zeros_like(keep), mode, blend="before"))
-        # Blending uses up their draws
+        # Blending uses up the draws of these samplers.
         if mode == "x0" or sampler not in (
             "ancestral",
             "consistency",

@@ -287,7 +287,7 @@ def test_targets_that_the_text_does_not_suggest_do_not_stretch_bones(model):
     assert np.abs(after / before - 1).max() < 0.05
     target = {"joints": [{"time": 1.5, "joint": "right_wrist", "position": [None, 1.4, None]}]}
     lengths = bones(flame_mdm.generate(model, TEXT, targets=target, **options)[0])
-    # 0.6, if kept in the frame of the target alone
+    # The difference is 0.6 if bone lengths are kept in the frame of the target alone.
     assert np.abs(lengths / np.median(lengths, 0) - 1).max() < 0.15
 
 
@@ -310,7 +310,7 @@ def test_a_vocabulary_holds_every_word_once_and_captions_only_if_they_may_be_sha
 
 def test_unseen_and_unread_words_are_named_once_with_one_suggestion():
     facts = vocabulary.vocabulary(CAPTIONS, CAPTIONS)
-    # Walks; function words
+    # The words are forms of walk, and function words.
     assert vocabulary.advice("A person WAVES, with the hand! They were walking", facts) == []
     (line,) = vocabulary.advice("a person dances the flamenco and dances with the left foot", facts)
     assert line == f"never seen in training: dances, flamenco, foot. Did you mean '{CAPTIONS[1]}'?"

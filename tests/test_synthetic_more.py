@@ -69,7 +69,7 @@ def test_bones_are_constant_and_feet_on_the_floor_do_not_move(attributes: Attrib
     across = motion[0, 16] - motion[0, 17]
     assert across[0] > 0.9 * np.linalg.norm(across), "it does not face +z"
 
-    # Of which those that neither rise nor sink for three frames stand on something
+    # Toes that neither rise nor sink for three frames stand on something.
     toes = motion[:, [10, 11]]
     level = np.abs(np.diff(toes[..., 1], axis=0)) < 1e-5
     stance = level[1:-1] & level[2:] & level[:-2]

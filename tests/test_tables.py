@@ -167,7 +167,7 @@ def test_the_same_results_give_the_same_bytes(folder, capsys):
     }
     assert names == files(folder / "a").keys()
     assert "![Steps](spec-steps-figure1.svg)" in (folder / "a" / "spec.md").read_text()
-    # The sweep's four rows count, too
+    # The four rows of the sweep count, too.
     assert "spec: 7 of 8 rows measured" in capsys.readouterr().out
 
 
@@ -176,7 +176,7 @@ def test_cells_ranks_and_real_motions(folder):
     real = [c.text if c else None for c in lines["real: Real motions"].cells]
     assert real == ["0.002 ±0.012", "0.797 ±0.012", "9.503 ±0.012", None]
     ranks_of = {name: [c.rank if c else None for c in line.cells] for name, line in lines.items()}
-    # 9.559 is 0.056 from real motions, 9.5 only 0.003
+    # 9.559 differs by 0.056 from real motions, 9.5 only by 0.003.
     assert ranks_of["measured: MDM"] == [
         2,
         0,

@@ -99,7 +99,7 @@ def test_a_resumed_run_is_the_uninterrupted_one_and_adds_up_what_it_cost(tiny, t
     assert 0.01 < training["memory_gib"] < 1000
     training |= {"hours": 100.0, "memory_gib": 2000.0}
     torch.save(first, parts)
-    # What a killed run leaves behind
+    # A killed run leaves half a line behind.
     with (tmp_path / "parts" / "metrics.jsonl").open("a") as file:
         file.write('{"step": 6, "train/loss": 77.0}\n{"step": 7, "train/lo')
     run(overrides, 11, tmp_path / "parts")
@@ -277,7 +277,7 @@ def test_sampling_writes_motions_and_a_player_and_takes_every_option(trained, tm
     for change in ({"spacing": "stride"}, {"eta": 0.0}, {"shared_noise": False}):
         assert not np.allclose(features(num_inference_steps=5, **change), five)
     with Image.open(out / "trajectory.png") as sheet, Image.open(out / "motions.png") as motions:
-        # Four estimates and the result
+        # The sheet shows four estimates and the result.
         assert sheet.height / 5 == pytest.approx(motions.height / 2, rel=0.2)
 
 

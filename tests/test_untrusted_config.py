@@ -126,7 +126,7 @@ def test_interpolations_in_saved_runs_and_protocols_are_refused(attacked, traine
             load_protocol(str(own), representation)
     for words in (["train", "quickstart", *TINY, f"run.dir={bad}"], ["report", str(bad)]):
         attacked(*words, says=f"config.yaml: x {says}")
-    # Its checkpoints would be refused
+    # Checkpoints of such a run would be refused.
     attacked("train", "quickstart", r"run.dir='x\${a}'", says=says)
     assert not marker.exists()
 

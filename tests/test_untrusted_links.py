@@ -209,7 +209,7 @@ def succeed(words: list[str]) -> None:
             raise UserError(errors[-1].removeprefix("error: "))
 
 
-# Others need packages of extras
+# The other files need packages of extras.
 CONVERTED = [ending for ending in WRITTEN if ending not in (".mp4", *USD)]
 CARD = ROOT / "docs" / "benchmarks" / "audit" / "synthetic-none.json"
 SAMPLES = [

@@ -401,7 +401,7 @@ def test_the_bones_of_an_asf_file_are_bounded(tmp_path: Path):
 def test_one_bad_task_ends_all_workers(case: str, says: str, tmp_path: Path):
     (tmp_path / "bomb").write_bytes(bvh_at("999999"))
     tasks: dict[str, list[tuple]] = {"killed": [(abs, 1), (signal.raise_signal, 9)]}
-    # The first has no end
+    # The first one has no end.
     tasks["bomb"] = [
         (signal.raise_signal, signal.SIGSTOP),
         (bvh_files.read, tmp_path / "bomb"),
@@ -419,7 +419,7 @@ PICKLES = {
     "memo": (b"\x80\x04Nr\xff\xff\xff\x7f.", "must contain"),
     "tuples": (b"\x80\x04})" + b"\x85" * (2 * 10**5) + b"Ns.", "is not text"),
     "lists": (b"\x80\x04" + b"](" * 10**5 + b"e" * 10**5 + b".", "nested too deeply"),
-    # A list that holds a list twice, ...
+    # A list that holds a list twice, which holds a list twice, and so on.
     "doubled": (
         b"\x80\x04]" + b"q\x00](h\x00h\x00e" * 60 + b".",
         "expand to",

@@ -26,7 +26,7 @@ MP4 = pytest.mark.skipif(av is None, reason="av is not installed: pip install fl
 
 
 def test_player_holds_the_joints_to_half_a_millimetre_and_huge_ones_coarser(tmp_path):
-    # Lengths, rates and skeletons may differ
+    # Motions on one page may differ in length, rate and skeleton.
     motions = [
         sway(contacts=True),
         sway(7, 12.5, SKELETONS["kit21"]),
@@ -68,7 +68,7 @@ def test_player_is_one_file_that_escapes_all_texts(tmp_path):
         assert reference not in page.source, reference
     assert page.tags.count("script") == 3
     assert page.texts["title"] == page.texts["h1"] == HOSTILE
-    # It rearranges no text
+    # The page does not rearrange texts.
     assert (page.motions[0]["caption"], page.motions[0]["id"]) == (
         HOSTILE,
         r"a\u2066b",

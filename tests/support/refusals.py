@@ -56,7 +56,7 @@ class Refused:
         handlers = {
             signum: signal.signal(signum, alarm) for signum in (signal.SIGALRM, signal.SIGPROF)
         }
-        # Of this process: other programs do not count
+        # The timer counts the time of this process only.
         signal.setitimer(signal.ITIMER_PROF, self.seconds)
         signal.alarm(WAITING * self.seconds)
         limits = resource.getrlimit(resource.RLIMIT_AS)

@@ -355,7 +355,7 @@ LABELS = [
 
 def small_babel(root: Path) -> tuple[Path, Path]:
     """BABEL with a few motions of 15 s in both parts, and one without frame labels."""
-    # Of the val part, 27 is for testing
+    # Motion 27 is the one of the val part that is for testing.
     names = [f"CMU/{k:02d}/{k:02d}_01_poses.npz" for k in [*range(23), 27]]
     for seed, name in enumerate(names):
         write_amass(root / "amass" / name, 900, 60.0, seed)

@@ -6,7 +6,7 @@
 PYTHON ?= python3
 VENV := .venv
 READY := $(VENV)/.ready
-COMMANDS := train adapt distill sample demo edit evaluate audit tables benchmark prepare browse inspect convert compare report import export push
+COMMANDS := train adapt distill sample demo edit evaluate audit tables benchmark prepare browse inspect judge convert compare report import export push
 PYTEST := $(VENV)/bin/python -m pytest -n 2 --dist loadfile
 export MAKEFLAGS
 

@@ -24,10 +24,11 @@ if TYPE_CHECKING:
     from flame_mdm.generator import MotionGenerator as MotionGenerator
     from flame_mdm.sampling.editing import edit
     from flame_mdm.sampling.generation import generate
+    from flame_mdm.sampling.referee.judging import judge
     from flame_mdm.sampling.streams import stream
     from flame_mdm.training.adaptation import adapt
 
-__all__ = ["Motion", "adapt", "edit", "generate", "load", "stream"]
+__all__ = ["Motion", "adapt", "edit", "generate", "judge", "load", "stream"]
 
 _MODULES = {
     "adapt": "training.adaptation",
@@ -37,6 +38,7 @@ _MODULES = {
     "Motion": "formats.motion",
     "edit": "sampling.editing",
     "stream": "sampling.streams",
+    "judge": "sampling.referee.judging",
 }
 
 

@@ -21,6 +21,7 @@ COMMANDS = {
     "prepare": "convert a data set to a packed store, or verify a store",
     "browse": "show a prepared data set as a web page",
     "inspect": "find physical faults of motions or of a data set",
+    "judge": "judge whether motions do what a sentence says",
     "convert": "convert a motion file",
     "compare": "compare runs side by side, or conduct a user study",
     "report": "write the report page of a run",

@@ -550,7 +550,7 @@ def test_help_and_wrong_words_do_not_wait_for_torch():
         "error: unknown command: trian. Did you mean train? `flame-mdm --help` lists the commands\n"
         in result.stderr
     )
-    assert dir(flame_mdm) == ["Motion", "adapt", "edit", "generate", "load", "stream"]
+    assert dir(flame_mdm) == ["Motion", "adapt", "edit", "generate", "judge", "load", "stream"]
 
 
 def test_only_errors_that_the_user_can_fix_are_one_line(capsys, monkeypatch):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from importlib.util import find_spec
 from pathlib import Path
@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 from flame_mdm.checkpoints.locating import Which, find
 from flame_mdm.config import EXPERIMENTS, Config, compose_data
 from flame_mdm.config.options import option, required, same_option
-from flame_mdm.errors import UserError, did_you_mean, say
-from flame_mdm.formats import ADVICE, ENDINGS, unread
+from flame_mdm.errors import UserError, did_you_mean, first_line, say
+from flame_mdm.formats import ADVICE, ENDINGS, motion_files, unread
 from flame_mdm.safe_io import sha256
 from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.sampling.motion_request import EditRequest, SamplingRequest
@@ -144,6 +144,34 @@ class FileSettings:
     animation: str | None = option(
         None, "name or number of an animation in an .fbx or .glb file; default: the first"
     )
+
+
+def read_motions(
+    source: str, settings: FileSettings, failures: list[str]
+) -> tuple[str, int, Iterator[Motion]]:
+    """Returns name, number and motions of a file or folder; errors of files of a folder are added to `failures`."""
+    from flame_mdm.formats.readers import read
+
+    path = Path(source)
+    keys = (settings.fps, settings.unit, settings.up)
+    if not path.is_dir():
+        return (
+            path.resolve().stem,
+            1,
+            iter([read(path, *keys, animation=settings.animation)]),
+        )
+    files = motion_files(path)
+
+    def motions() -> Iterator[Motion]:
+        for file in files:
+            try:
+                motion = read(file, *keys, animation=settings.animation)
+            except (UserError, OSError) as error:
+                failures.append(first_line(error))
+                continue
+            yield replace(motion, id=file.relative_to(path).with_suffix("").as_posix())
+
+    return path.resolve().stem, len(files), motions()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from glob import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
@@ -17,11 +17,11 @@ from flame_mdm.commands import (
     above_zero,
     existing,
     finish,
+    read_motions,
 )
 from flame_mdm.config import EXPERIMENTS, instantiate
 from flame_mdm.config.options import option, required
-from flame_mdm.errors import UserError, first_line, say
-from flame_mdm.formats import motion_files
+from flame_mdm.errors import UserError, say
 from flame_mdm.progress import ProgressBar
 
 if TYPE_CHECKING:
@@ -71,7 +71,10 @@ def main(settings: InspectSettings) -> None:
 
     body = load_body(settings.body)
     failures: list[str] = []
-    name, total, motions = _read(settings, failures) if settings.data is None else _clips(settings)
+    if settings.data is None:
+        name, total, motions = read_motions(settings.motion, settings, failures)
+    else:
+        name, total, motions = _clips(settings)
     worst, kinds, faulty, count = [], Counter(), 0, 0
     for motion in ProgressBar(
         motions, "inspecting", total, unit=" motions", disable=None if total > 1 else True
@@ -114,35 +117,6 @@ def main(settings: InspectSettings) -> None:
     finish(failures, total, "read")
     if faulty:
         raise SystemExit(3)
-
-
-def _read(settings: InspectSettings, failures: list[str]) -> tuple[str, int, Iterator[Motion]]:
-    """Returns name, number and motions of a file or folder; errors of files of a folder are added to `failures`."""
-    from flame_mdm.formats.readers import read
-
-    path = Path(settings.motion)
-    if not path.is_dir():
-        return (
-            path.resolve().stem,
-            1,
-            iter(
-                [read(path, settings.fps, settings.unit, settings.up, animation=settings.animation)]
-            ),
-        )
-    files = motion_files(path)
-
-    def motions() -> Iterator[Motion]:
-        for file in files:
-            try:
-                motion = read(
-                    file, settings.fps, settings.unit, settings.up, animation=settings.animation
-                )
-            except (UserError, OSError) as error:
-                failures.append(first_line(error))
-                continue
-            yield replace(motion, id=file.relative_to(path).with_suffix("").as_posix())
-
-    return path.resolve().stem, len(files), motions()
 
 
 def _clips(settings: InspectSettings) -> tuple[str, int, Iterator[Motion]]:

@@ -1,0 +1,95 @@
+"""`flame-mdm judge MOTION|FOLDER text="..."`: judges whether motions do what a sentence says."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
+
+from flame_mdm.commands import (
+    BodySettings,
+    FileSettings,
+    above_zero,
+    existing,
+    finish,
+    read_motions,
+)
+from flame_mdm.config.options import option, required
+from flame_mdm.errors import UserError, say, shortened
+
+if TYPE_CHECKING:
+    from flame_mdm.formats.motion import Motion
+    from flame_mdm.sampling.referee.judging import Judgment
+
+
+@dataclass(frozen=True, kw_only=True)
+class JudgeSettings(BodySettings, FileSettings):
+    """usage: flame-mdm judge MOTION text="a person waves with the left hand" [OUT.html] [fps=20] [unit=0.01] [up=z]
+           flame-mdm judge FOLDER [OUT.html] [clips=24]
+
+    Reads the claims of a sentence, such as side, count, direction, posture and order, and measures each on the motion:
+    yes, no or cannot tell, with joint, number and time. Without text, motions are judged by their own texts.
+    Writes a player whose time line marks the evidence. Exits with 3 if a claim is false. docs/referee.md
+    """
+
+    OBJECTS: ClassVar = ("motion", "out")
+    motion: str = required("a motion file on SMPL's 22 joints, or a folder of them", existing)
+    text: str | None = option(None, "the sentence; default: the text in each motion file")
+    out: str | None = option(None, "HTML file; default runs/judge/<name>.html")
+    clips: int = option(24, "maximum number of motions in the player, the worst ones", above_zero)
+
+
+def main(settings: JudgeSettings) -> None:
+    from flame_mdm.formats.people import load_body
+    from flame_mdm.sampling.referee.judging import judge
+    from flame_mdm.visualize import write_player
+
+    body = load_body(settings.body)
+    failures: list[str] = []
+    name, total, motions = read_motions(settings.motion, settings, failures)
+    judged: list[tuple[Motion, Judgment]] = []
+    for motion in motions:
+        try:
+            judgment = judge(motion, settings.text)
+        except UserError as error:
+            if total == 1:
+                raise UserError(f"{settings.motion}: {error}") from error
+            failures.append(f"{motion.id}: {error}")
+            continue
+        judged.append((replace(motion, text=judgment.text), judgment))
+        _report(motion.id, judgment)
+    if not judged:
+        finish(failures, total, "judged")
+        raise UserError(f"{settings.motion}: no motion to judge. Name a motion file or a folder")
+
+    answers = Counter(verdict.answer for _, judgment in judged for verdict in judgment.verdicts)
+    say(
+        f"{name}: {answers['yes']} claims are true, {answers['no']} false, "
+        f"{answers['cannot tell']} cannot be told, of {len(judged)} motions"
+    )
+    judged.sort(key=lambda pair: pair[1].true - pair[1].decided)
+    shown = judged[: settings.clips]
+    marks = [
+        [
+            mark
+            for verdict in judgment.verdicts
+            for mark in verdict.marks(motion.fps, len(motion.joints))
+        ]
+        for motion, judgment in shown
+    ]
+    out = Path(settings.out or Path("runs") / "judge" / f"{name}.html")
+    write_player(
+        out, [motion for motion, _ in shown], f"Verdicts on {name}", marks=marks, body=body
+    )
+    say(f"player: {out}")
+    finish(failures, total, "judged")
+    if answers["no"]:
+        raise SystemExit(3)
+
+
+def _report(name: str, judgment: Judgment) -> None:
+    say(f"{name}: '{shortened(judgment.text, 80)}'")
+    say(*(f"  {verdict}" for verdict in judgment.verdicts))
+    if not judgment.verdicts:
+        say("  no claim that can be checked")

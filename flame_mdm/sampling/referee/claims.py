@@ -1,0 +1,86 @@
+"""Claims: checkable statements of a sentence about a motion, and how to falsify them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+MIRRORED = {
+    "left": "right",
+    "right": "left",
+    "clockwise": "counterclockwise",
+    "counterclockwise": "clockwise",
+}
+FLIPPED = {**MIRRORED, "forward": "backward", "backward": "forward"}
+FLIPPED_SPEED = {"slow": "fast", "fast": "slow"}
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A statement of a sentence that can be checked on a motion.
+
+    Attributes:
+        kind: what is claimed, a key of `flame_mdm.sampling.referee.kinds.KINDS`.
+        words: the part of the sentence that states it.
+        side: "left", "right" or "both" limbs; "" = any.
+        direction: "forward", "backward", "left", "right", "clockwise" or "counterclockwise"; "" = any.
+        speed: "slow" or "fast"; "" = any.
+        amount: number of repetitions or steps, or angle of a turn in degrees; None = not stated.
+        parts: the two claims of an order, the first one first.
+    """
+
+    kind: str
+    words: str = ""
+    side: str = ""
+    direction: str = ""
+    speed: str = ""
+    amount: int | None = None
+    parts: tuple["Claim", ...] = ()
+
+    def __str__(self) -> str:
+        if self.parts:
+            return f"{self.parts[0]}, then {self.parts[1]}"
+        amount = "" if self.amount is None else str(self.amount)
+        values = (self.side, self.direction, self.speed, amount)
+        stated = ", ".join(value for value in values if value)
+        return f"{self.kind}: {stated}" if stated else self.kind
+
+    @property
+    def mirrored(self) -> "Claim":
+        """The claim about the mirror image of the motion."""
+        return replace(
+            self,
+            side=MIRRORED.get(self.side, self.side),
+            direction=MIRRORED.get(self.direction, self.direction),
+            parts=tuple(part.mirrored for part in self.parts),
+        )
+
+
+def falsified(claim: Claim) -> list[tuple[str, Claim]]:
+    """Returns claims that are wrong if `claim` is right, and what was changed in each.
+
+    The changes are "side", "direction", "speed", "count" (one more, and one fewer) and "order".
+    """
+    if claim.parts:
+        return [("order", replace(claim, parts=claim.parts[::-1]))]
+    wrong: list[tuple[str, Claim]] = []
+    if claim.side in MIRRORED:
+        wrong.append(("side", replace(claim, side=MIRRORED[claim.side])))
+    if claim.direction in FLIPPED:
+        wrong.append(("direction", replace(claim, direction=FLIPPED[claim.direction])))
+    if claim.speed in FLIPPED_SPEED:
+        wrong.append(("speed", replace(claim, speed=FLIPPED_SPEED[claim.speed])))
+    if claim.amount is not None and claim.kind.startswith("count"):
+        counts = (claim.amount - 1, claim.amount + 1)
+        wrong += [("count", replace(claim, amount=count)) for count in counts if count > 0]
+    return wrong
+
+
+def unique(claims: Sequence[Claim]) -> list[Claim]:
+    """Returns the claims without repetitions that differ in their words alone."""
+    kept: dict[Claim, Claim] = {}
+    for claim in claims:
+        kept.setdefault(_without_words(claim), claim)
+    return list(kept.values())
+
+
+def _without_words(claim: Claim) -> Claim:
+    return replace(claim, words="", parts=tuple(_without_words(part) for part in claim.parts))

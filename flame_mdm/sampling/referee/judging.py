@@ -1,0 +1,172 @@
+"""`judge`: verdicts on the claims of a sentence about a motion, with evidence."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from flame_mdm.errors import UserError, shortened
+from flame_mdm.formats.motion import Motion
+from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.sampling.referee.body import RATE, Body
+from flame_mdm.sampling.referee.claims import Claim
+from flame_mdm.sampling.referee.kinds import KINDS, band, group_of
+from flame_mdm.sampling.referee.readings import Reading
+from flame_mdm.sampling.referee.sentences import read_claims
+
+Answer = Literal["yes", "no", "cannot tell"]
+SHORTEST = 0.4  # seconds of the shortest motion that is judged
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The answer to whether a motion shows a claim, and the evidence.
+
+    Attributes:
+        claim: the claim.
+        answer: "yes", "no" or "cannot tell".
+        reading: what was measured.
+        band: score up to which the answer is "no", and from which it is "yes".
+    """
+
+    claim: Claim
+    answer: Answer
+    reading: Reading
+    band: tuple[float, float]
+
+    @property
+    def group(self) -> str:
+        """What the claim is about, such as "side" or "count"."""
+        return group_of(self.claim)
+
+    @property
+    def evidence(self) -> str:
+        """Number, unit, joint and times that decided: "left wrist: 0.21 m above the head, 1.2-1.9 s"."""
+        reading = self.reading
+        shown = ", ".join(f"{start:.1f}-{end:.1f} s" for start, end in reading.spans[:3])
+        times = f", {shown}" if shown else ""
+        reason = f" ({reading.unclear})" if reading.unclear else ""
+        return f"{reading.joint}: {reading.number:.2f} {reading.unit}{times}{reason}"
+
+    def __str__(self) -> str:
+        return f"{self.answer}: {self.claim}; {self.evidence}"
+
+    def marks(self, fps: float, frames: int) -> list[tuple[int, int, str, str]]:
+        """Returns the spans of the evidence on the time line of a player, in frames of the motion."""
+        marks = []
+        for start, end in self.reading.spans[:3]:
+            first = min(max(0, round(start * fps)), frames - 1)
+            last = min(frames, max(first + 1, round(end * fps)))
+            marks.append((first, last, f"{self.answer}: {self.claim}", self.evidence))
+        return marks
+
+
+@dataclass(frozen=True)
+class Judgment:
+    """The verdicts on all claims of a sentence.
+
+    Attributes:
+        text: the sentence.
+        verdicts: one per claim, in the order of the sentence; empty if it has no claim that can be checked.
+    """
+
+    text: str
+    verdicts: tuple[Verdict, ...]
+
+    @property
+    def decided(self) -> int:
+        """Number of claims with the answer "yes" or "no"."""
+        return sum(verdict.answer != "cannot tell" for verdict in self.verdicts)
+
+    @property
+    def true(self) -> int:
+        """Number of claims with the answer "yes"."""
+        return sum(verdict.answer == "yes" for verdict in self.verdicts)
+
+    @property
+    def accuracy(self) -> float | None:
+        """Share of the decided claims that are true; None if none is decided."""
+        return self.true / self.decided if self.decided else None
+
+    def __str__(self) -> str:
+        if not self.verdicts:
+            return f"'{shortened(self.text, 60)}': no claim that can be checked"
+        return f"{self.true} of {self.decided} decided claims are true, {len(self.verdicts)} read"
+
+
+def judge(
+    motion: Motion | np.ndarray, text: str | None = None, fps: float | None = None
+) -> Judgment:
+    """Judges whether a motion does what a sentence says.
+
+    Reads the claims of the sentence, measures each on the motion, and answers "yes", "no" or "cannot tell".
+    docs/referee.md says what can be checked.
+
+    Args:
+        motion: a motion on SMPL's 22 joints, or joints (F, 22, 3) in meters, y up.
+        text: the sentence; default: the motion's own text.
+        fps: frames per second; required for joints.
+
+    Raises:
+        UserError: the motion has another skeleton, is shorter than 0.4 seconds or not finite, there is no text, or
+            joints were given without `fps`.
+    """
+    if isinstance(motion, Motion):
+        if motion.skeleton != SMPL22:
+            raise UserError(
+                f"motion {motion.id!r} has the skeleton {motion.skeleton.name}. The referee needs {SMPL22.name}"
+            )
+        joints, fps = motion.joints, motion.fps
+        text = motion.text if text is None else text
+    else:
+        joints = motion
+    if fps is None:
+        raise UserError("fps is missing: joints have no frame rate. Give fps=20 or another rate")
+    if not text or not text.strip():
+        raise UserError("text is missing: the motion has none. Give the sentence to judge it by")
+    return Judgment(text, tuple(verdicts(joints, fps, read_claims(text))))
+
+
+def verdicts(joints: np.ndarray, fps: float, claims: Sequence[Claim]) -> list[Verdict]:
+    """Returns the verdict on each claim about joints (F, 22, 3) in meters, y up."""
+    if not claims:
+        return []
+    body = Body(joints, fps)
+    if len(body) < SHORTEST * RATE:
+        raise UserError(
+            f"the motion is {body.seconds:.2f} s long. The referee needs at least {SHORTEST} s"
+        )
+    return [decide(body, claim) for claim in claims]
+
+
+def decide(body: Body, claim: Claim) -> Verdict:
+    """Returns the verdict on a claim about a body."""
+    reading = _order(body, claim) if claim.parts else KINDS[claim.kind].measure(body, claim)
+    no, yes = band(claim)
+    answer: Answer = "cannot tell"
+    if reading.score <= no:
+        answer = "no"
+    elif reading.score >= yes and not reading.unclear:
+        answer = "yes"
+    return Verdict(claim, answer, reading, (no, yes))
+
+
+def _order(body: Body, claim: Claim) -> Reading:
+    """Measures how much later the second part of an order can begin than the first one, in seconds.
+
+    An order is undecided unless both parts are true, and if the reverse order happens, too.
+    """
+    first, second = (decide(body, part) for part in claim.parts)
+    firsts = [start for start, _ in first.reading.spans]
+    seconds = [start for start, _ in second.reading.spans]
+    if first.answer != "yes" or second.answer != "yes" or not firsts or not seconds:
+        return Reading(math.nan, 0.0, "s later", "body", (), "its parts are not clearly there")
+    later, reverse = max(seconds) - min(firsts), max(firsts) - min(seconds)
+    unclear = "the reverse order happens, too" if min(later, reverse) > 0.3 else ""
+    spans = (
+        first.reading.spans[firsts.index(min(firsts))],
+        second.reading.spans[seconds.index(max(seconds))],
+    )
+    return Reading(later, later, "s later", "body", spans, unclear)

@@ -1,0 +1,193 @@
+"""Measurements of postures and of the contact between parts of the body; `kinds.py` lists them."""
+
+import numpy as np
+
+from flame_mdm.sampling.referee.body import (
+    ANKLES,
+    HEAD,
+    HIPS,
+    KNEES,
+    NECK,
+    PELVIS,
+    RATE,
+    SHOULDERS,
+    TOES,
+    WRISTS,
+    Body,
+)
+from flame_mdm.sampling.referee.claims import Claim
+from flame_mdm.sampling.referee.readings import Reading, existence, of_side, spans_of
+
+SIDES = ("left", "right")
+STANDING = 0.9  # height of the pelvis of a standing body of the usual size, in meters
+
+
+def thighs(body: Body) -> np.ndarray:
+    """Returns the angle (F, 2) between each thigh and the vertical in degrees; 90 is level."""
+    thigh = body.joints[:, KNEES] - body.joints[:, HIPS]
+    return np.degrees(np.arctan2(np.linalg.norm(thigh[..., [0, 2]], axis=-1), -thigh[..., 1]))
+
+
+def sit(body: Body, claim: Claim) -> Reading:
+    """Measures by how much the pelvis is lower than in standing, with raised thighs and an upright trunk."""
+    lowered = STANDING - body.height[:, PELVIS]
+    is_folded = (thighs(body).min(1) > 40) & (body.tilt < 60)
+    return existence(np.where(is_folded, lowered, 0.0), "m lower", "pelvis", 0.3)
+
+
+def kneel(body: Body, claim: Claim) -> Reading:
+    """Measures how near a knee is to the floor, with the pelvis above it."""
+    is_up = body.height[:, PELVIS] > 0.25
+    knee = body.height[:, KNEES].min(1)
+    return existence(np.where(is_up, -knee, -0.5), "m above the floor", "knee", 0.2)
+
+
+def lie(body: Body, claim: Claim) -> Reading:
+    """Measures how low pelvis and neck are at the same time."""
+    top = np.maximum(body.height[:, PELVIS], body.height[:, NECK])
+    return existence(-top, "m above the floor", "trunk", 0.2)
+
+
+def all_fours(body: Body, claim: Claim) -> Reading:
+    """Measures how low the hands are while the trunk is level and the pelvis is above the floor."""
+    is_level = (body.tilt > 40) & (body.height[:, PELVIS] > 0.2)
+    hands = body.height[:, WRISTS].max(1)
+    return existence(np.where(is_level, -hands, -1.0), "m above the floor", "hands", 0.2)
+
+
+def crouch(body: Body, claim: Claim) -> Reading:
+    """Measures by how much the pelvis is lower than in standing."""
+    return existence(STANDING - body.height[:, PELVIS], "m lower", "pelvis", 0.15)
+
+
+def bend(body: Body, claim: Claim) -> Reading:
+    """Measures the angle of the trunk from the vertical."""
+    return existence(body.tilt, "degrees", "trunk", 0.15)
+
+
+def head_down(body: Body, claim: Claim) -> Reading:
+    """Measures how far the head comes down, by bending the trunk or the knees."""
+    top = np.percentile(body.height[:, HEAD], 95)
+    return existence(max(top, 1.3) - body.height[:, HEAD], "m lower", "head", 0.15)
+
+
+def hand_down(body: Body, claim: Claim) -> Reading:
+    """Measures how near a hand is to the floor."""
+    hands = body.height[:, WRISTS]
+    readings = [
+        existence(-hands[:, side], "m above the floor", f"{SIDES[side]} hand", 0.1)
+        for side in (0, 1)
+    ]
+    return of_side(readings, claim.side, 0.2)
+
+
+def stand_up(body: Body, claim: Claim) -> Reading:
+    """Measures the largest rise of the pelvis."""
+    return _change(body.height[:, PELVIS])
+
+
+def get_down(body: Body, claim: Claim) -> Reading:
+    """Measures the largest descent of the pelvis."""
+    return _change(-body.height[:, PELVIS])
+
+
+def _change(signal: np.ndarray) -> Reading:
+    """Returns a reading of the largest rise of a signal (F,) in meters, with the times from its start to its end."""
+    lowest = np.minimum.accumulate(signal)
+    end = int((signal - lowest).argmax())
+    start = int(signal[: end + 1].argmin())
+    rise = float(signal[end] - signal[start])
+    return Reading(rise, rise, "m", "pelvis", ((start / RATE, end / RATE),))
+
+
+def stand_still(body: Body, claim: Claim) -> Reading:
+    """Measures how far the pelvis gets from its median position on the floor."""
+    ground = body.joints[:, PELVIS][:, [0, 2]]
+    away = np.linalg.norm(ground - np.median(ground, axis=0), axis=-1)
+    farthest = float(np.percentile(away, 98))
+    return Reading(-farthest, farthest, "m from its place", "pelvis", ((0.0, body.seconds),))
+
+
+def raise_hand(body: Body, claim: Claim) -> Reading:
+    """Measures the height of a wrist above its shoulder."""
+    above = body.joints[:, WRISTS, 1] - body.joints[:, SHOULDERS, 1]
+    readings = [
+        existence(above[:, side], "m above the shoulder", f"{SIDES[side]} wrist") for side in (0, 1)
+    ]
+    return of_side(readings, claim.side, 0.2)
+
+
+def hand_above_head(body: Body, claim: Claim) -> Reading:
+    """Measures the height of a wrist above the head."""
+    above = body.joints[:, WRISTS, 1] - body.joints[:, [HEAD], 1]
+    readings = [
+        existence(above[:, side], "m above the head", f"{SIDES[side]} wrist") for side in (0, 1)
+    ]
+    return of_side(readings, claim.side, 0.2)
+
+
+def hand_to_head(body: Body, claim: Claim) -> Reading:
+    """Measures the distance between a wrist and the head."""
+    away = np.linalg.norm(body.joints[:, WRISTS] - body.joints[:, [HEAD]], axis=-1)
+    readings = [
+        existence(-away[:, side], "m from the head", f"{SIDES[side]} wrist", 0.15)
+        for side in (0, 1)
+    ]
+    return of_side(readings, claim.side, 0.12)
+
+
+def hands_together(body: Body, claim: Claim) -> Reading:
+    """Measures the distance between the wrists."""
+    away = np.linalg.norm(body.joints[:, WRISTS[0]] - body.joints[:, WRISTS[1]], axis=-1)
+    return existence(-away, "m apart", "wrists", 0.1)
+
+
+def hand_on_hip(body: Body, claim: Claim) -> Reading:
+    """Measures the distance between a wrist and the side of the waist, with the elbow out."""
+    waist = body.joints[:, HIPS] + 0.6 * (body.joints[:, [PELVIS]] - body.joints[:, HIPS])
+    waist = waist + np.array([0.0, 0.1, 0.0])
+    outward = (body.joints[:, HIPS] - body.joints[:, HIPS[::-1]]) * 0.9
+    away = np.linalg.norm(body.joints[:, WRISTS] - waist - outward, axis=-1)
+    readings = [
+        existence(-away[:, side], "m from the hip", f"{SIDES[side]} wrist", 0.3) for side in (0, 1)
+    ]
+    return of_side(readings, claim.side, 0.1)
+
+
+def arms_out(body: Body, claim: Claim) -> Reading:
+    """Measures how far both wrists are to the sides of the shoulders, relative to the length of an arm."""
+    aside = body.seen[:, WRISTS, 0] - body.seen[:, SHOULDERS, 0]
+    outward = np.minimum(aside[:, 0], -aside[:, 1]) / body.reach
+    is_up = (body.joints[:, WRISTS, 1] - body.joints[:, SHOULDERS, 1]).min(1) > -0.35
+    return existence(np.where(is_up, outward, 0.0), "of an arm", "both wrists", 0.15)
+
+
+def arms_crossed(body: Body, claim: Claim) -> Reading:
+    """Measures how far each wrist is on the other side of the trunk."""
+    aside = body.seen[:, WRISTS, 0]
+    crossed = aside[:, 1] - aside[:, 0]
+    is_front = body.seen[:, WRISTS, 2].min(1) > 0.05
+    is_high = (body.joints[:, WRISTS, 1] - body.joints[:, [PELVIS], 1]).min(1) > 0.05
+    return existence(np.where(is_front & is_high, crossed, -0.5), "m", "wrists", 0.2)
+
+
+def raise_foot(body: Body, claim: Claim) -> Reading:
+    """Measures how much higher an ankle is than the other one."""
+    higher = body.joints[:, ANKLES, 1] - body.joints[:, ANKLES[::-1], 1]
+    readings = [
+        existence(higher[:, side], "m above the other", f"{SIDES[side]} ankle", 0.1)
+        for side in (0, 1)
+    ]
+    return of_side(readings, claim.side, 0.12)
+
+
+def one_leg(body: Body, claim: Claim) -> Reading:
+    """Measures for how long one foot, the standing one, is on the floor and the other in the air, in seconds."""
+    toes = body.height[:, TOES]
+    readings = []
+    for side in (0, 1):
+        is_on = (toes[:, side] < 0.08) & (toes[:, 1 - side] > 0.15)
+        spans = spans_of(is_on, 0.2)
+        longest = max((end - start for start, end in spans), default=0.0)
+        readings.append(Reading(longest, longest, "s", f"{SIDES[side]} leg", spans))
+    return of_side(readings, claim.side, 0.3)

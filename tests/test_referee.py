@@ -1,0 +1,288 @@
+"""The referee: claims of sentences, measurements, verdicts, and what changes none of them."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from support.motions import Page, posed, synthetic
+
+import flame_mdm
+from flame_mdm.__main__ import main
+from flame_mdm.errors import UserError
+from flame_mdm.formats.motion import Motion
+from flame_mdm.formats.resampling import resample
+from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.sampling.referee.claims import Claim, falsified
+from flame_mdm.sampling.referee.judging import verdicts
+from flame_mdm.sampling.referee.kinds import KINDS, band, group_of, thresholds
+from flame_mdm.sampling.referee.sentences import read_claims
+
+FPS = 20.0
+
+
+@pytest.mark.parametrize(
+    ("text", "claims"),
+    [
+        ("a person walks forward.", ["walk", "travel: forward"]),
+        ("the man slowly walks backwards", ["walk", "travel: backward", "pace: slow"]),
+        ("a person walks to the left", ["walk", "veer: left"]),
+        ("she runs forward then jumps", ["run", "travel: forward", "jump", "run, then jump"]),
+        ("a figure turns 90 degrees to the left", ["turn: left", "turn angle: left, 90"]),
+        ("a man turns around clockwise", ["turn around: clockwise"]),
+        ("walks in a circle counter-clockwise", ["walk", "circle: counterclockwise"]),
+        ("a person kicks twice with the right leg", ["kick: right", "count kicks: right, 2", "use foot: right"]),
+        ("someone raises his left hand", ["raise hand: left", "use hand: left"]),
+        ("raises both arms above her head", ["raise hand: both", "hand above head: both"]),
+        ("a person does three jumping jacks", ["jumping jack", "count jumping jacks: 3"]),
+        ("a person sits down, then stands up", ["sit", "get down", "head down", "stand up", "sit, then stand up"]),
+        ("he crawls on all fours", ["all fours"]),
+        ("the man takes four steps forward", ["step", "step: forward", "count steps: 4"]),
+        ("a person waves with their right hand", ["use hand: right"]),
+        ("stands still with crossed arms", ["stand still", "arms crossed"]),
+    ],
+)  # fmt: skip
+def test_a_sentence_is_read_as_claims(text, claims):
+    got = [str(claim) for claim in read_claims(text)]
+    orders = [claim for claim in got if ", then " in claim]
+    expected_orders = [claim for claim in claims if ", then " in claim]
+    assert set(got) - set(orders) == set(claims) - set(expected_orders)
+    assert set(expected_orders) <= set(orders)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "a person does not walk",
+        "two people walk forward",
+        "a person walks or runs",
+        "a man turns his head to the left",
+        "someone acts like a monkey that jumps",
+        "a person is about to jump",
+        "the person is washing a window",
+        "a person walks back without stopping",
+    ],
+)
+def test_a_sentence_that_may_be_misunderstood_has_no_claim(text):
+    assert read_claims(text) == []
+
+
+@pytest.mark.parametrize(
+    "text", ["kicks with the left foot and the right foot", "waves with the right hand, then the left hand"]
+)  # fmt: skip
+def test_both_sides_in_a_sentence_make_no_claim_about_which_limb_moves_more(text):
+    assert not {claim.kind for claim in read_claims(text)} & {"use hand", "use foot"}
+
+
+def test_a_falsified_claim_differs_in_one_attribute():
+    claim = Claim("count kicks", side="left", amount=2)
+    wrong = {(change, str(other)) for change, other in falsified(claim)}
+    assert wrong == {
+        ("side", "count kicks: right, 2"),
+        ("count", "count kicks: left, 1"),
+        ("count", "count kicks: left, 3"),
+    }
+    order = Claim("order", parts=(Claim("sit"), Claim("jump")))
+    assert [str(other) for _, other in falsified(order)] == ["jump, then sit"]
+
+
+def test_every_pattern_has_a_kind_and_every_threshold_is_a_band():
+    for text in ("walks", "jumps twice", "kneels", "lies down", "leans to the left"):
+        assert all(claim.parts or claim.kind in KINDS for claim in read_claims(text))
+    for name, kind in KINDS.items():
+        assert kind.no < kind.yes, name
+    for name, values in thresholds().items():
+        assert values["no"] < values["yes"], name
+    assert band(Claim("order", parts=(Claim("sit"), Claim("jump")))) == (-0.3, 0.3)
+    assert group_of(Claim("travel", direction="left")) == "direction"
+
+
+def raising(side: str, frames: int = 60) -> Motion:
+    """A body that raises one arm above the head and lowers it."""
+    swing = np.sin(np.pi * np.arange(frames) / frames)
+    zero = 0 * swing
+    sign = 1.0 if side == "left" else -1.0
+    other = "right" if side == "left" else "left"
+    turns: dict[str, Any] = {
+        f"{side}_shoulder": np.stack([zero, zero, sign * (-75 + 155 * swing)], 1),
+        f"{other}_shoulder": np.stack([zero, zero, -sign * (-75 + zero)], 1),
+    }
+    return posed(frames, **turns)
+
+
+def answers(motion: Motion, text: str) -> dict[str, str]:
+    return {
+        str(verdict.claim): verdict.answer for verdict in flame_mdm.judge(motion, text).verdicts
+    }
+
+
+@pytest.mark.parametrize(("side", "other"), [("left", "right"), ("right", "left")])
+def test_the_hand_that_rises_is_told_from_the_other_one_with_evidence(side, other):
+    motion = raising(side)
+    judgment = flame_mdm.judge(motion, f"a person raises the {side} hand above the head")
+    assert judgment.accuracy == 1
+    evidence = next(v for v in judgment.verdicts if v.claim.kind == "hand above head")
+    assert f"{side} wrist" in evidence.evidence
+    assert "m above the head" in evidence.evidence
+    ((start, end), *_) = evidence.reading.spans
+    assert 0.3 < start < 1.5 < end < 2.8
+    wrong = flame_mdm.judge(motion, f"a person raises the {other} hand above the head")
+    assert wrong.accuracy == 0
+    assert wrong.decided == len(wrong.verdicts)
+
+
+@pytest.mark.parametrize(
+    ("action", "text", "wrong"),
+    [
+        ("jump", "a person jumps", "a person walks forward"),
+        ("walk", "a person walks", "a person lies down"),
+        ("squat", "a person squats", "a person runs"),
+        ("bow", "a person bows", "a person crawls"),
+        ("sit", "a person sits", "a person jumps"),
+    ],
+)
+def test_an_action_is_told_from_others(action, text, wrong):
+    motion = synthetic(action)
+    assert "no" not in answers(motion, text).values()
+    assert "yes" in answers(motion, text).values()
+    assert set(answers(motion, wrong).values()) == {"no"}
+
+
+SENTENCES = (
+    "a person walks forward slowly, then turns around to the left",
+    "a person raises the left hand above the head and kicks with the right leg",
+    "a person jumps twice, crouches and sits down",
+    "a person takes four steps forward and bends over",
+    "a person lies down with crossed arms on all fours",
+)
+
+
+def rotated(joints: np.ndarray) -> np.ndarray:
+    c, s = np.cos(2.0), np.sin(2.0)
+    return joints @ np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])
+
+
+CHANGES: dict[str, Callable[[np.ndarray], tuple[np.ndarray, float]]] = {
+    "rotation about the vertical": lambda x: (rotated(x), FPS),
+    "translation": lambda x: (x + np.array([3.0, 0.4, -2.0]), FPS),
+    "scale 0.8": lambda x: (0.8 * x, FPS),
+    "scale 1.2": lambda x: (1.2 * x, FPS),
+    "30 fps": lambda x: (resample(x, FPS, 30, cubic=True), 30.0),
+    "60 fps": lambda x: (resample(x, FPS, 60, cubic=True), 60.0),
+    "noise of a millimeter": lambda x: (
+        x + 0.001 * np.random.default_rng(0).standard_normal(x.shape), FPS
+    ),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def clips() -> list[np.ndarray]:
+    names = ("walk", "jump", "wave", "kick", "squat", "turn", "punch", "sit", "raise", "bow")
+    return [synthetic(name).joints.astype(float) for name in names]
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_answers_do_not_depend_on(clips, change):
+    claims = [claim for text in SENTENCES for claim in read_claims(text)]
+    for joints in clips:
+        before = verdicts(joints, FPS, claims)
+        after = verdicts(*CHANGES[change](joints), claims)
+        decided = {v.answer for v in before} - {"cannot tell"}
+        assert decided
+        for one, other in zip(before, after, strict=True):
+            # a score at the edge of the band may leave it, but never cross it
+            assert {one.answer, other.answer} != {"yes", "no"}, (one, other)
+        same = sum(a.answer == b.answer for a, b in zip(before, after, strict=True))
+        assert same >= 0.95 * len(claims)
+
+
+def test_the_mirror_image_and_the_mirrored_sentence_get_the_same_answers(clips):
+    claims = [claim for text in SENTENCES for claim in read_claims(text)]
+    for joints in clips:
+        mirrored = SMPL22.mirror(torch.from_numpy(joints)).numpy()
+        before = [v.answer for v in verdicts(joints, FPS, claims)]
+        after = [v.answer for v in verdicts(mirrored, FPS, [c.mirrored for c in claims])]
+        assert before == after
+
+
+def test_mirroring_reversal_freezing_and_a_dropped_repetition_are_noticed():
+    raised = raising("left")
+    text = "a person raises the left hand above the head"
+    image = SMPL22.mirror(torch.from_numpy(raised.joints)).numpy()
+    assert "yes" not in answers(Motion(image, FPS), text).values()
+    frozen = np.repeat(raised.joints[:1], 60, 0)
+    assert "yes" not in answers(Motion(frozen, FPS), text).values()
+
+    moving = raised.joints + np.arange(60)[:, None, None] / FPS * np.array([0.0, 0.0, 1.2])
+    text = "a person walks forward"
+    assert answers(Motion(moving, FPS), text)["travel: forward"] == "yes"
+    assert answers(Motion(moving[::-1], FPS), text)["travel: forward"] == "no"
+
+    twice = Motion(np.concatenate([raised.joints, raised.joints]), FPS)
+    claim = "count raises: left, 2"
+    assert answers(twice, "raises the left arm twice")[claim] == "yes"
+    assert answers(raised, "raises the left arm twice")[claim] == "no"
+
+
+def test_an_order_is_right_in_one_direction_only():
+    raised, jump = raising("left"), synthetic("jump")
+    parts = []
+    for joints in (raised.joints, jump.joints):
+        leg = np.linalg.norm(np.diff(joints[0, [1, 4, 7]], axis=0), axis=-1).sum()
+        parts.append(joints * (0.8 / leg))
+    joined = Motion(np.concatenate(parts), FPS)
+    text = "a person raises the left arm, then jumps"
+    assert answers(joined, text)["raise hand: left, then jump"] == "yes"
+    text = "a person jumps, then raises the left arm"
+    assert answers(joined, text)["jump, then raise hand: left"] == "no"
+
+
+@pytest.mark.parametrize(
+    ("joints", "options", "message"),
+    [
+        (np.zeros((30, 21, 3)), {"fps": 20}, "joints have shape (30, 21, 3)"),
+        (np.full((30, 22, 3), np.nan), {"fps": 20}, "joints contain NaN"),
+        (np.zeros((30, 22, 3)), {"fps": 20}, "the legs have no length"),
+        (np.ones((30, 22, 3)), {}, "fps is missing"),
+    ],
+)
+def test_joints_that_cannot_be_judged_are_refused(joints, options, message):
+    with pytest.raises(UserError) as error:
+        flame_mdm.judge(joints, "a person walks", **options)
+    assert message in str(error.value)
+
+
+def test_a_motion_without_a_sentence_and_one_that_is_too_short_are_refused():
+    with pytest.raises(UserError, match="text is missing"):
+        flame_mdm.judge(raising("left"), " ")
+    with pytest.raises(UserError, match=r"0\.2\d s long"):
+        flame_mdm.judge(raising("left").joints[:5], "a person walks", fps=20)
+    assert flame_mdm.judge(raising("left"), "someone cooks").accuracy is None
+
+
+def test_the_command_prints_verdicts_marks_the_evidence_and_exits_with_3(
+    tmp_path, capsys, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    raising("left").save("raise.npz")
+    assert main(["judge", "raise.npz", "text=raises the left hand"]) == 0
+    printed = capsys.readouterr().out
+    assert "yes: raise hand: left; left wrist: " in printed
+    (shown,) = Page(tmp_path / "runs/judge/raise.html").motions
+    assert shown["marks"][0][2] == "yes: raise hand: left"
+    assert main(["judge", "raise.npz", "page.html", "text=raises the right hand"]) == 3
+    assert "raise: 0 claims are true, 2 false" in capsys.readouterr().out
+
+
+def test_a_folder_is_judged_by_the_texts_in_its_files(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    motion = raising("left")
+    motion.text = "a person raises the left arm"
+    motion.save("motions/a.npz")
+    motion.text = ""
+    motion.save("motions/b.npz")
+    assert main(["judge", "motions"]) == 1
+    captured = capsys.readouterr()
+    assert "a: 'a person raises the left arm'" in captured.out
+    assert "b: text is missing" in captured.err

@@ -58,9 +58,8 @@ COLUMNS = (
     "split",
     "source",
 )
-UNKNOWN = (
-    1000  # frames of a recording whose length is not known before it is read: more than `SHORTEST`
-)
+# Assumed frames of a recording whose length is not known before it is read: more than `SHORTEST`.
+UNKNOWN = 1000
 # The arguments `seconds`, `last` and `is_sixty` of `decide_rate`.
 Evidence = tuple[float | None, int | None, bool]
 MAP = {**LAYOUTS["CMU ASF"].map, "pelvis": "pelvis", "neck": "upperneck", "head": "face"}
@@ -403,13 +402,18 @@ def _part_in_table(cells: Mapping[str, str]) -> _Part:
     )
 
 
-def _is_in(fact: str, trial: str) -> bool:  # or its subject is
+def _is_in(fact: str, trial: str) -> bool:
+    """Returns whether a list of `cmu.yaml` contains a recording or its subject."""
     return not {trial, trial.partition("_")[0]}.isdisjoint(FACTS[fact])
 
 
 def _rank(path: Path) -> int:
-    """Returns 0 for original files, 1 for conversions, 2 for Daz-friendly ones, whose legs often jump."""
-    return path.suffix.lower() != ".amc" and 1 + ("daz" in str(path).lower())
+    """Returns 0 for original files, 1 for conversions, 2 for Daz-friendly ones, whose legs often
+    jump.
+    """
+    if path.suffix.lower() == ".amc":
+        return 0
+    return 2 if "daz" in str(path).lower() else 1
 
 
 def _recording(key: str) -> str:
@@ -424,7 +428,7 @@ def _test_captions(path: Path) -> dict[str, list[Description]]:
     ):
         for entry in read_json(path):
             begin, end = map(float, entry["segment"] or (0, 0))
-            name = "M" * bool(entry["mirrored"]) + entry["base"]
+            name = f"M{entry['base']}" if entry["mirrored"] else entry["base"]
             texts[name] += [
                 Description(str(caption), [], begin, end) for caption in entry["captions"]
             ]
@@ -454,12 +458,13 @@ def decide_rate(
 def standardize(tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
     """Returns a recording with the bones of CMU's own files, and the fields of `Layout` for them.
 
-    The MotionBuilder-friendly conversion lost a bone of the trunk and of each hand. The Daz-friendly one moves another
-    figure, whose bones are replaced. Both begin with a T-pose, which is removed. Joints `pelvis` and `face` are added
-    where SMPL has pelvis and head, and `upperneck` to the Daz figure. Other skeletons are returned unchanged, with no
-    fields.
+    Both conversions begin with a T-pose, which is removed. Joints `pelvis` and `face` are added
+    where SMPL has pelvis and head, and `upperneck` to the Daz figure. Other skeletons are
+    returned unchanged, with no fields.
     """
     is_original, unit, blended = "lfemur" in tree.joints, LAYOUTS["CMU ASF"].unit, 0
+    # The MotionBuilder-friendly conversion lost a bone of the trunk and of each hand. Each lost bone gets
+    # its share of the neighboring bone that it was merged into.
     if "LHipJoint" in tree.joints:
         offsets, at = tree.offsets.copy(), tree.joints.index
         for child, (share, bone) in FACTS["lost"].items():
@@ -470,6 +475,8 @@ def standardize(tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
             offsets=offsets,
             joints=tuple(FACTS["motionbuilder"].get(n, n) for n in tree.joints),
         )
+    # The Daz-friendly conversion moves another figure. Rotations are kept, and its bones are replaced by
+    # bones of a person.
     elif "lButtock" in tree.joints:
         tree, unit, blended = _added(tree, upperback=("abdomen", [0, 0, 0])), 0.01, BLENDED
         rows = [
@@ -483,14 +490,19 @@ def standardize(tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
         )
     if "lfemur" not in tree.joints:
         return tree, {}
+    # A first frame without rotation is the T-pose. In Daz-friendly files, the next few frames blend it with
+    # the motion, and get the pose of the first frame after them.
     if not (is_original or tree.frames[0, 3:6].any()) and len(tree.frames) > 1 + blended:
         frames = tree.frames[1:].copy()
         frames[:blended, 6:] = frames[blended, 6:]
         tree = replace(tree, frames=frames)
+
+    # SMPL's pelvis is above the middle of the hips, by a distance that is scaled with the legs.
     bone = dict(zip(tree.joints, tree.offsets, strict=True))
     scale = float(np.linalg.norm(bone["ltibia"]) + np.linalg.norm(bone["lfoot"])) / ADULT_LEG
     pelvis = (bone["lfemur"] + bone["rfemur"]) / 2 - [0, scale * _HIP[1], 0]
-    # as in SMPL, the head joint follows the neck and not the turns of the head, so that its bone keeps its length
+    # As in SMPL, the head joint follows the neck and not the turns of the head, so that its bone keeps its
+    # length.
     above = tree.parents[tree.joints.index("head")]
     face = bone["head"] + [0, 0, scale * _HEAD[2]]
     tree = _added(tree, pelvis=("root", pelvis), face=(tree.joints[above], face))

@@ -12,7 +12,8 @@ from flame_mdm.formats.faults import depths, unit
 from flame_mdm.formats.motion import Motion
 from flame_mdm.representations.skeleton import Skeleton
 
-# Weight of the squared third differences of a joint's path, relative to its squared change
+# Weight of the squared third differences of a joint's path, relative to its squared change: removes
+# trembling at 20 frames per second and keeps the acceleration of kicks and punches.
 SMOOTHNESS = 0.034
 OUTLIER = 0.03  # distance in meters from the smooth path at which a position has half its weight
 LOW = 0.07  # height in meters above the floor at which a toe counts as in the air
@@ -47,15 +48,24 @@ def cleaned(motion: Motion, contacts: np.ndarray | None = None) -> Motion:
 def cleanup(
     joints: np.ndarray, fps: float, skeleton: Skeleton, contacts: np.ndarray | None = None
 ) -> np.ndarray:
-    """Removes pops, changes of bone lengths, sliding feet and hands inside the body from joints (F, J, 3), y up.
+    """Removes pops, changes of bone lengths, sliding feet and hands inside the body.
 
-    Paths of joints are smoothed, bones get their median lengths, the body moves over the ground so that its feet in
-    contact stand still on average, and two-bone inverse kinematics keeps each toe in place during its contacts and
-    moves hands out of the trunk and the thighs. Motions of fewer than 4 frames are returned unchanged.
+    Args:
+        joints: (F, J, 3) in meters, y up. Motions of fewer than 4 frames are returned unchanged.
+        fps: frames per second.
+        skeleton: skeleton of the joints.
+        contacts: (F, N), probabilities that each of `skeleton.feet` stands on the floor until the
+            next frame,
+            as models predict them for some representations. None = estimated from height and
+                speed of the
+            toes.
 
-    `contacts` (F, N) are the probabilities that each of `skeleton.feet` stands on the floor until the next frame, as
-    models predict them for some representations; None = estimated from height and speed of the toes.
+    Returns:
+        Joints (F, J, 3) float32.
     """
+    # Joints get smooth paths and bones their median lengths. Then the body moves over the ground so that its
+    # feet in contact stand still on average. What still slides is corrected by two-bone inverse kinematics:
+    # legs keep each toe in place during its contacts, and arms leave trunk and thighs.
     if len(joints) < 4:
         return np.array(joints, np.float32)
     smooth = _smooth(np.asarray(joints, float))
@@ -69,10 +79,8 @@ def cleanup(
         contact = np.clip(2 * contacts[:-1, [skeleton.feet.index(toe) for toe in toes]] - 0.5, 0, 1)
     for chain, weight in zip(skeleton.chains[:2], contact.T, strict=True):
         # Over the ground, the shift of a foot fades out between its contacts.
-        toe, shift = (
-            motion[:, chain[-1]],
-            np.zeros((len(motion), 3)),
-        )
+        toe = motion[:, chain[-1]]
+        shift = np.zeros((len(motion), 3))
         still = -np.diff(toe[:, [0, 2]], axis=0)
         shift[:, [0, 2]] = _least_squares(
             len(toe), (1, 30 * weight, still), (0, 0.03, 0.0), (2, 0.1, 0.0)
@@ -90,6 +98,8 @@ def _least_squares(
 
     A term is n, weight (frames - n,) or a number, and target (frames - n, N) or a number; one is an array.
     """
+    # An n-th difference has binomial coefficients with alternating signs. It couples frames that are at most
+    # three apart, so that the normal equations are a banded matrix and take time linear in the frames.
     width = next(target.shape[1] for _, _, target in terms if isinstance(target, np.ndarray))
     matrix, right = np.zeros((4, frames)), np.zeros((frames, width))
     for order, weight, target in terms:
@@ -105,6 +115,8 @@ def _least_squares(
 
 def _smooth(motion: np.ndarray) -> np.ndarray:
     """Returns smooth paths of the joints (Whittaker 1923); positions that jump for a few frames hardly bend them."""
+    # After each fit, positions far from the path lose weight, as in iteratively reweighted least squares: a
+    # pop of a few frames is cut off instead of being spread over its neighbors. Four fits are enough.
     smooth = motion.copy()
     for joint in range(motion.shape[1]):
         path, weight = motion[:, joint], np.ones(len(motion))
@@ -148,6 +160,8 @@ def _arm(skeleton: Skeleton, side: str) -> list[int]:
 
 def _contacts(toes: np.ndarray, root: np.ndarray, fps: float, share: float) -> np.ndarray:
     """Returns (F - 1, 2) in [0, 1]: the confidence that each toe (F, 2, 3) stands on the floor until the next frame."""
+    # A toe stands if it is both low and slow. The faster the body travels, the faster a toe may slide: feet
+    # of generated motions are carried along with the body.
     speed = np.linalg.norm(np.diff(toes[..., [0, 2]], axis=0), axis=-1) * fps
     travel = np.linalg.norm(np.diff(root[:, [0, 2]], axis=0), axis=-1) * fps
     travel = gaussian_filter1d(travel, 0.15 * fps, mode="nearest")
@@ -159,10 +173,13 @@ def _contacts(toes: np.ndarray, root: np.ndarray, fps: float, share: float) -> n
 
 def _follow_feet(motion: np.ndarray, toes: list[int], fps: float) -> np.ndarray:
     """Moves the body over the ground so that its feet in contact stand still on average."""
+    # The drift of the body is the mean slide of the feet in contact, smooth in time and almost 0 where no
+    # foot stands. Subtracting it from the path of the root lets these feet stand still.
     slides = np.diff(motion[:, toes], axis=0)[..., [0, 2]]
     contact = weights = _contacts(motion[:, toes], motion[:, 0], fps, SHARE)
     drift = np.zeros((len(slides), 2))
-    for _ in range(10):  # feet that move differently lose weight
+    # Feet that move differently from the mean lose weight, until one foot decides.
+    for _ in range(10):
         mean = (weights[..., None] * slides).sum(1) / np.maximum(weights.sum(1), 1e-9)[:, None]
         drift = _least_squares(
             len(slides), (0, weights.sum(1), mean), (0, 0.01, 0.0), (1, 1.0, 0.0)
@@ -183,6 +200,8 @@ def _push_out(motion: np.ndarray, skeleton: Skeleton, side: str, fps: float) -> 
     frames = max(1.0, CLEAR * fps)
     other = skeleton.joints.index("right_shoulder" if side == "left" else "left_shoulder")
     aside = unit(motion[:, arm[0]] - motion[:, other])  # a hand near the axis goes to its own side
+    # Each pass moves the wrist out where it is deepest. The shift rises and fades within `CLEAR` seconds, so
+    # that the hand avoids the body and does not jump out of it.
     for _ in range(4):
         depth, away = (values[:, 1:] for values in depths(motion, skeleton.joints, side))
         deepest = depth.argmax(1)[:, None]
@@ -199,6 +218,9 @@ def _push_out(motion: np.ndarray, skeleton: Skeleton, side: str, fps: float) -> 
 
 def bend(motion: np.ndarray, leg: Sequence[int], shift: np.ndarray) -> None:
     """Moves the foot of a leg (hip, knee, ankle, other joints of the foot) by `shift` (F, 3); hands work alike."""
+    # Two-bone inverse kinematics. The new ankle lies on the line from the hip to the requested position, as
+    # far as the leg reaches. Thigh and shin are two sides of a triangle over this line, which gives the
+    # position of the knee along the line; the knee stays on the side where it was.
     hip, knee, ankle, *foot = (motion[:, joint].copy() for joint in leg)
     thigh, shin = (np.linalg.norm(bone[0]) for bone in (knee - hip, ankle - knee))
     before = np.linalg.norm(ankle - hip, axis=-1, keepdims=True)

@@ -93,6 +93,8 @@ def find_cycle(motion: GroundedMotion, degrees: float) -> Cycle | None:
 
     Cycles that begin when the left foot lands are preferred, so that the loops of a set begin with the same foot.
     """
+    # A cycle lies in the longest part with a steady speed in the requested direction. All pairs of frames
+    # that are a plausible cycle apart are compared, by the distance of joints and of velocities.
     along, aside = progress(motion, degrees)
     even = gaussian_filter1d(along, EVEN * motion.fps, mode="nearest")
     full = np.percentile(even, 90)
@@ -102,11 +104,11 @@ def find_cycle(motion: GroundedMotion, degrees: float) -> Cycle | None:
     first, last = moving(motion)
     part = round(PART * motion.fps)
     begin, end = max(begin, first + part), min(end, last - part)
-    if (
-        end <= begin
-        or abs(np.degrees(np.arctan2(aside[begin : end + 1].mean(), along[begin : end + 1].mean())))
-        > ASIDE
-    ):
+    if end <= begin:
+        return None
+    steady = slice(begin, end + 1)
+    off = np.degrees(np.arctan2(aside[steady].mean(), along[steady].mean()))
+    if abs(off) > ASIDE:
         return None
 
     poses = motion.local
@@ -118,9 +120,8 @@ def find_cycle(motion: GroundedMotion, degrees: float) -> Cycle | None:
         for first in starts:
             for last in range(first + shortest, min(first + longest, end) + 1):
                 apart = np.linalg.norm(poses[first] - poses[last], axis=-1).mean()
-                changed = np.linalg.norm(speeds[first] - speeds[last], axis=-1).mean() + abs(
-                    even[first] - even[last]
-                )
+                changed = np.linalg.norm(speeds[first] - speeds[last], axis=-1).mean()
+                changed += abs(even[first] - even[last])
                 cycles.append(Cycle(first, last, float(apart + VELOCITY * changed)))
         best = min(cycles, key=lambda cycle: cycle.difference, default=None)
         if best is not None and best.difference < TALL:
@@ -139,6 +140,8 @@ def gait(
         degrees: the direction, relative to where the person looks.
         stand: (22, 3), the first pose of the start and the last pose of the stop.
     """
+    # All three parts come from one motion, so that they fit nearly. The loop is closed first; then the ends
+    # of start and stop are changed to its first pose and to the standing pose, and toes are planted again.
     straight = straightened(motion, degrees)
     loop = closed(straight.cut(cycle.first, cycle.last))
     along = direction(degrees)
@@ -168,6 +171,8 @@ def straightened(motion: GroundedMotion, degrees: float) -> GroundedMotion:
 
 def closed(motion: GroundedMotion) -> GroundedMotion:
     """Returns a cycle whose last pose is its first one; the difference is spread evenly over the cycle."""
+    # Half of the difference is added before the end and half after the beginning, so that the pose in the
+    # middle of the cycle does not change.
     share = np.linspace(-0.5, 0.5, len(motion))[:, None, None]
     change = motion.local[0] - motion.local[-1]
     local = with_lengths(motion.local + share * change, motion.local[0])
@@ -192,6 +197,7 @@ def turn(motion: GroundedMotion, degrees: float, stand: np.ndarray) -> GroundedM
 
     `stand` (22, 3) is the first and the last pose.
     """
+    # The model turns by about the requested angle. The root gets exactly this angle; the pose turns along.
     begin, end = moving(motion)
     part = motion.cut(begin, end)
     angle = part.heading[-1] - part.heading[0]
@@ -205,9 +211,10 @@ def turn(motion: GroundedMotion, degrees: float, stand: np.ndarray) -> GroundedM
 
 
 def loop(motion: GroundedMotion) -> GroundedMotion:
-    """Returns the middle of a loop that was generated three times in a row, as a loop of its own.
+    """Returns the middle repetition of a loop that was generated three times in a row.
 
-    The root follows a straight line at a constant speed if it leaves its place, otherwise it stays there.
+    The root follows a straight line at a constant speed if the loop travels; otherwise it stays
+    in place.
     """
     count = (len(motion) - 1) // 3
     cycle = closed(motion.cut(count, 2 * count))

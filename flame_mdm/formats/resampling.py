@@ -67,13 +67,20 @@ def frame_pairs(
             f"{frames:,} frames at {rate:g} frames per second would become {count:,} at {fps:g}, with {joints} joints: "
             "too many; check the frame rate, or cut the motion"
         )
+    # Frames are counted from the first one, so that rounding errors do not accumulate. The last new frame may
+    # lie a hair past the last old one and takes its value.
     times = np.arange(count) * rate / fps
     before = np.minimum(times.astype(int), frames - 1)
     return before, np.minimum(before + 1, frames - 1), times - before
 
 
 def resample(values: np.ndarray, rate: float, fps: float, cubic: bool = False) -> np.ndarray:
-    """Resamples positions (F, ...) from `rate` to `fps`, linearly, or `cubic`: bones keep their length to 0.1 %."""
+    """Resamples positions (F, ...) from `rate` to `fps` frames per second.
+
+    Returns F' = floor((F - 1) fps / rate) + 1 frames. With `cubic`, values between frames are on
+    a cubic spline, and bones keep their length to 0.1 %; otherwise they are interpolated
+    linearly.
+    """
     before, after, share = frame_pairs(len(values), rate, fps, math.prod(values.shape[1:-1]))
     if cubic:
         return interpolate(values, before + share)
@@ -82,7 +89,9 @@ def resample(values: np.ndarray, rate: float, fps: float, cubic: bool = False) -
 
 
 def interpolate(values: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Returns the cubic spline through values (F, ...) in frames 0, 1, ... at `times` (N,), which are frames, too."""
+    """Returns the cubic spline through values (F, ...) in frames 0, 1, ... at `times` (N,), in
+    frames.
+    """
     from scipy.interpolate import CubicSpline  # here, because few motions need it
 
     if len(values) < 2:

@@ -86,13 +86,12 @@ def preset(name: str | None, poses: Poses) -> Rig:
                     _RigJoint(label, parent, joint, rest[joint], posed[joint] @ local, local)
                 )
             else:
-                above, following = (
-                    joints[parent],
-                    next(ours for _, ours in names[number:] if isinstance(ours, str)),
-                )
-                position = above.position + source * (
-                    rest[JOINT[side + following]] - above.position
-                )
+                # A joint that SMPL lacks is at a share of the way from its parent to the next joint of SMPL.
+                # It does not rotate.
+                above = joints[parent]
+                following = next(ours for _, ours in names[number:] if isinstance(ours, str))
+                distance = rest[JOINT[side + following]] - above.position
+                position = above.position + source * distance
                 joints.append(_RigJoint(label, parent, -1, position, above.turn, above.neutral))
             parent = len(joints) - 1
     names, parents, sources, positions, turns, neutral = zip(*joints, strict=True)
@@ -121,6 +120,9 @@ class _RigJoint(NamedTuple):
 
 def _axes(axes: dict[str, Any], part: str, joint: str, bone: np.ndarray, right: bool) -> np.ndarray:
     """Returns the local axes (3, 3) in a T-pose of a joint whose bone has the direction `bone`."""
+    # Gram-Schmidt: the first direction is kept, the second one loses its part along the first, and the third
+    # axis is their cross product. The right side is the mirror image of the left side; skeletons that are
+    # "opposed" then have all three axes reversed, which keeps them right-handed.
     flip = np.array([-1, 1, 1]) if right else np.ones(3)
     matrix, columns = np.eye(3), []
     # Axes are listed for two directions, and for the left side only.
@@ -140,16 +142,28 @@ def _axes(axes: dict[str, Any], part: str, joint: str, bone: np.ndarray, right: 
 
 
 def retarget(poses: Poses, rig: Rig) -> tuple[np.ndarray, np.ndarray]:
-    """Returns rotations (F, J, 3, 3) of `Rig.local` and hips (F, 3) in the world of a skeleton that moves as a body."""
+    """Applies a motion to a skeleton.
+
+    Returns:
+        The local rotations (F, J, 3, 3), as in `Rig.local`, and the position of the hips (F, 3)
+            in the world.
+    """
     return rig.local(rig.turned(world_rotations(poses.rotations.numpy()))), poses.root.numpy()
 
 
 def continuous_euler(matrices: Tensor, orders: Sequence[str] = SMPL_ORDERS) -> Tensor:
-    """Converts rotations (F, J, 3, 3) to Euler angles (F, J, 3) in the joints' `orders`, radians, without jumps.
+    """Converts rotations to Euler angles in radians, without jumps, so that programs can
+    interpolate them.
 
-    Of the two triples of angles of a rotation, and full turns added to each angle, those nearest to the previous frame
-    are used, so that programs can interpolate.
+    Args:
+        matrices: (F, J, 3, 3).
+        orders: order of the axes of each joint, such as "ZXY".
+
+    Returns:
+        Angles (F, J, 3).
     """
+    # Two triples of Euler angles describe each rotation, (a, b, c) and (a + pi, pi - b, c + pi), up to full
+    # turns of each angle. In each frame, the triple nearest to the frame before is used.
     turn = 2 * torch.pi
     first = torch.stack(
         [rotation.matrix_to_euler(matrices[:, j], order) for j, order in enumerate(orders)], 1

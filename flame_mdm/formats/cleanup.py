@@ -12,8 +12,8 @@ from flame_mdm.formats.faults import depths, unit
 from flame_mdm.formats.motion import Motion
 from flame_mdm.representations.skeleton import Skeleton
 
-# Weight of the squared third differences of a joint's path, relative to its squared change: removes
-# trembling at 20 frames per second and keeps the acceleration of kicks and punches.
+# Weight of the squared third differences of a joint's path, relative to its squared change. Third
+# differences are changes of acceleration, so that steady accelerations of fast motions are kept.
 SMOOTHNESS = 0.034
 OUTLIER = 0.03  # distance in meters from the smooth path at which a position has half its weight
 LOW = 0.07  # height in meters above the floor at which a toe counts as in the air

@@ -217,7 +217,6 @@ class _Writer:
 
     def _bind_pose(self, poses: dict[int, np.ndarray]) -> None:
         """Adds the matrices (4, 4) of objects, by id, in the pose in which the meshes are bound."""
-        # Readers that lack a bind pose take the first frame for it, and deform the mesh twice.
         _, record = self._object("Pose", "bind pose", "BindPose")
         record.add("Type", "BindPose")
         record.add("Version", Int(100))

@@ -64,9 +64,10 @@ def main(settings: BrowseSettings) -> None:
     matching = sum(map(len, families))
     clips = [clip for family in choose(families, settings.clips) for clip in family]
     title = f"{store.info['dataset']}: {len(clips)} of {matching} clips"
-    title += f" in {settings.split}" * (settings.split is not None) + f" with '{search}'" * bool(
-        search
-    )
+    if settings.split is not None:
+        title += f" in {settings.split}"
+    if search:
+        title += f" with '{search}'"
     out = Path(settings.out or Path("runs") / "browse" / f"{data.folder.name}.html")
     write_page(out, store, representation, clips, title, body)
     say(f"{out}: {len(clips)} of {matching} clips, {out.stat().st_size / 1e6:.1f} MB")

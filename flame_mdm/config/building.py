@@ -161,7 +161,8 @@ def flatten(config: Any, prefix: str = "") -> dict[str, Any]:
 
 def save(config: Config, path: Path, head: str = "") -> None:
     """Writes the configuration as YAML, atomically, after the comment line `head`."""
-    write_text(path, f"# {head}\n" * bool(head) + OmegaConf.to_yaml(OmegaConf.create(config)))
+    content = OmegaConf.to_yaml(OmegaConf.create(config))
+    write_text(path, f"# {head}\n{content}" if head else content)
 
 
 def trust(config: Config) -> None:

@@ -173,20 +173,16 @@ def _help(kind: type[Any]) -> list[str]:
     }
     for entry in sorted(keys, key=lambda entry: (entry.name not in objects[:1], ranks[entry.name])):
         default = entry.default_factory() if callable(entry.default_factory) else entry.default
-        default = (
-            "..."
-            if default is MISSING
-            else " ".join(default)
-            if isinstance(default, list)
-            else default
-        )
-        shown = (
-            "null"
-            if default is None
-            else str(default).lower()
-            if isinstance(default, bool)
-            else default
-        )
+        if default is MISSING:
+            shown = "..."
+        elif default is None:
+            shown = "null"
+        elif isinstance(default, list):
+            shown = " ".join(default)
+        elif isinstance(default, bool):
+            shown = str(default).lower()
+        else:
+            shown = default
         text = textwrap.wrap(entry.metadata["help"], 84)
         lines += [
             f"  {f'{entry.name}={shown}':30} {text[0]}",

@@ -37,8 +37,18 @@ class HumanAct12(MotionSource):
 
     name = "humanact12"
     actions = (
-        *("warm_up", "walk", "run", "jump", "drink", "lift_dumbbell", "sit", "eat"),
-        *("turn steering wheel", "phone", "boxing", "throw"),
+        "warm_up",
+        "walk",
+        "run",
+        "jump",
+        "drink",
+        "lift_dumbbell",
+        "sit",
+        "eat",
+        "turn steering wheel",
+        "phone",
+        "boxing",
+        "throw",
     )
 
     def __init__(self, path: str, published_split: bool = False):

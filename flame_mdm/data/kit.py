@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from flame_mdm.batch import ceil_div
 from flame_mdm.data import SPLITS, Clip, MotionSource, Split, required
 from flame_mdm.data.parallel import in_order
 from flame_mdm.data.t2m import T2MFolder, read_splits
@@ -90,7 +91,7 @@ class KITTemos(MotionSource):
             name: len(read_text(self.path / f"{name}_fke.csv").splitlines()) - 1
             for name in self.texts
         }
-        return {name: -(-count // 8) for name, count in rows.items()}
+        return {name: ceil_div(count, 8) for name, count in rows.items()}
 
     def count(self) -> int:
         """Returns the number of motions with a caption and a permitted length."""

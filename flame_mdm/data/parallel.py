@@ -32,12 +32,20 @@ def cores() -> int:
 def in_order(
     function: Callable[[Task], Result], tasks: Iterable[Task], workers: int = 0
 ) -> Generator[Result]:
-    """Yields `function(task)` for each task, in the order of the tasks; reads only a few tasks ahead.
+    """Yields `function(task)` for each task, in the order of the tasks; reads only a few tasks
+    ahead.
 
-    Nested calls, in which the results of one are tasks of the other, share their processes. Function, tasks and results
-    are picklable. `workers` are processes; 1 = this one only, 0 = one per core as soon as the work takes `PATIENCE`.
+    If `tasks` comes from another `in_order`, both share one pool.
 
-    Raises `UserError` if a worker died, for instance because the system ran out of memory.
+    Args:
+        function: must be picklable, like tasks and results.
+        tasks: any number of tasks.
+        workers: number of processes. 1 works in this process. 0 starts one process per core once
+            the work has
+            taken `PATIENCE` seconds.
+
+    Raises:
+        UserError: if a worker died, for instance because the system ran out of memory.
     """
     workers = 1 if not workers and cores() == 1 else workers
     start, remaining = time.monotonic(), iter(tasks)

@@ -1,10 +1,13 @@
-"""Restricted reader of pickles: arrays, numbers, text, lists, tuples and dictionaries with text keys.
+"""Restricted reader of pickles: arrays, numbers, text, lists, tuples and dictionaries with text
+keys.
 
-A pickle can name any function and have it called. This reader calls none: each object is kept as its arguments and
-state, and arrays are made from the bytes among them: a wrong byte in a dtype crashes NumPy's own functions.
+A pickle can name any function and have it called. This reader calls none: each object is kept as
+its arguments and its state, and arrays are made from the bytes among them. NumPy's own functions
+are not used for that, because a wrong byte in a dtype crashes them.
 
-Python's C unpickler allocates as much memory as a file of ten bytes requests. Therefore this reader is based on the
-unpickler in Python: no read may request more bytes than are left in the file, and repeated content counts each time.
+Python's C unpickler allocates as much memory as a file of ten bytes requests. Therefore this
+reader is based on the unpickler in Python. No read may request more bytes than are left in the
+file, and content that a pickle repeats counts each time.
 """
 
 import pickle
@@ -20,7 +23,8 @@ from flame_mdm.errors import UserError, first_line
 from flame_mdm.safe_io import check_expansion, regular_file
 
 DTYPE = re.compile(r"[biufcSU]\d{1,9}|O8?")
-VALUE = 512  # bytes that each value counts as, so that a small file cannot repeat lists without end
+# Bytes that each value counts as: a file of a few bytes could otherwise repeat a list without end.
+VALUE = 512
 
 
 class _Object:
@@ -33,11 +37,9 @@ class _Object:
 
 
 ARRAY, SCALAR, BUFFER, BYTES = ALLOWED = (
-    *(
-        "numpy.core.multiarray._reconstruct",
-        "numpy.core.multiarray.scalar",
-        "numpy.core.numeric._frombuffer",
-    ),
+    "numpy.core.multiarray._reconstruct",
+    "numpy.core.multiarray.scalar",
+    "numpy.core.numeric._frombuffer",
     "_codecs.encode",
 )
 KINDS = {name: type(name, (_Object,), {}) for name in (*ALLOWED, "numpy.ndarray", "numpy.dtype")}
@@ -52,7 +54,9 @@ BASES = (
 
 
 class _Dictionary(dict[str, Any]):
-    """A dictionary with text keys: others could be chosen so that all have the same hash."""
+    """A dictionary with text keys. Keys of other types could be chosen so that all have the same
+    hash.
+    """
 
     def __setitem__(self, key: Any, value: Any) -> None:
         if type(key) is not str:
@@ -61,7 +65,10 @@ class _Dictionary(dict[str, Any]):
 
 
 class _Unpickler(pickle._Unpickler):
-    """Reads the pickle in a file of `size` bytes; objects of names that begin with one of `opaque` become states."""
+    """Reads the pickle in a file of `size` bytes.
+
+    Objects of globals whose names begin with one of `opaque` become their state.
+    """
 
     stack: list[Any]
     append: Callable[[Any], None]
@@ -73,11 +80,17 @@ class _Unpickler(pickle._Unpickler):
         self.file, self.size, self.opaque, self.expanded = file, size, opaque, 0
 
     def read_file(self, size: int) -> bytes:
+        """Returns `size` bytes; raises `EOFError` before any memory is taken if the file has
+        fewer.
+        """
         if size > self.size - self.file.tell():
             raise EOFError("it ends too early")
         return self.file.read(size)
 
     def find_class(self, module_name: str, global_name: str, /) -> type[_Object]:
+        """Returns the class of objects for a permitted global; raises `UnpicklingError` for
+        others.
+        """
         name = f"{module_name}.{global_name}".replace("numpy._core.", "numpy.core.")
         if name in KINDS:
             return KINDS[name]
@@ -98,6 +111,7 @@ class _Unpickler(pickle._Unpickler):
             case list() | tuple():
                 return type(value)(self.plain(item) for item in value)
             case _Object():
+                # The object only has the name of its class, and nothing was called to make it.
                 return self.plain_object(type(value).__name__, value)
         return value
 
@@ -128,6 +142,7 @@ class _Unpickler(pickle._Unpickler):
         data = data.encode("latin1") if isinstance(data, str) else data
         return np.frombuffer(data, kind).reshape(shape, order=order)
 
+    # BUILD would call `__setstate__` or set attributes. Here, it keeps the state.
     def _load_build(self) -> None:
         state = self.stack.pop()
         if not isinstance(self.stack[-1], _Object):
@@ -140,6 +155,7 @@ class _Unpickler(pickle._Unpickler):
         for key, value in zip(items[::2], items[1::2], strict=True):
             self.stack[-1][key] = value
 
+    # Python's version allocates the declared size before it reads.
     def _load_bytearray8(self) -> None:
         self.append(bytearray(self.read(struct.unpack("<Q", self.read(8))[0])))
 

@@ -20,9 +20,9 @@ from flame_mdm.data import SPLITS, Clip, MotionSource, Split, archives, required
 from flame_mdm.errors import UserError
 from flame_mdm.safe_io import naming, read_npy, read_text
 
-TAG_FPS = (
-    20  # frames per second of the tags `from` and `to`, also in KIT-ML, whose motions have 12.5
-)
+# Frames per second of the tags `from` and `to`. The published code uses 20 for KIT-ML, too, whose motions have
+# 12.5.
+TAG_FPS = 20
 MAX_LENGTH = 200  # motions and cuts of this many frames or more are left out
 MAX_TOKENS = 20
 
@@ -202,17 +202,19 @@ class T2MFolder(MotionSource):
         ]
         words = [word for text in texts for word in words_of(text.caption)]
         splits = Counter(self.names.values())
-        return {
-            "motions": len({name.removeprefix("M") for name in self._motions()}),
-            "texts": len(texts),
-            "vocabulary": len(set(words)),
-            "words per caption": round(len(words) / max(len(texts), 1), 2),
-            **{split: splits[split] for split in SPLITS},
-            **{
+        return (
+            {
+                "motions": len({name.removeprefix("M") for name in self._motions()}),
+                "texts": len(texts),
+                "vocabulary": len(set(words)),
+                "words per caption": round(len(words) / max(len(texts), 1), 2),
+            }
+            | {split: splits[split] for split in SPLITS}
+            | {
                 f"{split} share, %": round(100 * splits[split] / max(len(self.names), 1), 2)
                 for split in SPLITS
-            },
-        }
+            }
+        )
 
     def _motions(self) -> set[str]:
         files = (self.path / "new_joint_vecs").glob("*.npy")

@@ -18,72 +18,20 @@ from flame_mdm.data.humanact12 import FPS, NO_NUMBERS, find, read_lists
 from flame_mdm.errors import UserError
 from flame_mdm.safe_io import naming, read_text
 
+# fmt: off
 TRAIN_SUBJECTS = (
-    *(
-        1,
-        2,
-        6,
-        12,
-        13,
-        16,
-        21,
-        24,
-        28,
-        29,
-        30,
-        31,
-        33,
-        35,
-        39,
-        41,
-        42,
-        45,
-        47,
-        50,
-        52,
-        54,
-        55,
-        57,
-        59,
-        61,
-        63,
-    ),
-    *(
-        64,
-        67,
-        69,
-        70,
-        71,
-        73,
-        77,
-        81,
-        84,
-        86,
-        87,
-        88,
-        90,
-        91,
-        93,
-        96,
-        99,
-        102,
-        103,
-        104,
-        107,
-        108,
-        112,
-        113,
-    ),
+    1, 2, 6, 12, 13, 16, 21, 24, 28, 29, 30, 31, 33, 35, 39, 41, 42, 45, 47, 50, 52, 54, 55, 57,
+    59, 61, 63, 64, 67, 69, 70, 71, 73, 77, 81, 84, 86, 87, 88, 90, 91, 93, 96, 99, 102, 103, 104,
+    107, 108, 112, 113,
 )
+# fmt: on
 """Training subjects of the cross-subject protocol: 51 of 118; the other 67 are for testing."""
 VAL_SUBJECTS = 5  # number of training subjects that our split uses for validation
 MIN_FRAMES = 45  # minimum length of a training clip: three quarters of 60
 ROOT = 8  # index of the middle of the hips among VIBE's 49 joints, which ACTOR uses as the root
 # Focal length and image size in pixels that ACTOR assumes, since VIBE estimates only a scale.
-FOCAL_LENGTH, IMAGE_SIZE = (
-    500.0,
-    540.0,
-)
+FOCAL_LENGTH = 500.0
+IMAGE_SIZE = 540.0
 NAME = re.compile(r"(a(\d+)_d(\d+)_p(\d+)_c(\d+))(_.*)?")
 
 

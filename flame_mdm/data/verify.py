@@ -20,15 +20,23 @@ from flame_mdm.representations import Representation
 from flame_mdm.safe_io import read_yaml, write_text
 
 PUBLISHED = Path(__file__).with_name("published.yaml")
-STILL_DISTANCE = (
-    0.01  # meters; a clip in which no joint moves farther from its first position counts as still
-)
+# A clip counts as still if no joint moves farther, in meters, from its first position.
+STILL_DISTANCE = 0.01
 
 
 def report(data: MotionDataModule) -> dict[str, Any]:
-    """Hashes and scans the store; writes the report into its folder as `verify.json` and returns it.
+    """Hashes and scans the store of a data set; writes the report into its folder as
+    `verify.json`.
 
-    Raises `FileNotFoundError` or `UserError` if the store is missing or has wrong hashes or numbers.
+    Returns:
+        The report: data set, hashes of the `files`, `figures` next to published ones, numbers of
+            captions and
+        actions, lengths, `still` clips, `duplicates`, differences of the statistics, and
+            `excluded` clips.
+
+    Raises:
+        FileNotFoundError: if the data set is not prepared.
+        UserError: if the store has wrong hashes or numbers that are not finite.
     """
     store = data.open()
     store.verify()
@@ -40,10 +48,11 @@ def report(data: MotionDataModule) -> dict[str, Any]:
         store.folder, store.clips, len(store.features), data.representation
     )
     content = {
-        **{
-            key: store.info[key]
-            for key in ("dataset", "representation", "fps", "fingerprint", "published_split")
-        },
+        "dataset": store.info["dataset"],
+        "representation": store.info["representation"],
+        "fps": store.info["fps"],
+        "fingerprint": store.info["fingerprint"],
+        "published_split": store.info["published_split"],
         "files": store.info["sha256"],
         "figures": _figures(store),
         "captions": {
@@ -114,7 +123,10 @@ def deviations(content: dict[str, Any]) -> list[str]:
 
 
 def _figures(store: Store) -> dict[str, dict[str, Any]]:
-    """Returns figures of the store and of the raw data when it was prepared; the raw data keeps names in both."""
+    """Returns figures of the store, and figures of the raw data when it was prepared.
+
+    If both have a name, it stands for the raw data.
+    """
     labeled = [clip for clip in store.clips if clip.action is not None]
     counted: dict[str, float] = {"clips": len(store.clips), **store.info["clips"]}
     if labeled:

@@ -1,5 +1,6 @@
 """The page: form, player, edits, downloads, links. `page.js` writes the links; the server reads and answers them."""
 
+import math
 import re
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
@@ -71,7 +72,7 @@ def build_page(studio: Studio) -> gr.Blocks:
         try:
             request = studio.understood(parse_query(query_pairs(query)))
             model = studio.model(request.model)
-            runs = 1 + len(request.edits) + STEERING_STEPS * bool(request.path)
+            runs = 1 + len(request.edits) + (STEERING_STEPS if request.path else 0)
             steps = request.num_inference_steps or model.sampler_options.num_inference_steps
             total = (steps if isinstance(steps, int) else len(steps or ())) * runs
 
@@ -312,7 +313,8 @@ def _examples(model: MotionGenerator) -> dict[str, str]:
         texts = [
             text for action, text in reversed(actions.items()) if action in model.facts["actions"]
         ]
-        return {text: _picture(text) for text in texts[:: -(-len(texts) // EXAMPLES)]}
+        step = math.ceil(len(texts) / EXAMPLES)
+        return {text: _picture(text) for text in texts[::step]}
     texts = list(
         model.facts["actions"]
         if model.conditioned_on == "action"

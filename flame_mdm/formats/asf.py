@@ -62,7 +62,8 @@ def read(path: Path, fps: float | None) -> Bvh:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # in gimbal lock, any third angle is as good
                 columns.append((bone.axes * turned * bone.axes.inv()).as_euler("ZYX", degrees=True))
-        channels.append(_POSITIONS * (name == "root") + _ROTATIONS * bool(turns))
+        positions = _POSITIONS if name == "root" else ()
+        channels.append(positions + (_ROTATIONS if turns else ()))
     numbers = {name: number for number, name in enumerate(names)}
     return Bvh(
         joints=("root", *parents),

@@ -42,8 +42,12 @@ CHANGING = 0.25
 LIMBS = (("hip", "knee"), ("knee", "ankle"), ("shoulder", "elbow"), ("elbow", "wrist"))
 SIDES = ("left_", "right_")  # prefixes of SMPL's joints
 UNITS = {  # in meters
-    **{"meters": 1.0, "centimeters": 0.01, "millimeters": 0.001, "inches": 0.0254, "feet": 0.3048},
-    **{"the unit of CMU's recordings": 0.0564444},
+    "meters": 1.0,
+    "centimeters": 0.01,
+    "millimeters": 0.001,
+    "inches": 0.0254,
+    "feet": 0.3048,
+    "the unit of CMU's recordings": 0.0564444,
 }
 
 # A joint of the file, or the weights of a mean of several joints.

@@ -47,8 +47,11 @@ from flame_mdm.visualize.body import Mesh
 AMASS_AXES = torch.tensor([[-1.0, 0, 0], [0, 0, 1], [0, 1, 0]], dtype=torch.float64)
 """Converts AMASS's coordinates, z up, to y up as in HumanML3D: (-x, z, y). It is its own inverse."""
 END_SITES = {
-    **{"head": (0.0, 0.18, 0.0), "left_foot": (0.0, 0.0, 0.06), "right_foot": (0.0, 0.0, 0.06)},
-    **{"left_wrist": ADULT[22], "right_wrist": ADULT[23]},
+    "head": (0.0, 0.18, 0.0),
+    "left_foot": (0.0, 0.0, 0.06),
+    "right_foot": (0.0, 0.0, 0.06),
+    "left_wrist": ADULT[22],
+    "right_wrist": ADULT[23],
 }
 """Tips of head, toes and hands beyond the last joints, in meters; without them programs do not draw these bones."""
 

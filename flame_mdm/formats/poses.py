@@ -147,13 +147,15 @@ def _fit(offsets: Tensor, bones: Tensor) -> Tensor:
     Bones without length give the identity.
     """
     (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in (offsets.mT @ bones).unbind(-2))
-    elements = [
-        *(a + e + i, f - h, g - c, b - d),
-        *(f - h, a - e - i, b + d, g + c),
-        *(g - c, b + d, e - a - i, f + h),
-        *(b - d, g + c, f + h, i - a - e),
-    ]
-    power = torch.stack(elements, -1).unflatten(-1, (4, 4))
+    # The rotation is the eigenvector of the largest eigenvalue of this symmetric matrix. Powers of a matrix
+    # approach it, and repeated squaring takes few operations that ONNX has, unlike eigenvectors.
+    rows = (
+        torch.stack((a + e + i, f - h, g - c, b - d), -1),
+        torch.stack((f - h, a - e - i, b + d, g + c), -1),
+        torch.stack((g - c, b + d, e - a - i, f + h), -1),
+        torch.stack((b - d, g + c, f + h, i - a - e), -1),
+    )
+    power = torch.stack(rows, -2)
     size = torch.linalg.vector_norm(power, dim=(1, 2), keepdim=True)
     power = power / size.clamp_min(torch.finfo(bones.dtype).tiny) + torch.eye(4, dtype=bones.dtype)
     for _ in range(SQUARINGS):

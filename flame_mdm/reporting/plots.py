@@ -167,14 +167,15 @@ def _bars(histogram: Histogram, at: Any) -> list[tuple[int, str, str, str, str, 
 
 
 def _finite(curve: Curve) -> list[tuple[float, float]]:
-    # Drops NaN and values that would overflow
+    """Returns the points of a curve by step, without NaN and without values that would overflow."""
     return [(x, y) for x, y in sorted(curve.items()) if abs(y) < 1e300]
 
 
 def _thinned(points: Sequence[tuple[float, float]]) -> Sequence[tuple[float, float]]:
     if len(points) <= 2 * MOST:
         return points
-    size = -(-len(points) // MOST)
+    # Of each part of the curve, the smallest and the largest value stay, so that no spike is lost.
+    size = math.ceil(len(points) / MOST)
     parts = [points[begin : begin + size] for begin in range(0, len(points), size)]
     return [
         p
@@ -195,18 +196,15 @@ def _linear_axis(low: float, high: float, to_ticks: bool) -> _Axis:
         begin, end = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
         low, high = begin * step, end * step
     else:
-        # 2999 has a tick at 3k
-        begin, end = (
-            math.ceil(low / step - 0.02),
-            math.floor(high / step + 0.02),
-        )
+        # A tick may lie slightly past the end: an axis that ends at step 2999 has a tick at 3k.
+        begin, end = math.ceil(low / step - 0.02), math.floor(high / step + 0.02)
     return _Axis(low, high, [k * step for k in range(begin, end + 1)])
 
 
 def _log_axis(low: float, high: float) -> _Axis:
     low, high = max(low, SMALLEST), max(high, SMALLEST)
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-    every = -(-len(decades) // 6)
+    every = math.ceil(len(decades) / 6)  # at most six powers of ten have a tick
     steps = (1, 2, 5) if len(decades) <= 3 else (1,)
     ticks = [m * 10.0**d for d in decades if (d - decades[0]) % every == 0 for m in steps]
     within = [tick for tick in ticks if low * 0.999 <= tick <= high * 1.001]

@@ -11,7 +11,7 @@ import torch
 from lightning.pytorch.utilities import rank_zero_only
 from torch import Tensor
 
-from flame_mdm.batch import MotionBatch, collate, sent
+from flame_mdm.batch import MotionBatch, ceil_div, collate, sent
 from flame_mdm.checkpoints.adapters import About, read_merged, word_rows, write_adapter
 from flame_mdm.checkpoints.hub import export
 from flame_mdm.checkpoints.loading import GENERATORS, load_task
@@ -207,7 +207,8 @@ def _recipe(
     if not any(word.startswith("optimizer.lr=") for word in overrides):
         config["optimizer"]["lr"] = (model.config.get("optimizer") or config["optimizer"])["lr"]
     config["data"]["source"]["motion"] = (data.get("source") or {}).get("motion", "joints")
-    texts = [*captions[:: -(-len(captions) // 3)], *list(model.facts.get("captions", ()))[:3]]
+    few = captions[:: ceil_div(len(captions), 3)]
+    texts = [*few, *list(model.facts.get("captions", ()))[:3]]
     config["callbacks"]["samples"]["prompts"] = [styled(text, name) for text in texts]
     return config
 
@@ -263,7 +264,7 @@ def _comparison(name: str, data: LessonData, *tasks: GeneratorTask) -> str:
     data.setup("fit")
     before, after = (task.generator for task in tasks)
     clips = data.train.clips
-    lesson, kept = (rows[:: -(-len(rows) // COMPARED)] for rows in data.halves())
+    lesson, kept = (rows[:: ceil_div(len(rows), COMPARED)] for rows in data.halves())
     plain, taught = (
         {clips[row].captions[0]: clips[row] for row in rows} for rows in (kept, lesson)
     )

@@ -19,6 +19,7 @@ from torch.nn.utils import get_total_norm
 from torch.optim import Optimizer
 from torchmetrics import Metric
 
+from flame_mdm.batch import ceil_div
 from flame_mdm.checkpoints.locating import SHIPPED
 from flame_mdm.checkpoints.model_files import read_model_file
 from flame_mdm.conditions.action import ActionLabels
@@ -408,7 +409,7 @@ class SampleMotions(Callback):
             (set.intersection(*names), set.union(*names)) if names else (set(), set())
         )
         usable = [k for k, clip in enumerate(clips.clips) if common <= clip.attributes.keys()]
-        chosen = usable[:: -(-len(usable) // REAL) or 1]
+        chosen = usable[:: max(1, ceil_div(len(usable), REAL))]
         representation = task.generator.representation
         features = (clips[k, -1][1][None].to(representation.mean.device) for k in chosen)
         joints = [representation.to_joints(x)[0].cpu() for x in features]

@@ -14,7 +14,8 @@ from flame_mdm.representations.skeleton import JOINT, SMPL22, Skeleton
 from flame_mdm.safe_io import naming, read_npz
 
 TWISTED = {"hip": 0.4, "shoulder": 0.4, "elbow": 0.55}
-"""Joints whose limb has a helper bone, and its share of the twist about the limb: the joint's own, or the wrist's."""
+"""Limbs with a helper bone, by their first joint, and the share of the twist that the bone takes. It is the
+twist of the hip or shoulder or, for the elbow, of the wrist."""
 HELPERS = tuple(
     (JOINT[f"{side}_{name}"], share)
     for side in ("left", "right")
@@ -28,8 +29,11 @@ ANCHORS = (
 )
 MANNEQUIN = Path(__file__).with_name("mannequin.npz")
 SKIN, HAIR, SHIRT, TROUSERS, SHOES = MATERIALS = (
-    *((222, 186, 160), (96, 80, 70), (132, 164, 196)),
-    *((98, 106, 124), (64, 62, 66)),
+    (222, 186, 160),
+    (96, 80, 70),
+    (132, 164, 196),
+    (98, 106, 124),
+    (64, 62, 66),
 )
 
 

@@ -30,8 +30,8 @@ def recipes_page() -> str:
 {HEAD}
 Each row of the papers' tables that FLAME (Kim et al., AAAI 2023, arXiv:2209.00349), MDM (Tevet et al., ICLR 2023,
 arXiv:2209.14916) or Motion Flow Matching (Hu et al., 2023, arXiv:2312.08895) fill has a recipe: `make train
-EXP=humanml3d/mdm`. Recipes that name no table are not rows of a paper; their files list how they deviate. "Those of
-mdm" are the deviations of the recipe `mdm` in the same folder. Some hold for all recipes: a batch contains motions of
+EXP=humanml3d/mdm`. Recipes that name no table are not rows of a paper; their files list how they deviate. "As in
+mdm" means the deviations of the recipe `mdm` in the same folder. Some hold for all recipes: a batch contains motions of
 about the same length, every sample of a batch has the same weight, and checkpoints are chosen on validation clips.
 """
     page += "\n| recipe | what it reproduces |\n|---|---|\n"
@@ -96,7 +96,7 @@ def hyperparameters_page() -> str:
 
 {HEAD}
 Values of the recipes. Bold: the paper gives the same value. If the two differ, both are shown. The other values are not
-in the papers; most are those of the authors' code. "–": the recipe has no such value. Where a paper names only the kind
+in the papers; most come from the authors' code. "–": the recipe has no such value. Where a paper names only the kind
 of a text encoder (MFM: CLIP, T5; MDM: sentence-BERT), the checkpoint is our choice.
 """
     for title, published in TABLES.items():

@@ -58,11 +58,18 @@ class PosedFigure(Figure):
 
 
 def fit_body(motion: PosedFigure, body: Mesh | None = None) -> FittedBody:
-    """Fits a body (None = the mannequin) to a clip and computes the rotations of its bones.
+    """Fits a body to a clip and computes the rotations of its bones.
 
-    The body's joints are the motion's, but higher by the thickness of the sole. Rotations that are solved for are
-    completed. Raises `UserError` if the skeleton is not SMPL's, a limb is much longer or shorter than people's, or a
-    matrix is not a rotation.
+    The joints of the body are the joints of the motion, raised by the thickness of the sole.
+
+    Args:
+        motion: the clip. Rotations that it lacks are solved for and completed.
+        body: the mesh; None = the mannequin.
+
+    Raises:
+        UserError: if the skeleton is not SMPL's, a limb is much longer or shorter than people's,
+            or a matrix is
+            not a rotation.
     """
     poses, body = motion.posed(), body or mannequin()
     joints = motion.joints[:, : len(SMPL22)].astype(float)
@@ -73,11 +80,14 @@ def fit_body(motion: PosedFigure, body: Mesh | None = None) -> FittedBody:
     if motion.poses is None:
         neutral, world, offsets = complete(joints, offsets, world)
     _check_rotations(world)
+    # Feet are stretched such that the sole is below the ankle by the height that the clip has there.
     lift = wide * body.sole
     for toe in (JOINT["left_foot"], JOINT["right_foot"]):
         _, high, long = body.rest[toe]
         tall = (lift - offsets[toe, 1]) / (body.sole - high)
         fit[SMPL22.parents[toe]] = np.diag([wide, tall, offsets[toe, 2] / long])
+    # Each part of the mesh is stretched along its own axes to the clip's bone lengths. Vertices between two
+    # parts get the mean of both maps, by their weights, as in linear blend skinning.
     turns, rest = body.turns, np.zeros((len(SMPL22), 3))
     for parent, joint in SMPL22.edges:
         rest[joint] = rest[parent] + turns[parent] @ offsets[joint]
@@ -102,6 +112,8 @@ def local_rotations(body: FittedBody) -> np.ndarray:
 
 def proportions(body: Mesh, offsets: np.ndarray) -> tuple[np.ndarray, float]:
     """Returns the linear map (22, 3, 3) of each part to a clip's `offsets` (22, 3) at rest, and the map of widths."""
+    # The limbs decide how large the body is. Hips and shoulders follow the clip's own widths, the trunk
+    # blends both from bottom to top, and limbs are stretched along their bones only.
     lengths, usual = np.linalg.norm(offsets, axis=1), np.linalg.norm(body.rest, axis=1)
     ratio = np.divide(lengths, usual, out=np.ones_like(lengths), where=usual > 0)
     for joint in LIMBS:
@@ -147,6 +159,8 @@ def _check_rotations(world: np.ndarray) -> None:
 
 def _with_helpers(world: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     """Appends the rotations of the helper bones to the rotations of the joints (F, 22, 3, 3)."""
+    # Skin that follows a twisting bone wrings at the joint. A helper bone takes a share of the twist about the
+    # limb, so that the twist is spread along the limb as under real skin.
     helpers = []
     for joint, share in HELPERS:
         child = SMPL22.parents.index(joint)

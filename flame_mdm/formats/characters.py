@@ -1,9 +1,12 @@
-"""Motions on a user's own character: the skeleton of the skin of a .glb file, or of a .bvh file.
+"""Motions on a user's character: the skeleton of the skin of a .glb file, or of a .bvh file.
 
-It may have other proportions, units, axes, names and another rest pose than SMPL's body. Bones of arms and legs take
-the directions of the motion's. Trunk, head, hands and feet are turned as in the motion, starting from the rest pose,
-which must be upright with flat feet. The path of the hips is scaled by the length of the legs, which are then bent: the
-toes reach the scaled positions of the motion's toes, at the height above the floor that they have in the rest pose.
+A character may have other proportions, units, axes and names than SMPL's body, and another rest
+pose. The rest pose must be upright with flat feet.
+
+Arms and legs take the directions of the motion's bones. Trunk, head, hands and feet are turned as
+in the motion, starting from the rest pose. The path of the hips is scaled by the leg length. Then
+the legs are bent so that the toes reach the motion's toe positions, scaled in the same manner, at
+the character's own toe height.
 """
 
 import copy
@@ -150,6 +153,9 @@ def _rest(file: glb.Glb, pelvis: int) -> tuple[np.ndarray, np.ndarray]:
 
     If they are stored in another pose, the pelvis, which is nearly upright, shows how the skin's frame is turned.
     """
+    # Joint matrix times inverse bind matrix is the same for all joints if the file is stored in the bind pose.
+    # If it is not, this product of the pelvis is taken as the frame of the skin, its rotation rounded to
+    # quarter turns, and the bind matrices give the pose of all joints.
     worlds, corners = file.worlds.copy(), []
     rest: dict[int, np.ndarray] = {}
     for skin in sorted(file.skins, key=lambda skin: (pelvis in skin.joints, len(skin.joints))):
@@ -265,7 +271,8 @@ def write(path: Path, character: Character, motion: PosedFigure, name: str) -> s
     for joint, source in enumerate(rig.sources):
         if source >= 0 or joint in skinned:
             turns = glb.quaternions(np.concatenate([rest[None, joint], local[:, joint]]))
-            # the rest pose, also where the file has another pose, and in the form that animations need
+            # Animations need a node with translation, rotation and scale instead of a matrix. It gets the rest
+            # pose, also if the file was stored in another pose.
             size = float(
                 rig.scales[joint]
                 / (rig.scales[rig.parents[joint]] if rig.parents[joint] >= 0 else 1)
@@ -282,7 +289,7 @@ def write(path: Path, character: Character, motion: PosedFigure, name: str) -> s
     curves.append(
         ("translation", file.nodes[hips], rig.within(positions[:, hips], hips).astype("f4"))
     )
-    # programs show the first animation
+    # Programs show the first animation.
     document["animations"] = [
         binary.animation(name, motion.fps, curves),
         *document.get("animations", []),
@@ -299,7 +306,7 @@ def write_bvh(path: Path, character: BvhCharacter, motion: PosedFigure) -> str:
         )
     file, (world, positions, rig) = character.file, moved(character, motion)
     local, offsets, hips = rig.local(world), rig.offsets(), rig.hips
-    # the joint that carries the body: the hips, or a root above them
+    # The joint that carries the body is the hips, or a root above them.
     mover = next(joint for joint, names in _above(file, hips).items() if _moves(names))
     carried = rig.within(rig.positions[mover] + positions[:, hips] - rig.positions[hips], mover)
 

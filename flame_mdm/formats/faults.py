@@ -12,9 +12,8 @@ from flame_mdm.formats.motion import Motion
 # Height in meters above the floor, y = 0, below which a toe joint touches it. Foot skating uses
 # it, too.
 LOW = 0.05
-STANDSTILL = (
-    0.2  # speed of the root in m/s below which the body does not jump, except for 0.04 s at the top
-)
+# Speed of the root in m/s below which a body does not jump. At the top, a jump is slower for 0.04 s only.
+STANDSTILL = 0.2
 LIMITS = {
     "skating": (
         0.5,
@@ -91,6 +90,7 @@ def find_faults(motion: Motion) -> list[Fault]:
     # An acceleration: the distance of a joint from the middle between its neighbors in time.
     jumps = np.zeros(joints.shape[:2])
     jumps[1:-1] = np.linalg.norm(np.diff(joints, n=2, axis=0), axis=-1) * fps**2
+    # Opening a flag in time keeps only runs that are at least as long as the window.
     floats = [
         binary_opening(flag, np.ones((math.ceil(s * fps), 1)))
         for s, flag in ((0.8, aloft), (0.3, aloft & slow))
@@ -167,6 +167,8 @@ def _bends(joints: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.nda
             at = names.index(chain[1])
             flags[:, at], worst[:, at] = 180 - bend < limit, 180 - bend
             if "knee" in chain[1]:
+                # The front of the shin is the direction of the foot, perpendicular to the shin. A knee bends
+                # forward if the thigh tilts to this side.
                 toes = unit(joints[:, names.index(f"{side}_foot")] - lower)
                 front = toes - (toes * b).sum(-1, keepdims=True) * b
                 tilt = np.degrees(np.arcsin(np.clip(-(a * unit(front)).sum(-1), -1, 1)))
@@ -179,10 +181,18 @@ def _bends(joints: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.nda
 
 
 def depths(joints: np.ndarray, names: Sequence[str], side: str) -> tuple[np.ndarray, np.ndarray]:
-    """Measures the left or right arm against capsules about trunk and thighs, whose sizes follow from the bones.
+    """Measures the left or right arm against capsules about trunk and thighs, whose sizes follow
+    from the bones.
 
-    Returns the depth (F, 3) in meters of elbow, wrist and middle of the hand, negative outside, and unit vectors
-    (F, 3, 3) from the axis of the part in which a point is deepest; of joints (F, J, 3) in meters.
+    Args:
+        joints: (F, J, 3) in meters.
+        names: names of the joints.
+        side: "left" or "right".
+
+    Returns:
+        Depth (F, 3) in meters of elbow, wrist and middle of the hand, negative outside, and unit
+            vectors
+        (F, 3, 3) from the axis of the part in which each point is deepest.
     """
     at = {name: joints[:, number] for number, name in enumerate(names)}
     elbow, wrist = at[f"{side}_elbow"], at[f"{side}_wrist"]
@@ -192,6 +202,8 @@ def depths(joints: np.ndarray, names: Sequence[str], side: str) -> tuple[np.ndar
         (joints[:, 0], at["neck"]),
         *((at[f"{leg}_hip"], at[f"{leg}_knee"]) for leg in ("left", "right")),
     ]
+    # The trunk is wider than deep. Sideways distances from its axis are shortened, so that the same capsule
+    # works in all directions.
     away = [_away(points, start, end) for start, end in bones]
     lateral = (away[0] * across[:, None]).sum(-1, keepdims=True) * across[:, None]
     away[0] = away[0] - (1 - 1 / WIDTH) * lateral

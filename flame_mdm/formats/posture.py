@@ -14,13 +14,21 @@ TOES = (0.02, 0.09, np.radians(60))
 def complete(
     joints: np.ndarray, offsets: np.ndarray, world: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Completes rotations solved from positions, which determine neither the head's pitch nor the toes.
+    """Completes rotations that were solved from positions, which show neither the head's pitch
+    nor the toes.
 
-    The median pitch of the head while the chest is upright is level, and the toes stay flat while the heel rises. Takes
-    joints (F, 22, 3), offsets (22, 3) from their parents in the rest pose, and rotations in the world (F, 22, 3, 3).
-    Returns the rotation (22, 3, 3) of each part of the body in the rest pose, rotations (F, 22, 3, 3) of these parts in
-    the world, and offsets (22, 3) of a body that stands on flat feet.
+    Args:
+        joints: (F, 22, 3) in meters.
+        offsets: (22, 3), joints relative to their parents in the rest pose.
+        world: (F, 22, 3, 3), rotations in the world.
+
+    Returns:
+        The rotation (22, 3, 3) of each part of the body in the rest pose, the rotations (F, 22,
+            3, 3) of these
+        parts in the world, and the offsets (22, 3) of a body that stands on flat feet.
     """
+    # A person who stands upright looks straight ahead: the median direction from neck to head, seen from an
+    # upright chest, is where the head is level. Toes stay flat on the floor while the heel rises.
     neutral, offsets = np.tile(np.eye(3), (len(SMPL22), 1, 1)), offsets.copy()
     for side in ("left", "right"):
         ankle, toe = JOINT[f"{side}_ankle"], JOINT[f"{side}_foot"]
@@ -41,7 +49,7 @@ def complete(
 
 
 def world_rotations(rotations: np.ndarray) -> np.ndarray:
-    """Returns rotations (..., 22, 3, 3) in the world from those relative to parents."""
+    """Returns rotations (..., 22, 3, 3) in the world; `rotations` are relative to the parents."""
     world = rotations.copy()
     for parent, joint in SMPL22.edges:
         world[..., joint, :, :] = world[..., parent, :, :] @ rotations[..., joint, :, :]
@@ -68,6 +76,7 @@ def shortest_turns(start: np.ndarray, end: np.ndarray) -> np.ndarray:
 
 def rotations_about(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
     """Returns rotations (..., 3, 3) about unit vectors (..., 3) by angles (...)."""
+    # Rodrigues' formula, with the matrix of the cross product.
     x, y, z = np.moveaxis(axis, -1, 0)
     cross = np.stack([0 * x, -z, y, z, 0 * x, -x, -y, x, 0 * x], -1).reshape(*axis.shape, 3)
     sine, cosine = np.sin(angle)[..., None, None], np.cos(angle)[..., None, None]
@@ -76,6 +85,7 @@ def rotations_about(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
 
 def _flat_foot(ankle: np.ndarray, toe: np.ndarray, offset: np.ndarray) -> np.ndarray:
     """Returns the position of the toes relative to the ankle while the foot stands flat, in the rest pose."""
+    # The foot is flat in the frames in which ankle and toes together are lowest.
     height = ankle[:, 1] + toe[:, 1]
     flat = height <= height.min() + STANDING
     length = np.linalg.norm(offset)

@@ -48,13 +48,18 @@ def only_run(folder: Path) -> Iterator[None]:
 class BadLoss(Callback):
     """Stops training when a loss is not finite or explodes, before it reaches a checkpoint.
 
-    A loss explodes if it exceeds `factor` times the median of the previous interval. Losses are only copied from the
-    device at the log interval and for a checkpoint, so that steps do not wait for them. `bad_batch.json` in the run
-    directory describes the first bad batch: the step, and for each process the number of the batch, the ids of its
-    clips and its loss.
+    A loss explodes if it exceeds `factor` times the median of the previous interval.
+    `bad_batch.json` in the run directory describes the first bad batch: the step, and for each
+    process the number of the batch, the ids of its clips and its loss.
+
+    Args:
+        folder: the run directory.
+        factor: how many times a loss may exceed the usual loss.
     """
 
     def __init__(self, folder: str, factor: float = 1000.0):
+        # Copying a loss from the GPU waits for the step. Losses stay on the device and are copied together, at
+        # the log interval and before a checkpoint.
         self.path, self.factor = Path(folder) / "bad_batch.json", factor
         self.usual = float("inf")
         self.seen: list[tuple[int, int, Sequence[str], Tensor]] = []
@@ -118,9 +123,8 @@ class BadLoss(Callback):
 
 def lost_worker(error: BaseException) -> UserError | None:
     """Returns an explanation if an error means that a data loading process died, otherwise None."""
-    message = (
-        f"{error} {error.__cause__ or ''}"  # the cause, if it happens while a checkpoint is written
-    )
+    # If the worker dies while a checkpoint is written, its error is the cause of another error.
+    message = f"{error} {error.__cause__ or ''}"
     lost = re.search(
         r"DataLoader worker \(pid.*?\) (is killed by signal|exited unexpectedly)", message
     )

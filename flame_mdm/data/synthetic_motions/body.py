@@ -123,18 +123,21 @@ class Body:
 
     def joints(self) -> np.ndarray:
         """Returns joint positions (F, 22, 3) in meters, y up."""
+        # Footprints are fixed first, so that feet never slide. The pelvis is placed above them, the legs reach
+        # from the hips to the feet by inverse kinematics, and spine, head and arms follow from angles.
         out = np.empty((len(self.t), 22, 3))
         yaw, (pitch, twist, roll) = self.heading, self.pelvis
         pelvis = rotation(1, yaw) @ rotation(1, twist) @ rotation(0, pitch) @ rotation(2, -roll)
         hips = np.stack([pelvis @ np.array([SIGN[side] * HIP[0], *HIP[1:]]) for side in (0, 1)])
 
-        # A raised heel rotates about the toes, raised toes about the ankle: the part on the floor does not move.
+        # A raised heel rotates about the toes, and raised toes about the ankle, so that the part on the floor
+        # does not move.
         foot = rotation(1, self.foot_yaw) @ rotation(0, self.foot_pitch)
         toe_offset = foot @ np.array(FOOT)
         heel_up = (self.foot_pitch > 0)[..., None]
         ankles = self.ankles + heel_up * (rotation(1, self.foot_yaw) @ np.array(FOOT) - toe_offset)
 
-        # The pelvis sinks if a leg would not reach its footprint, which produces the bobbing of a walk.
+        # The pelvis sinks if a leg would not reach its footprint. This produces the bobbing of a walk.
         reach = 0.998 * (THIGH + SHIN)
         out[:, 0] = self.position
         apart = np.sum((ankles - hips - self.position)[..., [0, 2]] ** 2, -1)
@@ -200,6 +203,8 @@ def bent(
     start: np.ndarray, end: np.ndarray, upper: float, lower: float, toward: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns the middle and the end (F, 3) of a limb of two bones that bends `toward` (F, 3) and reaches for `end`."""
+    # Both bones are sides of a triangle over the line from start to end. A limb is never quite straight nor
+    # folded, so that its direction of bending is defined.
     line = end - start
     length = np.linalg.norm(line, axis=-1, keepdims=True)
     line /= length
@@ -246,7 +251,9 @@ def follow_feet(body: Body) -> None:
 
 
 def flight(t: np.ndarray, start: float, seconds: float) -> np.ndarray:
-    """Returns the height (F,) in meters of a body that leaves the ground at `start` and lands `seconds` later."""
+    """Returns the height (F,) in meters of a body in free fall that lands `seconds` after
+    `start`.
+    """
     s = np.clip((t - start) / seconds, 0, 1)
     return 9.81 / 8 * seconds**2 * 4 * s * (1 - s)
 
@@ -254,7 +261,9 @@ def flight(t: np.ndarray, start: float, seconds: float) -> np.ndarray:
 def events(
     rng: np.random.Generator, t: np.ndarray, count: int, slowest: float
 ) -> list[tuple[float, float]]:
-    """Returns (start, seconds) of `count` repetitions of equal duration at a random time inside the clip."""
+    """Returns (start, seconds) of `count` equally long repetitions, at a random time inside the
+    clip.
+    """
     seconds = min(rng.uniform(0.85, 1.0) * slowest, (t[-1] - 0.3) / count)
     start = rng.uniform(0.1, max(0.15, min(0.4, t[-1] - 0.15 - seconds * count)))
     return [(start + n * seconds, seconds) for n in range(count)]

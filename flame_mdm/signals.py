@@ -36,7 +36,8 @@ def stoppable(signums: Sequence[int]) -> Iterator[None]:
     try:
         yield
     except Exception:
-        # The exception of a signal may come between any two steps of a library, whose cleanup can then fail.
+        # The exception of a signal may come between any two steps of a library, whose cleanup can
+        # then fail.
         if _received is not None:
             raise _received from None
         raise

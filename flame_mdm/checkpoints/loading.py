@@ -180,7 +180,8 @@ class _CallLimit(TorchFunctionMode):
         self.left -= 1
         if self.left < 0:
             raise UserError("its recipe describes a larger model than the weights saved with it")
-        # on the meta device, drawing numbers imports torch's compiler, which takes longer than building the model
+        # on the meta device, drawing numbers imports torch's compiler, which takes longer than
+        # building the model
         if func is torch.nn.init.normal_:
             return kwargs["tensor"] if kwargs else args[0]
         func = torch.empty if func is torch.randn else func

@@ -32,10 +32,11 @@ from flame_mdm.safe_io import atomic_folder, sha256, write_json
 from flame_mdm.sampler_options import SamplerOptions
 
 RUNNER = Path(__file__).with_name("runner.py")
-# Maximum difference between the outputs of a graph and of PyTorch, relative to the largest output. Float32
-# arithmetic in another order of operations differs by about 1e-6.
+# Maximum difference between the outputs of a graph and of PyTorch, relative to the largest
+# output. Float32 arithmetic in another order of operations differs by about 1e-6.
 TOLERANCE = 1e-4
-# Networks whose ONNX graphs need a fixed number of frames: shorter motions are padded to the longest one.
+# Networks whose ONNX graphs need a fixed number of frames: shorter motions are padded to the
+# longest one.
 FIXED_LENGTH = (
     MDMGRU,
     MDMUNet,
@@ -135,11 +136,12 @@ class Probe:
     `variance` is the network's output for a learned variance.
     """
 
-    # All exported samplers are linear: each noisy motion is a weighted sum of draws of noise and of clean
-    # estimates. So the sampler is run once on unit vectors instead of motions. Draw number n is unit vector
-    # n, and clean estimate number k is unit vector `calls` + 1 + k. A noisy motion (1, 1, 2 `calls` + 1) of
-    # this run then lists its weights, and `_plan` solves for the four numbers of each step. This works for
-    # any sampler without a formula of its own here.
+    # All exported samplers are linear: each noisy motion is a weighted sum of draws of noise and
+    # of clean estimates. So the sampler is run once on unit vectors instead of motions. Draw
+    # number n is unit vector n, and clean estimate number k is unit vector `calls` + 1 + k. A
+    # noisy motion (1, 1, 2 `calls` + 1) of this run then lists its weights, and `_plan` solves
+    # for the four numbers of each step. This works for any sampler without a formula of its own
+    # here.
     def __init__(self, process: Process, calls: int, variance: float):
         self.process, self.calls, self.variance, self.output = process, calls, variance, variance
         self.time, self.draws = 0.0, 0
@@ -166,7 +168,8 @@ class Probe:
         """Records the coefficients p and q of a call from two inputs of almost nothing."""
         if len(self.records) == self.calls:
             raise UserError("it chooses its own steps")
-        # The clean estimate is p x + q y. With an output y = 0, it shows p; with x = 0, it shows q.
+        # The clean estimate is p x + q y. With an output y = 0, it shows p; with x = 0, it shows
+        # q.
         row = []
         for self.output, x in ((0.0, x_t * 0 + TINY), (TINY, x_t * 0)):
             row.append(float(clean(x)[0, 0, 0]) / TINY)
@@ -210,8 +213,8 @@ def _plan(process: Process, options: SamplerOptions, variance: float) -> list[li
     rows = []
     for number, (x_t, draws, row) in enumerate(probe.records):
         after, drawn, _ = (*probe.records, (end, probe.draws, []))[number + 1]
-        # The step must be a combination of these four: noisy motion, clean estimate, the estimate before
-        # it and fresh noise. What the step does not have is a column of zeros.
+        # The step must be a combination of these four: noisy motion, clean estimate, the estimate
+        # before it and fresh noise. What the step does not have is a column of zeros.
         nothing = torch.zeros_like(x_t)
         columns = [
             x_t,

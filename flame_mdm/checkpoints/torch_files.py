@@ -156,7 +156,8 @@ class _KeyCheck(pickle._Unpickler):
     def _load_set(self) -> None:
         self.append(_Named("builtins.set"))
 
-    # Exactly the instructions that PyTorch's own reader knows, so that no file passes here and fails there.
+    # Exactly the instructions that PyTorch's own reader knows, so that no file passes here and
+    # fails there.
     dispatch = {  # pyright: ignore[reportAssignmentType]
         code[0]: pickle._Unpickler.dispatch[code[0]]
         for code in (

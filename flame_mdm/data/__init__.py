@@ -39,17 +39,17 @@ class Clip:
     # Exact facts about the motion, such as side, count and direction, or tagged words. The values
     # are such that JSON can hold them.
     attributes: Mapping[str, Any] = field(default_factory=dict)
-    # Name of a representation if the release contains its features: `motion` (F, D) is then stored
-    # unchanged. Empty if `motion` is raw.
+    # Name of a representation if the release contains its features: `motion` (F, D) is then
+    # stored unchanged. Empty if `motion` is raw.
     encoded: str = ""
-    # (first, length): the clip is this cut of its motion. Consecutive clips that hold the same array
-    # object share its frames in the store. Only for representations with one row per frame.
+    # (first, length): the clip is this cut of its motion. Consecutive clips that hold the same
+    # array object share its frames in the store. Only for representations with one row per frame.
     window: tuple[int, int] | None = None
     # Joints (F', J, 3) in meters at the frame rate of the recording, for protocols that compare
     # motions at that rate.
     reference: np.ndarray | None = None
-    # License of this motion, an identifier such as "MIT". Empty if the data set has one license for
-    # all motions.
+    # License of this motion, an identifier such as "MIT". Empty if the data set has one license
+    # for all motions.
     license: str = ""
 
 
@@ -57,7 +57,8 @@ class MotionSource(ABC):
     """A data set in the form in which it is published."""
 
     name: str
-    # Whether the data set takes its name from `data.name` of the recipe: the files are the user's.
+    # Whether the data set takes its name from `data.name` of the recipe: the files are the
+    # user's.
     named_by_recipe: bool = False
     options: Mapping[str, Any] = {}
     """Arguments of the constructor that define the data, as JSON values. Paths and numbers of workers are

@@ -25,7 +25,8 @@ DRIFT = 0.05
 """Maximum rise of the floor, in meters, from the first to the last second of a clip."""
 FLOAT = 0.1
 """Maximum median height of the body above the floor, in meters."""
-# Maximum number of clips per split that keep what the model knows. They are evenly spaced in its data.
+# Maximum number of clips per split that keep what the model knows. They are evenly spaced in its
+# data.
 PRIOR = {
     "train": 2000,
     "val": 64,
@@ -130,8 +131,8 @@ def fault_of(joints: np.ndarray, fps: float) -> str:
         joints: (F, J, 3) in meters, y up.
         fps: frames per second.
     """
-    # The floor at a time is the lowest joint within a second around it. A jump is shorter than that,
-    # so that it does not lift the floor. Height 0 is the lowest joint of the whole clip.
+    # The floor at a time is the lowest joint within a second around it. A jump is shorter than
+    # that, so that it does not lift the floor. Height 0 is the lowest joint of the whole clip.
     floor = minimum_filter1d(joints[..., 1].min(1), round(fps), mode="nearest")
     rise, height = floor[-1] - floor[0], np.median(floor) - floor.min()
     if rise > DRIFT:

@@ -189,8 +189,8 @@ class Amass:
             workers: number of processes; 0 = one per core.
         """
         self.check(arguments)
-        # A task is a single recording or, for subsets that are not unpacked, a whole archive, which
-        # can only be read from its beginning.
+        # A task is a single recording or, for subsets that are not unpacked, a whole archive,
+        # which can only be read from its beginning.
         tasks: list[tuple[Path, dict[str, Argument]]] = []
         for subset, keys in groupby(sorted(arguments), _subset_of):
             of_subset = {key: arguments[key] for key in keys}
@@ -198,7 +198,8 @@ class Amass:
                 tasks += [(self.files[key], {key: argument}) for key, argument in of_subset.items()]
             else:
                 tasks.append((self.archives[subset], of_subset))
-        # An archive takes minutes, so that this process must not work on one before the others start.
+        # An archive takes minutes, so that this process must not work on one before the others
+        # start.
         for results in in_order(
             partial(_run, function), tasks, min(workers or cores(), len(tasks))
         ):

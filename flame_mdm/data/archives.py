@@ -155,7 +155,8 @@ class _Bounded:
         data = self.file.read(size)
         self.total += len(data)
         self.ended += not data
-        # Without this, tarfile reads on until the end of a member, whose header may declare any size.
+        # Without this, tarfile reads on until the end of a member, whose header may declare any
+        # size.
         if self.ended > 2:
             raise EOFError("it ends too early")
         check_expansion(self.total, self.packed)

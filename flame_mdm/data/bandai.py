@@ -64,10 +64,10 @@ def _sloping(degrees: float) -> np.ndarray:
     return np.cos(np.radians(degrees)) * _TOES - np.sin(np.radians(degrees)) * _UP
 
 
-# Directions of each joint's local axes (columns) when the body is in SMPL's rest pose: standing straight,
-# feet flat, arms out, palms down. In this pose, all rotations of SMPL are the identity. The bones of arms
-# and legs lie on x and have the directions of SMPL's rest pose; knees and elbows bend about y.
-# `docs/bandai.md` explains how the axes were measured.
+# Directions of each joint's local axes (columns) when the body is in SMPL's rest pose: standing
+# straight, feet flat, arms out, palms down. In this pose, all rotations of SMPL are the identity.
+# The bones of arms and legs lie on x and have the directions of SMPL's rest pose; knees and
+# elbows bend about y. `docs/bandai.md` explains how the axes were measured.
 REST = {
     "Hips": _axes(_UP, -_LEFT),
     **dict.fromkeys(("Spine", "Chest", "Neck", "Head"), _axes(_UP, _FORWARD)),
@@ -80,7 +80,8 @@ REST = {
     **_limb("Foot", _sloping(39.8), np.cross(_UP, _TOES)),
     **_limb("Toes", _sloping(23.0), np.cross(_UP, _TOES)),
 }
-# Swaps y up and AMASS's z up: (-x, z, y). The SMPL representation swaps them again when it decodes.
+# Swaps y up and AMASS's z up: (-x, z, y). The SMPL representation swaps them again when it
+# decodes.
 AXES = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
 
 WORDS = read_yaml(Path(__file__).with_suffix(".yaml"))  # contents, styles and captions
@@ -246,9 +247,9 @@ def smpl_motion(skeleton: bvh.Bvh, rotations: np.ndarray, translations: np.ndarr
         rotations: (F, J, 3, 3), each in the frame of the parent joint.
         translations: (F, J, 3) in centimeters, each in the frame of the parent joint.
     """
-    # A joint of SMPL has the same parent as in the file, except spine1: it lies between two joints of the
-    # file and rotates with the pelvis. So a rotation R of the file only needs the axes B of the rest pose
-    # to become a rotation of SMPL: B_parent R B_joint^-1.
+    # A joint of SMPL has the same parent as in the file, except spine1: it lies between two
+    # joints of the file and rotates with the pelvis. So a rotation R of the file only needs the
+    # axes B of the rest pose to become a rotation of SMPL: B_parent R B_joint^-1.
     positions, turned = bvh.forward_kinematics(skeleton.parents, rotations, translations)
     local = np.tile(np.eye(3), (len(rotations), 24, 1, 1))
     hips = skeleton.joints.index("Hips")

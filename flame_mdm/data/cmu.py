@@ -463,8 +463,8 @@ def standardize(tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
     returned unchanged, with no fields.
     """
     is_original, unit, blended = "lfemur" in tree.joints, LAYOUTS["CMU ASF"].unit, 0
-    # The MotionBuilder-friendly conversion lost a bone of the trunk and of each hand. Each lost bone gets
-    # its share of the neighboring bone that it was merged into.
+    # The MotionBuilder-friendly conversion lost a bone of the trunk and of each hand. Each lost
+    # bone gets its share of the neighboring bone that it was merged into.
     if "LHipJoint" in tree.joints:
         offsets, at = tree.offsets.copy(), tree.joints.index
         for child, (share, bone) in FACTS["lost"].items():
@@ -475,8 +475,8 @@ def standardize(tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
             offsets=offsets,
             joints=tuple(FACTS["motionbuilder"].get(n, n) for n in tree.joints),
         )
-    # The Daz-friendly conversion moves another figure. Rotations are kept, and its bones are replaced by
-    # bones of a person.
+    # The Daz-friendly conversion moves another figure. Rotations are kept, and its bones are
+    # replaced by bones of a person.
     elif "lButtock" in tree.joints:
         tree, unit, blended = _added(tree, upperback=("abdomen", [0, 0, 0])), 0.01, BLENDED
         rows = [
@@ -490,8 +490,8 @@ def standardize(tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
         )
     if "lfemur" not in tree.joints:
         return tree, {}
-    # A first frame without rotation is the T-pose. In Daz-friendly files, the next few frames blend it with
-    # the motion, and get the pose of the first frame after them.
+    # A first frame without rotation is the T-pose. In Daz-friendly files, the next few frames
+    # blend it with the motion, and get the pose of the first frame after them.
     if not (is_original or tree.frames[0, 3:6].any()) and len(tree.frames) > 1 + blended:
         frames = tree.frames[1:].copy()
         frames[:blended, 6:] = frames[blended, 6:]
@@ -501,8 +501,8 @@ def standardize(tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
     bone = dict(zip(tree.joints, tree.offsets, strict=True))
     scale = float(np.linalg.norm(bone["ltibia"]) + np.linalg.norm(bone["lfoot"])) / ADULT_LEG
     pelvis = (bone["lfemur"] + bone["rfemur"]) / 2 - [0, scale * _HIP[1], 0]
-    # As in SMPL, the head joint follows the neck and not the turns of the head, so that its bone keeps its
-    # length.
+    # As in SMPL, the head joint follows the neck and not the turns of the head, so that its bone
+    # keeps its length.
     above = tree.parents[tree.joints.index("head")]
     face = bone["head"] + [0, 0, scale * _HEAD[2]]
     tree = _added(tree, pelvis=("root", pelvis), face=(tree.joints[above], face))

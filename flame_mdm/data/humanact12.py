@@ -15,7 +15,8 @@ from flame_mdm.data import Clip, MotionSource, restricted_pickle, split_blocks
 from flame_mdm.errors import UserError
 from flame_mdm.safe_io import naming, read_npy
 
-# Frames per second at which the authors' code plays the action data sets; frames are not resampled
+# Frames per second at which the authors' code plays the action data sets; frames are not
+# resampled
 FPS = 20.0
 # Errors that NumPy raises for what does not consist of numbers
 NO_NUMBERS = (

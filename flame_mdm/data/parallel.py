@@ -83,7 +83,8 @@ _pool: _Pool | None = None  # the pool in use, if any
 @contextmanager
 def _shared_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
     global _pool
-    # Spawned, not forked: a fork would copy locks held by threads of this process, which may have used torch.
+    # Spawned, not forked: a fork would copy locks held by threads of this process, which may have
+    # used torch.
     pool = _pool = _pool or _Pool(
         ProcessPoolExecutor(workers, get_context("spawn"), _start_worker), active_children()
     )

@@ -14,8 +14,8 @@ from flame_mdm.data.crops import Clips, Draw
 from flame_mdm.data.store import Store
 from flame_mdm.representations import Representation
 
-# With data.resident=auto, a data set is kept on the device if it takes at most 1 / SHARE of the memory that
-# is free there: the rest is for the model and its activations.
+# With data.resident=auto, a data set is kept on the device if it takes at most 1 / SHARE of the
+# memory that is free there: the rest is for the model and its activations.
 SHARE = 4
 CHUNK = 1 << 16  # frames that are copied at once, so that the copy takes little memory
 

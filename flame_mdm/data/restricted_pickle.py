@@ -23,7 +23,8 @@ from flame_mdm.errors import UserError, first_line
 from flame_mdm.safe_io import check_expansion, regular_file
 
 DTYPE = re.compile(r"[biufcSU]\d{1,9}|O8?")
-# Bytes that each value counts as: a file of a few bytes could otherwise repeat a list without end.
+# Bytes that each value counts as: a file of a few bytes could otherwise repeat a list without
+# end.
 VALUE = 512
 
 

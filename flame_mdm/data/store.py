@@ -391,8 +391,9 @@ def _fingerprint(
     folder: Path, representation: str, fps: float, mean: np.ndarray, std: np.ndarray, version: int
 ) -> str:
     digest = hashlib.sha256((folder / "clips.jsonl").read_bytes())
-    # Features differ in their last bits between processors and thread counts, so the fingerprint depends on them only
-    # through statistics rounded to a fixed number of decimals. Adding 0.0 makes -0.0 and 0.0 equal.
+    # Features differ in their last bits between processors and thread counts, so the fingerprint
+    # depends on them only through statistics rounded to a fixed number of decimals. Adding 0.0
+    # makes -0.0 and 0.0 equal.
     rounded = [round(float(value), 4) + 0.0 for value in np.concatenate([mean, std])]
     versions = [version] if version > 1 else []  # fingerprints of version 1 do not contain it
     digest.update(json.dumps([representation, fps, rounded, *versions]).encode())

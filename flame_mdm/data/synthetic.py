@@ -33,8 +33,8 @@ CAPTIONS = 8  # captions per clip
 SIMULTANEOUS = 0.08  # share of the clips that show two actions at once, with actions="all"
 CYCLIC = 0.04  # share of the clips that show a part of a cycle, such as two steps of a walk
 MARGIN = 1.0  # seconds before and after a part of a cycle, in which the body starts and stops
-# Share of the training clips whose captions leave out attributes. Captions of val and test state all of
-# them, so that every attribute can be measured.
+# Share of the training clips whose captions leave out attributes. Captions of val and test state
+# all of them, so that every attribute can be measured.
 PARTIAL = 0.25
 ALWAYS = ("action", "while")  # attributes that each caption states
 UNSAID = {"speed": "normal", "amount": "quarter"}  # values that a caption need not state

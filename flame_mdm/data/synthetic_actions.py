@@ -26,7 +26,8 @@ class Action(NamedTuple):
     # moves a body at times (F,) in seconds, for the attributes
     motion: Callable[[Body, np.random.Generator, np.ndarray, Attributes], None]
     share: float = 1  # how often the action occurs, relative to the others
-    # attribute -> values, equally often, or with their probabilities; drawn in this order, `speed` for forward only
+    # attribute -> values, equally often, or with their probabilities; drawn in this order,
+    # `speed` for forward only
     values: Mapping[str, Sequence[str | int] | Mapping[str, float]] = {}
     seconds: float = 0.0  # minimum duration
     reverse: bool = False  # whether the motion is played backward

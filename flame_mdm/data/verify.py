@@ -83,8 +83,8 @@ def report(data: MotionDataModule) -> dict[str, Any]:
         "duplicates_across_splits": sum(
             len({clip.split for clip in group}) > 1 for group in duplicates
         ),
-        # Mean and std of the store may have been published with the data set. They are compared with values
-        # computed from its training clips.
+        # Mean and std of the store may have been published with the data set. They are compared
+        # with values computed from its training clips.
         "statistics": {
             "largest difference of a mean, in std": float((np.abs(store.mean - mean) / std).max()),
             "largest relative difference of a std": float(np.abs(store.std / std - 1).max()),

@@ -30,7 +30,8 @@ from flame_mdm.demo.studio import Studio
 from flame_mdm.demo.studio_page import build_page
 from flame_mdm.errors import UserError, first_line, one_line, say
 
-# Open pages that gradio remembers; it keeps half a megabyte for each, and the page needs none of it
+# Open pages that gradio remembers; it keeps half a megabyte for each, and the page needs none of
+# it
 SESSIONS = 64
 # Numbers of motion files that may be written, and that may wait to be written, at a time.
 WRITERS, WAITING_FILES = (

@@ -16,8 +16,9 @@ from flame_mdm.visualize.body import ANCHORS, HELPERS, Figure, FittedBody, Mesh,
 
 TRUNK = {"pelvis": 0.0, "spine1": 0.35, "spine2": 0.75, "spine3": 1.0}
 """Joints of the trunk -> how much their width follows the shoulders rather than the hips."""
-# Limits of the factor of hips and shoulders, relative to the factor of the limbs: a clip's joints may lie
-# elsewhere in the flesh than the mesh's, and must not make the trunk too thin or too wide.
+# Limits of the factor of hips and shoulders, relative to the factor of the limbs: a clip's joints
+# may lie elsewhere in the flesh than the mesh's, and must not make the trunk too thin or too
+# wide.
 WIDER = (0.8, 1.25)
 LONGER = (0.4, 2.5)  # limits of the length of a limb relative to the mesh's
 # Limits of the factor of the other parts' lengths, relative to the factor of the limbs.
@@ -80,14 +81,15 @@ def fit_body(motion: PosedFigure, body: Mesh | None = None) -> FittedBody:
     if motion.poses is None:
         neutral, world, offsets = complete(joints, offsets, world)
     _check_rotations(world)
-    # Feet are stretched such that the sole is below the ankle by the height that the clip has there.
+    # Feet are stretched such that the sole is below the ankle by the height that the clip has
+    # there.
     lift = wide * body.sole
     for toe in (JOINT["left_foot"], JOINT["right_foot"]):
         _, high, long = body.rest[toe]
         tall = (lift - offsets[toe, 1]) / (body.sole - high)
         fit[SMPL22.parents[toe]] = np.diag([wide, tall, offsets[toe, 2] / long])
-    # Each part of the mesh is stretched along its own axes to the clip's bone lengths. Vertices between two
-    # parts get the mean of both maps, by their weights, as in linear blend skinning.
+    # Each part of the mesh is stretched along its own axes to the clip's bone lengths. Vertices
+    # between two parts get the mean of both maps, by their weights, as in linear blend skinning.
     turns, rest = body.turns, np.zeros((len(SMPL22), 3))
     for parent, joint in SMPL22.edges:
         rest[joint] = rest[parent] + turns[parent] @ offsets[joint]
@@ -112,8 +114,8 @@ def local_rotations(body: FittedBody) -> np.ndarray:
 
 def proportions(body: Mesh, offsets: np.ndarray) -> tuple[np.ndarray, float]:
     """Returns the linear map (22, 3, 3) of each part to a clip's `offsets` (22, 3) at rest, and the map of widths."""
-    # The limbs decide how large the body is. Hips and shoulders follow the clip's own widths, the trunk
-    # blends both from bottom to top, and limbs are stretched along their bones only.
+    # The limbs decide how large the body is. Hips and shoulders follow the clip's own widths, the
+    # trunk blends both from bottom to top, and limbs are stretched along their bones only.
     lengths, usual = np.linalg.norm(offsets, axis=1), np.linalg.norm(body.rest, axis=1)
     ratio = np.divide(lengths, usual, out=np.ones_like(lengths), where=usual > 0)
     for joint in LIMBS:
@@ -159,8 +161,8 @@ def _check_rotations(world: np.ndarray) -> None:
 
 def _with_helpers(world: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     """Appends the rotations of the helper bones to the rotations of the joints (F, 22, 3, 3)."""
-    # Skin that follows a twisting bone wrings at the joint. A helper bone takes a share of the twist about the
-    # limb, so that the twist is spread along the limb as under real skin.
+    # Skin that follows a twisting bone wrings at the joint. A helper bone takes a share of the
+    # twist about the limb, so that the twist is spread along the limb as under real skin.
     helpers = []
     for joint, share in HELPERS:
         child = SMPL22.parents.index(joint)

@@ -173,7 +173,8 @@ def read(path: str | Path) -> Bvh:
     time = float(seconds)
     if not 1 / RATES[1] <= time <= 1 / RATES[0]:
         source.fail(f"the frame time must be between {1 / RATES[1]:g} and {1 / RATES[0]:g} seconds")
-    # a rounded time (0.0333333 for 1/30) means the integer, or resampling could move the last frame past the end
+    # a rounded time (0.0333333 for 1/30) means the integer, or resampling could move the last
+    # frame past the end
     whole, last_digit = max(round(1 / time), 1), 10.0 ** int(Decimal(seconds).as_tuple().exponent)
     fps = float(whole) if abs(1 / whole - time) < min(last_digit, 0.01 * time) else 1 / time
     width = sum(len(node.channels) for node in nodes)

@@ -153,9 +153,9 @@ def _rest(file: glb.Glb, pelvis: int) -> tuple[np.ndarray, np.ndarray]:
 
     If they are stored in another pose, the pelvis, which is nearly upright, shows how the skin's frame is turned.
     """
-    # Joint matrix times inverse bind matrix is the same for all joints if the file is stored in the bind pose.
-    # If it is not, this product of the pelvis is taken as the frame of the skin, its rotation rounded to
-    # quarter turns, and the bind matrices give the pose of all joints.
+    # Joint matrix times inverse bind matrix is the same for all joints if the file is stored in
+    # the bind pose. If it is not, this product of the pelvis is taken as the frame of the skin,
+    # its rotation rounded to quarter turns, and the bind matrices give the pose of all joints.
     worlds, corners = file.worlds.copy(), []
     rest: dict[int, np.ndarray] = {}
     for skin in sorted(file.skins, key=lambda skin: (pelvis in skin.joints, len(skin.joints))):
@@ -271,8 +271,8 @@ def write(path: Path, character: Character, motion: PosedFigure, name: str) -> s
     for joint, source in enumerate(rig.sources):
         if source >= 0 or joint in skinned:
             turns = glb.quaternions(np.concatenate([rest[None, joint], local[:, joint]]))
-            # Animations need a node with translation, rotation and scale instead of a matrix. It gets the rest
-            # pose, also if the file was stored in another pose.
+            # Animations need a node with translation, rotation and scale instead of a matrix. It
+            # gets the rest pose, also if the file was stored in another pose.
             size = float(
                 rig.scales[joint]
                 / (rig.scales[rig.parents[joint]] if rig.parents[joint] >= 0 else 1)

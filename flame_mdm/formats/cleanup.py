@@ -63,9 +63,10 @@ def cleanup(
     Returns:
         Joints (F, J, 3) float32.
     """
-    # Joints get smooth paths and bones their median lengths. Then the body moves over the ground so that its
-    # feet in contact stand still on average. What still slides is corrected by two-bone inverse kinematics:
-    # legs keep each toe in place during its contacts, and arms leave trunk and thighs.
+    # Joints get smooth paths and bones their median lengths. Then the body moves over the ground
+    # so that its feet in contact stand still on average. What still slides is corrected by
+    # two-bone inverse kinematics: legs keep each toe in place during its contacts, and arms leave
+    # trunk and thighs.
     if len(joints) < 4:
         return np.array(joints, np.float32)
     smooth = _smooth(np.asarray(joints, float))
@@ -98,8 +99,9 @@ def _least_squares(
 
     A term is n, weight (frames - n,) or a number, and target (frames - n, N) or a number; one is an array.
     """
-    # An n-th difference has binomial coefficients with alternating signs. It couples frames that are at most
-    # three apart, so that the normal equations are a banded matrix and take time linear in the frames.
+    # An n-th difference has binomial coefficients with alternating signs. It couples frames that
+    # are at most three apart, so that the normal equations are a banded matrix and take time
+    # linear in the frames.
     width = next(target.shape[1] for _, _, target in terms if isinstance(target, np.ndarray))
     matrix, right = np.zeros((4, frames)), np.zeros((frames, width))
     for order, weight, target in terms:
@@ -115,8 +117,9 @@ def _least_squares(
 
 def _smooth(motion: np.ndarray) -> np.ndarray:
     """Returns smooth paths of the joints (Whittaker 1923); positions that jump for a few frames hardly bend them."""
-    # After each fit, positions far from the path lose weight, as in iteratively reweighted least squares: a
-    # pop of a few frames is cut off instead of being spread over its neighbors. Four fits are enough.
+    # After each fit, positions far from the path lose weight, as in iteratively reweighted least
+    # squares: a pop of a few frames is cut off instead of being spread over its neighbors. Four
+    # fits are enough.
     smooth = motion.copy()
     for joint in range(motion.shape[1]):
         path, weight = motion[:, joint], np.ones(len(motion))
@@ -160,8 +163,8 @@ def _arm(skeleton: Skeleton, side: str) -> list[int]:
 
 def _contacts(toes: np.ndarray, root: np.ndarray, fps: float, share: float) -> np.ndarray:
     """Returns (F - 1, 2) in [0, 1]: the confidence that each toe (F, 2, 3) stands on the floor until the next frame."""
-    # A toe stands if it is both low and slow. The faster the body travels, the faster a toe may slide: feet
-    # of generated motions are carried along with the body.
+    # A toe stands if it is both low and slow. The faster the body travels, the faster a toe may
+    # slide: feet of generated motions are carried along with the body.
     speed = np.linalg.norm(np.diff(toes[..., [0, 2]], axis=0), axis=-1) * fps
     travel = np.linalg.norm(np.diff(root[:, [0, 2]], axis=0), axis=-1) * fps
     travel = gaussian_filter1d(travel, 0.15 * fps, mode="nearest")
@@ -173,8 +176,8 @@ def _contacts(toes: np.ndarray, root: np.ndarray, fps: float, share: float) -> n
 
 def _follow_feet(motion: np.ndarray, toes: list[int], fps: float) -> np.ndarray:
     """Moves the body over the ground so that its feet in contact stand still on average."""
-    # The drift of the body is the mean slide of the feet in contact, smooth in time and almost 0 where no
-    # foot stands. Subtracting it from the path of the root lets these feet stand still.
+    # The drift of the body is the mean slide of the feet in contact, smooth in time and almost 0
+    # where no foot stands. Subtracting it from the path of the root lets these feet stand still.
     slides = np.diff(motion[:, toes], axis=0)[..., [0, 2]]
     contact = weights = _contacts(motion[:, toes], motion[:, 0], fps, SHARE)
     drift = np.zeros((len(slides), 2))
@@ -200,8 +203,8 @@ def _push_out(motion: np.ndarray, skeleton: Skeleton, side: str, fps: float) -> 
     frames = max(1.0, CLEAR * fps)
     other = skeleton.joints.index("right_shoulder" if side == "left" else "left_shoulder")
     aside = unit(motion[:, arm[0]] - motion[:, other])  # a hand near the axis goes to its own side
-    # Each pass moves the wrist out where it is deepest. The shift rises and fades within `CLEAR` seconds, so
-    # that the hand avoids the body and does not jump out of it.
+    # Each pass moves the wrist out where it is deepest. The shift rises and fades within `CLEAR`
+    # seconds, so that the hand avoids the body and does not jump out of it.
     for _ in range(4):
         depth, away = (values[:, 1:] for values in depths(motion, skeleton.joints, side))
         deepest = depth.argmax(1)[:, None]
@@ -218,9 +221,10 @@ def _push_out(motion: np.ndarray, skeleton: Skeleton, side: str, fps: float) -> 
 
 def bend(motion: np.ndarray, leg: Sequence[int], shift: np.ndarray) -> None:
     """Moves the foot of a leg (hip, knee, ankle, other joints of the foot) by `shift` (F, 3); hands work alike."""
-    # Two-bone inverse kinematics. The new ankle lies on the line from the hip to the requested position, as
-    # far as the leg reaches. Thigh and shin are two sides of a triangle over this line, which gives the
-    # position of the knee along the line; the knee stays on the side where it was.
+    # Two-bone inverse kinematics. The new ankle lies on the line from the hip to the requested
+    # position, as far as the leg reaches. Thigh and shin are two sides of a triangle over this
+    # line, which gives the position of the knee along the line; the knee stays on the side where
+    # it was.
     hip, knee, ankle, *foot = (motion[:, joint].copy() for joint in leg)
     thigh, shin = (np.linalg.norm(bone[0]) for bone in (knee - hip, ankle - knee))
     before = np.linalg.norm(ankle - hip, axis=-1, keepdims=True)

@@ -12,7 +12,8 @@ from flame_mdm.formats.motion import Motion
 # Height in meters above the floor, y = 0, below which a toe joint touches it. Foot skating uses
 # it, too.
 LOW = 0.05
-# Speed of the root in m/s below which a body does not jump. At the top, a jump is slower for 0.04 s only.
+# Speed of the root in m/s below which a body does not jump. At the top, a jump is slower for 0.04
+# s only.
 STANDSTILL = 0.2
 LIMITS = {
     "skating": (
@@ -167,8 +168,8 @@ def _bends(joints: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.nda
             at = names.index(chain[1])
             flags[:, at], worst[:, at] = 180 - bend < limit, 180 - bend
             if "knee" in chain[1]:
-                # The front of the shin is the direction of the foot, perpendicular to the shin. A knee bends
-                # forward if the thigh tilts to this side.
+                # The front of the shin is the direction of the foot, perpendicular to the shin. A
+                # knee bends forward if the thigh tilts to this side.
                 toes = unit(joints[:, names.index(f"{side}_foot")] - lower)
                 front = toes - (toes * b).sum(-1, keepdims=True) * b
                 tilt = np.degrees(np.arcsin(np.clip(-(a * unit(front)).sum(-1), -1, 1)))
@@ -202,8 +203,8 @@ def depths(joints: np.ndarray, names: Sequence[str], side: str) -> tuple[np.ndar
         (joints[:, 0], at["neck"]),
         *((at[f"{leg}_hip"], at[f"{leg}_knee"]) for leg in ("left", "right")),
     ]
-    # The trunk is wider than deep. Sideways distances from its axis are shortened, so that the same capsule
-    # works in all directions.
+    # The trunk is wider than deep. Sideways distances from its axis are shortened, so that the
+    # same capsule works in all directions.
     away = [_away(points, start, end) for start, end in bones]
     lateral = (away[0] * across[:, None]).sum(-1, keepdims=True) * across[:, None]
     away[0] = away[0] - (1 - 1 / WIDTH) * lateral

@@ -26,7 +26,8 @@ CENTIMETER = 0.01  # meters per centimeter; `UnitScaleFactor` is the number of c
 MAX_MODELS = 4096  # maximum number of models of a scene
 MAX_CELLS = 4_000_000  # maximum number of frames times models
 
-# Order of Euler angles in `RotationOrder`, as in scipy: "xyz" turns about the fixed axes x, y and z, in this order.
+# Order of Euler angles in `RotationOrder`, as in scipy: "xyz" turns about the fixed axes x, y and
+# z, in this order.
 ORDERS = ("xyz", "xzy", "yzx", "yxz", "zxy", "zyx", "xyz")
 
 # Frames per second of `TimeMode`; 0 and 14 mean the rate in `CustomFrameRate`.

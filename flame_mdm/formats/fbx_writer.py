@@ -68,8 +68,9 @@ class _Writer:
             self._bind_pose(poses)
         self._animation(bones, duration)
 
-        # The order of a file: header, settings, documents, definitions, objects, connections, takes. Objects
-        # are a flat list; connections by id make it a tree, with id 0 as the scene.
+        # The order of a file: header, settings, documents, definitions, objects, connections,
+        # takes. Objects are a flat list; connections by id make it a tree, with id 0 as the
+        # scene.
         root = Record("")
         _header(root)
         root.children.append(_settings(clip.fps, duration))
@@ -124,8 +125,8 @@ class _Writer:
 
     def _skeleton(self) -> list[int]:
         """Adds the bones in the rest pose; returns their ids."""
-        # Each bone is a Model, which has the transform, and a NodeAttribute, which says that it is a bone.
-        # The rest pose is the PreRotation, so that the animated rotation is 0 at rest.
+        # Each bone is a Model, which has the transform, and a NodeAttribute, which says that it
+        # is a bone. The rest pose is the PreRotation, so that the animated rotation is 0 at rest.
         clip, bones = self.clip, []
         before = _degrees(clip.rest[None])[0]
         for joint, name in enumerate(clip.joints):
@@ -150,8 +151,9 @@ class _Writer:
         `materials` holds the ids of the materials that the file has so far. Returns the matrix (4, 4) of each object,
         by id, in this pose.
         """
-        # A Geometry has the vertices and a Model places it. A Skin deforms the geometry with one Cluster per
-        # bone: its vertices, their weights, and the matrices of mesh and bone when they were bound.
+        # A Geometry has the vertices and a Model places it. A Skin deforms the geometry with one
+        # Cluster per bone: its vertices, their weights, and the matrices of mesh and bone when
+        # they were bound.
         geometry, record = self._object("Geometry", skin.name, "Mesh")
         _geometry(record, skin)
         model, record = self._object("Model", skin.name, "Mesh")
@@ -272,8 +274,8 @@ class _Writer:
         interpolation: int = LINEAR_KEY,
     ) -> None:
         """Adds a curve for each axis of a property, values (F, axes)."""
-        # An animated property is a CurveNode that is connected to the property of the bone. Each of its axes
-        # has a curve with times, values and flags; one flag counts for all keys.
+        # An animated property is a CurveNode that is connected to the property of the bone. Each
+        # of its axes has a curve with times, values and flags; one flag counts for all keys.
         node, record = self._object("AnimationCurveNode", label, "", "AnimCurveNode")
         properties = record.add("Properties70")
         self._connect(node, layer)

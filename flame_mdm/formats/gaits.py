@@ -93,8 +93,9 @@ def find_cycle(motion: GroundedMotion, degrees: float) -> Cycle | None:
 
     Cycles that begin when the left foot lands are preferred, so that the loops of a set begin with the same foot.
     """
-    # A cycle lies in the longest part with a steady speed in the requested direction. All pairs of frames
-    # that are a plausible cycle apart are compared, by the distance of joints and of velocities.
+    # A cycle lies in the longest part with a steady speed in the requested direction. All pairs
+    # of frames that are a plausible cycle apart are compared, by the distance of joints and of
+    # velocities.
     along, aside = progress(motion, degrees)
     even = gaussian_filter1d(along, EVEN * motion.fps, mode="nearest")
     full = np.percentile(even, 90)
@@ -140,8 +141,9 @@ def gait(
         degrees: the direction, relative to where the person looks.
         stand: (22, 3), the first pose of the start and the last pose of the stop.
     """
-    # All three parts come from one motion, so that they fit nearly. The loop is closed first; then the ends
-    # of start and stop are changed to its first pose and to the standing pose, and toes are planted again.
+    # All three parts come from one motion, so that they fit nearly. The loop is closed first;
+    # then the ends of start and stop are changed to its first pose and to the standing pose, and
+    # toes are planted again.
     straight = straightened(motion, degrees)
     loop = closed(straight.cut(cycle.first, cycle.last))
     along = direction(degrees)
@@ -171,8 +173,8 @@ def straightened(motion: GroundedMotion, degrees: float) -> GroundedMotion:
 
 def closed(motion: GroundedMotion) -> GroundedMotion:
     """Returns a cycle whose last pose is its first one; the difference is spread evenly over the cycle."""
-    # Half of the difference is added before the end and half after the beginning, so that the pose in the
-    # middle of the cycle does not change.
+    # Half of the difference is added before the end and half after the beginning, so that the
+    # pose in the middle of the cycle does not change.
     share = np.linspace(-0.5, 0.5, len(motion))[:, None, None]
     change = motion.local[0] - motion.local[-1]
     local = with_lengths(motion.local + share * change, motion.local[0])
@@ -197,7 +199,8 @@ def turn(motion: GroundedMotion, degrees: float, stand: np.ndarray) -> GroundedM
 
     `stand` (22, 3) is the first and the last pose.
     """
-    # The model turns by about the requested angle. The root gets exactly this angle; the pose turns along.
+    # The model turns by about the requested angle. The root gets exactly this angle; the pose
+    # turns along.
     begin, end = moving(motion)
     part = motion.cut(begin, end)
     angle = part.heading[-1] - part.heading[0]

@@ -21,7 +21,8 @@ from flame_mdm.formats.fbx_scene import hermite
 from flame_mdm.formats.resampling import MAX_FRAMES, RATES
 
 MAX_CELLS = 4_000_000  # maximum number of frames times nodes
-# Keys that are farther apart than at this rate were placed by hand: sampled motions have more of them.
+# Keys that are farther apart than at this rate were placed by hand: sampled motions have more of
+# them.
 SPARSE_RATE = 24.0
 USUAL_RATE = 30.0  # rate at which motions with keys placed by hand are sampled
 # Numbers per key of the properties that move nodes
@@ -101,8 +102,9 @@ class Track:
 
     def at(self, times: np.ndarray) -> np.ndarray:
         """Returns the values (F, C) at times (F,); rotations are not normalized. The first and last keys hold."""
-        # Each time lies in a segment between two keys; before the first and after the last key, the value is
-        # held. CUBICSPLINE stores slopes per second, which become slopes per segment.
+        # Each time lies in a segment between two keys; before the first and after the last key,
+        # the value is held. CUBICSPLINE stores slopes per second, which become slopes per
+        # segment.
         if len(self.times) == 1:
             return np.tile(self.values[0], (len(times), 1))
         inside = np.clip(times, self.times[0], self.times[-1])
@@ -125,8 +127,8 @@ class Track:
 
 def slerp(begin: np.ndarray, end: np.ndarray, share: np.ndarray) -> np.ndarray:
     """Interpolates unit quaternions (F, 4) on the sphere, the shorter way; `share` (F, 1) is from 0 to 1."""
-    # q and -q are the same rotation; the one within a quarter turn of `begin` is the shorter way. For nearly
-    # equal rotations, sin(angle) is 0 and linear interpolation is exact enough.
+    # q and -q are the same rotation; the one within a quarter turn of `begin` is the shorter way.
+    # For nearly equal rotations, sin(angle) is 0 and linear interpolation is exact enough.
     cosine = (begin * end).sum(1, keepdims=True)
     end = np.where(cosine < 0, -end, end)
     angle = np.arccos(np.clip(np.abs(cosine), 0, 1))
@@ -264,8 +266,9 @@ def _track(file: glb.Glb, sampler: _Sampler, width: int) -> Track:
 
 def _rate(file: glb.Glb, items: Sequence[_Animation]) -> float:
     """Returns the frame rate: the one that the writer noted in `asset.extras.fps`, or the smallest distance of keys."""
-    # glTF has keys and no frame rate. The median distance of keys is the frame rate of sampled animations; it
-    # is rounded to a whole number that is nearly equal, since times are in single precision.
+    # glTF has keys and no frame rate. The median distance of keys is the frame rate of sampled
+    # animations; it is rounded to a whole number that is nearly equal, since times are in single
+    # precision.
     extras = file.document["asset"].get("extras")
     noted = extras.get("fps") if isinstance(extras, dict) else None
     if isinstance(noted, int | float) and RATES[0] <= noted <= RATES[1]:

@@ -98,8 +98,8 @@ def facing(joints: np.ndarray) -> np.ndarray:
 
 def grounded(joints: np.ndarray, fps: float) -> GroundedMotion:
     """Puts a root below joints (F, 22, 3); its path and its direction are smooth."""
-    # The root is where the pelvis is, projected onto the floor. It is smoothed in time: in an engine, the
-    # sway of a walk belongs to the pose and not to the path.
+    # The root is where the pelvis is, projected onto the floor. It is smoothed in time: in an
+    # engine, the sway of a walk belongs to the pose and not to the path.
     joints = joints.astype(float)
     frames = SMOOTHNESS * fps
     path = gaussian_filter1d(joints[:, 0][:, [0, 2]], frames, axis=0, mode="nearest")
@@ -110,8 +110,8 @@ def grounded(joints: np.ndarray, fps: float) -> GroundedMotion:
 
 def planted_toes(joints: np.ndarray, fps: float) -> np.ndarray:
     """Returns whether the left and the right toes are planted, (F, 2), by their height and speed."""
-    # A toe is planted if it is low, and slow both before and after a frame. Gaps and contacts shorter than
-    # `SHORT` are closed and removed.
+    # A toe is planted if it is low, and slow both before and after a frame. Gaps and contacts
+    # shorter than `SHORT` are closed and removed.
     toes = joints[:, [leg[-1] for leg in FEET]]
     steps = np.linalg.norm(np.diff(toes[..., [0, 2]], axis=0), axis=-1) * fps
     steps = np.concatenate([steps[:1], steps, steps[-1:]])
@@ -132,7 +132,8 @@ def anchored(
 
     `pose` (22, 3) is seen from the root. Bones keep their lengths.
     """
-    # The difference to the pose is added with a weight that falls from 1 to 0 without a kink: 3 w^2 - 2 w^3.
+    # The difference to the pose is added with a weight that falls from 1 to 0 without a kink: 3
+    # w^2 - 2 w^3.
     frames = np.arange(len(motion)) / max(1.0, min(seconds * motion.fps, len(motion) - 1))
     share = np.clip(1 - (frames[::-1] if at_end else frames), 0, 1)
     weight = share**2 * (3 - 2 * share)
@@ -167,8 +168,8 @@ def planted(
     The body is lowered where a leg would be too short. With `fixed_start` and `fixed_end`, the first and the last pose
     do not change: a foot that is planted there stays where this pose has it.
     """
-    # Each toe is moved to one footprint per contact. If a leg is too short for its footprint, the whole body
-    # is lowered for a moment, smoothly, before the legs bend to reach the footprints.
+    # Each toe is moved to one footprint per contact. If a leg is too short for its footprint, the
+    # whole body is lowered for a moment, smoothly, before the legs bend to reach the footprints.
     world = motion.world()
     shifts = [
         _shift(world[:, leg[-1]], flags, fixed_start, fixed_end)
@@ -197,8 +198,9 @@ def planted(
 
 def _lack(world: np.ndarray, leg: tuple[int, ...], shift: np.ndarray) -> np.ndarray:
     """Returns by how much (F,) the hip of a leg is too high for a foot that is moved by `shift` (F, 3)."""
-    # The hip may be anywhere in a sphere around the ankle whose radius is the straight leg, or the leg in the
-    # motion if that is longer. `highest` is the top of the sphere above the floor point of the hip.
+    # The hip may be anywhere in a sphere around the ankle whose radius is the straight leg, or
+    # the leg in the motion if that is longer. `highest` is the top of the sphere above the floor
+    # point of the hip.
     hip, knee, ankle = (world[:, joint] for joint in leg[:3])
     length = np.linalg.norm(knee - hip, axis=1) + np.linalg.norm(ankle - knee, axis=1)
     reach = np.maximum(REACH * length, np.linalg.norm(ankle - hip, axis=1))
@@ -209,8 +211,8 @@ def _lack(world: np.ndarray, leg: tuple[int, ...], shift: np.ndarray) -> np.ndar
 
 def _shift(toe: np.ndarray, flags: np.ndarray, fixed_start: bool, fixed_end: bool) -> np.ndarray:
     """Returns how far a toe (F, 3) is moved over the floor, (F, 3): smoothly from each contact to the next."""
-    # Within a contact, the shift brings the toe to its mean position, or to the position in a fixed pose.
-    # Between contacts, the shift of one becomes the shift of the next.
+    # Within a contact, the shift brings the toe to its mean position, or to the position in a
+    # fixed pose. Between contacts, the shift of one becomes the shift of the next.
     last = len(toe) - 1
     floor = np.array([1.0, 0.0, 1.0])
     frames, shifts = [], []
@@ -245,8 +247,8 @@ def _shift(toe: np.ndarray, flags: np.ndarray, fixed_start: bool, fixed_end: boo
 
 def repeated(motion: GroundedMotion, copies: int = COPIES) -> GroundedMotion:
     """Returns a loop several times in a row; its last frame is the first one of the next repetition."""
-    # Each repetition begins where the one before ended and in the direction that it ended in: its path is
-    # turned and moved there.
+    # Each repetition begins where the one before ended and in the direction that it ended in: its
+    # path is turned and moved there.
     step = turned(np.r_[motion.path[-1] - motion.path[0], 0][[0, 2, 1]], -motion.heading[0])
     turn = motion.heading[-1] - motion.heading[0]
     count = len(motion) - 1
@@ -270,8 +272,8 @@ def repeated(motion: GroundedMotion, copies: int = COPIES) -> GroundedMotion:
 
 def planted_loop(motion: GroundedMotion) -> GroundedMotion:
     """Returns a loop with planted toes, which is still a loop: the last pose is the first one."""
-    # A single cycle has contacts that are cut at its ends. Several cycles are planted in a row, and the
-    # middle one is kept, whose neighbors are cycles, too.
+    # A single cycle has contacts that are cut at its ends. Several cycles are planted in a row,
+    # and the middle one is kept, whose neighbors are cycles, too.
     count = len(motion) - 1
     several = planted(repeated(motion))
     middle = several.local[count * (COPIES // 2) : count * (COPIES // 2 + 1) + 1].copy()

@@ -385,8 +385,9 @@ def check_feet(joints: np.ndarray) -> None:
             raise UserError(
                 f"the {side} foot has no length. Map {side}_foot in skeleton.yaml {advice}"
             )
-    # The toes of a foot in the air may point backwards, as while running: of each frame, the lower foot counts. So do
-    # the toes of one foot of a person who kneels: both feet point backwards in a part of the frames.
+    # The toes of a foot in the air may point backwards, as while running: of each frame, the
+    # lower foot counts. So do the toes of one foot of a person who kneels: both feet point
+    # backwards in a part of the frames.
     across, trunk = at["left_hip"] - at["right_hip"], at["neck"] - at["pelvis"]
     depths = [
         ((at[f"{side}_hip"] - at[f"{side}_ankle"]) * trunk).sum(1) for side in ("left", "right")

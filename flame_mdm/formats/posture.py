@@ -27,8 +27,9 @@ def complete(
             3, 3) of these
         parts in the world, and the offsets (22, 3) of a body that stands on flat feet.
     """
-    # A person who stands upright looks straight ahead: the median direction from neck to head, seen from an
-    # upright chest, is where the head is level. Toes stay flat on the floor while the heel rises.
+    # A person who stands upright looks straight ahead: the median direction from neck to head,
+    # seen from an upright chest, is where the head is level. Toes stay flat on the floor while
+    # the heel rises.
     neutral, offsets = np.tile(np.eye(3), (len(SMPL22), 1, 1)), offsets.copy()
     for side in ("left", "right"):
         ankle, toe = JOINT[f"{side}_ankle"], JOINT[f"{side}_foot"]

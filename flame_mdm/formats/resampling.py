@@ -67,8 +67,8 @@ def frame_pairs(
             f"{frames:,} frames at {rate:g} frames per second would become {count:,} at {fps:g}, with {joints} joints: "
             "too many; check the frame rate, or cut the motion"
         )
-    # Frames are counted from the first one, so that rounding errors do not accumulate. The last new frame may
-    # lie a hair past the last old one and takes its value.
+    # Frames are counted from the first one, so that rounding errors do not accumulate. The last
+    # new frame may lie a hair past the last old one and takes its value.
     times = np.arange(count) * rate / fps
     before = np.minimum(times.astype(int), frames - 1)
     return before, np.minimum(before + 1, frames - 1), times - before

@@ -86,8 +86,8 @@ def preset(name: str | None, poses: Poses) -> Rig:
                     _RigJoint(label, parent, joint, rest[joint], posed[joint] @ local, local)
                 )
             else:
-                # A joint that SMPL lacks is at a share of the way from its parent to the next joint of SMPL.
-                # It does not rotate.
+                # A joint that SMPL lacks is at a share of the way from its parent to the next
+                # joint of SMPL. It does not rotate.
                 above = joints[parent]
                 following = next(ours for _, ours in names[number:] if isinstance(ours, str))
                 distance = rest[JOINT[side + following]] - above.position
@@ -120,9 +120,10 @@ class _RigJoint(NamedTuple):
 
 def _axes(axes: dict[str, Any], part: str, joint: str, bone: np.ndarray, right: bool) -> np.ndarray:
     """Returns the local axes (3, 3) in a T-pose of a joint whose bone has the direction `bone`."""
-    # Gram-Schmidt: the first direction is kept, the second one loses its part along the first, and the third
-    # axis is their cross product. The right side is the mirror image of the left side; skeletons that are
-    # "opposed" then have all three axes reversed, which keeps them right-handed.
+    # Gram-Schmidt: the first direction is kept, the second one loses its part along the first,
+    # and the third axis is their cross product. The right side is the mirror image of the left
+    # side; skeletons that are "opposed" then have all three axes reversed, which keeps them
+    # right-handed.
     flip = np.array([-1, 1, 1]) if right else np.ones(3)
     matrix, columns = np.eye(3), []
     # Axes are listed for two directions, and for the left side only.
@@ -162,8 +163,9 @@ def continuous_euler(matrices: Tensor, orders: Sequence[str] = SMPL_ORDERS) -> T
     Returns:
         Angles (F, J, 3).
     """
-    # Two triples of Euler angles describe each rotation, (a, b, c) and (a + pi, pi - b, c + pi), up to full
-    # turns of each angle. In each frame, the triple nearest to the frame before is used.
+    # Two triples of Euler angles describe each rotation, (a, b, c) and (a + pi, pi - b, c + pi),
+    # up to full turns of each angle. In each frame, the triple nearest to the frame before is
+    # used.
     turn = 2 * torch.pi
     first = torch.stack(
         [rotation.matrix_to_euler(matrices[:, j], order) for j, order in enumerate(orders)], 1

@@ -165,8 +165,8 @@ def rest_pose(
     def middle(name: str) -> np.ndarray:
         return (at[f"left_{name}"] + at[f"right_{name}"]) / 2
 
-    # First, the pose must be one that rotations can start from: limbs with a length, an upright trunk and
-    # upright legs, left and right apart.
+    # First, the pose must be one that rotations can start from: limbs with a length, an upright
+    # trunk and upright legs, left and right apart.
     trunk, legs = middle("shoulder") - middle("hip"), middle("hip") - middle("ankle")
     up = np.array(vertical)
     shortest = max(1e-4 * float(np.linalg.norm(legs)), 1e-9)
@@ -185,8 +185,9 @@ def rest_pose(
             f"{source}: the rest pose is not upright, it leans by {tilt:.0f} degrees. Use a T- or an A-pose"
         )
 
-    # The frame is: x to the left, from hips and shoulders, y up, z ahead. A direction that is nearly an axis
-    # of the file becomes this axis, so that small asymmetries of a mesh do not turn the character.
+    # The frame is: x to the left, from hips and shoulders, y up, z ahead. A direction that is
+    # nearly an axis of the file becomes this axis, so that small asymmetries of a mesh do not
+    # turn the character.
     left = at["left_hip"] + at["left_shoulder"] - at["right_hip"] - at["right_shoulder"]
     left = left - up * (up @ left)
     if np.linalg.norm(left) <= shortest:
@@ -224,9 +225,10 @@ def fitted(character: RestPose, offsets: np.ndarray) -> Rig:
 
     `offsets` (22, 3) are the offsets of SMPL's joints from their parents at rest.
     """
-    # Each limb bone is turned from the character's rest pose to SMPL's: its direction first, then the twist,
-    # such that knees and elbows bend about the same axis. A limb that is clearly bent at rest shows this
-    # axis. For a straight limb, knees are taken to bend backward and elbows forward.
+    # Each limb bone is turned from the character's rest pose to SMPL's: its direction first, then
+    # the twist, such that knees and elbows bend about the same axis. A limb that is clearly bent
+    # at rest shows this axis. For a straight limb, knees are taken to bend backward and elbows
+    # forward.
     rig, turns = character.rig, np.tile(np.eye(3), (len(SMPL22), 1, 1))
     for side in SIDES:
         for (start, middle, end), bend in (
@@ -267,9 +269,10 @@ def follow(
     The body has joints (F, 22, 3) in meters, with `offsets` (22, 3) from their parents in the rest pose; its parts have
     rotations `neutral` (22, 3, 3) in the rest pose and `world` (F, 22, 3, 3) in the world.
     """
-    # All joints get the rotations of the body, relative to the rest poses. The hips follow the scaled path.
-    # Legs of other proportions would then hover or sink, so that each leg is bent until its toes or its
-    # ankle are at the scaled position, at the character's own height above the floor.
+    # All joints get the rotations of the body, relative to the rest poses. The hips follow the
+    # scaled path. Legs of other proportions would then hover or sink, so that each leg is bent
+    # until its toes or its ankle are at the scaled position, at the character's own height above
+    # the floor.
     rig, neutral = fitted(character, offsets), neutral.copy()
     turned = world @ np.swapaxes(neutral, 1, 2)
     neutral[JOINT["neck"]] = neutral[JOINT["head"]]
@@ -321,7 +324,8 @@ def _bent(
     hip: np.ndarray, knee: np.ndarray, ankle: np.ndarray, target: np.ndarray, forward: np.ndarray
 ) -> np.ndarray:
     """Returns where a knee (F, 3) is if the ankle is at `target`, or as near as the leg reaches; it bends as before."""
-    # Thigh and shin are two sides of a triangle over the line to the target, as in `cleanup.bend`.
+    # Thigh and shin are two sides of a triangle over the line to the target, as in
+    # `cleanup.bend`.
     thigh, shin = np.linalg.norm(knee - hip, axis=1), np.linalg.norm(ankle - knee, axis=1)
     line = target - hip
     length = np.maximum(np.linalg.norm(line, axis=1), 1e-9)
@@ -332,7 +336,8 @@ def _bent(
     out = (knee - hip) - before * ((knee - hip) * before).sum(1, keepdims=True) / (before**2).sum(
         1, keepdims=True
     )
-    # A straight leg does not show where its knee points, so that a little of the thigh's front is added.
+    # A straight leg does not show where its knee points, so that a little of the thigh's front is
+    # added.
     out = out + STRAIGHT * thigh[:, None] * forward
     out = out - line * (out * line).sum(1, keepdims=True)
     out = out / np.linalg.norm(out, axis=1, keepdims=True)

@@ -278,7 +278,8 @@ def _skin(body: FittedBody, rig: Rig) -> Skin:
     count = len(skinned)
     binds[:count, :3] = rig.neutral[skinned].mT @ np.concatenate([stored, moves], -1)
 
-    # Joints without vertices keep their place in their parents: three.js reads it from the pose of the mesh.
+    # Joints without vertices keep their place in their parents: three.js reads it from the pose
+    # of the mesh.
     worlds = np.tile(np.eye(4), (len(rig.joints), 1, 1))
     worlds[skinned] = np.linalg.inv(binds[:count])
     local = np.tile(np.eye(4), (len(rig.joints), 1, 1))

@@ -174,7 +174,8 @@ def _finite(curve: Curve) -> list[tuple[float, float]]:
 def _thinned(points: Sequence[tuple[float, float]]) -> Sequence[tuple[float, float]]:
     if len(points) <= 2 * MOST:
         return points
-    # Of each part of the curve, the smallest and the largest value stay, so that no spike is lost.
+    # Of each part of the curve, the smallest and the largest value stay, so that no spike is
+    # lost.
     size = math.ceil(len(points) / MOST)
     parts = [points[begin : begin + size] for begin in range(0, len(points), size)]
     return [

@@ -80,7 +80,8 @@ def _player(run: Run, body: Mesh | None) -> str:
     from flame_mdm.formats.readers import read
     from flame_mdm.visualize import player_page
 
-    # Written again from the motions: `player.html` may be untrusted, and its scripts would run in the report.
+    # Written again from the motions: `player.html` may be untrusted, and its scripts would run in
+    # the report.
     return player_page([read(path) for path in sorted(run.samples.glob("motion_*.npz"))], body=body)
 
 

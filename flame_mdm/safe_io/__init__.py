@@ -50,7 +50,8 @@ ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, Run
 """Errors that `zipfile` raises for damaged, encrypted and unusually compressed archives."""
 DIRECTORY_LIMIT = 16 * MEBIBYTE
 """Maximum size of the directory of a zip archive in bytes. Each of its entries becomes a Python object."""
-# Maximum number of members of an archive. HumanML3D, the largest data set in archives, has 90,000.
+# Maximum number of members of an archive. HumanML3D, the largest data set in archives, has
+# 90,000.
 MAX_MEMBERS = 200_000
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # numbers of errors of a full disk
 

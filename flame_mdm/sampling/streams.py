@@ -169,7 +169,8 @@ class OnlineCleanup:
         begin = len(joints) - len(block.joints) - len(middle.joints)
         cleaned = joints[begin : begin + len(middle.joints)]
         if self.version is not None:
-            # The body follows its feet from the first frame of the three blocks on, so that places differ.
+            # The body follows its feet from the first frame of the three blocks on, so that
+            # places differ.
             shift = (self.version[0, 0] - cleaned[0, 0]) * np.array([1, 0, 1], np.float32)
             joints, cleaned = joints + shift, cleaned + shift
             weight = np.linspace(0, 1, len(cleaned), dtype=np.float32)[:, None, None]

@@ -85,8 +85,8 @@ class Checkpoints(Checkpoint):
         self.step = trainer.global_step
         signum = self.stop.signum
         if trainer.world_size > 1:
-            # All processes act on the signal exchanged in the previous step. Reading the one of this step would wait
-            # for the step to end on the device.
+            # All processes act on the signal exchanged in the previous step. Reading the one of
+            # this step would wait for the step to end on the device.
             signum, received = int(self.exchanged), torch.tensor(signum, device=pl_module.device)
             torch.distributed.all_reduce(received, torch.distributed.ReduceOp.MAX)
             self.exchanged = received
@@ -326,7 +326,8 @@ class SampleMotions(Callback):
         if isinstance(pl_module.generator.condition, ActionLabels) and not set(self.texts) & set(
             actions
         ):
-            # a text-to-motion recipe was overridden with condition=action, so its prompts are texts
+            # a text-to-motion recipe was overridden with condition=action, so its prompts are
+            # texts
             self.prompts = [(action, {"action": action}) for action in actions[: len(self.prompts)]]
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
@@ -377,7 +378,8 @@ class SampleMotions(Callback):
                 [torch.from_numpy(motion.joints) for motion in motions], requested
             )
             for logger in trainer.loggers:
-                # Lightning logs steps from 0: the values of this validation are logged at step - 1
+                # Lightning logs steps from 0: the values of this validation are logged at step -
+                # 1
                 log_video(logger, "samples", folder / "motions.gif", step - 1)
                 logger.log_metrics(
                     {f"samples/{name}": value for name, value in values.items()}, step - 1

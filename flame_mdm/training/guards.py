@@ -58,8 +58,8 @@ class BadLoss(Callback):
     """
 
     def __init__(self, folder: str, factor: float = 1000.0):
-        # Copying a loss from the GPU waits for the step. Losses stay on the device and are copied together, at
-        # the log interval and before a checkpoint.
+        # Copying a loss from the GPU waits for the step. Losses stay on the device and are copied
+        # together, at the log interval and before a checkpoint.
         self.path, self.factor = Path(folder) / "bad_batch.json", factor
         self.usual = float("inf")
         self.seen: list[tuple[int, int, Sequence[str], Tensor]] = []

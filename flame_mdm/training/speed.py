@@ -13,7 +13,8 @@ COMPILED_FROM = 5000
 """Minimum number of training steps for which the network is compiled: shorter runs would not make up for the time."""
 PAD_MULTIPLE = 32
 """Batches of a compiled network are padded to multiples of this number of frames, since each length is compiled."""
-# Maximum number of lengths and modes for which the network is compiled; torch stops at 8 by default
+# Maximum number of lengths and modes for which the network is compiled; torch stops at 8 by
+# default
 MOST_SHAPES = 64
 
 

@@ -33,7 +33,8 @@ TOWARD = np.array(
     [math.sin(YAW) * math.cos(PITCH), math.sin(PITCH), math.cos(YAW) * math.cos(PITCH)]
 )
 RIGHT = np.array([math.cos(YAW), 0, -math.sin(YAW)])
-# Number of the color space of HD video, which players assume where a large video does not name one
+# Number of the color space of HD video, which players assume where a large video does not name
+# one
 BT709 = 1
 SMOOTH = 2  # images are drawn this many times larger and then reduced
 
@@ -54,7 +55,8 @@ def write_gif(
         image.quantize(palette=palette, dither=Image.Dither.NONE)
         for image in _video(motions, fps, size, body)
     ]
-    # GIF counts in hundredths of a second: round the times, not the durations, so that errors do not add up
+    # GIF counts in hundredths of a second: round the times, not the durations, so that errors do
+    # not add up
     times = np.rint(100 * np.arange(len(images) + 1) / fps).astype(int)
     options = {"append_images": images[1:], "duration": (10 * np.diff(times)).tolist(), "loop": 0}
     with atomic_write(path) as temporary:
@@ -222,7 +224,8 @@ def _figure(motion: Figure, body: FittedBody | None, frame: int, size: int) -> I
     for parent, joint in motion.skeleton.edges:
         _capsule(ImageDraw.Draw(dark), soft[parent], soft[joint], 0.055, 255)
     dark = dark.filter(ImageFilter.BoxBlur(size / 192))
-    # The part is enlarged with a margin, so that it has the same edge as if the whole image were enlarged.
+    # The part is enlarged with a margin, so that it has the same edge as if the whole image were
+    # enlarged.
     if box := dark.getbbox():
         left, top, right, bottom = max(0, box[0] - 4), max(0, box[1] - 4), box[2] + 4, box[3] + 4
         dark = dark.crop((left, top, right, bottom)).resize(
@@ -288,7 +291,8 @@ def _rasterize(
     high = np.clip(np.floor(np.maximum(np.maximum(a, b), c) + 0.5), 0, [width, height]).T
     wide, tall = np.maximum(high - low, 0).astype(int)
     count = np.where(seen, wide * tall, 0)
-    # shares of the second and third corner at a pixel: linear functions of its column and row in the bounding box
+    # shares of the second and third corner at a pixel: linear functions of its column and row in
+    # the bounding box
     twice = np.where(seen, twice, 1)
     right, down = low + 0.5 - a.T
     table = [right * cy - down * cx, cy, -cx, down * bx - right * by, -by, bx]

@@ -9,7 +9,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-# Offsets from the parent in meters, standing with hanging arms, facing +z; x for the left side, mirrored on the right.
+# Offsets from the parent in meters, standing with hanging arms, facing +z; x for the left side,
+# mirrored on the right.
 HIP, SPINE1, SPINE2, SPINE3 = (
     (0.075, -0.075, 0.0),
     (0.0, 0.131, -0.015),
@@ -123,21 +124,23 @@ class Body:
 
     def joints(self) -> np.ndarray:
         """Returns joint positions (F, 22, 3) in meters, y up."""
-        # Footprints are fixed first, so that feet never slide. The pelvis is placed above them, the legs reach
-        # from the hips to the feet by inverse kinematics, and spine, head and arms follow from angles.
+        # Footprints are fixed first, so that feet never slide. The pelvis is placed above them,
+        # the legs reach from the hips to the feet by inverse kinematics, and spine, head and arms
+        # follow from angles.
         out = np.empty((len(self.t), 22, 3))
         yaw, (pitch, twist, roll) = self.heading, self.pelvis
         pelvis = rotation(1, yaw) @ rotation(1, twist) @ rotation(0, pitch) @ rotation(2, -roll)
         hips = np.stack([pelvis @ np.array([SIGN[side] * HIP[0], *HIP[1:]]) for side in (0, 1)])
 
-        # A raised heel rotates about the toes, and raised toes about the ankle, so that the part on the floor
-        # does not move.
+        # A raised heel rotates about the toes, and raised toes about the ankle, so that the part
+        # on the floor does not move.
         foot = rotation(1, self.foot_yaw) @ rotation(0, self.foot_pitch)
         toe_offset = foot @ np.array(FOOT)
         heel_up = (self.foot_pitch > 0)[..., None]
         ankles = self.ankles + heel_up * (rotation(1, self.foot_yaw) @ np.array(FOOT) - toe_offset)
 
-        # The pelvis sinks if a leg would not reach its footprint. This produces the bobbing of a walk.
+        # The pelvis sinks if a leg would not reach its footprint. This produces the bobbing of a
+        # walk.
         reach = 0.998 * (THIGH + SHIN)
         out[:, 0] = self.position
         apart = np.sum((ankles - hips - self.position)[..., [0, 2]] ** 2, -1)
@@ -203,8 +206,8 @@ def bent(
     start: np.ndarray, end: np.ndarray, upper: float, lower: float, toward: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns the middle and the end (F, 3) of a limb of two bones that bends `toward` (F, 3) and reaches for `end`."""
-    # Both bones are sides of a triangle over the line from start to end. A limb is never quite straight nor
-    # folded, so that its direction of bending is defined.
+    # Both bones are sides of a triangle over the line from start to end. A limb is never quite
+    # straight nor folded, so that its direction of bending is defined.
     line = end - start
     length = np.linalg.norm(line, axis=-1, keepdims=True)
     line /= length

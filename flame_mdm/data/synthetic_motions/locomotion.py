@@ -25,7 +25,8 @@ class Gait:
     """Parameters of steps, in seconds, meters and radians."""
 
     step: float  # time from one footprint to the next, about
-    # Time of a foot in the air, in steps. Above 1, both feet are in the air between two steps, as in a run.
+    # Time of a foot in the air, in steps. Above 1, both feet are in the air between two steps, as
+    # in a run.
     swing: float
     lift: float  # height of the foot in mid-swing
     heel_off: float  # angle of the heel when the foot leaves the floor
@@ -43,8 +44,9 @@ def walk_along(
 
     Returns (F,) how far the right foot is in front of the left one, in meters, relative to the heading of the pelvis.
     """
-    # The pelvis accelerates, keeps its speed and stops. Each footprint is where the pelvis will be in the
-    # middle of the foot's next stance, aside by the width of the gait: feet are under the body on average.
+    # The pelvis accelerates, keeps its speed and stops. Each footprint is where the pelvis will
+    # be in the middle of the foot's next stance, aside by the width of the gait: feet are under
+    # the body on average.
     t, start = body.t, rng.uniform(0.08, 0.18)
     seconds = t[-1] - rng.uniform(0.06, 0.16) - start  # until the last foot is down
     # A run ends with the steps of a walk, whose feet never leave the ground together.
@@ -84,8 +86,8 @@ def walk_along(
         goal = np.array(
             [px + across * cos + along * sin, pz - across * sin + along * cos, yaw + yaw0[side]]
         )
-        # In the air, the foot eases from print to print. Its highest point is early in the swing, when it
-        # has just been pulled up, and smaller steps are lower.
+        # In the air, the foot eases from print to print. Its highest point is early in the swing,
+        # when it has just been pulled up, and smaller steps are lower.
         s = np.clip((t - lift_off) / swing, 0, 1)
         share = ease(s, 0.08, 0.96)
         distance = np.hypot(*(goal - prints[side])[:2])

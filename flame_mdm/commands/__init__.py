@@ -105,7 +105,7 @@ class ModelSettings:
     ckpt: str = required(
         "a checkpoint, run directory, model file, shipped model (quickstart), or hub id"
     )
-    which: Which = option("last", "or best: the checkpoint of a run directory")
+    which: Which = option("last", "checkpoint of a run directory: last or best")
 
     def model_file(self) -> Path:
         """Returns the file of the model; see `flame_mdm.checkpoints.locating.find`."""
@@ -120,7 +120,7 @@ class AdaptedSettings(ModelSettings):
         None, "files of `flame-mdm adapt` for this model, separated by spaces"
     )
     adapter_strength: float | Sequence[float] = option(
-        1.0, "for all adapters, or a list; 0 = the model without them"
+        1.0, "strength of all adapters, or a list with one per adapter; 0 = the model without them"
     )
 
     def adapters(self) -> dict[str, Any]:
@@ -180,7 +180,7 @@ class BodySettings:
 
     body: str = option(
         "mannequin",
-        'or a file, or Anny with a shape, such as "anny gender=1 age=0.9": docs/formats.md',
+        'body to draw: mannequin, a file, or Anny with a shape, such as "anny gender=1 age=0.9": docs/formats.md',
         body_name,
     )
 
@@ -236,7 +236,7 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
 
     text: str | None = same_option(SamplingRequest, "texts")
     action: str | None = same_option(SamplingRequest, "actions")
-    unconditioned: bool = option(False, "true = neither text nor action")
+    unconditioned: bool = option(False, "true = motions of no text and no action")
     seed: int = same_option(SamplingRequest, "seed")
     cleanup: bool = same_option(SamplingRequest, "cleanup")
     targets: str | None = same_option(SamplingRequest, "targets", existing)
@@ -244,7 +244,7 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
         False, "draw the clean estimates along the sampling of the first motion: trajectory.png"
     )
     mp4: bool = option(False, 'also write motions.mp4; needs pip install "flame-mdm[video]"', video)
-    device: str | None = option(None, "default: cuda if available", device_name)
+    device: str | None = option(None, "cpu or cuda; default: cuda if available", device_name)
 
     def conditions(self) -> list[str]:
         """Returns the keys given that say what motions show."""

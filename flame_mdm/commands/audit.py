@@ -27,14 +27,14 @@ class AuditSettings(DataSettings):
         None, "a motion-CLIP, or as the protocol requires; none = metrics of joints", model_source
     )
     protocol: str | None = option(
-        None, "whose metrics are audited; default: synthetic or text_to_motion"
+        None, "protocol whose metrics are audited; default: synthetic or text_to_motion"
     )
     split: Literal["train", "val", "test"] = option("test", "train, val or test")
     samples: int | None = option(None, "number of motions; default: all of the split")
     resamples: int = option(100, "bootstrap resamples of motions, for the intervals")
     cards: list[str] | None = option(None, "one card (.json) to render again, or two, side by side")
-    batch_size: int = option(64, "motions at once")
-    device: str | None = option(None, "default: cpu", device_name)
+    batch_size: int = option(64, "motions per batch")
+    device: str | None = option(None, "cpu or cuda; default: cpu", device_name)
     data_root: str = option(
         "", "folder of the prepared data sets; default: FLAME_MDM_DATA, or data"
     )

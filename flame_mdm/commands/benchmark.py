@@ -33,7 +33,7 @@ class BenchmarkSettings:
     device: str | None = option(
         None, "device of the evaluations, such as cpu or cuda; default: cuda if there is one"
     )
-    batch_size: int = option(64, "motions at once")
+    batch_size: int = option(64, "motions per batch")
     data_root: str = option(
         "", "folder of the prepared data sets; default: the checkpoint's, or FLAME_MDM_DATA"
     )

@@ -30,7 +30,9 @@ class BrowseSettings(BodySettings, DataSettings):
     split: Split | None = option(None, "train, val or test; default: all")
     search: str | None = option(None, "words that must occur in the id or the captions of a clip")
     clips: int = option(
-        200, "maximum number, evenly spaced; mirrored copies come with their originals", above_zero
+        200,
+        "maximum number of clips, evenly spaced; mirrored copies come with their originals",
+        above_zero,
     )
     motions: str | None = option(None, "folder: also write the shown clips as motion files")
 

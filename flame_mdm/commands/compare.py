@@ -64,7 +64,9 @@ class CompareSettings(BodySettings):
         False, "write a rating page: motions of the first run against motions of each other run"
     )
     ratings: list[str] | None = option(None, "files saved by the rating page, to be counted")
-    out: str | None = option(None, "default runs/compare.html, runs/rate.html or runs/ratings.json")
+    out: str | None = option(
+        None, "file to write; default runs/compare.html, runs/rate.html or runs/ratings.json"
+    )
 
 
 def main(settings: CompareSettings) -> None:

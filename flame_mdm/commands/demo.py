@@ -27,11 +27,11 @@ class DemoSettings:
     host: str = option(
         "127.0.0.1", "address to listen on: this computer alone; 0.0.0.0 = all networks"
     )
-    port: int = option(7860, "0 = any free port")
+    port: int = option(7860, "port to listen on; 0 = any free port")
     hosts: list[str] = option(
         list, "names of this server, such as motion.example.org; localhost and addresses work"
     )
-    device: str | None = option(None, "default: cuda if available")
+    device: str | None = option(None, "cpu or cuda; default: cuda if available")
 
 
 def main(settings: DemoSettings) -> None:

@@ -29,9 +29,9 @@ class DistillSettings(ModelSettings):
     Trains a student of a model that predicts the clean motion or the velocity (MDM, MFM): it samples in 1, 2 or 4
     steps, with the guidance built in. Its recipe is the recipe of the model, with the keys in
     experiments/distillation/consistency.yaml, a fifth of the training steps and a tenth of the learning rate. Its data
-    are in FLAME_MDM_DATA, or where the model's were. trainer.max_steps=1000 overrides a key of the recipe. Running the
-    same command again resumes the run. --multirun seed=1,2 and launch= start sweeps and jobs, as in train. See
-    docs/few-steps.md.
+    are in FLAME_MDM_DATA, or in the folder of the model's data. trainer.max_steps=1000 overrides a key of the recipe.
+    Running the same command again resumes the run. --multirun seed=1,2 and launch= start sweeps and jobs, as in train.
+    See docs/few-steps.md.
     """
 
     OBJECTS: ClassVar = ("ckpt", "out")

@@ -19,7 +19,7 @@ class ExportSettings(AdaptedSettings):
     OBJECTS: ClassVar = ("ckpt", "out")
     out: str = required("a .safetensors file, or a folder; for format=onnx, a folder")
     format: Literal["safetensors", "onnx"] = option(
-        "safetensors", "or onnx: for onnxruntime, with a script"
+        "safetensors", "safetensors, or onnx: graphs for onnxruntime with a script that samples"
     )
     half: bool = option(False, "true = weight matrices in half precision")
 

@@ -14,14 +14,12 @@ class PrepareSettings(DataSettings):
     """usage: flame-mdm prepare data=NAME [source=PATH] [representation=NAME] [check|verify|force=true]
 
     Converts a data set, as distributed by its owners, into a packed store under data/. `check=true` only lists the
-    files that exist and those that are missing; `verify=true` checks an existing store; `force=true` rewrites it.
+    existing and the missing files; `verify=true` checks an existing store; `force=true` rewrites it.
     """
 
     OBJECTS: ClassVar = ("data",)
     source: str | None = option(None, "folder or archive, if the data set needs one")
-    check: bool = option(
-        False, "list the files that exist and those that are missing, prepare nothing"
-    )
+    check: bool = option(False, "list the existing and the missing files, prepare nothing")
     verify: bool = option(False, "check and report on an existing store, write nothing")
     force: bool = option(False, "rewrite an existing store")
 

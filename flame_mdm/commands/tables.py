@@ -40,7 +40,7 @@ class TablesSettings:
     device: str | None = option(
         None, "device of the evaluations, such as cpu or cuda; default: cuda if there is one"
     )
-    batch_size: int = option(64, "motions at once")
+    batch_size: int = option(64, "motions per batch")
     force: bool = option(
         False, "generate even if real motions miss the values that the protocol expects"
     )

@@ -160,7 +160,7 @@ class SamplingRequest:
     seconds: float | Sequence[float] | None = option(
         None,
         "length of the motion, or a list with one length per text; in a sequence, length of each part that has no "
-        "seconds of its own. Default: 3, or the longest motion in training if that is shorter",
+        "seconds in the text. Default: 3, or the longest motion in training if that is shorter",
     )
     frames: int | Sequence[int] | None = option(
         None, "length in frames, or a list of lengths, instead of seconds"
@@ -168,7 +168,7 @@ class SamplingRequest:
     samples: int = option(1, "motions per text or action")
     candidates: int = option(
         1,
-        "motions generated for each one that is kept: the best without faults, if there is one without",
+        "motions generated for each one that is kept: the best one without faults or, if all have faults, the best",
     )
     seed: int = option(0, "seed of the noise")
     after: str | Path | Motion | None = option(
@@ -177,7 +177,9 @@ class SamplingRequest:
     split: bool = option(
         True, 'sentences with several actions, "walks, then sits", become sequences, "walks | sits"'
     )
-    loop: bool = option(False, "the last frame leads to the first one")
+    loop: bool = option(
+        False, "true = the last frame leads to the first one, for motions that are repeated"
+    )
     targets: str | Path | Mapping[str, Any] | None = option(
         None, "a JSON file of way points, joint positions and poses to reach: docs/targets.md"
     )

@@ -19,6 +19,7 @@ from flame_mdm.formats.gaits import Clip, find_cycle, gait, turn
 from flame_mdm.formats.grounding import GroundedMotion, grounded, planted, repeated, slide
 from flame_mdm.formats.motion import Motion
 from flame_mdm.representations.skeleton import JOINT
+from flame_mdm.safe_io import read_yaml
 from flame_mdm.sampling import motion_sets
 from flame_mdm.sampling.motion_sets import make_set, read_set, rig_clips, write_set
 from flame_mdm.sampling.reading import with_features
@@ -292,11 +293,30 @@ def locomotion(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="session")
+def some(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of one motion of each kind of the package's set, by the package's model."""
+    folder = tmp_path_factory.mktemp("some")
+    content = read_yaml(motion_sets.SETS / "locomotion.yaml")
+    kinds = ("Idle", "Walk_Fwd", "Strafe_Left", "Turn_90_Right")
+    content["motions"] = {name: content["motions"][name] for name in kinds}
+    (folder / "some.yaml").write_text(json.dumps(content))
+    words = [f"set={folder / 'some.yaml'}", f"out={folder / 'set'}"]
+    assert main(["sample", "quickstart", *words]) == 0
+    return folder / "set"
+
+
 @pytest.mark.slow
-def test_the_locomotion_set_of_the_package_closes_its_loops_and_plants_its_feet(locomotion: Path):
+@pytest.mark.parametrize(
+    ("name", "count"), [("some", 8), pytest.param("locomotion", 20, marks=pytest.mark.robustness)]
+)
+def test_the_locomotion_set_of_the_package_closes_its_loops_and_plants_its_feet(
+    name: str, count: int, request: pytest.FixtureRequest
+):
+    locomotion: Path = request.getfixturevalue(name)
     clips = described(locomotion)
     assert json.loads((locomotion / "set.json").read_text())["left_out"] == {}
-    assert len(clips) == 20
+    assert len(clips) == count
     stand = fbx_scene.read(locomotion / clips["Idle"]["files"]["in_place"])
     for name, entry in clips.items():
         moving, still = (

@@ -347,24 +347,30 @@ def graphs(model: MotionGenerator) -> list[Graph]:
     return graphs
 
 
+def traced(graph: Graph) -> torch.export.ExportedProgram:
+    """Returns the operations of a graph's module, for inputs of any size along its named axes."""
+    dimensions = [graph.dimensions.get(name) for name in graph.examples]
+    return torch.export.export(
+        graph.module.eval(),
+        tuple(graph.examples.values()),
+        dynamic_shapes=dimensions,
+        strict=False,
+    )
+
+
 def write_graph(graph: Graph, path: Path, half: bool) -> None:
     """Writes a graph; raises `UserError` if it computes something else than PyTorch, for a batch of two or of one."""
     import onnxruntime
 
     examples = list(graph.examples.values())
-    dimensions = [graph.dimensions.get(name) for name in graph.examples]
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     raw = path.with_suffix(".raw")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            module = graph.module.eval()
-            exported = torch.export.export(
-                module, tuple(examples), dynamic_shapes=dimensions, strict=False
-            )
             names = {"input_names": list(graph.examples), "output_names": graph.outputs}
             program = torch.onnx.export(
-                exported, dynamo=True, verbose=False, optimize=False, **names
+                traced(graph), dynamo=True, verbose=False, optimize=False, **names
             )
             assert program is not None
             program.save(raw)

@@ -14,17 +14,19 @@ import pytest
 import torch
 from hypothesis import settings
 from support.distributed import GlooPool
-from support.fixtures import recipe
+from support.fixtures import bases_once, recipe
 from support.npm import node_modules as node_modules
 from support.refusals import Refused
 from support.runs import TINY
 
 from flame_mdm.__main__ import main
+from flame_mdm.config import composition
 from flame_mdm.data import parallel
 
 torch.set_num_threads(1)
 # Tests run on all cores: more processes would only import torch again
 parallel.PATIENCE = math.inf
+composition.resolve = bases_once(composition.resolve)
 settings.register_profile("repeatable", derandomize=True, deadline=None)
 settings.load_profile("repeatable")  # the same examples on every machine
 

@@ -48,7 +48,7 @@ def stoppable(signums: Sequence[int]) -> Iterator[None]:
 
 
 def raise_received() -> None:
-    """Raises the exception of a signal again that the command received, because a library may have swallowed it."""
+    """Raises the exception of a received signal again; a library may have swallowed the first one."""
     if _received is not None:
         raise _received
 

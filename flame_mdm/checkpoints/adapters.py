@@ -1,14 +1,19 @@
 """Adapters: small changes of a model's weights, learned from a few clips.
 
-A weight W (out, in) of attention or feed-forward becomes W + strength * up down, with `up` (out, rank) and `down`
-(rank, in) (Hu et al. 2021, arXiv:2106.09685); in the word table of a learned text encoder, a vector is added to a row
-of each new word. In training, `torch.nn.utils.parametrize` computes the weights, also for code that reads a weight
-without calling its layer, as cross-attention does. Training changes all layers. Of a style, only the changes of the
-second half are kept: the first half learns that the clips show few actions, and with it the model would forget which
-action is requested.
+A weight W (out, in) of attention or feed-forward becomes W + strength * up down, with `up` (out,
+rank) and
+`down` (rank, in) (Hu et al. 2021, arXiv:2106.09685). In a learned text encoder, the row of each
+  new word gets
+an additional vector. In training, `torch.nn.utils.parametrize` computes the weights. This also
+works for code that reads a weight without calling its layer, as cross-attention does.
 
-An adapter file (.safetensors) has these parts of a weight NAME as NAME.up, NAME.down and NAME.vectors, and `About` as
-JSON in its metadata.
+All layers are trained, but a style keeps only the changes in the second half of them: the first
+half would learn that the clips show few actions, and the model would no longer follow the
+requested action.
+
+An adapter file (.safetensors) has these parts of a weight NAME as NAME.up, NAME.down and
+NAME.vectors, and
+`About` as JSON in its metadata.
 """
 
 from __future__ import annotations

@@ -208,10 +208,12 @@ def make_variables() -> list[str]:
 
 
 def guarded(action: Callable[[], None], signums: Sequence[int] = ()) -> int:
-    """Runs `action` and returns the exit code; a signal of `signums` ends it after it has cleaned up.
+    """Runs `action` and returns the exit code; a signal of `signums` ends it after it has cleaned
+    up.
 
-    An error that the user can fix is one line, with FLAME_MDM_TRACEBACK=1 after the traceback, and 1 is returned. Any
-    other exception is a bug: the traceback, how to report it, and `BUG`.
+    Prints an error that the user can fix as one line and returns 1; FLAME_MDM_TRACEBACK=1 prints
+    the traceback first. Any other exception is a bug: prints the traceback and how to report it,
+    and returns `BUG`.
     """
     try:
         with stoppable(signums):

@@ -43,7 +43,15 @@ def recipes() -> list[str]:
 
 
 def compose(name: str, overrides: Sequence[str] = ()) -> Config:
-    """Composes and checks a recipe, a name in `experiments/` or a path, with overrides such as `denoiser=mdm_unet`."""
+    """Composes a recipe and checks every key against the signature of its class.
+
+    Args:
+        name: a name in `experiments/`, or the path of a .yaml file.
+        overrides: words such as `denoiser=mdm_unet` or `optimizer.lr=1e-4`.
+
+    Raises:
+        UserError: for an unknown recipe, group or key, or a value of the wrong type.
+    """
     source = find_recipe(name)
     return resolve(source, *prepare_overrides(source, overrides))
 
@@ -51,11 +59,12 @@ def compose(name: str, overrides: Sequence[str] = ()) -> Config:
 def compose_data(
     name: str, overrides: Sequence[str] = (), *, data_root: str = "data", seed: int = 0
 ) -> Config:
-    """Composes a file in experiments/data with its representation; returns the keys `data` and `representation`."""
-    source, first = (
-        ConfigSource(EXPERIMENTS, None),
-        [f"+seed={seed}", quoted(f"+data_root={data_root}")],
-    )
+    """Composes a file in experiments/data with its representation.
+
+    Returns the keys `data` and `representation`; raises the errors of `compose`.
+    """
+    source = ConfigSource(EXPERIMENTS, None)
+    first = [f"+seed={seed}", quoted(f"+data_root={data_root}")]
     config = resolve(source, *prepare_overrides(source, [f"+data={name}", *overrides], first))
     return {key: config[key] for key in ("data", "representation")}
 

@@ -188,7 +188,9 @@ def _name(node: ast.expr) -> str:
 
 
 def check_same_kinds(base: Config, config: Config, path: str = "") -> None:
-    """Raises `UserError` for values of another kind than in the recipe, for keys without a signature."""
+    """Checks keys that no signature describes: raises `UserError` if an override changes the type
+    of the recipe's value.
+    """
     for name, value in base.items():
         key = f"{path}{name}"
         if name not in config:

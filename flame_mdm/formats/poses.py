@@ -87,7 +87,7 @@ def solve(joints: Tensor, fps: float) -> Poses:
 def solve_checked(joints: Tensor, fps: float) -> tuple[Tensor, Tensor]:
     """Returns offsets (22, 3) and quaternions (F, 22, 4) of `solve` in the joints' precision, without checks.
 
-    Nothing branches on numbers, and joints that are alike are solved together: it is exported as a small graph.
+    Has no data-dependent branches and solves similar joints in one batch, so that its ONNX graph is small.
     """
     bones = SMPL22.bones(joints)
     lengths = torch.linalg.vector_norm(bones, dim=-1).mean(0)

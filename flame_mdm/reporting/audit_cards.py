@@ -241,29 +241,37 @@ def _facts(card: AuditCard) -> list[list[str]]:
 
 def findings(card: AuditCard) -> list[str]:
     """Returns what metrics do not see, or rate better than real motions, in plain sentences."""
-    table = {(p.name, m): seen(card, p, m) for p in card.perturbations for m in card.metrics}
-    noticed = {pair for pair, response in table.items() if response and response.grade is not None}
-    group = {p.name: p.group for p in card.perturbations}
-    wrong = [name for name in group if group[name] in ("joints", "meaning") and ":" not in name]
-    expected = [name for name in group if name in wrong or name == "memorized"]
-    blind = [
-        name for name in expected if not any((name, metric) in noticed for metric in card.metrics)
-    ]
-    lines = [f"No metric sees: {', '.join(blind)}."] if blind else []
-    single = {
-        m: [n for n in wrong if [x for x in card.metrics if (n, x) in noticed] == [m]]
-        for m in card.metrics
+    table = {
+        (perturbation.name, metric): seen(card, perturbation, metric)
+        for perturbation in card.perturbations
+        for metric in card.metrics
     }
-    lines += [
-        f"Only {metric} sees: {', '.join(names)}." for metric, names in single.items() if names
-    ]
+    group = {perturbation.name: perturbation.group for perturbation in card.perturbations}
+
+    # A perturbation is seen by the metrics that respond to one of its grades. Metrics are
+    # expected to see perturbations that make motions or their meaning wrong; a name with a colon
+    # is a variant of one.
+    seen_by: dict[str, list[str]] = {name: [] for name in group}
+    for (name, metric), response in table.items():
+        if response and response.grade is not None:
+            seen_by[name].append(metric)
+    wrong = [name for name in group if group[name] in ("joints", "meaning") and ":" not in name]
+    blind = [name for name in group if name in (*wrong, "memorized") and not seen_by[name]]
+    lines = [f"No metric sees: {', '.join(blind)}."] if blind else []
+
     for metric in card.metrics:
-        unseen = [n for n in wrong if (n, metric) not in noticed and n not in blind]
-        unseen = [n for n in unseen if group[n] == "joints" or _facts_of(card, metric).sees_meaning]
-        if unseen and _facts_of(card, metric).sums_up:
+        alone = [name for name in wrong if seen_by[name] == [metric]]
+        if alone:
+            lines.append(f"Only {metric} sees: {', '.join(alone)}.")
+    for metric in card.metrics:
+        facts = _facts_of(card, metric)
+        unseen = [name for name in wrong if metric not in seen_by[name] and name not in blind]
+        if not facts.sees_meaning:
+            unseen = [name for name in unseen if group[name] == "joints"]
+        if unseen and facts.sums_up:
             lines.append(f"{metric} does not see: {', '.join(unseen)}.")
     for metric in card.metrics:
-        liked = [n for n in wrong if (response := table[n, metric]) and response.rewarded]
+        liked = [name for name in wrong if (response := table[name, metric]) and response.rewarded]
         if liked:
             lines.append(f"{metric} rates better than real motions: {', '.join(liked)}.")
     biased = [metric for metric in card.metrics if _facts_of(card, metric).depends_on_count]

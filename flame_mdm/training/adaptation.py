@@ -188,6 +188,9 @@ def _about(
 def _recipe(
     model: MotionGenerator, captions: Sequence[str], name: str, out: Path, overrides: Sequence[str]
 ) -> Config:
+    """Returns the recipe of an adaptation; raises `UserError` for overrides of what the base
+    determines.
+    """
     if fixed := [word for word in overrides if word.partition(".")[0] in OF_BASE]:
         raise UserError(
             f"{fixed[0]}: an adaptation keeps the {fixed[0].partition('.')[0]} of its base. Drop it"
@@ -197,16 +200,18 @@ def _recipe(
     config |= {part: model.config[part] for part in OF_BASE if part in model.config}
     if config["task"]["_target_"] in GENERATORS:  # not a class of the user's
         config["task"] = config["task"] | {"_target_": TASK}
-    config["experiment"], config["run"]["name"], config["data"]["name"] = (
-        f"adapt/{name}",
-        name,
-        name,
-    )
+    config["experiment"] = f"adapt/{name}"
+    config["run"]["name"] = config["data"]["name"] = name
+
+    # Crop, kind of motion and learning rate are the base's. A released model has no data, so that
+    # its crops are as long as its longest motion, in units of 4 frames.
     data, longest = model.config.get("data") or {}, model.facts["max_frames"] // 4 * 4
     config["data"]["crop"] = data.get("crop") or config["data"]["crop"] | {"max_frames": longest}
     if not any(word.startswith("optimizer.lr=") for word in overrides):
         config["optimizer"]["lr"] = (model.config.get("optimizer") or config["optimizer"])["lr"]
     config["data"]["source"]["motion"] = (data.get("source") or {}).get("motion", "joints")
+
+    # Samples show three captions of the lesson, and three of the base in the new style.
     few = captions[:: ceil_div(len(captions), 3)]
     texts = [*few, *list(model.facts.get("captions", ()))[:3]]
     config["callbacks"]["samples"]["prompts"] = [styled(text, name) for text in texts]
@@ -214,6 +219,11 @@ def _recipe(
 
 
 def _prior(model: MotionGenerator, root: Path, out: Path, captions: Sequence[str]) -> Path:
+    """Returns the folder of the store of what the base knows.
+
+    It is the store of the base's training data if that is in `root`, otherwise a store of samples
+    in `out`.
+    """
     representation = model.representation
     folder = root / f"{(model.config.get('data') or {}).get('name')}-{representation.name}"
     if (folder / "store.json").exists() and Store(folder).fingerprint == model.facts.get(

@@ -1,4 +1,4 @@
-"""Instantiation of configurations, checks of those from untrusted files, reading and writing of configuration files."""
+"""Instantiation of configurations, checks of untrusted ones, reading and writing of configuration files."""
 
 import ast
 import copy

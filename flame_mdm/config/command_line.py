@@ -61,7 +61,11 @@ def checked_settings(kind: type[Settings], words: Sequence[str]) -> Settings:
 
 
 def read_settings(kind: type[Settings], words: Sequence[str]) -> Settings:
-    """Returns settings: texts are literal, lists of texts are split as in a shell, others have Hydra's grammar."""
+    """Returns settings.
+
+    Texts are taken literally, lists of texts are split as in a shell, and other values have
+    Hydra's grammar.
+    """
     annotations = _annotations(kind)
     values: dict[str, Any] = {}
     composed: list[str] = []

@@ -201,7 +201,11 @@ def _check_groups(overrides: Sequence[Override], recipe: ConfigSource) -> None:
 
 
 def resolve(source: ConfigSource, overrides: list[str], base: Config | None = None) -> Config:
-    """Composes a configuration with prepared overrides; checks it if `base` is given, whose types values must have."""
+    """Composes a configuration with prepared overrides.
+
+    If `base` is given, checks the configuration: values must have the types of the values in
+    `base`.
+    """
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(version_base="1.3", config_dir=str(source.folder)):

@@ -276,7 +276,9 @@ def find_layout(names: Sequence[str], fields: Mapping[str, Any]) -> Layout:
 
 
 def _one(name: str, candidates: Sequence[str]) -> str:
-    """Returns the joint of a file that is meant by a name: among different ones, the one with exactly this name."""
+    """Returns the joint of a file that a name means; if there are several, the joint with exactly
+    this name.
+    """
     if len(set(candidates)) == 1 or name in candidates:
         return name if name in candidates else candidates[0]
     listed = " or ".join(dict.fromkeys(candidates))[:500]

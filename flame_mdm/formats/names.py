@@ -69,13 +69,15 @@ def spelled(pairs: Mapping[str, str]) -> dict[str, str]:
 
 
 def best_match(names: Sequence[str], skeletons: Mapping[str, Mapping[str, str]]) -> Match:
-    """Returns the skeleton that names of joints fit best: without missing joints, then with the most.
+    """Returns the skeleton that names of joints fit best.
 
-    Among equals, the first skeleton counts. Prefixes that fit equally well make the match ambiguous.
+    Skeletons without missing joints come first, then the skeleton with the most joints; among
+    equals, the first one counts. Prefixes that fit equally well make the match ambiguous.
 
     Args:
-        names: of the joints of a file, at least one.
-        skeletons: for each key, spelling of a joint -> name in the skeleton; the first spelling is preferred.
+        names: names of the joints of a file, at least one.
+        skeletons: for each key, spelling of a joint -> name in the skeleton; the first spelling
+            is preferred.
     """
     best: list[Match] = []
     score = (False, -1)

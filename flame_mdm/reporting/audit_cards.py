@@ -101,9 +101,10 @@ class CitedCard:
     data: Data
 
     def strength(self, data: Data) -> tuple[bool, bool, bool, int]:
-        """Returns how well the card fits evaluated data: the same limits of length, the test split, the same data, N.
+        """Returns how well the card fits evaluated data, as a tuple to compare cards by.
 
-        Cards are compared in this order.
+        Cards with the same limits of length come first, then cards of the test split, of the same
+        data, and of more motions.
         """
         same_frames = self.data.frames == data.frames
         return (

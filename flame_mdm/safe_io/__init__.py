@@ -1,4 +1,4 @@
-"""Atomic writes, hashes, locks, and reading files of others.
+"""Atomic writes, hashes, locks, and reading files from other people.
 
 Every file that may come from other people is read or checked here first: it must be a regular file of limited size,
 and the sizes that it declares must match its bytes. Functions that read a path raise `FileNotFoundError` if it does not
@@ -428,10 +428,12 @@ def _check_array(file: IO[bytes], size: int, name: str) -> int:
 
 @contextmanager
 def opened_zip(file: IO[bytes]) -> Iterator[zipfile.ZipFile]:
-    """Opens a zip archive for reading; raises `UserError` if it has more than `MAX_MEMBERS` members.
+    """Opens a zip archive for reading; raises `UserError` if it has more than `MAX_MEMBERS`
+    members.
 
-    `zipfile` reads the directory of the archive at once, and makes an object for each entry, whatever the archive says
-    about their number. Therefore the directory is limited in bytes, too.
+    `zipfile` reads the directory of the archive at once and makes an object for each entry, even
+      if the archive
+    states a smaller number. Therefore the directory is limited in bytes, too.
     """
     directory = _DirectoryReader(file)
     with zipfile.ZipFile(cast(IO[bytes], directory)) as archive:
@@ -464,7 +466,10 @@ class _DirectoryReader:
 
 
 def check_member(member: zipfile.ZipInfo) -> None:
-    """Refuses members of a zip archive other than deflated ones, of which alone `zipfile` limits the unpacked bytes."""
+    """Refuses members of a zip archive that are not deflated.
+
+    `zipfile` limits the unpacked bytes of deflated members only.
+    """
     if member.flag_bits & 1 or member.compress_type not in (
         zipfile.ZIP_STORED,
         zipfile.ZIP_DEFLATED,

@@ -167,7 +167,7 @@ def resolve_edit(
 def sample_edit(
     model: MotionGenerator, edit: ResolvedEdit, *, stages: list[Motion] | None = None
 ) -> list[Edited]:
-    """Samples the motions of a resolved edit, and measures how well each kept what it was to keep."""
+    """Samples the motions of a resolved edit, and measures how well each one kept the part to keep."""
     representation, original, request = model.representation, edit.original, edit.resolved.request
     keep, kept_joints = edit.keep.numpy(), edit.kept_joints.numpy()
     # Normalization rounds, so kept values are compared with the input of the sampler.

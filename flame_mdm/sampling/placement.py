@@ -56,7 +56,7 @@ def step_after(representation: Representation, last: Tensor, world: Tensor) -> P
     """Returns the place of the frame after frames with features `last` (B, D) and joints `world` (B, J, 3).
 
     A frame holds the turn and the step of the root to the next frame, so that this place does not depend on what the
-    next frame is. Motions are decoded from their first frame on, which then is where this place says.
+    next frame is. Decoding starts from the first frame, which is at this place.
     """
     joints = representation.decode(torch.stack([last, last], 1))
     here = Placement.fit(joints[:, 0], world)

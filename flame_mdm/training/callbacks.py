@@ -110,7 +110,7 @@ class Checkpoints(Checkpoint):
 class Measurements(Callback):
     """Logs gradient norm, learning rate and speed every `trainer.log_every_n_steps`, without slowing other steps.
 
-    The norm of all gradients is that before clipping, and seconds per step are without validation. Adds
+    The norm of all gradients is measured before clipping. Seconds per step leave out validation. Adds
     `facts.training` to checkpoints: `hours` of training so far, including validation; `processes`, their number;
     `device`, `speed` and `precision`; and `memory_gib`, the peak memory of tensors on CUDA, otherwise of the first
     process.

@@ -119,7 +119,7 @@ def newest(folder: Path) -> Resumed | None:
 
 
 def check_optimizers(resumed: Resumed, optimizer: torch.optim.Optimizer) -> None:
-    """Raises `UserError` if the saved state of the optimizer and its schedule does not fit the one of the recipe.
+    """Raises `UserError` if the saved state of the optimizer and its schedule does not fit the recipe.
 
     PyTorch takes over any values, and would fail in the first step of the training.
     """

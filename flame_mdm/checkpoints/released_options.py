@@ -106,7 +106,7 @@ def check_hyperparameters(checkpoint: Mapping[str, Any], kind: str) -> None:
 
 
 def _check_known(options: Mapping[Any, Any], read: Any, table: Config, prefix: str = "") -> None:
-    """Raises `ValueError` for an option that is not read and not in the table, or has an effect that our model lacks."""
+    """Raises `ValueError` for an unknown option, or one with an effect that our model lacks."""
     for name, value in options.items():
         shown = f"{prefix}{shortened(str(name), 40)}={shortened(str(value), 40)}"
         if name in table["neutral"]:

@@ -1,8 +1,8 @@
 """The training step of the authors' code, GuyTevet/motion-diffusion-model, from a clone of it.
 
-The authors' network, diffusion, optimizer and loss logging are used as they are. CLIP is replaced by a stub that
-returns zeros, as in the framework's step, and the body model is left out, because a step on HumanML3D does not use
-it.
+The authors' network, diffusion, optimizer and loss logging are used as they are. CLIP is replaced
+by a stub that returns zeros, as in the framework's step, and the body model is left out, because
+a step on HumanML3D does not use it.
 """
 
 import sys

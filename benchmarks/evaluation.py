@@ -1,9 +1,10 @@
 """Time of an evaluation of the size of HumanML3D, without networks: `python benchmarks/evaluation.py`.
 
-A protocol measures random motions with the lengths of HumanML3D (40 to 196 frames at 20 fps, 22 joints). The
-extractor returns numbers of the motion and random text features, 512 each, and the source returns other windows of
-the same clips. What is left is the cost of the evaluation itself: reading and decoding motions, and metrics. FID
-alone is compared to torchmetrics' implementation on the same features.
+A protocol measures random motions with the lengths of HumanML3D
+(40 to 196 frames at 20 fps, 22 joints). The extractor returns numbers of the motion and random
+text features, 512 each, and the source returns other windows of the same clips. What is left is
+the cost of the evaluation itself: reading and decoding motions, and metrics. FID alone is
+compared to torchmetrics' implementation on the same features.
 """
 
 from collections.abc import Sequence

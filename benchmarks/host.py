@@ -1,10 +1,10 @@
 """Cost of the framework per training step, compared to bare Lightning: `python benchmarks/host.py`.
 
-A transformer of one layer and width 16 without a text encoder is trained, so that most of the time is spent outside
-of the network. Bare Lightning trains the same network with the same loss, optimizer and batches, without averaged
-weights, logger and checkpoints. All run on one thread and alternate. Times are times of the thread, which exclude
-other programs on the machine, between the ends of two steps. The parts of the framework's step are timed one by
-one, without Lightning.
+A transformer of one layer and width 16 without a text encoder is trained, so that most of the
+time is spent outside of the network. Bare Lightning trains the same network with the same loss,
+optimizer and batches, without averaged weights, logger and checkpoints. All run on one thread and
+alternate. Times are times of the thread, which exclude other programs on the machine, between the
+ends of two steps. The parts of the framework's step are timed one by one, without Lightning.
 """
 
 import itertools

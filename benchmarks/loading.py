@@ -1,9 +1,10 @@
 """Speed of both ways to load batches compared to a training step: `python benchmarks/loading.py`.
 
-A synthetic data set is packed into a temporary folder. Batches gathered from memory (data.resident=true), batches
-of the data loader in the training process, and forward pass, backward pass and update of the small MDM encoder
-alternate; they are measured in processor time of one core, which excludes other programs on the machine. Loading
-with workers is measured in wall time, which includes passing batches between processes and the load of the machine.
+A synthetic data set is packed into a temporary folder. Batches gathered from memory
+(data.resident=true), batches of the data loader in the training process, and forward pass,
+backward pass and update of the small MDM encoder alternate; they are measured in processor time
+of one core, which excludes other programs on the machine. Loading with workers is measured in
+wall time, which includes passing batches between processes and the load of the machine.
 """
 
 import itertools

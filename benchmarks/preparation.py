@@ -1,9 +1,10 @@
 """Speed and memory of `make prepare` at several sizes: `python benchmarks/preparation.py`.
 
-For each size, a fresh process prepares synthetic clips of about 51 frames in a temporary folder (1.1 KB of disk per
-frame), with one worker per core. Gives the processor time of all processes together, the maximum resident memory of
-the process and of its largest worker, of each the part that is not shared with other processes (sampled), and by
-how many bytes the process grows per frame.
+For each size, a fresh process prepares synthetic clips of about 51 frames in a temporary folder
+(1.1 KB of disk per frame), with one worker per core. Gives the processor time of all processes
+together, the maximum resident memory of the process and of its largest worker, of each the part
+that is not shared with other processes (sampled), and by how many bytes the process grows per
+frame.
 """
 
 import json

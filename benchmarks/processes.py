@@ -1,9 +1,9 @@
 """Scaling of DDP: seconds per step of two gloo processes and of one, `python benchmarks/processes.py`.
 
-Both train on the same batches of 16 clips, one process with all 16 and two processes with 8 each, one thread per
-process. With one core per process, the ideal ratio is 0.5; two processes on one core cannot be below 1. The
-overhead is reducing the gradients and waiting for the slower process. Times are between steps, so they do not
-include imports.
+Both train on the same batches of 16 clips, one process with all 16 and two processes with 8 each,
+one thread per process. With one core per process, the ideal ratio is 0.5; two processes on one
+core cannot be below 1. The overhead is reducing the gradients and waiting for the slower process.
+Times are between steps, so they do not include imports.
 """
 
 import json

@@ -1,8 +1,9 @@
 """Quality of models trained in both speeds: `make bench ONLY=quality RUNS=FOLDER`.
 
-Trains nothing: reads the runs in a folder, each trained by `make train ... speed=...` and evaluated by `make evaluate`,
-with two or more seeds per data set and speed. Gives the mean over the seeds and its 95 % interval by Student's t. The
-differences are between runs with the same seed, which begin with the same weights and see the same batches.
+Trains nothing: reads the runs in a folder, each trained by `make train ... speed=...` and
+evaluated by `make evaluate`, with two or more seeds per data set and speed. Gives the mean over
+the seeds and its 95 % interval by Student's t. The differences are between runs with the same
+seed, which begin with the same weights and see the same batches.
 """
 
 import statistics

@@ -1,8 +1,9 @@
 """Measures the speed of the framework and writes docs/benchmarks/speed.md: `make bench [ONLY=a,b] [DEVICE=cuda]`.
 
-Each script is run in its own process, one after another. With ONLY, the other sections keep their figures. DEVICE=cuda
-measures the sections that use a GPU, which are added to the page. MDM_REPO=PATH, a clone of the authors' code, adds
-the authors' training step. ONLY=quality RUNS=FOLDER compares the quality of trained runs.
+Each script is run in its own process, one after another. With ONLY, the other sections keep their
+figures. DEVICE=cuda measures the sections that use a GPU, which are added to the page.
+MDM_REPO=PATH, a clone of the authors' code, adds the authors' training step. ONLY=quality
+RUNS=FOLDER compares the quality of trained runs.
 """
 
 import datetime

@@ -1,8 +1,9 @@
 """Cost of sampling: `python benchmarks/sampling.py`.
 
-Three tables: latency at batch 1 and throughput at batch 64 of MDM's encoder, for 1, 2 and 4 steps of a distilled
-model, which has no guidance, and for 10, 50 and 1000 steps; the samplers with that encoder, which alternate; and
-milliseconds per network call that the sampling loop itself takes, with a denoiser that returns a stored tensor.
+Three tables: latency at batch 1 and throughput at batch 64 of MDM's encoder, for 1, 2 and 4 steps
+of a distilled model, which has no guidance, and for 10, 50 and 1000 steps; the samplers with that
+encoder, which alternate; and milliseconds per network call that the sampling loop itself takes,
+with a denoiser that returns a stored tensor.
 """
 
 from collections.abc import Callable

@@ -97,7 +97,8 @@ def take_turns(
 ) -> dict[str, float]:
     """Returns the median seconds of each function.
 
-    The functions alternate, so that a busy machine slows all of them. A first round, which warms up, is not counted.
+    The functions alternate, so that a busy machine slows all of them. A first round, which warms
+    up, is not counted.
 
     Args:
         runs: the functions, by name.

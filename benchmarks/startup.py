@@ -1,8 +1,8 @@
 """Startup time of commands: `python benchmarks/startup.py`.
 
-`--help` and a misspelled key answer without importing torch. The work itself is minimal (one training step, one
-motion, one replication of eight motions), so that mainly imports and preparation are measured. Ratios are relative
-to `python -c "import torch"`, to compare machines.
+`--help` and a misspelled key answer without importing torch. The work itself is minimal (one
+training step, one motion, one replication of eight motions), so that mainly imports and
+preparation are measured. Ratios are relative to `python -c "import torch"`, to compare machines.
 """
 
 import itertools

@@ -1,9 +1,10 @@
 """Training steps in both speeds, compared to the authors' step and to plain PyTorch: `python benchmarks/steps.py`.
 
-The full-size step is a step of humanml3d/mdm with lengths as in HumanML3D. The authors' step, from a clone of their
-code, and a plain PyTorch loop, which trains `nn.TransformerEncoder` of the same size, take the same clips, padded
-to 196 frames as in the published codes. Then follow a step of every network in its size for CPU runs, and on the
-CPU the quickstart by the complete framework. All take turns in one run.
+The full-size step is a step of humanml3d/mdm with lengths as in HumanML3D. The authors' step,
+from a clone of their code, and a plain PyTorch loop, which trains `nn.TransformerEncoder` of the
+same size, take the same clips, padded to 196 frames as in the published codes. Then follow a step
+of every network in its size for CPU runs, and on the CPU the quickstart by the complete
+framework. All take turns in one run.
 """
 
 import statistics

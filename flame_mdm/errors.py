@@ -71,7 +71,8 @@ def show_as(path: str, name: str) -> None:
 def say(*lines: object, error: bool = False) -> None:
     """Prints each argument as one `printable` line, because any name or text may come from an untrusted file.
 
-    If the reader of the output has ended, as `head` does, further lines are dropped, and the command finishes its work.
+    If the reader of the output has ended, as `head` does, further lines are dropped, and the
+    command finishes its work.
     """
     stream = sys.stderr if error else sys.stdout
     for line in lines:

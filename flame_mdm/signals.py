@@ -56,7 +56,8 @@ def raise_received() -> None:
 class StopRequest:
     """Notes a signal, `signum`, that asks training to stop at the end of a step; 0 = none.
 
-    A second SIGINT stops immediately. So does a second SIGTERM more than one second later: `timeout` sends two at once.
+    A second SIGINT stops immediately. So does a second SIGTERM more than one second later:
+    `timeout` sends two at once.
     """
 
     SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)

@@ -19,8 +19,9 @@ SHIPPED = {
 def find(source: str | Path, which: Which = "last") -> Path:
     """Returns the file of a model; raises `FileNotFoundError` or `UserError` if there is none.
 
-    `source` is a file; a run directory, of which `which` names the checkpoint; a folder with one .safetensors file; the
-    name of a model in this package; or "user/name[@revision]" on the Hugging Face hub. An existing path comes first.
+    `source` is a file; a run directory, of which `which` names the checkpoint; a folder with one
+    .safetensors file; the name of a model in this package; or "user/name[@revision]" on the
+    Hugging Face hub. An existing path comes first.
     """
     path = Path(source)
     if path.is_dir():

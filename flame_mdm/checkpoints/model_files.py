@@ -1,8 +1,8 @@
 """File formats of models: checkpoints (.ckpt) of training, and model files (.safetensors).
 
-A model file holds the (averaged) weights, including the statistics of the features. Its metadata has a key `flame_mdm`
-with recipe, metadata of the data set and origin of the weights, as JSON, and a key `sha256` with the hash of that text
-and the weights. It contains no code.
+A model file holds the (averaged) weights, including the statistics of the features. Its metadata
+has a key `flame_mdm` with recipe, metadata of the data set and origin of the weights, as JSON,
+and a key `sha256` with the hash of that text and the weights. It contains no code.
 """
 
 from __future__ import annotations

@@ -83,7 +83,8 @@ def description(model: MotionGenerator) -> dict[str, Any]:
     """Returns the content of `model.json`, without the hashes of the graphs.
 
     Raises:
-        UserError: If a value is not within the limits of the runner, or the sampler cannot be exported.
+        UserError: If a value is not within the limits of the runner, or the sampler cannot be
+            exported.
     """
     representation, skeleton, facts = (
         model.representation,
@@ -247,8 +248,9 @@ class Graph(NamedTuple):
 class Call(nn.Module):
     """One call of a model's denoiser, with its condition encoder and guidance, without a learned variance.
 
-    Inputs are x_t (B, F, D), the time t (B,) as the denoiser gets it, lengths (B,) int64, and the condition: actions
-    (B,) int64, or rows of the word table (B, S, 2) int64 with the `counts` (B,) of each caption.
+    Inputs are x_t (B, F, D), the time t (B,) as the denoiser gets it, lengths (B,) int64, and the
+    condition: actions (B,) int64, or rows of the word table (B, S, 2) int64 with the `counts`
+    (B,) of each caption.
     """
 
     def __init__(self, model: MotionGenerator):

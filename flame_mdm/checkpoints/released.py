@@ -1,6 +1,7 @@
 """Import of the checkpoints released by the authors of MDM, MFM and FLAME.
 
-Each learned weight is used exactly once, or the import fails. Frozen text encoders and sinusoids are skipped.
+Each learned weight is used exactly once, or the import fails. Frozen text encoders and sinusoids
+are skipped.
 """
 
 from collections.abc import Mapping

@@ -24,7 +24,8 @@ def read_released(
 ) -> Mapping[str, Any]:
     """Reads a released file; with `run_code` also pickles of other objects, which runs any code in them.
 
-    Raises `UserError` if it is damaged, or holds such objects, with `advice` what to do about them.
+    Raises `UserError` if it is damaged, or holds such objects, with `advice` what to do about
+    them.
     """
     try:
         check_torch(path)
@@ -68,8 +69,9 @@ def read_weights(path: Path, key: str | None = None) -> dict[str, Tensor]:
 def released_state(checkpoint: Mapping[str, Any], *, ema: bool = True) -> dict[str, Tensor]:
     """Returns the network's state dict in the content of a released file.
 
-    That is a flat state dict (MDM, MFM), {"model", "model_avg"} (MDM trained with `--use_ema`) or FLAME's Lightning
-    checkpoint with "state_dict". `ema` takes averaged weights if the file has them, as in the authors' evaluation.
+    That is a flat state dict (MDM, MFM), {"model", "model_avg"} (MDM trained with `--use_ema`) or
+    FLAME's Lightning checkpoint with "state_dict". `ema` takes averaged weights if the file has
+    them, as in the authors' evaluation.
     """
     prefixes = ("ema_model.model.", "net.") if ema else ("net.",)
     if "model_avg" in checkpoint:

@@ -2,8 +2,8 @@
 
 python runner.py FOLDER "a person walks forward" motion.npz seconds=3 seed=0
 
-The same caption, length and seed give the same motion as `flame_mdm.generate`, which also understands other
-sentences than captions of the training data.
+The same caption, length and seed give the same motion as `flame_mdm.generate`, which also
+understands other sentences than captions of the training data.
 """
 
 from __future__ import annotations
@@ -109,8 +109,8 @@ TYPES: dict[str, type | tuple[type, ...]] = {
 def faults(value: Any, schema: Mapping[str, Any], name: str = "") -> list[str]:
     """Returns the dotted names of values that a JSON schema refuses; items have the name of their list.
 
-    The schema has types, bounds of numbers and of numbers of items, patterns of whole texts, and required keys. Objects
-    may have keys that are not in the schema.
+    The schema has types, bounds of numbers and of numbers of items, patterns of whole texts, and
+    required keys. Objects may have keys that are not in the schema.
     """
     kind = schema["type"]
     if not _has_type(value, kind):
@@ -242,8 +242,8 @@ class Sampler:
     ) -> np.ndarray:
         """Returns normalized features (F, D) of one motion, for a text or an action; "" for an unconditional model.
 
-        `sample` numbers the motions of one text; `seconds` is by default up to 3. Raises `ValueError` for an unknown
-        length or action, and if the result is not finite.
+        `sample` numbers the motions of one text; `seconds` is by default up to 3. Raises
+        `ValueError` for an unknown length or action, and if the result is not finite.
         """
         content = self.content
         longest, fps = content["max_frames"], content["fps"]
@@ -400,8 +400,8 @@ def normal(number: int, frames: int, features: int) -> np.ndarray:
 def write(path: str | Path, **arrays: Any) -> None:
     """Writes an .npz file under a temporary name that is renamed at the end; a failure leaves no files behind.
 
-    A link at `path` is replaced, and the file it leads to stays as it is. Raises `ValueError` if `path` is a folder, a
-    pipe or a device, and `OSError` if the file cannot be written.
+    A link at `path` is replaced, and the file it leads to stays as it is. Raises `ValueError` if
+    `path` is a folder, a pipe or a device, and `OSError` if the file cannot be written.
     """
     path = Path(path)
     if path.suffix != ".npz":

@@ -50,9 +50,10 @@ def check_torch(path: Path) -> None:
 def check_keys(path: Path) -> None:
     """Raises `UserError` if keys of a file that `torch.load(weights_only=True)` would read may share one hash.
 
-    A dictionary of such keys takes quadratic time: hours for a file of a megabyte. Text has random hashes, and small
-    whole numbers have different ones. The check ends without an error where the pickle names an object that PyTorch
-    refuses, because PyTorch stops there, too, and says which.
+    A dictionary of such keys takes quadratic time: hours for a file of a megabyte. Text has
+    random hashes, and small whole numbers have different ones. The check ends without an error
+    where the pickle names an object that PyTorch refuses, because PyTorch stops there, too, and
+    says which.
     """
     regular_file(path)
     damage = naming(path, Exception, prefix="damaged, or not a file of plain values and tensors: ")

@@ -1,6 +1,7 @@
 """Configuration: command lines, recipes composed by Hydra, checks against signatures, instantiation.
 
-Nothing here imports torch or Lightning, so that `--help` and errors about misspelled keys are immediate.
+Nothing here imports torch or Lightning, so that `--help` and errors about misspelled keys are
+immediate.
 """
 
 from flame_mdm.config.building import (

@@ -198,7 +198,8 @@ def _help(kind: type[Any]) -> list[str]:
 def make_variables() -> list[str]:
     """Returns the variables given to make, as words: `EXP` names the recipe, other upper-case names are keys.
 
-    Make passes them in MAKEFLAGS after ` -- `, latest first, with escaped spaces and doubled dollar signs.
+    Make passes them in MAKEFLAGS after ` -- `, latest first, with escaped spaces and doubled
+    dollar signs.
     """
     variables = (" " + os.environ.get("MAKEFLAGS", "")).partition(" -- ")[2]
     words = [

@@ -29,9 +29,9 @@ FOLDER = Path("runs") / "sweeps"
 def run_jobs(command: Callable[[Settings], None], kind: type[Settings], argv: Sequence[str]) -> int:
     """Runs a command line `[OBJECT [OUT]] key=value ... [--multirun]` and returns the exit code.
 
-    With `--multirun`, values separated by commas are a sweep: one job per combination, one after the other.
-    `launch=...` passes the jobs of a sweep, or the only job, to that launcher, and waits for them. The values of keys
-    that take any text, such as paths, are never split.
+    With `--multirun`, values separated by commas are a sweep: one job per combination, one after
+    the other. `launch=...` passes the jobs of a sweep, or the only job, to that launcher, and
+    waits for them. The values of keys that take any text, such as paths, are never split.
     """
     words = make_variables() if "--from-make" in argv else list(argv)
     asks_for_help = any(word in ("-h", "--help") for word in words)

@@ -1,7 +1,7 @@
 """Checks of recipes against the signatures of the classes and functions that they name.
 
-Signatures are read from source files, so that misspelled keys are reported immediately, and naming a class in a recipe
-does not run its code.
+Signatures are read from source files, so that misspelled keys are reported immediately, and
+naming a class in a recipe does not run its code.
 """
 
 import ast

@@ -29,7 +29,8 @@ INTERRUPT = STOP[:1]
 def run_recipe(command: Callable[[Config], None], usage: str, argv: Sequence[str]) -> int:
     """Runs a command line `RECIPE key=value ... [--multirun]` and returns the exit code.
 
-    `launch=...` passes each job of a sweep, or the only job, to that launcher, and waits for them.
+    `launch=...` passes each job of a sweep, or the only job, to that launcher, and waits for
+    them.
     """
     words = make_variables() if "--from-make" in argv else list(argv)
     if not words or any(word in ("-h", "--help") for word in words):

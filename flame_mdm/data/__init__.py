@@ -129,8 +129,8 @@ class MotionSource(ABC):
     def count(self) -> int:
         """Returns the number of clips that `clips` yields, without reading motions.
 
-        Raises `FileNotFoundError`, which says how to get the raw data, if it is missing, and `UserError` if a file is
-        damaged or an option does not fit the data.
+        Raises `FileNotFoundError`, which says how to get the raw data, if it is missing, and
+        `UserError` if a file is damaged or an option does not fit the data.
         """
 
     def failure_lines(self) -> list[str]:

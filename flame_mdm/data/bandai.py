@@ -1,6 +1,7 @@
 """The Bandai-Namco-Research-Motiondataset 1 and 2: 3,077 takes of three actors, 25 contents in 19 styles.
 
-Kobayashi et al., arXiv 2306.08861, 2023; CC BY-NC 4.0. `docs/bandai.md` describes the set and how it is prepared.
+Kobayashi et al., arXiv 2306.08861, 2023; CC BY-NC 4.0. `docs/bandai.md` describes the set and how
+it is prepared.
 """
 
 import re
@@ -109,7 +110,8 @@ FILE = re.compile(r"dataset-([12])_([^_]+)_([^_]+)_(\d+)\.bvh")
 class Take(NamedTuple):
     """One BVH file.
 
-    `content` is the action that the actor performs. It differs from the file name for the takes in `WRONG_SIDE`.
+    `content` is the action that the actor performs. It differs from the file name for the takes
+    in `WRONG_SIDE`.
     """
 
     file: Path

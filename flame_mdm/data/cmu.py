@@ -1,7 +1,8 @@
 """The CMU motion capture database with the sentences of HumanML3D and KIT-ML, or with captions of one's own.
 
-Motions: http://mocap.cs.cmu.edu, free for all uses, as ASF/AMC or converted to BVH. Captions: Guo et al., CVPR 2022
-(HumanML3D), and Plappert et al., Big Data 2016 (KIT-ML). `docs/cmu.md` says what to download and what differs.
+Motions: http://mocap.cs.cmu.edu, free for all uses, as ASF/AMC or converted to BVH. Captions: Guo
+et al., CVPR 2022 (HumanML3D), and Plappert et al., Big Data 2016 (KIT-ML). `docs/cmu.md` says
+what to download and what differs.
 """
 
 import re
@@ -77,7 +78,8 @@ GET_IT = (
 class Item(NamedTuple):
     """Captions of a part of a recording, frames `start` to `end` at 20 fps, or of an entire recording.
 
-    `action` is the label of a part in `captions.csv`, which `is_own` tells from HumanML3D's and KIT-ML's.
+    `action` is the label of a part in `captions.csv`, which `is_own` tells from HumanML3D's and
+    KIT-ML's.
     """
 
     id: str
@@ -100,15 +102,17 @@ class Item(NamedTuple):
 class CMU(MotionSource):
     """Clips of HumanML3D, and recordings with captions of KIT-ML, on the 22 joints of SMPL; or captions of one's own.
 
-    HumanML3D's clips keep their names, splits and mirrored copies. Other recordings are in the test (val) split if one
-    of its test (val) clips is cut from them, and are split by subject if HumanML3D has no clip of them.
-    If there is a table `captions.csv`, its rows are the only captions. Each part of a recording in it becomes a clip.
+    HumanML3D's clips keep their names, splits and mirrored copies. Other recordings are in the
+    test (val) split if one of its test (val) clips is cut from them, and are split by subject if
+    HumanML3D has no clip of them. If there is a table `captions.csv`, its rows are the only
+    captions. Each part of a recording in it becomes a clip.
 
     Args:
-        path: folder with recordings such as 02_01.bvh, or 02_01.amc and 02.asf, in any subfolders; or an archive of it.
-        captions: clone of HumanML3D's repository, a folder with texts, splits and index, or a folder with
-            `captions.csv`; default: `path`. KIT-ML's captions of AMASS, kitml*.json, are used if they are in one of
-            the two folders.
+        path: folder with recordings such as 02_01.bvh, or 02_01.amc and 02.asf, in any
+            subfolders; or an archive of it.
+        captions: clone of HumanML3D's repository, a folder with texts, splits and index, or a
+            folder with `captions.csv`; default: `path`. KIT-ML's captions of AMASS, kitml*.json,
+            are used if they are in one of the two folders.
         motion: "joints", or "smpl" for SMPL's rotations, computed from the joints.
     """
 
@@ -440,8 +444,8 @@ def decide_rate(
 ) -> float:
     """Returns the frame rate of a recording of `frames` frames.
 
-    Durations are trusted first, KIT-ML's `seconds` and HumanML3D's `last` frame at 20 fps; then CMU's list; then the
-    `header` of the file: conversions say 120 for nearly all recordings.
+    Durations are trusted first, KIT-ML's `seconds` and HumanML3D's `last` frame at 20 fps; then
+    CMU's list; then the `header` of the file: conversions say 120 for nearly all recordings.
     """
     rates = RATES if header in (None, *RATES) else (*RATES, header)
     if fitting := [rate for rate in rates if seconds and abs(frames / rate - seconds) < SLACK]:

@@ -52,8 +52,8 @@ class Crop(ABC):
 class Units(Crop):
     """HumanML3D and KIT (Guo et al. 2022): a multiple of `unit` frames, one unit shorter in one of three draws.
 
-    A clip longer than `max_frames` gives a window of that length at a random position. Without a generator: the longest
-    window, beginning at the first frame.
+    A clip longer than `max_frames` gives a window of that length at a random position. Without a
+    generator: the longest window, beginning at the first frame.
     """
 
     min_frames: int = 40
@@ -92,7 +92,8 @@ class Whole(Crop):
 class Fixed(Crop):
     """ACTOR's action data sets: always `frames` frames; short clips repeat their last frame, long ones give a window.
 
-    As in ACTOR's code, the window never starts at the last possible frame. Without a generator: the first window.
+    As in ACTOR's code, the window never starts at the last possible frame. Without a generator:
+    the first window.
     """
 
     frames: int = 60
@@ -151,7 +152,8 @@ class Clips(Dataset[Sample]):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns first frame, number of frames and number of the caption (B,) of clips in a batch.
 
-        They are functions of (seed, batch, index); in evaluation (batch -1), they are always the same.
+        They are functions of (seed, batch, index); in evaluation (batch -1), they are always the
+        same.
         """
         rows = np.asarray(indices)
         if batch < 0:

@@ -1,7 +1,7 @@
 """Training and evaluation batches from a packed store.
 
-Every batch is a function of (seed, step, rank). No generator state needs to be saved, and a resumed run sees the same
-batches as an uninterrupted one.
+Every batch is a function of (seed, step, rank). No generator state needs to be saved, and a
+resumed run sees the same batches as an uninterrupted one.
 """
 
 import re
@@ -38,8 +38,8 @@ Loader = DataLoader[Sample] | ResidentLoader
 class TrainingBatches(Sampler[list[Draw]]):
     """An endless stream of batches. Batch n is a function of (seed, n); its clips have similar lengths.
 
-    Each pass over the data is shuffled and cut into groups of `BUCKETS` batches. Each group is sorted by length to
-    reduce padding. Process `rank` of `world` takes every `world`-th batch.
+    Each pass over the data is shuffled and cut into groups of `BUCKETS` batches. Each group is
+    sorted by length to reduce padding. Process `rank` of `world` takes every `world`-th batch.
     """
 
     BUCKETS = 16
@@ -93,10 +93,10 @@ class MotionDataModule(LightningDataModule):
         batch_size: clips per process and step.
         num_workers: number of loading processes; 0 loads in the training process.
         crop: rule for the frames of a sample and the minimum length of a clip.
-        resident: whether the data set is kept on the training device, where the same batches are gathered without
-            workers. "auto": if it takes at most a quarter of the free memory.
-        pad_multiple: batches are padded to multiples of this number of frames, so that compiled networks see few
-            shapes, at most to the longest sample of the crop rule.
+        resident: whether the data set is kept on the training device, where the same batches are
+            gathered without workers. "auto": if it takes at most a quarter of the free memory.
+        pad_multiple: batches are padded to multiples of this number of frames, so that compiled
+            networks see few shapes, at most to the longest sample of the crop rule.
     """
 
     def __init__(
@@ -173,8 +173,8 @@ class MotionDataModule(LightningDataModule):
     def open(self) -> Store:
         """Returns the prepared store and copies its statistics to the representation.
 
-        Raises `FileNotFoundError` if the data set is not prepared, and `UserError` if the store is damaged or was
-        prepared with other options.
+        Raises `FileNotFoundError` if the data set is not prepared, and `UserError` if the store
+        is damaged or was prepared with other options.
         """
         store = Store(self.folder)
         recipe = {
@@ -256,7 +256,8 @@ class MotionDataModule(LightningDataModule):
     def clips(self, split: Split) -> Clips:
         """Returns the clips of a split with their crop rule.
 
-        A data set prepared with a published split that has no test clips (HumanAct12) is tested on its training clips.
+        A data set prepared with a published split that has no test clips (HumanAct12) is tested
+        on its training clips.
         """
         if (
             split == "test"
@@ -284,8 +285,8 @@ class MotionDataModule(LightningDataModule):
     def val_dataloader(self) -> Loader:
         """Returns each validation clip once across all processes.
 
-        With fewer clips than processes, every process gets all clips: a process without a batch would skip validation
-        while the others wait for it.
+        With fewer clips than processes, every process gets all clips: a process without a batch
+        would skip validation while the others wait for it.
         """
         trainer = self.trainer
         shared = trainer is not None and len(self.val) >= trainer.world_size

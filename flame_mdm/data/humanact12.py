@@ -1,6 +1,7 @@
 """HumanAct12: 1,191 clips of 12 actions, as the SMPL poses published by ACTOR's authors.
 
-Guo et al. (Action2Motion), ACM MM 2020; poses by Petrovich et al. (ACTOR), ICCV 2021. See `docs/actions.md`.
+Guo et al. (Action2Motion), ACM MM 2020; poses by Petrovich et al. (ACTOR), ICCV 2021. See
+`docs/actions.md`.
 """
 
 from collections import Counter
@@ -32,8 +33,9 @@ BLOCK = 10
 class HumanAct12(MotionSource):
     """The clips of `humanact12poses.pkl`, as raw motions of the SMPL representations.
 
-    The file names neither subjects nor recordings. Our split (70 % train, 10 % val, 20 % test of each action) keeps
-    neighboring clips together. The published one uses all clips for training and for testing, as the papers do.
+    The file names neither subjects nor recordings. Our split (70 % train, 10 % val, 20 % test of
+    each action) keeps neighboring clips together. The published one uses all clips for training
+    and for testing, as the papers do.
     """
 
     name = "humanact12"
@@ -79,7 +81,8 @@ class HumanAct12(MotionSource):
     def _motions(self) -> list[tuple[np.ndarray, int]]:
         """Motion (F, 75) float32 and action of each clip, in the order of the file.
 
-        A motion is the position of the root joint (meters, camera axes), then 24 axis-angle vectors.
+        A motion is the position of the root joint (meters, camera axes), then 24 axis-angle
+        vectors.
         """
         path, motions = find(self.path, "humanact12poses.pkl"), []
         for number, (poses, joints, action) in enumerate(
@@ -106,8 +109,8 @@ class HumanAct12(MotionSource):
 def read_unconstrained(path: Path) -> np.ndarray:
     """Reads the reference motions of unconstrained generation (Tevet et al. 2023, section 4.3; Raab et al. 2022).
 
-    Returns (N, F, 15, 3) float32 of `humanact12_unconstrained_modi_struct.npy`, (N, 15 or more, 3, F): SMPL's joints
-    15, 12, 16, 18, 20, 17, 19, 21, 0, 1, 4, 7, 2, 5, 8.
+    Returns (N, F, 15, 3) float32 of `humanact12_unconstrained_modi_struct.npy`,
+    (N, 15 or more, 3, F): SMPL's joints 15, 12, 16, 18, 20, 17, 19, 21, 0, 1, 4, 7, 2, 5, 8.
     """
     data = read_npy(path)
     if data.dtype.kind not in "fiu" or data.ndim != 4 or data.shape[1] < 15 or data.shape[2] != 3:

@@ -1,6 +1,7 @@
 """HumanML3D: motions of AMASS and HumanAct12 with descriptions, as features and as SMPL parameters.
 
-Guo et al., "Generating Diverse and Natural 3D Human Motions From Text", CVPR 2022. See `docs/humanml3d.md`.
+Guo et al., "Generating Diverse and Natural 3D Human Motions From Text", CVPR 2022. See
+`docs/humanml3d.md`.
 """
 
 import csv

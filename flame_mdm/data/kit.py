@@ -1,6 +1,7 @@
 """KIT Motion-Language: a processed folder with 251 features, and joint positions as TEMOS reads them.
 
-Plappert, Mandery, Asfour, "The KIT Motion-Language Dataset", Big Data 2016. `docs/kit.md` says what to download.
+Plappert, Mandery, Asfour, "The KIT Motion-Language Dataset", Big Data 2016. `docs/kit.md` says
+what to download.
 """
 
 from collections.abc import Iterator, Sequence
@@ -33,9 +34,10 @@ class KIT(T2MFolder):
 class KITTemos(MotionSource):
     """Joints of the MMM model, every eighth of 100 frames per second, with TEMOS's splits and limits.
 
-    Petrovich, Black, Varol, "TEMOS", ECCV 2022, whose rules FLAME follows. Training and validation leave out motions
-    of fewer than 10 or more than 500 frames. The test split keeps all motions, but only their first caption; Ghosh et
-    al.'s test clips have the attribute `ghosh_test`. `path` contains `NUMBER_fke.csv`, `NUMBER_annotations.json` and
+    Petrovich, Black, Varol, "TEMOS", ECCV 2022, whose rules FLAME follows. Training and
+    validation leave out motions of fewer than 10 or more than 500 frames. The test split keeps
+    all motions, but only their first caption; Ghosh et al.'s test clips have the attribute
+    `ghosh_test`. `path` contains `NUMBER_fke.csv`, `NUMBER_annotations.json` and
     `NUMBER_meta.json`, `splits` TEMOS's lists of these numbers.
     """
 

@@ -175,7 +175,8 @@ class _Unpickler(pickle._Unpickler):
 def read(path: Path, opaque: tuple[str, ...] = ()) -> Any:
     """Returns the content of a pickle, protocols 0 to 5; raises `UserError` if it is damaged or names other globals.
 
-    Objects whose names begin with one of `opaque` may be there, too, and are replaced by their state.
+    Objects whose names begin with one of `opaque` may be there, too, and are replaced by their
+    state.
     """
     size = regular_file(path)
     with path.open("rb") as file:

@@ -90,7 +90,8 @@ class Contents(Schema):
 class Store:
     """A prepared data set, opened for reading.
 
-    Raises `FileNotFoundError` if `folder` contains no store, and `UserError` if its files are damaged.
+    Raises `FileNotFoundError` if `folder` contains no store, and `UserError` if its files are
+    damaged.
     """
 
     def __init__(self, folder: Path):
@@ -178,8 +179,9 @@ class Store:
 def write_store(folder: Path, source: MotionSource, representation: Representation) -> Store:
     """Encodes every clip of a data set and writes the store, under a temporary name until it is complete.
 
-    If another process is writing it, waits and opens the result. If data cannot be read, leaves no files behind.
-    Raises `UserError` if `folder` holds anything but an intact store, which is replaced if it existed before the call.
+    If another process is writing it, waits and opens the result. If data cannot be read, leaves
+    no files behind. Raises `UserError` if `folder` holds anything but an intact store, which is
+    replaced if it existed before the call.
     """
     source.suit(representation)
     total, before = source.count(), (folder / "store.json").exists()
@@ -202,7 +204,8 @@ def write_store(folder: Path, source: MotionSource, representation: Representati
 def _replaceable(folder: Path) -> list[Path]:
     """Returns the files of the store in a folder, `store.json` first; none if the folder does not exist or is empty.
 
-    Raises `UserError` if the folder is a link or holds other files but no store, or if the store is damaged.
+    Raises `UserError` if the folder is a link or holds other files but no store, or if the store
+    is damaged.
     """
     check_within(folder, folder.parent)
     if not folder.is_dir() or not any(folder.iterdir()):
@@ -270,8 +273,8 @@ def _pack(
 ) -> tuple[list[Entry], int]:
     """Writes the features and references of the data set `name` clip by clip; returns its clips and number of frames.
 
-    Consecutive clips with the same motion share its frames. Raises `UserError` if a clip exceeds its motion, has
-    the id of another clip, or is in another split than a clip of its source.
+    Consecutive clips with the same motion share its frames. Raises `UserError` if a clip exceeds
+    its motion, has the id of another clip, or is in another split than a clip of its source.
     """
     entries: dict[str, Entry] = {}
     split_of: dict[str, Split] = {}  # by source

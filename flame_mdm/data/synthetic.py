@@ -1,7 +1,8 @@
 """The synthetic data set: procedural motions with captions and exact attributes; needs no download.
 
-`docs/synthetic.md` describes the grammar of the captions and the limits of the data set. To add an action, write its
-motion in `synthetic_motions`, a line in `MORE` of `synthetic_actions`, and its captions in `synthetic_more.yaml`.
+`docs/synthetic.md` describes the grammar of the captions and the limits of the data set. To add
+an action, write its motion in `synthetic_motions`, a line in `MORE` of `synthetic_actions`, and
+its captions in `synthetic_more.yaml`.
 """
 
 import re
@@ -47,7 +48,8 @@ VERB = re.compile(r"((?:\w+ly )?)<([^>]*)>")  # with an adverb before it: "is sl
 def content() -> dict[str, Any]:
     """Returns the grammars of the two groups of actions as one.
 
-    Captions are by single keys, the forms of verbs by their infinitive; `core_verbs` are the infinitives of the core.
+    Captions are by single keys, the forms of verbs by their infinitive; `core_verbs` are the
+    infinitives of the core.
     """
     grammar = read_yaml(Path(__file__).with_name("synthetic.yaml"))
     more = read_yaml(Path(__file__).with_name("synthetic_more.yaml"))
@@ -75,7 +77,8 @@ def draw_captions(
 ) -> tuple[list[str], Attributes]:
     """Draws `count` different captions of a clip with these attributes, and returns them with those that they state.
 
-    If `incomplete`, they leave out some attributes, all of them the same ones, if the grammar has such captions.
+    If `incomplete`, they leave out some attributes, all of them the same ones, if the grammar has
+    such captions.
     """
     everything = {
         name
@@ -197,7 +200,8 @@ class Synthetic(MotionSource):
         clips: number of clips.
         seed: seed of the clips; from 0 on.
         workers: processes that generate clips; 0 = one per core.
-        actions: "core", 22 actions, or "all", which adds 54 actions, clips of two actions at once, and parts of cycles.
+        actions: "core", 22 actions, or "all", which adds 54 actions, clips of two actions at
+            once, and parts of cycles.
     """
 
     name = "synthetic"

@@ -1,7 +1,8 @@
 """The actions of the synthetic data set: their motions, their shares and the attributes of their clips.
 
-`CORE` has the actions of the data set `synthetic`. `MORE` has those that `Synthetic(actions="all")` adds, `CYCLES` and
-`BASES` with `GESTURES` its clips that begin and end in mid-action and those that show two actions at once.
+`CORE` has the actions of the data set `synthetic`. `MORE` has those that
+`Synthetic(actions="all")` adds, `CYCLES` and `BASES` with `GESTURES` its clips that begin and end
+in mid-action and those that show two actions at once.
 """
 
 from collections.abc import Callable, Mapping, Sequence

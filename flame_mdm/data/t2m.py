@@ -73,8 +73,9 @@ def parse(text: str, where: str) -> list[Description]:
 def cuts(name: str, frames: int, descriptions: Sequence[Description], shortest: int) -> list[Cut]:
     """Returns the items of a motion of `frames` frames, in the published order.
 
-    A description of a part gives a separate item, NAME@from-to, and the second of the same part NAME@from-to#2. As
-    published, a motion that is too short or too long gives none, even if parts of it would fit.
+    A description of a part gives a separate item, NAME@from-to, and the second of the same part
+    NAME@from-to#2. As published, a motion that is too short or too long gives none, even if parts
+    of it would fit.
     """
     if not shortest <= frames < MAX_LENGTH:
         return []
@@ -120,8 +121,8 @@ def read_splits(folder: Path, ending: str, get_it: str) -> dict[str, Split]:
 class T2MFolder(MotionSource):
     """A processed folder. Cuts and mirrored copies have the split of their motion, which is also their source.
 
-    The attribute `tokens` contains the words with their parts of speech, one list per caption. A mirrored copy has a
-    name of its own to exclude.
+    The attribute `tokens` contains the words with their parts of speech, one list per caption. A
+    mirrored copy has a name of its own to exclude.
     """
 
     representation: str  # name of the representation of the features in the folder

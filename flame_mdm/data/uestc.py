@@ -1,6 +1,7 @@
 """UESTC: 25,600 videos of 40 exercises by 118 subjects, as the SMPL poses that ACTOR's authors estimated with VIBE.
 
-Ji et al., ACM MM 2018; poses by Petrovich et al. (ACTOR), ICCV 2021. `docs/actions.md` describes the set.
+Ji et al., ACM MM 2018; poses by Petrovich et al. (ACTOR), ICCV 2021. `docs/actions.md` describes
+the set.
 """
 
 import math
@@ -49,8 +50,8 @@ class Video(NamedTuple):
 class UESTC(MotionSource):
     """The clips of `vibe_cache_refined.pkl`, rotated to the front view, as raw motions of the SMPL representations.
 
-    As published, training clips of fewer than 45 frames are left out and all test clips are kept. The published split
-    trains on all 51 training subjects; ours uses 5 of them for validation.
+    As published, training clips of fewer than 45 frames are left out and all test clips are kept.
+    The published split trains on all 51 training subjects; ours uses 5 of them for validation.
     """
 
     name = "uestc"
@@ -153,10 +154,11 @@ class UESTC(MotionSource):
 def front_view(pose: np.ndarray, root: np.ndarray, camera: np.ndarray, video: Video) -> np.ndarray:
     """Converts VIBE's estimates to a raw motion; videos of side 2 are rotated about the vertical by their view.
 
-    VIBE's camera is weak-perspective: a scale s and a shift. ACTOR's code places the body at x, y = the shift and at
-    the depth z at which a camera of focal length f shows it in that size: z = f / (s w / 2) in an image w pixels wide.
-    `pose` (F, 72) is axis-angle, `root` (F, 3) relative to the body; `camera` (F, 4) has scales sx (used) and sy, then
-    the shift. Returns (F, 75) float32: translation relative to the first frame and pose, in camera axes.
+    VIBE's camera is weak-perspective: a scale s and a shift. ACTOR's code places the body at x, y
+    = the shift and at the depth z at which a camera of focal length f shows it in that size: z =
+    f / (s w / 2) in an image w pixels wide. `pose` (F, 72) is axis-angle, `root` (F, 3) relative
+    to the body; `camera` (F, 4) has scales sx (used) and sy, then the shift. Returns (F, 75)
+    float32: translation relative to the first frame and pose, in camera axes.
     """
     depth = FOCAL_LENGTH / (np.abs(camera[:, 0]) * IMAGE_SIZE / 2)
     shift = np.concatenate([camera[:, 2:], depth[:, None]], 1)

@@ -159,8 +159,8 @@ def _anomalies(
 ) -> tuple[list[Entry], list[list[Entry]]]:
     """Returns the clips without movement, and groups of clips of bit-identical motions.
 
-    Clips that share all their frames are one motion: they differ only in caption. Raises `UserError` if a frame is not
-    finite.
+    Clips that share all their frames are one motion: they differ only in caption. Raises
+    `UserError` if a frame is not finite.
     """
     sharing: defaultdict[tuple[int, int], list[Entry]] = defaultdict(list)
     for clip in store.clips:

@@ -18,7 +18,8 @@ SHOWN = ("direction", "speed", "count", "side")  # attributes with a chip
 def chips(abilities: Abilities, parts: Sequence[Part], readings: Sequence[Reading]) -> str:
     """Returns the chips of a text: its actions in their order, their attributes, and the words that change nothing.
 
-    The options of a chip are texts in which its word is replaced; they take the place of the text in the form.
+    The options of a chip are texts in which its word is replaced; they take the place of the text
+    in the form.
 
     Args:
         abilities: actions and attributes of the model, to choose from.

@@ -15,14 +15,17 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 class ConnectionLimits:
     """Limits of the connections of a server.
 
-    A connection is *waiting* until the headers of a request are complete, and again after the answer. When a limit of
-    their number is reached, the connection that has waited longest is closed in favor of a new one. If none is waiting,
-    the request of the new connection gets status 503.
+    A connection is *waiting* until the headers of a request are complete, and again after the
+    answer. When a limit of their number is reached, the connection that has waited longest is
+    closed in favor of a new one. If none is waiting, the request of the new connection gets
+    status 503.
 
     Attributes:
         total: maximum number of open connections.
-        per_address: maximum number of open connections of one address, or of one IPv6 network of 64 bits.
-        header_seconds: maximum waiting time of a connection, however many bytes of the headers arrive.
+        per_address: maximum number of open connections of one address, or of one IPv6 network of
+            64 bits.
+        header_seconds: maximum waiting time of a connection, however many bytes of the headers
+            arrive.
         idle_seconds: maximum waiting time after an answer, if nothing arrives.
         stall_seconds: maximum number of seconds in which a client reads nothing of an answer.
     """

@@ -78,10 +78,10 @@ POSTS: dict[str, type[Post]] = {
 class Guard:
     """ASGI middleware that checks host, origin, path, size and content of a request before the application sees it.
 
-    `hosts` are names of this server, besides localhost and addresses in numbers: another name is one that somebody else
-    pointed at this computer (DNS rebinding). `calls` are the functions of the page that may be called: number -> path,
-    and whether arguments are accepted. `is_open` says whether a session has called a function, so that its results can
-    be read.
+    `hosts` are names of this server, besides localhost and addresses in numbers: another name is
+    one that somebody else pointed at this computer (DNS rebinding). `calls` are the functions of
+    the page that may be called: number -> path, and whether arguments are accepted. `is_open`
+    says whether a session has called a function, so that its results can be read.
     """
 
     def __init__(

@@ -55,8 +55,8 @@ Path = Annotated[
 class DemoEdit(BaseModel):
     """An edit of one of the motions so far, by number; see `flame_mdm.sampling.motion_request.EditRequest`.
 
-    `text` is what the person does in the new part; "" = unconditioned. A variation of the entire motion keeps text,
-    parts and path of the request.
+    `text` is what the person does in the new part; "" = unconditioned. A variation of the entire
+    motion keeps text, parts and path of the request.
     """
 
     model_config = RULES

@@ -48,8 +48,8 @@ def unread(path: Path) -> UserError:
 def motions_in(folder: Path) -> list[Path]:
     """Returns the motion files in a folder and the folders below it, sorted.
 
-    Hidden files, as macOS and editors leave them, folders and files of AMASS without motion are left out. Of JSON
-    files, only those with an array of joints are motions.
+    Hidden files, as macOS and editors leave them, folders and files of AMASS without motion are
+    left out. Of JSON files, only those with an array of joints are motions.
     """
     return sorted(file for file in folder.rglob("*") if _is_motion(file, folder))
 

@@ -1,7 +1,7 @@
 """Node hierarchies in motion, as FBX and GLB files contain them: the positions of all nodes in each frame.
 
-Only positions are used. Rotations of the motion are solved for afterward, so that a rest pose that is no T-pose, and
-local axes that differ between programs, do not matter.
+Only positions are used. Rotations of the motion are solved for afterward, so that a rest pose
+that is no T-pose, and local axes that differ between programs, do not matter.
 """
 
 from collections.abc import Sequence
@@ -23,11 +23,13 @@ class AnimatedNodes:
 
     Attributes:
         names: names of the N nodes.
-        parents: index of the parent of each node, smaller than the index of the node; -1 for a root.
+        parents: index of the parent of each node, smaller than the index of the node; -1 for a
+            root.
         positions: (F, N, 3) in the world, in meters, y up.
         fps: frames per second.
         animation: the name of the animation.
-        humanoid: joint of SMPL -> index of a node, if the file says which nodes are a human body; else empty.
+        humanoid: joint of SMPL -> index of a node, if the file says which nodes are a human body;
+            else empty.
         unit: meters per unit of length, as the file declares it.
     """
 
@@ -71,7 +73,8 @@ def choose(animations: Sequence[tuple[str, Item]], requested: str | int | None) 
 def parents_first(parents: Sequence[int]) -> list[int]:
     """Returns an order of nodes in which parents precede their children.
 
-    Raises `ValueError` if a node is its own ancestor. `parents` holds the index of each node's parent, -1 for a root.
+    Raises `ValueError` if a node is its own ancestor. `parents` holds the index of each node's
+    parent, -1 for a root.
     """
     children: list[list[int]] = [[] for _ in parents]
     order = []

@@ -45,8 +45,9 @@ NUMBERS = ", ".join(map(str, AXIS_ANGLES))
 def read_arrays(path: Path) -> dict[str, Any]:
     """Reads the arrays of an .npz, .json or .npy motion.
 
-    Returns joints, or poses (F, 72) and trans (F, 3) as in AMASS. Also returns fps, text, features and representation
-    if the file has them, and of `.json` files up, unit and names. `ours` is whether this project wrote the file.
+    Returns joints, or poses (F, 72) and trans (F, 3) as in AMASS. Also returns fps, text,
+    features and representation if the file has them, and of `.json` files up, unit and names.
+    `ours` is whether this project wrote the file.
     """
     suffix = path.suffix.lower()
     if suffix == ".npz":

@@ -1,8 +1,9 @@
 """ASF/AMC motion capture files, as recorded by Acclaim and the CMU database: a skeleton and its motion in two files.
 
-An ASF file lists the bones of a subject: direction and length in the world while standing in the rest pose, the axes C
-in which the bone turns, and its degrees of freedom. An AMC file has their angles per frame. With the angles' rotation
-M, a bone turns by C M C^-1 relative to its parent. Orders such as XYZ mean that x is applied first: C = Rz Ry Rx.
+An ASF file lists the bones of a subject: direction and length in the world while standing in the
+rest pose, the axes C in which the bone turns, and its degrees of freedom. An AMC file has their
+angles per frame. With the angles' rotation M, a bone turns by C M C^-1 relative to its parent.
+Orders such as XYZ mean that x is applied first: C = Rz Ry Rx.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """BVH motion capture files: reading, forward kinematics, resampling, writing.
 
-A BVH file is a tree of joints with offsets, and a table of numbers with one row per frame and one column per channel.
-The rotation channels of a joint are intrinsic Euler angles in degrees, in the order in which they are listed:
-`Zrotation Xrotation Yrotation` means R = Rz Rx Ry on column vectors. Position channels replace the joint's offset.
+A BVH file is a tree of joints with offsets, and a table of numbers with one row per frame and one
+column per channel. The rotation channels of a joint are intrinsic Euler angles in degrees, in the
+order in which they are listed: `Zrotation Xrotation Yrotation` means R = Rz Rx Ry on column
+vectors. Position channels replace the joint's offset.
 """
 
 from __future__ import annotations
@@ -78,8 +79,8 @@ class Bvh:
     def resample(self, fps: float, cubic: bool = False) -> tuple[np.ndarray, np.ndarray]:
         """Returns rotations (F', J, 3, 3) and translations (F', J, 3) at times 0, 1/fps, ... up to the last frame.
 
-        Rotations are interpolated on the sphere (slerp), so that bones keep their length. Translations are interpolated
-        linearly, or with `cubic` splines.
+        Rotations are interpolated on the sphere (slerp), so that bones keep their length.
+        Translations are interpolated linearly, or with `cubic` splines.
         """
         before, after, share = frame_pairs(
             len(self.frames), self.fps, fps, len(self.joints), slack=0
@@ -104,7 +105,8 @@ def forward_kinematics(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns positions (F, J, 3) and rotations in the world: G_j = G_p R_j and p_j = p_p + G_p t_j, p the parent of j.
 
-    Parents precede their children, -1 for a root; rotations (F, J, 3, 3) and translations are in a parent's frame.
+    Parents precede their children, -1 for a root; rotations (F, J, 3, 3) and translations are in
+    a parent's frame.
     """
     positions, turned = translations.copy(), rotations.copy()
     for joint, parent in enumerate(parents):

@@ -48,8 +48,8 @@ class BvhCharacter(RestPose):
 def read(path: str | Path) -> Character | BvhCharacter:
     """Reads a character. Its joints have the names of a known skeleton, or of a `.yaml` file with the same name.
 
-    Raises `UserError` if the file is damaged, or has no skin (.glb), no known joints (`UnknownJoints`) or no usable
-    rest pose.
+    Raises `UserError` if the file is damaged, or has no skin (.glb), no known joints
+    (`UnknownJoints`) or no usable rest pose.
     """
     path = Path(path)
     return _read_bvh(path) if path.suffix.lower() == ".bvh" else read_skinned(path)
@@ -151,7 +151,8 @@ def read_skinned(path: Path) -> Character:
 def _rest(file: glb.Glb, pelvis: int) -> tuple[np.ndarray, np.ndarray]:
     """Returns matrices (N, 4, 4) of nodes in the pose in which the skin was bound, and corners around its meshes.
 
-    If they are stored in another pose, the pelvis, which is nearly upright, shows how the skin's frame is turned.
+    If they are stored in another pose, the pelvis, which is nearly upright, shows how the skin's
+    frame is turned.
     """
     # Joint matrix times inverse bind matrix is the same for all joints if the file is stored in
     # the bind pose. If it is not, this product of the pelvis is taken as the frame of the skin,

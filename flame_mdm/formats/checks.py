@@ -36,8 +36,9 @@ _LIMBS = (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle"))
 def check_body(joints: np.ndarray, layout: Layout) -> None:
     """Raises `UserError` if joints (F, 22, 3) are no person: wrong size, or feet of no length or backwards.
 
-    The `layout` of the file has its unit, its axis that points up, and whether the body may be a child's. The advice on
-    the size also names the axis if the body lies, so that one correction of the file is enough.
+    The `layout` of the file has its unit, its axis that points up, and whether the body may be a
+    child's. The advice on the size also names the axis if the body lies, so that one correction
+    of the file is enough.
     """
     doubt = lying(joints, layout.up, np.array(UP[layout.up], float))
     check_size(joints, layout.unit, layout.children, doubt)
@@ -52,7 +53,8 @@ def uprightness(joints: np.ndarray) -> float:
 def lying(joints: np.ndarray, up: str, axes: np.ndarray) -> str:
     """Returns a line if the body lies in most frames, with the axis that would make it stand, or "".
 
-    Joints (F, 22, 3) are y up, turned by `axes` (3, 3) from the axes of the file, in which `up` was up.
+    Joints (F, 22, 3) are y up, turned by `axes` (3, 3) from the axes of the file, in which `up`
+    was up.
     """
     if uprightness(joints) >= LYING:
         return ""
@@ -98,8 +100,8 @@ def below_floor(joints: np.ndarray) -> str:
 def rest_frames(joints: np.ndarray, fps: float) -> int:
     """Returns the number of frames in front of a motion that show a rest pose, or lead from it to the motion.
 
-    Several programs write a T- or A-pose as the first frame. In motion that was recorded from a rest pose on, the first
-    step is no longer than the following ones.
+    Several programs write a T- or A-pose as the first frame. In motion that was recorded from a
+    rest pose on, the first step is no longer than the following ones.
     """
     if len(joints) < 3 or not _is_rest_pose(joints[0].astype(float)):
         return 0

@@ -1,7 +1,8 @@
 """Binary FBX files as trees of records: the container of `fbx_scene`, which reads motions, and `fbx_writer`.
 
-Autodesk does not publish the format. The layout of records, arrays and the end of the file follows the description of
-the Blender Foundation (https://code.blender.org/2013/08/fbx-binary-file-format-specification) and files of Autodesk's
+Autodesk does not publish the format. The layout of records, arrays and the end of the file
+follows the description of the Blender Foundation
+(https://code.blender.org/2013/08/fbx-binary-file-format-specification) and files of Autodesk's
 own SDK. A record has a name, properties and nested records. Numbers are little-endian.
 """
 
@@ -60,10 +61,12 @@ class Record:
 
     Attributes:
         name: the name, such as "Model".
-        properties: bool, int, float, str, bytes or one-dimensional arrays. `write` stores an int as 64-bit integer and
-            a float as double; `Int` and `Short` are written as shorter integers.
+        properties: bool, int, float, str, bytes or one-dimensional arrays. `write` stores an int
+            as 64-bit integer and a float as double; `Int` and `Short` are written as shorter
+            integers.
         children: nested records.
-        block: whether a terminator follows the children even if there are none. Some readers need it.
+        block: whether a terminator follows the children even if there are none. Some readers need
+            it.
     """
 
     name: str

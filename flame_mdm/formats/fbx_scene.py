@@ -66,7 +66,8 @@ class Curve:
         times: (K,) in seconds, increasing.
         values: (K,).
         flags: (K,), interpolation from each key to the next.
-        slopes: (K, 2), change per second after each key and before the next one, for cubic segments.
+        slopes: (K, 2), change per second after each key and before the next one, for cubic
+            segments.
     """
 
     times: np.ndarray
@@ -166,9 +167,11 @@ def read(path: Path, animation: str | int | None = None) -> AnimatedNodes:
 
     Args:
         path: the file.
-        animation: name of the take, or its number, counted from 1; None = the first one with keys.
+        animation: name of the take, or its number, counted from 1; None = the first one with
+            keys.
 
-    Raises `UserError` if the file is damaged, has no animation, or has several animation layers with keys.
+    Raises `UserError` if the file is damaged, has no animation, or has several animation layers
+    with keys.
     """
     root = fbx.read(path)
     try:

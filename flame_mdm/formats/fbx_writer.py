@@ -1,8 +1,9 @@
 """Writes a motion with its skeleton and skin as an FBX file: binary 7.4, centimeters, y up.
 
-The structure of the scene follows files of Autodesk's FBX SDK. Programs differ in what they need; the comments name the
-reader that fails without a detail. The bones are at the top level, since Unreal and Unity take a node above them for a
-bone. Their rest pose is in `PreRotation`, so that rotations of 0 are the rest pose in every program.
+The structure of the scene follows files of Autodesk's FBX SDK. Programs differ in what they need;
+the comments name the reader that fails without a detail. The bones are at the top level, since
+Unreal and Unity take a node above them for a bone. Their rest pose is in `PreRotation`, so that
+rotations of 0 are the rest pose in every program.
 """
 
 from collections import Counter
@@ -109,7 +110,8 @@ class _Writer:
     def _lifted(self) -> tuple[np.ndarray, dict[int, np.ndarray]]:
         """Returns the offsets (J, 3) and the moves of the clip in centimeters, with the person on its soles.
 
-        A root on the floor is moved back by `ROOT_BACK`, and the hips forward by the same distance.
+        A root on the floor is moved back by `ROOT_BACK`, and the hips forward by the same
+        distance.
         """
         clip = self.clip
         offsets, moves = clip.on_soles()
@@ -148,8 +150,8 @@ class _Writer:
     ) -> dict[int, np.ndarray]:
         """Adds a mesh in the pose in which it is bound, with its materials and its skin.
 
-        `materials` holds the ids of the materials that the file has so far. Returns the matrix (4, 4) of each object,
-        by id, in this pose.
+        `materials` holds the ids of the materials that the file has so far. Returns the matrix
+        (4, 4) of each object, by id, in this pose.
         """
         # A Geometry has the vertices and a Model places it. A Skin deforms the geometry with one
         # Cluster per bone: its vertices, their weights, and the matrices of mesh and bone when

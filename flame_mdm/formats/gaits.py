@@ -1,7 +1,8 @@
 """Clips for game engines, cut from longer motions: loops, starts, stops and turns whose ends fit together.
 
-A gait is cut at two frames one cycle apart: the start before them, the loop between them, and the stop after them. The
-ends of the clips are then changed to shared poses: the loop's first pose, and the pose in which the person stands.
+A gait is cut at two frames one cycle apart: the start before them, the loop between them, and the
+stop after them. The ends of the clips are then changed to shared poses: the loop's first pose,
+and the pose in which the person stands.
 """
 
 from collections.abc import Sequence
@@ -91,7 +92,8 @@ def progress(motion: GroundedMotion, degrees: float) -> tuple[np.ndarray, np.nda
 def find_cycle(motion: GroundedMotion, degrees: float) -> Cycle | None:
     """Returns the cycle of a gait in a direction whose ends differ least; None if there is none.
 
-    Cycles that begin when the left foot lands are preferred, so that the loops of a set begin with the same foot.
+    Cycles that begin when the left foot lands are preferred, so that the loops of a set begin
+    with the same foot.
     """
     # A cycle lies in the longest part with a steady speed in the requested direction. All pairs
     # of frames that are a plausible cycle apart are compared, by the distance of joints and of
@@ -231,7 +233,8 @@ def loop(motion: GroundedMotion) -> GroundedMotion:
 def passing(motion: GroundedMotion) -> list[float | None]:
     """Returns when the left and the right toes, planted, pass the root of a loop, in seconds; None if they never do.
 
-    Two gaits are best blended at these moments, because then both have the foot at the same place.
+    Two gaits are best blended at these moments, because then both have the foot at the same
+    place.
     """
     travel = motion.path[-1] - motion.path[0]
     distance = np.linalg.norm(travel)
@@ -252,8 +255,9 @@ def passing(motion: GroundedMotion) -> list[float | None]:
 def with_neighbors(clips: Sequence[Clip], frames: int) -> tuple[np.ndarray, list[slice]]:
     """Returns the joints of all clips, seen from the root, in one array, and the frames of each clip in it.
 
-    Each clip has as many `frames` of neighbors before and after it, so that filters over time do not mix the clips: a
-    loop continues with itself, other clips stay in their first and last pose.
+    Each clip has as many `frames` of neighbors before and after it, so that filters over time do
+    not mix the clips: a loop continues with itself, other clips stay in their first and last
+    pose.
     """
     parts, slices, position = [], [], 0
     for clip in clips:

@@ -1,7 +1,7 @@
 """Motions in animated .glb files, VRM and VRMA files included: positions of all nodes in each frame of an animation.
 
-Khronos Group, "glTF 2.0 Specification", section 3.11 and appendix C (interpolation). VRM consortium,
-"VRMC_vrm_animation 1.0", https://github.com/vrm-c/vrm-specification
+Khronos Group, "glTF 2.0 Specification", section 3.11 and appendix C (interpolation). VRM
+consortium, "VRMC_vrm_animation 1.0", https://github.com/vrm-c/vrm-specification
 """
 
 import math
@@ -144,7 +144,8 @@ def read(path: Path, animation: str | int | None = None) -> AnimatedNodes:
 
     Args:
         path: the file.
-        animation: name of the animation, or its number, counted from 1; None = the first one that moves nodes.
+        animation: name of the animation, or its number, counted from 1; None = the first one that
+            moves nodes.
 
     Raises `UserError` if the file is damaged, or has no such animation.
     """

@@ -1,10 +1,12 @@
 """Motions seen from a root on the floor, and feet that stay where they are planted.
 
-Game engines move a character by a root on the floor and play the rest of the motion relative to this root. Cuts of a
-motion are changed in this view, so that the last pose of one clip can be the first pose of the next. Then the path of
-the root is put below them again, and inverse kinematics keeps each foot in place during its contacts.
+Game engines move a character by a root on the floor and play the rest of the motion relative to
+this root. Cuts of a motion are changed in this view, so that the last pose of one clip can be the
+first pose of the next. Then the path of the root is put below them again, and inverse kinematics
+keeps each foot in place during its contacts.
 
-Arrays hold F frames and the 22 joints of SMPL, in meters, y up. Angles are radians; positive angles turn to the left.
+Arrays hold F frames and the 22 joints of SMPL, in meters, y up. Angles are radians; positive
+angles turn to the left.
 """
 
 from dataclasses import dataclass, replace
@@ -165,8 +167,9 @@ def planted(
 ) -> GroundedMotion:
     """Returns the motion with toes that do not move during their contacts.
 
-    The body is lowered where a leg would be too short. With `fixed_start` and `fixed_end`, the first and the last pose
-    do not change: a foot that is planted there stays where this pose has it.
+    The body is lowered where a leg would be too short. With `fixed_start` and `fixed_end`, the
+    first and the last pose do not change: a foot that is planted there stays where this pose has
+    it.
     """
     # Each toe is moved to one footprint per contact. If a leg is too short for its footprint, the
     # whole body is lowered for a moment, smoothly, before the legs bend to reach the footprints.

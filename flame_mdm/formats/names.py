@@ -1,8 +1,8 @@
 """Names of joints: one way to match them. Blender's extension contains this file, which needs the standard library.
 
-Programs write the same joint in many ways: `mixamorig:LeftUpLeg`, `Character1_LeftUpLeg`, `Actor left up leg`,
-`L_UpLeg`. Case, separators, a prefix that many joints share and the place and length of the mark of the side (left, L)
-make no difference.
+Programs write the same joint in many ways: `mixamorig:LeftUpLeg`, `Character1_LeftUpLeg`, `Actor
+left up leg`, `L_UpLeg`. Case, separators, a prefix that many joints share and the place and
+length of the mark of the side (left, L) make no difference.
 """
 
 import re
@@ -21,7 +21,8 @@ class Match(NamedTuple):
 
     Attributes:
         skeleton: its key.
-        numbers: name in the skeleton -> indices of the joints that may be meant, more than one if this is ambiguous.
+        numbers: name in the skeleton -> indices of the joints that may be meant, more than one if
+            this is ambiguous.
         missing: names of the skeleton that no joint has.
     """
 
@@ -38,7 +39,8 @@ def plain(name: str) -> str:
 def spellings(name: str, opposite: str) -> list[str]:
     """Returns the `plain` spellings of a name, itself first; `opposite` is its counterpart on the other side.
 
-    The mark of the side is spelled in either length, before or after the rest: LeftHip, L_Hip, hip.L.
+    The mark of the side is spelled in either length, before or after the rest: LeftHip, L_Hip,
+    hip.L.
     """
     name, opposite = plain(name), plain(opposite)
     options = [name]

@@ -1,8 +1,9 @@
 """Bodies by name: the mannequin, the body in a file, and people of all shapes made by Anny (`body="anny age=0.9"`).
 
-Brégier et al., "Human Mesh Modeling for Anny Body", 2026, https://arxiv.org/abs/2511.03589: (c) 2025 NAVER Corp.,
-Apache-2.0; its shapes and weights come from MakeHuman and MPFB2, CC0. Topologies of SMPL and SMPL-X, which Anny
-downloads and which are not free for commercial use, are never built.
+Brégier et al., "Human Mesh Modeling for Anny Body", 2026, https://arxiv.org/abs/2511.03589: (c)
+2025 NAVER Corp., Apache-2.0; its shapes and weights come from MakeHuman and MPFB2, CC0.
+Topologies of SMPL and SMPL-X, which Anny downloads and which are not free for commercial use, are
+never built.
 """
 
 import os
@@ -68,8 +69,8 @@ CLOTHES = {
 def load_body(name: str) -> Mesh:
     """Returns a body: "mannequin", a file, or "anny" and numbers of its shape, such as "anny gender=1 age=0.9".
 
-    Anny takes about 90 seconds for the first body; each body is kept in the user's cache. Raises `UserError` if the
-    file is damaged, a number is unknown, or Anny is not installed.
+    Anny takes about 90 seconds for the first body; each body is kept in the user's cache. Raises
+    `UserError` if the file is damaged, a number is unknown, or Anny is not installed.
     """
     kind, *words = name.split() or [""]
     if kind != "anny":
@@ -177,7 +178,8 @@ def _joints(heads: dict[str, np.ndarray]) -> np.ndarray:
 def _turns(joints: np.ndarray) -> np.ndarray:
     """Returns rotations (22, 3, 3) in the world from the rest pose of SMPL to joints (22, 3) in Anny's rest pose.
 
-    Pelvis, chest and head keep their direction, and feet stay level; arms are twisted so that elbows bend as SMPL's.
+    Pelvis, chest and head keep their direction, and feet stay level; arms are twisted so that
+    elbows bend as SMPL's.
     """
     turns = np.tile(np.eye(3), (len(SMPL22), 1, 1))
     usual = np.array(ADULT)
@@ -230,8 +232,8 @@ def smooth(low: float, high: float, value: np.ndarray) -> np.ndarray:
 def with_helpers(points: np.ndarray, weights: np.ndarray, joints: np.ndarray) -> np.ndarray:
     """Returns weights (V, 28): the upper part of limbs moves to helper bones, which turn less about the limb.
 
-    The forearm is the other way round: its lower half moves to a bone that takes part in the twist of the wrist.
-    `joints` (22, 3) are the joints of the mesh.
+    The forearm is the other way round: its lower half moves to a bone that takes part in the
+    twist of the wrist. `joints` (22, 3) are the joints of the mesh.
     """
     columns = []
     for joint, _ in HELPERS:

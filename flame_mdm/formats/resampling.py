@@ -57,8 +57,9 @@ def frame_pairs(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns the frames before and after each new frame, and its position between them, 0 to 1.
 
-    New frames are at times 0, 1/fps, 2/fps, ... up to the last frame, or past it by `slack` of a frame. Raises
-    `UserError` if there are more than `MAX_FRAMES` frames before, or more than `MAX_RESAMPLED` positions after.
+    New frames are at times 0, 1/fps, 2/fps, ... up to the last frame, or past it by `slack` of a
+    frame. Raises `UserError` if there are more than `MAX_FRAMES` frames before, or more than
+    `MAX_RESAMPLED` positions after.
     """
     check_frames(frames)
     count = math.floor((frames - 1) * fps / rate + slack) + 1

@@ -104,7 +104,8 @@ def recognized(
 ) -> dict[str, list[int]]:
     """Returns the numbers of the joints that the most similar skeleton names: joint of SMPL -> numbers.
 
-    `skeletons` are spellings of joints -> joints of SMPL, as in `flame_mdm.formats.names.best_match`.
+    `skeletons` are spellings of joints -> joints of SMPL, as in
+    `flame_mdm.formats.names.best_match`.
     """
     numbers = list(names)
     match = best_match(
@@ -157,8 +158,9 @@ def rest_pose(
 ) -> RestPose:
     """Returns a rest pose, turned to y up and +z ahead; `source` names the character in messages.
 
-    Positions (J, 3), rotations `turned` (J, 3, 3) and points that include the `lowest` one are in a world of any unit
-    and direction, in which `vertical` (3,) is up. `joints` maps SMPL's joints to indices of the character's.
+    Positions (J, 3), rotations `turned` (J, 3, 3) and points that include the `lowest` one are in
+    a world of any unit and direction, in which `vertical` (3,) is up. `joints` maps SMPL's joints
+    to indices of the character's.
     """
     at = {joint: positions[number] for joint, number in joints.items()}
 
@@ -266,8 +268,9 @@ def follow(
 ) -> tuple[np.ndarray, np.ndarray, Rig]:
     """Moves a character as a body moves; returns rotations (F, J, 3, 3), positions (F, J, 3) and the skeleton for it.
 
-    The body has joints (F, 22, 3) in meters, with `offsets` (22, 3) from their parents in the rest pose; its parts have
-    rotations `neutral` (22, 3, 3) in the rest pose and `world` (F, 22, 3, 3) in the world.
+    The body has joints (F, 22, 3) in meters, with `offsets` (22, 3) from their parents in the
+    rest pose; its parts have rotations `neutral` (22, 3, 3) in the rest pose and `world`
+    (F, 22, 3, 3) in the world.
     """
     # All joints get the rotations of the body, relative to the rest poses. The hips follow the
     # scaled path. Legs of other proportions would then hover or sink, so that each leg is bent

@@ -1,6 +1,7 @@
 """A motion on a skeleton of another program, with the skin of a person, for the writers of .glb, .fbx and .usd files.
 
-Lengths are in meters, y up; the rest pose faces +z. Frames, joints and vertices are counted by F, J and V.
+Lengths are in meters, y up; the rest pose faces +z. Frames, joints and vertices are counted by F,
+J and V.
 """
 
 from dataclasses import dataclass, field, replace
@@ -52,11 +53,14 @@ class Skin:
         triangles: (T, 3), counterclockwise seen from outside.
         palette: the materials.
         materials: (T,), index into `palette` of each triangle.
-        ordered: indices of joints of the skeleton. For a person, joints that follow SMPL's come first, in its order.
+        ordered: indices of joints of the skeleton. For a person, joints that follow SMPL's come
+            first, in its order.
         bones: (V, K), the joints that move a vertex, as indices into `ordered`.
         weights: (V, K), the share of each of these joints; a row adds up to 1.
-        binds: (len(ordered), 4, 4), matrices from the coordinates of the mesh to the coordinates of each joint.
-        colors: (V, 3) from 0 to 255, as screens show them; (0, 3) if the materials alone have colors.
+        binds: (len(ordered), 4, 4), matrices from the coordinates of the mesh to the coordinates
+            of each joint.
+        colors: (V, 3) from 0 to 255, as screens show them; (0, 3) if the materials alone have
+            colors.
         uvs: (V, 2), places in the images, from the lower left corner; (0, 2) without images.
     """
 
@@ -82,16 +86,19 @@ class RiggedClip:
         name: the name of the animation.
         fps: frames per second.
         joints: names of the J joints.
-        parents: index of the parent of each joint, smaller than the index of the joint; -1 for the root.
+        parents: index of the parent of each joint, smaller than the index of the joint; -1 for
+            the root.
         offsets: (J, 3), position of each joint relative to its parent in the rest pose.
         rest: (J, 3, 3), rotation of each joint relative to its parent in the rest pose.
         turns: (F, J, 3, 3), rotations relative to parents.
-        moves: joints that move relative to their parents -> positions (F, 3) relative to their parents.
+        moves: joints that move relative to their parents -> positions (F, 3) relative to their
+            parents.
         lift: height by which a person is above these positions: the thickness of the soles.
         skins: the meshes; () if the motion does not fit a person.
         scales: (J,), units of the parent per unit of each joint.
         root: index of the joint on the floor above the hips; -1 if there is none.
-        contacts: (F, 2), whether the left and the right toes are planted; (0, 2) if it is not known.
+        contacts: (F, 2), whether the left and the right toes are planted; (0, 2) if it is not
+            known.
     """
 
     name: str
@@ -136,7 +143,8 @@ class RiggedClip:
 
         Args:
             path: (F, 2), x and z.
-            heading: (F,), rotations about the vertical in radians; positive angles turn to the left.
+            heading: (F,), rotations about the vertical in radians; positive angles turn to the
+                left.
         """
         joint = self.root if self.root >= 0 else max(self.moves)
         facing = np.tile(np.eye(3), (len(heading), 1, 1))
@@ -202,7 +210,8 @@ def rigged(
         fps: frames per second.
         skeleton: the skeleton, with the bone lengths of the body.
         fitted: the body of the person, whose toes bend as in pictures; None = no skin.
-        root_motion: the root on the floor follows the hips and their direction; otherwise it stays in place.
+        root_motion: the root on the floor follows the hips and their direction; otherwise it
+            stays in place.
 
     Raises `UserError` for `root_motion` of a skeleton without a root on the floor.
     """
@@ -240,7 +249,8 @@ def _with_root_motion(
 ) -> tuple[np.ndarray, dict[int, np.ndarray]]:
     """Moves the path of the hips on the floor, and their direction, to the root, the joint above the hips.
 
-    The direction is the heading of the hips relative to the first frame's axes, a turn about the vertical.
+    The direction is the heading of the hips relative to the first frame's axes, a turn about the
+    vertical.
     """
     root, joint = skeleton.parents[skeleton.hips], skeleton.hips
     above = skeleton.turns[root]

@@ -25,8 +25,9 @@ def animations(path: Path) -> list[str]:
 def joint_names(scene: AnimatedNodes) -> tuple[str, ...]:
     """Returns a name per node, as the layouts of skeletons expect them.
 
-    Bones of a humanoid that the file identifies get SMPL's names. A node at the tip of a bone is named as the end site
-    of the bone in a BVH file, `NAME.end`, also if the tip has the name of the bone with another ending.
+    Bones of a humanoid that the file identifies get SMPL's names. A node at the tip of a bone is
+    named as the end site of the bone in a BVH file, `NAME.end`, also if the tip has the name of
+    the bone with another ending.
     """
     if scene.humanoid:
         humanoid = {node: joint for joint, node in scene.humanoid.items()}

@@ -2,7 +2,8 @@
 # The modules of usd-core come from C++ and have no types.
 """Writes a motion with its skeleton and skin as Universal Scene Description: .usda, .usdc or .usdz, with UsdSkel.
 
-Pixar, "UsdSkel", https://openusd.org/release/api/usd_skel_page_front.html. Needs the package usd-core, extra `usd`.
+Pixar, "UsdSkel", https://openusd.org/release/api/usd_skel_page_front.html. Needs the package
+usd-core, extra `usd`.
 """
 
 import re

@@ -1,9 +1,10 @@
 """Writes a motion as a VRM animation (.vrma), which moves any VRM avatar.
 
-VRM consortium, "VRMC_vrm_animation 1.0", https://github.com/vrm-c/vrm-specification. A .vrma file is a .glb file
-without a mesh. It says which nodes are the bones of a humanoid, and its rest pose is the T-pose of VRM: limbs along the
-axes, feet straight ahead, soles on the floor. Programs apply the rotations relative to this pose, and scale the path of
-the hips by the ratio of the heights of the hips.
+VRM consortium, "VRMC_vrm_animation 1.0", https://github.com/vrm-c/vrm-specification. A .vrma file
+is a .glb file without a mesh. It says which nodes are the bones of a humanoid, and its rest pose
+is the T-pose of VRM: limbs along the axes, feet straight ahead, soles on the floor. Programs
+apply the rotations relative to this pose, and scale the path of the hips by the ratio of the
+heights of the hips.
 """
 
 from pathlib import Path

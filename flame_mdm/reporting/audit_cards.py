@@ -69,7 +69,8 @@ def seen(card: AuditCard, perturbation: AuditedPerturbation, metric: str) -> See
 def card_name(card: AuditCard) -> str:
     """Returns the name of a card's files: data set, extractor, number of motions, and a hash of what was audited.
 
-    An audit of other motions, or of another crop, has another name, so that it does not overwrite a stronger one.
+    An audit of other motions, or of another crop, has another name, so that it does not overwrite
+    a stronger one.
     """
     extractor = card.extractor.sha256[:12] if card.extractor else "none"
     facts = card.model_dump(include={"protocol", "data", "split", "seed", "motions", "resamples"})
@@ -121,8 +122,9 @@ class CitedCard:
 def card_of(data: Data, sha256: str | None) -> CitedCard | None:
     """Returns the strongest card of an extractor that fits evaluated data; None if it was not audited.
 
-    Without an extractor, it is a card of the metrics of joints. Cards are in the folder that FLAME_MDM_AUDITS names, by
-    default runs/audit, and in the repository; audited.json lists the latter.
+    Without an extractor, it is a card of the metrics of joints. Cards are in the folder that
+    FLAME_MDM_AUDITS names, by default runs/audit, and in the repository; audited.json lists the
+    latter.
     """
     extractor = sha256[:12] if sha256 else None
     listed = read_json(Path(__file__).with_name("audited.json"), list[ListedCard])

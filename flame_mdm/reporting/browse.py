@@ -24,7 +24,8 @@ SECONDS = 15  # seconds shown of a longer clip, to keep the page small
 def find(clips: Sequence[Entry], split: str | None, search: str) -> list[list[Entry]]:
     """Returns the clips of a split (None = all) whose id and captions contain all words of `search`, in any case.
 
-    Each clip is grouped with its mirrored copy, original first; a group matches if one of its clips does.
+    Each clip is grouped with its mirrored copy, original first; a group matches if one of its
+    clips does.
     """
     ids = {clip.id for clip in clips}
     families: dict[str, list[Entry]] = {}
@@ -92,7 +93,8 @@ def write_clips(
 ) -> None:
     """Writes clips as `motion_000_ID.npz` ..., in the layout of generated motions, each with one caption.
 
-    A clip with several captions gets the first one that no earlier clip has, so that captions are unique if possible.
+    A clip with several captions gets the first one that no earlier clip has, so that captions are
+    unique if possible.
 
     Args:
         folder: the folder to write.

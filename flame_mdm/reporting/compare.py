@@ -51,8 +51,8 @@ class ComparedRun:
 def find(folders: Sequence[Path]) -> list[ComparedRun]:
     """Returns two or more runs and folders of motion files.
 
-    Runs are labeled by recipe and run name, folders of motions by their name, and both by their path if two labels are
-    the same.
+    Runs are labeled by recipe and run name, folders of motions by their name, and both by their
+    path if two labels are the same.
     """
     if len(set(folders)) < 2:
         raise UserError(
@@ -113,7 +113,8 @@ def comparison(
 
     Args:
         compared: runs and folders of motions.
-        shown: the motions of each of them, by prompt; the page plays those for the prompts that all have.
+        shown: the motions of each of them, by prompt; the page plays those for the prompts that
+            all have.
         mesh: the body to draw.
     """
     runs = only_runs(compared)

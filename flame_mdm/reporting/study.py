@@ -148,8 +148,8 @@ def tally(files: Sequence[Path]) -> list[Pair]:
     """Counts the answers of several raters, per pair of runs.
 
     Raises:
-        UserError: a file is malformed, a rater's answers to one page are given twice, or a rating compares a run with
-            itself.
+        UserError: a file is malformed, a rater's answers to one page are given twice, or a rating
+            compares a run with itself.
     """
     answered: dict[tuple[str, str], Path] = {}
     pairs: dict[tuple[str, str], Pair] = {}

@@ -1,8 +1,9 @@
 """Atomic writes, hashes, locks, and reading files from other people.
 
-Every file that may come from other people is read or checked here first: it must be a regular file of limited size,
-and the sizes that it declares must match its bytes. Functions that read a path raise `FileNotFoundError` if it does not
-exist, and `UserError` if it is no regular file or its content is refused.
+Every file that may come from other people is read or checked here first: it must be a regular
+file of limited size, and the sizes that it declares must match its bytes. Functions that read a
+path raise `FileNotFoundError` if it does not exist, and `UserError` if it is no regular file or
+its content is refused.
 """
 
 from __future__ import annotations
@@ -60,15 +61,16 @@ FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # numbers of errors
 def atomic_write(path: str | Path, *, within: str | Path | None = None) -> Iterator[Path]:
     """Yields a temporary path next to `path` that is renamed to `path` at the end; a failure leaves no files behind.
 
-    The temporary name is unique, so that several processes can write the same file; the last one wins. A link at `path`
-    is replaced, and the file it leads to stays as it is.
+    The temporary name is unique, so that several processes can write the same file; the last one
+    wins. A link at `path` is replaced, and the file it leads to stays as it is.
 
     Args:
         path: file to write.
-        within: folder that contains `path`, and that other people may have filled: links must not lead out of it.
+        within: folder that contains `path`, and that other people may have filled: links must not
+            lead out of it.
 
-    Raises `UserError` if a link leads out of `within`, `path` is a pipe or a device, or the file cannot be written, for
-    instance because the disk is full.
+    Raises `UserError` if a link leads out of `within`, `path` is a pipe or a device, or the file
+    cannot be written, for instance because the disk is full.
     """
     path = Path(path)
     if within is not None:
@@ -113,8 +115,8 @@ def atomic_folder(path: str | Path, *, within: str | Path | None = None) -> Iter
 def _temporary(path: Path) -> Iterator[Path]:
     """Yields a unique path next to `path`, in a folder that is created, and removes what is there at the end.
 
-    Errors that name it name `path` instead, and an `OSError` that names either of them or a folder above becomes a
-    `UserError`.
+    Errors that name it name `path` instead, and an `OSError` that names either of them or a
+    folder above becomes a `UserError`.
     """
     temporary = path
     try:
@@ -189,9 +191,10 @@ def naming(name: object, *errors: type[Exception], prefix: str = "") -> Iterator
 def locked(path: Path, busy: Callable[[str], object], advice: str) -> Iterator[str]:
     """Holds a lock file that names process and host; yields the process that died and left the file behind, or "".
 
-    If another process holds the lock, calls `busy` with its name, which raises, or returns to wait. `advice` is for
-    file systems without locks. The operating system releases the lock when a process ends in any way. POSIX record
-    locks also hold between hosts on NFS and Lustre, unlike the locks of `filelock`. Windows has neither.
+    If another process holds the lock, calls `busy` with its name, which raises, or returns to
+    wait. `advice` is for file systems without locks. The operating system releases the lock when
+    a process ends in any way. POSIX record locks also hold between hosts on NFS and Lustre,
+    unlike the locks of `filelock`. Windows has neither.
     """
     while True:
         with made_folder(path.parent), open_in_place(path) as file:

@@ -1,7 +1,7 @@
 """Names under which files may be written in a folder that other people may have filled.
 
-Links must not lead out of the folder, a file that is written in place must have one name only, and temporary names are
-unique.
+Links must not lead out of the folder, a file that is written in place must have one name only,
+and temporary names are unique.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ def check_within(path: str | Path, root: str | Path) -> None:
 def check_tree(folder: Path) -> None:
     """Checks a folder of somebody else before libraries write into it, which open their files in place.
 
-    Raises `UserError` if the folder contains a link that leads out of it, a pipe, a device, or a file with a second
-    name (hard link), through which a file elsewhere would be changed.
+    Raises `UserError` if the folder contains a link that leads out of it, a pipe, a device, or a
+    file with a second name (hard link), through which a file elsewhere would be changed.
     """
     for parent, folders, files in os.walk(folder):
         for name in (*folders, *files):
@@ -65,8 +65,8 @@ def check_tree(folder: Path) -> None:
 def open_in_place(path: Path) -> IO[str]:
     """Opens a text file for reading and appending, and creates it if it does not exist.
 
-    Writing in place changes a file that has other names, so that links are not followed. Raises `UserError` if the
-    path is a link, no regular file, or a file with a second name (hard link).
+    Writing in place changes a file that has other names, so that links are not followed. Raises
+    `UserError` if the path is a link, no regular file, or a file with a second name (hard link).
     """
     flags = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
     try:
@@ -117,8 +117,9 @@ def remove_abandoned(folder: Path, path: Path | None = None, *, is_locked: bool 
     Args:
         folder: folder of the temporary files and folders.
         path: only those written for this file or folder; None = for any.
-        is_locked: whether this process holds the lock that writers of such files need. Then the files of
-            processes on other machines are removed, too. Otherwise they stay: these processes may be alive.
+        is_locked: whether this process holds the lock that writers of such files need. Then the
+            files of processes on other machines are removed, too. Otherwise they stay: these
+            processes may be alive.
     """
     if not folder.is_dir():
         return

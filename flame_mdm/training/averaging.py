@@ -13,15 +13,17 @@ from flame_mdm.errors import UserError
 class MovingAverage(WeightAveraging):
     """Exponential moving average of the weights, which replaces them in validation and in the saved model.
 
-    By default it computes the same as Lightning's `EMAWeightAveraging`, but with one call for all parameters: that
-    class walks through all modules in every step, and on CUDA waits for the device. Buffers are not averaged.
+    By default it computes the same as Lightning's `EMAWeightAveraging`, but with one call for all
+    parameters: that class walks through all modules in every step, and on CUDA waits for the
+    device. Buffers are not averaged.
 
     Args:
         decay: average = decay * average + (1 - decay) * weights, from 0 to 1.
         update_every_n_steps: updates are at the multiples of this number of steps.
-        update_starting_at_step: up to this step, updates copy the weights instead of averaging them; so does the first.
-        from_initial_weights: the average starts from the weights before the first step, as in MDM's code, so that the
-            first update is an average, too.
+        update_starting_at_step: up to this step, updates copy the weights instead of averaging
+            them; so does the first.
+        from_initial_weights: the average starts from the weights before the first step, as in
+            MDM's code, so that the first update is an average, too.
     """
 
     def __init__(

@@ -57,8 +57,9 @@ class Interrupted(Exception):
 class Checkpoints(Checkpoint):
     """Writes `last.ckpt` periodically, at the last step and when interrupted; keeps a checkpoint `keep_every_n_steps`.
 
-    Signals stop training at the end of the current step (`StopRequest`); with several processes, at the end of the next
-    one. Validation is never interrupted, since averaged weights replace the trained ones meanwhile.
+    Signals stop training at the end of the current step (`StopRequest`); with several processes,
+    at the end of the next one. Validation is never interrupted, since averaged weights replace
+    the trained ones meanwhile.
     """
 
     def __init__(self, folder: str, every_n_steps: int, keep_every_n_steps: int | None = None):
@@ -110,10 +111,10 @@ class Checkpoints(Checkpoint):
 class Measurements(Callback):
     """Logs gradient norm, learning rate and speed every `trainer.log_every_n_steps`, without slowing other steps.
 
-    The norm of all gradients is measured before clipping. Seconds per step leave out validation. Adds
-    `facts.training` to checkpoints: `hours` of training so far, including validation; `processes`, their number;
-    `device`, `speed` and `precision`; and `memory_gib`, the peak memory of tensors on CUDA, otherwise of the first
-    process.
+    The norm of all gradients is measured before clipping. Seconds per step leave out validation.
+    Adds `facts.training` to checkpoints: `hours` of training so far, including validation;
+    `processes`, their number; `device`, `speed` and `precision`; and `memory_gib`, the peak
+    memory of tensors on CUDA, otherwise of the first process.
     """
 
     def __init__(self) -> None:
@@ -287,12 +288,16 @@ class SampleMotions(Callback):
     """Samples fixed prompts with fixed noise: writes files to the run directory and logs a video.
 
     Args:
-        folder: folder of the samples. Samples of a step are in a subfolder such as `step_0001000`.
-        every_n_steps: minimum number of steps between samples, which are drawn at validation and after training.
-        prompts: texts, action names, or (text, requested attributes) pairs; None = `UNCONDITIONED` motions. If a model
-            is conditioned on actions and no prompt is one of them, its first actions are used instead.
+        folder: folder of the samples. Samples of a step are in a subfolder such as
+            `step_0001000`.
+        every_n_steps: minimum number of steps between samples, which are drawn at validation and
+            after training.
+        prompts: texts, action names, or (text, requested attributes) pairs; None =
+            `UNCONDITIONED` motions. If a model is conditioned on actions and no prompt is one of
+            them, its first actions are used instead.
         seconds: length of the motions.
-        metrics: torchmetrics by name; their `update` takes some of joints (B, F, J, 3), mask (B, F), keys, requested.
+        metrics: torchmetrics by name; their `update` takes some of joints (B, F, J, 3), mask
+            (B, F), keys, requested.
     """
 
     def __init__(

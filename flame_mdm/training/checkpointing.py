@@ -1,7 +1,8 @@
 """Atomic checkpoints, and resuming from them.
 
-A run directory may come from somebody else. Reading a checkpoint runs no code and takes no more memory than the file,
-and only files in the folder of the checkpoints are removed, even if the state of a callback names others.
+A run directory may come from somebody else. Reading a checkpoint runs no code and takes no more
+memory than the file, and only files in the folder of the checkpoints are removed, even if the
+state of a callback names others.
 """
 
 import math

@@ -25,9 +25,9 @@ from flame_mdm.training.averaging import MovingAverage
 class DistillationTask(GeneratorTask):
     """Trains a student to sample in one to four steps, with the guidance built in.
 
-    The student starts as its teacher, with the same parts, data and captions; the teacher is only needed in training.
-    The text encoder is not trained, and nothing has dropout. `experiments/distillation/consistency.yaml` explains the
-    section `distillation`.
+    The student starts as its teacher, with the same parts, data and captions; the teacher is only
+    needed in training. The text encoder is not trained, and nothing has dropout.
+    `experiments/distillation/consistency.yaml` explains the section `distillation`.
     """
 
     kind = DistilledGenerator

@@ -21,7 +21,8 @@ from flame_mdm.safe_io.paths import check_tree, remove_abandoned
 def only_run(folder: Path) -> Iterator[None]:
     """Holds the lock `run.lock` in the run directory, which somebody else may have filled.
 
-    Raises `UserError` if a process on any host holds the lock, or links in the directory lead out of it.
+    Raises `UserError` if a process on any host holds the lock, or links in the directory lead out
+    of it.
     """
 
     def refuse(owner: str) -> None:

@@ -21,10 +21,11 @@ MOST_SHAPES = 64
 def accelerate(task: Task, data: MotionDataModule, config: Config) -> str:
     """Prepares task and data for `speed=fast`, before training; returns the precision of the trainer.
 
-    On CUDA: bfloat16 if the device supports it, and a compiled denoiser in runs of `COMPILED_FROM` steps or more.
+    On CUDA: bfloat16 if the device supports it, and a compiled denoiser in runs of
+    `COMPILED_FROM` steps or more.
 
-    On a CPU: bfloat16 if it has instructions for products in it; `CheapDropout`; `attention`, without dropout of its
-    weights. Compilation made no difference there.
+    On a CPU: bfloat16 if it has instructions for products in it; `CheapDropout`; `attention`,
+    without dropout of its weights. Compilation made no difference there.
 
     A precision in the recipe other than 32-true stays.
     """
@@ -67,7 +68,8 @@ def _simplify(network: nn.Module) -> None:
 class CheapDropout(nn.Module):
     """Dropout that takes four decisions from one 64-bit random number, with a probability rounded to 2^-16.
 
-    On a CPU, torch draws one random number per element in a single thread, which takes a fifth of a training step.
+    On a CPU, torch draws one random number per element in a single thread, which takes a fifth of
+    a training step.
     """
 
     def __init__(self, p: float):
@@ -93,7 +95,8 @@ def attention(
 ) -> Tensor:
     """Computes `scaled_dot_product_attention` by two matrix products; ignores `dropout_p`.
 
-    On a CPU, torch's fused attention takes up to twice as long in float32, and 3 to 5 times as long in bfloat16.
+    On a CPU, torch's fused attention takes up to twice as long in float32, and 3 to 5 times as
+    long in bfloat16.
     """
     weights = (query * query.shape[-1] ** -0.5) @ key.transpose(-1, -2)
     if attn_mask is not None:

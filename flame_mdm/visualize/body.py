@@ -44,9 +44,11 @@ class Figure:
     Attributes:
         joints: (F, J, 3) joint positions in meters, y up, floor at y = 0.
         fps: frames per second.
-        skeleton: names and parents of the J joints; the prefixes `left_` and `right_` mark the sides.
+        skeleton: names and parents of the J joints; the prefixes `left_` and `right_` mark the
+            sides.
         text: the caption, or the name of the action; "" if there is none.
-        id: name of the motion: a clip, a file, or text and sample number, which determine the noise.
+        id: name of the motion: a clip, a file, or text and sample number, which determine the
+            noise.
         contacts: (F, N) bool, True if a joint of `skeleton.feet` is on the floor; None = unknown.
     """
 
@@ -97,7 +99,8 @@ class Mesh:
         points: (V, 3) in meters; `normals` (V, 3), `colors` (V, 3) from 0 to 255.
         weights: (V, 28), of the 22 joints of SMPL and `HELPERS`; at most four are not 0.
         triangles: (T, 3), counterclockwise seen from outside.
-        turns: (28, 3, 3), rotation of each bone in the world from the rest pose of SMPL to the stored pose.
+        turns: (28, 3, 3), rotation of each bone in the world from the rest pose of SMPL to the
+            stored pose.
         rest: (22, 3), position of each joint relative to its parent in the rest pose of SMPL.
         sole: height of the toe joints above the soles.
     """

@@ -45,16 +45,18 @@ def player_page(
 ) -> str:
     """Returns a self-contained HTML page that plays motions side by side in 3D, with a shared clock and camera.
 
-    Motions that no body fits are shown as skeletons, with the reason in their caption. Positions are rounded to
-    millimeters, or to 1/65534 of the span of a motion.
+    Motions that no body fits are shown as skeletons, with the reason in their caption. Positions
+    are rounded to millimeters, or to 1/65534 of the span of a motion.
 
     Args:
         motions: of any skeletons, lengths and frame rates; `title` is the heading of the page.
         about: HTML of a collapsible section below the heading; its texts must be escaped.
         columns: motions per row; 0 = as many as fit into the window.
         groups: for each motion, a name to filter by, such as its split; "" = none.
-        beside: for each motion, the id of an earlier one to show it next to, such as its original; "" = none.
-        marks: for each motion, spans of its time line to mark: first frame, end (exclusive), kind and description.
+        beside: for each motion, the id of an earlier one to show it next to, such as its
+            original; "" = none.
+        marks: for each motion, spans of its time line to mark: first frame, end (exclusive), kind
+            and description.
         body: the body to draw; None = the mannequin.
     """
     blank = [""] * len(motions)
@@ -116,7 +118,8 @@ def _packed(
 def _packed_body(body: FittedBody) -> dict[str, Any]:
     """Returns proportions, and for each frame and bone a quaternion in 32 bits, exact to about 0.1 degrees.
 
-    The two highest bits tell which of x, y, z, w is largest; the others, from -0.71 to 0.71, follow in 10 bits each.
+    The two highest bits tell which of x, y, z, w is largest; the others, from -0.71 to 0.71,
+    follow in 10 bits each.
     """
     quaternions = Rotation.from_matrix(body.turns.reshape(-1, 3, 3)).as_quat()
     largest = np.abs(quaternions).argmax(1)

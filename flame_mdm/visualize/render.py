@@ -44,8 +44,8 @@ def write_gif(
 ) -> None:
     """Writes a looping animation of motions side by side, with captions below, in panels of `size` pixels.
 
-    It has the highest frame rate of the motions, but at most 50 per second, the limit of the format. A motion that ends
-    earlier stays at its last frame. `body` None = the mannequin.
+    It has the highest frame rate of the motions, but at most 50 per second, the limit of the
+    format. A motion that ends earlier stays at its last frame. `body` None = the mannequin.
     """
     path = target(path, motions)
     fps = max(motion.fps for motion in motions)
@@ -277,8 +277,9 @@ def _rasterize(
 ) -> None:
     """Draws triangles into an image, the nearest one at each pixel, with colors interpolated between their corners.
 
-    The image is (height, width, 3) uint8; `at` (V, 2) are pixel coordinates, y down; `depth` (V,) distances from the
-    camera; `colors` (V, 3) from 0 to 255. Triangles (T, 3) seen from inside, clockwise, are not drawn.
+    The image is (height, width, 3) uint8; `at` (V, 2) are pixel coordinates, y down; `depth` (V,)
+    distances from the camera; `colors` (V, 3) from 0 to 255. Triangles (T, 3) seen from inside,
+    clockwise, are not drawn.
     """
     lowest = np.clip(np.floor(at.min(0)), 0, image.shape[1::-1]).astype(int)
     highest = np.clip(np.ceil(at.max(0)), lowest, image.shape[1::-1]).astype(int)

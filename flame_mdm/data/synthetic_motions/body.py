@@ -1,8 +1,9 @@
 """The body of the synthetic motions: curves that an action sets, and its kinematics.
 
-Joint angles move the upper body by forward kinematics. The legs follow planned footprints by two-bone inverse
-kinematics, so that a foot on the ground does not move at all; hands do the same if they reach for something. Bone
-lengths are close to HumanML3D's reference skeleton (Guo et al. 2022).
+Joint angles move the upper body by forward kinematics. The legs follow planned footprints by
+two-bone inverse kinematics, so that a foot on the ground does not move at all; hands do the same
+if they reach for something. Bone lengths are close to HumanML3D's reference skeleton (Guo et al.
+2022).
 """
 
 from collections.abc import Sequence
@@ -118,7 +119,8 @@ class Body:
     ) -> None:
         """Draws a wrist by `weight` (F,) from where the arm's angles put it to a point (3,) or (F, 3) in meters.
 
-        `frame` is world, or chest or head: then the point is relative to this joint, with x to the left and z ahead.
+        `frame` is world, or chest or head: then the point is relative to this joint, with x to
+        the left and z ahead.
         """
         self.reaches.append((side, weight[:, None], np.asarray(target, float), frame))
 

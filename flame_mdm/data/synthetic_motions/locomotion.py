@@ -42,7 +42,8 @@ def walk_along(
 ) -> np.ndarray:
     """Moves the pelvis at `speed`, in m/s, along a path, and places the feet on either side of it, `first` first.
 
-    Returns (F,) how far the right foot is in front of the left one, in meters, relative to the heading of the pelvis.
+    Returns (F,) how far the right foot is in front of the left one, in meters, relative to the
+    heading of the pelvis.
     """
     # The pelvis accelerates, keeps its speed and stops. Each footprint is where the pelvis will
     # be in the middle of the foot's next stance, aside by the width of the gait: feet are under

@@ -134,7 +134,8 @@ def _tread(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Lifts the feet in turn on the spot, the left one first, by `lift` meters, and moves them `ahead` in the air.
 
-    Returns (F,) a wave that is 1 with the left and -1 with the right foot up, and whether the body is moving.
+    Returns (F,) a wave that is 1 with the left and -1 with the right foot up, and whether the
+    body is moving.
     """
     t = body.t
     phases = max(2, round((t[-1] - 0.2) * 2 * frequency))

@@ -142,7 +142,8 @@ def _condition_notes(
 
     Args:
         conditions: the conditions, in the order of their letters.
-        columns: the columns that were measured under the conditions of a letter; not listed if these are all columns.
+        columns: the columns that were measured under the conditions of a letter; not listed if
+            these are all columns.
     """
     notes = []
     for facts in conditions:
@@ -202,7 +203,8 @@ def _conditions(result: Result, timed: bool, shows_multimodality: bool) -> dict[
     Args:
         result: the result.
         timed: whether the table shows its seconds per motion.
-        shows_multimodality: whether the table shows multimodality; if not, whether it was measured does not matter.
+        shows_multimodality: whether the table shows multimodality; if not, whether it was
+            measured does not matter.
     """
     protocol, data, extractor, cost = result.protocol, result.data, result.extractor, result.cost
     checkpoint = result.checkpoint
@@ -371,7 +373,8 @@ def _entry(values: Mapping[str, Value | None] | None, name: str) -> Cell | None:
 def _print_cells(lines: Sequence[Line], columns: int) -> None:
     """Formats the numbers of each column with the same decimals, about three digits for the largest.
 
-    Settings with at most one decimal keep their text. Numbers that would round to zero show two significant digits.
+    Settings with at most one decimal keep their text. Numbers that would round to zero show two
+    significant digits.
     """
     for index in range(columns):
         cells = [

@@ -251,8 +251,8 @@ def _inert(text: str) -> str:
 def draw(part: Part, figure: Figure) -> Markup | None:
     """Draws a figure of a part as SVG; None if it has no points.
 
-    Curves are named after rows; reported ones are dashed. If closer to real motions is better in a column, real motions
-    are a dotted line.
+    Curves are named after rows; reported ones are dashed. If closer to real motions is better in
+    a column, real motions are a dotted line.
     """
     panels = []
     for column in figure.y:
@@ -290,7 +290,8 @@ def _series(part: Part, figure: Figure, column: str) -> tuple[list[Series], list
 def ranks(values: Sequence[float | None], better: str, real: float | None) -> list[int]:
     """Ranks values: 1 for the best, 2 for the second best, 0 for all others. A single value is not ranked.
 
-    `better` is higher, lower, real (closest to the value `real` of real motions) or none; a missing value is None.
+    `better` is higher, lower, real (closest to the value `real` of real motions) or none; a
+    missing value is None.
     """
     if (
         better == "none"

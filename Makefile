@@ -31,7 +31,8 @@ setup: $(READY) ## install into .venv
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(VENV)/bin/python -m pip install -q --upgrade pip
-	$(VENV)/bin/python -m pip install -q -c constraints.txt -e '.[dev,offline,video,demo,docs,onnx,usd]'
+	$(VENV)/bin/python -m pip install -q --no-compile -c constraints.txt -e '.[dev,offline,video,demo,docs,onnx,usd]'
+	@$(VENV)/bin/python -m compileall -qq -j 0 $(VENV)/lib || true # on all cores; some packages hold files for other versions
 	@touch $@
 
 test: $(READY) ## run all tests, except those that need outside tools

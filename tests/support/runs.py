@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import random
 import runpy
 import signal
 import socket
@@ -12,7 +13,7 @@ import sys
 import time
 import warnings
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
+from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout, suppress
 from multiprocessing import active_children
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -28,7 +29,10 @@ from flame_mdm.generator import MotionGenerator
 from flame_mdm.task import GeneratorTask
 from flame_mdm.training.distillation import DistillationTask
 
-SECONDS = 120
+SECONDS = 240
+"""How long a fork of this process may take."""
+LAUNCHED = 900
+"""How long processes may take that import torch, several after one another, on a machine with other work."""
 
 TINY = [
     *(
@@ -164,9 +168,12 @@ def inputs_of(module: torch.nn.Module) -> Iterator[list[tuple[torch.Tensor, ...]
 
 
 def free_port() -> int:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return free.getsockname()[1]
+    """A port that nobody uses, below those that the system gives to outgoing connections meanwhile."""
+    for port in random.sample(range(20_000, 32_000), 100):
+        with socket.socket() as free, suppress(OSError):
+            free.bind(("127.0.0.1", port))
+            return port
+    raise OSError("no port is free")
 
 
 def spawn(words: list[str], **environment: str) -> subprocess.Popen[str]:
@@ -184,7 +191,7 @@ def spawn(words: list[str], **environment: str) -> subprocess.Popen[str]:
 def finish(process: subprocess.Popen[str]) -> tuple[int, str, str]:
     """Exit code and what was printed; processes that hang fail the test."""
     try:
-        out, err = process.communicate(timeout=SECONDS)
+        out, err = process.communicate(timeout=LAUNCHED)
     except subprocess.TimeoutExpired:
         os.killpg(process.pid, signal.SIGKILL)
         out, err = process.communicate()

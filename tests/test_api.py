@@ -11,6 +11,17 @@ import torch
 from support.runs import TINY_DIP, untrained
 
 MODULES = [
+    "evaluators.metrics.accuracy",
+    "evaluators.metrics.alignment",
+    "evaluators.metrics.attributes",
+    "evaluators.metrics.distribution",
+    "evaluators.metrics.diversity",
+    "evaluators.metrics.memorization",
+    "evaluators.metrics.physics",
+    "evaluators.metrics.published_physics",
+    "evaluators.metrics.reconstruction",
+    "evaluators.metrics.retrieval",
+    "evaluators.metrics.samples",
     "flame_mdm.checkpoints.loading",
     "flame_mdm.conditions",
     "flame_mdm.conditions.action",

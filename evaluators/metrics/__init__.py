@@ -19,16 +19,21 @@ Every `update` takes some of these inputs by name, of B generated and R real mot
 | contacts | (B, F, 4) bool | contacts of `skeleton.feet` as generated, if the features have them |
 | kept | (B, F, J) bool | True = this joint of this frame was to be kept, if motions are edits |
 | keys | (B,) int64 | unique keys of generated motions |
-| real, real_joints, real_mask, real_keys | as above | the same for real motions |
+| real | (R, E) | features of real motions |
+| real_joints | (B, F, J, 3) | real motions in meters, y up, floor at y = 0 |
+| real_mask | (B, F) bool | True = real frame of a real motion |
+| real_keys | (R,) int64 | unique keys of real motions |
 | nearest, real_nearest | (B, 1 or 2) | distances from the nearest training motion, see `memorization` |
 | references | B of (F', J, 3) | real motions at the frame rate of their recording |
 
-A key is `flame_mdm.seeds.key` of an id, and of the number of the sample if there are several. Metrics that compare
-motions one by one (MID, position and displacement errors) take real motions in the order of the generated ones.
+A key is `flame_mdm.seeds.key` of an id, and of the number of the sample if there are several.
+Metrics that compare motions one by one (MID, position and displacement errors) take real motions
+in the order of the generated ones.
 
-`compute()` returns a number, or a dict of numbers by name; None without samples. It raises UserError if a number would
-be meaningless, for example with too few samples. For the same features, values are bit-identical for any batch size,
-order and number of processes; random draws depend on `seed` alone.
+`compute()` returns a number, or a dict of numbers by name; None without samples. It raises
+UserError if a number would be meaningless, for example with too few samples. For the same
+features, values are bit-identical for any batch size, order and number of processes; random draws
+depend on `seed` alone.
 """
 
 from __future__ import annotations
@@ -66,6 +71,7 @@ def inputs_of(metric: Metric) -> dict[str, bool]:
 
 
 def required_inputs(metric: Metric) -> list[str]:
+    """Returns the names of the inputs that `update` requires."""
     return [name for name, is_required in inputs_of(metric).items() if is_required]
 
 
@@ -81,6 +87,7 @@ def update_metrics(metrics: Mapping[str, Metric], **inputs: Any) -> None:
 
 
 def missing_input(name: str, metric: Metric, needed: str) -> UserError:
+    """Returns the error for a metric that lacks the input `needed`."""
     return UserError(
         f"metric {name} ({type(metric).__name__}): missing input: {needed}. Remove the metric from the protocol, or "
         "choose data, an extractor or a protocol with this input"

@@ -7,10 +7,23 @@ from evaluators.metrics.samples import SampleMetric
 
 
 class ActionAccuracy(SampleMetric):
-    """Fraction of motions whose largest logit is that of their label (Guo et al. 2020), in [0, 1]."""
+    """Accuracy: the fraction of motions whose largest logit belongs to their label, in [0, 1].
+
+    Guo et al. 2020 ("Action2Motion"), reported by MDM. Higher is better. `update` takes `logits`
+    (B, A), `labels` (B,) and `keys` (B,).
+
+    Example:
+        >>> import torch
+        >>> metric = ActionAccuracy()
+        >>> logits, labels = torch.tensor([[2.0, 1.0], [0.0, 1.0]]), torch.tensor([0, 0])
+        >>> metric.update(logits=logits, labels=labels, keys=torch.arange(2))
+        >>> metric.compute()
+        0.5
+    """
 
     higher_is_better = True
     states = ("logits", "labels")
 
     def value(self, logits: Tensor, labels: Tensor) -> float:
+        """Returns the accuracy of logits (N, A) for labels (N,) int64."""
         return (logits.argmax(1) == labels).double().mean().item()

@@ -11,7 +11,8 @@ from evaluators.metrics.diversity import distances
 from evaluators.metrics.samples import Rows, SampleMetric
 from flame_mdm.errors import UserError
 
-TOP = (1, 2, 3)  # k of R-precision
+# The k of R-precision
+TOP = (1, 2, 3)
 
 
 def equally_weighted(values: Tensor) -> Tensor:
@@ -22,8 +23,8 @@ def equally_weighted(values: Tensor) -> Tensor:
 def retrieval_ranks(queries: Tensor, candidates: Tensor, pools: Tensor, correct: Tensor) -> Tensor:
     """Returns (N,) how many candidates are closer than the correct one, or equally close and earlier in the pool.
 
-    `pools` (N, P) are the indices of the candidates (M, E) of each query (N, E), `correct` (N,) is the position of the
-    correct one in each pool.
+    `pools` (N, P) are the indices of the candidates (M, E) of each query (N, E), `correct` (N,)
+    is the position of the correct one in each pool.
     """
     pools, correct = pools.to(queries.device), correct.to(queries.device)
     ranks = []
@@ -38,7 +39,15 @@ def retrieval_ranks(queries: Tensor, candidates: Tensor, pools: Tensor, correct:
 
 
 class RPrecision(SampleMetric):
-    """R-precision: the fraction of queries with fewer than k candidates before the correct one in a pool of `pool`."""
+    """Base class of R-precision: the fraction of queries whose correct candidate is among the k nearest of a pool.
+
+    `update` takes `generated` (B, E), `text` (B, E), `text_keys` (B,) and `keys` (B,). The values
+    `top1`, `top2` and `top3` are in [0, 1]; higher is better.
+
+    Args:
+        pool: number of candidates of a query, the correct one included.
+        seed: seed of the random draws.
+    """
 
     higher_is_better = True
     summary = "top3"
@@ -51,6 +60,7 @@ class RPrecision(SampleMetric):
         self.pool, self.seed = pool, seed
 
     def value(self, generated: Tensor, text: Tensor, text_keys: Tensor) -> dict[str, float | None]:
+        """Returns `top1`, `top2` and `top3` of features (N, E) and the keys (N,) of the captions."""
         ranks = self.ranks(generated, text, text_keys)
         return {f"top{k}": int((ranks < k).sum()) / len(ranks) for k in TOP}
 
@@ -65,6 +75,9 @@ class RPrecision(SampleMetric):
             distance: (N, M) from queries to candidates.
             correct: (N,) index of the correct candidate of each query.
         """
+        # A random pool has pool - 1 of the other candidates, so the number of closer ones in it
+        # is hypergeometric: the probability is exact, without drawing pools. Of the candidates at
+        # an equal distance, half count as closer.
         others = distance.shape[1] - 1
         if others + 1 < self.pool:
             raise UserError(f"{others + 1} candidates are fewer than a pool of {self.pool}")
@@ -81,13 +94,28 @@ class RPrecision(SampleMetric):
 class TextsForMotion(RPrecision):
     """R-precision, texts for a motion: is the motion's text among the k nearest of 32?
 
-    The definition of the papers (FLAME, "Evaluation Metrics"; MDM, B.2; MFM, 9.1) and of FLAME's code. A motion ranks
-    its own text and 31 others, drawn without replacement from captions that differ from it, by Euclidean distance. In
-    FLAME's code, the last pools are smaller, since a pool is a batch. The own text is at a random position, so that an
-    extractor that cannot tell texts apart gets k / 32.
+    The definition of the papers (FLAME, "Evaluation Metrics"; MDM, B.2; MFM, 9.1) and of FLAME's
+    code. A motion ranks its own text and 31 others, drawn without replacement from captions that
+    differ from it, by Euclidean distance. In FLAME's code, the last pools are smaller, since a
+    pool is a batch. The own text is at a random position, so that an extractor that cannot tell
+    texts apart gets k / 32.
+
+    Args:
+        pool: number of texts in a pool, the own text included.
+        seed: seed of the pools.
+
+    Example:
+        >>> metric, features, keys = TextsForMotion(pool=3), torch.eye(3), torch.arange(3)
+        >>> metric.update(generated=features, text=features, text_keys=keys, keys=keys)
+        >>> metric.compute()
+        {'top1': 1.0, 'top2': 1.0, 'top3': 1.0}
     """
 
     def ranks(self, generated: Tensor, text: Tensor, text_keys: Tensor) -> Tensor:
+        """Returns the rank (N,) of each motion's own text in its pool, 0 = first."""
+        # Each motion draws its other texts from the captions without its own: numbers from the
+        # own caption on move up by one. Then the own caption, which is last, swaps places with a
+        # random one.
         generator = np.random.default_rng(self.seed)
         _, first, correct = np.unique(
             text_keys.cpu().numpy(), return_index=True, return_inverse=True
@@ -104,6 +132,7 @@ class TextsForMotion(RPrecision):
         )
 
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
+        """Returns the probability that each motion's text is among the k nearest of a random pool, by k."""
         keys = rows["text_keys"].numpy()
         _, first, correct = np.unique(keys, return_index=True, return_inverse=True)
         return self.in_random_pools(
@@ -114,14 +143,25 @@ class TextsForMotion(RPrecision):
 class MotionsForText(RPrecision):
     """R-precision, motions for a text: is the text's motion among the k nearest of 32?
 
-    The definition of the code of Guo et al. 2022, which the tables of MDM and MFM use. Test pairs in random order are
-    split into pools of 32, in which each text ranks the motions by Euclidean distance; equal captions may be in the
-    same pool. In that code, an incomplete last pool is dropped, and distances are float32, so that a motion whose
-    features equal those of its text may rank last (square root of a negative number). Here, the texts of an incomplete
-    last pool rank the last 32 motions, so that every text counts once.
+    The definition of the code of Guo et al. 2022, which the tables of MDM and MFM use. Test pairs
+    in random order are split into pools of 32, in which each text ranks the motions by Euclidean
+    distance; equal captions may be in the same pool. In that code, an incomplete last pool is
+    dropped, and distances are float32, so that a motion whose features equal those of its text
+    may rank last (square root of a negative number). Here, the texts of an incomplete last pool
+    rank the last 32 motions, so that every text counts once.
 
-    `normalize` scales features to length 1 first, which ranks by cosine. An extractor trained with cosines, such as
-    motion-CLIP, does not constrain lengths; the motions with the shortest features would be nearest to every text.
+    Args:
+        pool: number of motions in a pool, the own motion included.
+        seed: seed of the pools.
+        normalize: scale features to length 1 first, which ranks by cosine. An extractor trained
+            with cosines, such as motion-CLIP, does not constrain lengths; the motions with the
+            shortest features would be nearest to every text.
+
+    Example:
+        >>> metric, features, keys = MotionsForText(pool=3), torch.eye(3), torch.arange(3)
+        >>> metric.update(generated=features, text=features, text_keys=keys, keys=keys)
+        >>> metric.compute()
+        {'top1': 1.0, 'top2': 1.0, 'top3': 1.0}
     """
 
     def __init__(self, pool: int = 32, seed: int = 0, normalize: bool = False):
@@ -129,6 +169,7 @@ class MotionsForText(RPrecision):
         self.normalize = normalize
 
     def ranks(self, generated: Tensor, text: Tensor, text_keys: Tensor) -> Tensor:
+        """Returns the rank (N,) of each text's own motion in its pool, 0 = first, in random order of the texts."""
         self.need(len(generated), self.pool, "motions")
         if self.normalize:
             generated, text = F.normalize(generated, dim=-1), F.normalize(text, dim=-1)
@@ -136,6 +177,7 @@ class MotionsForText(RPrecision):
         return retrieval_ranks(text[order], generated, pools, position)
 
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
+        """Returns the probability that each text's motion is among the k nearest of a random pool, by k."""
         generated, text = rows["generated"], rows["text"]
         if self.normalize:
             generated, text = F.normalize(generated, dim=-1), F.normalize(text, dim=-1)
@@ -150,10 +192,22 @@ def own_pools(count: int, pool: int, seed: int) -> tuple[Tensor, Tensor, Tensor]
 
 
 class MultimodalDistance(SampleMetric):
-    """MM-Dist (MFM, eq. 10), "matching score" of Guo et al. 2022: mean Euclidean distance of motions and their texts.
+    """MM-Dist (MFM, eq. 10), "matching score" of Guo et al. 2022: mean Euclidean distance of
+    motions and their texts.
 
-    That code computes in float32 and drops an incomplete last batch. With `normalize`, as for `MotionsForText`, the
-    value is in [0, 2].
+    The code of Guo et al. computes in float32 and drops an incomplete last batch; here, every
+    motion counts. Lower is better. `update` takes `generated` (B, E), `text` (B, E) and `keys`
+    (B,).
+
+    Args:
+        normalize: scale features to length 1 first, for extractors trained with cosines; the
+            value is then in [0, 2].
+
+    Example:
+        >>> metric = MultimodalDistance()
+        >>> metric.update(generated=torch.zeros(2, 4), text=torch.ones(2, 4), keys=torch.arange(2))
+        >>> metric.compute()
+        2.0
     """
 
     higher_is_better = False
@@ -164,6 +218,7 @@ class MultimodalDistance(SampleMetric):
         self.normalize = normalize
 
     def value(self, generated: Tensor, text: Tensor) -> float:
+        """Returns the mean distance of features (N, E) of motions and texts."""
         return self._distances(generated, text).mean().item()
 
     def _distances(self, generated: Tensor, text: Tensor) -> Tensor:
@@ -172,19 +227,31 @@ class MultimodalDistance(SampleMetric):
         return torch.linalg.vector_norm(generated - text, dim=-1)
 
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
+        """Returns the distance of each motion from its text."""
         return {"": equally_weighted(self._distances(rows["generated"], rows["text"]))}
 
 
 class MotionCLIPScore(SampleMetric):
-    """mCLIP score of FLAME ("Evaluation Metrics"): mean cosine of the features of motions and texts, in [-1, 1]."""
+    """mCLIP score of FLAME ("Evaluation Metrics"): mean cosine of the features of motions and texts, in [-1, 1].
+
+    Higher is better. `update` takes `generated` (B, E), `text` (B, E) and `keys` (B,).
+
+    Example:
+        >>> metric = MotionCLIPScore()
+        >>> metric.update(generated=torch.eye(2), text=torch.eye(2), keys=torch.arange(2))
+        >>> metric.compute()
+        1.0
+    """
 
     higher_is_better = True
     states = ("generated", "text")
 
     def value(self, generated: Tensor, text: Tensor) -> float:
+        """Returns the mean cosine of features (N, E) of motions and texts."""
         return F.cosine_similarity(generated, text).mean().item()
 
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
+        """Returns the cosine of each motion and its text."""
         cosines = F.normalize(rows["generated"], dim=-1) * F.normalize(rows["text"], dim=-1)
         return {"": equally_weighted(cosines.sum(1))}
 
@@ -194,13 +261,16 @@ def pointwise_mutual_information(
 ) -> Tensor:
     """Computes the terms (M,) whose mean is MID, of motions (M, E) generated for texts (M, T), in float64.
 
-    Kim et al. 2022, "Mutual Information Divergence": the mean pointwise mutual information of generated motions and
-    their texts under a normal distribution fitted to real motions (N, E) and their texts (N, T),
+    Kim et al. 2022, "Mutual Information Divergence": the mean pointwise mutual information of
+    generated motions and their texts under a normal distribution fitted to real motions (N, E)
+    and their texts (N, T),
 
-        (log det S_x + log det S_y - log det S_z) / 2 + (tr S_x^-1 S_x' + tr S_y^-1 S_y - tr S_z^-1 S_z') / 2
+        (log det S_x + log det S_y - log det S_z) / 2 + (tr S_x^-1 S_x' + tr S_y^-1 S_y - tr
+        S_z^-1 S_z') / 2
 
-    where x is real, y is text, and z is both; covariances of generated motions (') are about the means of the real
-    ones; inverses are those of S + eps I. The denominators are N - 1 and M - 1.
+    where x is real, y is text, and z is both. Covariances of generated motions (') are about the
+    means of the real ones. S + eps I is inverted instead of S. The denominators are N - 1 and M -
+    1.
     """
     both, fake = torch.cat([real, text], 1), torch.cat([generated, requested], 1)
     value = real.new_zeros(len(generated))
@@ -217,8 +287,21 @@ def pointwise_mutual_information(
 class MutualInformationDivergence(SampleMetric):
     """MID, in nats: mean `pointwise_mutual_information` of generated motions, their texts and the real motions.
 
-    It needs more samples than motion and text have features together, or the joint covariance is singular; the authors'
-    code requires half as many. `eps` is 5e-4 in FLAME, 0 in the authors' release.
+    Kim et al. 2022. Higher is better. It needs more samples than motion and text have features
+    together, or the joint covariance is singular; the authors' code requires half as many.
+    `update` takes `generated` (B, E), `text` (B, E), `real` (B, E) and `keys` (B,); row i of
+    `real` is the real motion of text i.
+
+    Args:
+        eps: added to the diagonals of covariances before they are inverted; 5e-4 in FLAME, 0 in
+            the authors' release.
+
+    Example:
+        >>> metric, text = MutualInformationDivergence(), torch.randn(64, 2)
+        >>> generated, real = text + 0.1 * torch.randn(64, 2), text + 0.1 * torch.randn(64, 2)
+        >>> metric.update(generated=generated, text=text, real=real, keys=torch.arange(64))
+        >>> metric.compute() > 2  # a motion says much about its text
+        True
     """
 
     higher_is_better = True
@@ -230,6 +313,7 @@ class MutualInformationDivergence(SampleMetric):
         self.eps = eps
 
     def value(self, generated: Tensor, text: Tensor, real: Tensor) -> float:
+        """Returns the MID of features (N, E); raises `UserError` if there are too few samples."""
         self.need(
             len(text),
             real.shape[1] + text.shape[1] + 1,
@@ -238,6 +322,7 @@ class MutualInformationDivergence(SampleMetric):
         return pointwise_mutual_information(real, text, generated, text, self.eps).mean().item()
 
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
+        """Returns the pointwise mutual information of each motion; raises `UserError` if there are too few motions."""
         real, real_text = rows["paired"], rows["paired_text"]
         if len(real) <= real.shape[1] + real_text.shape[1]:
             raise UserError(f"{len(real)} motions are too few for its covariances")

@@ -1,8 +1,8 @@
 # pyright: standard
 """Attributes of a motion, read from its joints by geometric rules: action, side, count, direction, speed, amount.
 
-They read what a person would see in a clip of a few seconds that shows one action of the synthetic set; each threshold
-is stated next to its rule. The joints are the 22 of SMPL.
+They read what a person would see in a clip of a few seconds that shows one action of the
+synthetic set; each threshold is stated next to its rule. The joints are the 22 of SMPL.
 """
 
 import json
@@ -58,8 +58,20 @@ UNDECIDED = MORE.keys() - CHECKED.keys()  # actions without a rule, which are no
 def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
     """Reads one clip (F, 22, 3) of SMPL's joints in meters, y up, with any position and heading.
 
-    Returns "action" and the others of `ATTRIBUTES` that it has; {} if no action of the set is recognized, for example
-    in noise, or if the joints do not form a body.
+    The rules are tried in order: motions that lower the body, jumps, walks and runs, whole-body
+    actions, then gestures of the arms and the head.
+
+    Args:
+        joints: (F, 22, 3).
+        fps: frames per second.
+
+    Returns:
+        "action" and the others of `ATTRIBUTES` that the motion has; {} if no action of the set is
+        recognized, for example in noise, or if the joints do not form a body.
+
+    Example:
+        >>> read_attributes(np.random.default_rng(0).normal(size=(40, 22, 3)), fps=20)  # noise
+        {}
     """
     joints = np.asarray(joints, np.float64)
     if len(joints) < fps or not np.isfinite(joints).all():
@@ -70,7 +82,8 @@ def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
     floor = np.percentile(smooth[:, TOES, 1], 10)
     forward, left, turned = heading_of(smooth)
 
-    # Standing, the neck is 25 cm above the pelvis and the pelvis 50 cm above the toes, half of the time.
+    # Standing, the neck is 25 cm above the pelvis and the pelvis 50 cm above the toes, half of
+    # the time.
     pelvis = smooth[:, PELVIS, 1]
     stands = (
         np.median(smooth[:, NECK, 1] - pelvis) > 0.25
@@ -80,8 +93,9 @@ def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
     if lowered or not stands:
         return lowered
     jumps = count_rises((smooth[:, TOES, 1] - floor).min(1), 0.07, 0.035)
-    # A leap goes more than 45 cm with both feet side by side, a dance sways at least three times by more than 3.5 cm to
-    # one side and the other, and a hand that picks something up comes within 42 cm of the floor.
+    # A leap goes more than 45 cm with both feet side by side, a dance sways at least three times
+    # by more than 3.5 cm to one side and the other, and a hand that picks something up comes
+    # within 42 cm of the floor.
     stride = ((smooth[:, TOES[0]] - smooth[:, TOES[1]])[:, [0, 2]] * forward).sum(-1)
     if (
         jumps
@@ -140,10 +154,11 @@ def _is_a_body(joints: np.ndarray, smooth: np.ndarray) -> bool:
 def _lowered(
     smooth: np.ndarray, floor: float, forward: np.ndarray, fps: float
 ) -> dict[str, str | int]:
-    """Reads crawling, lying down, sitting down and standing up from the height of the pelvis and the tilt of the trunk.
+    """Reads crawling, lying down, sitting down and standing up from the height of the pelvis and
+    the tilt of the trunk.
 
-    A standing pelvis is higher than 78 cm, a seated one at 35 to 72 cm, a lying one below 35 cm. The trunk of who lies
-    or crawls is tilted by more than 55 degrees.
+    A standing pelvis is higher than 78 cm, a seated one at 35 to 72 cm, a lying one below 35 cm.
+    The trunk of who lies or crawls is tilted by more than 55 degrees.
     """
     pelvis, tilt = smooth[:, PELVIS, 1] - floor, tilt_of(smooth)
     first, last = (slice(0, max(1, round(0.1 * fps))), slice(-max(1, round(0.1 * fps)), None))
@@ -268,8 +283,8 @@ def right_attributes(seen: Mapping[str, Any], requested: Mapping[str, Any]) -> d
         requested: the attributes of the request.
 
     Returns:
-        Whether the attributes are right, by name. `action_and_side`: both are, or the action if no side was requested;
-        `all`: every requested attribute is.
+        Whether the attributes are right, by name. `action_and_side`: both are, or the action if
+        no side was requested; `all`: every requested attribute is.
     """
     if requested["action"] in UNDECIDED or requested.keys() & set(UNREAD):
         return {}
@@ -283,7 +298,22 @@ def right_attributes(seen: Mapping[str, Any], requested: Mapping[str, Any]) -> d
 
 
 class AttributeAccuracy(Timed, MotionMean):
-    """Fraction of motions that show the requested value, by attribute; see `right_attributes`."""
+    """Fraction of motions that show the requested value, by attribute. A metric of this project.
+
+    The values, in [0, 1], are one for each of `ATTRIBUTES`, `action_and_side` and `all`; higher
+    is better. Attributes are read from the joints by rules, without a network: see
+    `right_attributes`.
+
+    Args:
+        fps: frames per second of the motions.
+
+    Example:
+        >>> metric, joints = AttributeAccuracy(fps=20), torch.zeros(1, 40, 22, 3)
+        >>> mask, requested = torch.ones(1, 40, dtype=torch.bool), [{"action": "walk"}]
+        >>> metric.update(joints, mask, requested, keys=torch.tensor([0]))
+        >>> metric.compute()["action"]  # 22 joints in one point are no walk
+        0.0
+    """
 
     higher_is_better = True
     summary = exact = "all"
@@ -308,6 +338,15 @@ class AttributeAccuracy(Timed, MotionMean):
     def update(
         self, joints: Tensor, mask: Tensor, requested: Sequence[Mapping[str, Any]], keys: Tensor
     ) -> None:
+        """Adds B motions.
+
+        Args:
+            joints: (B, F, 22, 3) positions of SMPL's joints in meters, y up.
+            mask: (B, F) bool, True = real frame.
+            requested: B mappings from names of `ATTRIBUTES` to values, such as {"action": "walk",
+                "speed": "slow"}. Requests without a rule do not count.
+            keys: (B,) int64, unique keys of the motions.
+        """
         rows = []
         for motion, real, attributes in zip(
             joints.detach().cpu(), mask.cpu(), requested, strict=True
@@ -319,8 +358,14 @@ class AttributeAccuracy(Timed, MotionMean):
 def read_side(joints: np.ndarray, content: str, fps: float) -> str:
     """Reads the side, left or right, of a motion (F, 22, 3) of the Bandai set.
 
-    walk-turn-left and -right are read from the turn of the body, walk-left and -right from the direction of travel, all
-    others from the hand that rises higher above its shoulder. The content's own side is not used.
+    Contents walk-turn-left and -right are read from the turn of the body, walk-left and -right
+    from the direction of travel, all others from the hand that rises higher above its shoulder.
+    The side in the content's name is not used.
+
+    Args:
+        joints: (F, 22, 3) in meters, y up.
+        content: content of the motion, such as "walk-turn-left" or "wave-left-hand".
+        fps: frames per second.
     """
     smooth = gaussian_filter1d(np.asarray(joints, np.float64), 0.05 * fps, axis=0, mode="nearest")
     if content.startswith("walk"):
@@ -334,9 +379,22 @@ def read_side(joints: np.ndarray, content: str, fps: float) -> str:
 
 
 class SideAccuracy(Timed, MotionMean):
-    """Share of motions that show the requested side, left or right, on the Bandai set; see `read_side`.
+    """Share of motions that show the requested side, left or right, on the Bandai set. A metric of this project.
 
-    `hand` is about gestures, `path` about turns and sideways walks, `hand_or_path` about both; chance is 0.5.
+    `hand` is about gestures, `path` about turns and sideways walks, `hand_or_path` about both.
+    Chance is 0.5; higher is better. Sides are read from the joints by rules, without a network:
+    see `read_side`.
+
+    Args:
+        fps: frames per second of the motions.
+
+    Example:
+        >>> metric, joints = SideAccuracy(fps=20), torch.zeros(1, 40, 22, 3)
+        >>> joints[:, :, 20, 1] = 1.0  # the left wrist is above the left shoulder
+        >>> mask, sides = torch.ones(1, 40, dtype=torch.bool), [("wave-left-hand", "left")]
+        >>> metric.update(joints, mask, sides, keys=torch.tensor([0]))
+        >>> metric.compute()
+        {'hand': 1.0, 'path': None, 'hand_or_path': 1.0}
     """
 
     higher_is_better = True
@@ -346,7 +404,15 @@ class SideAccuracy(Timed, MotionMean):
     def update(
         self, joints: Tensor, mask: Tensor, sides: Sequence[tuple[str, str]], keys: Tensor
     ) -> None:
-        """Adds motions; those requested with another side than left and right do not count."""
+        """Adds B motions.
+
+        Args:
+            joints: (B, F, 22, 3) positions of SMPL's joints in meters, y up.
+            mask: (B, F) bool, True = real frame.
+            sides: B pairs of requested content and side. Requests with another side than left and
+                right do not count.
+            keys: (B,) int64, unique keys of the motions.
+        """
         rows = []
         for motion, real, (content, side) in zip(
             joints.detach().cpu(), mask.cpu(), sides, strict=True

@@ -1,8 +1,9 @@
 """Checks of single actions: whether a motion shows a certain action, and with which side, count or direction.
 
-`evaluators.metrics.attributes` reads one of 22 actions from a motion. Other actions are too similar to be told apart by
-rules, so that a check only verifies one that was requested. A hand at the head for half a second shows a drink, a
-phone call and a scratch alike. Thresholds are next to the rules.
+`evaluators.metrics.attributes` reads one of 22 actions from a motion. Other actions are too
+similar to be told apart by rules, so that a check only verifies one that was requested. A hand at
+the head for half a second shows a drink, a phone call and a scratch alike. Thresholds are next to
+the rules.
 """
 
 from collections.abc import Callable
@@ -66,6 +67,7 @@ class View:
 
     @classmethod
     def of(cls, smooth: np.ndarray, fps: float) -> "View":
+        """Returns the view of smoothed joints (F, 22, 3) in meters, y up."""
         forward, left, turned = heading_of(smooth)
         return cls(smooth, fps, forward, left, turned, float(np.percentile(smooth[:, TOES, 1], 10)))
 
@@ -212,8 +214,8 @@ def _strafe(view: View) -> Shown:
 def _limp(view: View) -> Shown:
     """Reads the leg on which the pelvis sinks while the other foot is in the air, during a walk.
 
-    The height of the pelvis correlates with the difference of the feet's heights by more than 0.35; in an even walk,
-    the correlation is about 0.
+    The height of the pelvis correlates with the difference of the feet's heights by more than
+    0.35; in an even walk, the correlation is about 0.
     """
     right_up = view.smooth[:, ANKLES[1], 1] - view.smooth[:, ANKLES[0], 1]
     low = -view.smooth[:, PELVIS, 1]

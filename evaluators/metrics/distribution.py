@@ -9,16 +9,24 @@ from torch import Tensor
 
 from evaluators.metrics.samples import Rows, TwoSets
 
-NEIGHBORS = 3  # of a sample of `PrecisionRecall`, as in MoDi and MDM
+# Number of neighbors that define the manifold of `PrecisionRecall`, as in MoDi and MDM
+NEIGHBORS = 3
 
 
 def frechet_distance(a: Tensor, b: Tensor) -> Tensor:
     """Computes the Fréchet distance of normal distributions fitted to the rows of a (N, E) and b (M, E), float64.
 
-    |m_a - m_b|^2 + tr S_a + tr S_b - 2 tr (S_a S_b)^(1/2) (Dowson and Landau 1982). With centered rows A / sqrt(N - 1)
-    = Q_a R_a, and likewise for b, the last trace is the sum of the singular values of R_a R_b^T, also if covariances
-    are rank-deficient.
+    |m_a - m_b|^2 + tr S_a + tr S_b - 2 tr (S_a S_b)^(1/2) (Dowson and Landau 1982).
+
+    Example:
+        >>> a = torch.randn(50, 2, dtype=torch.float64)
+        >>> round(frechet_distance(a, a + 1).item(), 9)  # only the means differ, by 1 in each feature
+        2.0
     """
+    # No matrix square root is needed: with the QR decomposition A / sqrt(N - 1) = Q_a R_a of the
+    # centered rows, and likewise for b, the last trace is the sum of the singular values of R_a
+    # R_b^T. This also holds if covariances are rank-deficient, where an iterative square root
+    # fails.
     r_a, r_b = (torch.linalg.qr((x - x.mean(0)) / (len(x) - 1) ** 0.5, mode="r").R for x in (a, b))
     shared = torch.linalg.svdvals(r_a @ r_b.T).sum()
     return ((a.mean(0) - b.mean(0)) ** 2).sum() + (r_a**2).sum() + (r_b**2).sum() - 2 * shared
@@ -27,14 +35,25 @@ def frechet_distance(a: Tensor, b: Tensor) -> Tensor:
 class FrechetMotionDistance(TwoSets):
     """Fréchet distance of motion features, "FID" (Heusel et al. 2017) or "FD" (FLAME): `frechet_distance`.
 
-    Covariances have N - 1 in the denominator, as in the authors' code. That code computes means in float32 and scipy's
-    `sqrtm` of the product, and adds 1e-6 to the diagonals if that fails; the relative difference is 1e-8. The value is
-    biased upwards, and more so with fewer samples: compare only values for equal N.
+    Covariances have N - 1 in the denominator, as in the authors' code. The authors' code computes
+    means in float32 and scipy's `sqrtm` of the product, and adds 1e-6 to the diagonals if that
+    fails; the relative difference is 1e-8.
+
+    Lower is better. The value is biased upward, and more so with fewer samples: compare only
+    values for equal N. `update` takes `generated` (B, E) with `keys` (B,), and `real` (R, E) with
+    `real_keys` (R,).
+
+    Example:
+        >>> metric, real = FrechetMotionDistance(), torch.randn(50, 2)
+        >>> metric.update(generated=real + 1, keys=torch.arange(50), real=real, real_keys=torch.arange(50))
+        >>> round(metric.compute(), 4)
+        2.0
     """
 
     higher_is_better = False
 
     def value(self, generated: Tensor, real: Tensor) -> float:
+        """Returns the distance of features (N, E) and (M, E); raises `UserError` if N or M is below 2."""
         self.need(len(generated), 2, "generated motions")
         self.need(len(real), 2, "real motions")
         # Rounding may give a value slightly below 0
@@ -53,7 +72,12 @@ class FrechetMotionDistance(TwoSets):
 def polynomial_mmd2(a: Tensor, b: Tensor) -> Tensor:
     """Computes the unbiased squared MMD of a (n, E) and b (n, E) with the kernel (x . y / E + 1)^3.
 
-    Bińkowski et al. 2018, eq. 4, including the pairs (i, i) across the sets, as in the authors' code.
+    Bińkowski et al. 2018, eq. 4, including the pairs (i, i) across the sets, as in the authors'
+    code.
+
+    Example:
+        >>> polynomial_mmd2(torch.ones(4, 1), torch.ones(4, 1)).item()
+        0.0
     """
     n, width = a.shape
     inner_a, inner_b, cross = ((x @ y.T / width + 1) ** 3 for x, y in ((a, a), (b, b), (a, b)))
@@ -64,8 +88,21 @@ def polynomial_mmd2(a: Tensor, b: Tensor) -> Tensor:
 class KernelMotionDistance(TwoSets):
     """Kernel distance of motion features, "KID" (Bińkowski et al. 2018): mean `polynomial_mmd2` of random subsets.
 
-    Each of the `subsets` has `subset_size` samples of either set. `replace` draws them with replacement, as the code of
-    MoDi and MDM does if there are more real motions than that; samples that are drawn twice increase the value.
+    The values are `mean`, lower is better, and `std` over the subsets. `update` takes `generated`
+    (B, E) with `keys` (B,), and `real` (R, E) with `real_keys` (R,).
+
+    Args:
+        subsets: number of random subsets.
+        subset_size: number of samples of either set in a subset; neither set may be smaller.
+        replace: draw with replacement, as the code of MoDi and MDM does if there are more real
+            motions than `subset_size`; samples that are drawn twice increase the value.
+        seed: seed of the draws.
+
+    Example:
+        >>> metric, keys = KernelMotionDistance(subsets=2, subset_size=4), torch.arange(8)
+        >>> metric.update(generated=torch.ones(8, 1), keys=keys, real=torch.ones(8, 1), real_keys=keys)
+        >>> metric.compute()
+        {'mean': 0.0, 'std': 0.0}
     """
 
     higher_is_better = False
@@ -85,6 +122,7 @@ class KernelMotionDistance(TwoSets):
         )
 
     def value(self, generated: Tensor, real: Tensor) -> dict[str, float | None]:
+        """Returns `mean` and `std` of features (N, E), (M, E); `UserError` if there are fewer than `subset_size`."""
         for name, features in (("generated", generated), ("real", real)):
             self.need(
                 len(features), self.subset_size, f"{name} motions for subsets of {self.subset_size}"
@@ -100,9 +138,16 @@ class KernelMotionDistance(TwoSets):
 
 
 def manifold_coverage(points: Tensor, samples: Tensor) -> Tensor:
-    """Returns the fraction of points (M, E) that are no farther from a sample (N, E) than its third-nearest neighbor.
+    """Returns the fraction of `points` (M, E) in the manifold of `samples` (N, E).
 
-    Kynkäänniemi et al. 2019, eq. 1 and 2. A sample is not a neighbor of itself.
+    A point is in the manifold if it is within the distance from some sample to that sample's
+    third-nearest neighbor. Kynkäänniemi et al. 2019, eq. 1 and 2. A sample is not a neighbor of
+    itself.
+
+    Example:
+        >>> samples = torch.tensor([[0.0], [1.0], [2.0], [3.0]])
+        >>> manifold_coverage(torch.tensor([[1.5], [9.0]]), samples).item()
+        0.5
     """
     reach = _squared_distances(samples, samples).kthvalue(NEIGHBORS + 1, dim=1).values
     return (_squared_distances(points, samples) <= reach).any(1).double().mean()
@@ -115,9 +160,19 @@ def _squared_distances(a: Tensor, b: Tensor) -> Tensor:
 class PrecisionRecall(TwoSets):
     """Precision and recall of generated motions (Kynkäänniemi et al. 2019), in [0, 1].
 
-    Precision is the `manifold_coverage` of generated motions by the real ones, recall that of the real motions by the
-    generated ones. Since neighbor distances shrink with the number of samples, both sets are cut to the size of the
-    smaller one, in the order of the keys; the authors' code cuts in the order of the files.
+    `precision` is the fraction of generated motions in the manifold of the real motions, `recall`
+    the fraction of real motions in the manifold of the generated motions (`manifold_coverage`);
+    higher is better. Since neighbor distances shrink with the number of samples, both sets are
+    cut to the size of the smaller one, in the order of the keys; the authors' code cuts in the
+    order of the files.
+
+    `update` takes `generated` (B, E) with `keys` (B,), and `real` (R, E) with `real_keys` (R,).
+
+    Example:
+        >>> metric, real, keys = PrecisionRecall(), torch.randn(8, 2), torch.arange(8)
+        >>> metric.update(generated=real, keys=keys, real=real, real_keys=keys)
+        >>> metric.compute()
+        {'precision': 1.0, 'recall': 1.0}
     """
 
     higher_is_better = True
@@ -125,6 +180,7 @@ class PrecisionRecall(TwoSets):
     names = ("precision", "recall")
 
     def value(self, generated: Tensor, real: Tensor) -> dict[str, float | None]:
+        """Returns `precision` and `recall` of features (N, E), (M, E); `UserError` with fewer than four motions."""
         size = min(len(generated), len(real))
         self.need(size, NEIGHBORS + 1, "motions in the smaller set")
         generated, real = generated[:size], real[:size]

@@ -27,10 +27,23 @@ def _random_pairs(count: int, pairs: int, replace: bool, seed: int) -> tuple[Ten
 
 
 class Diversity(SampleMetric):
-    """Mean distance of random pairs of motions (Guo et al. 2020; MDM, eq. 6). Best if equal to that of real motions.
+    """Diversity: mean distance of random pairs of motions (Guo et al. 2020; MDM, eq. 6).
 
-    Published are 300 pairs, drawn as two sets without replacement, for text-to-motion, and 200 pairs with replacement
-    for action-to-motion and unconstrained synthesis. In both cases, a motion may be paired with itself.
+    Best if equal to the diversity of real motions. Published are 300 pairs, drawn as two sets
+    without replacement, for text-to-motion, and 200 pairs with replacement for action-to-motion
+    and unconstrained synthesis. In both cases, a motion may be paired with itself. `update` takes
+    `generated` (B, E) and `keys` (B,).
+
+    Args:
+        pairs: number of pairs.
+        replace: draw both sides of the pairs with replacement.
+        seed: seed of the draws.
+
+    Example:
+        >>> metric = Diversity(pairs=2, replace=False)
+        >>> metric.update(generated=torch.ones(4, 2), keys=torch.arange(4))
+        >>> metric.compute()  # all motions are the same
+        0.0
     """
 
     higher_is_better = None
@@ -41,6 +54,7 @@ class Diversity(SampleMetric):
         self.pairs, self.replace, self.seed = pairs, replace, seed
 
     def value(self, features: Tensor) -> float:
+        """Returns the diversity of features (N, E); raises `UserError` if there are too few motions for the pairs."""
         self.need(
             len(features), 2 if self.replace else self.pairs, f"motions for {self.pairs} pairs"
         )
@@ -58,9 +72,22 @@ class Diversity(SampleMetric):
 class TextMultimodality(SampleMetric):
     """Multimodality of Guo et al. 2022 (MDM, B.2; MFM, eq. 12): 10 random pairs out of 30 motions per text.
 
-    As in their code, two sets of 10 are drawn without replacement from the 30, with the same indices for all texts; a
-    motion that is in both may be paired with itself. Published for 100 texts; the code of MDM and MFM uses whole
-    batches, that is 128 texts. `samples` and `pairs` are per text.
+    As in their code, two sets of 10 are drawn without replacement from the 30, with the same
+    indices for all texts; a motion that is in both may be paired with itself. Published for 100
+    texts; the code of MDM and MFM uses whole batches, that is 128 texts. `update` takes
+    `generated` (B, E), `groups` (B,) and `keys` (B,).
+
+    Args:
+        samples: number of motions per text.
+        pairs: number of pairs per text, at most `samples`.
+        seed: seed of the draws.
+
+    Example:
+        >>> metric = TextMultimodality(samples=2, pairs=2)
+        >>> groups = torch.tensor([0, 0, 1, 1])
+        >>> metric.update(generated=torch.ones(4, 2), groups=groups, keys=torch.arange(4))
+        >>> metric.compute()  # all motions are the same
+        0.0
     """
 
     higher_is_better = None
@@ -71,6 +98,7 @@ class TextMultimodality(SampleMetric):
         self.samples, self.pairs, self.seed = samples, pairs, seed
 
     def value(self, features: Tensor, groups: Tensor) -> float:
+        """Returns the multimodality of features (N, E); `UserError` if a text of `groups` has not `samples` motions."""
         features = features[self.by_group(groups, self.samples)]
         first, second = _random_pairs(self.samples, self.pairs, False, self.seed)
         return pair_distance(features[:, first], features[:, second])
@@ -79,7 +107,18 @@ class TextMultimodality(SampleMetric):
 class PairedMultimodality(SampleMetric):
     """Multimodality of FLAME (eq. 19): two sets of `samples` motions per text, compared one by one.
 
-    FLAME published no code for it. Its Table 3 has 10 motions per text, but eq. 19 uses two sets of 10.
+    FLAME published no code for it. Its Table 3 has 10 motions per text, but eq. 19 uses two sets
+    of 10. `update` takes `generated` (B, E), `groups` (B,) and `keys` (B,).
+
+    Args:
+        samples: number of motions of each of the two sets per text.
+
+    Example:
+        >>> metric = PairedMultimodality(samples=1)
+        >>> generated, groups = torch.tensor([[0.0], [3.0]]), torch.tensor([0, 0])
+        >>> metric.update(generated=generated, groups=groups, keys=torch.arange(2))
+        >>> metric.compute()
+        3.0
     """
 
     higher_is_better = None
@@ -90,6 +129,7 @@ class PairedMultimodality(SampleMetric):
         self.samples = samples
 
     def value(self, features: Tensor, groups: Tensor) -> float:
+        """Returns the value of features (N, E); `UserError` if a text of `groups` (N,) has not 2 `samples` motions."""
         first, second = features[self.by_group(groups, 2 * self.samples)].chunk(2, dim=1)
         return pair_distance(first, second)
 
@@ -97,8 +137,20 @@ class PairedMultimodality(SampleMetric):
 class ActionMultimodality(SampleMetric):
     """Multimodality of Guo et al. 2020 (MDM, eq. 7): 20 random pairs of the same class, for each class.
 
-    As in the authors' code, a motion may be drawn repeatedly and be paired with itself. The authors divide the sum by
-    the number of all classes; here, it is divided by that of classes with motions.
+    As in the authors' code, a motion may be drawn repeatedly and be paired with itself. The
+    authors divide the sum by the number of all classes; here, it is divided by the number of
+    classes with motions. `update` takes `generated` (B, E), `labels` (B,) and `keys` (B,).
+
+    Args:
+        pairs: number of pairs per class.
+        seed: seed of the draws.
+
+    Example:
+        >>> metric = ActionMultimodality(pairs=2)
+        >>> labels = torch.tensor([0, 0, 1, 1])
+        >>> metric.update(generated=torch.ones(4, 2), labels=labels, keys=torch.arange(4))
+        >>> metric.compute()  # all motions are the same
+        0.0
     """
 
     higher_is_better = None
@@ -109,6 +161,7 @@ class ActionMultimodality(SampleMetric):
         self.pairs, self.seed = pairs, seed
 
     def value(self, features: Tensor, labels: Tensor) -> float:
+        """Returns the value of features (N, E) with labels (N,); `UserError` if a class has a single motion."""
         generator = np.random.default_rng(self.seed)
         pairs = []
         for label in labels.unique():
@@ -123,9 +176,21 @@ class ActionMultimodality(SampleMetric):
 class JointVariance(SampleMetric):
     """Variance of joint positions among the motions of a text, in square meters.
 
-    The variance over the `samples` motions of a text, of equal length (n - 1 in the denominator), is summed over x, y
-    and z, and averaged over joints, frames and texts. It is not comparable with FLAME's numbers: Table 3 averages "the
-    variance of joints for the 10 generated motions", by eq. 18, a variance over the frames of one motion, without code.
+    The variance over the `samples` motions of a text, of equal length (n - 1 in the denominator),
+    is summed over x, y and z, and averaged over joints, frames and texts. It is not comparable
+    with FLAME's numbers: Table 3 averages "the variance of joints for the 10 generated motions",
+    by eq. 18, a variance over the frames of one motion, without code.
+
+    Args:
+        samples: number of motions per text.
+
+    Example:
+        >>> metric, joints = JointVariance(samples=2), torch.zeros(2, 5, 22, 3)
+        >>> joints[1, ..., 0] = 2  # the second motion is 2 m beside the first
+        >>> mask = torch.ones(2, 5, dtype=torch.bool)
+        >>> metric.update(joints, mask, groups=torch.tensor([0, 0]), keys=torch.arange(2))
+        >>> metric.compute()
+        2.0
     """
 
     higher_is_better = None
@@ -139,10 +204,22 @@ class JointVariance(SampleMetric):
         self.add_state("motions", [], dist_reduce_fx="cat")
 
     def update(self, joints: Tensor, mask: Tensor, groups: Tensor, keys: Tensor) -> None:
+        """Adds B motions.
+
+        Args:
+            joints: (B, F, J, 3) positions in meters.
+            mask: (B, F) bool, True = real frame.
+            groups: (B,) int64, keys of the texts.
+            keys: (B,) int64, unique keys of the motions.
+
+        Raises:
+            UserError: If a real frame is not finite.
+        """
         self.motions += self.real_frames(joints, mask)
         super().update(keys=keys, groups=groups)
 
     def value(self, groups: Tensor) -> float:
+        """Returns the variance; `UserError` if a text has not `samples` motions, or they differ in length."""
         order, values = self.order("keys"), []
         for members in self.by_group(groups, self.samples):
             motions = [self.motions[index].double() for index in order[members].tolist()]

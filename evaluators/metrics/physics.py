@@ -9,18 +9,32 @@ from torch import Tensor
 from evaluators.metrics.samples import JointMean, Timed
 from flame_mdm.formats.faults import LIMITS, LOW
 
-TOLERANCE = 0.005  # distance from the floor, in meters, that counts as 0
-STANDING = 0.03  # speed in meters per second below which a motion counts as static
+# Distance from the floor, in meters, that counts as 0
+TOLERANCE = 0.005
+# Speed in meters per second below which a motion counts as static
+STANDING = 0.03
 
 
 class FootSkating(Timed, JointMean):
     """Foot skating ratio: fraction of frame transitions in which a foot that touches the floor slides.
 
-    A toe joint touches the floor if it is below 5 cm in two adjacent frames, and slides if it moves more than 2.5 cm
-    over the ground between them (Karunratanakul et al. 2023, "Guided Motion Diffusion"). The 2.5 cm are for 20 frames
-    per second; at other frame rates, the same speed of 0.5 m/s is the limit. The code released with the paper also
-    requires this speed in the mean of five frames, which the paper does not, and averages the ratios of the motions;
-    here, every frame transition has the same weight. The default `toes` are those of the 22 SMPL joints.
+    A toe joint touches the floor if it is below 5 cm in two adjacent frames, and slides if it
+    moves more than 2.5 cm over the ground between them (Karunratanakul et al. 2023, "Guided
+    Motion Diffusion"). The 2.5 cm are for 20 frames per second; at other frame rates, the same
+    speed of 0.5 m/s is the limit. The code released with the paper also requires this speed in
+    the mean of five frames, which the paper does not, and averages the ratios of the motions;
+    here, every frame transition has the same weight. Lower is better.
+
+    Args:
+        fps: frames per second of the motions.
+        toes: indices of the toe joints; default: the toes of the 22 SMPL joints.
+
+    Example:
+        >>> metric, joints = FootSkating(fps=20), torch.zeros(1, 3, 22, 3)
+        >>> joints[..., 0] = torch.tensor([0.0, 0.1, 0.1])[:, None]  # slides 10 cm, then stands
+        >>> metric.update(joints, torch.ones(1, 3, dtype=torch.bool), keys=torch.tensor([0]))
+        >>> metric.compute()
+        0.5
     """
 
     higher_is_better = False
@@ -30,6 +44,7 @@ class FootSkating(Timed, JointMean):
         self.toes = list(toes)
 
     def measure(self, motion: Tensor) -> Tensor:
+        """Returns whether each frame transition of a motion (F, J, 3) skates, (F - 1,) bool."""
         toes = motion[:, self.toes].double()
         fast = toes[..., [0, 2]].diff(dim=0).norm(dim=-1) * self.fps > LIMITS["skating"][0]
         low = toes[..., 1] < LOW
@@ -39,20 +54,37 @@ class FootSkating(Timed, JointMean):
 class Penetration(JointMean):
     """Mean depth over frames of the lowest joint below the floor, y = 0, in meters; depths up to 5 mm count as 0.
 
-    Yuan et al. 2023 (PhysDiff) measure the lowest vertex of a mesh instead.
+    Yuan et al. 2023 (PhysDiff) measure the lowest vertex of a mesh instead. Lower is better.
+
+    Example:
+        >>> metric, joints = Penetration(), torch.full((1, 3, 22, 3), -0.25)
+        >>> metric.update(joints, torch.ones(1, 3, dtype=torch.bool), keys=torch.tensor([0]))
+        >>> metric.compute()
+        0.25
     """
 
     higher_is_better = False
     unit = "m"
-    side = -1  # of the floor
+    #: Side of the floor that is measured: -1 = below, 1 = above.
+    side = -1
 
     def measure(self, motion: Tensor) -> Tensor:
+        """Returns the distance (F,) of the lowest joint of a motion (F, J, 3) from the floor, in meters."""
         distance = self.side * motion.double()[..., 1].amin(1)
         return torch.where(distance > TOLERANCE, distance, 0.0)
 
 
 class Floating(Penetration):
-    """Mean height of the lowest joint above the floor, as for `Penetration`. Jumps count as floating, too."""
+    """Mean height over frames of the lowest joint above the floor, in meters; heights up to 5 mm count as 0.
+
+    Jumps count as floating, too. Lower is better.
+
+    Example:
+        >>> metric, joints = Floating(), torch.full((1, 3, 22, 3), 0.25)
+        >>> metric.update(joints, torch.ones(1, 3, dtype=torch.bool), keys=torch.tensor([0]))
+        >>> metric.compute()
+        0.25
+    """
 
     side = 1
 
@@ -60,25 +92,46 @@ class Floating(Penetration):
 class Jitter(Timed, JointMean):
     """Mean jerk of the joints, the third difference of their positions, in m/s^3, as in Yi et al. 2022 (PIP).
 
-    It grows with the frame rate: compare only values for equal frame rates.
+    It grows with the frame rate: compare only values for equal frame rates. Lower is better.
+
+    Args:
+        fps: frames per second of the motions.
+
+    Example:
+        >>> metric, joints = Jitter(fps=20), torch.zeros(1, 5, 22, 3)
+        >>> metric.update(joints, torch.ones(1, 5, dtype=torch.bool), keys=torch.tensor([0]))
+        >>> metric.compute()
+        0.0
     """
 
     higher_is_better = False
     unit = "m/s^3"
 
     def measure(self, motion: Tensor) -> Tensor:
+        """Returns the mean jerk (F - 3,) of the joints of a motion (F, J, 3), in m/s^3."""
         return motion.double().diff(n=3, dim=0).norm(dim=-1).mean(1) * self.fps**3
 
 
 class StaticShare(Timed, JointMean):
     """Fraction of motions that hardly move: less than 3 cm/s on average over joints and frames.
 
-    Real data sets have static motions, too, of standing people: compare with their value.
+    Real data sets have static motions, too, of standing people: compare with their value. Lower
+    is better.
+
+    Args:
+        fps: frames per second of the motions.
+
+    Example:
+        >>> metric, joints = StaticShare(fps=20), torch.zeros(1, 5, 22, 3)
+        >>> metric.update(joints, torch.ones(1, 5, dtype=torch.bool), keys=torch.tensor([0]))
+        >>> metric.compute()
+        1.0
     """
 
     higher_is_better = False
 
     def measure(self, motion: Tensor) -> Tensor:
+        """Returns whether a motion (F, J, 3) is static, (1,) bool; (0,) for a single frame."""
         moved = motion.double().diff(dim=0).norm(dim=-1)
         # Undefined for a single frame
         return (moved.mean() * self.fps < STANDING)[None][: len(moved)]

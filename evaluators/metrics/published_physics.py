@@ -1,7 +1,8 @@
 # pyright: standard
 """Physics metrics of published benchmarks, each with its own units, thresholds and frame rate; the floor is y = 0.
 
-Values of different benchmarks are not comparable with one another, nor with those of `evaluators.metrics.physics`.
+Values of different benchmarks are not comparable with one another, nor with values of
+`evaluators.metrics.physics`.
 """
 
 import math
@@ -27,7 +28,14 @@ Values = dict[str, Tensor | float]
 
 
 class PublishedPhysics(Timed, JointMean):
-    """Means over motions of values by name; `measured` is the fraction of motions that have all of them."""
+    """Base class of published physics metrics: means over motions of values by name.
+
+    `measured` is the fraction of motions that have all values.
+
+    Args:
+        fps: frames per second of the motions.
+        feet: indices of the foot joints.
+    """
 
     higher_is_better = False
     summary = None
@@ -40,6 +48,7 @@ class PublishedPhysics(Timed, JointMean):
         self.feet = list(feet)
 
     def value(self, sums: Tensor, counts: Tensor) -> dict[str, float | None]:
+        """Returns the means by name; raises `UserError` if they are not defined at the frame rate."""
         if not self.defined:
             raise self.error(
                 f"defined at {self.required_fps:g} frames per second, but the motions have {self.fps:g}"
@@ -52,20 +61,33 @@ class PublishedPhysics(Timed, JointMean):
         return self.required_fps in (None, self.fps)
 
     def readings(self, motions: Rows) -> dict[str, np.ndarray]:
+        """Returns the sum and the number (N, 2) of the values of each motion, by name; {} if they are not defined."""
         return super().readings(motions) if self.defined else {}
 
 
 class MBenchQuality(PublishedPhysics):
     """Motion quality of MBench (ViMoGen, bf891de), in meters per frame, only at 20 frames per second.
 
-    `jitter_degree`: mean length of the second difference of joint positions, plus the same relative to the root;
-    `dynamic_degree`: the same of the first difference, higher = more motion; `ground_penetration`: mean depth of the
-    toes that are deeper than 5 mm, or 0; `foot_sliding`: mean step over the ground of toes in contact; `foot_floating`:
-    frames in which the body moves without a foot that carries it, per frame; it can exceed 1. A toe is in contact if it
-    moves less than 1 cm per frame, also in the air, or is lower than 2 cm.
+    `jitter_degree`: mean length of the second difference of joint positions, plus the same
+    relative to the root; `dynamic_degree`: the same of the first difference, higher = more
+    motion; `ground_penetration`: mean depth of the toes that are deeper than 5 mm, or 0;
+    `foot_sliding`: mean step over the ground of toes in contact; `foot_floating`: frames in which
+    the body moves without a foot that carries it, per frame; it can exceed 1. A toe is in contact
+    if it moves less than 1 cm per frame, also in the air, or is lower than 2 cm.
 
-    The code takes z as height, although its published pipeline passes motions in which y is height. Here, it is y.
-    `toes` are the indices of the left and the right toe.
+    The code takes z as height, although its published pipeline passes motions in which y is
+    height. Here, it is y.
+
+    Args:
+        fps: frames per second of the motions; at other rates than 20, `compute` raises
+            `UserError`.
+        toes: indices of the left and the right toe.
+
+    Example:
+        >>> metric, joints = MBenchQuality(fps=20), torch.zeros(1, 5, 22, 3)
+        >>> metric.update(joints, torch.ones(1, 5, dtype=torch.bool), keys=torch.tensor([0]))
+        >>> metric.compute()["jitter_degree"]
+        0.0
     """
 
     parts = (
@@ -85,6 +107,7 @@ class MBenchQuality(PublishedPhysics):
         super().__init__(fps, toes)
 
     def measure(self, motion: Tensor) -> Values:
+        """Computes the values of a motion (F, J, 3) by name."""
         motion = motion.double()
         local, feet = motion - motion[:, :1], motion[:, self.feet]
         height, contact = feet[..., 1], mbench_contact(feet)
@@ -117,8 +140,10 @@ def _speed(points: Tensor) -> Tensor:
 def mbench_floating(motion: Tensor, feet: Tensor, contact: Tensor) -> tuple[int, int, int]:
     """Counts the frames of `foot_floating` of a motion (F, J, 3) with two feet (F, 2, 3) in contact or not (F, 2).
 
-    They are those in which the feet on the ground move unlike the body; those of feet in the air that move much less
-    than the body, which count half; and those in which both feet swing to and fro in the air.
+    Returns:
+        Three numbers of frames: frames in which the feet on the ground move unlike the body;
+        frames in which a foot in the air moves much less than the body, which count half in the
+        score; and frames in which both feet swing to and fro in the air.
     """
     root = _speed(motion[:, 0])
     rate = _speed(feet - motion[:, :1]) / (root[:, None] + 1e-6)
@@ -147,13 +172,24 @@ def _runs(aloft: Tensor) -> list[tuple[int, int]]:
 class KimodoQuality(PublishedPhysics):
     """Foot skating of Kimodo (7330e7e), in m/s, from joints and from the contacts that the model predicts.
 
-    `skate_from_height`: mean speed of toes that are lower than 5 cm; `skate_ratio`: fraction of their steps with more
-    than 0.2 m/s, among steps that begin and end lower than 5 cm; `low`: mean fraction of steps that begin there: if it
-    is 0, so are the two. If the representation has contacts: `skate_from_contacts` and `skate_max` are mean and largest
-    speed of heels and toes in contact; `contact_consistency` is the fraction of contacts that agree with a heuristic
+    `skate_from_height`: mean speed of toes that are lower than 5 cm; `skate_ratio`: fraction of
+    their steps with more than 0.2 m/s, among steps that begin and end lower than 5 cm; `low`:
+    mean fraction of steps that begin there: if it is 0, so are the two. If the representation has
+    contacts: `skate_from_contacts` and `skate_max` are mean and largest speed of heels and toes
+    in contact; `contact_consistency` is the fraction of contacts that agree with a heuristic
     (slower than 0.15 m/s and lower than 10 cm), higher is better.
 
-    Speeds are in three dimensions; a motion of one frame has none. `feet` are left heel and toe, right heel and toe.
+    Speeds are in three dimensions; a motion of one frame has none.
+
+    Args:
+        fps: frames per second of the motions.
+        feet: indices of left heel and toe, right heel and toe.
+
+    Example:
+        >>> metric, joints = KimodoQuality(fps=20), torch.zeros(1, 5, 22, 3)
+        >>> metric.update(joints, torch.ones(1, 5, dtype=torch.bool), keys=torch.tensor([0]))
+        >>> metric.compute()["skate_ratio"]
+        0.0
     """
 
     parts = (
@@ -177,6 +213,18 @@ class KimodoQuality(PublishedPhysics):
     def update(
         self, joints: Tensor, mask: Tensor, keys: Tensor, contacts: Tensor | None = None
     ) -> None:
+        """Adds B motions.
+
+        Args:
+            joints: (B, F, J, 3) positions in meters, y up, floor at y = 0.
+            mask: (B, F) bool, True = real frame.
+            keys: (B,) int64, unique keys of the motions.
+            contacts: (B, F, 4) bool, predicted contacts of the feet. None = values of contacts
+                are not measured.
+
+        Raises:
+            UserError: If a motion is not finite.
+        """
         motions = self.real_frames(joints, mask)
         labels = (
             [None] * len(motions)
@@ -186,6 +234,7 @@ class KimodoQuality(PublishedPhysics):
         self.add(keys, [self.measure(*pair) for pair in zip(motions, labels, strict=True)])
 
     def extras(self, motions: Rows, i: int) -> dict[str, Tensor]:
+        """Returns the contacts of the motion with number i, if it has any."""
         return {"contacts": motions["contacts"][i][None]} if "contacts" in motions else {}
 
     def measure(self, motion: Tensor, contacts: Tensor | None = None) -> Values:
@@ -213,10 +262,20 @@ class KimodoQuality(PublishedPhysics):
 class KimodoConstraints(MotionMean):
     """Constraint errors of Kimodo (7330e7e), for edits: distance of kept parts from the real motion, in meters.
 
-    `root2d_err`: over the ground, of the root in frames that keep it; `root2d_err_p95`: its 95th percentile over
-    motions; `root2d_acc`: fraction of those frames with at most 10 cm; `fullbody_keyframe`: of all joints in frames
-    that keep all; `end_effector`: of the kept joints in other frames. In the code, the user draws the trajectory of the
-    root; here, it is that of the real motion.
+    `root2d_err`: over the ground, of the root in frames that keep it; `root2d_err_p95`: its 95th
+    percentile over motions; `root2d_acc`: fraction of those frames with at most 10 cm;
+    `fullbody_keyframe`: of all joints in frames that keep all; `end_effector`: of the kept joints
+    in other frames. In the code, the user draws the trajectory of the root; here, it is the
+    trajectory of the real motion.
+
+    Example:
+        >>> metric, real = KimodoConstraints(), torch.zeros(1, 5, 22, 3)
+        >>> joints, mask = real + torch.tensor([0.0, 0.5, 0.0]), torch.ones(1, 5, dtype=torch.bool)
+        >>> kept = torch.ones(1, 5, 22, dtype=torch.bool)
+        >>> metric.update(joints, real, mask, kept, keys=torch.tensor([0]))
+        >>> values = metric.compute()
+        >>> values["fullbody_keyframe"], values["root2d_err"]  # half a meter too high
+        (0.5, 0.0)
     """
 
     higher_is_better = False
@@ -230,6 +289,18 @@ class KimodoConstraints(MotionMean):
     def update(
         self, joints: Tensor, real_joints: Tensor, mask: Tensor, kept: Tensor, keys: Tensor
     ) -> None:
+        """Adds B edits.
+
+        Args:
+            joints: (B, F, J, 3) edited motions in meters, y up.
+            real_joints: (B, F', J, 3) motions before editing, in the same order, F' >= F.
+            mask: (B, F) bool, True = real frame.
+            kept: (B, F, J) bool, True = the edit kept this joint of this frame.
+            keys: (B,) int64, unique keys of the edits.
+
+        Raises:
+            UserError: If an edited motion is not finite.
+        """
         motions = self.real_frames(joints, mask)
         parts = kept[mask].split(mask.sum(1).tolist())
         errors = []
@@ -243,6 +314,7 @@ class KimodoConstraints(MotionMean):
         self.add(keys, errors)
 
     def value(self, sums: Tensor, counts: Tensor) -> dict[str, float | None]:
+        """Returns the means over motions, and the percentile `root2d_err_p95`, by name."""
         roots = sums[counts[:, 0] > 0, 0]
         return self.means(sums, counts) | {
             "root2d_err_p95": roots.quantile(0.95).item() if len(roots) else None
@@ -260,10 +332,22 @@ def constraint_errors(root: Tensor, full: Tensor, parts: Tensor) -> dict[str, Te
 class PhysicalFootContact(PublishedPhysics):
     """Physical foot contact score (PFC) of EDGE (17c3428), x 10^4: acceleration of the root without a planted foot.
 
-    Mean over frames of the product of both feet's steps over the ground, in meters per frame, and the root's
-    acceleration, divided by its largest value; downward accelerations count as 0. A foot's step is the smaller one of
-    its ankle and toe. Motions without acceleration, which the code averages as NaN, have no value, and none has one at
-    other rates than 30 frames per second. `feet` are left ankle and toe, right ankle and toe.
+    Mean over frames of the product of both feet's steps over the ground, in meters per frame, and
+    the root's acceleration, divided by its largest value; downward accelerations count as 0. A
+    foot's step is the smaller one of its ankle and toe. Motions without acceleration, which the
+    code averages as NaN, have no value. Lower is better.
+
+    Args:
+        fps: frames per second of the motions; at other rates than 30, `compute` raises
+            `UserError`.
+        feet: indices of left ankle and toe, right ankle and toe.
+
+    Example:
+        >>> metric, joints = PhysicalFootContact(fps=30), torch.zeros(1, 4, 22, 3)
+        >>> joints[0, :, 0, 0] = torch.tensor([0.0, 0.0, 0.1, 0.3])  # the root speeds up, the feet stand
+        >>> metric.update(joints, torch.ones(1, 4, dtype=torch.bool), keys=torch.tensor([0]))
+        >>> metric.compute()
+        {'pfc': 0.0, 'measured': 1.0}
     """
 
     parts = ("pfc",)
@@ -273,7 +357,8 @@ class PhysicalFootContact(PublishedPhysics):
     def measure(self, motion: Tensor) -> Values:
         """Computes the score of a motion (F, J, 3); NaN if the root does not accelerate or frames are fewer than 3."""
         motion = motion.double()
-        # The code divides by the frame duration first, which decides whether rounding errors of a steady root are 0.
+        # The code divides by the frame duration first, which decides whether rounding errors of a
+        # steady root are 0.
         acceleration = (motion[:, 0].diff(dim=0) * self.fps).diff(dim=0) * self.fps
         acceleration[:, 1].clamp_(min=0)
         acceleration = acceleration.norm(dim=-1)
@@ -287,11 +372,26 @@ class PhysicalFootContact(PublishedPhysics):
 class TransitionJerk(SampleMetric):
     """Peak jerk and area under the jerk of transitions between kept and generated frames, of FlowMDM (e81c67f).
 
-    The jerk of a frame is the largest L1 norm of the third difference of a joint's position, in meters per frame^3.
-    Windows of `window` frames (published: 60 at 20 frames per second, 30 at 30) are centered at the first frame after
-    each change from kept to generated frames or back, if the motion contains them. `peak` is the maximum of the mean
-    over windows, frame by frame; `area` is the sum of its distances from `JERK_OF_REAL_MOTIONS`, also if it is smaller,
-    and grows with the window; `windows` is the number of windows. At other frame rates there is no area.
+    The jerk of a frame is the largest L1 norm of the third difference of a joint's position, in
+    meters per frame^3. Windows are centered at the first frame after each change from kept to
+    generated frames or back, if the motion contains them. `peak` is the maximum of the mean over
+    windows, frame by frame. `area` is the sum of the mean's distances from
+    `JERK_OF_REAL_MOTIONS`, above or below; it grows with the window. `windows` is the number of
+    windows. Frame rates that `JERK_OF_REAL_MOTIONS` lacks have no area.
+
+    Args:
+        fps: frames per second of the motions.
+        window: number of frames of a window; published are 60 at 20 frames per second, and 30 at
+            30.
+
+    Example:
+        >>> metric, joints = TransitionJerk(fps=20, window=8), torch.zeros(1, 12, 22, 3)
+        >>> kept = torch.zeros(1, 12, 22, dtype=torch.bool)
+        >>> kept[:, :6] = True
+        >>> metric.update(joints, torch.ones(1, 12, dtype=torch.bool), kept, keys=torch.tensor([0]))
+        >>> values = metric.compute()
+        >>> values["peak"], values["windows"]
+        (0.0, 1)
     """
 
     higher_is_better = False
@@ -307,6 +407,17 @@ class TransitionJerk(SampleMetric):
         self.real, self.window = JERK_OF_REAL_MOTIONS.get(round(fps, 6)), window
 
     def update(self, joints: Tensor, mask: Tensor, kept: Tensor, keys: Tensor) -> None:
+        """Adds B motions.
+
+        Args:
+            joints: (B, F, J, 3) positions in meters.
+            mask: (B, F) bool, True = real frame.
+            kept: (B, F, J) bool, True = the edit kept this joint of this frame.
+            keys: (B,) int64, unique keys of the motions.
+
+        Raises:
+            UserError: If a motion is not finite.
+        """
         parts = kept[mask].split(mask.sum(1).tolist())
         total = torch.zeros(len(keys), self.window - 3, dtype=torch.float64)
         count = torch.zeros(len(keys), 1, dtype=torch.long)
@@ -321,6 +432,7 @@ class TransitionJerk(SampleMetric):
         super().update(keys=keys, total=total, windows=count)
 
     def value(self, total: Tensor, windows: Tensor) -> dict[str, float | None]:
+        """Returns `peak`, `area` and `windows`; without windows, peak and area are None."""
         count = int(windows.sum())
         peak, area = peak_and_area(total.sum(0) / count, self.real) if count else (None, None)
         return {"peak": peak, "area": area, "windows": count}

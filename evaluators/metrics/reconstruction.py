@@ -15,11 +15,13 @@ RIFKE = Rifke()
 
 
 def temos_parts(joints: Tensor) -> dict[str, Tensor]:
-    """Returns root (F, 3), trajectory (F, 2), local (F, 20, 3) and global (F, 21, 3) positions, as compared by TEMOS.
+    """Returns root (F, 3), trajectory (F, 2), local (F, 20, 3) and global (F, 21, 3) positions,
+    as compared by TEMOS.
 
-    The motion (F, 21, 3), in KIT units, is placed on the floor, with its first root at x = z = 0 and its first heading
-    along +z. Local positions, of all joints except the root, have the root at x = z = 0 and the heading along +z in
-    each frame. Floor and heading are those of `Rifke`, with their peculiarities.
+    The motion (F, 21, 3), in KIT units, is placed on the floor, with its first root at x = z = 0
+    and its first heading along +z. Local positions, of all joints except the root, have the root
+    at x = z = 0 and the heading along +z in each frame. `Rifke` defines floor and heading, with
+    the peculiarities of the published code.
     """
     ground = joints[:, :1] * joints.new_tensor([1.0, 0.0, 1.0])
     floor = joints.new_tensor([0.0, 1.0, 0.0]) * RIFKE.floor(joints)
@@ -34,17 +36,26 @@ def temos_parts(joints: Tensor) -> dict[str, Tensor]:
 
 
 def flame_parts(joints: Tensor, root: Tensor, parents: Sequence[int]) -> dict[str, Tensor]:
-    """Returns root (F, 3), trajectory (F, 2), bones (F, J - 1, 3) and joints (F, J, 3), as compared by FLAME's code."""
+    """Returns root (F, 3), trajectory (F, 2), bones (F, J - 1, 3) and joints (F, J, 3), as compared by FLAME's code.
+
+    Args:
+        joints: (F, J, 3) in meters.
+        root: (F, 3) in meters.
+        parents: parent of each joint, -1 for the root.
+    """
     bones = joints[:, 1:] - joints[:, list(parents[1:])]
     return {"root": root, "trajectory": root[:, [0, 2]], "mean_local": bones, "mean_global": joints}
 
 
 class PositionErrors(MotionMean):
-    """APE and AVE of each of `PARTS`, such as `ape_root`; of several `samples` per text, `best_ape_root`, ...
+    """Base class of position errors: APE and AVE of each of `PARTS`, such as `ape_root`. Lower is better.
 
-    With several `samples` per text, the values are those of the best and the worst one, as in TEMOS: those with the
-    smallest and the largest APE of the root. `upsampling` is the number of frames of a recording per frame of a motion;
-    above 1, motions are interpolated and compared with the recordings.
+    Args:
+        samples: number of motions per text. With several, as in TEMOS, `best_ape_root`, ... are
+            errors of the motion with the smallest APE of the root, and `worst_ape_root`, ... of
+            the motion with the largest.
+        upsampling: number of frames of a recording per frame of a motion. Above 1, motions are
+            interpolated and compared with the recordings.
     """
 
     higher_is_better = False
@@ -68,7 +79,22 @@ class PositionErrors(MotionMean):
         groups: Tensor | None = None,
         references: Sequence[Tensor] | None = None,
     ) -> None:
-        """Compares pairs of motions up to the end of the shorter one, of at least two frames."""
+        """Compares B pairs of motions, up to the end of the shorter one.
+
+        Args:
+            joints: (B, F, J, 3) generated motions in meters, y up.
+            mask: (B, F) bool, True = real frame.
+            real_joints: (B, F', J, 3) real motions of the same texts, in the same order.
+            real_mask: (B, F') bool.
+            keys: (B,) int64, unique keys of the generated motions.
+            groups: (B,) int64, keys of the texts; only needed for several `samples`.
+            references: B real motions (F'', J, 3) at the frame rate of their recording; only
+                needed for `upsampling`.
+
+        Raises:
+            UserError: If a motion is not finite or has fewer than two frames, or `references` are
+                needed and missing.
+        """
         motions, real_motions = (
             self.real_frames(joints, mask),
             self.real_frames(real_joints, real_mask),
@@ -93,6 +119,7 @@ class PositionErrors(MotionMean):
         self.add(keys, errors, groups=keys if groups is None or self.samples == 1 else groups)
 
     def value(self, sums: Tensor, counts: Tensor, groups: Tensor) -> dict[str, float | None]:
+        """Returns the errors by name; raises `UserError` if a text has not `samples` motions."""
         texts = (
             self.by_group(groups, self.samples)
             if self.samples > 1
@@ -117,21 +144,35 @@ class PositionErrors(MotionMean):
 class TemosPositionErrors(PositionErrors):
     """APE and AVE of TEMOS (Petrovich et al. 2022), used by FLAME on KIT (eq. 16 to 18, Table 2).
 
-    APE is the distance of `temos_parts`, averaged over joints, and over all frames of all clips. AVE is the distance of
-    the variances over time (n - 1 in the denominator) of each coordinate, averaged over joints, then over clips. Both
-    are in 1000 KIT units, which are 1.56 m and which the tables call meters. TEMOS compares at 100 frames per second:
-    `upsampling=8`.
+    APE is the distance of `temos_parts`, averaged over joints, and over all frames of all clips.
+    AVE is the distance of the variances over time (n - 1 in the denominator) of each coordinate,
+    averaged over joints, then over clips. Both are in 1000 KIT units, which are 1.56 m and which
+    the tables call meters. TEMOS compares at 100 frames per second: `upsampling=8`.
+
+    Args:
+        samples: number of motions per text; see `PositionErrors`.
+        upsampling: number of frames of a recording per frame of a motion.
+
+    Example:
+        >>> metric, joints = TemosPositionErrors(), torch.rand(1, 5, 21, 3)
+        >>> mask = torch.ones(1, 5, dtype=torch.bool)
+        >>> metric.update(joints, mask, joints, mask, keys=torch.tensor([0]))
+        >>> metric.compute()["ape_root"]
+        0.0
     """
 
     unit = "1,000 KIT units"
-    units_per_meter = 640.0  # KIT units per meter of `joints`, as in the KIT representations
+    #: KIT units per meter of `joints`, as in the KIT representations.
+    units_per_meter = 640.0
 
     def positions(self, joints: Tensor) -> dict[str, Tensor]:
+        """Returns `temos_parts` of a motion (F, 21, 3), in 1000 KIT units; `UserError` for other skeletons."""
         if joints.shape[1] != 21:
             raise self.error(f"{joints.shape[1]} joints, but defined only for KIT's 21 (MMM)")
         return {part: x / 1000 for part, x in temos_parts(joints * self.units_per_meter).items()}
 
     def errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Returns the APE of each frame (F,) and the AVE of the clip, by name."""
         distances = {part: (a[part] - b[part]).norm(dim=-1) for part in PARTS}
         position = {f"ape_{part}": x if x.ndim == 1 else x.mean(1) for part, x in distances.items()}
         return position | {
@@ -142,10 +183,23 @@ class TemosPositionErrors(PositionErrors):
 class FlamePositionErrors(PositionErrors):
     """APE and AVE of `flame_parts` as in FLAME's code, which its tables do not use. In meters and square meters.
 
-    The error of the trajectory is the sum of the distances along its two axes; the local error is that of bones.
-    Variances of global positions are averaged over joints before they are compared. Each clip has the same weight.
-    FLAME's joints lack the orientation of the root and start from its translation; here, `joints` are compared
-    unchanged, and the first one is the root. `parents` are those of the skeleton's joints, -1 for the root.
+    The error of the trajectory is the sum of the distances along its two axes; the local error is
+    the error of bones. Variances of global positions are averaged over joints before they are
+    compared. Each clip has the same weight. FLAME's joints lack the orientation of the root and
+    start from its translation; here, `joints` are compared unchanged, and the first one is the
+    root.
+
+    Args:
+        parents: parent of each joint of the skeleton, -1 for the root.
+        samples: number of motions per text; see `PositionErrors`.
+
+    Example:
+        >>> metric, real = FlamePositionErrors(parents=[-1, 0]), torch.zeros(1, 5, 2, 3)
+        >>> mask = torch.ones(1, 5, dtype=torch.bool)
+        >>> metric.update(real + 1, mask, real, mask, keys=torch.tensor([0]))
+        >>> values = metric.compute()
+        >>> values["ape_trajectory"], values["ape_mean_local"], values["ave_root"]
+        (2.0, 0.0, 0.0)
     """
 
     def __init__(self, parents: Sequence[int], samples: int = 1):
@@ -154,9 +208,11 @@ class FlamePositionErrors(PositionErrors):
         self.units = {name: "m^2" if "ave_" in name else "m" for name in self.names}
 
     def positions(self, joints: Tensor) -> dict[str, Tensor]:
+        """Returns `flame_parts` of a motion (F, J, 3)."""
         return flame_parts(joints, joints[:, 0], self.parents)
 
     def errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Returns APE, in meters, and AVE, in square meters, of a clip, by name."""
         root, path, local, joints = (a[part] - b[part] for part in PARTS)
         distances = [
             root.norm(dim=-1),
@@ -170,7 +226,7 @@ class FlamePositionErrors(PositionErrors):
 
 
 class EditErrors(MotionMean):
-    """Distances of the joints from those of real motions, of the part that an edit kept or generated."""
+    """Base class of the distances between the joints of edited and real motions, in meters. Lower is better."""
 
     higher_is_better = False
     unit = "m"
@@ -185,7 +241,7 @@ class EditErrors(MotionMean):
         keys: Tensor,
         kept: Tensor | None,
     ) -> None:
-        """Adds the errors of pairs of motions (B, F, J, 3) with masks (B, F), up to the end of the shorter one."""
+        """Adds the errors of B pairs of motions, up to the end of the shorter one; see `update` for the arguments."""
         motions = zip(
             self.real_frames(joints, mask), self.real_frames(real_joints, real_mask), strict=True
         )
@@ -209,9 +265,18 @@ class EditErrors(MotionMean):
 class DisplacementErrors(EditErrors):
     """ADE and FDE: mean distance of the joints in all predicted frames, and in the last of them, in meters.
 
-    As usual in motion prediction (Yuan and Kitani 2020), averaged over joints and frames of a clip, then over clips.
-    What an edit `kept` is ignored. Raises `UserError` if nothing of a motion was generated. MFM (Table 3) gives no
-    formula, code or unit for its numbers, which are too large for meters: they are not comparable.
+    As usual in motion prediction (Yuan and Kitani 2020), averaged over joints and frames of a
+    clip, then over clips. The part that an edit kept does not count. MFM (Table 3) gives no
+    formula, code or unit for its numbers, which are too large for meters: they are not
+    comparable.
+
+    Example:
+        >>> metric, real = DisplacementErrors(), torch.zeros(1, 5, 22, 3)
+        >>> joints = real + torch.tensor([0.0, 0.5, 0.0])
+        >>> mask = torch.ones(1, 5, dtype=torch.bool)
+        >>> metric.update(joints, mask, real, mask, keys=torch.tensor([0]))
+        >>> metric.compute()
+        {'ade': 0.5, 'fde': 0.5}
     """
 
     names = ("ade", "fde")
@@ -225,9 +290,24 @@ class DisplacementErrors(EditErrors):
         keys: Tensor,
         kept: Tensor | None = None,
     ) -> None:
+        """Compares B pairs of motions, up to the end of the shorter one.
+
+        Args:
+            joints: (B, F, J, 3) generated motions in meters.
+            mask: (B, F) bool, True = real frame.
+            real_joints: (B, F', J, 3) real motions, in the same order.
+            real_mask: (B, F') bool.
+            keys: (B,) int64, unique keys of the generated motions.
+            kept: (B, F, J) bool, True = the edit kept this joint of this frame. None = everything
+                was generated.
+
+        Raises:
+            UserError: If a motion is not finite, or has no generated frame.
+        """
         self.compare(joints, mask, real_joints, real_mask, keys, kept)
 
     def errors_of(self, distance: Tensor, kept: Tensor) -> dict[str, Tensor]:
+        """Returns ADE and FDE of a motion from distances (F, J) and kept joints (F, J) bool."""
         new = ~kept
         if not new.any():
             raise self.error("a motion has no generated frame to compare")
@@ -238,8 +318,17 @@ class DisplacementErrors(EditErrors):
 class KeptDrift(EditErrors):
     """Distance in the world, in meters, by which the kept part of an edit has moved. A metric of this project.
 
-    `mean` is over the kept joints and frames of a motion, then over motions, `largest` over all. With features relative
-    to the root, an edit can keep steps and poses exactly, and still move a kept ending to where the new part leads.
+    `mean` is over the kept joints and frames of a motion, then over motions, `largest` over all.
+    With features relative to the root, an edit can keep steps and poses exactly, and still move a
+    kept ending to where the new part leads.
+
+    Example:
+        >>> metric, real = KeptDrift(), torch.zeros(1, 5, 22, 3)
+        >>> joints, mask = real + torch.tensor([0.0, 0.5, 0.0]), torch.ones(1, 5, dtype=torch.bool)
+        >>> kept = torch.ones(1, 5, 22, dtype=torch.bool)
+        >>> metric.update(joints, mask, real, mask, keys=torch.tensor([0]), kept=kept)
+        >>> metric.compute()
+        {'mean': 0.5, 'largest': 0.5}
     """
 
     names = ("mean", "largest")
@@ -253,14 +342,29 @@ class KeptDrift(EditErrors):
         keys: Tensor,
         kept: Tensor,
     ) -> None:
+        """Compares B pairs of motions, up to the end of the shorter one.
+
+        Args:
+            joints: (B, F, J, 3) edited motions in meters.
+            mask: (B, F) bool, True = real frame.
+            real_joints: (B, F', J, 3) motions before editing, in the same order.
+            real_mask: (B, F') bool.
+            keys: (B,) int64, unique keys of the edited motions.
+            kept: (B, F, J) bool, True = the edit kept this joint of this frame.
+
+        Raises:
+            UserError: If a motion is not finite.
+        """
         self.compare(joints, mask, real_joints, real_mask, keys, kept)
 
     def errors_of(self, distance: Tensor, kept: Tensor) -> dict[str, Tensor]:
+        """Returns mean and largest distance of the kept joints of a motion; {} if the edit kept none."""
         return (
             {"mean": distance[kept].mean(), "largest": distance[kept].max()} if kept.any() else {}
         )
 
     def value(self, sums: Tensor, counts: Tensor) -> dict[str, float | None]:
+        """Returns `mean` and `largest` over the motions with kept joints; None if there are none."""
         drift = sums[counts[:, 0] > 0]
         values = (
             (drift[:, 0].mean().item(), drift[:, 1].max().item()) if len(drift) else (None, None)

@@ -22,8 +22,10 @@ from flame_mdm.seeds import key
 
 # Cosine above which TMR considers captions the same: its threshold 0.95 is of (cosine + 1) / 2
 SAME = 0.9
-TMR_TOP = (1, 2, 3, 5, 10)  # k of recall
-BATCH, DISSIMILAR = 32, 100  # motions in a batch, and most dissimilar motions, of TMR
+# The k of recall
+TMR_TOP = (1, 2, 3, 5, 10)
+# Number of motions in a batch, and maximum number of dissimilar motions, of TMR
+BATCH, DISSIMILAR = 32, 100
 
 
 @functools.cache
@@ -50,7 +52,19 @@ def plain_caption(caption: str) -> str:
 def whole_set_retrieval(similarity: Tensor, correct: Tensor | None = None) -> dict[str, float]:
     """Computes recall and median rank of TMR from similarities (N, N) of texts (rows) and motions (columns).
 
-    The rank is that of the best pair that is `correct` (N, N) bool, symmetric; None = the diagonal.
+    Args:
+        similarity: (N, N).
+        correct: (N, N) bool, symmetric, True = correct pair; the best of the correct candidates
+            counts. None = the diagonal.
+
+    Returns:
+        Recall `t2m_top1`, ... in [0, 1] and median rank `t2m_median`, 1 = best, of motions for
+        texts, and `m2t_` of texts for motions.
+
+    Example:
+        >>> values = whole_set_retrieval(torch.eye(4))
+        >>> values["t2m_top1"], values["m2t_median"]
+        (1.0, 1.0)
     """
     values: dict[str, float] = {}
     for direction, table in (("t2m", similarity), ("m2t", similarity.T)):
@@ -69,9 +83,15 @@ def best_ranks(similarity: Tensor, correct: Tensor) -> Tensor:
 
 
 class CaptionMetric(SampleMetric):
-    """A metric of motions and captions, some of which are the same: those equal but for case, punctuation and spaces.
+    """Base class of metrics in which several motions may have the same caption.
 
-    With `encoder`, a mapping with the `_target_` of a text encoder, so are captions with a cosine above `SAME`.
+    Captions are the same if they differ only in case, punctuation and spaces or, with an
+    `encoder`, if the cosine of their embeddings exceeds `SAME`.
+
+    Args:
+        encoder: mapping with the `_target_` of a text encoder; None = captions are compared as
+            text.
+        seed: seed of the random draws.
     """
 
     higher_is_better = True
@@ -87,6 +107,17 @@ class CaptionMetric(SampleMetric):
     def update(
         self, generated: Tensor, text: Tensor, captions: Sequence[str], keys: Tensor
     ) -> None:
+        """Stores B motions.
+
+        Args:
+            generated: (B, E) features of the motions.
+            text: (B, E) features of the captions.
+            captions: B captions.
+            keys: (B,) int64, unique keys of the motions.
+
+        Raises:
+            ValueError: If the arguments have different numbers of rows.
+        """
         if not len(captions):
             return
         caption_keys = torch.tensor([key(plain_caption(caption)) for caption in captions])
@@ -99,12 +130,29 @@ class CaptionMetric(SampleMetric):
 
 
 class MultiPositiveRPrecision(CaptionMetric):
-    """R-precision, motions for a text, where the motions of the same captions are correct, too: our definition.
+    """R-precision, motions for a text, where motions with the same caption are correct, too. A
+    metric of this project.
 
-    Pools and `normalize` are those of `MotionsForText`, to which `single_top1`, ... are equal up to ties. `top1`, ...
-    is the fraction of texts with one of their correct motions among the k nearest, ties sharing their mean rank;
-    `proper` is R-precision of information retrieval: the fraction of their R correct motions among the R nearest. Since
-    similar captions raise all values, `chance_top1`, ... are those of a random order, and `positives` is the mean of R.
+    - `topK`: the fraction of texts with a correct motion among the K nearest; ties share their mean rank.
+    - `proper`: R-precision as in information retrieval, the fraction of a text's R correct motions among its R nearest.
+    - `single_topK`: only the text's own motion is correct, as in `MotionsForText`; equal to its values up to ties.
+    - `chance_topK`: expected values of a random order, since similar captions raise all values.
+    - `positives`: the mean number R of correct motions.
+
+    Args:
+        encoder: mapping with the `_target_` of a text encoder; None = captions are compared as
+            text.
+        pool: number of motions in a pool, as in `MotionsForText`.
+        seed: seed of the pools.
+        normalize: scale features to length 1 first, which ranks by cosine.
+
+    Example:
+        >>> metric, features = MultiPositiveRPrecision(pool=3), torch.eye(3)
+        >>> captions = ["a person walks", "A person walks.", "a person waves"]
+        >>> metric.update(features, features, captions, keys=torch.arange(3))
+        >>> values = metric.compute()
+        >>> values["top1"], values["proper"] < 1, round(values["positives"], 2)
+        (1.0, True, 1.67)
     """
 
     names = (
@@ -126,6 +174,7 @@ class MultiPositiveRPrecision(CaptionMetric):
     def value(
         self, motion: Tensor, text: Tensor, caption_keys: Tensor, meaning: Tensor
     ) -> dict[str, float | None]:
+        """Returns the values of features (N, E), keys (N,) of plain captions and their embeddings (N, C)."""
         self.need(len(motion), self.pool, "motions")
         if self.normalize:
             motion, text = F.normalize(motion, dim=-1), F.normalize(text, dim=-1)
@@ -148,6 +197,8 @@ def multi_positive(similarity: Tensor, correct: Tensor) -> dict[str, float | Non
     """Computes hit rates, R-precision and chance from similarity and correctness (N, M) of candidates."""
     rank, count, size = best_ranks(similarity, correct), correct.sum(1), similarity.shape[1]
     values: dict[str, float | None] = {f"top{k}": (rank < k).double().mean().item() for k in TOP}
+    # In a random order, the probability that none of the first k candidates is correct is a
+    # product over k draws without replacement.
     missed = torch.ones(len(count), dtype=torch.float64)
     for k in TOP:
         missed = missed * ((size - count - k + 1).clamp(min=0) / (size - k + 1))
@@ -165,20 +216,34 @@ def multi_positive(similarity: Tensor, correct: Tensor) -> dict[str, float | Non
 class TMRRetrieval(CaptionMetric):
     """Retrieval by cosine with the protocols of Petrovich et al. 2023 (TMR, 6d74688), both ways.
 
-    `all`: all motions, the own one is correct; `threshold`: motions of the same captions are correct, too;
-    `dissimilar`: only among 100 motions with different captions, at most half of all, and none without an encoder;
-    `batches`: in batches of 32, the rest is left out; their medians are averaged. Each has recall `t2m_top1`, ... in
-    [0, 1] and median rank `t2m_median` (1 = best) of motions for texts, and `m2t_` of texts for motions.
+    `all`: all motions, the own one is correct; `threshold`: motions of the same captions are
+    correct, too; `dissimilar`: only among 100 motions with different captions, at most half of
+    all, and none without an encoder; `batches`: in batches of 32, the rest is left out; their
+    medians are averaged. Each has recall `t2m_top1`, ... in [0, 1] and median rank `t2m_median`
+    (1 = best) of motions for texts, and `m2t_` of texts for motions.
 
-    TMR's encoder of captions is all-mpnet-base-v2; its dissimilar motions and batches are lists for HumanML3D and KIT.
-    Here, batches are drawn. Without `ids`, the dissimilar subset starts with the first motion by key; the motion whose
-    caption is least similar to those already chosen is added next.
+    TMR's encoder of captions is all-mpnet-base-v2; its dissimilar motions and batches are lists
+    for HumanML3D and KIT. Here, batches are drawn. Without `ids`, the dissimilar subset starts
+    with the first motion by key; the motion whose caption is least similar to those already
+    chosen is added next.
 
     Args:
-        encoder: mapping with the `_target_` of a text encoder; None = captions are compared as text.
+        encoder: mapping with the `_target_` of a text encoder; None = captions are compared as
+            text.
         seed: seed of the batches.
-        ids: file with the ids of the dissimilar motions, one per line, such as TMR's `nsim_test.txt`. Ids that were not
-            evaluated are ignored.
+        ids: file with the ids of the dissimilar motions, one per line, such as TMR's
+            `nsim_test.txt`. Ids that were not evaluated are ignored.
+
+    Raises:
+        UserError: If the file of ids is empty.
+
+    Example:
+        >>> metric, features = TMRRetrieval(), torch.eye(3)
+        >>> captions = ["a person walks", "a person sits", "a person waves"]
+        >>> metric.update(features, features, captions, keys=torch.arange(3))
+        >>> values = metric.compute()
+        >>> values["all_t2m_top1"], values["all_m2t_median"], values["batches_t2m_top1"]
+        (1.0, 1.0, None)
     """
 
     names = tuple(
@@ -202,6 +267,7 @@ class TMRRetrieval(CaptionMetric):
     def value(
         self, motion: Tensor, text: Tensor, caption_keys: Tensor, meaning: Tensor
     ) -> dict[str, float | None]:
+        """Returns the values of features (N, E), keys (N,) of plain captions and their embeddings (N, C)."""
         similarity = F.normalize(text, dim=-1) @ F.normalize(motion, dim=-1).T
         same = (caption_keys[None] == caption_keys[:, None]) | (meaning @ meaning.T > SAME)
         values = {
@@ -229,6 +295,8 @@ class TMRRetrieval(CaptionMetric):
 
 def dissimilar(meaning: Tensor) -> list[int]:
     """Returns the indices of the `dissimilar` motions of `TMRRetrieval` from the vectors (N, C) of their captions."""
+    # Greedy farthest-point selection: `nearest` is each caption's similarity to the most similar
+    # chosen caption.
     chosen = [0]
     nearest = meaning @ meaning[0]
     while len(chosen) < min(DISSIMILAR, len(meaning) // 2):

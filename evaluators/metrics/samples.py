@@ -27,12 +27,14 @@ class Declared:
     Attributes:
         unit: unit of the values; "" = a number without a unit.
         units: units of single values by name, if they differ from `unit`.
-        directions: of single values by name, if they differ from `higher_is_better`: whether higher is better; None =
-            neither.
+        directions: of single values by name, if they differ from `higher_is_better`: whether
+            higher is better; None = neither.
         summary: name of the value that sums up the others; None = there is none.
         audited: names of the values that audits show; None = all.
-        sees_meaning: whether the metric may see that a motion shows something other than requested.
-        exact: name of the value that reads the requested attributes without a network; None = there is none.
+        sees_meaning: whether the metric may see that a motion shows something other than
+            requested.
+        exact: name of the value that reads the requested attributes without a network; None =
+            there is none.
         depends_on_count: whether the value is biased by the number of motions.
     """
 
@@ -64,8 +66,9 @@ class Declared:
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
         """Returns the value and the weight (N, 2) of each sample, by the names of the values; {} if there are none.
 
-        The metric is the weighted mean, and, if it draws pools at random, the mean over all draws. `rows` has the
-        inputs of the metric and its `readings`. Raises `UserError` if there are too few samples.
+        The metric is the weighted mean, and, if it draws pools at random, the mean over all
+        draws. `rows` has the inputs of the metric and its `readings`. Raises `UserError` if there
+        are too few samples.
         """
         return {}
 
@@ -85,15 +88,26 @@ class Declared:
 class SampleMetric(Declared, Metric):
     """Base class of all metrics: keeps one row per sample and computes its value from all rows, sorted by key.
 
-    The value therefore does not depend on the batches, their order or the number of processes, of which some may have
-    no samples. `value` is the formula. Several metrics take `seed`, that of their random draws.
+    The value therefore does not depend on the batches, their order or the number of processes, of
+    which some may have no samples. `value` is the formula. If a metric draws at random, its
+    argument `seed` determines the draws.
 
     A class also declares what readers of its values need to know, see `Declared`.
 
     Attributes:
-        states: names of the kept rows, in the order of the arguments of `value`. Each row also has a key. Unless
-            `update` is overridden, they are its inputs.
+        states: names of the kept rows, in the order of the arguments of `value`. Each row also
+            has a key. Unless `update` is overridden, they are its inputs.
         names: names of the values; empty if there is only one.
+
+    Example:
+        >>> class MeanFeature(SampleMetric):  # a metric is its inputs and a formula
+        ...     states = ("generated",)
+        ...     def value(self, generated):
+        ...         return generated.mean().item()
+        >>> metric = MeanFeature()
+        >>> metric.update(generated=torch.tensor([[1.0], [3.0]]), keys=torch.tensor([7, 8]))
+        >>> metric.compute()
+        2.0
     """
 
     full_state_update = False
@@ -107,10 +121,19 @@ class SampleMetric(Declared, Metric):
 
     @property
     def update_called(self) -> bool:
-        return True  # a metric without samples returns None, without a warning
+        """True, since a metric without samples returns None, without a warning."""
+        return True
 
     def update(self, *_: Any, **rows: Any) -> None:
-        """Adds equally many rows by the names of their states, which include the keys; `ValueError` otherwise."""
+        """Stores a batch of B samples.
+
+        Args:
+            rows: one keyword argument per state and `keys`, (B,) int64, all with B rows;
+                `evaluators.metrics` lists shapes and units.
+
+        Raises:
+            ValueError: If the arguments have different numbers of rows.
+        """
         if len({len(values) for values in rows.values()}) > 1:
             sizes = ", ".join(f"{len(values)} {name}" for name, values in rows.items())
             raise ValueError(f"{type(self).__name__}: got {sizes}")
@@ -118,11 +141,13 @@ class SampleMetric(Declared, Metric):
             getattr(self, name).append(values.detach())
 
     def compute(self) -> Any:
+        """Returns the value of all samples; None, or None by name, without samples."""
         rows = self.rows("keys", *self.states)
         return self.value(*rows) if rows else self.nothing
 
     @property
     def nothing(self) -> Value:
+        """The value without samples: None, or None by name."""
         return dict.fromkeys(self.names) if self.names else None
 
     def value(self, *rows: Any, **_: Any) -> Value:
@@ -179,6 +204,7 @@ class SampleMetric(Declared, Metric):
         return groups.argsort(stable=True).unflatten(0, (len(names), samples))
 
     def error(self, message: str) -> UserError:
+        """Returns an error whose message begins with the name of the metric."""
         return UserError(f"{type(self).__name__}: {message}")
 
     def need(self, count: int, least: int, noun: str) -> None:
@@ -187,7 +213,8 @@ class SampleMetric(Declared, Metric):
             raise self.error(f"got {count} {noun}, needs at least {least}")
 
     def real_frames(self, joints: Tensor, mask: Tensor) -> list[Tensor]:
-        """Splits joints (B, F, J, 3) with mask (B, F) into motions (F, J, 3), whose sums are the same in every batch.
+        """Splits joints (B, F, J, 3) with mask (B, F) into motions (F, J, 3), whose sums are the
+        same in every batch.
 
         Raises `UserError` if a motion contains NaN or infinity.
         """
@@ -212,7 +239,7 @@ class SampleMetric(Declared, Metric):
 
 
 class Timed(SampleMetric):
-    """A metric that depends on `fps`, the frame rate of the motions."""
+    """Base class of metrics that depend on `fps`, the frames per second of the motions."""
 
     def __init__(self, fps: float):
         super().__init__()
@@ -220,15 +247,21 @@ class Timed(SampleMetric):
 
 
 class MotionMean(SampleMetric):
-    """Means of values of motions. A motion adds any number of values to a mean, such as one, or one per frame."""
+    """Base class of means of values of motions. A motion adds any number of values, such as one, or one per frame."""
 
     states = ("sums", "counts")
-    parts: Sequence[str] = ()  # names of the values of a motion, if `names` has more
+    #: Names of the values of a motion, if `names` has more.
+    parts: Sequence[str] = ()
 
     def add(self, keys: Tensor, motions: Sequence[Any], **more: Tensor) -> None:
-        """Adds motions, given as their values, by name if the metric has `names`; NaN or missing = undefined.
+        """Adds motions, given as their values.
 
-        Undefined values do not count. A value may be a tensor of several, such as one per frame.
+        Args:
+            keys: (B,) int64, unique keys of the motions.
+            motions: B numbers or tensors, such as one number per frame; if the metric has
+                `names`, B mappings of them by name. NaN or missing = undefined; undefined values
+                do not count.
+            more: further states, with B rows each.
         """
         names, rows = self.parts or self.names, []
         for motion in motions:
@@ -241,26 +274,37 @@ class MotionMean(SampleMetric):
             SampleMetric.update(self, keys=keys, sums=sums, counts=counts, **more)
 
     def value(self, *rows: Any, **_: Any) -> Value:
+        """Returns the means; see `means`."""
         return self.means(*rows)
 
     def means(self, sums: Tensor, counts: Tensor) -> Any:
-        """Returns the mean of all values, by name if the metric has `names`; None for what has no value."""
+        """Returns the mean of all values, by name if the metric has `names`; None for a name without values."""
         totals = zip(sums.sum(0).tolist(), counts.sum(0).tolist(), strict=True)
         means = [total / count if count else None for total, count in totals]
         return dict(zip(self.parts or self.names, means, strict=True)) if self.names else means[0]
 
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
+        """Returns the sum and the number (N, 2) of the values of each motion, by name."""
         names = self.parts or self.names or [""]
         return {name: torch.as_tensor(rows[name]) for name in names if name in rows}
 
 
 class JointMean(MotionMean):
-    """A mean of values that are measured on the joints of one motion at a time."""
+    """Base class of means of values that are measured on the joints of one motion at a time."""
 
     sees_meaning = False
 
     def update(self, joints: Tensor, mask: Tensor, keys: Tensor) -> None:
-        """Adds motions with joints (B, F, J, 3) in meters, y up, mask (B, F) and keys (B,)."""
+        """Adds B motions.
+
+        Args:
+            joints: (B, F, J, 3) positions in meters, y up, floor at y = 0.
+            mask: (B, F) bool, True = real frame.
+            keys: (B,) int64, unique keys of the motions.
+
+        Raises:
+            UserError: If a real frame is not finite.
+        """
         self.add(keys, [self.measure(motion) for motion in self.real_frames(joints, mask)])
 
     def measure(self, motion: Tensor) -> Any:
@@ -285,7 +329,7 @@ class JointMean(MotionMean):
 
 
 class TwoSets(SampleMetric):
-    """A metric that compares the set of features of generated motions with that of real motions."""
+    """Base class of metrics that compare the set of features of generated motions with the set of real motions."""
 
     states = ("generated",)
     depends_on_count = True
@@ -302,15 +346,27 @@ class TwoSets(SampleMetric):
         real: Tensor | None = None,
         real_keys: Tensor | None = None,
     ) -> None:
-        """Adds generated (B, E) and real (R, E) features with their keys, together or separately."""
+        """Adds features of generated and of real motions, together or separately.
+
+        Args:
+            generated: (B, E) features of generated motions.
+            keys: (B,) int64, their unique keys.
+            real: (R, E) features of real motions.
+            real_keys: (R,) int64, their unique keys.
+
+        Raises:
+            ValueError: If features and keys have different numbers of rows.
+        """
         if generated is not None:
             super().update(keys=keys, generated=generated)
         if real is not None:
             super().update(real_keys=real_keys, real=real)
 
     def compute(self) -> Any:
+        """Returns the value of both sets; None, or None by name, if one of them is empty."""
         generated, real = self.rows("keys", "generated"), self.rows("real_keys", "real")
         return self.value(*generated, *real) if generated and real else self.nothing
 
     def drawn_value(self, drawn: Tensor, real_drawn: Tensor) -> Value:
+        """Computes the value of samples (N,) and real motions (M,) drawn with replacement, for a bootstrap."""
         return self.value(*self._taken(drawn, "generated"), *self._taken(real_drawn, "real"))

@@ -136,8 +136,8 @@ def _claims(pattern: Pattern, text: str) -> list[Claim]:
     elif pattern.kind == "circle":
         claims.append(replace(claim, direction=_way(text) or ""))
     elif pattern.kind == "lean":
-        way = _way(text)
-        claims += [replace(claim, direction=way)] if way else []
+        direction = _way(text)
+        claims += [replace(claim, direction=direction)] if direction else []
     elif pattern.kind:
         claims.append(claim)
     for take in pattern.take:
@@ -151,8 +151,8 @@ def _further(take: str, claim: Claim, text: str) -> list[Claim]:
         direction = _direction(text)
         kind = "step" if take == "jumped" or claim.kind == "step" else "travel"
         return [Claim(kind, text, direction=direction)] if direction else []
-    if take == "way" and (way := _way(text)) in ("left", "right"):
-        return [] if _is_turning(text) else [Claim("veer", text, direction=way)]
+    if take == "way" and (direction := _way(text)) in ("left", "right"):
+        return [] if _is_turning(text) else [Claim("veer", text, direction=direction)]
     if take == "pace" and (speed := _speed(text)):
         return [Claim("pace", text, speed=speed)]
     if take.startswith("count") and (amount := _amount(text, take)) is not None:
@@ -164,13 +164,13 @@ def _further(take: str, claim: Claim, text: str) -> list[Claim]:
 
 def _turns(claim: Claim, text: str) -> list[Claim]:
     """Returns the claims of a turn: its direction, its angle, and that there is one."""
-    way = _way(text) or ""
+    direction = _way(text) or ""
     angle = re.search(r"\b(45|90|180|270|360)\b", text)
-    claims = [replace(claim, direction=way)]
+    claims = [replace(claim, direction=direction)]
     if angle is not None:
-        claims.append(Claim("turn angle", text, direction=way, amount=int(angle[1])))
+        claims.append(Claim("turn angle", text, direction=direction, amount=int(angle[1])))
     elif re.search(r"\bquarter turn\b", text):
-        claims.append(Claim("turn angle", text, direction=way, amount=90))
+        claims.append(Claim("turn angle", text, direction=direction, amount=90))
     return claims
 
 

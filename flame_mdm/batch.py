@@ -20,9 +20,15 @@ class MotionBatch:
     Attributes:
         x: (B, F, D) float32, normalized features, 0 past the end of each motion.
         mask: (B, F) bool, True = real frame.
-        ids: B names, unique in the data set; they seed the noise of each sample and are keys for joining tables.
+        ids: B names, unique in the data set; they seed the noise of each sample and are keys for
+            joining tables.
         text: one caption per motion, or None if the data has none.
         action: (B,) int64 class labels, or None.
+
+    Example:
+        >>> batch = collate([("a", torch.ones(4, 2), "walks", None), ("b", torch.ones(2, 2), "sits", None)])
+        >>> batch.x.shape, batch.lengths.tolist(), batch.text
+        (torch.Size([2, 4, 2]), [4, 2], ['walks', 'sits'])
     """
 
     x: Tensor
@@ -57,11 +63,21 @@ class Condition:
     Attributes:
         pooled: (B, C), one vector per sample.
         tokens: (B, S, C), one vector per word piece; (B, 0, C) if the encoder has none.
-        token_mask: (B, S) bool, True = real token. In a null, None means: keep the mask of the replaced sample.
+        token_mask: (B, S) bool, True = real token. In a null, None means: keep the mask of the
+            replaced sample.
         null: the condition that means "no condition", with batch size 1; None if there is none.
-        prefix: (B, P, D), normalized features of the P clean frames before the motion; None if there are none.
-        target: (B, 8, 4), where the motion should end: `flame_mdm.conditions.target`; None = anywhere.
-        target_mask: (B,) bool, False = this sample's target is left out; None = all samples have theirs.
+        prefix: (B, P, D), normalized features of the P clean frames before the motion; None if
+            there are none.
+        target: (B, 8, 4), where the motion should end: `flame_mdm.conditions.target`; None =
+            anywhere.
+        target_mask: (B,) bool, False = this sample's target is left out; None = all samples have
+            theirs.
+
+    Example:
+        >>> null = Condition(torch.zeros(1, 3), torch.zeros(1, 0, 3), None)
+        >>> cond = Condition(torch.ones(2, 3), torch.zeros(2, 0, 3), None, null)
+        >>> cond.drop(torch.tensor([True, False])).pooled.tolist()
+        [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]
     """
 
     pooled: Tensor
@@ -126,7 +142,7 @@ class Guide(Protocol):
     """Leads motions (B, F, D) to a goal, such as positions in the world."""
 
     def steer(self, clean: Callable[[Tensor], Tensor], x_t: Tensor) -> Tensor:
-        """Returns a noisy motion whose clean estimate, that of the function `clean`, is nearer to the goal."""
+        """Returns a noisy motion like `x_t` whose clean estimate, returned by `clean`, is nearer to the goal."""
         ...
 
     def reach(self, x0_hat: Tensor) -> Tensor:
@@ -136,20 +152,32 @@ class Guide(Protocol):
 
 @dataclass
 class Edit:
-    """Parts of a motion to keep; in-betweening, prediction, interpolation and body-part editing differ only in `keep`.
+    """Parts of a motion to keep; in-betweening, prediction, interpolation and body-part editing
+    differ only in `keep`.
 
     Attributes:
         known: (B, F, D) normalized features of the motion.
         keep: (B, F, D) bool, True = keep this feature of this frame.
-        mode: "x0" overwrites the clean estimate (MDM); "x_t" replaces part of the noisy sample by the equally noisy
-            known part (FLAME, RePaint); "trajectory" overwrites the early part of the flow's path (MFM).
+        mode: "x0" overwrites the clean estimate (MDM); "x_t" replaces part of the noisy sample by
+            the equally noisy known part (FLAME, RePaint); "trajectory" overwrites the early part
+            of the flow's path (MFM).
         until: for "trajectory", the last flow time at which the path is overwritten.
-        blend: for "x_t", replace the kept part "after" each step (FLAME, eq. 6), which ends in the known motion itself,
-            or "before" each call of the denoiser (FLAME's code), which ends in the model's version of it.
-        resample: for "x_t", how many times each step is repeated, after adding noise again (RePaint, algorithm 1).
-        guide: for "x0", leads the motion to a goal in each step, before the kept part overwrites the clean estimate.
-        strength: fraction of the sampling steps to take, in (0, 1]. Sampling starts from `known`, as noisy as the first
-            of these steps (SDEdit; of N steps, MDM's code skips `skip_timesteps` = (1 - strength) N). None: from noise.
+        blend: for "x_t", replace the kept part "after" each step (FLAME, eq. 6), which ends in
+            the known motion itself, or "before" each call of the denoiser (FLAME's code), which
+            ends in the model's version of it.
+        resample: for "x_t", how many times each step is repeated, after adding noise again
+            (RePaint, algorithm 1).
+        guide: for "x0", leads the motion to a goal in each step, before the kept part overwrites
+            the clean estimate.
+        strength: fraction of the sampling steps to take, in (0, 1]. Sampling starts from `known`,
+            as noisy as the first of these steps (SDEdit; of N steps, MDM's code skips
+            `skip_timesteps` = (1 - strength) N). None: from noise.
+
+    Example:
+        >>> known, keep = torch.ones(1, 4, 2), torch.zeros(1, 4, 2, dtype=torch.bool)
+        >>> keep[:, :2] = True  # the first two frames are kept
+        >>> Edit(known, keep).impose(torch.zeros(1, 4, 2))[0, :, 0].tolist()
+        [1.0, 1.0, 0.0, 0.0]
     """
 
     known: Tensor
@@ -179,13 +207,18 @@ Noise = Callable[[int], Tensor]
 
 
 def pad_to(x: Tensor, size: int) -> Tensor:
-    """Pads dimension 1 of (B, N, ...) with zeros (False) up to `size`."""
+    """Pads dimension 1 of x (B, N, ...) with zeros (False) up to `size` entries."""
     missing = size - x.shape[1]
     return x if missing == 0 else torch.cat([x, x.new_zeros(x.shape[0], missing, *x.shape[2:])], 1)
 
 
 def length_mask(lengths: Tensor, frames: int | None = None) -> Tensor:
-    """Returns the mask (B, F) bool of lengths (B,); F is `frames` or the maximum length."""
+    """Returns the mask (B, F) bool of lengths (B,); F is `frames` or the maximum length.
+
+    Example:
+        >>> length_mask(torch.tensor([1, 2])).tolist()
+        [[True, False], [True, True]]
+    """
     frames = int(lengths.max()) if frames is None else frames
     return torch.arange(frames, device=lengths.device) < lengths[:, None]
 
@@ -209,9 +242,13 @@ def sent(x: Tensor, device: torch.device) -> Tensor:
 def collate(
     samples: Sequence[tuple[str, Tensor, str | None, int | None]], multiple: int = 1, most: int = 0
 ) -> MotionBatch:
-    """Joins (id, x (F, D), caption, action) samples into a batch.
+    """Joins samples into a batch, padded with zeros.
 
-    The batch is padded with zeros to the longest sample, rounded up to a multiple of frames, but at most `most`.
+    Args:
+        samples: id, normalized features (F, D), caption and action of each motion.
+        multiple: the length of the longest sample is rounded up to a multiple of this number of
+            frames.
+        most: maximum number of frames after rounding; a longer sample is never cut.
     """
     ids, motions, texts, actions = zip(*samples, strict=True)
     lengths = torch.tensor([len(x) for x in motions])

@@ -23,11 +23,19 @@ from flame_mdm.seeds import seeded_noise
 
 @dataclass(frozen=True)
 class Parts:
-    """The four parts of a model: who removes noise, along which path, from which description, of which features."""
+    """The four parts of a model.
 
+    Raises:
+        UserError: If `denoiser` is no `flame_mdm.denoisers.Denoiser`.
+    """
+
+    #: Network that predicts the target of the process.
     denoiser: Denoiser
+    #: Path between noise and motion.
     process: Process
+    #: Encoder of texts or actions.
     condition: ConditionEncoder
+    #: Features of a motion.
     representation: Representation
 
     def __post_init__(self) -> None:
@@ -94,7 +102,17 @@ class MotionGenerator(Model, nn.Module):
 
     Args:
         parts: the four parts.
-        sampler_options: defaults of `generate`.
+        sampler_options: default options of `generate`.
+
+    Example:
+        >>> import flame_mdm
+        >>> from flame_mdm.batch import length_mask
+        >>> model = flame_mdm.load("quickstart")
+        >>> mask = length_mask(torch.tensor([20]))
+        >>> batch = MotionBatch(torch.zeros(1, 20, 1), mask, ["first"], text=["a person walks"])
+        >>> x = model.generate(batch, SamplerOptions(num_inference_steps=2), seed=0)
+        >>> model.representation.to_joints(x).shape
+        torch.Size([1, 20, 22, 3])
     """
 
     noun = "a motion generator"
@@ -131,9 +149,11 @@ class MotionGenerator(Model, nn.Module):
 
     @property
     def device(self) -> torch.device:
+        """Device of the model."""
         return self.representation.mean.device
 
     def describe(self) -> str:
+        """Returns the name of the denoiser's class."""
         return type(self.denoiser).__name__
 
     @property
@@ -159,15 +179,32 @@ class MotionGenerator(Model, nn.Module):
         shared_noise: bool = False,
         trajectory: list[Tensor] | None = None,
     ) -> Tensor:
-        """Samples motions for the conditions, lengths and ids of `batch`; its `x` is ignored.
+        """Samples motions for the conditions, lengths and ids of a batch.
 
-        Options of the sampler that are None have the values of the recipe. The noise of a motion is a function of
-        (seed, replication, id), so the motion is the same in any batch; with `shared_noise`, of (seed, replication).
-        `unconditioned` samples a conditional model with its null condition. The normalized clean estimate (B, F, D) of
-        each denoiser call is appended to `trajectory`. With `windows`, motions may be longer than those in training,
-        and the conditions are those of the windows. A model with `context_frames` continues `prefix` (B, C, D), frames
-        of normalized features, block by block, without an edit. Returns (B, F, D) normalized, 0 past the end of each
-        motion.
+        The noise of a motion is a function of (seed, replication, id), so the motion is the same
+        in any batch.
+
+        Args:
+            batch: conditions, `mask` and `ids` of B motions; its `x` is ignored.
+            options: options of the sampler; options that are None have the values of the recipe.
+            seed: seed of the noise.
+            replication: number of the repetition, for several motions per id.
+            edit: part of a motion to keep.
+            windows: windows that cover motions longer than the motions in training; their
+                conditions replace the conditions of the batch.
+            prefix: (B, C, D) normalized features of the frames before the motions. A model with
+                `context_frames` C needs it and continues it block by block, without edit, windows
+                and trajectory.
+            unconditioned: sample a conditional model with its null condition.
+            shared_noise: the noise does not depend on the id, but on (seed, replication) alone.
+            trajectory: list that gets the normalized clean estimate (B, F, D) of each call of the
+                denoiser.
+
+        Returns:
+            Normalized features (B, F, D), 0 past the end of each motion.
+
+        Raises:
+            UserError: If the model or its process cannot sample with these arguments.
         """
         self.check_request(options, unconditioned)
         options = self.sampler_options if options is None else options.over(self.sampler_options)
@@ -203,7 +240,8 @@ class MotionGenerator(Model, nn.Module):
 
         mask, frames = batch.mask, batch.mask.shape[1]
         if windows is None and not self.denoiser.mask_padding:
-            # This denoiser attends to padding, so the padded length must be the same as in training.
+            # This denoiser attends to padding, so the padded length must be the same as in
+            # training.
             mask = pad_to(mask, max(frames, self.facts.get("max_frames", 0)))
             if edit is not None:
                 padded = mask.shape[1]
@@ -255,18 +293,20 @@ class MotionGenerator(Model, nn.Module):
 class Blocks:
     """Motions that grow by blocks, each of which continues the last frames before it (Tevet et al. 2025, "CLoSD").
 
-    The noise of a block is a function of (seed, replication, id, number of the block): later conditions change later
-    blocks alone.
+    The noise of a block is a function of (seed, replication, id, number of the block): later
+    conditions change later blocks alone.
 
     Args:
         model: a model whose denoiser has `context_frames` C.
         ids: B names of the motions, which seed their noise.
         prefix: (B, C, D) normalized features of the frames before the first block.
         options: all options of the sampler.
-        seed, replication: of the noise.
+        seed: seed of the noise.
+        replication: number of the repetition, for several motions per id.
         unconditioned: whether conditions are null conditions already.
 
-    Raises `UserError` if the prefix is missing or has another shape.
+    Raises:
+        UserError: If the prefix is missing or has another shape.
     """
 
     def __init__(
@@ -298,7 +338,8 @@ class Blocks:
 
         Args:
             cond: the conditions of this block.
-            kept: (B,) int64, number of frames of the block that stay; the next block continues these. Default: all.
+            kept: (B,) int64, number of frames of the block that stay; the next block continues
+                these. Default: all.
             edit: part of the block to keep.
         """
         model, prefix = self.model, self.prefix

@@ -12,7 +12,13 @@ CONTACT_SPEED = 0.01
 def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
     """Returns the mean (B,) of x (B, F, ...) over the real frames of each sample; 0 if a sample has none.
 
-    Unlike in MDM's code, 1e-8 is not added to the number of entries: it is below the resolution of float32.
+    Unlike in MDM's code, 1e-8 is not added to the number of entries: it is below the resolution
+    of float32.
+
+    Example:
+        >>> x, mask = torch.tensor([[[1.0], [3.0], [9.0]]]), torch.tensor([[True, True, False]])
+        >>> masked_mean(x, mask).tolist()
+        [2.0]
     """
     x = x.flatten(2)
     total = (x * mask[..., None]).sum((1, 2))
@@ -22,7 +28,12 @@ def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
 def masked_mse(a: Tensor, b: Tensor, mask: Tensor) -> Tensor:
     """Returns the squared error (B,) of a and b (B, F, ...), averaged over the entries of real frames (mask (B, F)).
 
-    All samples have equal weight, regardless of length (Tevet et al. 2022, eq. 2, averaged as in their code).
+    All samples have equal weight, regardless of length (Tevet et al. 2022, eq. 2, averaged as in
+    their code).
+
+    Example:
+        >>> masked_mse(torch.zeros(1, 2, 3), torch.full((1, 2, 3), 2.0), torch.ones(1, 2) > 0).tolist()
+        [4.0]
     """
     return masked_mean((a - b).square(), mask)
 
@@ -34,24 +45,36 @@ def bone_lengths(joints: Tensor, edges: Sequence[tuple[int, int]] | Tensor) -> T
 
 
 class MotionLosses(nn.Module):
-    """Weighted geometric losses of MDM (Tevet et al. 2022, eq. 3-5), and of bone lengths (Liang et al. 2024, InterGen).
+    """Weighted geometric losses of MDM (Tevet et al. 2022, eq. 3-5), and of bone lengths (Liang
+    et al. 2024, InterGen).
 
-    All are means over real frames and entries: the norms in the paper are divided by the number of entries per frame,
-    as in its code. Velocities are per frame. Terms with weight 0 are not computed.
+    All are means over real frames and entries: the norms in the paper are divided by the number
+    of entries per frame, as in its code. Velocities are per frame. Terms with weight 0 are not
+    computed.
 
     Args:
-        to_joints: differentiable map from normalized features (B, F, D) to joint positions (B, F, J, 3) in meters.
+        to_joints: differentiable map from normalized features (B, F, D) to joint positions (B, F,
+            J, 3) in meters.
         feet: indices of the joints that touch the ground.
         edges: (parent, child) of each bone, for `bone_length`.
         joints: weight of the squared error of the joint positions (eq. 3).
         velocity: weight of the squared error of the features' velocity (eq. 5).
-        foot_contact: weight of the squared velocity of feet in contact in the data (eq. 4). The mean includes feet that
-            are not in contact, whose entries are 0, like the sum over all frames in the paper.
-        bone_length: weight of the squared error of the bone lengths, in square meters; the bone length loss of InterGen
-            (arXiv:2304.05684), which applies it only up to a noise level, here at all of them.
+        foot_contact: weight of the squared velocity of feet in contact in the data (eq. 4). The
+            mean includes feet that are not in contact, whose entries are 0, like the sum over all
+            frames in the paper.
+        bone_length: weight of the squared error of the bone lengths, in square meters; the bone
+            length loss of InterGen (arXiv:2304.05684), which applies it only up to a noise level,
+            here at all of them.
         root_relative: subtract the first joint from all joints, as in MDM's code.
-        velocity_features: number of features, from the first, that `velocity` uses, as in MDM's code (144 of 25 x 6,
-            262 of 263: the last row of the feature matrix is left out). None = all.
+        velocity_features: number of features, from the first, that `velocity` uses, as in MDM's
+            code (144 of 25 x 6, 262 of 263: the last row of the feature matrix is left out). None
+            = all.
+
+    Example:
+        >>> losses = MotionLosses(lambda x: x.unflatten(-1, (-1, 3)), feet=[1], joints=2.0)
+        >>> x, mask = torch.zeros(1, 5, 6), torch.ones(1, 5, dtype=torch.bool)
+        >>> losses(x + 1, x, mask)
+        {'joints': tensor([2.])}
     """
 
     def __init__(
@@ -80,7 +103,8 @@ class MotionLosses(nn.Module):
 
     def forward(self, x0_hat: Tensor, x: Tensor, mask: Tensor) -> dict[str, Tensor]:
         """Returns weighted losses (B,) by name, from clean estimate and data (B, F, D) and mask (B, F)."""
-        # The first frame has no velocity. Padding is at the end, so a velocity is real if its second frame is.
+        # The first frame has no velocity. Padding is at the end, so a velocity is real if its
+        # second frame is.
         moving = mask[:, 1:]
         losses: dict[str, Tensor] = {}
         if self.velocity:

@@ -50,8 +50,13 @@ class Value(Schema):
 def percentiles(drawn: Sequence[float], value: float) -> tuple[float, float]:
     """Returns the 95 % interval of a value from its bootstrap, shifted so that it is centered at the value.
 
-    Efron and Tibshirani 1993, section 13.3. The shift is for values such as Fréchet distances, which are larger for
-    sets with repetitions (section 10.6): the interval is that of the value for the same number of motions.
+    Efron and Tibshirani 1993, section 13.3. The shift is for values such as Fréchet distances,
+    which are larger for sets with repetitions (section 10.6); the interval belongs to the value
+    for the same number of motions.
+
+    Example:
+        >>> percentiles([1.0, 2.0, 3.0], 5.0)
+        (4.05, 5.95)
     """
     import numpy as np
 
@@ -113,7 +118,7 @@ class Checkpoint(Schema):
 
 
 class UsedSkeleton(Schema):
-    """The bones of joints computed from SMPL's rotations: those of SMPL's model file, or of a stand-in."""
+    """The bones of joints computed from SMPL's rotations: from SMPL's model file, or from a stand-in."""
 
     stand_in: bool
     smpl_sha256: str | None = None
@@ -186,12 +191,13 @@ class Result(Measured):
 
     @property
     def stand_in_skeleton(self) -> bool:
+        """Whether the bones of the joints come from a stand-in for SMPL's model file."""
         return self.skeleton is not None and self.skeleton.stand_in
 
 
 class AuditedGrade(ClosedSchema):
-    """One grade of a perturbation; by metric: value, half width of its 95 % interval, difference from real motions,
-    and half width of the interval of that difference; None if not computable.
+    """One grade of a perturbation; by metric: value, half width of its 95 % interval, difference
+    from real motions, and half width of the interval of that difference; None if not computable.
     """
 
     grade: Number
@@ -239,7 +245,7 @@ class AuditCard(ClosedSchema):
     seed: Int
     resamples: Int
     packages: dict[str, str]
-    # Whether higher values are better; None = values near those of real motions
+    # Whether higher values are better; None = values are best if near the values of real motions
     metrics: dict[str, bool | None]
     facts: dict[str, AuditedMetric] = Field({})  # by metric; earlier versions wrote none
     # And half widths of intervals
@@ -251,6 +257,7 @@ class AuditCard(ClosedSchema):
 
 
 def read_result(path: Path) -> Result:
+    """Reads the result file of an evaluation; raises `UserError` if it is damaged."""
     return read_json(
         path, Result, "delete it, then run `flame-mdm evaluate` or `flame-mdm tables` again"
     )

@@ -8,7 +8,8 @@ from typing import Any, Self
 from flame_mdm.config.options import option
 from flame_mdm.errors import UserError
 
-MAX_STEPS = 100_000  # maximum number of steps of a diffusion or sampler
+# Maximum number of steps of a diffusion or sampler
+MAX_STEPS = 100_000
 # How diffusion places steps; see `flame_mdm.processes.schedules.timesteps`
 SPACINGS = (
     "linspace",
@@ -20,8 +21,16 @@ SPACINGS = (
 class SamplerOptions:
     """How motions are sampled. None = the value of the recipe or, if the recipe has none, of the sampler.
 
-    A sampler declares which of the options it has (`flame_mdm.processes.samplers`); `flame_mdm.processes.Process`
-    refuses the others. Raises `UserError` if a value is invalid for every model.
+    A sampler declares which of the options it has (`flame_mdm.processes.samplers`);
+    `flame_mdm.processes.Process` refuses the others.
+
+    Raises:
+        UserError: If a value is invalid for every model.
+
+    Example:
+        >>> recipe = SamplerOptions(sampler="ddim", num_inference_steps=50)
+        >>> SamplerOptions(num_inference_steps=10).over(recipe).chosen()
+        {'sampler': 'ddim', 'num_inference_steps': 10}
     """
 
     guidance_scale: float | None = option(

@@ -1,8 +1,9 @@
 """Counter-based random numbers, which depend on their purpose and not on the order of draws.
 
-In a sampling run, the noise of a motion is an elementwise function of (seed, replication, id): it does not depend on
-batch, padding, number of processes or device. A counter is hashed (splitmix64: Steele, Lea and Flood 2014, "Fast
-splittable pseudorandom number generators") and mapped to the normal distribution (Box and Muller 1958).
+In a sampling run, the noise of a motion is an elementwise function of (seed, replication, id): it
+does not depend on batch, padding, number of processes or device. A counter is hashed (splitmix64:
+Steele, Lea and Flood 2014, "Fast splittable pseudorandom number generators") and mapped to the
+normal distribution (Box and Muller 1958).
 """
 
 import hashlib
@@ -20,7 +21,12 @@ Counters = TypeVar("Counters", Tensor, np.ndarray)
 
 
 def key(*parts: str | int) -> int:
-    """Hashes parts to a 63-bit number, the same on every machine."""
+    """Hashes parts to a 63-bit number, the same on every machine.
+
+    Example:
+        >>> key("noise", 0, "clip_1") == key("noise", 0, "clip_1"), key("noise", 0, "clip_2") < 2**63
+        (True, True)
+    """
     text = "\x1f".join(str(part) for part in parts)
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 1
 
@@ -28,7 +34,8 @@ def key(*parts: str | int) -> int:
 def seed_generator(number: int, device: torch.device) -> None:
     """Seeds torch's generators of the processor and of `device`.
 
-    `torch.manual_seed` seeds those of all devices, and takes about a millisecond where CUDA is not initialized.
+    `torch.manual_seed` seeds the generators of all devices, which takes about a millisecond if
+    CUDA is not initialized.
     """
     torch.default_generator.manual_seed(number)
     if device.type != "cpu":
@@ -55,7 +62,8 @@ def _hash(x: Counters) -> Counters:
 def integers(keys: np.ndarray) -> Callable[[Any], np.ndarray]:
     """Returns a function that draws uniform integers (B,) from 0 up to, and not including, its argument.
 
-    The argument is an integer below 2^31, or one for each key (B,) int64. Each call is another draw.
+    The argument is an integer below 2^31, or one for each key (B,) int64. Each call is another
+    draw.
     """
     state = keys
 
@@ -76,7 +84,15 @@ def uniform(keys: Tensor, shape: Sequence[int]) -> tuple[Tensor, Tensor]:
 
 
 def normal(keys: Tensor, frames: int, features: int) -> Tensor:
-    """Returns standard normal noise (B, F, D), float32. Element (f, d) of key k does not depend on B or F."""
+    """Returns standard normal noise (B, F, D), float32, for keys (B,) int64.
+
+    Element (f, d) of a key does not depend on B or F (Box and Muller 1958).
+
+    Example:
+        >>> keys = torch.tensor([key("a"), key("b")])
+        >>> torch.equal(normal(keys, 4, 3)[1:], normal(keys[1:], 6, 3)[:, :4])
+        True
+    """
     pairs = (features + 1) // 2
     u, v = uniform(keys, (frames, pairs))
     radius, angle = torch.sqrt(-2 * torch.log(u)), 2 * math.pi * v
@@ -88,6 +104,18 @@ def normal(keys: Tensor, frames: int, features: int) -> Tensor:
 def seeded_noise(
     ids: Sequence[str], frames: int, features: int, *, seed: int, replication: int, like: Tensor
 ) -> Noise:
-    """Returns the noise of a sampling run for the motions named `ids`, on the device of `like`."""
+    """Returns the noise of a sampling run.
+
+    Args:
+        ids: B names of the motions.
+        frames: F.
+        features: D.
+        seed: seed of the run.
+        replication: number of the repetition of the run.
+        like: a tensor of the device and the precision of the noise.
+
+    Returns:
+        A function from the number of a draw, 0, 1, 2, ..., to noise (B, F, D).
+    """
     keys = torch.tensor([key("noise", seed, replication, name) for name in ids], device=like.device)
     return lambda draw: normal(_hash(keys + draw), frames, features).to(like.dtype)

@@ -52,6 +52,7 @@ class Task(Model, LightningModule):
         return self.trainer.datamodule  # type: ignore[attr-defined]
 
     def describe(self) -> str:
+        """Returns the name of the network's class."""
         return type(getattr(self, "network", self)).__name__
 
     def prepare_data(self) -> None:
@@ -64,8 +65,8 @@ class Task(Model, LightningModule):
         size = encoder.load_cache(*self._captions())
         if device := data.choose_device(size):
             encoder.move_cache(device)
-        # Buffers are equal in all processes. If DDP broadcast them in each forward pass, processes with more validation
-        # batches than others would wait forever.
+        # Buffers are equal in all processes. If DDP broadcast them in each forward pass,
+        # processes with more validation batches than others would wait forever.
         self._ddp_params_and_buffers_to_ignore = [name for name, _ in self.named_buffers()]
         self.add_facts(
             {
@@ -83,6 +84,7 @@ class Task(Model, LightningModule):
         return sorted({*self.data.captions(), *prompts}), self.data.folder.parent / "text"
 
     def make_optimizer(self) -> torch.optim.Optimizer:
+        """Returns the optimizer of the recipe, for all parameters that are trained."""
         return instantiate(self.optimizer, params=[p for p in self.parameters() if p.requires_grad])
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
@@ -119,13 +121,15 @@ class GeneratorTask(Task):
         losses: weights of `MotionLosses` on the clean estimate.
         optimizer: a mapping with the `_target_` of a torch optimizer and its arguments.
         cond_drop_prob: probability that a training sample gets the null condition.
-        guidance_scale, sampler, num_inference_steps: defaults of `generate`; see `SamplerOptions`.
+        guidance_scale, sampler, num_inference_steps: defaults of `generate`; see
+            `SamplerOptions`.
         seed: of all random draws in training, which are functions of (seed, batch number, rank).
         compile: compile the denoiser with torch.compile, when training begins.
-        targets: options of `TargetConditions`, for a denoiser with a target encoder; None = no targets.
+        targets: options of `TargetConditions`, for a denoiser with a target encoder; None = no
+            targets.
 
-    If the denoiser reads `context_frames`, the first frames of a training sample are its clean prefix, and the losses
-    are those of the frames after them.
+    If the denoiser reads `context_frames`, the first frames of a training sample are its clean
+    prefix, and only the frames after them count in the losses.
     """
 
     noun = MotionGenerator.noun
@@ -197,6 +201,7 @@ class GeneratorTask(Task):
         self.generator.add_facts(facts)
 
     def describe(self) -> str:
+        """Returns the name of the denoiser's class."""
         return self.generator.describe()
 
     def setup(self, stage: str) -> None:
@@ -234,6 +239,7 @@ class GeneratorTask(Task):
         )
 
     def on_train_start(self) -> None:
+        """Also trains the text encoder, before the first step of a new run."""
         super().on_train_start()
         if self.global_step == 0:
             self.pretrain()
@@ -276,7 +282,8 @@ class GeneratorTask(Task):
     ) -> dict[str, Tensor]:
         """Returns the losses (B,) of the motions of a batch by name; "loss" is their sum.
 
-        Uniform numbers u (B,) in (0, 1), which decide on the times, and noise (B, F, D) are drawn if not given.
+        Uniform numbers u (B,) in (0, 1), which decide on the times, and noise (B, F, D) are drawn
+        if not given.
         """
         process = self.generator.process
         t = None if u is None else process.training_times(u)
@@ -307,6 +314,7 @@ class GeneratorTask(Task):
         return self.loss_terms(batch, cond, u, noise)
 
     def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:
+        """Adds the losses of a batch to the means of the validation."""
         for name, value in self.losses_of(batch).items():
             if name not in self.val_losses:
                 self.val_losses[name] = MeanMetric().to(self.device)

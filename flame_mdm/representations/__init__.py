@@ -40,18 +40,46 @@ class Frames:
 
 
 class Representation(nn.Module, ABC):
-    """Conversion of motions to features and back. Mean and std are buffers, so that sampling needs no data set."""
+    """Conversion of motions to features and back: base class of all representations.
 
+    Mean and std are buffers, so that sampling needs no data set.
+
+    Args:
+        name: saved in stores and checkpoints; features with different names are never mixed.
+        features: D, the number of features of a frame.
+        fps: frames per second, 1 to 1000.
+        skeleton: the skeleton of the decoded joints.
+
+    Raises:
+        UserError: If `fps` is out of range.
+
+    Example:
+        >>> from flame_mdm.representations.skeleton import SMPL22
+        >>> class Positions(Representation):  # joint positions as features
+        ...     def encode(self, motion):
+        ...         return motion.flatten(1).float()
+        ...     def decode(self, features):
+        ...         return features.unflatten(-1, (-1, 3))
+        ...     def joint_features(self, joints):
+        ...         return self.joint_mask(joints).repeat_interleave(3)
+        >>> positions = Positions("positions", 66, 20.0, SMPL22)
+        >>> motion = torch.randn(5, 22, 3)
+        >>> torch.equal(positions.to_joints(positions.normalize(positions.encode(motion))), motion)
+        True
+    """
+
+    #: (D,) mean of the features.
     mean: Tensor
+    #: (D,) standard deviation of the features.
     std: Tensor
-    # Name of a representation whose first features these are, so that its features can be cut
+    #: Name of a representation whose first features these are, so that its features can be cut.
     part_of: str = ""
-    # Whether the root moves by steps between frames, so that any window of frames is a motion
+    #: Whether the root moves by steps between frames, so that any window of frames is a motion.
     relative: bool = True
-    slices: Mapping[str, slice] = {}  # columns of the features by name
+    #: Columns of the features by name.
+    slices: Mapping[str, slice] = {}
 
     def __init__(self, name: str, features: int, fps: float, skeleton: Skeleton):
-        """`name` is saved in stores and checkpoints; features with different names are never mixed."""
         super().__init__()
         if not isinstance(fps, int | float) or not 1 <= fps <= 1000:
             raise UserError(
@@ -66,6 +94,7 @@ class Representation(nn.Module, ABC):
         """Encodes a raw motion as features (F', D) float32 in the data's units, not normalized."""
 
     def encode_many(self, motions: Sequence[Tensor]) -> list[Tensor]:
+        """Encodes several motions; subclasses may do so in one pass."""
         return [self.encode(motion) for motion in motions]
 
     @abstractmethod

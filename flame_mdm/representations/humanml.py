@@ -32,19 +32,44 @@ class HumanML(Representation):
     | velocities | 3 J | each joint's displacement to the next frame, in body coordinates |
     | contacts | 4 | 1 if a foot joint (`skeleton.feet`) hardly moves to the next frame |
 
-    The heading is 0 when the body faces +z and increases as it turns left, towards +x. Motions are first made
-    canonical: lowest joint at y = 0, root of the first frame at x = z = 0, facing +z there.
+    The heading is 0 when the body faces +z and increases as it turns left, towards +x. Motions
+    are first made canonical: lowest joint at y = 0, root of the first frame at x = z = 0, facing
+    +z there.
 
-    Variant "legacy" equals the published data with all its peculiarities. Its heading subtracts the hips from the
-    shoulders instead of adding them, and is 0 in the first frame although the smoothed heading is not. `turn` is half
-    the turn to the right and changes sign where the heading crosses 180 degrees. The root velocity is in the body
-    coordinates of the next frame. Rotations are those of bones in the world relative to the inverse heading, also at
-    the shoulders. `decode` is the published one. If a bone is exactly opposite to its rest direction, the published
-    code gives NaN; here it is a half turn.
+    Variant "legacy" equals the published data with all its peculiarities. Its heading subtracts
+    the hips from the shoulders instead of adding them, and is 0 in the first frame although the
+    smoothed heading is not. `turn` is half the turn to the right and changes sign where the
+    heading crosses 180 degrees. The root velocity is in the body coordinates of the next frame.
+    Rotations are rotations of bones in the world relative to the inverse heading, also at the
+    shoulders. `decode` is the published one. If a bone is exactly opposite to its rest direction,
+    the published code gives NaN; here it is a half turn.
 
-    Variant "clean" has none of these. Headings are unwrapped before smoothing and padded point-symmetrically at both
-    ends, which preserves the first and the last heading and steady turns. Rotations are those of the body facing +z,
-    each relative to its parent in the skeleton.
+    Variant "clean" has none of these. Headings are unwrapped before smoothing and padded
+    point-symmetrically at both ends, which preserves the first and the last heading and steady
+    turns. Rotations are taken of the body facing +z, each relative to its parent in the skeleton.
+
+    Input and output joints are in meters; features are in units of 1 / `units_per_metre` meters
+    (KIT: 1/640).
+
+    Args:
+        skeleton: key in `SKELETONS`.
+        variant: "clean" for the intended features, "legacy" for the published ones.
+        fps: frames per second.
+        bone_lengths: J lengths in the features' unit, of the bone that ends in each joint, that
+            all motions are retargeted to; None keeps the lengths of each motion.
+        units_per_metre: units of the features per meter.
+        contact_threshold: squared displacement of a foot per frame, in the features' unit, below
+            which the foot is in contact: 0.002 for HumanML3D, 0.05 for KIT.
+
+    Raises:
+        UserError: If the skeleton is unknown, or `bone_lengths` do not fit it.
+
+    Example:
+        >>> representation = HumanML()
+        >>> motion = torch.randn(10, 22, 3)
+        >>> features = representation.encode(motion)
+        >>> features.shape, representation.decode(features).shape
+        (torch.Size([9, 263]), torch.Size([9, 22, 3]))
     """
 
     essential: bool = False  # whether the last three columns of the table are left out
@@ -58,16 +83,6 @@ class HumanML(Representation):
         units_per_metre: float = 1.0,
         contact_threshold: float = 0.002,
     ):
-        """Input and output joints are in meters; features are in units of 1 / `units_per_metre` meters (KIT: 1/640).
-
-        Args:
-            skeleton: key in `SKELETONS`.
-            variant: "clean" for the intended features, "legacy" for the published ones.
-            bone_lengths: J lengths in the features' unit, of the bone that ends in each joint, that all motions are
-                retargeted to; None keeps the lengths of each motion.
-            contact_threshold: squared displacement of a foot per frame, in the features' unit, below which the foot is
-                in contact: 0.002 for HumanML3D, 0.05 for KIT.
-        """
         if skeleton not in SKELETONS:
             raise UserError(f"skeleton: {skeleton!r} is unknown; use one of {', '.join(SKELETONS)}")
         joints = len(SKELETONS[skeleton])
@@ -179,7 +194,8 @@ class HumanML(Representation):
     def _facing(self, joints: Tensor, hips: float = 1.0) -> Tensor:
         """Returns x and z (N, 2) of the direction hips and shoulders face; shorter if the body lies on its side.
 
-        It is the cross product of the vertical and the direction to the right; `hips` is the weight of the hips.
+        It is the cross product of the vertical and the direction to the right; `hips` is the
+        weight of the hips.
         """
         right_hip, left_hip, right_shoulder, left_shoulder = joints[
             :, list(self.skeleton.facing)

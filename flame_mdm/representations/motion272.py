@@ -23,19 +23,31 @@ class Motion272(Representation):
     | velocities | 66 | differences of `positions` from the last frame: without the body's own motion and turn |
     | rotations | 132 | SMPL's rotations as 6D rows, of the root in body coordinates |
 
-    In the first row, `turn` is the identity and velocities are 0. The heading is that of the root's rotation, so it
-    jumps when a body lies down. Motions begin at x = z = 0, facing +z. Raw motions are those of `read_pose`, whose z
-    axis is up; bones have the lengths of `offsets`, whereas the authors keep those of each subject.
+    In the first row, `turn` is the identity and velocities are 0. The heading is the heading of
+    the root's rotation, so it jumps when a body lies down. Motions begin at x = z = 0, facing +z.
+    `smpl.read_pose` describes raw motions, whose z axis is up. Bones have the lengths of
+    `offsets`, whereas the authors keep the bone lengths of each subject.
+
+    Args:
+        fps: frames per second.
+        offsets: (24, 3) offsets of the body in meters, like `ADULT`; the first is from
+            translation to pelvis.
+
+    Example:
+        >>> representation = Motion272()
+        >>> features = representation.encode(torch.zeros(10, 75))  # SMPL's rest pose
+        >>> features.shape, representation.decode(features).shape
+        (torch.Size([10, 272]), torch.Size([10, 22, 3]))
     """
 
     def __init__(self, fps: float = 30.0, offsets: Sequence[Sequence[float]] = ADULT):
-        """`offsets` (24, 3) of the body, like `ADULT`; the first is from translation to pelvis."""
         super().__init__("motion272", 272, fps, SMPL22)
         self.slices = {"root_velocity": slice(0, 2), "turn": slice(2, 8), "positions": slice(8, 74)}
         self.slices |= {"velocities": slice(74, 140), "rotations": slice(140, 272)}
         self.offsets = offsets
 
     def encode(self, motion: Tensor) -> Tensor:
+        """Encodes a raw motion (F >= 2, 3 + 3 K) as features (F, 272) float32; see `smpl.read_pose`."""
         translation, rotations = read_pose(motion)
         if len(motion) < 2:
             raise UserError("motion: 1 frame, but encoding needs at least 2; leave the motion out")
@@ -110,7 +122,7 @@ class Motion272(Representation):
         return inverse, torch.cat([velocity[..., :1, :], level], -2).cumsum(-2)
 
     def rebase(self, features: Features) -> Features:
-        """Sets the velocities and the turn in the first frame of cuts (..., F, D) to those of a complete motion."""
+        """Sets velocities and turn in the first frame of cuts (..., F, D), as in the first frame of a motion."""
         cut = deepcopy(features)
         for name in ("root_velocity", "turn", "velocities"):
             cut[..., 0, self.slices[name]] = 0.0
@@ -118,6 +130,7 @@ class Motion272(Representation):
         return cut
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
+        """Returns (272,) bool, True for features of these joints; the root trajectory belongs to joint 0."""
         part = self.joint_mask(joints)
         return torch.cat([part[:1].expand(8), *(part.repeat_interleave(n) for n in (3, 3, 6))])
 

@@ -26,12 +26,23 @@ class Rifke(Representation):
     | 61 | heading change since the previous frame, radians, 0 in the first frame |
     | 62:64 | x and z of the root's displacement since the previous frame, in body coordinates |
 
-    Kept as published: the floor is a soft minimum, which depends on the unit of length; heading changes are not
-    unwrapped; and the heading is that of knees and elbows instead of the intended hips and shoulders.
+    Kept as published: the floor is a soft minimum, which depends on the unit of length; heading
+    changes are not unwrapped; and the heading is computed from knees and elbows instead of the
+    intended hips and shoulders.
+
+    Args:
+        fps: frames per second.
+        units_per_metre: units of the features per meter; KIT's unit is 1/640 meters. Joints are
+            in meters.
+
+    Example:
+        >>> representation = Rifke()
+        >>> features = representation.encode(torch.randn(10, 21, 3))
+        >>> features.shape, representation.decode(features).shape
+        (torch.Size([10, 64]), torch.Size([10, 21, 3]))
     """
 
     def __init__(self, fps: float = 12.5, units_per_metre: float = 640.0):
-        """Input and output joints are in meters; features are in KIT's unit, 1 / `units_per_metre` meters."""
         super().__init__("rifke", 64, fps, KIT21)
         self.units_per_metre = units_per_metre
 
@@ -78,6 +89,7 @@ class Rifke(Representation):
         return torch.atan2(-across[:, 2], across[:, 0])
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
+        """Returns (64,) bool, True for features of these joints; the root trajectory belongs to joint 0."""
         part = self.joint_mask(joints)
         return torch.cat([part[:1], part[1:].repeat_interleave(3), part[:1].expand(3)])
 

@@ -15,18 +15,29 @@ from flame_mdm.representations.smpl import ADULT, read_pose
 class Rot6D(Representation):
     """25 x 6 features of Petrovich et al. 2021 (ACTOR): 24 rotations as 6D rows, then (x, y, z, 0, 0, 0).
 
-    (x, y, z) is the root's translation relative to the first frame, in camera coordinates: meters, y down, z away from
-    the camera. Not normalized. Raw motions are those of `read_pose`.
+    (x, y, z) is the root's translation relative to the first frame, in camera coordinates:
+    meters, y down, z away from the camera. Not normalized. `smpl.read_pose` describes raw
+    motions.
+
+    Args:
+        fps: frames per second.
+        offsets: (24, 3) offsets of the body used for decoding, in meters, like `ADULT`.
+
+    Example:
+        >>> representation = Rot6D()
+        >>> features = representation.encode(torch.zeros(10, 75))  # SMPL's rest pose
+        >>> features.shape, representation.decode(features).shape
+        (torch.Size([10, 150]), torch.Size([10, 24, 3]))
     """
 
     relative = False
 
     def __init__(self, fps: float = 20.0, offsets: Sequence[Sequence[float]] = ADULT):
-        """`offsets` (24, 3) of the body used for decoding, like `ADULT`."""
         super().__init__("rot6d-25", 150, fps, SMPL24)
         self.offsets = offsets
 
     def encode(self, motion: Tensor) -> Tensor:
+        """Encodes a raw motion (F, 3 + 3 K) as features (F, 150) float32; see `smpl.read_pose`."""
         translation, rotations = read_pose(motion)
         rows = rotation.matrix_to_rot6d(rotations, "rows").flatten(1)
         return torch.cat([rows, F.pad(translation - translation[:1], (0, 3))], 1).float()
@@ -39,6 +50,7 @@ class Rot6D(Representation):
         return moved
 
     def rotations6d(self, features: Tensor) -> Tensor:
+        """Returns the rotations (..., F, 24, 6) of the joints."""
         return features[..., :144].unflatten(-1, (24, 6))
 
     def decode(self, features: Tensor) -> Tensor:
@@ -51,5 +63,6 @@ class Rot6D(Representation):
         return joints * joints.new_tensor([1.0, -1.0, -1.0])
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
+        """Returns (150,) bool, True for features of these joints; the translation belongs to joint 0."""
         part = self.joint_mask(joints)
         return torch.cat([part, part[:1]]).repeat_interleave(6)

@@ -1,7 +1,8 @@
 """Conversions between rotations: axis-angle, quaternions, matrices, the two 6D conventions and Euler angles.
 
-Every function accepts any leading batch shape, preserves the dtype and is differentiable. Quaternions are (w, x, y, z)
-of unit length; matrices act on column vectors; angles are in radians.
+Every function accepts any leading batch shape, preserves the dtype and is differentiable.
+Quaternions are (w, x, y, z) of unit length; matrices act on column vectors; angles are in
+radians.
 """
 
 from typing import Literal
@@ -13,8 +14,9 @@ from torch import Tensor
 from flame_mdm.errors import UserError
 
 SixD = Literal["rows", "columns"]
-"""Which vectors of the matrix are kept: the first two rows (pytorch3d, FLAME, ACTOR, TEMOS, MDM's action data) or the
-first two columns (HumanML3D). rows(R) = columns(R^T): decoding one as the other gives the inverse rotation."""
+"""Which vectors of the matrix are kept: the first two rows (pytorch3d, FLAME, ACTOR, TEMOS, MDM's
+action data) or the first two columns (HumanML3D). rows(R) = columns(R^T): decoding one as the
+other gives the inverse rotation."""
 
 
 def axis_angle_to_quaternion(axis_angle: Tensor) -> Tensor:
@@ -83,8 +85,9 @@ def matrix_to_rot6d(matrix: Tensor, convention: SixD) -> Tensor:
 def rot6d_to_matrix(rot6d: Tensor, convention: SixD) -> Tensor:
     """(..., 6), orthonormal or not -> (..., 3, 3) by Gram-Schmidt (Zhou et al. 2019, eq. 15).
 
-    Every finite pair of vectors gives a rotation. If one has no direction, it is replaced by the basis vector that is
-    least along the other one; so is the second vector if both are parallel. Two zeros give the identity.
+    Every finite pair of vectors gives a rotation. If one has no direction, it is replaced by the
+    basis vector that is least along the other one; so is the second vector if both are parallel.
+    Two zeros give the identity.
     """
     degenerate = _degenerate(rot6d, *_orthogonal(rot6d))
     # not a branch: neither exported graphs nor torch.func.vmap, which guidance uses, can have one
@@ -111,7 +114,8 @@ def _orthogonal(rot6d: Tensor) -> tuple[Tensor, Tensor]:
 def _degenerate(rot6d: Tensor, first: Tensor, across: Tensor) -> Tensor:
     """Returns (..., 1) bool: whether two vectors (..., 6), of which `_orthogonal` is known, define no rotation.
 
-    Of parallel vectors, rounding alone determines `across`. NaN is not degenerate, so it stays NaN.
+    Of parallel vectors, rounding alone determines `across`. NaN is not degenerate, so it stays
+    NaN.
     """
     length = torch.linalg.vector_norm(rot6d[..., 3:], dim=-1, keepdim=True)
     parallel = (
@@ -122,7 +126,7 @@ def _degenerate(rot6d: Tensor, first: Tensor, across: Tensor) -> Tensor:
 
 
 def _shorter(normalized: Tensor) -> Tensor:
-    """Returns (..., 1) bool: whether normalized vectors (..., 3) are shorter than 1, as those of 0 are."""
+    """Returns (..., 1) bool: whether normalized vectors (..., 3) are shorter than 1, because they were about 0."""
     return (
         torch.linalg.vector_norm(normalized, dim=-1, keepdim=True)
         < 1 - torch.finfo(normalized.dtype).eps ** 0.5
@@ -141,7 +145,11 @@ def _completed(rot6d: Tensor) -> Tensor:
 
 
 def matrix_to_euler(matrix: Tensor, order: str) -> Tensor:
-    """(..., 3, 3) -> (..., 3), the middle angle in [-pi/2, pi/2]; in gimbal lock the third angle is 0."""
+    """Returns Euler angles (..., 3) of matrices (..., 3, 3), the middle one in [-pi/2, pi/2].
+
+    In gimbal lock, the third angle is 0. Raises `UserError` if `order` is not one of XYZ, XZY,
+    YXZ, YZX, ZXY, ZYX.
+    """
     if sorted(order) != ["X", "Y", "Z"]:
         raise UserError(
             f"Euler order {order!r} is not supported; use the letters X, Y and Z once each, as in 'ZXY'"
@@ -160,7 +168,12 @@ def matrix_to_euler(matrix: Tensor, order: str) -> Tensor:
 
 
 def standardize(quaternion: Tensor) -> Tensor:
-    """Returns q or -q, which are the same rotation, with w >= 0."""
+    """Returns q or -q (..., 4), which are the same rotation, with w >= 0.
+
+    Example:
+        >>> standardize(torch.tensor([-1.0, 0.0, 0.0, 0.5])).tolist()
+        [1.0, -0.0, -0.0, -0.5]
+    """
     return torch.where(quaternion[..., :1] < 0, -quaternion, quaternion)
 
 
@@ -196,10 +209,18 @@ def _scaled(vectors: Tensor) -> Tensor:
 
 
 def between(a: Tensor, b: Tensor) -> Tensor:
-    """Returns the shortest rotation from the direction of `a` to that of `b`: (..., 3), (..., 3) -> (..., 4), w >= 0.
+    """Returns the shortest rotation that turns vectors `a` (..., 3) to the directions of `b` (..., 3).
 
-    For opposite directions, it is a half turn about a perpendicular axis; if a vector is 0, the identity.
+    The quaternions (..., 4) have w >= 0. For opposite directions, the result is a half turn about
+    a perpendicular axis; if a vector is 0, the identity.
+
+    Example:
+        >>> quarter = between(torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 2.0, 0.0]))
+        >>> [round(value, 4) for value in quarter.tolist()]  # 90 degrees about z
+        [0.7071, 0.0, 0.0, 0.7071]
     """
+    # (|a| |b| + a . b, a x b) is the quaternion of half the angle between a and b, up to its
+    # length.
     a, b = torch.broadcast_tensors(_scaled(a), _scaled(b))
     lengths = torch.linalg.vector_norm(a, dim=-1, keepdim=True) * torch.linalg.vector_norm(
         b, dim=-1, keepdim=True

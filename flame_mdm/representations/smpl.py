@@ -18,8 +18,9 @@ ADULT = (
     *((0.12, 0.045, -0.02), (-0.12, 0.045, -0.02), (0.26, -0.015, -0.025), (-0.26, -0.015, -0.025)),
     *((0.267, 0.01, 0.0), (-0.267, 0.01, 0.0), (0.085, -0.01, -0.015), (-0.085, -0.01, -0.015)),
 )
-"""Position of each of SMPL's 24 joints relative to its parent in the rest pose (arms out, facing +z, y up), meters.
-It replaces the licensed model files: bone lengths of HumanML3D's reference clip, rounded and symmetric."""
+"""Position of each of SMPL's 24 joints relative to its parent in the rest pose (arms out, facing
++z, y up), meters. It replaces the licensed model files: bone lengths of HumanML3D's reference
+clip, rounded and symmetric."""
 
 
 AXIS_ANGLES = {66: 22, 72: 24, 156: 52, 165: 55}
@@ -29,9 +30,10 @@ AXIS_ANGLES = {66: 22, 72: 24, 156: 52, 165: 55}
 def read_pose(motion: Tensor) -> tuple[Tensor, Tensor]:
     """Splits a raw SMPL motion (F, 3 + 3 K) into translation (F, 3) and matrices (F, 24, 3, 3), float64.
 
-    It is a translation in meters, then axis-angle vectors of K = 24, 52 or 55 joints. Of SMPL+H's 52, the first 24 are
-    used, as in FLAME's code, so that the hands are its left_index1 and left_index2. Raises `UserError` if the shape is
-    another one, such as 24 rotation matrices, or a number is not finite.
+    It is a translation in meters, then axis-angle vectors of K = 24, 52 or 55 joints. Of SMPL+H's
+    52, the first 24 are used, as in FLAME's code, so that the hands are its left_index1 and
+    left_index2. Raises `UserError` if the shape is another one, such as 24 rotation matrices, or
+    a number is not finite.
     """
     widths = [3 + numbers for numbers, joints in AXIS_ANGLES.items() if joints >= 24]
     if motion.ndim != 2 or not len(motion) or motion.shape[1] not in widths:
@@ -46,23 +48,36 @@ def read_pose(motion: Tensor) -> tuple[Tensor, Tensor]:
 class SMPL(Representation):
     """147 features of Kim et al. 2023 (FLAME): translation (3), then 24 rotations as 6D rows. Not normalized.
 
-    World coordinates as in AMASS: meters, z up, neither centered nor rotated. Raw motions are those of `read_pose`.
+    World coordinates as in AMASS: meters, z up, neither centered nor rotated. `read_pose`
+    describes raw motions.
+
+    Args:
+        fps: frames per second.
+        offsets: (24, 3) offsets of the body used for decoding, in meters, like `ADULT`; the first
+            is from translation to pelvis.
+
+    Example:
+        >>> representation = SMPL()
+        >>> features = representation.encode(torch.zeros(10, 75))  # SMPL's rest pose
+        >>> features.shape, representation.decode(features).shape
+        (torch.Size([10, 147]), torch.Size([10, 24, 3]))
     """
 
     relative = False
 
     def __init__(self, fps: float = 20.0, offsets: Sequence[Sequence[float]] = ADULT):
-        """`offsets` (24, 3) of the body used for decoding, like `ADULT`; the first is from translation to pelvis."""
         super().__init__("smpl147", 147, fps, SMPL24)
         self.offsets = offsets
 
     def encode(self, motion: Tensor) -> Tensor:
+        """Encodes a raw motion (F, 3 + 3 K) as features (F, 147) float32; see `read_pose`."""
         translation, rotations = read_pose(motion)
         return torch.cat(
             [translation, rotation.matrix_to_rot6d(rotations, "rows").flatten(1)], 1
         ).float()
 
     def rotations6d(self, features: Tensor) -> Tensor:
+        """Returns the rotations (..., F, 24, 6) of the joints."""
         return features[..., 3:].unflatten(-1, (24, 6))
 
     def decode(self, features: Tensor) -> Tensor:
@@ -75,5 +90,6 @@ class SMPL(Representation):
         return joints[..., [0, 2, 1]] * joints.new_tensor([-1.0, 1.0, 1.0])
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
+        """Returns (147,) bool, True for features of these joints; the translation belongs to joint 0."""
         part = self.joint_mask(joints)
         return torch.cat([part[:1].expand(3), part.repeat_interleave(6)])

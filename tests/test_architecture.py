@@ -346,7 +346,7 @@ def writing_calls(text: str) -> list[str]:
 
 
 def within(scope: ast.AST) -> list[ast.AST]:
-    """Nodes of a module or function, apart from those of the functions in it."""
+    """Nodes of a module or function, without the nodes of the functions in it."""
     nodes: list[ast.AST] = []
     for node in ast.iter_child_nodes(scope):
         if not isinstance(node, ast.FunctionDef):

@@ -245,7 +245,7 @@ def test_compositional_split_holds_out_whole_combinations():
 
 
 def test_archives_give_the_same_clips_and_leave_no_files(tiny, tmp_path, monkeypatch):
-    files = sorted(tiny.rglob("*"), reverse=True)  # another order than that of the clips
+    files = sorted(tiny.rglob("*"), reverse=True)  # another order than the clips have
     with zipfile.ZipFile(tmp_path / "set.zip", "w", zipfile.ZIP_DEFLATED) as archive:
         for file in files:
             archive.write(file, file.relative_to(tiny.parent))

@@ -130,7 +130,7 @@ def condition(arrays: Arrays, model: MotionGenerator, dtype: torch.dtype) -> Con
 
 
 def assert_output(arrays: Arrays, case: str, y: torch.Tensor) -> None:
-    """Within ten times what the authors' float32 differs from their float64; by default, that of the condition."""
+    """Within ten times the difference between the authors' float32 and float64, by default of the condition."""
     differences = meta(arrays)["max_abs_diff_f32_vs_f64"]
     difference = np.ravel(differences.get(f"out/{case}") or differences["out/cond"])[0]
     # A float64 time a hair off one of MFM's table rows makes its own float64 differ: that says nothing on float32.
@@ -471,7 +471,7 @@ DIP_FILES = {
         {"memory": "concat", "target_encoder": "single", "target_layers": 1},
     ),
 }
-"""Options in args.json of the two released models of DiP, weights besides those of the network, and our options."""
+"""Options in args.json of the two released models of DiP, weights besides the network's, and our options."""
 
 
 @pytest.mark.golden

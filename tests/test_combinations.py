@@ -95,7 +95,7 @@ def build(denoiser: str, process: str, condition: str = "learned") -> GeneratorT
 def generated(
     task: GeneratorTask, motions: MotionBatch, options: SamplerOptions | None = None
 ) -> Tensor:
-    """Samples motions; those of a denoiser with a context continue the same random frames."""
+    """Samples motions; a denoiser with a context continues the same random frames."""
     x = torch.randn(CONTEXT, 263, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     prefix = x.expand(len(motions), -1, -1) if task.generator.denoiser.context_frames else None
     return task.generator.generate(motions, options, prefix=prefix)

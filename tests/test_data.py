@@ -1,4 +1,4 @@
-"""Stores, crops, and the batches that training and evaluation see, also those of data on the training device."""
+"""Stores, crops, and the batches of training and evaluation, also of data on the training device."""
 
 import shutil
 from collections.abc import Iterable

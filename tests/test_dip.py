@@ -1,4 +1,4 @@
-"""DiP, the decoder that continues clean frames: its numbers are those of the authors' code."""
+"""DiP, the decoder that continues clean frames: its numbers agree with the authors' code."""
 
 import math
 from collections.abc import Callable
@@ -228,7 +228,7 @@ def test_locations_of_targets(case):
 
 
 def losses(group: str, dtype: torch.dtype) -> tuple[dict[str, Tensor], Denoiser]:
-    """The losses of a group of the fixture, and the network, whose gradients are those of their mean."""
+    """The losses of a group of the fixture, and the network with the gradients of their mean."""
     encoder = group.removeprefix("target_") if group.startswith("target_") else ""
     network = denoiser(encoder, dtype)
     network.zero_grad()

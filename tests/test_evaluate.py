@@ -96,7 +96,7 @@ class Runs:
         )
 
     def copy(self, folder: Path) -> Path:
-        """The model in another folder; its motions are kept there, and no test sees those of another."""
+        """The model in another folder; its motions are kept there, so that no test sees the motions of another one."""
         return (
             Path(
                 shutil.copytree(

@@ -253,7 +253,7 @@ def test_samples_given_twice_and_features_that_are_not_finite_are_errors():
 def loss_and_gradients(
     first: int, last: int, hard: bool = False
 ) -> tuple[float, dict[str, torch.Tensor]]:
-    """Of the pairs first to last of six, with those of the other processes as negatives."""
+    """Loss of the pairs `first` to `last` of six; pairs of other processes are negatives."""
     torch.manual_seed(0)
     clip = MotionCLIP(
         7,

@@ -56,7 +56,7 @@ def test_mdm_losses(case):
     assert_golden(FIXTURE, f"{case}/loss", terms["loss"])
     computed = set(terms) - {"loss"}
     for term, ours in OURS.items():
-        # The code computes a term under conditions of its own; those of weight 0 are not computed here.
+        # The authors' code computes terms under other conditions. Terms of weight 0 are not computed here.
         weight = 1.0 if term == "rot_mse" else lambdas.get(WEIGHTS[term], 0.0)
         if f"{case}/{term}" in FIXTURE and weight:
             assert_golden(FIXTURE, f"{case}/{term}", terms[ours] / weight)
@@ -66,7 +66,7 @@ def test_mdm_losses(case):
 
 @golden_case("mfm")
 def test_velocity_loss_of_mfm(stem):
-    """Its code compares velocities of the flow as if they were motions; the formula is that of MDM."""
+    """Its code compares velocities of the flow as if they were motions; the formula is MDM's."""
     process, t = FlowMatching(meta(FLOW)["sigma_min"]), torch.from_numpy(FLOW["loss/t"])
     x, noise = motions(FLOW["loss/x_start"]), motions(FLOW["loss/noise"])
     mask = torch.from_numpy(FLOW["in/mask"]).flatten(1)

@@ -48,7 +48,7 @@ SIZES = {
 RECIPES = sorted((ROOT / "experiments" / "denoiser").glob("*.yaml"))
 # One recipe of each class of denoisers
 NETWORKS = {read_yaml(path)["_target_"]: path.stem for path in RECIPES}
-CONDITIONS = {"MDMEncoder": "action", "MDMUNet": "none"}  # those of other classes are texts
+CONDITIONS = {"MDMEncoder": "action", "MDMUNet": "none"}  # other classes are conditioned on texts
 VARIANTS = [
     (name, CONDITIONS.get(target.rpartition(".")[2], "learned"))
     for target, name in NETWORKS.items()

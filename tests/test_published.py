@@ -245,7 +245,7 @@ ROWS: dict[str, list[int]] = {
         "mfm_figure_4": [2],
     },
 }
-"""Reported rows of the parts of each table; four of those of mdm_1 are the authors' corrections."""
+"""Reported rows of the parts of each table; four rows of mdm_1 are the authors' corrections."""
 
 
 def test_rows_are_those_of_the_papers():

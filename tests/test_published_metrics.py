@@ -336,7 +336,7 @@ def test_multi_positive_r_precision_of_an_example_and_dissimilar_captions():
 
 
 def test_equal_captions_count_as_correct_and_the_classic_value_stays():
-    """Half of the captions are repeated: a motion ranks behind that of the same caption half of the time."""
+    """Half of the captions are repeated: a motion ranks behind the motion of the same caption half of the time."""
     count, generator = 96, torch.Generator().manual_seed(0)
     text = torch.randn(count // 2, 4, generator=generator).repeat(2, 1)
     motion = text + 1e-3 * torch.randn(text.shape, generator=generator)

@@ -141,7 +141,7 @@ def test_local_axes_are_those_of_the_skeleton_and_rotations_those_of_the_source(
 
 
 def limbs_off(at: dict[str, np.ndarray], joints: np.ndarray, *limbs: str) -> float:
-    """Median angle in degrees between the limbs of a character and those of a motion, of the worst limb."""
+    """Median angle in degrees between a limb of a character and of a motion, for the worst limb."""
     angles = []
     for side, start in itertools.product(SIDES, limbs):
         ours = joints[:, JOINT[f"{side}_{LIMBS[start]}"]] - joints[:, JOINT[f"{side}_{start}"]]

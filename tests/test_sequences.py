@@ -164,7 +164,7 @@ def test_bad_requests_give_one_clear_line(model):
 
 
 def bones(motion: flame_mdm.Motion) -> np.ndarray:
-    """Lengths (F, N) of all bones but those of the root."""
+    """Lengths (F, N) of all bones, except bones of the root."""
     return np.linalg.norm(
         motion.skeleton.bones(torch.from_numpy(motion.joints)).numpy()[:, 1:], axis=-1
     )

@@ -90,7 +90,7 @@ class Tiny(LightningModule):
 
 
 def train_with(callbacks: list[WeightAveraging], model: Tiny, steps: int) -> Iterator[int]:
-    """Changes the weights at random in each step and calls the callbacks, twice as for two accumulated batches."""
+    """Changes the weights at random in each step and calls the callbacks twice, as with two accumulated batches."""
     trainer: Any = SimpleNamespace(global_step=0)
     for callback in callbacks:
         callback.setup(trainer, model, "fit")

@@ -297,7 +297,7 @@ def test_padding_and_batching_do_not_matter(clips: list[Clip]):
 
 
 def test_planted_feet_do_not_skate_and_sliding_feet_do():
-    """Of a body whose left toes move while all else stands; the limits are those of the fault of that name."""
+    """Of a body whose left toes move while all else stands; the limits belong to the fault of that name."""
     way = np.arange(40)[:, None] * np.array([0.6, 0, 0.8])
     half = np.where(np.arange(40)[:, None] <= 13, 0, way - way[13])
     for toe, fps, real, expected in (

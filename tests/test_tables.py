@@ -124,7 +124,7 @@ def request_of(folder: Path, label: str) -> Evaluation:
 
 
 def change(folder: Path, label: str, **changes: Any) -> None:
-    """Changes keys of a row's result; those of mappings are added to the mapping."""
+    """Changes keys of a row's result; keys of a mapping are added to the mapping."""
     path = request_of(folder, label).path(folder / "results")
     content = json.loads(path.read_text())
     for key, value in changes.items():

@@ -232,7 +232,7 @@ def ended(process: BaseProcess, folder: Path) -> tuple[int | None, str, str]:
 
 
 def no_children(before: list[BaseProcess]) -> bool:
-    """Whether the only child processes are those of `before`. A process that ended may take a moment to be noticed."""
+    """Whether there are no child processes besides `before`. A process that ended may take a moment to be noticed."""
     for _ in range(500):
         if not set(active_children()) - set(before):
             return True

@@ -27,6 +27,7 @@ from flame_mdm.checkpoints import onnx_export as onnx
 from flame_mdm.checkpoints import runner
 from flame_mdm.conditions import vocabulary
 from flame_mdm.errors import UserError
+from flame_mdm.formats import fbx_scene
 from flame_mdm.formats.poses import solve
 from flame_mdm.formats.readers import read
 from flame_mdm.generator import MotionGenerator
@@ -355,7 +356,7 @@ def test_the_page_samples_the_motions_of_the_package(
             joints = np.array(tab.run("joints()")).reshape(expected.joints.shape)
             assert np.abs(joints - expected.joints).max() < 1e-3
         file = tmp_path / "a-person-kicks-twice-with-the-left-leg.glb"
-        for ending in ("bvh", "glb"):
+        for ending in ("bvh", "glb", "fbx"):
             expected.save(tmp_path / f"python.{ending}")
             tab.click(f"#{ending}")
             while not file.with_suffix(f".{ending}").exists():  # until the time of the test is up
@@ -368,6 +369,11 @@ def test_the_page_samples_the_motions_of_the_package(
         )
         # The body of the page has the proportions of one example, so that its joints differ a little.
         assert np.abs(theirs - ours).max() < 0.01
+        theirs, ours = (
+            fbx_scene.read(path) for path in (file.with_suffix(".fbx"), tmp_path / "python.fbx")
+        )
+        assert theirs.names == ours.names
+        assert np.abs(theirs.positions - ours.positions).max() < 1e-3
         assert "seed=2" in tab.run("location.hash")
         tab.type("#text", "a person kicks backflipping")
         tab.click("#generate")

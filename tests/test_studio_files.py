@@ -4,6 +4,7 @@ import json
 import shutil
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -15,14 +16,14 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
-from support.fixtures import ROOT, blender, python_with
+from support.fixtures import ROOT, blender, python_with, script
 from support.glb import odd_character, write_names
 from support.motions import synthetic
 from support.npm import node
 
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError
-from flame_mdm.formats import fbx_scene, glb, glb_animation, vrma
+from flame_mdm.formats import fbx, fbx_scene, glb, glb_animation, vrma
 from flame_mdm.formats.animated import AnimatedNodes
 from flame_mdm.formats.body import fit_body
 from flame_mdm.formats.motion import Motion
@@ -354,6 +355,150 @@ def test_three_vrm_animation_reads_the_motion(node_modules: Path, tmp_path: Path
                 positions[:, number] = positions[:, parent] + turned[:, parent] @ offset
                 turned[:, number] = turned[:, parent] @ turn
         assert np.abs(positions - ours.positions).max() < 0.01 * MILLIMETER
+
+
+# The page in the browser writes FBX with tools/web/fbx.js
+
+WEB = ROOT / "tools" / "web"
+
+
+@pytest.fixture(scope="module")
+def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the page's scripts, and the person that the page dresses motions with."""
+    folder = tmp_path_factory.mktemp("web")
+    for path in WEB.glob("*.js"):
+        shutil.copy(path, folder)
+    (folder / "package.json").write_text('{"type": "module"}')
+    example = synthetic("walk")
+    example.save(folder / "template.fbx")
+    figure = script("tools/web.py").figure(example)
+    (folder / "figure.json").write_text(json.dumps(figure))
+    return folder
+
+
+def test_the_page_finds_in_its_template_what_it_changes(template: Path):
+    root = fbx.read(template / "template.fbx")
+    figure = json.loads((template / "figure.json").read_text())
+    objects, connections = root.first("Objects"), root.first("Connections")
+    assert objects is not None
+    assert connections is not None
+    kinds = Counter(record.name for record in objects.children)
+    assert kinds["AnimationCurve"] == 3 * (len(figure["names"]) + 1)
+    assert kinds["AnimationStack"] == 1
+    models = {
+        record.properties[1].partition("\0")[0]: record.first("Properties70")
+        for record in objects.all("Model")
+    }
+    assert list(models) == [*figure["names"], "person"]
+    for properties in models.values():
+        assert properties is not None
+        values = {record.properties[0]: record.properties[4:] for record in properties.children}
+        # the page writes rotations relative to a rest pose without rotations
+        assert values["PreRotation"] == [0, 0, 0]
+        assert len(values["Lcl Translation"]) == 3
+    targets = Counter(
+        record.properties[3] for record in connections.children if record.properties[0] == "OP"
+    )
+    joints = len(figure["names"])
+    assert targets == {
+        "Lcl Rotation": joints,
+        "Lcl Translation": 1,
+        **dict.fromkeys(("d|X", "d|Y", "d|Z"), joints + 1),
+    }
+
+
+@pytest.fixture(scope="module")
+def from_page(template: Path) -> tuple[Written, Motion]:
+    """The FBX file of another person's motion, longer than the template's, by the page's scripts under Node."""
+    if shutil.which("node") is None:
+        pytest.skip("Node.js is not installed")
+    motion = synthetic("kick")
+    motion = Motion(1.03 * motion.joints, motion.fps, text=motion.text)
+    poses = motion.posed()
+    content = {
+        "fps": motion.fps,
+        "text": 'a "kick" über 1 m',
+        "frames": len(motion.joints),
+        "joints": poses.joints().flatten().tolist(),
+        "offsets": poses.offsets.flatten().tolist(),
+        "quaternions": Rotation.from_matrix(poses.rotations.reshape(-1, 3, 3))
+        .as_quat(scalar_first=True)
+        .ravel()
+        .tolist(),
+    }
+    (template / "motion.json").write_text(json.dumps(content))
+    path = template / "page.fbx"
+    node("web_fbx.mjs", template, path)
+    return Written(path, motion.fps, fbx_scene.read(path)), motion
+
+
+def of_page(test: Callable[..., None]) -> Callable[..., None]:
+    """Marks a test of outside tools on the page's file."""
+    return pytest.mark.tools(pytest.mark.slow(test))
+
+
+@of_page
+def test_the_file_of_the_page_has_the_joints_of_the_page(
+    from_page: tuple[Written, Motion], template: Path
+):
+    file, motion = from_page
+    lift = json.loads((template / "figure.json").read_text())["lift"]
+    expected = motion.posed().joints().numpy() + np.array([0, lift, 0])
+    joints = [file.read.names.index(name) for name in SMPL22.joints]
+    assert np.abs(file.read.positions[:, joints] - expected).max() < 0.01 * MILLIMETER
+    assert file.read.fps == motion.fps
+    root = fbx.read(template / "page.fbx")
+    takes, objects = root.first("Takes"), root.first("Objects")
+    assert takes is not None
+    assert objects is not None
+    assert takes.value("Current") == 'a "kick" über 1 m'
+    # the skin is bound where the bones are
+    for cluster in objects.all("Deformer"):
+        if cluster.properties[2] == "Cluster":
+            inverse, bind = (
+                cluster.value(name).reshape(4, 4) for name in ("Transform", "TransformLink")
+            )
+            np.testing.assert_allclose(inverse @ bind, np.eye(4), atol=1e-9)
+
+
+@of_page
+def test_autodesk_reads_the_file_of_the_page(from_page: tuple[Written, Motion], node_modules: Path):
+    file, motion = from_page
+    converted = autodesk(node_modules, file.path)
+    other, scene = glb_animation.read(converted), glb.read(converted)
+    expected = file.positions([0, 2, 20, 40])
+    assert largest_difference(file.joints, expected, other, [0, 3, 30, 60]) < 0.01 * MILLIMETER
+    assert (len(scene.skins), len(scene.document["materials"])) == (1, 5)
+    motion.save(file.path.with_name("python.glb"))
+    surfaces = [skinned(file.path.with_name("python.glb"), 20), skinned(converted, 30)]
+    for first, second in (surfaces, surfaces[::-1]):
+        nearest, _ = KDTree(first).query(second)
+        # head, hands and feet keep the template's size, which is 3 % smaller
+        assert nearest.max() < 20 * MILLIMETER
+
+
+@of_page
+def test_three_reads_the_file_of_the_page(from_page: tuple[Written, Motion], node_modules: Path):
+    file, _ = from_page
+    (scene,) = node("three_fbx.mjs", node_modules, seconds(file.fps), file.path)
+    check_positions(file, FRAMES, scene["frames"])
+    assert len(scene["materials"]) == 5
+
+
+@of_page
+def test_ufbx_reads_the_file_of_the_page(from_page: tuple[Written, Motion]):
+    file, _ = from_page
+    python = python_with("ufbx", "FLAME_MDM_UFBX")
+    command = [python, str(ROOT / "tests/support/ufbx_read.py"), seconds(file.fps), str(file.path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    check_positions(file, FRAMES, json.loads(done.stdout)[0])
+
+
+@of_page
+def test_blender_reads_the_file_of_the_page(from_page: tuple[Written, Motion], tmp_path: Path):
+    file, _ = from_page
+    (scene,) = in_blender(tmp_path / "out.json", file.fps, [file.path])
+    check_blender(file, file.joints, scene)
 
 
 @pytest.mark.parametrize("ending", [".usda", ".usdc", ".usdz"])

@@ -54,7 +54,8 @@ def build(model: str, out: Path) -> None:
     fetch_runtime(out / "ort")
     loaded = flame_mdm.load(model)
     example = flame_mdm.generate(loaded, loaded.facts["captions"][0])[0]
-    example.save(out / "template.glb")
+    for ending in ("glb", "fbx"):
+        example.save(out / f"template.{ending}")
     page = player_page([example], "")
     style, code = (
         re.findall(rf"<{tag}>\n(.*?)</{tag}>", page, re.DOTALL)[0] for tag in ("style", "script")
@@ -70,7 +71,7 @@ def build(model: str, out: Path) -> None:
 
 
 def figure(example: Motion) -> dict[str, Any]:
-    """Returns what `figure.js` needs to dress a motion with the mannequin: numbers of the example's body."""
+    """Returns what the page needs to dress a motion with the mannequin: numbers of the example's body."""
     body, names = fit_body(example), list(SMPL22.joints)
     offsets = np.asarray(example.posed().offsets)
     helpers = []
@@ -85,6 +86,7 @@ def figure(example: Motion) -> dict[str, Any]:
         )
     return {
         **{"names": names, "parents": SMPL22.parents, "helpers": helpers, "toes": TOES},
+        "lift": body.lift,
         "feet": [JOINT["left_foot"], JOINT["right_foot"]],
         "ends": {JOINT[name]: np.asarray(site).tolist() for name, site in END_SITES.items()},
         "neutral": _quaternions(body.neutral),

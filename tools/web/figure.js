@@ -1,4 +1,5 @@
-// From rotations to the player's body, BVH and GLB. Quaternions are [w, x, y, z]; figure.json is written by tools/web.py.
+// From rotations to the player's body, BVH and GLB; fbx.js writes FBX. Quaternions are [w, x, y, z]; figure.json is written
+// by tools/web.py.
 const clamp = (x, least, most) => Math.min(most, Math.max(least, x));
 const base64 = (array) => btoa(Array.from(new Uint8Array(array.buffer), (byte) => String.fromCharCode(byte)).join(""));
 const inverse = ([w, x, y, z]) => [w, -x, -y, -z];
@@ -21,6 +22,28 @@ function posed(figure, { joints, quaternions }, frame) {
     fitted[toe] = times(fitted[toe], about([1, 0, 0], -down * clamp((far - height) / (far - near), 0, 1)));
   }
   return fitted;
+}
+
+// Rotations of the mannequin's joints relative to their parents, by frame and joint.
+export function localRotations(figure, motion) {
+  return Array.from({ length: motion.frames }, (_, frame) => {
+    const world = posed(figure, motion, frame).map((q, j) => times(q, inverse(figure.neutral[j])));
+    return world.map((q, j) => (j ? times(inverse(world[figure.parents[j]]), q) : q));
+  });
+}
+
+// Angles about z, y and x in radians. Two triples describe a rotation, up to full turns: the one nearest to `before`.
+export function angles([w, x, y, z], before) {
+  const first = [
+    Math.atan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z)),
+    Math.asin(clamp(2 * (w * y - x * z), -1, 1)),
+    Math.atan2(2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+  ];
+  const second = [first[0] + Math.PI, Math.PI - first[1], first[2] + Math.PI];
+  const near = (angle, k) => angle + 2 * Math.PI * Math.round((before[k] - angle) / 2 / Math.PI);
+  const choices = [first.map(near), second.map(near)];
+  const [distance, other] = choices.map((choice) => choice.reduce((sum, angle, k) => sum + Math.abs(angle - before[k]), 0));
+  return choices[other < distance ? 1 : 0];
 }
 
 export function shown(figure, motion) { // the motion as data of the player
@@ -54,13 +77,10 @@ export function bvh(figure, { joints, quaternions, offsets, frames }, fps) { // 
   const order = [];
   const visit = (j) => { order.push(j); figure.parents.forEach((parent, child) => parent === j && visit(child)); };
   visit(0);
-  const last = [], near = (angle, before) => angle + 2 * Math.PI * Math.round((before - angle) / 2 / Math.PI);
+  const last = [];
   const lines = Array.from({ length: frames }, (_, f) => order.flatMap((j) => {
-    const at = 22 * f + j, [w, x, y, z] = quaternions.subarray(4 * at, 4 * at + 4), before = last[j] ?? [0, 0, 0];
-    const angles = [Math.atan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z)), Math.asin(clamp(2 * (w * y - x * z), -1, 1)), Math.atan2(2 * (y * z + w * x), 1 - 2 * (x * x + y * y))];
-    const choices = [angles, [angles[0] + Math.PI, Math.PI - angles[1], angles[2] + Math.PI]].map((c) => c.map((angle, k) => near(angle, before[k])));
-    const far = choices.map((c) => c.reduce((sum, angle, k) => sum + Math.abs(angle - before[k]), 0));
-    last[j] = choices[far[1] < far[0] ? 1 : 0];
+    const at = 22 * f + j;
+    last[j] = angles(quaternions.subarray(4 * at, 4 * at + 4), last[j] ?? [0, 0, 0]);
     const root = j ? [] : [0, 1, 2].map((k) => (100 * joints[3 * at + k]).toFixed(5));
     return [...root, ...last[j].map((angle) => (angle * 180 / Math.PI).toFixed(6))];
   }).join(" "));
@@ -80,10 +100,7 @@ export function glb(figure, template, motion, fps, text) { // the mannequin of t
   };
   while (end % 4) { parts.push(new Uint8Array(1)); end++; }
   const seconds = Float32Array.from({ length: motion.frames }, (_, f) => f / fps), input = store(seconds, "SCALAR", { min: [0], max: [seconds.at(-1)] });
-  const local = Array.from({ length: motion.frames }, (_, f) => {
-    const world = posed(figure, motion, f).map((q, j) => times(q, inverse(figure.neutral[j])));
-    return world.map((q, j) => (j ? times(inverse(world[figure.parents[j]]), q) : q));
-  });
+  const local = localRotations(figure, motion);
   const curves = figure.parents.map((_, j) => [j, "rotation", store(Float32Array.from(local.flatMap((f) => { const [w, ...xyz] = f[j]; return [...xyz, w]; })), "VEC4")]);
   const root = Float32Array.from({ length: 3 * motion.frames }, (_, i) => motion.joints[66 * Math.floor(i / 3) + i % 3]);
   curves.push([0, "translation", store(root, "VEC3")]);

@@ -1,6 +1,7 @@
 // The page: form, player, downloads, and a link that holds the request.
 import { Sampler, json, knownForm, words } from "./sampling.js";
 import { bvh, glb, shown } from "./figure.js";
+import { fbx } from "./fbx.js";
 
 const element = (id) => document.getElementById(id), fields = ["text", "seconds", "seed"].map(element);
 let sampler, figure, player, motion;
@@ -45,7 +46,7 @@ async function generate() {
     const query = new URLSearchParams({ text, seconds, seed });
     history.replaceState(null, "", `#${query}`);
     Object.assign(element("link"), { href: `#${query}`, hidden: false });
-    for (const kind of ["bvh", "glb"]) element(kind).disabled = false;
+    for (const kind of ["bvh", "glb", "fbx"]) element(kind).disabled = false;
     document.body.dataset.made = JSON.stringify({ text, seed, milliseconds });
   } catch (error) {
     say(error.message.split("\n")[0], "error");
@@ -82,9 +83,11 @@ async function open() {
 
 element("form").addEventListener("submit", (event) => { event.preventDefault(); generate(); });
 element("bvh").addEventListener("click", () => save(new Blob([bvh(figure, motion, sampler.content.fps)], { type: "text/plain" }), "bvh"));
-element("glb").addEventListener("click", async () => {
-  const template = await (await fetch("template.glb")).arrayBuffer();
-  save(glb(figure, template, motion, sampler.content.fps, motion.text), "glb");
-});
+for (const [ending, dress] of Object.entries({ glb, fbx })) {
+  element(ending).addEventListener("click", async () => {
+    const template = await (await fetch(`template.${ending}`)).arrayBuffer();
+    save(await dress(figure, template, motion, sampler.content.fps, motion.text), ending);
+  });
+}
 window.joints = () => Array.from(motion.joints);
 open();

@@ -22,15 +22,17 @@ from flame_mdm.training.loggers import log_table
 class Evaluate(Callback):
     """Evaluates the model on the validation split under a protocol, and logs val/<protocol>/<metric>.
 
-    Checkpoints can be selected by these values. Dashboards show them with their units, as val/<protocol>/<metric>
-    (<unit>), beside the value of real motions, .../real. With several replications, .../ci is the half width of the
-    95 % interval. The evaluation runs at the first validation and then at multiples of `every_n_steps`, with
-    averaged weights if the recipe averages them. The motions are divided among all processes.
+    Checkpoints can be selected by these values. Dashboards show them with their units, as
+    val/<protocol>/<metric> (<unit>), beside the value of real motions, .../real. With several
+    replications, .../ci is the half width of the 95 % interval. The evaluation runs at the first
+    validation and then at multiples of `every_n_steps`, with averaged weights if the recipe
+    averages them. The motions are divided among all processes.
 
     Args:
         protocol: a name in experiments/evaluation, or the path of a file.
-        extractor: file, folder, model in the package or run directory from which the protocol's extractor is loaded, as
-            for `flame-mdm evaluate`; None = the protocol's own; "none" skips metrics of features.
+        extractor: file, folder, model in the package or run directory from which the protocol's
+            extractor is loaded, as for `flame-mdm evaluate`; None = the protocol's own; "none"
+            skips metrics of features.
         samples: motions per replication; None = the protocol's number.
 
     Raises `UserError` before training begins if the extractor does not exist.
@@ -55,6 +57,7 @@ class Evaluate(Callback):
         self.real: dict[str, Value | None] = {}
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Opens protocol and extractor, which fail here if they do not fit the data."""
         assert isinstance(pl_module, GeneratorTask)
         data: MotionDataModule = trainer.datamodule  # type: ignore[attr-defined]
         model = pl_module.generator
@@ -68,6 +71,7 @@ class Evaluate(Callback):
         self.next = trainer.global_step
 
     def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Evaluates the averaged weights, if `every_n_steps` steps have passed since the last evaluation."""
         if trainer.global_step < self.next or not hasattr(self, "evaluation"):
             return
         assert isinstance(pl_module, GeneratorTask)
@@ -111,6 +115,7 @@ class Evaluate(Callback):
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         # Computed at the start, since averaged weights are swapped out by now.
+        """Logs the values of the last evaluation."""
         pl_module.log_dict(self.curves)
         pl_module.log_dict(
             {name: x for name, x in self.values.items() if name not in self.curves}, logger=False

@@ -17,6 +17,7 @@ Item = TypeVar("Item")
 
 
 def world_size() -> int:
+    """Returns the number of processes; 1 without a process group."""
     return dist.get_world_size() if dist.is_available() and dist.is_initialized() else 1
 
 
@@ -59,11 +60,13 @@ def processes(device: str | None) -> Iterator[str]:
     if int(os.environ.get("WORLD_SIZE", 1)) == 1:
         yield device
         return
-    # Imported before the group exists: otherwise, the default arguments of its functions would keep the group and its
-    # gloo threads alive, and a live thread can abort the process while Python shuts down.
+    # Imported before the group exists: otherwise, the default arguments of its functions would
+    # keep the group and its gloo threads alive, and a live thread can abort the process while
+    # Python shuts down.
     from torch.distributed.nn import functional  # noqa: F401
 
-    # Motions are gathered once per replication, on the CPU; a process that finishes early may wait for hours.
+    # Motions are gathered once per replication, on the CPU; a process that finishes early may
+    # wait for hours.
     dist.init_process_group("gloo", timeout=timedelta(days=7))
     try:
         yield device

@@ -32,9 +32,21 @@ SKIPPED = {"extractor": "extractor=none: metrics that need features were not com
 
 
 def evaluate(request: EvaluationRequest) -> None:
-    """Evaluates a checkpoint, motion files or a baseline, and writes the result file; see `Plan`.
+    """Evaluates a checkpoint, motion files of another system or a baseline, and writes the result file.
 
-    Raises `UserError` if model, data, protocol and extractor do not match, or real motions miss the expected values.
+    Real motions are measured first. If they do not have the values that the protocol expects,
+    data or extractor are wrong, and nothing is generated. `docs/evaluation.md` is the guide.
+
+    Args:
+        request: what is evaluated and how; its fields are the keys of `flame-mdm evaluate`.
+
+    Raises:
+        UserError: If model, data, protocol and extractor do not match, or real motions miss the
+            expected values.
+
+    Example:
+        >>> from evaluators.evaluation_request import EvaluationRequest
+        >>> evaluate(EvaluationRequest(ckpt="runs/quickstart/default", quick=True))  # doctest: +SKIP
     """
     if request.out is not None:  # checked here, before hours of work
         if Path(request.out).is_dir():
@@ -80,15 +92,16 @@ class Evaluation:
     ) -> Measured:
         """Evaluates real motions of all replications, and then the motions of the source, if there is one.
 
-        Of several processes, each generates and extracts a share of the batches. The first one computes the metrics;
-        all return the result. Raises `UserError` before anything is generated if real motions do not have the expected
-        values, unless `force`.
+        Of several processes, each generates and extracts a share of the batches. The first one
+        computes the metrics; all return the result. Raises `UserError` before anything is
+        generated if real motions do not have the expected values, unless `force`.
 
         Args:
             source: source of the motions; None = only real motions are measured.
             ground_truth: whether real motions are measured, too.
             force: whether to generate even if real motions do not have the expected values.
-            resamples: number of sets drawn from the motions of the first replication, for intervals over motions.
+            resamples: number of sets drawn from the motions of the first replication, for
+                intervals over motions.
         """
         real_sets, real = self._measure_real(source, ground_truth)
         unexpected = shared(self._unexpected(real.values))
@@ -157,9 +170,11 @@ class Evaluation:
     def _measure_real(
         self, source: Source | None, ground_truth: bool
     ) -> tuple[list[tuple[Rows, Rows]], Outcome]:
-        """Measures real motions; also returns for each replication those that the source's motions are compared with.
+        """Measures real motions; also returns for each replication those that the source's
+        motions are compared with.
 
-        The first of each pair are the real motions of the same clips, the second are for comparisons of sets.
+        The first of each pair are the real motions of the same clips, the second are for
+        comparisons of sets.
         """
         scores = []
         real_sets = []
@@ -179,7 +194,8 @@ class Evaluation:
                 # Before motions are generated
                 for checked in filter(None, (self.evaluator, self.several)):
                     checked.check(paired)
-                # All replications are kept in memory; joints, the largest part, only if metrics compare them.
+                # All replications are kept in memory; joints, the largest part, only if metrics
+                # compare them.
                 real_sets.append(
                     (
                         paired if self.evaluator.reads("real_joints") else _without_joints(paired),
@@ -215,7 +231,8 @@ class Evaluation:
 
     def _expected(self) -> dict[str, list[float]]:
         """Returns value and tolerance of real motions by metric; {} for other splits than the test split."""
-        # Without test clips (HumanAct12), the training clips are the test split, so they are checked.
+        # Without test clips (HumanAct12), the training clips are the test split, so they are
+        # checked.
         info = self.clips.store.info
         if self.clips.clips[0].split != "test" and info["clips"]["test"]:
             return {}

@@ -39,9 +39,11 @@ class EvaluationKeys:
     split: Literal["train", "val", "test"] = option("test", "train, val or test")
     seed: int = option(0, "seed of the noise and of the drawn motions")
     replications: int | None = option(
-        None, "replications and samples: override the protocol; the result says so"
+        None, "repetitions of the evaluation, instead of the protocol's number; the result says so"
     )
-    samples: int | None = option(None, "number of motions")
+    samples: int | None = option(
+        None, "motions per replication, instead of the protocol's number; the result says so"
+    )
     resamples: int = option(
         0, "sets of motions drawn with replacement, for 95 % intervals over motions, such as 200"
     )
@@ -87,6 +89,7 @@ class EvaluationRequest(EvaluationKeys):
 
     @classmethod
     def of(cls, config: Config) -> EvaluationRequest:
+        """Returns the request of a mapping from keys to values; keys of the sampler become `options`."""
         kinds = (cls, SamplerOptions)
         keywords, options = (
             {key.name: config[key.name] for key in fields(kind) if key.name in config}

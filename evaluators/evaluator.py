@@ -60,15 +60,24 @@ class Motions:
 
 
 Rows = dict[str, Any]
-"""Metric inputs of N motions by the names in `evaluators.metrics`: tensors, or lists, as for joints, of N entries."""
+"""Metric inputs of N motions by the names in `evaluators.metrics`: tensors or, such as joints, lists of N entries."""
 
 
 @dataclass
 class Evaluator:
-    """Computes metrics of motions.
+    """Computes metrics of motions, with one feature pass for all metrics.
 
-    For the same features, all values are bit-identical for any batch size and order. Several processes share the
-    feature pass, in whole batches, so that features do not depend on their number. The first one computes the metrics.
+    For the same features, all values are bit-identical for any batch size and order. Several
+    processes share the feature pass, in whole batches, so that features do not depend on their
+    number. The first one computes the metrics.
+
+    Example:
+        >>> from flame_mdm.representations.humanml import HumanML
+        >>> metrics = {"penetration": {"_target_": "evaluators.metrics.physics.Penetration"}}
+        >>> evaluator = Evaluator(None, metrics, HumanML())
+        >>> rows = evaluator.extract(Motions(["a"], [np.zeros((8, 263), np.float32)]))
+        >>> evaluator.score(rows, {}, {}, seed=0)
+        ({'penetration': 0.0}, {})
     """
 
     extractor: Extractor | None  # computes the features for metrics; None = no features
@@ -178,9 +187,10 @@ class Evaluator:
     ) -> tuple[dict[str, float | None], dict[str, str]]:
         """Computes all metrics of generated motions and of the real ones paired with them, in the same order.
 
-        Comparisons of sets use `real`, a separate draw, since the distance of a set from itself is 0. Returns the
-        values by name, `metric` or `metric/part`, None if not computable; and by metric, why a value is missing. Both
-        are empty in all processes but the first. Raises `UserError` if the motions lack an input that a metric needs.
+        Comparisons of sets use `real`, a separate draw, since the distance of a set from itself
+        is 0. Returns the values by name, `metric` or `metric/part`, None if not computable; and
+        by metric, why a value is missing. Both are empty in all processes but the first. Raises
+        `UserError` if the motions lack an input that a metric needs.
         """
         if not is_first():
             return {}, {}
@@ -192,8 +202,9 @@ class Evaluator:
     ) -> dict[str, list[float | None]]:
         """Computes all metrics of `resamples` sets of motions drawn with replacement, for a bootstrap; see `score`.
 
-        Both sets of comparisons of sets are drawn. The draws are functions of `seed` and the numbers of motions alone,
-        so that those of two models are of the same clips. Returns (resamples,) values by name, like `score`.
+        Metrics that compare two sets draw from both. The draws depend only on `seed` and the
+        numbers of motions, so that the same clips are drawn for two models. Returns (resamples,)
+        values by name, like `score`.
         """
         count, others = len(generated["keys"]), len(real["keys"])
         if not is_first() or not count or not resamples:
@@ -217,7 +228,7 @@ class Evaluator:
     def _updated(
         self, generated: Rows, paired: Rows, real: Rows, seed: int
     ) -> tuple[dict[str, SampleMetric], dict[str, SampleMetric]]:
-        """Returns all metrics with the motions, and those of them that can be computed."""
+        """Returns all metrics, updated with the motions, and the metrics that can be computed."""
         metrics = make_metrics(self.metrics, seed=key("metric", seed) % 2**32)
         for metric in metrics.values():
             metric.distributed_available_fn = (
@@ -259,7 +270,11 @@ class Evaluator:
     def check(
         self, motions: Rows, metrics: Mapping[str, SampleMetric] | None = None
     ) -> dict[str, SampleMetric]:
-        """Returns the metrics that can be computed, without `skip_features` all; `UserError` if an input is missing."""
+        """Returns the metrics that can be computed.
+
+        With `skip_features`, metrics that lack features are left out; otherwise a missing input
+        raises `UserError`.
+        """
         available = {
             *motions,
             "mask",
@@ -280,6 +295,7 @@ class Evaluator:
 
 
 def keys_of(names: Sequence[str]) -> Tensor:
+    """Returns the keys (N,) int64 of N unique names; see `flame_mdm.seeds.key`."""
     return torch.tensor([key(name) for name in names], dtype=torch.long)
 
 

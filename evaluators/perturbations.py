@@ -1,8 +1,9 @@
 # pyright: standard
 """Graded perturbations of real motions, to audit evaluators with: what a metric should see, or should ignore.
 
-Each function of joints (F, J, 3) in meters, y up, returns as many frames unless it says otherwise. Random draws come
-from a generator alone, so that the grades of a perturbation share theirs.
+Each function of joints (F, J, 3) in meters, y up, returns as many frames unless it says
+otherwise. Random draws come from a generator alone, so that the grades of a perturbation share
+theirs.
 """
 
 from __future__ import annotations
@@ -73,7 +74,7 @@ def pop(joints: Joints, centimeters: float, draws: Draws, *, last: bool = False)
 
 
 def draw_in(joints: Joints, centimeters: float) -> Joints:
-    """Moves the wrists toward the axis of the trunk, as far as it at most, and the elbows half as far."""
+    """Moves the wrists toward the axis of the trunk, but not past it, and the elbows half as far."""
     names = next(
         skeleton.joints for skeleton in SKELETONS.values() if len(skeleton) == joints.shape[1]
     )
@@ -107,11 +108,15 @@ def through_rate(joints: Joints, rate: float, fps: float) -> Joints:
 
 
 def crop(joints: Joints, percent: float) -> Joints:
+    """Cuts this share off the end of the motion; at least three frames remain."""
     return joints[: max(3, round(len(joints) * (1 - percent / 100)))]
 
 
 def continue_with(joints: Joints, other: Joints, fps: float) -> Joints:
-    """Replaces the second half by that of another motion, from the same place; poses are blended over 0.4 seconds."""
+    """Replaces the second half by the second half of another motion, from the same place.
+
+    Poses are blended over `BLEND` seconds.
+    """
     half = len(joints) // 2
     rest = other[len(other) // 2 :]
     rest = rest[np.minimum(np.arange(len(joints) - half), len(rest) - 1)]
@@ -121,8 +126,9 @@ def continue_with(joints: Joints, other: Joints, fps: float) -> Joints:
 
 
 BASE, STORED, REAL = "decoded and encoded", "as stored", "reference"
-"""Sets of motions of every audit: those that all others are compared with, the features as stored, and a second draw of
-real motions, with which sets are compared."""
+"""Sets of motions of every audit: `BASE`, with which all perturbed motions are compared;
+`STORED`, the features as stored; and `REAL`, a second draw of real motions for metrics that
+compare sets."""
 
 Inputs = dict[str, np.ndarray]
 """Metric inputs of N motions by name: features (N, E), and what the metrics read from the motions."""
@@ -164,7 +170,10 @@ class Perturbation:
 class ChangedJoints(Perturbation):
     """Changes the joints of all motions; the draws of a motion are the same at all grades.
 
-    `change` takes joints, the grade, and those of `draws` and `fps` that `takes` names; `sign` multiplies the grade.
+    Attributes:
+        change: function of joints (F, J, 3), the grade, and the options that `takes` names.
+        takes: options of `change`: "draws", a generator, and "fps", frames per second.
+        sign: multiplies the grade.
     """
 
     change: Callable[..., Joints] = lambda joints, grade: joints
@@ -172,6 +181,7 @@ class ChangedJoints(Perturbation):
     sign: int = 1
 
     def motions(self, scene: Scene) -> dict[str, Motions]:
+        """Returns the changed motions of each grade, by name."""
         return {self._set(grade): partial(self._motions, scene, grade) for grade in self.grades}
 
     def _set(self, grade: float) -> str:
@@ -191,6 +201,7 @@ class ChangedJoints(Perturbation):
     def apply(
         self, scene: Scene, grade: float, sets: Mapping[str, Inputs], texts: Sequence[Text]
     ) -> tuple[Inputs, Sequence[Text]]:
+        """Returns the changed motions of a grade, with the same texts."""
         return sets[self._set(grade)], texts
 
 
@@ -201,11 +212,13 @@ class ChangedSet(Perturbation):
     make: Callable[[Scene], list[np.ndarray]] = lambda scene: scene.features
 
     def motions(self, scene: Scene) -> dict[str, Motions]:
+        """Returns the new motions, by name."""
         return {self.name: partial(self.make, scene)}
 
     def apply(
         self, scene: Scene, grade: float, sets: Mapping[str, Inputs], texts: Sequence[Text]
     ) -> tuple[Inputs, Sequence[Text]]:
+        """Returns the new motions, with the same texts."""
         return sets[self.name], texts
 
 
@@ -219,6 +232,7 @@ class ReplacedShare(ChangedSet):
     def apply(
         self, scene: Scene, grade: float, sets: Mapping[str, Inputs], texts: Sequence[Text]
     ) -> tuple[Inputs, Sequence[Text]]:
+        """Returns the motions, of which this share (in percent) is replaced, with the same texts."""
         count = round(len(scene) * grade / 100)
         replaced = np.isin(np.arange(len(scene)), self.order(scene)[:count])
         base, other = sets[BASE], sets[self.name]
@@ -234,6 +248,7 @@ class ReplacedCaptions(Perturbation):
     grades: Sequence[float] = (1, 2, 5, 10, 20, 50, 100)
 
     def offered(self, scene: Scene, captioned: bool) -> Sequence[Perturbation]:
+        """Returns a perturbation for each kind of wrong captions that the scene has, up to the share that it has."""
         offered = []
         for kind in scene.wrong if captioned else ():
             if kind.partition(":")[0] == self.name:
@@ -245,6 +260,7 @@ class ReplacedCaptions(Perturbation):
     def apply(
         self, scene: Scene, grade: float, sets: Mapping[str, Inputs], texts: Sequence[Text]
     ) -> tuple[Inputs, Sequence[Text]]:
+        """Returns the same motions with texts of which this share (in percent) is replaced."""
         wrong, replaced = scene.wrong[self.name], list(texts)
         for i in [i for i in self.order(scene) if wrong[i]][: round(len(scene) * grade / 100)]:
             replaced[i] = wrong[i] or texts[i]
@@ -258,11 +274,13 @@ class DroppedActions(Perturbation):
     unit: str = "% of actions"
 
     def offered(self, scene: Scene, captioned: bool) -> Sequence[Perturbation]:
+        """Returns the perturbation if there are at least two actions."""
         return [self] if len({row.clip.action for row in scene.rows}) > 1 else []
 
     def apply(
         self, scene: Scene, grade: float, sets: Mapping[str, Inputs], texts: Sequence[Text]
     ) -> tuple[Inputs, Sequence[Text]]:
+        """Returns the motions of the remaining actions, repeated up to the same number, with their texts."""
         actions = sorted(set(scene.actions), key=lambda action: key("missing", scene.seed, action))
         gone = set(actions[: max(1, round(len(actions) * grade / 100))])
         kept = [i for i in self.order(scene) if scene.actions[i] not in gone]
@@ -280,12 +298,14 @@ class FewerMotions(Perturbation):
     unit: str = "motions"
 
     def offered(self, scene: Scene, captioned: bool) -> Sequence[Perturbation]:
+        """Returns the perturbation with the grades below the number of motions."""
         grades = [grade for grade in self.grades if grade < len(scene)]
         return [replace(self, grades=grades)] if grades else []
 
     def apply(
         self, scene: Scene, grade: float, sets: Mapping[str, Inputs], texts: Sequence[Text]
     ) -> tuple[Inputs, Sequence[Text]]:
+        """Returns the first motions, with their texts."""
         return {name: x[: int(grade)] for name, x in sets[BASE].items()}, texts[: int(grade)]
 
 

@@ -28,12 +28,16 @@ from flame_mdm.sampling.motion_request import EditRequest
 class Plan:
     """All parts of an evaluation, opened and checked before anything is measured.
 
-    Raises `UserError` or `FileNotFoundError` if a file is missing, or model, data, protocol and extractor do not match.
+    Raises `UserError` or `FileNotFoundError` if a file is missing, or model, data, protocol and
+    extractor do not match.
 
     Attributes:
-        model, file, sampling: the model, its checkpoint and its sampling options; None and {} without a model.
-        clips, representation: the evaluated split of `data`, and its representation, on its device.
-        skeleton: the bones of joints computed from SMPL's rotations; None if the data has joint positions.
+        model, file, sampling: the model, its checkpoint and its sampling options; None and {}
+            without a model.
+        clips, representation: the evaluated split of `data`, and its representation, on its
+            device.
+        skeleton: the bones of joints computed from SMPL's rotations; None if the data has joint
+            positions.
         protocol, changed: the protocol in the requested size, and the options that differ.
         path: path of the result file.
     """
@@ -117,7 +121,8 @@ class Plan:
 def open_data(request: EvaluationRequest, model: MotionGenerator | None) -> MotionDataModule:
     """Returns the prepared data, with its own representation.
 
-    Raises `UserError` if no data set is named, it is not prepared, or the model generates another representation.
+    Raises `UserError` if no data set is named, it is not prepared, or the model generates another
+    representation.
     """
     module, encoding, root = request.data, request.representation, "data"
     if model is not None and not module:
@@ -158,7 +163,7 @@ def sampling_options(
     options: SamplerOptions | None = None,
     editing: EditRequest | None = None,
 ) -> tuple[SamplerOptions, dict[str, Any]]:
-    """Returns the options of the sampler and those of `Edit`: the requested ones, otherwise those of the recipe."""
+    """Returns the options of the sampler and of `Edit`: the requested ones, by default the recipe's."""
     options, editing = options or SamplerOptions(), editing or EditRequest()
     edit: dict[str, Any] = {}
     if protocol.edit is not None:

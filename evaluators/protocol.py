@@ -37,16 +37,22 @@ Count = Annotated[Int, Field(ge=1)]
 class DrawnClip:
     """A clip, and the frames and caption drawn from it for one motion to generate."""
 
-    id: str  # unique name of the motion
-    clip: Entry  # the real clip that it is compared with
-    frames: np.ndarray  # indices of the frames drawn from the clip
-    caption: int | None  # index of the caption drawn from the clip; None = the clip has none
-    prompt: str  # name shared by all motions with the same caption and length
-    # indices of the frames that a model gets and continues; they are not measured
+    #: Unique name of the motion.
+    id: str
+    #: The real clip that the motion is compared with.
+    clip: Entry
+    #: Indices of the frames drawn from the clip.
+    frames: np.ndarray
+    #: Index of the caption drawn from the clip; None = the clip has none.
+    caption: int | None
+    #: Name shared by all motions with the same caption and length.
+    prompt: str
+    #: Indices of the frames that a model gets and continues; they are not measured.
     context: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
 
     @property
     def text(self) -> str:
+        """The drawn caption."""
         assert self.caption is not None
         return self.clip.captions[self.caption]
 
@@ -72,64 +78,69 @@ class DrawnClip:
 class Multimodality(ClosedSchema):
     """A second evaluation with several motions per prompt."""
 
-    prompts: Int | None  # number of prompts; None = all prompts of the split
-    samples: Int  # motions per prompt
-    replications: Int  # number of repetitions
-    metrics: dict[str, Config]  # as in `Protocol`
+    #: Number of prompts; None = all prompts of the split.
+    prompts: Int | None
+    #: Motions per prompt.
+    samples: Int
+    #: Number of repetitions.
+    replications: Int
+    #: Mappings with the `_target_` of a metric, by name.
+    metrics: dict[str, Config]
 
 
 class Protocol(ClosedSchema):
     """A named and versioned evaluation procedure, as a file in experiments/evaluation describes it.
 
-    The caption and crop of a clip, and the noise of its generated motion, are functions of (seed, replication, id).
-    Motions are generated at the length of the real clip. Real motions are compared with a second draw of them.
+    The caption and crop of a clip, and the noise of its generated motion, are functions of (seed,
+    replication, id). Motions are generated at the length of the real clip. Real motions are
+    compared with a second draw of them.
     """
 
     model_config = ConfigDict(strict=True, frozen=True)
 
-    name: str  # name of the file, with that of the variant
-    version: (
-        Int  # raised when the protocol changes; values of different versions are not comparable
-    )
-    condition: Literal["text", "action", "none"]  # condition of the generated motions
-    # Mapping with the `_target_` of an `Extractor`, and its `path` unless it must be given
+    #: Name of the file, with the name of the variant.
+    name: str
+    #: Raised when the protocol changes; values of different versions are not comparable.
+    version: Int
+    #: Condition of the generated motions.
+    condition: Literal["text", "action", "none"]
+    #: Mapping with the `_target_` of an `Extractor`, and its `path` unless it must be given.
     extractor: Config | None
-    metrics: dict[str, Config]  # mappings with the `_target_` of a metric, by name
-    replications: Count  # number of repetitions of the evaluation
-    samples: Count | None = (
-        None  # motions per replication; clips are drawn at random. None = each clip once
-    )
-    real_samples: Count | None = (
-        None  # real motions in comparisons of sets, drawn likewise; None = each clip once
-    )
-    multimodality: Multimodality | None = (
-        None  # a second evaluation with several motions per prompt
-    )
-    edit: dict[str, Any] | None = (
-        None  # motions are edits of real motions: `region` and `joints` of `kept_parts`
-    )
-    smoothing: Number | None = (
-        None  # deviation, in frames, of a Gaussian filter over time of generated features
-    )
-    batch_size: Count | None = (
-        None  # motions per batch of a protocol that measures time; a first batch is not timed
-    )
-    # which frames a model that continues frames gets: the first ones of the drawn frames, which are then not measured;
-    # or frames of the clip from one of the first five on, before motions as long as the drawn frames (DiP's code)
+    #: Mappings with the `_target_` of a metric, by name.
+    metrics: dict[str, Config]
+    #: Number of repetitions of the evaluation.
+    replications: Count
+    #: Motions per replication; clips are drawn at random. None = each clip once.
+    samples: Count | None = None
+    #: Real motions in comparisons of sets; clips are drawn at random. None = each clip once.
+    real_samples: Count | None = None
+    #: A second evaluation with several motions per prompt.
+    multimodality: Multimodality | None = None
+    #: If given, motions are edits of real motions: `region` and `joints` of `kept_parts`.
+    edit: dict[str, Any] | None = None
+    #: Standard deviation, in frames, of a Gaussian filter over time of generated features.
+    smoothing: Number | None = None
+    #: Motions per batch of a protocol that measures time; a first batch is not timed.
+    batch_size: Count | None = None
+    #: Which frames a model that continues frames gets. "drawn": the first of the drawn frames,
+    #: which are then not measured. "start": frames of the clip from one of the first five on,
+    #: before motions as long as the drawn frames, as in DiP's code.
     context: Literal["drawn", "start"] = "drawn"
-    context_frames: Int = 0  # number of these frames, set by `open_protocol`
-    # Attributes that evaluated clips must have; {} = all clips of the split
+    #: Number of frames that the model gets, set by `open_protocol`.
+    context_frames: Int = 0
+    #: Attributes that evaluated clips must have; {} = all clips of the split.
     only: dict[str, Any] = Field({})
-    # values of real motions of the test split, by data set or sha256 of the extractor: metric -> [value, tolerance].
-    # If they differ, nothing is generated.
+    #: Values of real motions of the test split, by data set or sha256 of the extractor: metric ->
+    #: [value, tolerance]. If they differ, nothing is generated.
     expected: dict[str, dict[str, Annotated[list[Number], Field(min_length=2, max_length=2)]]] = (
         Field({})
     )
-    quick: bool = False  # whether the evaluation is a quick one, set by `resized`
-    resized_samples: bool = (
-        False  # whether the number of motions is not that of the file, set by `resized`
-    )
-    sha256: str = ""  # hash of the content of the file, set by `load_protocol`
+    #: Whether the evaluation is a quick one, set by `resized`.
+    quick: bool = False
+    #: Whether the number of motions differs from the number in the file, set by `resized`.
+    resized_samples: bool = False
+    #: Hash of the content of the file, set by `load_protocol`.
+    sha256: str = ""
 
     def resized(
         self,
@@ -143,7 +154,8 @@ class Protocol(ClosedSchema):
     ) -> tuple[Protocol, dict[str, Any]]:
         """Returns the protocol with another size for a split of `clips`, and the options that changed.
 
-        A quick evaluation has few motions and replications. `batch_size` is for protocols that measure time.
+        A quick evaluation has few motions and replications. `batch_size` is for protocols that
+        measure time.
         """
         defaults = (
             {"replications": QUICK_REPLICATIONS, "samples": min(QUICK_SAMPLES, clips)}
@@ -176,9 +188,10 @@ class Protocol(ClosedSchema):
     def open_extractor(
         self, path: str | None, representation: Representation, dataset: str
     ) -> Extractor | None:
-        """Opens an extractor at `path`, or that of the protocol; None if it is not needed, or `path` is "none".
+        """Opens the extractor at `path`, by default the protocol's; None if none is needed, or `path` is "none".
 
-        Raises `UserError` or `FileNotFoundError` if it is missing, or belongs to another representation or data set.
+        Raises `UserError` or `FileNotFoundError` if it is missing, or belongs to another
+        representation or data set.
         """
         if self.extractor is None or path == "none":
             return None
@@ -201,6 +214,7 @@ class Protocol(ClosedSchema):
 
     @property
     def title(self) -> str:
+        """Name and version, such as "text_to_motion-1"."""
         return f"{self.name}-{self.version}"
 
     def selected(self, clips: Clips) -> list[Entry]:
@@ -293,14 +307,16 @@ class Protocol(ClosedSchema):
 
 
 def protocol_names(folder: Path = FOLDER) -> list[str]:
+    """Returns the names of the protocols in a folder, with their variants, sorted."""
     return sorted(name for path in folder.glob("*.yaml") for name in _protocols(path))
 
 
 def protocol_config(name: str) -> Config:
     """Returns the options of a protocol, named in experiments/evaluation, or of a .yaml file.
 
-    A file may hold `variants`. Protocol `editing_in_between` is the variant `in_between` of editing.yaml: its options
-    replace those of the file. Raises `UserError` if there is no such protocol.
+    A file may hold `variants`. Protocol `editing_in_between` is the variant `in_between` of
+    editing.yaml; its options replace options of the file. Raises `UserError` if there is no such
+    protocol.
     """
     path = Path(name) if name.endswith((".yaml", ".yml")) else FOLDER / f"{name}.yaml"
     for file in [path] if path.is_file() else sorted(path.parent.glob("*.yaml")):
@@ -398,6 +414,7 @@ def open_protocol(
 
 
 def default_protocol(model: MotionGenerator) -> str:
+    """Returns the name of the protocol for a model, by its condition and data set."""
     condition, dataset = model.conditioned_on, model.facts.get("dataset", "")
     if condition == "none":
         return "unconditioned"

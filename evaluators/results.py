@@ -85,8 +85,9 @@ class Outcome:
 def mean_ci(values: Sequence[float]) -> tuple[float, float | None]:
     """Returns the mean of R replications, at least one, and the half width of its 95 % confidence interval.
 
-    The half width is 1.96 std / sqrt(R), with R in the denominator of the variance, as in the code of Guo et al. 2022,
-    MDM and MFM. ACTOR's tables show 1.96 times the variance instead. A single replication has no interval.
+    The half width is 1.96 std / sqrt(R), with R in the denominator of the variance, as in the
+    code of Guo et al. 2022, MDM and MFM. ACTOR's tables show 1.96 times the variance instead. A
+    single replication has no interval.
     """
     half = float(1.96 * np.std(values) / len(values) ** 0.5) if len(values) > 1 else None
     return float(np.mean(values)), half
@@ -153,7 +154,7 @@ def _extractor_path(request: EvaluationRequest, plan: Plan) -> str:
 
 
 def _checkpoint(plan: Plan) -> Checkpoint | None:
-    """Describes the checkpoint, and how it was selected among those of its run, judging by its file name."""
+    """Describes the checkpoint, and how it was selected from its run, judging by its file name."""
     model, file = plan.model, plan.file
     if model is None or file is None:
         return None
@@ -192,6 +193,7 @@ def _overlaps(request: EvaluationRequest, plan: Plan) -> list[str]:
 
 
 def show(result: Result, path: Path) -> None:
+    """Prints a result: its values, intervals and warnings, and the path of its file."""
     protocol, data, values = result.protocol, result.data, result.values or {}
     mark = " QUICK RUN, NOT FOR PUBLICATION" if result.quick else ""
     say(f"{protocol.name} version {protocol.version}, {data.dataset} {result.split}{mark}")

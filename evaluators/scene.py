@@ -16,7 +16,7 @@ from flame_mdm.representations.humanml import HumanML
 from flame_mdm.seeds import key
 
 RANDOM, NEAR = "wrong captions", "near misses"
-"""Kinds of wrong captions: those of random other motions, and those that are wrong in one attribute."""
+"""Kinds of wrong captions: captions of random other motions, and captions that are wrong in one attribute."""
 
 
 class Text(NamedTuple):
@@ -28,6 +28,7 @@ class Text(NamedTuple):
 
 
 def text_of(row: DrawnClip, caption: str) -> Text:
+    """Returns a caption of a drawn clip with its tagged words and attributes."""
     return Text(caption, row.tokens(caption), row.requested)
 
 
@@ -46,6 +47,7 @@ class Scene:
 
     @property
     def fps(self) -> float:
+        """Frames per second of the motions."""
         return self.representation.fps
 
     @cached_property
@@ -68,7 +70,8 @@ class Scene:
     def wrong(self) -> dict[str, list[Text | None]]:
         """A wrong text for each motion, by kind; None if there is none.
 
-        The kinds are `RANDOM`, `NEAR`, and, if near misses differ in several attributes, "near misses: ATTRIBUTE".
+        The kinds are `RANDOM`, `NEAR`, and, if near misses differ in several attributes, "near
+        misses: ATTRIBUTE".
         """
         texts = {
             caption: text_of(row, caption) for row in self.rows for caption in row.clip.captions

@@ -11,6 +11,8 @@ import torch
 from support.runs import TINY_DIP, untrained
 
 MODULES = [
+    "evaluators.evaluation",
+    "evaluators.evaluator",
     "evaluators.metrics.accuracy",
     "evaluators.metrics.alignment",
     "evaluators.metrics.attributes",

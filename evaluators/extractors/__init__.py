@@ -46,7 +46,8 @@ class Extractor(ABC):
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
         """Returns "features" (B, E) of motions, and "logits" (B, A) of classifiers.
 
-        Motions are `features` (B, F, D) in the data's units, and joints (B, F, J, 3) in meters, y up, with mask (B, F).
+        Motions are `features` (B, F, D) in the data's units, and joints (B, F, J, 3) in meters, y
+        up, with mask (B, F).
         """
 
     def texts(
@@ -77,6 +78,7 @@ class OwnExtractor(Extractor, Generic[TrainedTask]):
         self.fingerprint = self.task.facts.get("fingerprint")
 
     def check(self, representation: Representation, dataset: str) -> None:
+        """Raises `UserError` if the extractor was trained on another representation, frame rate or data set."""
         trained, learned = self.task.representation, self.task.facts.get("dataset", dataset)
         if not self.reads(representation) or learned != dataset:
             raise UserError(
@@ -95,6 +97,7 @@ class OwnExtractor(Extractor, Generic[TrainedTask]):
         )
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
+        """Returns "features" (B, E) of features (B, F, D) in the data's units, with mask (B, F)."""
         return {"features": self.task(features, mask)}
 
 
@@ -108,6 +111,7 @@ class MotionCLIPExtractor(OwnExtractor[MotionCLIPTask]):
         self.encoded: dict[str, Tensor] = {}
 
     def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
+        """Returns features (B, E) of captions; each distinct caption is encoded once."""
         new = sorted(set(captions) - self.encoded.keys())
         if new:
             self.encoded |= dict(zip(new, self.task.text(new), strict=True))
@@ -117,7 +121,8 @@ class MotionCLIPExtractor(OwnExtractor[MotionCLIPTask]):
     def fit(self, motions: Sequence[Motion]) -> list[float]:
         """Returns how well motions fit their texts: the cosine similarity, its mean over the parts of a motion.
 
-        Motions that were selected by a motion-CLIP have a better score of it: evaluate them with a different one.
+        Motions that were selected by a motion-CLIP have a better score of it: evaluate them with
+        a different one.
         """
         scores = []
         for motion in motions:
@@ -144,6 +149,9 @@ class OwnT2MExtractor(OwnExtractor[T2MTask]):
         return reads_part or super().reads(other)
 
     def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
+        """Returns features (B, E) of captions, from their words or, if the extractor reads these,
+        from their tagged words.
+        """
         return self.task.text(
             list(map(words, captions)) if self.task.learns_words else _tagged(self.path, tokens)
         )
@@ -155,6 +163,7 @@ class OwnClassifierExtractor(OwnExtractor[ClassifierTask]):
     trained, recipes = ClassifierTask, "classifier"
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
+        """Returns "features" (B, E) and "logits" (B, actions) of joints (B, F, J, 3), with mask (B, F)."""
         return {
             "features": self.task(joints, mask),
             "logits": self.task.network.logits(joints, mask),
@@ -192,6 +201,7 @@ class ReleasedExtractor(Extractor, Generic[Network]):
         )
 
     def check(self, representation: Representation, dataset: str) -> None:
+        """Raises `UserError` if the extractor was released for another representation or data set."""
         names = {representation.name} | (
             {representation.part_of} if self.used <= representation.features else set()
         )
@@ -202,14 +212,16 @@ class ReleasedExtractor(Extractor, Generic[Network]):
             )
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
+        """Returns "features" (B, E) of features (B, F, D) in the data's units, with mask (B, F)."""
         return {"features": self.network(features, mask)}
 
 
 class T2MExtractor(ReleasedExtractor[T2MEvaluator]):
     """The evaluator of Guo et al. 2022, or MARDM's first evaluator, as released, from a folder with five files.
 
-    They are finest.tar (from text_mot_match/model), mean.npy and std.npy (t2m_... in MDM, kit_... for KIT, eval_... in
-    MARDM), our_vab_data.npy and our_vab_idx.pkl (GloVe). `full_length` is a legacy option, see `WordVectors`.
+    They are finest.tar (from text_mot_match/model), mean.npy and std.npy (t2m_... in MDM, kit_...
+    for KIT, eval_... in MARDM), our_vab_data.npy and our_vab_idx.pkl (GloVe). `full_length` is a
+    legacy option, see `WordVectors`.
     """
 
     FILES = ("finest.tar", "mean.npy", "std.npy", "our_vab_data.npy", "our_vab_idx.pkl")
@@ -229,6 +241,7 @@ class T2MExtractor(ReleasedExtractor[T2MEvaluator]):
         )
 
     def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
+        """Returns features (B, E) of the tagged words of captions."""
         return self.network.text(
             self.words(_tagged(self.path, tokens), full_length=self.full_length)
         )
@@ -237,7 +250,8 @@ class T2MExtractor(ReleasedExtractor[T2MEvaluator]):
 class MARDMClipExtractor(ReleasedExtractor[MARDMClip]):
     """The second evaluator of MARDM as released, for its CLIP-score: `MotionCLIPScore` of its features.
 
-    The files are finest.tar (from text_mot_match_clip/model), mean.npy and std.npy (eval_mean and eval_std).
+    The files are finest.tar (from text_mot_match_clip/model), mean.npy and std.npy (eval_mean and
+    eval_std).
     """
 
     FILES = ("finest.tar", "mean.npy", "std.npy")
@@ -251,6 +265,7 @@ class MARDMClipExtractor(ReleasedExtractor[MARDMClip]):
         )
 
     def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
+        """Returns features (B, E) of captions."""
         return self.network.text(clip_tokens(captions).to(self.network.mean.device))
 
 
@@ -259,16 +274,17 @@ CLASSIFIERS: dict[str, tuple[type[ActionGRU | UESTC | Unconstrained], str | None
     "humanact12_unconstrained": (Unconstrained, None, "humanact12"),
     "uestc": (UESTC, None, "uestc"),
 }
-"""Released action classifiers: network, key of the weights in its file, and data set. The authors' files are
-action_recognition_model_humanact12.tar (humanact12_gru.tar in MDM), humanact12_gru_modi_struct.pth.tar (not a GRU
-despite its name) and uestc_rot6d_stgcn.tar."""
+"""Released action classifiers: network, key of the weights in its file, and data set. The
+authors' files are action_recognition_model_humanact12.tar (humanact12_gru.tar in MDM),
+humanact12_gru_modi_struct.pth.tar (not a GRU despite its name) and uestc_rot6d_stgcn.tar."""
 
 
 class ClassifierExtractor(ReleasedExtractor[ActionGRU | UESTC | Unconstrained]):
     """A released action classifier, one of `CLASSIFIERS`, which reads rotations or joints of 24 SMPL joints.
 
-    `random_start` is a legacy option of Guo et al. 2020 and all later work: the initial state of the humanact12 GRU is
-    drawn from a normal distribution, separately for features and scores; here, as a function of the motion.
+    `random_start` is a legacy option of Guo et al. 2020 and all later work: the initial state of
+    the humanact12 GRU is drawn from a normal distribution, separately for features and scores;
+    here, as a function of the motion.
     """
 
     def __init__(
@@ -290,6 +306,7 @@ class ClassifierExtractor(ReleasedExtractor[ActionGRU | UESTC | Unconstrained]):
             raise UserError(f"random_start: the classifier {kind} is not recurrent")
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
+        """Returns "features" (B, E) and "logits" (B, actions) of motions, with mask (B, F)."""
         network = self.network
         x = features if isinstance(network, UESTC) else joints
         if not (self.random_start and isinstance(network, ActionGRU)):

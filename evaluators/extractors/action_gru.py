@@ -12,8 +12,9 @@ NUM_ACTIONS = 12
 class ActionGRU(nn.Module):
     """Action classifier with two GRU layers over joint positions; it classifies the state at the last real frame.
 
-    The released weights provide the features and the accuracy in every HumanAct12 table. The authors draw the initial
-    state from a normal distribution in every call; here, `state` (layers, B, hidden) is zero, unless it is passed.
+    The released weights provide the features and the accuracy in every HumanAct12 table. The
+    authors draw the initial state from a normal distribution in every call; here, `state`
+    (layers, B, hidden) is zero, unless it is passed.
     """
 
     features = 30
@@ -37,13 +38,13 @@ class ActionGRU(nn.Module):
         return self.published(joints - joints[:, :1, :1], mask, state)
 
     def published(self, x: Tensor, mask: Tensor, state: Tensor | None = None) -> Tensor:
-        """The same with y down and relative to the first position of the pelvis, as the network sees them."""
+        """Returns features (B, 30) of joints with y down, relative to the first position of the pelvis."""
         outputs, _ = self.recurrent(x.flatten(2), state)
         last = mask.sum(1) - 1
         return torch.tanh(self.linear1(outputs[torch.arange(len(last), device=last.device), last]))
 
     def logits(self, joints: Tensor, mask: Tensor, state: Tensor | None = None) -> Tensor:
-        """Returns unnormalized log-probabilities (B, actions); arguments as for `forward`."""
+        """Returns unnormalized log-probabilities (B, actions) of joints (B, F, J, 3) in meters, with mask (B, F)."""
         return self.linear2(self(joints, mask, state))
 
     def random_state(self, seeds: Sequence[int]) -> Tensor:

@@ -31,6 +31,7 @@ class ClassifierTask(ExtractorTask[ActionGRU | JointSTGCN]):
     def parts(
         cls, config: Config, representation: Representation, actions: Sequence[str]
     ) -> dict[str, Any]:
+        """Returns the network of a recipe; raises `UserError` if the data has fewer than two actions."""
         if len(actions) < 2:
             raise UserError(
                 f"a classifier needs a data set with at least two actions, but this one has {len(actions)}"
@@ -45,6 +46,7 @@ class ClassifierTask(ExtractorTask[ActionGRU | JointSTGCN]):
         return {"network": network, "condition": Unconditional()}
 
     def metrics(self) -> dict[str, Metric]:
+        """Returns the validation metrics: loss and accuracy."""
         return {"loss": MeanMetric(), "accuracy": ActionAccuracy()}
 
     def setup(self, stage: str) -> None:
@@ -57,6 +59,7 @@ class ClassifierTask(ExtractorTask[ActionGRU | JointSTGCN]):
             raise UserError(f"{data.folder}: {which}. Prepare the data without these clips")
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
+        """Returns the cross-entropy of a batch."""
         self.seed_step(batch_idx)
         logits, labels = self._classified(batch)
         loss = F.cross_entropy(logits, labels)
@@ -77,6 +80,7 @@ class ClassifierTask(ExtractorTask[ActionGRU | JointSTGCN]):
                 torch.distributed.broadcast(buffer, 0)
 
     def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:
+        """Adds a batch to the validation metrics."""
         logits, labels = self._classified(batch)
         self.val_metrics["loss"].update(F.cross_entropy(logits, labels, reduction="none"))  # type: ignore[operator]
         self.update_samples(batch, logits=logits, labels=labels)

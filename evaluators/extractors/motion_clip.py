@@ -37,13 +37,15 @@ POOL = 32  # pairs per pool in which validation ranks, as in R-precision
 class MotionCLIP(nn.Module):
     """A transformer over [CLS, length, frame 1, frame 2, ...], and a linear map of the text encoder's pooled vector.
 
-    The features are not scaled to length 1, since Fréchet distance and MID use them unscaled. The temperature is
-    learned, with an initial value of 0.07.
+    The features are not scaled to length 1, since Fréchet distance and MID use them unscaled. The
+    temperature is learned, with an initial value of 0.07.
 
     Args:
-        in_features, text_features, embedding_dim: D of the motions, C of the pooled condition, E of the joint space.
-        blind_features: number of features at the beginning of each frame that are set to 0. It is 3 in FLAME's
-            code, whose motions begin with the root's translation: scores do not depend on position and height.
+        in_features, text_features, embedding_dim: D of the motions, C of the pooled condition, E
+            of the joint space.
+        blind_features: number of features at the beginning of each frame that are set to 0. It is
+            3 in FLAME's code, whose motions begin with the root's translation: scores do not
+            depend on position and height.
         roughness: whether absolute second differences over time are inputs, too. They show noise.
     """
 
@@ -65,7 +67,8 @@ class MotionCLIP(nn.Module):
         super().__init__()
         self.max_frames, self.blind_features, self.roughness = max_frames, blind_features, roughness
         self.cls = nn.Parameter(torch.randn(latent_dim))
-        # Row 0, unused in the authors' code, is that of the longest motion: see the FLAME denoiser.
+        # Row 0, unused in the authors' code, embeds the length of the longest motion: see the
+        # FLAME denoiser.
         self.length_embedding = nn.Embedding(max_frames, latent_dim)
         self.input = nn.Linear((1 + roughness) * in_features, latent_dim)
         self.transformer = Transformer(latent_dim, ff_size, num_layers, num_heads, dropout, nn.ReLU)
@@ -106,13 +109,15 @@ def info_nce(
 ) -> Tensor:
     """Contrastive loss over the pairs of all processes: the mean of both cross-entropies.
 
-    Oord et al. 2018, eq. 4; symmetric, as in Radford et al. 2021. Each process compares its own pairs (B, E) with all
-    motions and texts. If all processes have the same number of pairs, the average over processes, as of gradients in
-    DDP, is the loss and gradient of a single process with all pairs.
+    Oord et al. 2018, eq. 4; symmetric, as in Radford et al. 2021. Each process compares its own
+    pairs (B, E) with all motions and texts. If all processes have the same number of pairs, the
+    average over processes, as of gradients in DDP, is the loss and gradient of a single process
+    with all pairs.
 
     Args:
         logit_scale: (), logarithm of the inverse temperature.
-        meaning: (B, M) int64. Pairs that are equal in one of the M numbers are not negatives of each other.
+        meaning: (B, M) int64. Pairs that are equal in one of the M numbers are not negatives of
+            each other.
         wrong_text: (B, K, E) features of texts that are negatives of one motion each.
     """
     motion, text = F.normalize(motion, dim=-1), F.normalize(text, dim=-1)
@@ -151,6 +156,7 @@ class PooledLoss(SampleMetric):
         super().update(keys=keys, generated=scale * generated, text=text)
 
     def value(self, motion: Tensor, text: Tensor) -> float:
+        """Returns the mean loss of features (N, E) in pools of `POOL` motions and texts."""
         losses = []
         for begin in range(0, len(motion), POOL):
             pool = slice(max(0, min(begin, len(motion) - POOL)), begin + POOL)
@@ -169,11 +175,13 @@ class MotionCLIPTask(ExtractorTask[MotionCLIP]):
     def parts(
         cls, config: Config, representation: Representation, actions: Sequence[str]
     ) -> dict[str, Any]:
+        """Returns the text encoder and the network of a recipe."""
         condition: ConditionEncoder = instantiate(config["condition"])
         widths = {"in_features": representation.features, "text_features": condition.features}
         return {"condition": condition, "network": instantiate(config["task"]["network"], **widths)}
 
     def metrics(self) -> dict[str, Metric]:
+        """Returns the validation metrics: loss and R-precision in both directions."""
         return {
             "loss": PooledLoss(),
             "texts_for_motion": TextsForMotion(),
@@ -182,10 +190,11 @@ class MotionCLIPTask(ExtractorTask[MotionCLIP]):
 
     @classmethod
     def import_released(cls, state: Mapping[str, Tensor], config: Config) -> Self:
-        """Imports FLAME's released motion-CLIP, by the authors' names, into the task of a recipe with the same sizes.
+        """Imports FLAME's released motion-CLIP, by the authors' names, into the task of a recipe
+        with the same sizes.
 
-        The text encoder takes its pooler, with the random weights of the training. Raises `ValueError` if weights or
-        sizes do not match.
+        The text encoder takes its pooler, with the random weights of the training. Raises
+        `ValueError` if weights or sizes do not match.
         """
         representation: Representation = instantiate(config["representation"])
         task = cls.build(config, representation)
@@ -201,14 +210,17 @@ class MotionCLIPTask(ExtractorTask[MotionCLIP]):
         return task.eval()
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
+        """Returns features (B, E) of motions (B, F, D) in the data's units, with mask (B, F)."""
         return self.network(self.representation.normalize(x), mask)
 
     def text(self, captions: Sequence[str]) -> Tensor:
+        """Returns features (B, E) of captions."""
         x = torch.zeros(len(captions), 1, self.representation.features, device=self.device)
         mask = torch.ones(len(captions), 1, dtype=torch.bool, device=self.device)
         return self.text_features(MotionBatch(x, mask, ids=list(captions), text=list(captions)))
 
     def text_features(self, batch: MotionBatch) -> Tensor:
+        """Returns features (B, E) of the captions of a batch."""
         cond = self.condition(batch)
         # Gives a learned null, which is not used here, a gradient, as DDP requires
         if cond.null is not None:
@@ -216,6 +228,7 @@ class MotionCLIPTask(ExtractorTask[MotionCLIP]):
         return self.network.text(cond.pooled)
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
+        """Returns the contrastive loss of a batch."""
         self.seed_step(batch_idx)
         text, motion = self.text_features(batch), self.network(batch.x, batch.mask)
         loss = info_nce(motion, text, self.network.logit_scale)
@@ -224,6 +237,7 @@ class MotionCLIPTask(ExtractorTask[MotionCLIP]):
         return loss
 
     def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:
+        """Adds a batch to the validation metrics."""
         motion = F.normalize(self.network(batch.x, batch.mask), dim=-1)
         text = F.normalize(self.text_features(batch), dim=-1)
         self.update_samples(

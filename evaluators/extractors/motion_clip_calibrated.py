@@ -28,7 +28,8 @@ JITTER = (
 # Standard deviation of normalized features at which it is 1: joints err by about 20 mm, too
 FEATURE_NOISE = 0.3
 WEIGHT = 5.0  # weight of `calibration_error`, compared with `info_nce`
-# Of all features: the FID of noise of strength s, which moves all motions alike, is about (10 s)^2
+# Of all features: the FID of noise of strength s, which moves all motions alike, is about (10
+# s)^2
 LENGTH = 10.0
 
 
@@ -38,10 +39,12 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
     - Texts: motions of clips with the same captions or attributes are not negatives of each other's captions. Near-miss
       captions (see `near_misses`) are additional negatives.
     - Motions: half of them have a noisy copy. The distance of both, scaled to length 1, is trained to be the strength
-      of the noise, drawn from [0, 1], small values more often. One half of the copies has white noise on the joints and
-      is encoded again, as motions from files are; the other half on normalized features, as generated motions have.
+      of the noise, drawn from [0, 1], small values more often. One half of the copies has white
+      noise on the joints and is encoded again, as motions from files are; the other half on
+      normalized features, as generated motions have.
 
-    Features have the same length, since the lengths that cosines leave undetermined would disturb Euclidean distances.
+    Features have the same length, since the lengths that cosines leave undetermined would disturb
+    Euclidean distances.
     """
 
     representation: HumanML
@@ -52,6 +55,7 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
     def parts(
         cls, config: Config, representation: Representation, actions: Sequence[str]
     ) -> dict[str, Any]:
+        """Returns the parts of a recipe; raises `UserError` if the representation does not encode joints."""
         if not isinstance(representation, HumanML):
             raise UserError(
                 f"representation={representation.name}: {cls.__name__} adds noise to joints and encodes them again. "
@@ -60,12 +64,15 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
         return super().parts(config, representation, actions)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
+        """Returns features (B, E) of length `LENGTH` of motions (B, F, D) in the data's units, with mask (B, F)."""
         return LENGTH * F.normalize(super().forward(x, mask), dim=-1)
 
     def text(self, captions: Sequence[str]) -> Tensor:
+        """Returns features (B, E) of length `LENGTH` of captions."""
         return LENGTH * F.normalize(super().text(captions), dim=-1)
 
     def on_fit_start(self) -> None:
+        """Collects the meanings and the near misses of the training captions."""
         super().on_fit_start()
         clips = self.trainer.datamodule.train.clips  # type: ignore[attr-defined]
         self.meanings, self.near_misses = {}, {}
@@ -78,6 +85,7 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
             self.near_misses[clip.id] = list(texts.values())
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
+        """Returns the loss of a batch against its captions and near misses of them."""
         self.seed_step(batch_idx)
         assert batch.text is not None
         wrong = [
@@ -134,7 +142,8 @@ def calibration_error(motion: Tensor, copy: Tensor, strength: Tensor) -> Tensor:
 def noisy_copies(representation: HumanML, x: Tensor, lengths: Tensor, strength: Tensor) -> Tensor:
     """Returns copies (B, F, D) of normalized motions with noise, drawn from torch's generator of the processor.
 
-    The `strength` (B,) is of noise on the joints in the first half of the motions, and on the features in the others.
+    The `strength` (B,) is of noise on the joints in the first half of the motions, and on the
+    features in the others.
     """
     half, frames = (len(x) + 1) // 2, lengths.tolist()
     joints = representation.to_joints(x[:half]).cpu()

@@ -17,9 +17,9 @@ TEMPORAL_KERNEL = 9
 def adjacency(parents: Sequence[int]) -> Tensor:
     """Returns (3, V, V) matrices that gather from a vertex itself, its neighbors, and its neighbors nearer the root.
 
-    Entry (v, w) is the weight of v in w, divided by the number of vertices that contribute to w. As in the authors'
-    code, all vertices beyond distance 1 from the root are equally far, so the spatial partition of Yan et al. 2018
-    (section 3.3) only affects the vertices next to it.
+    Entry (v, w) is the weight of v in w, divided by the number of vertices that contribute to w.
+    As in the authors' code, all vertices beyond distance 1 from the root are equally far, so the
+    spatial partition of Yan et al. 2018 (section 3.3) only affects the vertices next to it.
     """
     size, root = len(parents), parents.index(-1)
     linked = torch.eye(size)
@@ -37,9 +37,10 @@ def adjacency(parents: Sequence[int]) -> Tensor:
 class STGCN(nn.Module):
     """A stack of graph convolutions and temporal convolutions over 9 frames, averaged over frames and joints.
 
-    The dropout of the published training code is omitted. Past the end of a motion, the convolutions see zeros, so that
-    features do not depend on the other motions of a batch. In the published evaluations, all motions have 60 frames,
-    and short clips repeat their last frame. `widths` and `strides` are those of the blocks.
+    The dropout of the published training code is omitted. Past the end of a motion, the
+    convolutions see zeros, so that features do not depend on the other motions of a batch. In the
+    published evaluations, all motions have 60 frames, and short clips repeat their last frame.
+    `widths` and `strides` have one number per block.
     """
 
     def __init__(
@@ -73,7 +74,7 @@ class STGCN(nn.Module):
         return x.mean(3).masked_fill(~mask[:, None], 0).sum(2) / mask.sum(1, keepdim=True)
 
     def logits(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Returns unnormalized log-probabilities (B, actions); arguments as for `forward`."""
+        """Returns unnormalized log-probabilities (B, actions) of the input of `forward`."""
         return self.fcn(self(x, mask)[..., None, None])[..., 0, 0]
 
 
@@ -135,4 +136,5 @@ class JointSTGCN(STGCN):
     """A classifier to train on the joints of any skeleton, relative to the first position of the root."""
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
+        """Returns features (B, 256) of joints (B, F, J, 3) in meters, with mask (B, F)."""
         return super().forward(x - x[:, :1, :1], mask)

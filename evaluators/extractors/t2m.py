@@ -1,7 +1,9 @@
 # pyright: standard
-"""The evaluator of HumanML3D and KIT-ML (Guo et al. 2022, "Generating Diverse and Natural 3D Human Motions from Text").
+"""The evaluator of HumanML3D and KIT-ML (Guo et al. 2022, "Generating Diverse and Natural 3D
+Human Motions from Text").
 
-The authors' code returns embeddings in the order of descending length, ours in the order of the input.
+The authors' code returns embeddings in the order of descending length, ours in the order of the
+input.
 """
 
 import itertools
@@ -39,7 +41,7 @@ _SPECIAL_WORDS = {
     "Desc_VIP": "slowly carefully fast careful slow quickly happy angry sad happily angrily sadly",
 }
 SPECIAL = {word: part for part, words in _SPECIAL_WORDS.items() for word in words.split()}
-"""Words with a special part of speech, which overrides that of the tagger."""
+"""Words with a special part of speech, which overrides the tagger's."""
 
 
 class Words(NamedTuple):
@@ -75,9 +77,10 @@ class WordVectors:
     def __call__(self, captions: Sequence[Sequence[str]], *, full_length: bool = False) -> Words:
         """Returns the text encoder's input for captions.
 
-        Captions are lists of "word/PART" tokens, without start and end marks. Tokens after the 20th are dropped. A word
-        without a vector is unknown, and so is its part of speech. `full_length` is a legacy option of MDM's code before
-        January 2024, and of MFM's: every caption is treated as filling all 22 slots, which lowers R-precision.
+        Captions are lists of "word/PART" tokens, without start and end marks. Tokens after the
+        20th are dropped. A word without a vector is unknown, and so is its part of speech.
+        `full_length` is a legacy option of MDM's code before January 2024, and of MFM's: every
+        caption is treated as filling all 22 slots, which lowers R-precision.
         """
         framed, lengths = zip(*map(frame_tokens, captions), strict=True)
         rows, parts = [], []
@@ -115,12 +118,13 @@ class LearnedWords(nn.Module):
 
 
 class T2MEvaluator(nn.Module):
-    """Embeds motions and captions in a joint space, for R-precision, MM-Dist, FID and diversity on HumanML3D and KIT.
+    """Embeds motions and captions in a joint space, for R-precision, MM-Dist, FID and diversity
+    on HumanML3D and KIT.
 
-    Features are in the data's units, and are normalized with the `mean` and `std` (D,) of the released weights. As in
-    the authors' code for real motions, motions are padded to `max_frames` with zeros after normalization; the
-    convolutions see 3 frames past the end. The network sees the first `used_features` (MARDM's 67, KIT: 64); None = all
-    but the contacts.
+    Features are in the data's units, and are normalized with the `mean` and `std` (D,) of the
+    released weights. As in the authors' code for real motions, motions are padded to `max_frames`
+    with zeros after normalization; the convolutions see 3 frames past the end. The network sees
+    the first `used_features` (MARDM's 67, KIT: 64); None = all but the contacts.
     """
 
     mean: Tensor

@@ -60,12 +60,20 @@ def reconstruction_terms(
 def matching_loss(
     motion: Tensor, text: Tensor, margin: float, fits: Tensor | None = None
 ) -> Tensor:
-    """Contrastive loss () of Guo et al. 2022 (Hadsell et al. 2006, eq. 4, without its factor 1/2), of B pairs (B, E).
+    """Contrastive loss () of Guo et al. 2022 (Hadsell et al. 2006, eq. 4, without its factor
+    1/2), of B pairs (B, E).
 
-    Each text is compared with its own motion, and with that of the nearest previous pair that it does not fit, which
-    adds no loss if it is farther than `margin`. The authors shift the motions by a random number of places instead,
-    which also pushes matching pairs apart. `fits` (B, B) is whether the text of the row describes the motion of the
-    column; None = only its own.
+    Each text is compared with its own motion, and with the motion of the nearest previous pair
+    that it does not fit. The second motion adds no loss if it is farther than `margin`. The
+    authors shift the motions by a random number of places instead, which also pushes matching
+    pairs apart.
+
+    Args:
+        motion: (B, E) features of the motions.
+        text: (B, E) features of the texts.
+        margin: distance from which a wrong motion adds no loss.
+        fits: (B, B) bool, True = the text of the row describes the motion of the column; None =
+            only its own.
     """
     count = len(motion)
     rows = torch.arange(count, device=motion.device)
@@ -90,20 +98,23 @@ class MatchingLoss(SampleMetric):
         self.margin = margin
 
     def value(self, motion: Tensor, text: Tensor) -> float | None:
+        """Returns the loss of features (N, E) of motions and texts; None for a single pair."""
         return matching_loss(motion, text, self.margin).item() if len(motion) > 1 else None
 
 
 class T2MTask(ExtractorTask[T2MEvaluator]):
     """Trains the evaluator (`make train EXP=t2m/...`).
 
-    Until step `movement_steps`, the movement encoder is trained with a decoder to reconstruct motions. It is then
-    frozen, and the encoders of text and motion are trained to match. A motion is a wrong one for a text only if the
-    text is not among its captions. Checkpoints contain the word vectors.
+    Until step `movement_steps`, the movement encoder is trained with a decoder to reconstruct
+    motions. It is then frozen, and the encoders of text and motion are trained to match. A motion
+    is a wrong one for a text only if the text is not among its captions. Checkpoints contain the
+    word vectors.
 
     Args:
-        words: folder of our_vab_data.npy and our_vab_idx.pkl, see `WordVectors`, only read for training; "learned" for
-            data sets whose words are not tagged, see `LearnedWords`.
-        sparsity, smoothness: weights of the mean magnitude of movement vectors, and of differences of successive ones.
+        words: folder of our_vab_data.npy and our_vab_idx.pkl, see `WordVectors`, only read for
+            training; "learned" for data sets whose words are not tagged, see `LearnedWords`.
+        sparsity, smoothness: weights of the mean magnitude of movement vectors, and of
+            differences of successive ones.
     """
 
     noun = "a trained evaluator of Guo et al."
@@ -137,6 +148,7 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
     def parts(
         cls, config: Config, representation: Representation, actions: Sequence[str]
     ) -> dict[str, Any]:
+        """Returns the network, the decoder and the word vectors of a recipe."""
         statistics = {"mean": representation.mean.clone(), "std": representation.std.clone()}
         return {
             "network": instantiate(config["task"]["network"], **statistics),
@@ -144,6 +156,7 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
         }
 
     def metrics(self) -> dict[str, Metric]:
+        """Returns the validation metrics: losses, distance and R-precision."""
         of_pairs = {"mm_dist": MultimodalDistance(), "motions_for_text": MotionsForText()}
         return {"loss": MatchingLoss(self.margin), **of_pairs, "reconstruction": MeanMetric()}
 
@@ -178,6 +191,7 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
 
     @property
     def learns_words(self) -> bool:
+        """Whether the word vectors are trained, instead of read from a file."""
         return isinstance(self.words, LearnedWords)
 
     def get_extra_state(self) -> Tensor:
@@ -200,6 +214,7 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
         return self.network.text(self.words(tokens))
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
+        """Returns the loss of a batch: reconstruction at first, then matching of texts."""
         self.seed_step(batch_idx)
         self.network.movement_encoder.train(self._learns_movement)
         if self._learns_movement:
@@ -243,6 +258,7 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
         return self(self.representation.denormalize(batch.x), batch.mask), self.text(tokens)
 
     def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:
+        """Adds a batch to the validation metrics."""
         motion, text = self._embed(batch)
         self.update_samples(batch, generated=motion, text=text)
         errors = reconstruction_terms(self.network, self.decoder, batch)["reconstruction"]

@@ -44,6 +44,7 @@ class ExtractorTask(Task, Generic[Network]):
     def build(
         cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()
     ) -> Self:
+        """Builds the task of a recipe; `actions` are the names of the actions in its data."""
         options = {name: value for name, value in config["task"].items() if name != "_target_"}
         options |= {
             "representation": representation,
@@ -70,6 +71,7 @@ class ExtractorTask(Task, Generic[Network]):
         raise NotImplementedError
 
     def setup(self, stage: str) -> None:
+        """Also creates the validation metrics."""
         super().setup(stage)
         self.val_metrics.update(self.metrics())
 

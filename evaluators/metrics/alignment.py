@@ -146,9 +146,9 @@ class MotionsForText(RPrecision):
     The definition of the code of Guo et al. 2022, which the tables of MDM and MFM use. Test pairs
     in random order are split into pools of 32, in which each text ranks the motions by Euclidean
     distance; equal captions may be in the same pool. In that code, an incomplete last pool is
-    dropped, and distances are float32, so that a motion whose features equal those of its text
-    may rank last (square root of a negative number). Here, the texts of an incomplete last pool
-    rank the last 32 motions, so that every text counts once.
+    dropped, and distances are float32, so that a motion whose features equal the features of its
+    text may rank last (square root of a negative number). Here, the texts of an incomplete last
+    pool rank the last 32 motions, so that every text counts once.
 
     Args:
         pool: number of motions in a pool, the own motion included.

@@ -90,10 +90,8 @@ class Bare(LightningModule):
     def __init__(self, task: GeneratorTask):
         super().__init__()
         # The task is in a list, so that its parameters are not registered twice.
-        self.denoiser, self.task = (
-            task.generator.denoiser,
-            [task],
-        )
+        self.denoiser = task.generator.denoiser
+        self.task = [task]
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
         """Returns and logs the loss."""

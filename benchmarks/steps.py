@@ -143,11 +143,9 @@ def full_size(settings: Settings) -> tuple[list[Row], str]:
             "denoiser.num_layers=1",
         ]
     config, device = compose("humanml3d/mdm", words), settings.device
-    rows, width, layers = (
-        config["data"]["batch_size"],
-        config["denoiser"]["latent_dim"],
-        config["denoiser"]["num_layers"],
-    )
+    rows = config["data"]["batch_size"]
+    width = config["denoiser"]["latent_dim"]
+    layers = config["denoiser"]["num_layers"]
 
     steps = {"plain PyTorch, padded to 196": (peer_step(width, layers, device), LONGEST)}
     if settings.mdm_repo:

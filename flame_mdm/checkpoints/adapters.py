@@ -153,11 +153,9 @@ def read_merged(
             f"adapter strength {strength}: give one number, or one for each of {len(paths)} adapters"
         )
     checkpoint = read_checkpoint(path)
-    state, config, facts = (
-        checkpoint["state_dict"],
-        dict(checkpoint["config"]),
-        dict(checkpoint["facts"]),
-    )
+    state = checkpoint["state_dict"]
+    config = dict(checkpoint["config"])
+    facts = dict(checkpoint["facts"])
     plain = {
         name.replace(ORIGINAL, ".weight"): value
         for name, value in state.items()

@@ -28,10 +28,8 @@ if TYPE_CHECKING:
 FORMAT = 2  # format of checkpoints and model files: 2 since version 0.2.0
 FORMAT_KEY = "flame_mdm_format"  # key of the format in a checkpoint
 # Keys of the metadata of model files and of adapters
-KEY, ADAPTER = (
-    "flame_mdm",
-    "flame_mdm_adapter",
-)
+KEY = "flame_mdm"
+ADAPTER = "flame_mdm_adapter"
 FILE = "model.safetensors"
 # Maximum number of frames that a model file may declare: more than an hour at 20 per second
 MOST_FRAMES = 100_000
@@ -51,10 +49,8 @@ def read_model_file(path: Path) -> dict[str, Any]:
         )
     try:
         content = parse_json(text)
-        number, model = (
-            content["format"],
-            {name: content[name] for name in ("config", "facts", "origin")},
-        )
+        number = content["format"]
+        model = {name: content[name] for name in ("config", "facts", "origin")}
     except (ValueError, TypeError, KeyError) as error:
         raise UserError(f"{path}: damaged: its recipe cannot be read") from error
     check_format(path, number)

@@ -86,11 +86,9 @@ def description(model: MotionGenerator) -> dict[str, Any]:
         UserError: If a value is not within the limits of the runner, or the sampler cannot be
             exported.
     """
-    representation, skeleton, facts = (
-        model.representation,
-        model.representation.skeleton,
-        model.facts,
-    )
+    representation = model.representation
+    skeleton = model.representation.skeleton
+    facts = model.facts
     encoder, denoiser = model.condition, model.denoiser
     if denoiser.context_frames:
         raise UserError(
@@ -307,15 +305,11 @@ class Function(nn.Module):
 
 def graphs(model: MotionGenerator) -> list[Graph]:
     """Returns the graphs of a model: the guided denoiser, decoding to joints and, for SMPL's skeleton, to rotations."""
-    representation, encoder, longest = (
-        model.representation,
-        model.condition,
-        model.facts["max_frames"],
-    )
-    batch, frames = (
-        torch.export.Dim("batch", max=1024),
-        torch.export.Dim("frames", min=4, max=max(longest, 5)),
-    )
+    representation = model.representation
+    encoder = model.condition
+    longest = model.facts["max_frames"]
+    batch = torch.export.Dim("batch", max=1024)
+    frames = torch.export.Dim("frames", min=4, max=max(longest, 5))
     x = torch.randn(2, min(longest, 9), representation.features)
     fixed = isinstance(model.denoiser, FIXED_LENGTH)
     inputs = {"x_t": torch.randn(2, longest, representation.features) if fixed else x}

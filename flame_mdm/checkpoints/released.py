@@ -316,11 +316,9 @@ def _model(
 ) -> MotionGenerator:
     """Builds a model of a recipe with its weights, `extra` besides the network's, and the statistics in a folder."""
     plain(config, "the options of the released model")
-    representation, width, dataset = (
-        instantiate(config["representation"]),
-        released.features[0],
-        facts["dataset"],
-    )
+    representation = instantiate(config["representation"])
+    width = released.features[0]
+    dataset = facts["dataset"]
     if representation.features != width:
         expected = f"{representation.features} of {representation.name}, the representation of data set {dataset}"
         raise ValueError(f"released weights: have {width} features, but not the {expected}")

@@ -389,10 +389,8 @@ def normal(number: int, frames: int, features: int) -> np.ndarray:
         (part & np.uint64(0xFFFFFF)).astype(np.float32) for part in (bits, bits >> np.uint64(40))
     )
     half, scale = np.float32(0.5), np.float32(2.0**-24)
-    radius, angle = (
-        np.sqrt(-2 * np.log((low + half) * scale)),
-        np.float32(2 * np.pi) * ((high + half) * scale),
-    )
+    radius = np.sqrt(-2 * np.log((low + half) * scale))
+    angle = np.float32(2 * np.pi) * ((high + half) * scale)
     both = np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1)
     return both.reshape(frames, 2 * pairs)[:, :features]
 

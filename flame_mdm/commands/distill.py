@@ -69,10 +69,8 @@ def student_recipe(settings: DistillSettings) -> Config:
         raise UserError(
             f"{settings.ckpt}: was not trained by this framework, so that its data and steps are unknown"
         )
-    name, root = (
-        f"{recipe['experiment']}_distilled",
-        os.environ.get("FLAME_MDM_DATA", recipe["data_root"]),
-    )
+    name = f"{recipe['experiment']}_distilled"
+    root = os.environ.get("FLAME_MDM_DATA", recipe["data_root"])
     steps = max(1, round(SHARE_OF_STEPS * teacher.steps))
     changes: Config = {
         "experiment": name,

@@ -78,10 +78,8 @@ def main(settings: EditSettings) -> None:
     write_motions(folder, [shown, *edits], facts, stages, settings.mp4, loaded.body)
     say(summary(folder, edits, mp4=settings.mp4))
 
-    changed, moved = (
-        max(edit.feature_error for edit in edits),
-        max(edit.joint_error for edit in edits),
-    )
+    changed = max(edit.feature_error for edit in edits)
+    moved = max(edit.joint_error for edit in edits)
     largest = f"{changed:.3g} in normalized features, {moved:.3g} m in world joint positions"
     say(
         f"{edits[0].keep.mean():.0%} of the features are kept. Largest change in the kept part: {largest}"

@@ -72,11 +72,9 @@ class Babel(MotionSource):
     name = "babel"
 
     def __init__(self, path: str, amass: str, published_split: bool = False, workers: int = 0):
-        self.path, self.amass, self.published_split = (
-            Path(path),
-            Amass(Path(amass)),
-            published_split,
-        )
+        self.path = Path(path)
+        self.amass = Amass(Path(amass))
+        self.published_split = published_split
         self.workers = workers
         self.options = {"published_split": published_split}
 

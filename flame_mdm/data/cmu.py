@@ -177,10 +177,8 @@ class CMU(MotionSource):
             return [], {}, {}
         required(self.captions, f"it is the folder of the captions: {GET_IT}")
         if files := sorted(self.captions.glob("humanml3d_test_captions*.json")):
-            rows, texts = (
-                read_index(self.captions / "humanml3d_index_cmu.csv"),
-                _test_captions(files[0]),
-            )
+            rows = read_index(self.captions / "humanml3d_index_cmu.csv")
+            texts = _test_captions(files[0])
             splits: Mapping[str, Split] = dict.fromkeys(texts, SPLITS[2])
         else:
             inner = self.captions / "HumanML3D"
@@ -365,10 +363,8 @@ def _own_items(parts: Mapping[str, _Part]) -> dict[str, list[Item]]:
 
     items: defaultdict[str, list[Item]] = defaultdict(list)
     for name, part in parts.items():
-        source, descriptions = (
-            part.source or f"recording {part.trial}",
-            [Description(text, []) for text in part.texts],
-        )
+        source = part.source or f"recording {part.trial}"
+        descriptions = [Description(text, []) for text in part.texts]
         item = Item(
             name,
             splits[name],

@@ -91,11 +91,9 @@ class HumanAct12(MotionSource):
             with naming(
                 f"{path}: clip {number}", *NO_NUMBERS, prefix="does not consist of numbers: "
             ):
-                pose, joint, label = (
-                    np.asarray(poses, np.float32),
-                    np.asarray(joints, np.float32),
-                    int(action),
-                )
+                pose = np.asarray(poses, np.float32)
+                joint = np.asarray(joints, np.float32)
+                label = int(action)
                 if pose.shape[1:] != (72,) or joint.shape != (len(pose), 24, 3) or not len(pose):
                     raise UserError(
                         f"poses {pose.shape} and joints {joint.shape}, not (F, 72) and (F, 24, 3)"

@@ -192,10 +192,8 @@ class HumanML3D(T2MFolder):
             self._write_statistics()
 
     def _make_motions(self, amass: Amass, todo: Sequence[IndexedClip]) -> None:
-        folder, encoder = (
-            self.path / "new_joint_vecs",
-            HumanML("smpl22", "legacy", bone_lengths=self.bone_lengths),
-        )
+        folder = self.path / "new_joint_vecs"
+        encoder = HumanML("smpl22", "legacy", bone_lengths=self.bone_lengths)
         write = partial(_write_features, folder, encoder)
         write_all = partial(_from_amass, write, self._bodies())
         try:

@@ -34,10 +34,8 @@ from flame_mdm.errors import UserError, first_line, one_line, say
 # it
 SESSIONS = 64
 # Numbers of motion files that may be written, and that may wait to be written, at a time.
-WRITERS, WAITING_FILES = (
-    2,
-    32,
-)
+WRITERS = 2
+WAITING_FILES = 32
 FONT, MONO = ("system-ui", "sans-serif"), ("ui-monospace", "monospace")
 
 

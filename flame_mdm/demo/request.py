@@ -19,13 +19,11 @@ from flame_mdm.errors import UserError, did_you_mean, one_line, shortened
 from flame_mdm.sampling.motion_request import path_targets, read_parts, read_path
 
 # Limits of one request, so that no visitor occupies the machine for minutes.
-MAX_TEXT, MAX_SECONDS, MAX_SAMPLES, MAX_STEPS, MAX_EDITS = (
-    300,
-    30,
-    4,
-    1000,
-    8,
-)
+MAX_TEXT = 300
+MAX_SECONDS = 30
+MAX_SAMPLES = 4
+MAX_STEPS = 1000
+MAX_EDITS = 8
 MAX_SEED = 2**31 - 1
 MAX_FIELDS = 50  # of a query string
 MAX_WAY_POINTS, FAR = 16, 20.0  # a path: way points, and meters along x and z

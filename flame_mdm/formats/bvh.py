@@ -56,10 +56,8 @@ class Bvh:
         for joint, (names, column) in enumerate(zip(self.channels, self.columns(), strict=True)):
             turning = [k for k, name in enumerate(names) if name.endswith("rotation")]
             if turning:
-                order, angles = (
-                    "".join(names[k][0] for k in turning),
-                    self.frames[:, column][:, turning],
-                )
+                order = "".join(names[k][0] for k in turning)
+                angles = self.frames[:, column][:, turning]
                 rotations[:, joint] = Rotation.from_euler(order, angles, degrees=True).as_matrix()
         return rotations
 

@@ -183,10 +183,8 @@ def _rest(file: glb.Glb, pelvis: int) -> tuple[np.ndarray, np.ndarray]:
 def moved(character: RestPose, motion: PosedFigure) -> tuple[np.ndarray, np.ndarray, Rig]:
     """Moves a character as in a motion; see `follow`."""
     body = fit_body(motion)
-    joints, world = (
-        motion.joints[:, : len(SMPL22)],
-        world_rotations(local_rotations(body)) @ body.neutral,
-    )
+    joints = motion.joints[:, : len(SMPL22)]
+    world = world_rotations(local_rotations(body)) @ body.neutral
     return follow(character, joints, motion.posed().offsets.numpy(), body.neutral, world)
 
 

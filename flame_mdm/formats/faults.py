@@ -154,11 +154,9 @@ def _inside(joints: np.ndarray, names: Sequence[str]) -> np.ndarray:
 
 def _bends(joints: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
     """Finds knees that bend forward, judged by the direction of the foot, and knees and elbows folded into the limb."""
-    limit, flags, worst = (
-        LIMITS["limit"][0],
-        np.zeros(joints.shape[:2], bool),
-        np.zeros(joints.shape[:2]),
-    )
+    limit = LIMITS["limit"][0]
+    flags = np.zeros(joints.shape[:2], bool)
+    worst = np.zeros(joints.shape[:2])
     for side in ("left", "right"):
         for limb in (("hip", "knee", "ankle"), ("shoulder", "elbow", "wrist")):
             chain = [f"{side}_{name}" for name in limb]

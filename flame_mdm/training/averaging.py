@@ -37,10 +37,8 @@ class MovingAverage(WeightAveraging):
             raise UserError(f"ema.decay={decay}: must be from 0 to 1")
         super().__init__(use_buffers=False)
         self.average = get_ema_multi_avg_fn(decay)
-        self.update_every_n_steps, self.update_starting_at_step = (
-            update_every_n_steps,
-            update_starting_at_step,
-        )
+        self.update_every_n_steps = update_every_n_steps
+        self.update_starting_at_step = update_starting_at_step
         self.from_initial_weights = from_initial_weights
         self.averages: list[Tensor] = []
         self.weights: list[Tensor] = []

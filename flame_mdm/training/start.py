@@ -72,10 +72,8 @@ def recipe_changes(config: Config) -> list[str]:
 
 
 def _check_same(folder: Path, config: Config) -> None:
-    saved, requested = (
-        flatten(movable(read_saved(folder / "config.yaml"))),
-        flatten(movable(config)),
-    )
+    saved = flatten(movable(read_saved(folder / "config.yaml")))
+    requested = flatten(movable(config))
     differing = [
         f"{key} ({saved.get(key, 'absent')} there, {requested.get(key, 'absent')} here)"
         for key in sorted(saved.keys() | requested.keys())

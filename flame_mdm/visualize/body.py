@@ -107,10 +107,8 @@ class Mesh:
 
     def __init__(self, path: Path) -> None:
         self.stored = read_npz(path)
-        self.points, self.colors = (
-            self.stored["points"] / 20000,
-            self.stored["colors"].astype(float),
-        )
+        self.points = self.stored["points"] / 20000
+        self.colors = self.stored["colors"].astype(float)
         self.normals = self.stored["normals"] / np.linalg.norm(
             self.stored["normals"], axis=1, keepdims=True
         )

@@ -19,13 +19,11 @@ from flame_mdm.visualize.body import MATERIALS, Figure, FittedBody, Mesh, head, 
 Color = tuple[int, int, int]
 SIDE_COLORS: dict[int, Color] = {1: (47, 127, 209), -1: (226, 112, 42), 0: (140, 149, 163)}
 RIM_COLORS: dict[int, Color] = {1: (26, 70, 115), -1: (124, 62, 23), 0: (77, 82, 90)}
-PAPER, GROUND, LINE, TEXT, FAINT = (
-    (255, 255, 255),
-    (243, 245, 247),
-    (205, 211, 219),
-    (28, 36, 48),
-    (102, 112, 133),
-)
+PAPER = (255, 255, 255)
+GROUND = (243, 245, 247)
+LINE = (205, 211, 219)
+TEXT = (28, 36, 48)
+FAINT = (102, 112, 133)
 SHADOW, TRAIL, CONTACT = (212, 216, 222), (122, 91, 208), (15, 157, 107)
 NEAR = 0.3  # distance from the camera in meters below which nothing is drawn
 YAW, PITCH = 0.6, 0.24  # of the camera, which is in front of the body, to the left and above
@@ -86,10 +84,8 @@ def write_mp4(
         for image in _video(motions, fps, size, body):
             if not context.is_open:
                 # H.264 needs even widths and heights.
-                context.width, context.height = (
-                    image.width // 2 * 2,
-                    image.height // 2 * 2,
-                )
+                context.width = image.width // 2 * 2
+                context.height = image.height // 2 * 2
             pixels = np.asarray(image)[: context.height, : context.width]
             frame = av.VideoFrame.from_ndarray(pixels).reformat(
                 format="yuv420p", dst_colorspace=BT709

@@ -12,24 +12,18 @@ import numpy as np
 
 # Offsets from the parent in meters, standing with hanging arms, facing +z; x for the left side,
 # mirrored on the right.
-HIP, SPINE1, SPINE2, SPINE3 = (
-    (0.075, -0.075, 0.0),
-    (0.0, 0.131, -0.015),
-    (0.0, 0.142, 0.0),
-    (0.0, 0.057, 0.01),
-)
-NECK, HEAD, COLLAR, SHOULDER = (
-    (0.0, 0.217, -0.02),
-    (0.0, 0.085, 0.058),
-    (0.072, 0.119, -0.01),
-    (0.125, -0.02, -0.01),
-)
+HIP = (0.075, -0.075, 0.0)
+SPINE1 = (0.0, 0.131, -0.015)
+SPINE2 = (0.0, 0.142, 0.0)
+SPINE3 = (0.0, 0.057, 0.01)
+NECK = (0.0, 0.217, -0.02)
+HEAD = (0.0, 0.085, 0.058)
+COLLAR = (0.072, 0.119, -0.01)
+SHOULDER = (0.125, -0.02, -0.01)
 THIGH, SHIN, UPPER_ARM, FOREARM = 0.393, 0.429, 0.260, 0.268
 # A flat foot: the ankle at 6 cm, the toe joint on the floor
-ANKLE_HEIGHT, FOOT = (
-    0.06,
-    (0.0, -0.06, 0.134),
-)
+ANKLE_HEIGHT = 0.06
+FOOT = (0.0, -0.06, 0.134)
 STAND = 0.97  # target height of the pelvis in meters, which standing legs just do not reach
 
 LEFT, RIGHT = 0, 1

@@ -257,10 +257,8 @@ def talk(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
     """Speaks with both hands in front of the body."""
     on = hold(rng, t)
     for side, sign in enumerate(SIGN):
-        slow, quick = (
-            beat(t, rng.uniform(0.5, 0.8), rng.random()),
-            beat(t, rng.uniform(1.2, 1.7), rng.random()),
-        )
+        slow = beat(t, rng.uniform(0.5, 0.8), rng.random())
+        quick = beat(t, rng.uniform(1.2, 1.7), rng.random())
         body.move_arm(side, on, (0.35, 0.3, 0.0, 1.5))
         hand = np.stack([sign * (0.2 + 0.06 * slow), -0.14 + 0.06 * quick, 0.27 + 0.04 * slow], 1)
         body.reach(side, on, hand, "chest")

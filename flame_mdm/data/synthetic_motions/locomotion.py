@@ -105,10 +105,8 @@ def walk_along(
         body.foot_pitch[side] += size * (gait.heel_off * heel_up - gait.toe_up * toe_up)
         prints[side] = goal
 
-    forward, left = (
-        np.array([np.sin(heading), np.cos(heading)]),
-        np.array([np.cos(heading), -np.sin(heading)]),
-    )
+    forward = np.array([np.sin(heading), np.cos(heading)])
+    left = np.array([np.cos(heading), -np.sin(heading)])
     body.position[:, [0, 2]] += (0.025 * (raised[1] - raised[0]) * left).T
     apart = body.ankles[1][:, [0, 2]] - body.ankles[0][:, [0, 2]]
     return (apart.T * forward).sum(0)

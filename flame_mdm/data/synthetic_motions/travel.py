@@ -20,10 +20,8 @@ from flame_mdm.data.synthetic_motions.body import (
 from flame_mdm.data.synthetic_motions.locomotion import Gait, straight, swing_arms, walk_along
 
 # Distance between rungs, and distance of the ladder from the pelvis, in meters
-RUNG, LADDER = (
-    0.3,
-    0.36,
-)
+RUNG = 0.3
+LADDER = 0.36
 RISE, TREAD = 0.17, 0.29  # height and depth of a stair in meters
 
 

@@ -16,9 +16,8 @@ from flame_mdm.visualize.body import ANCHORS, HELPERS, Figure, FittedBody, Mesh,
 
 TRUNK = {"pelvis": 0.0, "spine1": 0.35, "spine2": 0.75, "spine3": 1.0}
 """Joints of the trunk -> how much their width follows the shoulders rather than the hips."""
-# Limits of the factor of hips and shoulders, relative to the factor of the limbs: a clip's joints
-# may lie elsewhere in the flesh than the mesh's, and must not make the trunk too thin or too
-# wide.
+# Limits of the factor of hips and shoulders, relative to the factor of the limbs: joints at unusual
+# places must not make the trunk too thin or too wide.
 WIDER = (0.8, 1.25)
 LONGER = (0.4, 2.5)  # limits of the length of a limb relative to the mesh's
 # Limits of the factor of the other parts' lengths, relative to the factor of the limbs.

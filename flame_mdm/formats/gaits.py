@@ -175,8 +175,8 @@ def straightened(motion: GroundedMotion, degrees: float) -> GroundedMotion:
 
 def closed(motion: GroundedMotion) -> GroundedMotion:
     """Returns a cycle whose last pose is its first one; the difference is spread evenly over the cycle."""
-    # Half of the difference is added before the end and half after the beginning, so that the
-    # pose in the middle of the cycle does not change.
+    # The first half of the cycle takes up one half of the difference and the second half the other,
+    # so that the pose in the middle does not change.
     share = np.linspace(-0.5, 0.5, len(motion))[:, None, None]
     change = motion.local[0] - motion.local[-1]
     local = with_lengths(motion.local + share * change, motion.local[0])

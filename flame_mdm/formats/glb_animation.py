@@ -127,8 +127,8 @@ class Track:
 
 def slerp(begin: np.ndarray, end: np.ndarray, share: np.ndarray) -> np.ndarray:
     """Interpolates unit quaternions (F, 4) on the sphere, the shorter way; `share` (F, 1) is from 0 to 1."""
-    # q and -q are the same rotation; the one within a quarter turn of `begin` is the shorter way.
-    # For nearly equal rotations, sin(angle) is 0 and linear interpolation is exact enough.
+    # q and -q are the same rotation; the one on the side of `begin` is the shorter way. For nearly
+    # equal rotations, sin(angle) is 0 and linear interpolation is exact enough.
     cosine = (begin * end).sum(1, keepdims=True)
     end = np.where(cosine < 0, -end, end)
     angle = np.arccos(np.clip(np.abs(cosine), 0, 1))

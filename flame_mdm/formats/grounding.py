@@ -112,7 +112,7 @@ def grounded(joints: np.ndarray, fps: float) -> GroundedMotion:
 
 def planted_toes(joints: np.ndarray, fps: float) -> np.ndarray:
     """Returns whether the left and the right toes are planted, (F, 2), by their height and speed."""
-    # A toe is planted if it is low, and slow both before and after a frame. Gaps and contacts
+    # A toe is planted if it is low, and slow before or after a frame. Gaps and contacts
     # shorter than `SHORT` are closed and removed.
     toes = joints[:, [leg[-1] for leg in FEET]]
     steps = np.linalg.norm(np.diff(toes[..., [0, 2]], axis=0), axis=-1) * fps

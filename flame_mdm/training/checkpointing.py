@@ -52,13 +52,11 @@ class AtomicCheckpoints(TorchCheckpointIO):
 
     def load_checkpoint(self, path: Any, *args: Any, **options: Any) -> dict[str, Any]:
         """Returns the content of the checkpoint that the run resumes from, as `newest` checked it."""
+        assert self.resumed is not None
+        content = self.resumed.content
         # The checkpoint is let go: it takes as much memory as the model and its optimizer.
-        resumed, self.resumed = (
-            self.resumed,
-            None,
-        )
-        assert resumed is not None
-        return resumed.content
+        self.resumed = None
+        return content
 
     def remove_checkpoint(self, path: Any) -> None:
         """Removes a checkpoint, but only from the folder of this run."""

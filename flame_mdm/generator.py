@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from flame_mdm.batch import Condition, Denoise, Edit, MotionBatch, ceil_div, pad_to
 from flame_mdm.conditions import ConditionEncoder
-from flame_mdm.config import Config, instantiate, parameters
+from flame_mdm.config import Config, instantiate
 from flame_mdm.denoisers import Denoiser
 from flame_mdm.errors import UserError
 from flame_mdm.processes import Process
@@ -46,21 +46,17 @@ class Parts:
     @classmethod
     def build(cls, config: Config, representation: Representation, num_actions: int) -> Self:
         """Builds the parts of a recipe, with the sizes that depend on other parts."""
-
-        def part(name: str, **sizes: Any) -> Any:
-            legal = parameters(config[name]["_target_"])
-            sizes = {key: size for key, size in sizes.items() if key in legal or "**" in legal}
-            return instantiate(config[name], **sizes)
-
-        process: Process = part("process")
-        condition: ConditionEncoder = part("condition", num_actions=num_actions)
-        denoiser: Denoiser = part(
-            "denoiser",
-            in_features=representation.features,
-            out_features=process.out_features(representation.features),
-            cond_features=condition.features,
-            length_unit=_length_unit(config),
-        )
+        features = representation.features
+        process: Process = instantiate(config["process"])
+        out_features = process.out_features(features)
+        condition: ConditionEncoder = instantiate(config["condition"], {"num_actions": num_actions})
+        sizes = {
+            "in_features": features,
+            "out_features": out_features,
+            "cond_features": condition.features,
+            "length_unit": _length_unit(config),
+        }
+        denoiser: Denoiser = instantiate(config["denoiser"], sizes)
         return cls(denoiser, process, condition, representation)
 
 
@@ -234,10 +230,6 @@ class MotionGenerator(Model, nn.Module):
                 self.train()
             return x * batch.mask[..., None]
 
-        denoise = self.guided(cond, options, unconditioned)
-        if windows is not None:
-            denoise = blended(denoise, windows)
-
         mask, frames = batch.mask, batch.mask.shape[1]
         if windows is None and not self.denoiser.mask_padding:
             # This denoiser attends to padding, so the padded length must be the same as in
@@ -253,6 +245,10 @@ class MotionGenerator(Model, nn.Module):
         noise = seeded_noise(
             ids, mask.shape[1], features, seed=seed, replication=replication, like=batch.x
         )
+
+        denoise = self.guided(cond, options, unconditioned)
+        if windows is not None:
+            denoise = blended(denoise, windows)
         x = self.process.sample(
             denoise, noise, mask, cond, options, edit=edit, trajectory=trajectory
         )

@@ -90,7 +90,7 @@ def test_prompts_have_parts_frames_and_unknown_words(model):
     assert (sentence.frames, bow.frames) == ((30, 30), (40,))
     assert (sentence.is_split, bow.is_split, resolved.is_sequence) == (True, False, True)
     assert (sentence.unknown, bow.unknown) == (("moonily",), ())
-    (warning,) = resolved.warnings(model)
+    (warning,) = resolved.warnings
     assert warning == "'a man walks forward | jumps moonily': not understood: moonily"
 
 
@@ -99,7 +99,7 @@ def test_notes_on_the_motion_to_continue_are_warnings(model, tmp_path):
     joints = synthetic("walk").joints[:, :, [0, 2, 1]] * np.array([1, -1, 1], np.float32)
     np.savez(tmp_path / "lies.npz", joints=joints, fps=20)
     path = str(tmp_path / "lies.npz")
-    (warning,) = resolve(SamplingRequest(texts=TEXT, after=path), model).warnings(model)
+    (warning,) = resolve(SamplingRequest(texts=TEXT, after=path), model).warnings
     assert warning.startswith(f"after={path}: the body is lying down. If it should stand, set up=")
 
 

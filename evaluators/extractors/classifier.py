@@ -16,7 +16,7 @@ from evaluators.extractors.training import ExtractorTask
 from evaluators.metrics.accuracy import ActionAccuracy
 from flame_mdm.batch import MotionBatch
 from flame_mdm.conditions import Unconditional
-from flame_mdm.config import Config, instantiate, parameters
+from flame_mdm.config import Config, instantiate
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.errors import UserError
 from flame_mdm.representations import Representation
@@ -38,11 +38,7 @@ class ClassifierTask(ExtractorTask[ActionGRU | JointSTGCN]):
             )
         parents = representation.skeleton.parents
         sizes = {"num_joints": len(parents), "parents": parents, "num_actions": len(actions)}
-        settings = config["task"]["network"]
-        legal = parameters(settings["_target_"])
-        network = instantiate(
-            settings, **{name: value for name, value in sizes.items() if name in legal}
-        )
+        network = instantiate(config["task"]["network"], sizes)
         return {"network": network, "condition": Unconditional()}
 
     def metrics(self) -> dict[str, Metric]:

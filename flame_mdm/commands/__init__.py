@@ -280,8 +280,8 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
             if hasattr(self, entry.name)
         }
 
-    def load(self, request: SamplingRequest) -> LoadedModel:
-        """Loads the model and the body; raises `UserError` with examples if the request names no condition."""
+    def load(self) -> LoadedModel:
+        """Loads the model and the body; raises `UserError` with examples if no key says what motions show."""
         file = find(self.ckpt, self.which)  # before PyTorch is imported
         import torch
 
@@ -292,7 +292,7 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
         adapters = self.adapters()
         device = self.device or ("cuda" if torch.cuda.is_available() else "cpu")
         model = load(file, device, **adapters)
-        if request.kind == "none" and not self.unconditioned:
+        if not self.conditions():
             refuse_no_condition(model)
         body = load_body(self.body)
         return LoadedModel(model, sha256(file), body)

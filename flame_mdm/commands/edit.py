@@ -8,7 +8,6 @@ from typing import ClassVar
 from flame_mdm.commands import FileSettings, OutputSettings, motion_file, usual_data_root
 from flame_mdm.config.options import option, required, same_option
 from flame_mdm.errors import say
-from flame_mdm.safe_io.paths import check_within
 from flame_mdm.sampling.motion_request import EditRequest, SamplingRequest
 
 
@@ -48,7 +47,7 @@ def main(settings: EditSettings) -> None:
     )
     from flame_mdm.sampling.reading import read_motion
 
-    loaded = settings.load(request)
+    loaded = settings.load()
     model, digest = loaded.model, loaded.sha256
     original = read_motion(
         model.representation,
@@ -62,7 +61,7 @@ def main(settings: EditSettings) -> None:
     )
     say(*(f"{settings.motion}: {note}" for note in original.notes))
     resolved = resolve_edit(request, model, original)
-    say(*(f"warning: {line}" for line in resolved.resolved.warnings(model)))
+    say(*(f"warning: {line}" for line in resolved.resolved.warnings))
     stages = [] if settings.trajectory else None
     edits = sample_edit(model, resolved, stages=stages)
     say(*degenerate_notes(edits))
@@ -74,8 +73,15 @@ def main(settings: EditSettings) -> None:
     )
     shown = replace(original, text=f"original: {original.text or original.id}")
     facts = {"seed": settings.seed, "checkpoint": digest, "keep": edits[0].keep}
-    check_within(folder, settings.out or SAMPLES)
-    write_motions(folder, [shown, *edits], facts, stages, settings.mp4, loaded.body)
+    write_motions(
+        folder,
+        [shown, *edits],
+        facts,
+        stages,
+        settings.mp4,
+        loaded.body,
+        within=settings.out or SAMPLES,
+    )
     say(summary(folder, edits, mp4=settings.mp4))
 
     changed = max(edit.feature_error for edit in edits)

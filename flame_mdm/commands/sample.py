@@ -140,8 +140,9 @@ class SampleSettings(OutputSettings, WritingSettings):
         )
 
     def conditions(self) -> list[str]:
-        """Returns the keys that say which motions are requested, a file of prompts included."""
-        return [*super().conditions(), *(["prompts"] if self.prompts is not None else [])]
+        """Returns the keys that say which motions are requested, a file of prompts and a set included."""
+        sources = [key for key in ("prompts", "set") if getattr(self, key) is not None]
+        return [*super().conditions(), *sources]
 
     def request_for(self, prompts: PromptFile | None) -> SamplingRequest:
         """Returns what is requested of the model, for the accepted prompts of a file if there is one."""
@@ -184,7 +185,7 @@ def main(settings: SampleSettings) -> None:
 
 def _sample(settings: SampleSettings, request: SamplingRequest, prompts: PromptFile | None) -> None:
     """Samples and writes the motions of a request; prompts of a file that the model cannot sample are refused."""
-    loaded = settings.load(request)  # finds the file before PyTorch is imported
+    loaded = settings.load()  # finds the file before PyTorch is imported
     character = settings.read_character()
     from flame_mdm.sampling.generation import sample
     from flame_mdm.sampling.output import SAMPLES, degenerate_notes, summary, write_motions
@@ -200,9 +201,9 @@ def _sample(settings: SampleSettings, request: SamplingRequest, prompts: PromptF
     for prompt in resolved.prompts:
         if prompt.is_split:
             say(f"sampled as a sequence: {prompt.text}. Add split=false to sample it as one action")
-        if prompts is None and prompt.readings:
-            say(f"understood: {', then '.join(reading.summary() for reading in prompt.readings)}")
-    say(*(f"warning: {line}" for line in resolved.warnings(model)))
+        if prompts is None and prompt.summary:
+            say(f"understood: {prompt.summary}")
+    say(*(f"warning: {line}" for line in resolved.warnings))
 
     score = None if settings.scorer is None else _score(settings.scorer, model)
     stages = [] if settings.trajectory else None
@@ -217,9 +218,15 @@ def _sample(settings: SampleSettings, request: SamplingRequest, prompts: PromptF
 
     folders = _folders(settings, resolved, model, loaded.sha256, motions)
     for folder, written in folders.items():
-        check_within(folder, settings.out or SAMPLES)
-        stages_shown = stages if written[0] is motions[0] else None
-        write_motions(folder, written, facts, stages_shown, settings.mp4, loaded.body)
+        write_motions(
+            folder,
+            written,
+            facts,
+            stages if written[0] is motions[0] else None,
+            settings.mp4,
+            loaded.body,
+            within=settings.out or SAMPLES,
+        )
         if prompts is None:
             say(summary(folder, written, mp4=settings.mp4))
         if resolved.targets is not None:
@@ -231,10 +238,9 @@ def _sample(settings: SampleSettings, request: SamplingRequest, prompts: PromptF
 def _sample_set(settings: SampleSettings, source: str) -> None:
     """Samples and writes a set of clips."""
     content = settings.set_content(source)
-    request = settings.request(
-        texts=[motion.text for motion in content.motions.values()], samples=1
-    )
-    loaded = settings.load(request)
+    texts = [motion.text for motion in content.motions.values()]
+    _ = settings.request(texts=texts, samples=1)  # raises before the model is loaded
+    loaded = settings.load()
     from flame_mdm.sampling.motion_sets import make_set, write_set
     from flame_mdm.sampling.output import SAMPLES, default_folder
 

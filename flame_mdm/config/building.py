@@ -11,7 +11,7 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from flame_mdm.config.signatures import Config, check, definition, walk
+from flame_mdm.config.signatures import Config, check, definition, parameters, walk
 from flame_mdm.errors import UserError, first_line, shortened
 from flame_mdm.safe_io import read_yaml, write_text
 
@@ -118,15 +118,23 @@ def moved(node: Any, folders: Mapping[str, str]) -> Any:
     return node if folder is None else folders[folder] + node.removeprefix(folder)
 
 
-def instantiate(node: Config, **derived: Any) -> Any:
+def instantiate(node: Config, offered: Mapping[str, Any] | None = None, /, **derived: Any) -> Any:
     """Instantiates the object described by a mapping with a `_target_`, including nested ones.
 
     It supports Hydra's keys `_target_` and `_recursive_`. Interpolations are treated as plain text. Mappings and lists
-    are passed as plain copies, as with Hydra's `_convert_: all`. `derived` are further arguments.
+    are passed as plain copies, as with Hydra's `_convert_: all`.
+
+    Args:
+        node: the mapping.
+        offered: further arguments, of which the object gets those that its class or function takes.
+        derived: further arguments, all of which the object gets.
     """
     name = node.get("_target_") if isinstance(node, Mapping) else None
     if not isinstance(name, str):
         raise UserError(f"no _target_, the name of a class, in {str(node)[:80]}")
+    if offered:
+        legal = parameters(name)
+        derived |= {key: value for key, value in offered.items() if key in legal or "**" in legal}
     build = _instances if node.get("_recursive_", True) else copy.deepcopy
     skipped = ("_target_", "_recursive_", *derived)
     arguments: dict[str, Any] = {
@@ -191,15 +199,15 @@ def trust(config: Config) -> None:
 
 def _is_of_kind(target: str, kind: str) -> bool:
     modules = MODULES.get(kind, ())
-    if modules and target in _shipped(kind):
-        return True
 
     def is_listed(name: str) -> bool:
         return any(f"{name}.".startswith(f"{module}.") for module in modules)
 
     module, _, name = target.rpartition(".")
     defined = definition(module, name) if is_listed(module) else None
-    return defined is not None and isinstance(defined[1], ast.ClassDef) and is_listed(defined[0])
+    if defined is not None and isinstance(defined[1], ast.ClassDef) and is_listed(defined[0]):
+        return True
+    return bool(modules) and target in _shipped(kind)
 
 
 @functools.cache

@@ -169,11 +169,11 @@ def _sample(
     """Samples a batch of motions."""
     if model.denoiser.context_frames:
         return _sample_streams(model, resolved, rows)
-    request, device = resolved.request, model.device
+    request = resolved.request
     lengths = [row.prompt.frames for row in rows]
     conditions = [row.prompt.conditions for row in rows]
-    mask = length_mask(torch.tensor([sum(frames) for frames in lengths], device=device))
-    x = torch.zeros(*mask.shape, model.representation.features, device=device)
+    mask = length_mask(torch.tensor([sum(frames) for frames in lengths])).to(model.device)
+    x = torch.zeros(*mask.shape, model.representation.features, device=mask.device)
     batch = MotionBatch(x=x, mask=mask, ids=[row.id for row in rows])
 
     covering = windows(model, request, conditions, lengths) if resolved.is_sequence else None
@@ -181,7 +181,7 @@ def _sample(
         batch.text = [" | ".join(row.prompt.conditions) for row in rows]
     elif request.kind == "action" and covering is None:
         labels = [model.facts["actions"].index(name) for (name,) in conditions]
-        batch.action = torch.tensor(labels, device=device)
+        batch.action = torch.tensor(labels, device=mask.device)
 
     x = model.generate(
         batch,

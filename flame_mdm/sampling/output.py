@@ -72,15 +72,18 @@ def write_motions(
     stages: Sequence[Motion] | None = None,
     mp4: bool = False,
     body: Mesh | None = None,
+    *,
+    within: str | Path | None = None,
 ) -> None:
     """Writes `motion_000.npz` ..., `motions.gif`, `motions.png` and `player.html` into a folder, all or none.
 
     Such files of an earlier request that are not written again are removed. The first eight motions are drawn, and the
-    stages of a sampling run in `trajectory.png`; `facts` are added to each `.npz`.
+    stages of a sampling run in `trajectory.png`; `facts` are added to each `.npz`. Links must not lead out of `within`,
+    as for `flame_mdm.safe_io.atomic_folder`.
     """
     scene = [replace(motion, text=motion.text or "unconditioned") for motion in motions]
     title = motions[0].text if len({motion.text for motion in motions}) == 1 else ""
-    with atomic_folder(folder) as temporary:
+    with atomic_folder(folder, within=within) as temporary:
         write_player(temporary / "player.html", scene, title or "Motions", body=body)
         for number, motion in enumerate(motions):
             motion.save(temporary / f"motion_{number:03d}.npz", **facts)

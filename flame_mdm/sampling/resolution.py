@@ -44,10 +44,11 @@ class ResolvedPrompt:
         is_split: whether the prompt was such a sentence.
         conditions: caption or action of each part, as the model reads it.
         texts: words of the prompt for each part.
-        readings: what was understood of the texts, if the model's captions have single actions.
         frames: number of frames of each part. In a continued motion, the first part includes the frames that overlap
             with the motion before.
         unknown: words of the text that the model has never seen in training, or does not read.
+        summary: what was understood, in one line; "" unless the model's captions have single actions.
+        changes: lines about what is sampled differently from what the text says.
     """
 
     text: str
@@ -55,8 +56,9 @@ class ResolvedPrompt:
     conditions: tuple[str, ...]
     frames: tuple[int, ...]
     texts: tuple[str, ...] = ()
-    readings: tuple[Reading, ...] = ()
     unknown: tuple[str, ...] = ()
+    summary: str = ""
+    changes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,8 @@ class ResolvedRequest:
         before: features (F, D), in the data's units, of the motion that all motions continue.
         targets: places in the world to reach.
         edit: part of a motion that all motions keep, with `known` and `keep` (1, F, D).
-        notes: lines about the motion to continue: what was left out of its file, or looks wrong.
+        warnings: lines about the motion to continue (what was left out of its file, or looks wrong), about what is
+            sampled differently from what a text says, and about words that the model does not know or read.
     """
 
     request: SamplingRequest
@@ -88,26 +91,7 @@ class ResolvedRequest:
     before: Tensor | None = None
     targets: Targets | None = None
     edit: Edit | None = None
-    notes: tuple[str, ...] = ()
-
-    def warnings(self, model: MotionGenerator) -> list[str]:
-        """Returns notes on the motion to continue, and lines about words unknown to the model or not read."""
-        lines = [f"after={self.request.after}: {note}" for note in self.notes]
-        several = len(self.prompts) > 1
-        for prompt in self.prompts:
-            about = f"'{shortened(prompt.text, 60)}': " if several else ""
-            lines += [
-                f"{about}{line}" for reading in prompt.readings for line in reading.warnings()
-            ]
-        unread = (prompt for prompt in self.prompts if prompt.unknown and not prompt.readings)
-        texts = dict.fromkeys(text for prompt in unread for text in prompt.conditions)
-        for text in texts:
-            is_only_text = len(self.prompts) == 1 and text == self.prompts[0].text
-            about = "" if is_only_text else f"'{shortened(text, 60)}': "
-            lines += [
-                f"{about}{line}" for line in advice(text, model.facts, model.condition.max_words)
-            ]
-        return lines
+    warnings: tuple[str, ...] = ()
 
 
 def resolve(
@@ -156,7 +140,14 @@ def resolve(
             frames = (shared + first, *others)
             unknown = _unknown_words(prompt, model) if request.kind == "text" else ()
             resolved[number] = ResolvedPrompt(
-                text, is_split, prompt.captions, frames, texts, prompt.readings, unknown
+                text,
+                is_split,
+                prompt.captions,
+                frames,
+                texts,
+                unknown,
+                summary=", then ".join(reading.summary() for reading in prompt.readings),
+                changes=tuple(line for reading in prompt.readings for line in reading.warnings()),
             )
 
     targets = _targets(request, model, list(resolved.values()))
@@ -165,7 +156,10 @@ def resolve(
             if targets is not None:
                 targets.check_end(sum(prompt.frames), model.representation.fps)
     prompts = [prompt for number, prompt in resolved.items() if number not in (refused or {})]
-    return ResolvedRequest(request, tuple(prompts), is_sequence, before, targets, edit, notes)
+    warnings = [f"after={request.after}: {note}" for note in notes] + _warnings(prompts, model)
+    return ResolvedRequest(
+        request, tuple(prompts), is_sequence, before, targets, edit, tuple(warnings)
+    )
 
 
 @contextmanager
@@ -265,6 +259,21 @@ def _unknown_words(prompt: _Parts, model: MotionGenerator) -> tuple[str, ...]:
         words += [] if prompt.readings else unknown_words(text, model.facts)
         words += unread_words(text, model.condition.max_words)
     return tuple(words)
+
+
+def _warnings(prompts: Sequence[ResolvedPrompt], model: MotionGenerator) -> list[str]:
+    """Returns lines about prompts that are read differently, or have words unknown to the model or not read."""
+    lines = []
+    for prompt in prompts:
+        about = f"'{shortened(prompt.text, 60)}': " if len(prompts) > 1 else ""
+        lines += [f"{about}{line}" for line in prompt.changes]
+
+    read_as_typed = (prompt for prompt in prompts if prompt.unknown and not prompt.summary)
+    for text in dict.fromkeys(text for prompt in read_as_typed for text in prompt.conditions):
+        is_only_text = len(prompts) == 1 and text == prompts[0].text
+        about = "" if is_only_text else f"'{shortened(text, 60)}': "
+        lines += [f"{about}{line}" for line in advice(text, model.facts, model.condition.max_words)]
+    return lines
 
 
 def _continued(

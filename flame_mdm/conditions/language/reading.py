@@ -82,25 +82,26 @@ class Reader:
         """
         sentence, style = _without_style(text)
         understood = understand(sentence)
-        shown = f"'{shortened(text, 60)}'"
         if understood.is_foreign:
-            raise UserError(f"{shown}: texts are understood in English only. Write it in English")
+            raise UserError(
+                f"{_shown(text)}: texts are understood in English only. Write it in English"
+            )
         as_typed = Reading(understood, (), (text,), (text,))
         if not understood.steps:
             if understood.unknown and self.abilities.has_words(" ".join(understood.unknown)):
                 return as_typed
             raise NotUnderstood(
-                f"{shown}: no word says what happens", self.abilities.nearest(understood)
+                f"{_shown(text)}: no word says what happens", self.abilities.nearest(understood)
             )
 
         try:
-            return self._read_steps(understood, shown, style)
+            return self._read_steps(understood, text, style)
         except NotUnderstood:
             if sentence not in self.abilities.captions:
                 raise
             return as_typed
 
-    def _read_steps(self, understood: Understanding, shown: str, style: str) -> Reading:
+    def _read_steps(self, understood: Understanding, text: str, style: str) -> Reading:
         """Returns the actions of a sentence as captions; raises `NotUnderstood` if the model lacks one."""
         notes = _Notes(
             [f"'{typed}' is read as '{word}'" for typed, word in understood.corrected.items()]
@@ -109,7 +110,7 @@ class Reader:
         steps: list[Step] = []
         texts: list[str] = []
         for step in _joined(understood.steps, self.abilities.actions):
-            read = tuple(self._mention(mention, shown, notes) for mention in step)
+            read = tuple(self._mention(mention, text, notes) for mention in step)
             parts = [
                 part for one in self._possible(read, notes) for part in self._repeated(one, notes)
             ]
@@ -131,7 +132,7 @@ class Reader:
         changes = tuple(dict.fromkeys(notes.changes))
         return Reading(understood, tuple(steps), tuple(captions), tuple(texts), changes, ignored)
 
-    def _mention(self, mention: Mention, shown: str, notes: "_Notes") -> Mention:
+    def _mention(self, mention: Mention, text: str, notes: "_Notes") -> Mention:
         """Returns a mention of an action that the model knows, with the attributes that it knows."""
         action, attributes = self._known_action(mention)
         if action is None:
@@ -139,7 +140,8 @@ class Reader:
                 caption((Mention(name),)) for name in self.abilities.ranked(mention.action)[:3]
             ]
             raise NotUnderstood(
-                f"{shown}: the model does not know '{predicate(Mention(mention.action))}'", nearest
+                f"{_shown(text)}: the model does not know '{predicate(Mention(mention.action))}'",
+                nearest,
             )
 
         if mention.typed:
@@ -249,6 +251,10 @@ def _joined(steps: Sequence[Step], names: Sequence[str]) -> list[Step]:
         else:
             joined.append(step)
     return joined
+
+
+def _shown(text: str) -> str:
+    return f"'{shortened(text, 60)}'"
 
 
 def _caption(step: Step, words: str, special: Set[str]) -> str:

@@ -96,6 +96,6 @@ def refused(tmp_path, monkeypatch, capfd, trained, data_root) -> Iterator[Refuse
 
 @pytest.fixture
 def attacked(refused) -> Refused:
-    """`refused` for crafted input: 5 seconds and 1 GiB of memory for each command."""
-    refused.seconds, refused.memory = 5, 2**30
+    """`refused` for crafted input: 10 seconds and 1 GiB of memory for each command."""
+    refused.seconds, refused.memory = 10, 2**30
     return refused

@@ -62,7 +62,8 @@ class Folder(MotionSource):
     Args:
         path: the folder; motions may be in subfolders.
         motion: "joints" for representations of joint positions; "smpl" for representations of SMPL's
-            rotations, which AMASS files contain. They are fitted to the joints of other files.
+            rotations, which AMASS files contain and the bones of BVH files show. They are fitted to the
+            joints of other files.
         mirror: yield a mirrored copy after each clip of the training split; joints only.
         exclude: motions to leave out, by their path in the folder without extension.
         balance: training clips of an action that has fewer than this many, mirrored copies included, are repeated
@@ -389,10 +390,9 @@ def _read(
             fitted = raw_motion(recording.motion, representation or SMPL(fps))
             motion = fitted.values.numpy().astype(np.float32)
             if fitted.note:
+                source, _, _ = fitted.note.partition(", on the body")
                 centimeters = math.ceil(100 * fitted.error)
-                notes.append(
-                    f"rotations were fitted to joints, with a mean error of at most {centimeters} cm"
-                )
+                notes.append(f"{source}, with a mean error of at most {centimeters} cm")
         else:
             translation, turns = recording.smpl
             angles = rotation.quaternion_to_axis_angle(turns).flatten(1)

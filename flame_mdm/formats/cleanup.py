@@ -10,6 +10,7 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
 from flame_mdm.formats.faults import depths, unit
 from flame_mdm.formats.motion import Motion
+from flame_mdm.formats.poses import BoneRotations
 from flame_mdm.representations.skeleton import Skeleton
 
 # Weight of the squared third differences of a joint's path, relative to its squared change. Third
@@ -40,6 +41,7 @@ def cleaned(motion: Motion, contacts: np.ndarray | None = None) -> Motion:
         features=none,
         representation="",
         poses=None,
+        bones=BoneRotations(),
         contacts=None,
         cleanup=True,
     )

@@ -1,6 +1,5 @@
 """Motions as the raw motions that representations encode: joints, or rotations of SMPL's body."""
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,11 +9,11 @@ from torch import Tensor
 from flame_mdm.errors import UserError
 from flame_mdm.formats.motion import AMASS_AXES, Motion
 from flame_mdm.formats.poses import Poses
-from flame_mdm.formats.resampling import frame_pairs, resample
+from flame_mdm.formats.resampling import resample
 from flame_mdm.representations import Representation, rotation
 from flame_mdm.representations.motion272 import Motion272
 from flame_mdm.representations.rot6d import Rot6D
-from flame_mdm.representations.skeleton import KIT21, SMPL22, forward_kinematics
+from flame_mdm.representations.skeleton import KIT21, SMPL22
 from flame_mdm.representations.smpl import ADULT, SMPL
 
 CAMERA_AXES = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))
@@ -35,8 +34,9 @@ class RawMotion:
 
     Attributes:
         values: joints (F, J, 3) in meters, y up, or rotations of SMPL (F, 75) as in `representations.smpl.read_pose`.
-        note: a line for the user if rotations were fitted to joints, with the error; "" otherwise.
-        error: mean distance in meters of the joints of the fitted body from the joints of the motion.
+        note: a line for the user if a body of other proportions was used, with the error; "" otherwise. It says whether
+            rotations are those of the file, or were fitted to joints.
+        error: mean distance in meters of the joints of this body from the joints of the motion.
     """
 
     values: Tensor
@@ -48,8 +48,9 @@ def raw_motion(motion: Motion, representation: Representation) -> RawMotion:
     """Returns a motion at the frame rate of a representation, as the representation encodes motions.
 
     Joints are resampled with cubic splines, rotations on the sphere. KIT-ML's 21 joints are taken from SMPL's.
-    Rotations of SMPL that are not known are solved for; the body then has the bones of an adult, and its path is scaled
-    by the length of the legs. Raises `UserError` if the skeleton of the motion does not fit the representation.
+    Rotations of SMPL that are not known are taken from the bones of the file or else solved for; the body then has the
+    bones of an adult, and its path is scaled by the length of the legs. Raises `UserError` if the skeleton of the
+    motion does not fit the representation.
     """
     if isinstance(representation, SMPL | Motion272):
         return _rotations(motion, representation.fps, AMASS_AXES)
@@ -86,13 +87,22 @@ def _rotations(motion: Motion, fps: float, axes: Tensor) -> RawMotion:
             "motion of SMPL's 22 joints"
         )
     note, error = "", 0.0
-    if motion.poses is None:
-        moved = Motion(
-            resample(motion.joints.astype(float), motion.fps, fps, cubic=True), fps, motion.skeleton
-        )
-        poses, note, error = _adult(moved)
+    if motion.poses is not None:
+        poses = motion.poses.resampled(motion.fps, fps)
     else:
-        poses = _resampled(motion.poses, motion.fps, fps)
+        joints = resample(motion.joints.astype(float), motion.fps, fps, cubic=True)
+        if motion.bones.poses is not None:
+            source, body = "are those of the file", motion.bones.poses.resampled(motion.fps, fps)
+        else:
+            because = f" ({motion.bones.reason})" if motion.bones.reason else ""
+            source = f"were fitted to joints{because}"
+            body = Motion(joints, fps, motion.skeleton).posed()
+        poses, apart = _adult(body, joints[:, : len(SMPL22)])
+        error = float(apart.mean())
+        note = (
+            f"rotations {source}, on the body of an adult: mean error {100 * error:.1f} cm, "
+            f"max {100 * apart.max():.1f} cm"
+        )
     rotations = poses.rotations.clone()
     rotations[:, 0] = axes.T @ rotations[:, 0]
     vectors = rotation.matrix_to_axis_angle(rotations).flatten(1)
@@ -101,31 +111,17 @@ def _rotations(motion: Motion, fps: float, axes: Tensor) -> RawMotion:
     return RawMotion(torch.cat([translation, vectors, hands], 1), note, error)
 
 
-def _adult(motion: Motion) -> tuple[Poses, str, float]:
-    """Returns the motion on the body of an adult, a line about the distance of its joints, and the mean in meters."""
-    solved = motion.posed()
-    adult = solved.offsets.new_tensor(ADULT[: len(SMPL22)])
-    scale = float(
-        adult[list(LEGS)].norm(dim=1).sum() / solved.offsets[list(LEGS)].norm(dim=1).sum()
-    )
-    poses = Poses(adult, solved.rotations, scale * solved.root)
-    joints = forward_kinematics(SMPL22, poses.rotations, adult, poses.root).numpy()
-    apart = 100 * np.linalg.norm(joints - scale * motion.joints[:, : len(SMPL22)], axis=-1)
-    note = "rotations were fitted to joints, on the body of an adult"
-    return (
-        poses,
-        f"{note}: mean error {apart.mean():.1f} cm, max {apart.max():.1f} cm",
-        float(apart.mean()) / 100,
-    )
+def _adult(body: Poses, joints: np.ndarray) -> tuple[Poses, np.ndarray]:
+    """Puts a motion on the body of an adult, whose path is scaled by the length of the legs.
 
+    Args:
+        body: the motion, with its own bones.
+        joints: (F, 22, 3), its joints in meters.
 
-def _resampled(poses: Poses, rate: float, fps: float) -> Poses:
-    if math.isclose(rate, fps):
-        return poses
-    before, after, share = frame_pairs(len(poses.root), rate, fps, len(SMPL22))
-    quaternions = rotation.matrix_to_quaternion(poses.rotations)
-    turns = rotation.slerp(
-        quaternions[before], quaternions[after], torch.from_numpy(share)[:, None, None]
-    )
-    root = torch.from_numpy(resample(poses.root.numpy(), rate, fps, cubic=True))
-    return Poses(poses.offsets, rotation.quaternion_to_matrix(turns), root)
+    Returns the poses, and the distances (F, 22) in meters of their joints from the scaled `joints`.
+    """
+    adult = body.offsets.new_tensor(ADULT[: len(SMPL22)])
+    legs = list(LEGS)
+    scale = float(adult[legs].norm(dim=1).sum() / body.offsets[legs].norm(dim=1).sum())
+    poses = Poses(adult, body.rotations, scale * body.root)
+    return poses, np.linalg.norm(poses.joints().numpy() - scale * joints, axis=-1)

@@ -70,6 +70,7 @@ class Layout(BaseModel):
     children: bool = False  # whether children may be among the bodies
     _name: str = PrivateAttr("own map")
     _bones: dict[str, str] = PrivateAttr(default_factory=dict)
+    _rig: str = PrivateAttr("")
 
     @property
     def used(self) -> set[str]:
@@ -85,6 +86,16 @@ class Layout(BaseModel):
     def bones(self) -> Mapping[str, str]:
         """SMPL's joints -> the bones that follow them; a map of positions may use means of several joints instead."""
         return self._bones
+
+    @property
+    def rig(self) -> str:
+        """The name of the skeleton of `rigs.yaml` with the same joints, or ""."""
+        return self._rig
+
+    def bone(self, joint: str) -> str:
+        """Returns the joint of files that turns as a joint of SMPL: its bone, or the largest share of its position."""
+        shares = _shares(self.map[joint])
+        return self.bones.get(joint) or max(shares, key=lambda name: shares[name])
 
     def named(self, name: str, map: Mapping[str, Source]) -> Layout:
         """Returns the layout with another map, as a known one."""
@@ -163,7 +174,7 @@ def _layout(
     layout = Layout(
         map={joint: sources[joint] for joint in SMPL22.joints}, joints=list(names), **fields
     )
-    layout._bones = bones
+    layout._bones, layout._rig = bones, rig
     return layout
 
 
@@ -272,7 +283,10 @@ def find_layout(names: Sequence[str], fields: Mapping[str, Any]) -> Layout:
         for name, numbers in match.numbers.items()
     }
     map = {joint: _renamed(source, chosen) for joint, source in layout.map.items()}
-    return layout.named(layout.name, map).model_copy(update={**fields, "map": map})
+    renamed = {joint: chosen.get(name, name) for joint, name in layout.bones.items()}
+    layout = layout.named(layout.name, map).model_copy(update={**fields, "map": map})
+    layout._bones = {joint: name for joint, name in renamed.items() if name in names}
+    return layout
 
 
 def _one(name: str, candidates: Sequence[str]) -> str:

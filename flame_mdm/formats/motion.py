@@ -33,7 +33,7 @@ from flame_mdm.formats import (
 from flame_mdm.formats.body import PosedFigure
 from flame_mdm.formats.character_meshes import character_clip
 from flame_mdm.formats.characters import BvhCharacter, Character
-from flame_mdm.formats.poses import Poses
+from flame_mdm.formats.poses import BoneRotations, Poses
 from flame_mdm.formats.resampling import frame_pairs, frame_rate, resample
 from flame_mdm.formats.retarget import continuous_euler, preset, retarget
 from flame_mdm.formats.rig import CENTIMETER
@@ -69,6 +69,8 @@ class Motion(PosedFigure):
         degenerate: number of frames in which the features determine no rotation for some joint.
         parts: text, first and last frame (exclusive) of each part of a sequence; () = one part.
         notes: lines for the user about the file that was read, such as frames that were left out.
+        bones: rotations from the bones of the file that was read, for features that contain rotations. They show how a
+            forearm turns about its own axis. Files and pictures are made from `poses` or joint positions.
 
     Raises `UserError` if a shape is wrong, a joint is not finite, or the frame rate is not a positive number.
     """
@@ -79,6 +81,7 @@ class Motion(PosedFigure):
     degenerate: int = 0
     parts: tuple[tuple[str, int, int], ...] = ()
     notes: tuple[str, ...] = ()
+    bones: BoneRotations = field(default_factory=BoneRotations)
 
     def __post_init__(self) -> None:
         name, skeleton = f"motion {self.id!r}", self.skeleton
@@ -187,13 +190,11 @@ class Motion(PosedFigure):
         )
         joints, poses = resample(self.joints.astype(float), self.fps, fps, cubic=True), None
         if self.poses is not None:
-            turns = rotation.matrix_to_quaternion(self.poses.rotations)
-            turns = rotation.slerp(
-                turns[before], turns[after], torch.from_numpy(share)[:, None, None]
-            )
-            path = torch.from_numpy(resample(self.poses.root.numpy(), self.fps, fps, cubic=True))
-            poses = Poses(self.poses.offsets, rotation.quaternion_to_matrix(turns), path)
+            poses = self.poses.resampled(self.fps, fps)
             joints[:, : len(SMPL22)] = poses.joints().numpy()
+        bones = self.bones
+        if bones.poses is not None:
+            bones = BoneRotations(bones.poses.resampled(self.fps, fps))
         return Motion(
             joints=joints,
             fps=fps,
@@ -205,6 +206,7 @@ class Motion(PosedFigure):
             cleanup=self.cleanup,
             parts=parts,
             notes=self.notes,
+            bones=bones,
         )
 
     def show(self) -> Any:

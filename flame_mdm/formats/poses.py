@@ -1,5 +1,6 @@
 """Joint rotations from joint positions, by analytic inverse kinematics of SMPL's first 22 joints."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -8,6 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from flame_mdm.errors import UserError
+from flame_mdm.formats.resampling import frame_pairs, resample
 from flame_mdm.representations import rotation
 from flame_mdm.representations.skeleton import SMPL22, forward_kinematics
 from flame_mdm.representations.smpl import ADULT
@@ -55,6 +57,33 @@ class Poses:
         """Returns joint positions (22, 3) of the rest pose, with the lowest joint on the floor."""
         joints = SMPL22.assemble(self.offsets, self.offsets.new_zeros(3))
         return joints - joints.new_tensor([0, 1, 0]) * joints[:, 1].min()
+
+    def resampled(self, rate: float, fps: float) -> "Poses":
+        """Returns the motion at `fps` instead of `rate` frames per second, with rotations interpolated on the sphere.
+
+        The path of the pelvis is interpolated by cubic splines.
+        """
+        if math.isclose(rate, fps):
+            return self
+        before, after, share = frame_pairs(len(self.root), rate, fps, len(SMPL22))
+        turns = rotation.matrix_to_quaternion(self.rotations)
+        between = torch.from_numpy(share)[:, None, None]
+        turns = rotation.slerp(turns[before], turns[after], between)
+        root = torch.from_numpy(resample(self.root.numpy(), rate, fps, cubic=True))
+        return Poses(self.offsets, rotation.quaternion_to_matrix(turns), root)
+
+
+@dataclass(frozen=True, eq=False)
+class BoneRotations:
+    """Rotations of SMPL's joints that a file contains, taken from its bones.
+
+    Attributes:
+        poses: the rotations, on a body with the bones of the file; None if there are none that can be used.
+        reason: why the rotations of the file cannot be used; "" if it has none, or if they can.
+    """
+
+    poses: Poses | None = None
+    reason: str = ""
 
 
 def solve(joints: Tensor, fps: float) -> Poses:

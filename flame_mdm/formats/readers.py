@@ -17,6 +17,7 @@ from torch import Tensor
 from flame_mdm.errors import UserError
 from flame_mdm.formats import ENDINGS, SCENES, TREES, checks, scenes, unread
 from flame_mdm.formats.arrays import check_numbers, is_real, read_arrays, smpl_motion
+from flame_mdm.formats.bones import bone_poses
 from flame_mdm.formats.bvh import Bvh, forward_kinematics
 from flame_mdm.formats.layouts import (
     UP,
@@ -211,19 +212,23 @@ def _of_tree(
         )
         tree = replace(tree, fps=recorded)
 
-    joints = layout.apply(tree.positions(), names)
+    joints, in_front = layout.apply(tree.positions(), names), None
     if start := checks.rest_frames(joints, tree.fps):
         notes.append(_rest_note(start))
+        in_front = replace(tree, frames=tree.frames[:1]).rotations()[0]
         tree, joints = replace(tree, frames=tree.frames[start:]), joints[start:]
     checks.check_body(joints, layout)
     doubts = _doubts(joints, tree.fps, layout.up, np.array(UP[layout.up], float))
     label = _label(path, layout, tree.fps)
 
-    fps = tree.fps if resample_to is None else resample_to
-    if not math.isclose(fps, tree.fps):
-        local = tree.resample(fps, cubic=standard is None)
-        joints = layout.apply(forward_kinematics(tree.parents, *local)[0], names)
+    fps, local = tree.fps, (tree.rotations(), tree.translations())
+    if resample_to is not None and not math.isclose(resample_to, fps):
+        fps, local = resample_to, tree.resample(resample_to, cubic=standard is None)
+    positions, worlds = forward_kinematics(tree.parents, *local)
+    joints = layout.apply(positions, names)
     motion = Motion(joints, fps, id=path.stem, notes=(*notes, *doubts.lines))
+    if standard is None:
+        motion.bones = bone_poses(tree, layout, joints, worlds, in_front)
     return Recording(motion, label, doubts, tree=tree)
 
 

@@ -1,0 +1,158 @@
+"""Rotations of SMPL's joints from the bones of a file with a tree of joints, BVH or AMC.
+
+Joint positions do not show how a forearm or a head turns about its own axis; the bones of a file do. A joint of SMPL
+turns as its bone has turned since the rest pose. Three rest poses are known, in this order: the pose of the file
+without rotations, a rest pose in front of the motion, and the axes of a known skeleton in a T-pose. Arms and legs of a
+rest pose that is no T-pose are raised, by the smallest rotation, to the directions of SMPL's.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+
+from flame_mdm.errors import UserError
+from flame_mdm.formats.bvh import Bvh, forward_kinematics
+from flame_mdm.formats.layouts import UP, Layout
+from flame_mdm.formats.poses import BoneRotations, Poses
+from flame_mdm.formats.posture import shortest_turns
+from flame_mdm.formats.retarget import preset, presets
+from flame_mdm.formats.rig import LIMBS, SIDES, rest_pose
+from flame_mdm.representations.skeleton import JOINT, SMPL22
+from flame_mdm.representations.smpl import ADULT
+
+APART = 0.03  # mean distance in meters of joints above which rotations and positions disagree
+# Largest angle between a limb of a known skeleton in its T-pose and SMPL's, as a cosine
+ALIKE = np.cos(np.radians(30))
+VERTICALS = ((0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
+"""Directions in which the trunk of a rest pose may point: some programs export it with another axis up."""
+
+
+def bone_poses(
+    tree: Bvh,
+    layout: Layout,
+    joints: np.ndarray,
+    worlds: np.ndarray,
+    in_front: np.ndarray | None = None,
+) -> BoneRotations:
+    """Returns the rotations of SMPL's joints in a file.
+
+    Args:
+        tree: the file.
+        layout: its skeleton.
+        joints: (F, 22, 3) of SMPL in meters, y up.
+        worlds: (F, J, 3, 3), rotations of the J joints of the file in the world of the file.
+        in_front: (J, 3, 3), rotations relative to parents of a rest pose in front of the motion, if there is one.
+
+    They cannot be used if the rest pose is not known, or if they do not move the joints as the positions do, as in
+    files that move each joint by position channels.
+    """
+    if layout.mirrored:
+        return BoneRotations(reason="the motion of the file is mirrored")
+    bones = [tree.joints.index(layout.bone(joint)) for joint in SMPL22.joints]
+    up = np.array(UP[layout.up], float)
+    turned = up @ worlds[:, bones]
+    joints = joints.astype(float)
+    steps = np.zeros_like(joints)
+    steps[:, 1:] = joints[:, 1:] - joints[:, list(SMPL22.parents[1:])]
+
+    rest = _rest(tree, layout, bones, turned, steps, in_front)
+    if rest is None:
+        return BoneRotations(reason="the rest pose of the file is not known")
+    turned = turned @ _aligned(rest, turned, steps)
+    poses = _assembled(turned, joints[:, 0], steps)
+    apart = np.linalg.norm(poses.joints().numpy() - joints, axis=-1).mean()
+    if not apart <= APART:
+        reason = f"the rotations of the file place joints {100 * apart:.0f} cm from the positions"
+        return BoneRotations(reason=reason)
+    return BoneRotations(poses)
+
+
+def _rest(
+    tree: Bvh,
+    layout: Layout,
+    bones: Sequence[int],
+    turned: np.ndarray,
+    steps: np.ndarray,
+    in_front: np.ndarray | None,
+) -> np.ndarray | None:
+    """Returns rotations (22, 3, 3) of bones in the rest pose, y up and facing +z, or None if no rest pose is known."""
+    still = np.tile(np.eye(3), (len(tree.joints), 1, 1))
+    for local in (still, in_front):
+        if local is not None:
+            positions, worlds = forward_kinematics(tree.parents, local[None], tree.offsets[None])
+            pose = layout.apply(positions, tree.joints)[0].astype(float)
+            up = np.array(UP[layout.up], float)
+            if (rest := _upright(pose, up @ worlds[0, bones])) is not None:
+                return rest
+    if "axes" in presets().get(layout.rig, {}):
+        rig = preset(layout.rig, _adult(np.eye(3)[None]))
+        rest = np.stack([rig.neutral[rig.sources.index(joint)] for joint in range(len(SMPL22))])
+        if all(
+            _unit(rest[start] @ _local(turned, steps, start, end)) @ _unit(ADULT[end]) > ALIKE
+            for start, end in _limbs()
+        ):
+            return rest
+    return None
+
+
+def _upright(pose: np.ndarray, turned: np.ndarray) -> np.ndarray | None:
+    """Returns rotations (22, 3, 3) of bones in a pose (22, 3) turned to y up and +z ahead, or None if it leans."""
+    shoulders = pose[[JOINT["left_shoulder"], JOINT["right_shoulder"]]].mean(0)
+    trunk = shoulders - pose[[JOINT["left_hip"], JOINT["right_hip"]]].mean(0)
+    vertical = max(VERTICALS, key=lambda axis: float(trunk @ np.array(axis)))
+    try:
+        names, parents = SMPL22.joints, SMPL22.parents
+        found = rest_pose("", names, parents, pose, turned, JOINT, pose, vertical)
+    except UserError:
+        return None
+    return found.rig.turns
+
+
+def _limbs() -> list[tuple[int, int]]:
+    """Returns the first joint of each bone of arms and legs, and the joint at its end."""
+    return [
+        (JOINT[f"{side}_{start}"], JOINT[f"{side}_{end}"])
+        for side in SIDES
+        for start, end in LIMBS.items()
+    ]
+
+
+def _aligned(rest: np.ndarray, turned: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Returns the rotations (22, 3, 3) from SMPL's joints at rest to the bones of the file."""
+    aligned = np.swapaxes(rest, 1, 2).copy()
+    for start, end in _limbs():
+        along = rest[start] @ _local(turned, steps, start, end)
+        turn = shortest_turns(np.array(ADULT[end]), along)
+        aligned[start] = rest[start].T @ turn
+        if SMPL22.joints[start].endswith("elbow"):
+            aligned[end] = rest[end].T @ turn
+    return aligned
+
+
+def _local(turned: np.ndarray, steps: np.ndarray, start: int, end: int) -> np.ndarray:
+    """Returns the mean position (3,) of the end of a bone in the frame of the bone."""
+    return np.einsum("fji,fj->fi", turned[:, start], steps[:, end]).mean(0)
+
+
+def _unit(vector: ArrayLike) -> np.ndarray:
+    vector = np.asarray(vector, float)
+    return vector / max(float(np.linalg.norm(vector)), 1e-9)
+
+
+def _assembled(turned: np.ndarray, root: np.ndarray, steps: np.ndarray) -> Poses:
+    """Returns the poses of joints with rotations (F, 22, 3, 3) in the world, on a body with bones as in the file."""
+    offsets = np.zeros((len(SMPL22), 3))
+    local = turned.copy()
+    for parent, joint in SMPL22.edges:
+        local[:, joint] = np.swapaxes(turned[:, parent], 1, 2) @ turned[:, joint]
+        length = np.linalg.norm(steps[:, joint], axis=1).mean()
+        offsets[joint] = length * _unit(_local(turned, steps, parent, joint))
+    return Poses(torch.from_numpy(offsets), torch.from_numpy(local), torch.from_numpy(root))
+
+
+def _adult(turns: np.ndarray) -> Poses:
+    offsets = torch.tensor(ADULT[: len(SMPL22)], dtype=torch.float64)
+    local = torch.from_numpy(np.tile(turns[:, None], (1, len(SMPL22), 1, 1)))
+    return Poses(offsets, local, torch.zeros(len(turns), 3, dtype=torch.float64))

@@ -96,6 +96,13 @@ def test_the_hierarchy_and_its_motion_are_read(parse):
     np.testing.assert_allclose(positions[4], np.array([4, 5, 6]) + hips @ [0, 9.5, 9], atol=1e-12)
 
 
+def test_names_of_channels_may_be_written_in_any_case(parse):
+    text = ARM.replace("Xposition", "XPOSITION").replace("Yrotation", "yrotation")
+    motion, other = parse(ARM), parse(text)
+    assert other.channels == motion.channels
+    np.testing.assert_array_equal(other.positions(), motion.positions())
+
+
 def test_fps_is_the_one_the_rounded_frame_time_stands_for(parse):
     for time, fps in (
         *(

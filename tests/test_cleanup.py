@@ -116,6 +116,24 @@ def test_a_foot_stands_from_the_first_frame_of_its_contact_to_the_frame_after_th
     assert min(steps[7], steps[16]) > 0.008
 
 
+def test_a_foot_that_is_in_contact_with_even_odds_is_held_too():
+    slides = posed(30, root=np.arange(30)[:, None] * [0.006, 0, 0] + [0, 0.955, 0])
+    moved = []
+    for odds in (0.25, 0.5, 0.75):
+        contacts = np.zeros((30, 4))
+        contacts[8:16] = odds
+        toe = cleanup(slides.joints, FPS, SMPL22, contacts)[:, SMPL22.joints.index("left_foot")]
+        moved.append(np.linalg.norm(np.diff(toe[8:17, [0, 2]], axis=0), axis=1).mean())
+    assert moved[2] <= moved[1] < 0.5 * moved[0]
+
+
+def test_a_foot_that_lands_does_not_skate():
+    motion = torch.full((3, 22, 3), 0.5)
+    for toe in (10, 11):
+        motion[:, toe, 0], motion[:, toe, 1] = torch.arange(3) / 10, torch.tensor([0.3, 0.0, 0.0])
+    assert FootSkating(FPS).measure(motion).tolist() == [False, True]
+
+
 def test_hands_leave_the_body_without_a_jolt(clips):
     """Wrists of a walk are drawn 25 cm into the trunk and back within a second; all bones keep their lengths."""
     clip = next(clip for clip in clips if clip.attributes["action"] == "walk")

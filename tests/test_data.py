@@ -359,3 +359,11 @@ def test_free_memory_is_that_of_the_machine_or_the_container(monkeypatch):
     assert free_memory(torch.device("cpu")) == 2**21
     texts["memory.max"] = "5000\n"
     assert free_memory(torch.device("cpu")) == 4000
+
+
+def test_captions_of_an_evaluation_follow_from_the_seed(store):
+    parts = {"representation": HumanML(), "crop": Units(24, 60, 4)}
+    first, again, other = (Clips(store, "train", seed=seed, **parts) for seed in (0, 0, 1))
+    assert first.captions.max() > 1
+    np.testing.assert_array_equal(first.evaluated, again.evaluated)
+    assert (first.evaluated != other.evaluated).any()

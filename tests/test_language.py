@@ -245,3 +245,14 @@ def test_abilities_are_read_from_the_facts_of_a_model():
     assert "backflip" not in abilities.actions
     assert abilities.choices("kick") == {"count": [1, 2], "side": ["left", "right"]}
     assert not abilities.is_simultaneous
+
+
+@pytest.mark.parametrize(
+    ("text", "count"),
+    [
+        ("a person walks next to the table slowly", 1),
+        ("a person waves, next they jump", 2),
+    ],
+)
+def test_next_to_a_thing_is_a_place_and_next_alone_a_time(text: str, count: int):
+    assert len(understand(text).steps) == count

@@ -31,6 +31,7 @@ from evaluators.metrics.alignment import (
 )
 from evaluators.metrics.distribution import (
     FrechetMotionDistance,
+    KernelMotionDistance,
     PrecisionRecall,
     frechet_distance,
     polynomial_mmd2,
@@ -652,3 +653,14 @@ def test_multimodality_draws_no_motion_twice_on_the_same_side(seed: int):
         metric, generated=features[:, None], groups=torch.zeros(5, dtype=torch.long), keys=keys(5)
     )
     assert min(abs(value - float(pairing)) for pairing in pairings) < 1e-9
+
+
+def test_spread_of_the_kernel_distance_is_that_of_its_subsets():
+    generator = torch.Generator().manual_seed(0)
+    generated, real = torch.randn(2, 9, 3, generator=generator, dtype=torch.float64)
+    values = KernelMotionDistance(subsets=2, subset_size=4).value(generated, real)
+    draw = np.random.default_rng(0).choice
+    pairs = [[x[draw(9, 4, replace=False)] for x in (generated, real)] for _ in range(2)]
+    first, second = (polynomial_mmd2(*pair).item() for pair in pairs)
+    assert values["mean"] == pytest.approx((first + second) / 2)
+    assert values["std"] == pytest.approx(abs(first - second) / 2)

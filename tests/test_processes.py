@@ -29,7 +29,13 @@ from flame_mdm.losses import masked_mean, masked_mse
 from flame_mdm.processes import Process
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.processes.flow_matching import FlowMatching
-from flame_mdm.processes.guidance import classifier_free_guidance
+from flame_mdm.processes.guidance import (
+    STEERING_LIMIT,
+    STEERING_STEPS,
+    Positions,
+    classifier_free_guidance,
+    steer,
+)
 from flame_mdm.processes.schedules import build_schedule, timesteps
 from flame_mdm.safe_io import read_yaml
 
@@ -376,3 +382,13 @@ def test_doubled_conditions_and_masks_are_made_once_per_run_and_follow_a_change(
         False,
         True,
     ]
+
+
+def test_a_step_toward_a_distant_position_is_limited_over_all_features_of_a_motion():
+    x, place = torch.zeros(2, 7, 6), torch.tensor([3])
+    far = Positions(
+        frames=place, joints=torch.tensor([1]), axes=torch.tensor([2]), values=100.0 * place
+    )
+    steered = steer(lambda noisy: noisy, x, lambda motion: motion.unflatten(-1, (2, 3)), far)
+    rms = (steered - x).square().mean((1, 2)).sqrt()
+    torch.testing.assert_close(rms, torch.full((2,), STEERING_STEPS * STEERING_LIMIT))

@@ -347,6 +347,15 @@ def test_every_recipe_builds_decodes_and_passes_gradients():
         assert (owners.sum(0) >= 1).all()
 
 
+def test_features_of_a_joint_of_motion272_are_its_position_velocity_and_rotation():
+    representation, joint = Motion272(), 4
+    columns = []
+    for name, width in (("positions", 3), ("velocities", 3), ("rotations", 6)):
+        begin = representation.slices[name].start + width * joint
+        columns += range(begin, begin + width)
+    assert representation.joint_features([joint]).nonzero()[:, 0].tolist() == columns
+
+
 @golden_case("temos64")
 def test_features_floor_heading_and_joints_are_temos(stem: str):
     rifke, file, atol = Rifke(), tensors(golden(stem)), 2e-3  # in KIT's unit, about 1.6 mm

@@ -26,7 +26,7 @@ from flame_mdm.data.store import Store
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError
 from flame_mdm.processes.diffusion import GaussianDiffusion
-from flame_mdm.training.checkpointing import LAST, PREVIOUS, newest
+from flame_mdm.training.checkpointing import LAST, PREVIOUS, AtomicCheckpoints, newest
 from flame_mdm.training.guards import only_run
 
 pytestmark = pytest.mark.slow
@@ -93,6 +93,16 @@ def test_a_foreign_checkpoint_removes_no_other_files(resume, best, tmp_path):
         assert resume(content) == int(name.startswith("link"))
         assert (tmp_path / "victim.txt").read_text() == "mine"
         assert (folder / "best.ckpt").is_file()
+
+
+def test_only_files_in_the_folder_of_the_checkpoints_are_removed(tmp_path):
+    folder = tmp_path / "run" / "checkpoints"
+    (folder / "of_user").mkdir(parents=True)
+    files = [folder / "step.ckpt", folder / "of_user" / "step.ckpt", tmp_path / "step.ckpt"]
+    for file in files:
+        file.write_text("weights")
+        AtomicCheckpoints(folder).remove_checkpoint(file)
+    assert [file.exists() for file in files] == [False, True, True]
 
 
 HUGE = torch.zeros(1, dtype=torch.float64).expand(2**31, 16)

@@ -179,3 +179,10 @@ def test_mutated_files_give_one_line_or_a_motion(ending: str, tmp_path: Path):
         assert np.isfinite(joints).all(), number
         assert not message or str(path) in message, number
         assert "\n" not in message, number
+
+
+def test_a_track_of_steps_holds_each_value_until_the_next_key():
+    times, values = np.array([0.0, 1.0, 2.0]), np.array([[1.0], [5.0], [7.0]])
+    track = glb_animation.Track(times, values, "STEP", np.zeros((2, 3, 1)))
+    moments = np.array([0.0, 0.4, 0.9, 1.0, 1.9, 2.0])
+    assert track.at(moments)[:, 0].tolist() == [1, 1, 1, 5, 5, 7]

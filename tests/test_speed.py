@@ -159,6 +159,19 @@ def test_a_resumed_average_keeps_the_initial_weights_before_its_first_update():
     torch.testing.assert_close(saved(average, model)["state_dict"]["layer.weight"], initial)
 
 
+def test_a_resumed_average_goes_on():
+    model = Tiny()
+    average = MovingAverage(0.5)
+    list(train_with([average], model, 2))
+    before = saved(average, model)["state_dict"]["layer.weight"].clone()
+    trainer: Any = SimpleNamespace(global_step=2)
+    average.on_train_start(trainer, model)
+    trainer.global_step = 3
+    average.on_train_batch_end(trainer, model, None, None, 0)
+    expected = (before + model.layer.weight.detach()) / 2
+    torch.testing.assert_close(saved(average, model)["state_dict"]["layer.weight"], expected)
+
+
 @pytest.mark.slow
 def test_fast_is_reproducible_resumes_exactly_and_is_recorded(tiny, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": True})

@@ -24,7 +24,7 @@ from flame_mdm.sampling.editing import edit
 from flame_mdm.sampling.keywords import SamplerKeywords
 from flame_mdm.sampling.placement import Placement
 from flame_mdm.sampling.reading import decoded, with_features
-from flame_mdm.sampling.streams import Streams, standing, starting_point
+from flame_mdm.sampling.streams import Schedule, Streams, standing, starting_point
 from flame_mdm.sampling.targets import errors, read_targets
 
 CONTEXT, BLOCK, FPS = 10, 30, 20.0
@@ -391,3 +391,10 @@ def test_what_such_a_model_cannot_do_is_said_in_one_line(model, walk):
 def test_streams_are_public():
     assert "stream" in flame_mdm.__all__
     assert Path(flame_mdm.stream.__code__.co_filename).name == "streams.py"
+
+
+def test_a_condition_ends_in_the_frame_before_the_next_one():
+    schedule = Schedule("a person walks")
+    schedule.add(5, "a person jumps")
+    assert [schedule.until_change(frame) for frame in (0, 3, 4, 5)] == [5, 2, 1, None]
+    assert [schedule.at(frame) for frame in (4, 5)] == ["a person walks", "a person jumps"]

@@ -20,11 +20,10 @@ from flame_mdm.data.parallel import in_order
 from flame_mdm.errors import UserError, first_line, printable
 from flame_mdm.formats import ENDINGS, SCENES, motions_in, scenes
 from flame_mdm.formats.checks import LYING
-from flame_mdm.formats.conversion import raw_motion
+from flame_mdm.formats.conversion import needs_rotations, raw_motion
 from flame_mdm.formats.readers import read_recording
 from flame_mdm.representations import Representation, rotation
 from flame_mdm.representations.humanml import HumanML
-from flame_mdm.representations.motion272 import Motion272
 from flame_mdm.representations.rifke import Rifke
 from flame_mdm.representations.rot6d import Rot6D
 from flame_mdm.representations.skeleton import KIT21, SMPL22
@@ -114,11 +113,8 @@ class Folder(MotionSource):
         """Makes `clips` yield raw motions of a representation; raises `UserError` if `motion`
         does not fit it.
         """
-        name, needs_rotations = (
-            representation.name,
-            isinstance(representation, SMPL | Rot6D | Motion272),
-        )
-        if needs_rotations and self.motion == "joints":
+        name = representation.name
+        if needs_rotations(representation) and self.motion == "joints":
             raise UserError(
                 f"{name} is made of rotations. Add data.source.motion=smpl: they are read, or fitted to joints"
             )

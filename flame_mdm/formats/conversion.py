@@ -44,6 +44,11 @@ class RawMotion:
     error: float = 0.0
 
 
+def needs_rotations(representation: Representation) -> bool:
+    """Returns whether a representation encodes rotations of SMPL's joints instead of joint positions."""
+    return isinstance(representation, SMPL | Rot6D | Motion272)
+
+
 def raw_motion(motion: Motion, representation: Representation) -> RawMotion:
     """Returns a motion at the frame rate of a representation, as the representation encodes motions.
 
@@ -52,10 +57,9 @@ def raw_motion(motion: Motion, representation: Representation) -> RawMotion:
     bones of an adult, and its path is scaled by the length of the legs. Raises `UserError` if the skeleton of the
     motion does not fit the representation.
     """
-    if isinstance(representation, SMPL | Motion272):
-        return _rotations(motion, representation.fps, AMASS_AXES)
-    if isinstance(representation, Rot6D):
-        return _rotations(motion, representation.fps, CAMERA_AXES)
+    if needs_rotations(representation):
+        axes = CAMERA_AXES if isinstance(representation, Rot6D) else AMASS_AXES
+        return _rotations(motion, representation.fps, axes)
     joints, skeleton = motion.joints.astype(float), representation.skeleton
     if skeleton.joints == motion.skeleton.joints[: len(skeleton)]:
         joints = joints[:, : len(skeleton)]  # without the hands

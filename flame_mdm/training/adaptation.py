@@ -26,6 +26,7 @@ from flame_mdm.data.adaptation import KEPT, LessonData, check_clips, styled
 from flame_mdm.data.folder import Folder
 from flame_mdm.data.store import Store, write_store
 from flame_mdm.errors import UserError, say
+from flame_mdm.formats.conversion import needs_rotations
 from flame_mdm.formats.motion import Motion
 from flame_mdm.generator import MotionGenerator
 from flame_mdm.reporting.page import number, page, render
@@ -209,7 +210,8 @@ def _recipe(
     config["data"]["crop"] = data.get("crop") or config["data"]["crop"] | {"max_frames": longest}
     if not any(word.startswith("optimizer.lr=") for word in overrides):
         config["optimizer"]["lr"] = (model.config.get("optimizer") or config["optimizer"])["lr"]
-    config["data"]["source"]["motion"] = (data.get("source") or {}).get("motion", "joints")
+    kind = "smpl" if needs_rotations(model.representation) else "joints"
+    config["data"]["source"]["motion"] = kind
 
     # Samples show three captions of the lesson, and three of the base in the new style.
     few = captions[:: ceil_div(len(captions), 3)]

@@ -10,6 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from support.motions import posed, synthetic
 
+from flame_mdm.errors import UserError
 from flame_mdm.formats import bvh
 from flame_mdm.formats.cleanup import cleaned
 from flame_mdm.formats.conversion import raw_motion
@@ -205,3 +206,31 @@ def test_rotations_follow_the_frame_rate_and_end_with_cleanup(tmp_path: Path):
     raw = raw_motion(read(tmp_path / "a.bvh"), SMPL(40.0)).values
     assert len(raw) == len(motion.joints) == 2 * FRAMES - 1
     assert cleaned(motion).bones.poses is None
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_mixed_orders_and_missing_channels_give_one_line_or_rotations_that_fit(seed: int, changed):
+    rng = np.random.default_rng(seed)
+
+    def mutated(tree: bvh.Bvh) -> bvh.Bvh:
+        channels, frames = [], []
+        for names, columns in zip(tree.channels, tree.columns(), strict=True):
+            kept = np.arange(len(names))
+            if rng.random() < 0.3:
+                kept = rng.permutation(kept)[rng.random(len(kept)) < 0.9]
+            channels.append(tuple(names[number] for number in kept))
+            frames.append(tree.frames[:, columns][:, kept])
+        return replace(tree, channels=tuple(channels), frames=np.concatenate(frames, 1))
+
+    motion, refusal = None, ""
+    try:
+        motion = changed(mutated)
+    except UserError as error:
+        refusal = str(error)
+    assert "\n" not in refusal
+    if motion is None:
+        return
+    assert raw_motion(motion, SMPL(20.0)).values.isfinite().all()
+    assert motion.bones.poses is not None, motion.bones.reason
+    apart = motion.bones.poses.joints().numpy() - motion.joints
+    assert np.linalg.norm(apart, axis=-1).mean() < 1e-4

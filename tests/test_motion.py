@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from support.motions import synthetic
+from support.refusals import error_of
 from support.runs import TINY, untrained
 
 import flame_mdm
@@ -152,3 +153,17 @@ def test_arrays_are_edited_and_what_cannot_be_edited_is_refused_in_one_line(
         with pytest.raises(UserError, match=message) as caught:
             edit(model, motion, fps=fps, region="prediction")
         assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["a.bvh", "folder/../a.bvh", "link.bvh", "second.bvh"])
+def test_a_file_is_not_converted_into_itself_under_any_name(
+    name: str, tmp_path: Path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    synthetic("walk").save("a.bvh")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "link.bvh").symlink_to("a.bvh")
+    (tmp_path / "second.bvh").hardlink_to("a.bvh")
+    before = Path("a.bvh").read_bytes()
+    assert "the same file as the input" in error_of(capsys, "convert", "a.bvh", name)
+    assert Path("a.bvh").read_bytes() == before

@@ -104,10 +104,10 @@ def _upright(pose: np.ndarray, turned: np.ndarray) -> np.ndarray | None:
     vertical = max(VERTICALS, key=lambda axis: float(trunk @ np.array(axis)))
     try:
         names, parents = SMPL22.joints, SMPL22.parents
-        found = rest_pose("", names, parents, pose, turned, JOINT, pose, vertical)
+        pose_at_rest = rest_pose("", names, parents, pose, turned, JOINT, pose, vertical)
     except UserError:
         return None
-    return found.rig.turns
+    return pose_at_rest.rig.turns
 
 
 def _limbs() -> list[tuple[int, int]]:

@@ -282,11 +282,15 @@ class Synthetic(MotionSource):
         return actions[action].draw(rng, action)
 
 
-def prompts() -> list[tuple[str, Attributes]]:
-    """Returns fixed prompts with their attributes, for dashboard samples and `evaluators.metrics.attributes`."""
+def prompts(count: int | None = None) -> list[tuple[str, Attributes]]:
+    """Returns fixed prompts with their attributes, for dashboard samples and `evaluators.metrics.attributes`.
+
+    Args:
+        count: Number of prompts, the first ones. Default: all.
+    """
     return [
         (row["text"], {name: row[name] for name in row if name != "text"})
-        for row in content()["prompts"]
+        for row in content()["prompts"][:count]
     ]
 
 

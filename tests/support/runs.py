@@ -45,6 +45,8 @@ TINY = [
     *("task.num_inference_steps=5", "trainer.accelerator=cpu", "trainer.enable_progress_bar=false"),
     *("condition.features=16", "condition.pretrain_steps=10"),
     "callbacks.samples.seconds=1.5",
+    # Files of all prompts of the recipe would take most of the time
+    "callbacks.samples.prompts.count=3",
     "lr_decay=0",  # it depends on trainer.max_steps, which tests raise to resume
 ]
 """Overrides that make the quick-start experiment train in a second."""

@@ -43,7 +43,7 @@ from flame_mdm.training.provenance import environment
 
 FORMAT = 1
 CACHE = 2  # version of the cached metric inputs
-OF_TEXTS = {"text", "text_keys", "requested"}
+OF_TEXTS = {"text", "text_keys", "captions", "requested"}
 """Inputs that depend on the captions of the motions."""
 AVAILABLE = OF_TEXTS | {"keys", "joints", "mask", "contacts", "generated", "real"}
 """Inputs that an audit has; metrics that require others are not audited."""
@@ -295,6 +295,7 @@ class _Measure:
             ):
                 return None
             rows["requested"] = [text.requested for text in texts]
+            rows["captions"] = [text.caption for text in texts]
         if "text" in required:
             rows["text"] = self._encoded(texts)
             rows["text_keys"] = keys_of([text.caption for text in texts])

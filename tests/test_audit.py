@@ -65,7 +65,9 @@ def scene(tmp_path_factory):
     representation = HumanML()
     protocol = load_protocol("synthetic", representation)
     physics = load_protocol("text_to_motion_2026", representation).metrics
-    metrics = protocol.metrics | {name: physics[name] for name in ("mbench", "kimodo", "edge")}
+    metrics = protocol.metrics | {
+        name: physics[name] for name in ("claims", "mbench", "kimodo", "edge")
+    }
     evaluator = Evaluator(
         Linear(), {k: v for k, v in metrics.items() if k != "diversity"}, representation
     )
@@ -112,6 +114,8 @@ def test_values_without_resampling_are_those_of_an_evaluation(scene):
         "attributes/action",
     } <= compared.keys()
     assert {
+        "claims/all",
+        "claims/side",
         "mbench/foot_floating",
         "kimodo/skate_ratio",
         "kimodo/contact_consistency",

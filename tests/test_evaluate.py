@@ -717,6 +717,8 @@ def test_metrics_of_2026(runs):
         "the contacts are read from the features"
     )
     assert values["real edge/pfc"] is None, "defined at 30 frames per second"
+    assert values["real claims/all"] > 0.9
+    assert values["real claims/captions"] > 0.3
     evaluation = runs.evaluation("editing_in_between_2026")
     values = means(evaluation.run(runs.generator(evaluation)))
     assert values["generated flowmdm/windows"] > 0

@@ -19,6 +19,7 @@ from evaluators.extractors.t2m_training import MatchingLoss
 from evaluators.metrics import (
     accuracy,
     alignment,
+    claims,
     distribution,
     diversity,
     memorization,
@@ -65,6 +66,7 @@ def all_metrics() -> dict[str, Metric]:
         "jitter": physics.Jitter(20.0),
         "static": physics.StaticShare(20.0),
         "skating": physics.FootSkating(20.0),
+        "claims": claims.ClaimAccuracy(20.0),
         "mbench": published_physics.MBenchQuality(20.0),
         "kimodo": published_physics.KimodoQuality(20.0),
         "kimodo_constraints": published_physics.KimodoConstraints(),

@@ -1,6 +1,7 @@
 """The referee: claims of sentences, measurements, verdicts, and what changes none of them."""
 
 from collections.abc import Callable
+from html import unescape
 from typing import Any
 
 import numpy as np
@@ -9,15 +10,18 @@ import torch
 from support.motions import Page, posed, synthetic
 
 import flame_mdm
+from evaluators.metrics.claims import ClaimAccuracy
 from flame_mdm.__main__ import main
 from flame_mdm.errors import UserError
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.resampling import resample
 from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.sampling.generation import best
 from flame_mdm.sampling.referee.claims import Claim, falsified
-from flame_mdm.sampling.referee.judging import verdicts
+from flame_mdm.sampling.referee.judging import claim_score, verdicts
 from flame_mdm.sampling.referee.kinds import KINDS, band, group_of, thresholds
 from flame_mdm.sampling.referee.sentences import read_claims
+from flame_mdm.seeds import key
 
 FPS = 20.0
 
@@ -236,6 +240,63 @@ def test_an_order_is_right_in_one_direction_only():
     assert answers(joined, text)["raise hand: left, then jump"] == "yes"
     text = "a person jumps, then raises the left arm"
     assert answers(joined, text)["jump, then raise hand: left"] == "no"
+
+
+def test_the_metric_counts_true_and_decided_claims():
+    metric = ClaimAccuracy(FPS)
+    motion = torch.from_numpy(raising("left").joints).float()
+    joints, mask = motion.expand(3, *motion.shape), torch.ones(3, len(motion), dtype=torch.bool)
+    captions = ["raises the left hand", "raises the right hand", "someone cooks"]
+    metric.update(joints, mask, captions, torch.tensor([key(text) for text in captions]))
+    values = metric.compute()
+    assert values["all"] == values["side"] == 0.5
+    assert values["decided"] == 1
+    assert values["captions"] == pytest.approx(2 / 3)
+    assert values["count"] is None
+    read = metric.readings({"joints": list(joints)})
+    pairs = metric.per_sample(read | {"captions": captions})
+    assert pairs["all"].tolist() == [[2, 2], [0, 2], [0, 0]]
+
+
+def test_of_several_candidates_the_one_with_the_most_true_claims_is_kept():
+    candidates = [raising("right"), raising("left")]
+    for candidate in candidates:
+        candidate.text = "a person raises the left hand"
+    assert best(candidates, claim_score) is candidates[1]
+    candidates[0].text = candidates[1].text = "a person raises the right hand"
+    assert best(candidates, claim_score) is candidates[0]
+    candidates[0].text = "someone cooks"
+    assert claim_score(candidates) == [0, -2]
+
+
+def test_the_command_samples_candidates_and_warns_of_a_text_without_claims(
+    tmp_path, capsys, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    options = ["seconds=1", "num_inference_steps=2", "candidates=2", "scorer=claims"]
+    sample = ["sample", "quickstart", "out.npz", *options]
+    assert main([*sample, "text=a person raises the left hand"]) == 0
+    assert "no claim" not in capsys.readouterr().out
+    assert main([*sample, "text=a person dances"]) == 0
+    assert "'a person dances' has no claim that can be checked" in capsys.readouterr().out
+
+
+def test_pages_mark_the_evidence_and_the_demo_lists_the_verdicts(tmp_path, monkeypatch):
+    motion = raising("left")
+    motion.text = "a person raises the left hand"
+    motion.save(tmp_path / "a" / "motion.npz")
+    motion.save(tmp_path / "b" / "motion.npz")
+    page = tmp_path / "page.html"
+    assert main(["compare", f"{tmp_path / 'a'} {tmp_path / 'b'}", f"out={page}"]) == 0
+    assert "yes: raise hand: left" in unescape(page.read_text())
+
+    from flame_mdm.demo.studio_page import _verdicts
+
+    shown = _verdicts("Motion 1", motion)
+    assert "Motion 1 2 of 2 claims are true" in shown
+    assert "left wrist: " in shown
+    motion.text = "<b>cooks</b>"
+    assert _verdicts("", motion) == ""
 
 
 @pytest.mark.parametrize(

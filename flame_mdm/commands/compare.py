@@ -97,6 +97,7 @@ def _count(files: Sequence[Path], out: str) -> None:
 def _compare(folders: Sequence[Path], settings: CompareSettings) -> None:
     compared = find(folders)
     from flame_mdm.formats.people import load_body
+    from flame_mdm.sampling.referee.judging import evidence_marks
 
     body = load_body(settings.body)
     shown = _motions(compared, settings)
@@ -105,7 +106,7 @@ def _compare(folders: Sequence[Path], settings: CompareSettings) -> None:
         content = rating_page(compared, shown, settings.seed, body)
     else:
         out = settings.out or "runs/compare.html"
-        content = comparison(compared, shown, body)
+        content = comparison(compared, shown, body, evidence_marks)
         say(*_tested(only_runs(compared)))
 
     write_text(out, content)

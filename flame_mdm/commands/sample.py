@@ -29,6 +29,13 @@ if TYPE_CHECKING:
 
 # Maximum number of motions on the page of a file of prompts, which has about 20 kB for each
 GALLERY = 200
+CLAIMS = "claims"  # scorer that judges the claims of the text: docs/referee.md
+
+
+def scorer_source(key: str, source: str) -> None:
+    """Checks that the scorer is `CLAIMS` or a model that exists."""
+    if source != CLAIMS:
+        model_source(key, source)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +44,7 @@ class SampleSettings(OutputSettings, WritingSettings):
            flame-mdm sample CKPT walk.fbx text="a person walks forward" [rig=unreal] [resample=30]
            flame-mdm sample CKPT text="walks forward @3 | turns around | bows @2.5" [after=walk.npz] [loop=true]
            flame-mdm sample CKPT text="walks forward" path="0,1 0.5,2" | targets=FILE.json
-           flame-mdm sample CKPT text="jumps" candidates=8 [scorer=RUN]
+           flame-mdm sample CKPT text="jumps" candidates=8 [scorer=claims|RUN]
            flame-mdm sample CKPT prompts=FILE.txt [seconds=[2,3.5,...]] [mp4=true]
            flame-mdm sample CKPT set=locomotion OUT [rig=unity] [format=glb]
            flame-mdm sample CKPT action=walk
@@ -65,7 +72,9 @@ class SampleSettings(OutputSettings, WritingSettings):
     )
     format: str | None = option(None, "format of the files of a set: fbx, glb, usda, usdc or usdz")
     scorer: str | None = option(
-        None, "a motion-CLIP that chooses the candidate that fits the text best", model_source
+        None,
+        "claims, or a motion-CLIP: chooses the candidate that fits the text best",
+        scorer_source,
     )
     shared_noise: bool = same_option(SamplingRequest, "shared_noise")
     samples: int | None = option(
@@ -189,6 +198,7 @@ def _sample(settings: SampleSettings, request: SamplingRequest, prompts: PromptF
     character = settings.read_character()
     from flame_mdm.sampling.generation import sample
     from flame_mdm.sampling.output import SAMPLES, degenerate_notes, summary, write_motions
+    from flame_mdm.sampling.referee.sentences import read_claims
     from flame_mdm.sampling.resolution import resolve
 
     model = loaded.model
@@ -206,6 +216,10 @@ def _sample(settings: SampleSettings, request: SamplingRequest, prompts: PromptF
     say(*(f"warning: {line}" for line in resolved.warnings))
 
     score = None if settings.scorer is None else _score(settings.scorer, model)
+    if settings.scorer == CLAIMS:
+        for prompt in resolved.prompts:
+            if not read_claims(prompt.text):
+                say(f"warning: '{shortened(prompt.text, 60)}' has no claim that can be checked")
     stages = [] if settings.trajectory else None
     motions = sample(model, resolved, score=score, stages=stages)
     say(*degenerate_notes(motions))
@@ -282,7 +296,9 @@ def _write_files(
 
 
 def _score(source: str, model: MotionGenerator) -> Score:
-    """Returns the score of candidates by the motion-CLIP in `source`; `UserError` if it cannot read their motions."""
+    """Returns the score of candidates by claims or by a motion-CLIP; `UserError` if it cannot read their motions."""
+    if source == CLAIMS:
+        return claims_score(model)
     from evaluators.extractors import MotionCLIPExtractor
 
     try:
@@ -291,6 +307,20 @@ def _score(source: str, model: MotionGenerator) -> Score:
     except (UserError, FileNotFoundError) as error:
         raise UserError(f"scorer: {error}") from error
     return scorer.fit
+
+
+def claims_score(model: MotionGenerator) -> Score:
+    """Returns the score of candidates by the claims of their texts; `UserError` for motions on another skeleton."""
+    from flame_mdm.representations.skeleton import SMPL22
+    from flame_mdm.sampling.referee.judging import claim_score
+
+    skeleton = model.representation.skeleton
+    if skeleton != SMPL22:
+        raise UserError(
+            f"scorer={CLAIMS}: the model's motions are on {skeleton.name}, and the referee needs {SMPL22.name}. "
+            "Give a motion-CLIP"
+        )
+    return claim_score
 
 
 def _folders(

@@ -26,6 +26,7 @@ from flame_mdm.formats.retarget import presets
 from flame_mdm.generator import MotionGenerator
 from flame_mdm.processes.guidance import STEERING_STEPS
 from flame_mdm.sampling.motion_request import read_parts
+from flame_mdm.sampling.referee.judging import evidence_marks, try_judge
 from flame_mdm.visualize import player_page
 from flame_mdm.visualize.render import thumbnail
 
@@ -236,7 +237,8 @@ def _result(
         original = studio.motions(request.model_copy(update={"edits": tuple(before)}))[last.motion]
         scene.insert(0, replace(original, id="before", text=f"before: {original.text}"))
     links = ""
-    for number in range(len(motions)):
+    for number, motion in enumerate(motions):
+        links += "" if request.edits else _verdicts(names[number], motion)
         address = f"?{escape(request.query())}&amp;motion={number}"
         files = [(f"motion{extension}{address}", name) for extension, name in FORMATS.items()]
         programs = [
@@ -251,7 +253,8 @@ def _result(
         links += f"<div>Files {_links(files)}</div>"
         links += f"<details><summary>More</summary><div>{_links(rigs)}</div></details>"
     text = (request.edits[-1].text if request.edits else "") or request.text
-    player = escape(player_page(scene, text or "Motion"))
+    marks = [] if request.edits else [evidence_marks(motion) for motion in scene]
+    player = escape(player_page(scene, text or "Motion", marks=marks))
     return {
         ui.player: f'<iframe title="Player" sandbox="allow-scripts allow-downloads" srcdoc="{player}"></iframe>',
         ui.text: request.text,
@@ -263,6 +266,16 @@ def _result(
             [(str(k + 1), k) for k in range(len(motions))], value=0, visible=len(motions) > 1
         ),
     }
+
+
+def _verdicts(name: str, motion: Motion) -> str:
+    """Returns what the referee says about the claims of a motion's text; "" if there is none."""
+    judgment = try_judge(motion)
+    if judgment is None:
+        return ""
+    lines = "".join(f"<div>{escape(one_line(str(verdict)))}</div>" for verdict in judgment.verdicts)
+    summary = f"{name} {judgment.true} of {len(judgment.verdicts)} claims are true".strip()
+    return f'<details class="verdicts"><summary>{summary}</summary>{lines}</details>'
 
 
 def _understood(studio: Studio, request: DemoRequest) -> str:

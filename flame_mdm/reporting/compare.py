@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 
 # Requested caption or action, and the index of the motion among those with the same request
 Prompt = tuple[str, int]
+# First frame, last frame (exclusive), kind and description of a span of a time line
+Mark = tuple[int, int, str, str]
 
 
 @dataclass(frozen=True)
@@ -108,6 +110,7 @@ def comparison(
     compared: Sequence[ComparedRun],
     shown: Sequence[Mapping[Prompt, Motion]],
     mesh: Mesh | None = None,
+    evidence: Callable[[Motion], Sequence[Mark]] = lambda motion: (),
 ) -> str:
     """Returns the page that compares runs side by side. The same runs give the same bytes.
 
@@ -116,6 +119,7 @@ def comparison(
         shown: the motions of each of them, by prompt; the page plays those for the prompts that
             all have.
         mesh: the body to draw.
+        evidence: function that returns the marks on the time line of a motion.
     """
     runs = only_runs(compared)
     labels = [entry.label for entry in compared]
@@ -125,7 +129,7 @@ def comparison(
         labels=list(runs),
         facts=_facts(runs) if runs else None,
         differences=_differences(runs),
-        player=_player(labels, shown, mesh),
+        player=_player(labels, shown, mesh, evidence),
         evaluations=_evaluations(runs),
         unpaired=in_common(runs),
         columns=HEAD,
@@ -178,7 +182,10 @@ def _differences(runs: Mapping[str, Run]) -> list[list[str]]:
 
 
 def _player(
-    labels: Sequence[str], shown: Sequence[Mapping[Prompt, Motion]], body: Mesh | None
+    labels: Sequence[str],
+    shown: Sequence[Mapping[Prompt, Motion]],
+    body: Mesh | None,
+    evidence: Callable[[Motion], Sequence[Mark]],
 ) -> str:
     """Plays the motions for the prompts that all runs have, in the order of the first run."""
     from flame_mdm.visualize import player_page
@@ -188,7 +195,8 @@ def _player(
         for prompt in in_all(shown)
         for label, motions in zip(labels, shown, strict=True)
     ]
-    return player_page(scene, "", columns=len(labels), body=body) if scene else ""
+    spans = [evidence(motion) for motion in scene]
+    return player_page(scene, "", columns=len(labels), marks=spans, body=body) if scene else ""
 
 
 HEAD = ["", "difference", "95 % over replications", ""]  # column titles of differences

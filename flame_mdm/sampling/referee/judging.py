@@ -129,6 +129,30 @@ def judge(
     return Judgment(text, tuple(verdicts(joints, fps, read_claims(text))))
 
 
+def try_judge(motion: Motion) -> Judgment | None:
+    """Returns the judgment of a motion by its own text; None if it cannot be judged, or its text has no claim."""
+    is_long = len(motion.joints) > (SHORTEST + 0.1) * motion.fps
+    if motion.skeleton != SMPL22 or not motion.text.strip() or not is_long:
+        return None
+    judgment = judge(motion)
+    return judgment if judgment.verdicts else None
+
+
+def evidence_marks(motion: Motion) -> list[tuple[int, int, str, str]]:
+    """Returns the evidence for the claims of a motion's own text, as marks of a player's time line."""
+    judgment = try_judge(motion)
+    if judgment is None:
+        return []
+    shown = (verdict.marks(motion.fps, len(motion.joints)) for verdict in judgment.verdicts)
+    return [mark for marks in shown for mark in marks]
+
+
+def claim_score(motions: Sequence[Motion]) -> list[float]:
+    """Returns the true claims minus the false claims of each motion's own text; 0 for a text without claims."""
+    judged = [try_judge(motion) for motion in motions]
+    return [0.0 if one is None else float(2 * one.true - one.decided) for one in judged]
+
+
 def verdicts(joints: np.ndarray, fps: float, claims: Sequence[Claim]) -> list[Verdict]:
     """Returns the verdict on each claim about joints (F, 22, 3) in meters, y up."""
     if not claims:

@@ -18,9 +18,9 @@ from flame_mdm.sampling.referee.claims import Claim, unique
 from flame_mdm.sampling.referee.kinds import KINDS, ORDER
 
 BOUNDARY = re.compile(
-    r"\s*(?:[.;:!?,]|\b(?:and then|then|followed by|and|while|whilst|as|before|after|but|when|until)\b)\s*"
+    r"\s*(?:[.;:!?,|]|\b(?:and then|then|followed by|and|while|whilst|as|before|after|but|when|until)\b)\s*"
 )
-LATER = ("then", "followed by", "before")
+LATER = ("then", "followed by", "before", "|")
 SIDES = re.compile(r"\b(left|right)\b")
 LONGEST = 600  # characters of a sentence that are read
 COUNT_NOUNS = {

@@ -1,0 +1,99 @@
+# pyright: standard
+"""Accuracy of the claims of captions, judged by the referee."""
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from evaluators.metrics.samples import MotionMean, Rows, Timed
+from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.sampling.referee.claims import Claim
+from flame_mdm.sampling.referee.judging import SHORTEST, Verdict, verdicts
+from flame_mdm.sampling.referee.kinds import GROUPS
+from flame_mdm.sampling.referee.sentences import read_claims
+
+# Seconds of a motion that an audit keeps; all sets of motions have the same size
+KEPT_SECONDS = 10.0
+STEP = 0.0005  # meters per unit of the kept positions
+
+
+@lru_cache(maxsize=20_000)
+def claims_of(caption: str) -> tuple[Claim, ...]:
+    """Returns the claims of a caption, which is often the caption of many motions."""
+    return tuple(read_claims(caption))
+
+
+class ClaimAccuracy(Timed, MotionMean):
+    """Share of the decided claims of captions that are true of the motions (`flame_mdm.sampling.referee`).
+
+    The values are the shares by group of claims, such as "side" and "count", and over all claims. "decided" is the
+    share of all claims that are decided, "captions" the share of captions with at least one decided claim. Motions on
+    other skeletons than SMPL's 22 joints, and motions shorter than 0.4 seconds, are not judged.
+    """
+
+    higher_is_better = True
+    summary = "all"
+    names = (*GROUPS, "all", "decided", "captions")
+    directions = {"decided": None, "captions": None}  # noqa: RUF012
+
+    def update(self, joints: Tensor, mask: Tensor, captions: Sequence[str], keys: Tensor) -> None:
+        """Adds motions with joints (B, F, 22, 3) in meters, y up, mask (B, F), their captions and keys (B,)."""
+        motions = self.real_frames(joints, mask)
+        rows = [
+            self._shares(self.judged(motion.cpu().numpy(), caption))
+            for motion, caption in zip(motions, captions, strict=True)
+        ]
+        self.add(keys, rows)
+
+    def judged(self, joints: np.ndarray, caption: str) -> list[Verdict]:
+        """Returns the verdicts on the claims of a caption about joints (F, J, 3)."""
+        if joints.shape[1] != len(SMPL22) or len(joints) < (SHORTEST + 0.1) * self.fps:
+            return []
+        return verdicts(joints, self.fps, claims_of(caption))
+
+    @staticmethod
+    def _shares(judged: Sequence[Verdict]) -> dict[str, Tensor]:
+        """Returns 1 or 0 for each claim that counts, by the names of the values."""
+        decided = [verdict for verdict in judged if verdict.answer != "cannot tell"]
+        true = {
+            name: [verdict.answer == "yes" for verdict in decided if name in (verdict.group, "all")]
+            for name in (*GROUPS, "all")
+        }
+        flags = true | {
+            "decided": [verdict.answer != "cannot tell" for verdict in judged],
+            "captions": [bool(decided)],
+        }
+        return {name: torch.tensor(values, dtype=torch.float64) for name, values in flags.items()}
+
+    def readings(self, motions: Rows) -> dict[str, np.ndarray]:
+        """Returns the joints of each motion, since the captions say what to measure on them.
+
+        "positions" (N, F, 3 J) are int16 in units of `STEP` from the start on the floor, "frames" (N,) their lengths.
+        """
+        longest = round(KEPT_SECONDS * self.fps)
+        motions_of = motions["joints"]
+        frames = np.array([min(len(joints), longest) for joints in motions_of])
+        width = motions_of[0].shape[1] * 3
+        positions = np.zeros((len(frames), longest, width), np.int16)
+        for row, joints in enumerate(motions_of):
+            kept = joints[:longest].double().numpy()
+            kept = kept - kept[0, 0] * np.array([1.0, 0.0, 1.0])
+            units = np.clip(np.rint(kept / STEP), -32_767, 32_767)
+            positions[row, : len(kept)] = units.reshape(len(kept), width)
+        return {"positions": positions, "frames": frames}
+
+    def per_sample(self, rows: Rows) -> dict[str, Tensor]:
+        """Returns the number of true claims and of decided claims (N, 2) of each motion, by the names of the values."""
+        pairs: dict[str, list[list[float]]] = {name: [] for name in self.names}
+        for packed, frames, caption in zip(
+            rows["positions"], rows["frames"], rows["captions"], strict=True
+        ):
+            joints = packed[:frames].reshape(frames, -1, 3) * STEP
+            shares = self._shares(self.judged(joints, caption))
+            for name, flags in shares.items():
+                pairs[name].append([float(flags.sum()), len(flags)])
+        tensors = {name: torch.tensor(pair, dtype=torch.float64) for name, pair in pairs.items()}
+        return {name: pair for name, pair in tensors.items() if pair[:, 1].any()}

@@ -281,13 +281,13 @@ def test_the_command_samples_candidates_and_warns_of_a_text_without_claims(
     assert "'a person dances' has no claim that can be checked" in capsys.readouterr().out
 
 
-def test_pages_mark_the_evidence_and_the_demo_lists_the_verdicts(tmp_path, monkeypatch):
+def test_pages_mark_the_evidence_and_the_demo_lists_the_verdicts(tmp_path):
     motion = raising("left")
     motion.text = "a person raises the left hand"
     motion.save(tmp_path / "a" / "motion.npz")
     motion.save(tmp_path / "b" / "motion.npz")
     page = tmp_path / "page.html"
-    assert main(["compare", f"{tmp_path / 'a'} {tmp_path / 'b'}", f"out={page}"]) == 0
+    assert main(["compare", f"runs={tmp_path / 'a'} {tmp_path / 'b'}", f"out={page}"]) == 0
     assert "yes: raise hand: left" in unescape(page.read_text())
 
     from flame_mdm.demo.studio_page import _verdicts

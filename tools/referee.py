@@ -2,6 +2,8 @@
 
     python tools/referee.py data/bandai-humanml-clean-smpl22 data/cmu-humanml-clean-smpl22 ... [figures=FILE.json]
 
+docs/benchmarks/referee_calibration.json holds the figures of this repository, and `tools/referee_page.py` shows them.
+
 Takes prepared data sets on SMPL's 22 joints. Recordings are split in two halves by a hash of their names: thresholds
 come from one half, figures from the other. Procedural motions set no thresholds, their figures are separate.
 

@@ -27,11 +27,24 @@ def claims_of(caption: str) -> tuple[Claim, ...]:
 
 
 class ClaimAccuracy(Timed, MotionMean):
-    """Share of the decided claims of captions that are true of the motions (`flame_mdm.sampling.referee`).
+    """Share of the decided claims of captions that are true of the motions. A metric of this project.
 
-    The values are the shares by group of claims, such as "side" and "count", and over all claims. "decided" is the
-    share of all claims that are decided, "captions" the share of captions with at least one decided claim. Motions on
-    other skeletons than SMPL's 22 joints, and motions shorter than 0.4 seconds, are not judged.
+    The referee (`flame_mdm.sampling.referee`) reads the claims of a caption and measures each on the joints. The
+    values, in [0, 1], are the shares by group of claims, such as "side" and "count", and over "all" claims; higher is
+    better. "decided" is the share of all claims that are decided, "captions" the share of captions with at least one
+    decided claim. Motions on other skeletons than SMPL's 22 joints, and motions shorter than 0.5 seconds, are not
+    judged.
+
+    Args:
+        fps: frames per second of the motions.
+
+    Example:
+        >>> metric, joints = ClaimAccuracy(fps=20), torch.zeros(1, 40, 22, 3)
+        >>> joints[:, :, [1, 4, 7], 1] = torch.tensor([0.9, 0.5, 0.1])  # a leg
+        >>> mask, captions = torch.ones(1, 40, dtype=torch.bool), ["a person walks forward"]
+        >>> metric.update(joints, mask, captions, keys=torch.tensor([0]))
+        >>> metric.compute()["all"]  # it does not move
+        0.0
     """
 
     higher_is_better = True
@@ -40,7 +53,17 @@ class ClaimAccuracy(Timed, MotionMean):
     directions = {"decided": None, "captions": None}  # noqa: RUF012
 
     def update(self, joints: Tensor, mask: Tensor, captions: Sequence[str], keys: Tensor) -> None:
-        """Adds motions with joints (B, F, 22, 3) in meters, y up, mask (B, F), their captions and keys (B,)."""
+        """Adds B motions.
+
+        Args:
+            joints: (B, F, J, 3) positions in meters, y up.
+            mask: (B, F) bool, True = real frame.
+            captions: B captions.
+            keys: (B,) int64, unique keys of the motions.
+
+        Raises:
+            UserError: If a real frame is not finite.
+        """
         motions = self.real_frames(joints, mask)
         rows = [
             self._shares(self.judged(motion.cpu().numpy(), caption))

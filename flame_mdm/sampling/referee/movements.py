@@ -186,7 +186,7 @@ def flight(body: Body) -> np.ndarray:
 
 def jump(body: Body, claim: Claim) -> Reading:
     """Measures the height of the lower foot above the floor."""
-    return existence(flight(body), "m above the floor", "feet", 0.06, share=0.4)
+    return existence(flight(body), "m off the floor", "feet", 0.06, share=0.4)
 
 
 def count_jumps(body: Body, claim: Claim) -> Reading:

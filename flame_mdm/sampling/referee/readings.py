@@ -9,6 +9,9 @@ from flame_mdm.sampling.referee.body import RATE
 
 Spans = tuple[tuple[float, float], ...]
 
+# Units of distances, of which less speaks for a claim
+AWAY = ("m above the floor", "m apart", "m from")
+
 
 @dataclass(frozen=True)
 class Reading:
@@ -57,7 +60,9 @@ def existence(
     score = held(signal, seconds)
     low = float(np.percentile(signal, 20))
     bound = low + share * (score - low)
-    return Reading(score, score, unit, joint, spans_of(signal >= bound))
+    # a signal of a distance is negative: less speaks for the claim
+    number = -score if unit.startswith(AWAY) else score
+    return Reading(score, number, unit, joint, spans_of(signal >= bound))
 
 
 def of_side(readings: Sequence[Reading], side: str, margin: float) -> Reading:
@@ -69,7 +74,8 @@ def of_side(readings: Sequence[Reading], side: str, margin: float) -> Reading:
     left, right = readings
     if side == "both":
         lower = min(readings, key=lambda reading: reading.score)
-        return replace(lower, joint=f"both {lower.joint.partition(' ')[2]}s")
+        limb = lower.joint.partition(" ")[2]
+        return replace(lower, joint="both feet" if limb == "foot" else f"both {limb}s")
     if side == "":
         return max(readings, key=lambda reading: reading.score)
     chosen, other = (left, right) if side == "left" else (right, left)

@@ -1,0 +1,144 @@
+"""Compares systems by the referee and by R-precision: writes docs/benchmarks/referee_systems.json.
+
+    python tools/referee_table.py [data/bandai-humanml-clean-smpl22 ...]
+
+On clips of the synthetic test split: motions of the package's model, the real motions, their mirror images, and real
+motions with the captions of others. R-precision is `MotionsForText` with the package's motion-CLIP. Prepared data sets
+on SMPL's 22 joints are added without a model and without R-precision.
+"""
+
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.stats import spearmanr
+
+import flame_mdm
+from evaluators.extractors import MotionCLIPExtractor
+from evaluators.metrics.alignment import MotionsForText
+from evaluators.metrics.claims import ClaimAccuracy
+from flame_mdm.batch import length_mask
+from flame_mdm.config import EXPERIMENTS, instantiate
+from flame_mdm.data.store import Store
+from flame_mdm.data.synthetic import Synthetic
+from flame_mdm.representations.humanml import HumanML
+from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.safe_io import read_yaml, write_json
+from flame_mdm.seeds import key
+
+OUT = Path(__file__).resolve().parents[1] / "docs" / "benchmarks" / "referee_systems.json"
+FPS = 20.0
+COUNT = 128  # motions per row
+CLIPS = 1600  # synthetic clips, of which the test split is taken
+LONGEST = 3.0  # seconds of the longest motion of the package's model
+REAL, MIRRORED, SHUFFLED = "real motions", "mirrored real motions", "captions of other motions"
+
+Joints = Sequence[np.ndarray]
+
+
+def main(folders: Sequence[Path]) -> None:
+    ids, joints, captions = synthetic()
+    model = flame_mdm.load("quickstart")
+    seconds = [min(LONGEST, len(motion) / FPS) for motion in joints]
+    generated = flame_mdm.generate(model, captions, seconds=seconds, seed=0, split=False)
+    sets = {"quickstart": ([motion.joints for motion in generated], captions)}
+    sets |= baselines(joints, captions)
+
+    extractor = MotionCLIPExtractor("motion_clip_synthetic", "cpu")
+    rows = [
+        {"data": "synthetic", "system": name, **measured(ids, *motions, extractor)}
+        for name, motions in sets.items()
+    ]
+    for folder in folders:
+        ids, joints, captions = stored(folder)
+        name = folder.name.partition("-")[0]
+        rows += [
+            {"data": name, "system": system, **measured(ids, *motions, None)}
+            for system, motions in baselines(joints, captions).items()
+        ]
+    both = [row for row in rows if row["top3"] is not None]
+    pairs = [(row["claims"]["all"], row["top3"]) for row in both]
+    correlation = float(spearmanr(*zip(*pairs, strict=True)).statistic)
+    write_json(OUT, {"format": 1, "motions": COUNT, "rank_correlation": correlation, "rows": rows})
+    for row in rows:
+        print(row["data"], row["system"], row["claims"], row["top3"])
+    print("rank correlation", correlation)
+
+
+def synthetic() -> tuple[list[str], list[np.ndarray], list[str]]:
+    """Returns ids, joints (F, 22, 3) and captions of the test split of the synthetic set."""
+    clips = [clip for clip in Synthetic(clips=CLIPS, seed=0).clips(FPS) if clip.split == "test"]
+    clips = clips[:COUNT]
+    return (
+        [clip.id for clip in clips],
+        [np.asarray(clip.motion, np.float32) for clip in clips],
+        [clip.captions[0] for clip in clips],
+    )
+
+
+def stored(folder: Path) -> tuple[list[str], list[np.ndarray], list[str]]:
+    """Returns ids, joints and first captions of clips of the test split of a prepared data set."""
+    store = Store(folder)
+    representation = instantiate(read_yaml(EXPERIMENTS / "representation" / "humanml_clean.yaml"))
+    clips = [clip for clip in store.clips if clip.split == "test" and clip.id[0] != "M"]
+    clips = sorted(clips, key=lambda clip: key("referee table", clip.id))[:COUNT]
+    motions = [
+        representation.decode(torch.from_numpy(store.motion(clip).copy())).numpy() for clip in clips
+    ]
+    return [clip.id for clip in clips], motions, [clip.captions[0] for clip in clips]
+
+
+def baselines(joints: Joints, captions: list[str]) -> Mapping[str, tuple[Joints, list[str]]]:
+    """Returns real motions, mirrored motions, and real motions with captions of others, by name."""
+    mirrored = [SMPL22.mirror(torch.from_numpy(motion)).numpy() for motion in joints]
+    order = np.random.default_rng(0).permutation(len(captions))
+    shuffled = list(captions)
+    for one, other in zip(order, np.roll(order, 1), strict=True):
+        shuffled[one] = captions[other]
+    return {
+        REAL: (joints, captions),
+        MIRRORED: (mirrored, captions),
+        SHUFFLED: (joints, shuffled),
+    }
+
+
+def measured(
+    ids: Sequence[str],
+    motions: Joints,
+    captions: Sequence[str],
+    extractor: MotionCLIPExtractor | None,
+) -> dict[str, Any]:
+    """Returns the claim accuracy, by group, and the R-precision of motions; None without an extractor."""
+    keys = torch.tensor([key(name) for name in ids])
+    lengths = torch.tensor([len(motion) for motion in motions])
+    joints = torch.zeros(len(motions), int(lengths.max()), 22, 3)
+    for row, motion in enumerate(motions):
+        joints[row, : len(motion)] = torch.as_tensor(motion)
+    mask = length_mask(lengths, joints.shape[1])
+    claims = ClaimAccuracy(FPS)
+    claims.update(joints, mask, captions, keys)
+
+    top3 = None
+    if extractor is not None:
+        representation = HumanML(variant="clean")
+        features = [representation.encode(torch.as_tensor(motion).float()) for motion in motions]
+        padded = torch.zeros(len(features), joints.shape[1], features[0].shape[-1])
+        for row, motion in enumerate(features):
+            padded[row, : len(motion)] = motion
+        frames = torch.tensor([len(motion) for motion in features])
+        with torch.no_grad():
+            encoded = extractor.motions(padded, joints, length_mask(frames, padded.shape[1]))
+            text = extractor.texts(list(captions), [None] * len(captions))
+        metric = MotionsForText(normalize=True)
+        text_keys = torch.tensor([key(caption) for caption in captions])
+        assert text is not None
+        metric.update(generated=encoded["features"], text=text, text_keys=text_keys, keys=keys)
+        top3 = metric.compute()["top3"]
+    return {"motions": len(motions), "claims": claims.compute(), "top3": top3}
+
+
+if __name__ == "__main__":
+    main([Path(word) for word in sys.argv[1:]])

@@ -375,17 +375,62 @@ def test_the_page_samples_the_motions_of_the_package(
         assert theirs.names == ours.names
         assert np.abs(theirs.positions - ours.positions).max() < 1e-3
         assert "seed=2" in tab.run("location.hash")
-        tab.type("#text", "a person kicks backflipping")
-        tab.click("#generate")
-        assert "backflipping" in tab.wait("document.getElementById('notes').textContent")
-        assert tab.run("document.querySelectorAll('#notes button').length") == 3
-        tab.type("#text", "qwer asdf")
-        tab.click("#generate")
-        assert "knows no word" in tab.wait("document.querySelector('#notes.error')?.textContent")
         assert tab.errors == []
         assert [
             address for address in tab.requested if not address.startswith((url, "blob:", "data:"))
         ] == []
+
+
+CHIPS = "[...document.querySelectorAll('#understood select')].map((e) => e.selectedOptions[0].textContent)"
+NOTES = "document.getElementById('notes').innerText"
+
+
+def typed(tab: Tab, text: str) -> None:
+    """Types a text, presses Generate, and waits for the motion or the refusal."""
+    tab.run("delete document.body.dataset.made; document.getElementById('notes').className = ''")
+    tab.type("#text", text)
+    tab.click("#generate")
+    tab.wait(DONE, 120)
+
+
+@of_page
+def test_the_page_shows_what_was_understood(served: tuple[Path, str], tmp_path: Path) -> None:
+    with browser(tmp_path / "profile") as tab:
+        tab.open(f"{served[1]}#seconds=1")
+        made(tab)
+        typed(tab, "a persn kiks twice with teh left leg sparkly")
+        assert tab.run(CHIPS) == ["kicks", "any speed", "twice", "left"]
+        assert "'kiks' is read as 'kicks'" in tab.run(NOTES)
+        assert tab.run("document.querySelector('#understood del').textContent") == "sparkly"
+
+        tab.run("delete document.body.dataset.made")
+        choose = "e.selectedIndex = [...e.options].findIndex((o) => o.textContent === 'right')"
+        tab.run(
+            "((e) => { " + choose + "; e.dispatchEvent(new Event('change')) })"
+            "(document.querySelector('#understood select[aria-label=Side]'))"
+        )
+        assert made(tab)["text"] == "a person kicks twice with the right leg"
+        assert tab.run(CHIPS)[-1] == "right"
+
+        typed(tab, "a man walks backwards, then he waves")
+        assert [word for word in tab.run(CHIPS) if not word.startswith("any ")][:3] == [
+            "walks forward",
+            "backward",
+            "waves",
+        ]
+        assert "one action at a time" in tab.run(NOTES)
+
+        typed(tab, "a man qwerts")
+        assert "no word says what happens. Nearest in meaning:" in tab.run(NOTES)
+        assert tab.run("document.querySelectorAll('#notes button img').length") == 3
+        tab.run("delete document.body.dataset.made")
+        tab.click("#notes button")
+        assert made(tab)["text"].startswith("a person ")
+
+        typed(tab, "ein Mann geht nach links")
+        assert "in English only" in tab.run(NOTES)
+        assert tab.run(CHIPS) == []
+        assert tab.errors == []
 
 
 @of_page

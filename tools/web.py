@@ -14,6 +14,8 @@ import subprocess
 import sys
 import tarfile
 import tempfile
+from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -23,14 +25,33 @@ from scipy.spatial.transform import Rotation
 import flame_mdm
 from flame_mdm.checkpoints.onnx_export import export_onnx
 from flame_mdm.checkpoints.runner import SCHEMA
+from flame_mdm.conditions.language import (
+    abilities,
+    attributes,
+    clauses,
+    matching,
+    meaning,
+    morphology,
+    parsing,
+    reading,
+    spelling,
+    tables,
+    tokens,
+    vectors,
+    wording,
+)
+from flame_mdm.data.synthetic import example as synthetic_motion
+from flame_mdm.data.synthetic import prompts
+from flame_mdm.demo.chips import SHOWN
 from flame_mdm.errors import UserError, say
 from flame_mdm.formats.body import fit_body
 from flame_mdm.formats.motion import END_SITES, Motion
 from flame_mdm.formats.posture import TOES
 from flame_mdm.representations.skeleton import JOINT, SMPL22
-from flame_mdm.safe_io import write_json, write_text
+from flame_mdm.safe_io import read_npz, write_json, write_text
 from flame_mdm.visualize.body import HELPERS
 from flame_mdm.visualize.player import player_page
+from flame_mdm.visualize.render import thumbnail
 
 SOURCE = Path(__file__).with_suffix("")
 RUNTIME, INTEGRITY = (
@@ -45,14 +66,24 @@ POLICY = (
 
 
 def build(model: str, out: Path) -> None:
-    """Writes the page of a model with a learned text encoder and SMPL's 22 joints."""
+    """Writes the page of a model with a learned text encoder, captions of single actions and SMPL's 22 joints.
+
+    Raises:
+        UserError: If the model's captions do not name single actions, or onnxruntime-web cannot be fetched.
+    """
+    loaded = flame_mdm.load(model)
+    if not reading.Reader.fits(loaded.facts):
+        raise UserError(
+            f"{model}: its captions do not name single actions. Use a model like quickstart"
+        )
     export_onnx(model, out, half=True)
     (out / "runner.py").unlink()
     for path in SOURCE.iterdir():
         shutil.copy(path, out)
     write_text(out / "schema.js", f"export const SCHEMA = {json.dumps(SCHEMA)};\n")
     fetch_runtime(out / "ort")
-    loaded = flame_mdm.load(model)
+    write_language(out)
+    write_pictures(out, abilities.Abilities(loaded.facts).actions)
     example = flame_mdm.generate(loaded, loaded.facts["captions"][0])[0]
     for ending in ("glb", "fbx"):
         example.save(out / f"template.{ending}")
@@ -68,6 +99,72 @@ def build(model: str, out: Path) -> None:
     for name, content in (("player.css", style), ("player.js", code), ("player.html", page)):
         write_text(out / name, content)
     write_json(out / "figure.json", figure(example) | {"motion": json.loads(data)[0]}, indent=None)
+
+
+def write_language(out: Path) -> None:
+    """Writes `language.json` and `language.bin`: the tables by which the page understands texts.
+
+    `language.bin` has the vectors of the words, of 8 bits per number, followed by the words.
+    """
+    arrays = read_npz(vectors.FILE)
+    count, dimensions = arrays["vectors"].shape
+    content = {
+        "actions": [asdict(entry) for entry in tables.actions().values()],
+        "phrases": tables.phrases(),
+        "vectors": {"count": count, "dimensions": dimensions},
+        "constants": language_constants(),
+    }
+    listed = json.dumps(content, default=sorted, ensure_ascii=False)
+    write_text(out / "language.json", listed)
+    (out / "language.bin").write_bytes(arrays["vectors"].tobytes() + arrays["words"].tobytes())
+
+
+def language_constants() -> dict[str, Any]:
+    """Returns the constants of `flame_mdm.conditions.language` that the page needs besides its tables."""
+    return {
+        "vowels": morphology.VOWELS,
+        "never_corrected": spelling.NEVER_CORRECTED,
+        "frequent": spelling.FREQUENT,
+        "smoothing": vectors.SMOOTHING,
+        "similar": meaning.SIMILAR,
+        "neighbors": meaning.NEIGHBORS,
+        "rare": tokens.RARE,
+        "nearest": parsing.NEAREST,
+        "longest_gap": matching.LONGEST_GAP,
+        "weak_phrases": [" ".join(words) for words in matching.WEAK_PHRASES],
+        "connectors": [
+            {"words": words, "link": link} for words, link in clauses.CONNECTORS.items()
+        ],
+        "at_the_end": sorted(word for (word,) in clauses.AT_THE_END),
+        "need_subject": clauses.NEED_SUBJECT,
+        "need_clause": clauses.NEED_CLAUSE,
+        "measures": attributes.MEASURES,
+        "who": wording.WHO,
+        "directions": wording.DIRECTIONS,
+        "speeds": wording.SPEEDS,
+        "times": wording.TIMES,
+        "plurals": wording.PLURALS,
+        "choices": abilities.CHOICES,
+        "words_of_values": abilities.WORDS_OF_VALUES,
+        "attributes": reading.ATTRIBUTES,
+        "longest_count": reading.LONGEST_COUNT,
+        "shown": SHOWN,
+    }
+
+
+def write_pictures(out: Path, actions: Sequence[str]) -> None:
+    """Writes a picture of each action that the synthetic set has, and their names to `pictures.json`."""
+    (out / "pictures").mkdir(exist_ok=True)
+    pictures = {}
+    for number, action in enumerate(actions):
+        names = tables.actions()[action].names
+        drawn = (stated for _, stated in prompts() if stated["action"] in names)
+        if (stated := next(drawn, None)) is None:
+            continue
+        pictures[action] = f"pictures/{number}.webp"
+        motion = Motion(synthetic_motion(stated), 20.0)
+        (out / pictures[action]).write_bytes(thumbnail(motion))
+    write_json(out / "pictures.json", pictures)
 
 
 def figure(example: Motion) -> dict[str, Any]:

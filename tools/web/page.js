@@ -1,33 +1,56 @@
 // The page: form, player, downloads, and a link that holds the request.
-import { Sampler, json, knownForm, words } from "./sampling.js";
+import { Sampler, json, words } from "./sampling.js";
+import { NotUnderstood } from "./language_reading.js";
+import { chips, openLanguage } from "./language.js";
 import { bvh, glb, shown } from "./figure.js";
 import { fbx } from "./fbx.js";
 
 const element = (id) => document.getElementById(id), fields = ["text", "seconds", "seed"].map(element);
-let sampler, figure, player, motion;
+let sampler, figure, player, motion, language;
 
 function say(text, kind = "") {
   element("notes").textContent = text;
   element("notes").className = kind;
 }
 
-function advise(text) { // unknown words and the nearest captions; returns whether the model knows a word that says what happens
-  const { vocabulary, captions, function_words: skipped } = sampler.content, prompt = new Set(words(text)), seen = new Set(vocabulary);
-  const content = [...prompt].filter((word) => !skipped.includes(word)), unknown = content.filter((word) => !knownForm(word, seen));
-  const refused = unknown.length === content.length;
-  say(refused ? "The model knows no word that says what happens. Try:" : unknown.length ? `Never seen in training: ${unknown.join(", ")}. Did you mean:` : "", refused ? "error" : "");
-  if (!refused && !unknown.length) return true;
-  const likeness = (caption) => {
-    const others = new Set(words(caption)), shared = (list) => list.filter((word) => others.has(word)).length, all = shared([...prompt]);
-    return shared(content) && shared(content) + all / (prompt.size + others.size - all);
-  };
-  const ranked = captions.map((caption) => [likeness(caption), caption]).sort((a, b) => b[0] - a[0]);
-  for (const [, caption] of ranked.filter(([like]) => like || refused).slice(0, 3)) {
-    const button = Object.assign(document.createElement("button"), { textContent: caption, type: "button" });
-    button.addEventListener("click", () => { element("text").value = caption; generate(); });
-    element("notes").append(button);
+/** Returns a button that puts a text into the form and samples it. */
+function suggestion(text) {
+  const button = document.createElement("button");
+  button.type = "button";
+  button.textContent = text;
+  button.addEventListener("click", () => ask(text));
+  const picture = language.picture(text);
+  if (picture) button.prepend(Object.assign(document.createElement("img"), { src: picture, alt: "" }));
+  return button;
+}
+
+function ask(text) {
+  element("text").value = text;
+  generate();
+}
+
+/** Returns what the model reads for a text, and shows it as chips and lines; throws `NotUnderstood`. */
+function understood(text) {
+  element("understood").replaceChildren();
+  say("");
+  const reading = language.reader.read(text);
+  element("understood").replaceChildren(...chips(language.reader.abilities, reading, ask));
+  const lines = [...reading.changes];
+  if (reading.captions.length > 1) {
+    lines.push(`This page samples one action at a time, here the first: ${reading.captions[0]}. The demo samples all.`);
   }
-  return !refused;
+  element("notes").replaceChildren(...lines.map((line) => Object.assign(document.createElement("p"), { textContent: line })));
+  return reading;
+}
+
+/** Shows why a text is refused, and the actions with the nearest meanings. */
+function refuse(error) {
+  const { message, nearest } = error;
+  say(nearest.length ? `${message}. Nearest in meaning:` : message, "error");
+  if (!nearest.length) return;
+  const buttons = Object.assign(document.createElement("div"), { className: "nearest" });
+  buttons.append(...nearest.map(suggestion));
+  element("notes").append(buttons);
 }
 
 async function generate() {
@@ -35,12 +58,15 @@ async function generate() {
   if (!/^-?\d{1,18}$/.test(seed)) return say(`seed=${seed}: give a whole number`, "error");
   element("generate").disabled = true;
   try {
-    if (!advise(text)) return;
+    const reading = understood(text);
+    // A single action has the noise that `flame_mdm.generate` draws for the text as typed.
+    const isOne = reading.captions.length === 1;
+    const [shownText, read] = isOne ? [text, reading.captions[0]] : [reading.texts[0], reading.captions[0]];
     const begin = performance.now();
-    const x = await sampler.generate(text, seconds, BigInt(seed).toString(), (share) => { element("progress").value = share; });
+    const x = await sampler.generate(read, seconds, BigInt(seed).toString(), (share) => { element("progress").value = share; }, shownText);
     const joints = await sampler.decode(x), frames = x.length / sampler.content.features;
     const milliseconds = performance.now() - begin;
-    motion = { text, seed, frames, joints, milliseconds, ...(await sampler.rotations(joints)) };
+    motion = { text: shownText, seed, frames, joints, milliseconds, ...(await sampler.rotations(joints)) };
     const data = JSON.stringify([shown(figure, motion)]).replaceAll("<", "\\u003c");
     element("player").srcdoc = player.replace("__DATA__", () => data);
     const query = new URLSearchParams({ text, seconds, seed });
@@ -49,7 +75,8 @@ async function generate() {
     for (const kind of ["bvh", "glb", "fbx"]) element(kind).disabled = false;
     document.body.dataset.made = JSON.stringify({ text, seed, milliseconds });
   } catch (error) {
-    say(error.message.split("\n")[0], "error");
+    if (error instanceof NotUnderstood) refuse(error);
+    else say(error.message.split("\n")[0], "error");
   } finally {
     element("generate").disabled = false;
     element("progress").value = 0;
@@ -68,6 +95,7 @@ async function open() {
     let page;
     [sampler, figure, page] = await Promise.all([Sampler.open(), json("figure.json"), fetch("player.html")]);
     player = await page.text();
+    language = await openLanguage(sampler.content);
     const { fps, max_frames: longest, captions } = sampler.content, request = new URLSearchParams(location.hash.slice(1));
     Object.assign(element("seconds"), { min: 2 / fps, max: longest / fps, value: Math.min(3, longest / fps) });
     element("text").value = captions.find((caption) => caption.startsWith("a person")) ?? captions[0] ?? "";

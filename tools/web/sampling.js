@@ -74,7 +74,7 @@ export function normal(key, draw, frames, features) { // key: 64 bits; standard 
 }
 
 // ---- the model ----
-async function download(name) {
+export async function download(name) {
   const answer = await fetch(name);
   if (!answer.ok) throw new Error(`${name}: ${answer.status} ${answer.statusText}`);
   return answer.arrayBuffer();
@@ -101,10 +101,11 @@ export class Sampler {
     try { return await ort.InferenceSession.create(bytes); } catch { throw new Error(`${name} is damaged`); }
   }
 
-  async generate(text, seconds, seed, progress = () => {}) { // normalized features (frames * D)
+  // Normalized features (frames * D). The model reads the text; its noise depends on the name.
+  async generate(text, seconds, seed, progress = () => {}, name = text) {
     const frames = frameCount(seconds, this.content);
     const { features, steps, clip_x0: clip, padded_frames: least, buckets, max_words: most } = this.content;
-    const bytes = await digest(new TextEncoder().encode(["noise", seed, 0, `${text}#0`].join("\x1f")));
+    const bytes = await digest(new TextEncoder().encode(["noise", seed, 0, `${name}#0`].join("\x1f")));
     const key = bytes.slice(0, 8).reduce((sum, byte) => sum << 8n | BigInt(byte), 0n) >> 1n;
     const seen = new Set(this.content.vocabulary);
     const read = seen.size ? words(text).map((word) => knownForm(word, seen)).filter(Boolean) : words(text);

@@ -9,6 +9,8 @@ from flame_mdm.conditions.language.tokens import Token
 
 # Maximum number of words for a gap in a phrase
 LONGEST_GAP = 4
+WEAK_PHRASES = (("stand", "still"), ("take", "step"), ("stand", "around"), ("stand", "there"))
+"""Phrases of several words that are no actions if the sentence has another one."""
 
 
 @dataclass(frozen=True)
@@ -98,11 +100,6 @@ def _is_negated(tokens: Sequence[Token], number: int) -> bool:
 def _is_weak(tokens: Sequence[Token], used: Sequence[int], phrase: Phrase) -> bool:
     """Returns whether a phrase is a general verb, such as "go", or a noun after an article, such as "the guard"."""
     if phrase.size > 1:
-        return phrase.words in {
-            ("stand", "still"),
-            ("take", "step"),
-            ("stand", "around"),
-            ("stand", "there"),
-        }
+        return phrase.words in WEAK_PHRASES
     before = tokens[used[0] - 1].word if used[0] else ""
     return phrase.words[0] in words_of("weak") or before in words_of("determiners")

@@ -5,10 +5,13 @@ import { actions, constant, useTables } from "./language_words.js";
 import { mentionsOf, understand } from "./language_sentences.js";
 import { Reader, attributeWords, caption, predicate } from "./language_reading.js";
 
+/** Returns the tables of the language, the vectors of its words, and the names of the pictures. */
+export function languageFiles() {
+  return Promise.all([json("language.json"), download("language.bin"), json("pictures.json")]);
+}
+
 /** Returns the reader of a model, and a function that returns the picture of the action in a caption. */
-export async function openLanguage(model) {
-  const files = [json("language.json"), download("language.bin"), json("pictures.json")];
-  const [tables, bytes, pictures] = await Promise.all(files);
+export function openLanguage(model, [tables, bytes, pictures]) {
   useTables(tables, bytes);
   const picture = (text) => {
     const [mention] = mentionsOf(understand(text));

@@ -1,7 +1,7 @@
 // The page: form, player, downloads, and a link that holds the request.
 import { Sampler, json, words } from "./sampling.js";
 import { NotUnderstood } from "./language_reading.js";
-import { chips, openLanguage } from "./language.js";
+import { chips, languageFiles, openLanguage } from "./language.js";
 import { bvh, glb, shown } from "./figure.js";
 import { fbx } from "./fbx.js";
 
@@ -39,7 +39,8 @@ function understood(text) {
   if (reading.captions.length > 1) {
     lines.push(`This page samples one action at a time, here the first: ${reading.captions[0]}. The demo samples all.`);
   }
-  element("notes").replaceChildren(...lines.map((line) => Object.assign(document.createElement("p"), { textContent: line })));
+  const paragraphs = lines.map((line) => Object.assign(document.createElement("p"), { textContent: line }));
+  element("notes").replaceChildren(...paragraphs);
   return reading;
 }
 
@@ -57,11 +58,12 @@ async function generate() {
   const [text, seconds, seed] = [element("text").value.trim(), element("seconds").valueAsNumber, element("seed").value.trim()];
   if (!/^-?\d{1,18}$/.test(seed)) return say(`seed=${seed}: give a whole number`, "error");
   element("generate").disabled = true;
+  element("understood").inert = true;
   try {
     const reading = understood(text);
     // A single action has the noise that `flame_mdm.generate` draws for the text as typed.
-    const isOne = reading.captions.length === 1;
-    const [shownText, read] = isOne ? [text, reading.captions[0]] : [reading.texts[0], reading.captions[0]];
+    const shownText = reading.captions.length === 1 ? text : reading.texts[0];
+    const [read] = reading.captions;
     const begin = performance.now();
     const x = await sampler.generate(read, seconds, BigInt(seed).toString(), (share) => { element("progress").value = share; }, shownText);
     const joints = await sampler.decode(x), frames = x.length / sampler.content.features;
@@ -79,6 +81,7 @@ async function generate() {
     else say(error.message.split("\n")[0], "error");
   } finally {
     element("generate").disabled = false;
+    element("understood").inert = false;
     element("progress").value = 0;
   }
 }
@@ -92,10 +95,10 @@ function save(blob, ending) {
 
 async function open() {
   try {
-    let page;
-    [sampler, figure, page] = await Promise.all([Sampler.open(), json("figure.json"), fetch("player.html")]);
+    let page, files;
+    [sampler, figure, page, files] = await Promise.all([Sampler.open(), json("figure.json"), fetch("player.html"), languageFiles()]);
     player = await page.text();
-    language = await openLanguage(sampler.content);
+    language = openLanguage(sampler.content, files);
     const { fps, max_frames: longest, captions } = sampler.content, request = new URLSearchParams(location.hash.slice(1));
     Object.assign(element("seconds"), { min: 2 / fps, max: longest / fps, value: Math.min(3, longest / fps) });
     element("text").value = captions.find((caption) => caption.startsWith("a person")) ?? captions[0] ?? "";

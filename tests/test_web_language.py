@@ -25,6 +25,7 @@ ODD = [
     "",
     "!!!",
     "kicks ４ times",
+    "kicks ² times",
     "kicks x 3, then faster",
     "jumps 13 times",
     "constructor walks __proto__ toString",

@@ -150,10 +150,10 @@ class Reader:
             if not self._is_connector(position):
                 self._state("count", tables["times"][word], number)
             return
-        if word == "x" and self._word(position + 1).isdigit():
+        if word == "x" and self._word(position + 1).isdecimal():
             self._state("count", int(self._word(position + 1)), number, self.numbers[position + 1])
             return
-        count = int(word) if word.isdigit() and len(word) < 4 else tables["numbers"].get(word)
+        count = int(word) if word.isdecimal() and len(word) < 4 else tables["numbers"].get(word)
         if word in ("a", "an", "the") or (word == "couple" and self._word(position + 1) == "of"):
             count = 2 if word == "couple" else None
         if count is None:

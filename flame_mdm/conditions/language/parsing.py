@@ -51,7 +51,12 @@ def understand(text: str) -> Understanding:
 
 def is_explained(word: str) -> bool:
     """Returns whether a word is in a table of words that are no actions."""
-    if word.isdigit() or word in phrases()["numbers"] or word in phrases()["times"] or word == "x":
+    if (
+        word.isdecimal()
+        or word in phrases()["numbers"]
+        or word in phrases()["times"]
+        or word == "x"
+    ):
         return True
     if word in word_values("direction") or word in word_values("speed"):
         return True

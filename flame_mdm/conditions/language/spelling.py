@@ -58,7 +58,7 @@ def corrections(word: str) -> tuple[str, ...]:
     A word of up to four letters may have one wrong letter, a longer word two. Numbers are not
     corrected.
     """
-    if len(word) <= NEVER_CORRECTED or any(char.isdigit() for char in word):
+    if len(word) <= NEVER_CORRECTED or any(char.isdecimal() for char in word):
         return ()
     most = 1 if len(word) <= 4 else 2
     near: dict[int, list[str]] = {}

@@ -55,7 +55,7 @@ def tokenize(text: str) -> list[Token]:
 
 def is_known(word: str) -> bool:
     """Returns whether a word is English: in the tables or among the frequent words, in any form."""
-    if word.isdigit() or word in _listed():
+    if word.isdecimal() or word in _listed():
         return True
     # not a form of a short word, most of which are names: "tims"
     return any(form == word or len(form) > 3 for form in base_forms(word) if word_table().has(form))

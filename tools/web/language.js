@@ -47,7 +47,7 @@ export function chips(abilities, { steps, ignored }, choose) {
 /** Returns the chips of an action; `changed` returns the text with another action. */
 function selects(abilities, mention, changed, choose) {
   const names = [mention.action, ...abilities.actions.filter((name) => name !== mention.action)];
-  const others = names.map((name) => [changed(withAction(mention, name)), predicate({ action: name })]);
+  const others = names.map((name) => [changed(withAction(mention, name)), actionLabel(name)]);
   const listed = [select("Action", others, 0, choose)];
   for (const [name, values] of abilities.choices(mention.action)) {
     const options = [[changed(withValue(mention, name, undefined)), `any ${name}`]];
@@ -58,6 +58,13 @@ function selects(abilities, mention, changed, choose) {
     listed.push(select(label, options, 1 + values.indexOf(mention.attributes[name]), choose));
   }
   return listed;
+}
+
+/** Returns the words for an action without the usual direction, which a chip beside it may contradict. */
+function actionLabel(action) {
+  const words = predicate({ action });
+  const usual = ` ${actions().get(action).usual}`;
+  return words.endsWith(usual) ? words.slice(0, -usual.length) : words;
 }
 
 function select(label, options, chosen, choose) {

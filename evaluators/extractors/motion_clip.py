@@ -115,6 +115,8 @@ def info_nce(
     with all pairs.
 
     Args:
+        motion: (B, E) features of the motions of this process.
+        text: (B, E) features of their texts.
         logit_scale: (), logarithm of the inverse temperature.
         meaning: (B, M) int64. Pairs that are equal in one of the M numbers are not negatives of
             each other.

@@ -32,7 +32,20 @@ REACH = 0.999
 
 
 def cleaned(motion: Motion, contacts: np.ndarray | None = None) -> Motion:
-    """Returns the motion with joints from `cleanup`, without features, rotations and contacts, which no longer fit."""
+    """Returns a motion with smooth joints, constant bone lengths and feet that do not slide.
+
+    `cleanup` says how the joints are changed. The result has no features, rotations and contacts,
+    since they would no longer fit.
+
+    Args:
+        motion: the motion.
+        contacts: (F, N) probabilities that each of `skeleton.feet` stands on the floor; None = estimated.
+
+    Example:
+        >>> motion = Motion(joints=np.zeros((3, 22, 3)), fps=20)
+        >>> cleaned(motion).cleanup
+        True
+    """
     joints = cleanup(motion.joints, motion.fps, motion.skeleton, contacts)
     none = np.zeros((0, 0), np.float32)
     return replace(

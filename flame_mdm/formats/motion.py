@@ -72,7 +72,12 @@ class Motion(PosedFigure):
         bones: rotations from the bones of the file that was read, for features that contain rotations. They show how a
             forearm turns about its own axis. Files and pictures are made from `poses` or joint positions.
 
-    Raises `UserError` if a shape is wrong, a joint is not finite, or the frame rate is not a positive number.
+    Raises:
+        UserError: If a shape is wrong, a joint is not finite, or the frame rate is not a positive number.
+
+    Example:
+        >>> Motion(joints=np.zeros((40, 22, 3)), fps=20, text="a person stands")
+        Motion('a person stands', 40 frames, 20 fps, smpl22)
     """
 
     features: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), np.float32))

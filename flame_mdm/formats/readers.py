@@ -118,12 +118,23 @@ def read(
         fps: frames per second, overrides the rate in the file; .npy and .amc files have none.
         unit: meters per unit of length in the file, not for files with SMPL's rotations, such as AMASS.
         up: the axis of the file that points up: y, z or -y.
-        resample_to: target frame rate, None = the rate of the file. Rotations are interpolated on the
+        resample_to: target frame rate; None = the rate of the file. Rotations are interpolated on the
             sphere, joints and translations with cubic splines.
         animation: name or number, from 1, of an animation in an FBX or GLB file; None = the first one.
 
-    Returns the motion; its `notes` say what was left out or looks wrong. Raises `FileNotFoundError`, or `UserError` if
-    the file is damaged, of another kind, without rate, not of a person's size, or if a key has no effect on it.
+    Returns:
+        The motion; its `notes` say what was left out or looks wrong.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        UserError: If the file is damaged, of another kind, without rate, not of a person's size,
+            or if an argument has no effect on it.
+
+    Example:
+        >>> walk = read("walk.bvh", resample_to=20)
+        Traceback (most recent call last):
+        ...
+        FileNotFoundError: walk.bvh...
     """
     return read_recording(path, resample_to, fps=fps, unit=unit, up=up, animation=animation).motion
 

@@ -55,7 +55,15 @@ ARRIVAL = 0.2  # seconds before the end of a motion at which the last way point 
 
 @dataclass(frozen=True, kw_only=True)
 class EditRequest:
-    """Which part of a motion to resample, and how; raises `UserError` if a value is invalid for every motion."""
+    """Which part of a motion to resample, and how: keywords of `flame_mdm.edit`.
+
+    Raises:
+        UserError: If a value is invalid for every motion.
+
+    Example:
+        >>> EditRequest(region_seconds=[[0, 1], [3, 4]], joints="left_arm").ranges
+        [(0, 1), (3, 4)]
+    """
 
     region: str | Ranges | None = option(
         None,
@@ -142,14 +150,21 @@ class EditRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class SamplingRequest:
-    """Motions to sample, for texts or actions; unconditioned if neither is given.
+    """Motions to sample, for texts or actions: keywords of `flame_mdm.generate`; unconditioned without both.
 
-    A text or action may have several parts, "walks forward @3 | turns left | sits down @2", with their seconds. They
-    are generated together as one motion, in windows that overlap; see docs/sequences.md. So is a single part with
-    seconds, "walks forward @10", which may be longer than the motions in training.
+    A text or action may have several parts, "walks forward @3 | turns left | sits down @2", with
+    their seconds. They are generated together as one motion, in windows that overlap; see
+    docs/sequences.md. So is a single part with seconds, "walks forward @10", which may be longer
+    than the motions in training.
 
-    Raises `UserError` if a value is invalid for every model, or two values contradict each other.
     `flame_mdm.sampling.resolution.resolve` adds what depends on a model.
+
+    Raises:
+        UserError: If a value is invalid for every model, or two values contradict each other.
+
+    Example:
+        >>> SamplingRequest(texts="walks forward @3 | turns left | sits down @2").parts
+        [[('walks forward', 3.0), ('turns left', None), ('sits down', 2.0)]]
     """
 
     texts: str | Sequence[str] | None = option(
@@ -199,8 +214,8 @@ class SamplingRequest:
     ) -> SamplingRequest:
         """Returns the request of the keywords of a function, `generate` or `edit`.
 
-        Raises `UserError` if a keyword is no field of this class, of `SamplerOptions` or, with `editing`, of
-        `EditRequest`.
+        Raises `UserError` if a keyword is no field of this class, of `SamplerOptions` or, with
+        `editing`, of `EditRequest`.
         """
         request_names = _names(cls) - {"options", "editing"}
         option_names = _names(SamplerOptions)

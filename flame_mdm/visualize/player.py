@@ -29,7 +29,17 @@ from flame_mdm.visualize.body import (
 def write_player(
     path: str | Path, motions: Sequence[Figure], title: str = "Motions", **options: Any
 ) -> None:
-    """Writes the page of `player_page`, with its options, to a file."""
+    """Writes an HTML page that plays motions in any browser, without a network.
+
+    Args:
+        path: the .html file.
+        motions: the motions to play.
+        title: title of the page.
+        options: further options of `player_page`.
+
+    Example:
+        >>> write_player("walk.html", [motion], title="A walk")  # doctest: +SKIP
+    """
     write_text(target(path, motions), player_page(motions, title, **options))
 
 

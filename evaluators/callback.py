@@ -31,7 +31,7 @@ class Evaluate(Callback):
     Args:
         protocol: a name in experiments/evaluation, or the path of a file.
         extractor: file, folder, model in the package or run directory from which the protocol's
-            extractor is loaded, as for `flame-mdm evaluate`; None = the protocol's own; "none"
+            extractor is loaded, like the key of `flame-mdm evaluate`; None = the protocol's own; "none"
             skips metrics of features.
         samples: motions per replication; None = the protocol's number.
 

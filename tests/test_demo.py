@@ -359,6 +359,7 @@ def test_a_sentence_becomes_parts_and_a_suggestion_a_button(server):
         '<option value="a person walks | a person waves with the right hand">right</option>'
         in notes
     )
+    assert ">walks</option>" in notes, "the chip beside it says the direction"
     _, notes, *_, text = generated(server, request.model_copy(update={"split": False}).query())
     assert text == request.text
     refused = generated(server, query_of("text=asdf+qwer"))[1]

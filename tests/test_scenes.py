@@ -43,6 +43,22 @@ def test_a_motion_comes_back_from_each_kind_of_file_and_rig(
     assert np.abs(again.joints - motion.posed().joints().numpy()).max() < 0.1 * MILLIMETER
 
 
+@pytest.mark.parametrize("root_motion", [False, True])
+@pytest.mark.parametrize("rig", ["unreal", "soma"])
+def test_a_root_is_on_the_floor_and_the_person_on_its_soles(
+    rig: str, root_motion: bool, tmp_path: Path
+):
+    motion = synthetic("walk")
+    motion.save(tmp_path / "walk.glb", rig=rig, root_motion=root_motion)
+    nodes = glb_animation.read(tmp_path / "walk.glb")
+    heights = dict(zip(nodes.names, nodes.positions[..., 1].T, strict=True))
+    hips = heights["pelvis" if rig == "unreal" else "Hips"]
+    assert np.abs(heights["root" if rig == "unreal" else "Root"]).max() < 0.01 * MILLIMETER
+    lift = hips - motion.joints[: len(hips), 0, 1]
+    assert lift.min() > 0.02
+    assert np.ptp(lift) < 0.01 * MILLIMETER
+
+
 def test_splines_of_a_glb_file_have_a_slope_before_and_another_one_after_each_key(tmp_path: Path):
     """A node goes along x as t^3 in the first second, and as 1 - 4 u + u^3 in the following half second u."""
     binary = glb.Binary()

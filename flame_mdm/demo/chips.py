@@ -58,7 +58,7 @@ def _step(
             )
 
         others = [mention.action, *(name for name in abilities.actions if name != mention.action)]
-        named = [(_with_action(mention, name), predicate(Mention(name))) for name in others]
+        named = [(_with_action(mention, name), _action_label(name)) for name in others]
         selects = [_select("Action", [(text(changed), label) for changed, label in named], 0)]
         for name, values in abilities.choices(mention.action).items():
             stated = mention.attributes.get(name)
@@ -70,6 +70,11 @@ def _step(
             chosen = 0 if stated not in values else 1 + values.index(stated)
             selects.append(_select(name.capitalize(), options, chosen))
         yield " ".join(selects)
+
+
+def _action_label(action: str) -> str:
+    """Returns the words for an action without its usual direction, which a chip beside it may contradict."""
+    return predicate(Mention(action)).removesuffix(f" {actions()[action].usual}")
 
 
 def _select(label: str, options: Sequence[tuple[str, str]], chosen: int) -> str:

@@ -14,15 +14,20 @@ VERTICES, INDICES = 34962, 34963  # uses of a buffer view in glTF
 def write(path: Path, clip: RiggedClip, text: str) -> None:
     """Writes a clip with one node per joint, and the skin of a person if it has one; `text` is stored in the file.
 
-    The node above the joints lifts the person by the thickness of the soles.
+    The person stands on its soles: the node `lifted` above the joints is as high as the soles are thick.
+    In a rig with a root on the floor, the hips are lifted instead, so that the root stays there.
     """
+    offsets, moves, lift = clip.offsets, clip.moves, clip.lift
+    if clip.root >= 0:
+        offsets, moves = clip.on_soles()
+        lift = 0.0
     binary = Binary()
     turns = quaternions(np.concatenate([clip.rest[None], clip.turns]))
     curves = [("rotation", node, turns[1:, node]) for node in range(len(clip.joints))]
-    curves += [("translation", node, moved.astype("f4")) for node, moved in clip.moves.items()]
+    curves += [("translation", node, moved.astype("f4")) for node, moved in moves.items()]
     nodes: list[dict[str, Any]] = [
         {"name": name, "translation": offset.tolist(), "rotation": turn.tolist()}
-        for name, offset, turn in zip(clip.joints, clip.offsets, turns[0], strict=True)
+        for name, offset, turn in zip(clip.joints, offsets, turns[0], strict=True)
     ]
     for joint, parent in enumerate(clip.parents):
         if parent >= 0:
@@ -36,7 +41,7 @@ def write(path: Path, clip: RiggedClip, text: str) -> None:
     for skin in clip.skins:
         nodes.append({"name": "figure", "mesh": 0, "skin": 0})
         figure = _skin(binary, skin)
-    nodes.append({"name": "lifted", "children": [0], "translation": [0, clip.lift, 0]})
+    nodes.append({"name": "lifted", "children": [0], "translation": [0, lift, 0]})
     document = {
         "asset": {
             "version": "2.0",

@@ -167,3 +167,15 @@ def test_a_file_is_not_converted_into_itself_under_any_name(
     before = Path("a.bvh").read_bytes()
     assert "the same file as the input" in error_of(capsys, "convert", "a.bvh", name)
     assert Path("a.bvh").read_bytes() == before
+
+
+@pytest.mark.parametrize("ending", ["bvh", "glb"])
+def test_a_joint_far_from_constant_bone_lengths_is_named_with_its_frame(ending, tmp_path: Path):
+    motion = synthetic("walk")
+    line = motion.save(tmp_path / f"walk.{ending}")
+    assert "max 0" in line
+    assert "in frame" not in line
+
+    motion.joints[7, 21, 1] += 0.05
+    line = motion.save(tmp_path / f"walk.{ending}")
+    assert "right_wrist in frame 7, where a bone changes its length" in line

@@ -315,9 +315,8 @@ def _write_bvh(motion: Motion, path: Path, rest_pose: bool, rig: str | None) -> 
     )
     bvh.write(file, path)
     unit = "centimeters" if skeleton.unit == CENTIMETER else f"unit {skeleton.unit:.4g} m"
-    return (
-        f"{unit}, y up; {_error(motion, poses)}" + "; the first frame is the rest pose" * rest_pose
-    )
+    line = f"{unit}, y up; {_error(motion, poses)}"
+    return f"{line}; the first frame is the rest pose" if rest_pose else line
 
 
 def _write_rigged(
@@ -336,7 +335,8 @@ def _write_rigged(
     else:
         usd.write(path, clip)
     unit = "centimeters" if ending == ".fbx" else "meters"
-    return f"{unit}, y up; {_error(motion, poses)}" + (reason and f"; without a body: {reason}")
+    line = f"{unit}, y up; {_error(motion, poses)}"
+    return f"{line}; without a body: {reason}" if reason else line
 
 
 def _write_character(motion: Motion, path: Path, character: Character | BvhCharacter) -> str:
@@ -388,8 +388,16 @@ def _write_video(motion: Motion, path: Path, body: Mesh | None) -> str:
     return summary + (reason and f"; without a body: {reason}")
 
 
+# Millimeters; above it, the line about a file names the joint
+LARGE_ERROR = 10
+
+
 def _error(motion: Motion, poses: Poses) -> str:
     """Describes how far joints with constant bone lengths are from the joints of the motion."""
     off = np.linalg.norm(poses.joints().numpy() - motion.joints[:, : len(SMPL22)], axis=-1)
     mean, most = 1000 * off.mean(), 1000 * off.max()
-    return f"constant bone lengths; mean joint error {mean:.2g} mm, max {most:.2g} mm"
+    line = f"constant bone lengths; mean joint error {mean:.2g} mm, max {most:.2g} mm"
+    if most < LARGE_ERROR:
+        return line
+    frame, joint = np.unravel_index(off.argmax(), off.shape)
+    return f"{line}: {SMPL22.joints[joint]} in frame {frame}, where a bone changes its length"

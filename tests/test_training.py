@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -27,6 +28,7 @@ from flame_mdm.runs import read_history
 from flame_mdm.sampling.editing import edit
 from flame_mdm.sampling.generation import generate
 from flame_mdm.task import GeneratorTask
+from flame_mdm.training.callbacks import SampleMotions
 
 STEPS = [
     "trainer.val_check_interval=4",
@@ -327,3 +329,22 @@ def test_stages_are_the_clean_estimates_up_to_the_motion(trained):
     # The last step is the mean of the posterior, which is the estimate itself.
     np.testing.assert_allclose(stages[3].joints, motion.joints, atol=1e-5)
     assert np.abs(stages[0].joints - motion.joints).max() > 1e-3
+
+
+@pytest.mark.parametrize("collapsed", [False, True])
+def test_samples_that_do_not_depend_on_the_input_are_reported(
+    trained, tmp_path, capsys, collapsed: bool
+):
+    task = object.__new__(GeneratorTask)
+    model = load(trained)
+    task.__dict__["generator"] = model
+    if collapsed:
+        torch.nn.init.zeros_(cast(Any, model.denoiser).output.weight)
+    prompts = ["a person walks", "a person jumps", "a person waves"]
+    samples = SampleMotions(str(tmp_path), every_n_steps=1, prompts=prompts, seconds=0.5)
+    trainer = SimpleNamespace(
+        global_step=5, global_rank=0, world_size=1, is_global_zero=True, loggers=[]
+    )
+    samples.write(trainer, task)  # type: ignore[arg-type]
+    warning = "warning: step 5: all 3 samples are the same motion. The network no longer depends"
+    assert (warning in capsys.readouterr().out) == collapsed

@@ -11,6 +11,7 @@ from pathlib import Path
 from resource import RUSAGE_SELF, getrusage
 from typing import Any
 
+import numpy as np
 import torch
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint
@@ -43,6 +44,8 @@ from flame_mdm.training.provenance import device_name
 
 REAL = 64  # training clips that metrics of samples are compared with
 UNCONDITIONED = 4  # motions without a prompt
+# Meters. Samples for different prompts differ by more, even those of a model that has learned little
+SAME = 0.01
 Values = Mapping[str, float]  # values by metric, or by metric/part
 
 
@@ -284,6 +287,19 @@ class Progress(Callback):
         self.on_train_end()
 
 
+def are_same(motions: Sequence[Motion]) -> bool:
+    """Returns whether motions differ by less than `SAME`, which shows that a network ignores its input.
+
+    A learning rate that is too high can end in a network that returns one pose for every prompt and
+    noise. Its loss is finite and even falls a little, so that curves alone do not show it.
+    """
+    if len(motions) < 2:
+        return False
+    frames = min(len(motion.joints) for motion in motions)
+    joints = np.stack([motion.joints[:frames] for motion in motions])
+    return bool(np.ptp(joints, axis=0).max() < SAME)
+
+
 class SampleMotions(Callback):
     """Samples fixed prompts with fixed noise: writes files to the run directory and logs a video.
 
@@ -378,6 +394,11 @@ class SampleMotions(Callback):
         values: Values = {}
         if trainer.is_global_zero:
             write_motions(folder, motions, {"seed": 0, "step": step, "checkpoint": ""})
+            if are_same(motions):
+                say(
+                    f"warning: step {step}: all {len(motions)} samples are the same motion. The network "
+                    "no longer depends on its input: stop, and train again with a lower optimizer.lr"
+                )
             requested = [attributes for _, attributes in self.prompts]
             values = self.measure(
                 [torch.from_numpy(motion.joints) for motion in motions], requested

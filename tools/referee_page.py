@@ -23,7 +23,7 @@ true of its motion. A falsified claim states the other side, direction or speed,
 reverse order, and is taken to be false. Wrong captions count as errors. Patterns and measurements were corrected while
 the errors on both halves were known, so that the figures are optimistic for other data.
 
-The captions of CMU are those of HumanML3D's test split and of KIT-ML for the recordings at hand. Those of Bandai-Namco
+CMU's captions come from HumanML3D's test split and from KIT-ML, for the recordings at hand. Bandai-Namco's captions
 are templates of its labels, so that its many clips have few different sentences. Read the sets one by one.
 """
 

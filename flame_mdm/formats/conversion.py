@@ -35,7 +35,7 @@ class RawMotion:
     Attributes:
         values: joints (F, J, 3) in meters, y up, or rotations of SMPL (F, 75) as in `representations.smpl.read_pose`.
         note: a line for the user if a body of other proportions was used, with the error; "" otherwise. It says whether
-            rotations are those of the file, or were fitted to joints.
+            rotations come from the file, or were fitted to joints.
         error: mean distance in meters of the joints of this body from the joints of the motion.
     """
 

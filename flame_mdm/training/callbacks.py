@@ -44,7 +44,7 @@ from flame_mdm.training.provenance import device_name
 
 REAL = 64  # training clips that metrics of samples are compared with
 UNCONDITIONED = 4  # motions without a prompt
-# Meters. Samples for different prompts differ by more, even those of a model that has learned little
+# Meters. Samples for different prompts differ by more, even if a model has learned little
 SAME = 0.01
 Values = Mapping[str, float]  # values by metric, or by metric/part
 

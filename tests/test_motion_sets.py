@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from support.npm import node
 from support.refusals import error_of
+from support.usd import opened
 
 import flame_mdm
 from flame_mdm.__main__ import main
@@ -216,6 +217,22 @@ def test_contacts_are_in_the_description_and_markers_in_the_files(small: Path, t
     assert {(marker["foot"], marker["event"]) for marker in markers} == {
         (foot, event) for foot in ("left", "right") for event in ("plant", "lift")
     }
+
+
+def test_contacts_are_attributes_of_the_animation_in_usd_files(tmp_path: Path):
+    motion = grounded(synthetic("a person walks").joints, 20)
+    (clip,) = rig_clips([Clip("walk", "start", motion, "a walk")], "unreal")
+    motion_sets.WRITERS["usdc"](tmp_path / "walk.usdc", clip)
+    stage = opened(tmp_path / "walk.usdc")
+    animation = stage.GetPrimAtPath("/person/skeleton/animation")
+    for foot, name in enumerate(("LeftFootContact", "RightFootContact")):
+        contact = animation.GetAttribute(name)
+        # booleans are held between samples
+        values = [contact.Get(frame) for frame in range(len(motion))]
+        assert values == motion.contacts[:, foot].tolist()
+        changes = np.flatnonzero(np.diff(motion.contacts[:, foot])) + 1
+        assert contact.GetTimeSamples() == [0, *changes.tolist()]
+        assert len(changes) > 2
 
 
 def test_a_rig_without_a_root_moves_its_hips(tmp_path: Path):

@@ -18,7 +18,7 @@ from flame_mdm.formats import fbx
 from flame_mdm.formats.fbx import Int, Record
 from flame_mdm.formats.fbx_scene import TICKS, TIME_MODES
 from flame_mdm.formats.retarget import continuous_euler
-from flame_mdm.formats.rigged import Material, RiggedClip, Skin
+from flame_mdm.formats.rigged import CONTACTS, Material, RiggedClip, Skin
 
 PER_METER = 100  # the files are in centimeters
 CUSTOM_RATE = 14  # `TimeMode` of a rate in `CustomFrameRate`
@@ -33,8 +33,6 @@ LINEAR_KEY = 0x4 | 0x100 | 0x2000 | 0x4000
 ROOT_BACK = 1e-4
 AXES = ("X", "Y", "Z")
 HELD_KEY = 0x2  # a value that is held until the next key
-CONTACTS = ("LeftFootContact", "RightFootContact")
-"""Properties of the first bone that say whether a foot is planted, 0 or 1; Unreal imports them as curves."""
 
 
 def write(path: Path, clip: RiggedClip) -> None:
@@ -248,21 +246,10 @@ class _Writer:
             self._curves(layer, bone, "Lcl Rotation", "R", times, angles[:, joint])
         for joint, moved in self.moves.items():
             self._curves(layer, bones[joint], "Lcl Translation", "T", times, moved)
-        for foot, name in enumerate(
-            CONTACTS[: clip.contacts.shape[1] if len(clip.contacts) else 0]
-        ):
-            planted = clip.contacts[:, foot].astype(float)
-            changes = np.flatnonzero(np.diff(planted, prepend=-1.0))
-            self._curves(
-                layer,
-                bones[0],
-                name,
-                name,
-                times[changes],
-                planted[changes, None],
-                (name,),
-                HELD_KEY,
-            )
+        # Unreal imports such properties of a bone as curves.
+        for name, (changes, planted) in clip.contact_changes().items():
+            values = planted[:, None].astype(float)
+            self._curves(layer, bones[0], name, name, times[changes], values, (name,), HELD_KEY)
 
     def _curves(
         self,

@@ -41,6 +41,8 @@ PALETTE = tuple(
     for name, (red, green, blue) in zip(MATERIAL_NAMES, MATERIALS, strict=True)
 )
 """Materials of the package's person."""
+CONTACTS = ("LeftFootContact", "RightFootContact")
+"""Names of the properties that say whether the left and the right foot are planted, in .fbx and USD files."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,6 +137,19 @@ class RiggedClip:
         """Returns some frames as a clip with a name and the contacts (F, 2) of these frames."""
         moves = {joint: moved[frames] for joint, moved in self.moves.items()}
         return replace(self, name=name, turns=self.turns[frames], moves=moves, contacts=contacts)
+
+    def contact_changes(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """Returns for each of `CONTACTS` the frames (K,) at which it changes, and its values (K,) from there on.
+
+        The first frame is always among them. Empty if the contacts are not known.
+        """
+        if not len(self.contacts):
+            return {}
+        changes = {}
+        for name, planted in zip(CONTACTS, self.contacts.T, strict=True):
+            frames = np.flatnonzero(np.r_[True, planted[1:] != planted[:-1]])
+            changes[name] = frames, planted[frames]
+        return changes
 
     def on_path(self, path: np.ndarray, heading: np.ndarray) -> "RiggedClip":
         """Returns a clip whose body stays in place, moved along a path.

@@ -76,7 +76,7 @@ def _matrices(values: np.ndarray) -> Any:
 
 
 def _skeleton(stage: Any, clip: RiggedClip) -> None:
-    from pxr import Gf, UsdSkel, Vt
+    from pxr import Gf, Sdf, UsdSkel, Vt
 
     skeleton = UsdSkel.Skeleton.Define(stage, "/person/skeleton")
     paths = _paths(clip)
@@ -108,6 +108,11 @@ def _skeleton(stage: Any, clip: RiggedClip) -> None:
         values = [Gf.Quatf(float(w), float(x), float(y), float(z)) for x, y, z, w in turns[frame]]
         rotations.Set(Vt.QuatfArray(values), frame)
         translations.Set(Vt.Vec3fArray.FromNumpy(moved[frame].astype("f4")), frame)
+    # Booleans are held until the next sample, so the frames in which they change are enough.
+    for name, (frames, planted) in clip.contact_changes().items():
+        contact = animation.GetPrim().CreateAttribute(name, Sdf.ValueTypeNames.Bool, custom=True)
+        for frame, value in zip(frames.tolist(), planted.tolist(), strict=True):
+            contact.Set(value, frame)
     binding = UsdSkel.BindingAPI.Apply(skeleton.GetPrim())
     binding.CreateAnimationSourceRel().SetTargets([animation.GetPath()])
 

@@ -18,6 +18,7 @@ from hydra.utils import instantiate
 from support.browser import Tab, browser, in_chromium
 from support.fixtures import ROOT, recipe, script
 from support.glb import Glb
+from support.runs import TINY_DIP, untrained
 from torch import Tensor
 
 import flame_mdm
@@ -273,6 +274,43 @@ def test_the_runner_samples_the_motions_of_the_package_without_pytorch_and_refus
         assert runner.main([str(exported), "walk", str(out)]) == 1
         assert says in (error := capfd.readouterr().err)
         assert error.count("\n") == 1
+
+
+@pytest.fixture(scope="module")
+def continuing() -> MotionGenerator:
+    """A tiny model that continues 10 frames by 30, with random weights."""
+    model = untrained(TINY_DIP, 40, "synthetic/dip")
+    model.representation.std.fill_(0.05)
+    return model
+
+
+def test_a_model_that_continues_frames_is_traced_with_them_as_an_input(
+    continuing: MotionGenerator,
+) -> None:
+    graph = onnx.graphs(continuing)[0]
+    assert list(graph.examples) == ["x_t", "t", "lengths", "prefix", "condition", "counts"]
+    with torch.no_grad():
+        traced = onnx.traced(graph).module()
+        inputs = {name: example[:1] for name, example in graph.examples.items()}
+        expected = graph.module(*inputs.values())
+        torch.testing.assert_close(traced(*inputs.values()), expected, atol=1e-4, rtol=1e-4)
+        inputs["prefix"] = inputs["prefix"] + 1
+        assert (traced(*inputs.values()) - expected).abs().max() > 1e-3
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_the_runner_continues_frames_as_the_package_does(
+    continuing: MotionGenerator, tmp_path: Path
+) -> None:
+    onnx.write_folder(continuing, tmp_path / "model")
+    sampler = runner.Sampler(tmp_path / "model")
+    for seconds, seed in ((0.5, 0), (4.2, 3)):
+        motion = flame_mdm.generate(continuing, TEXT, seconds=seconds, seed=seed)[0]
+        joints = sampler.decode(sampler.generate(TEXT, seconds, seed))
+        assert np.abs(joints - motion.joints).max() < 1e-3
+    with pytest.raises(ValueError, match=r"give 0\.1 to 600 seconds"):
+        sampler.generate(TEXT, 601)
 
 
 def test_a_model_beyond_the_limits_of_the_runner_is_not_exported() -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 import flame_mdm
 from flame_mdm import generate, stream
 from flame_mdm.batch import Condition
-from flame_mdm.checkpoints.onnx_export import description
+from flame_mdm.data.standing import standing
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.denoisers import Denoiser
 from flame_mdm.errors import UserError
@@ -24,7 +24,7 @@ from flame_mdm.sampling.editing import edit
 from flame_mdm.sampling.keywords import SamplerKeywords
 from flame_mdm.sampling.placement import Placement
 from flame_mdm.sampling.reading import decoded, with_features
-from flame_mdm.sampling.streams import Schedule, Streams, standing, starting_point
+from flame_mdm.sampling.streams import Schedule, Streams, starting_point
 from flame_mdm.sampling.targets import errors, read_targets
 
 CONTEXT, BLOCK, FPS = 10, 30, 20.0
@@ -372,10 +372,6 @@ def test_what_such_a_model_cannot_do_is_said_in_one_line(model, walk):
         (
             lambda: edit(model, walk, region="in_between"),
             "this model continues frames and cannot edit",
-        ),
-        (
-            lambda: description(model),
-            "this model continues frames, which the exported runner does not",
         ),
         (
             lambda: generate(model, "a person walks", seconds=601),

@@ -114,6 +114,7 @@ INVALID: dict[str, list[Any]] = {
     "fps": [MISSING, None, "20", [], True, 0, -20, 0.001, 1e9, NAN, INFINITY],
     "max_frames": [*COUNT, 1],
     "padded_frames": [*COUNT, 59],
+    "start": [None, {}, [], [[]], [[1.0] * (FEATURES - 1)], [["1"] * FEATURES], [[NAN] * FEATURES]],
     "skeleton": [MISSING, None, [], "smpl22"],
     "skeleton.joints": [*TEXT_LIST, []],
     "skeleton.parents": [MISSING, None, [], ["a"], [NAN], [-2], [10**9], [0.5]],

@@ -5,6 +5,7 @@ import logging
 import shutil
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +20,7 @@ from flame_mdm.checkpoints.loading import load
 from flame_mdm.checkpoints.runner import FORMAT, MIN_WORDS, SCHEMA, digest, faults
 from flame_mdm.conditions.tokens import LearnedTokens
 from flame_mdm.conditions.vocabulary import FUNCTION_WORDS
+from flame_mdm.data.standing import standing
 from flame_mdm.denoisers.gru import MDMGRU
 from flame_mdm.denoisers.unet import MDMUNet
 from flame_mdm.errors import UserError, first_line
@@ -67,7 +69,12 @@ def export_onnx(source: str | Path, out: str | Path, *, half: bool = False, **ad
         raise UserError(
             f"format=onnx needs the package {error.name}: pip install flame-mdm[onnx]"
         ) from error
-    model = load(source, **adapted)
+    write_folder(load(source, **adapted), out, half=half)
+    return Path(out)
+
+
+def write_folder(model: MotionGenerator, out: str | Path, *, half: bool = False) -> None:
+    """Writes the folder of `export_onnx` for a model that is loaded."""
     content = description(model)
     with atomic_folder(out) as folder, torch.no_grad():
         for graph in ProgressBar(graphs(model), desc="graphs", unit="graph"):
@@ -76,7 +83,6 @@ def export_onnx(source: str | Path, out: str | Path, *, half: bool = False, **ad
             content["sha256"][path.name] = sha256(path)
         write_json(folder / "model.json", content | {"digest": digest(content)}, indent=None)
         shutil.copy(RUNNER, folder / RUNNER.name)
-    return Path(out)
 
 
 def description(model: MotionGenerator) -> dict[str, Any]:
@@ -90,21 +96,22 @@ def description(model: MotionGenerator) -> dict[str, Any]:
     skeleton = model.representation.skeleton
     facts = model.facts
     encoder, denoiser = model.condition, model.denoiser
-    if denoiser.context_frames:
-        raise UserError(
-            "this model continues frames, which the exported runner does not. Export another model"
-        )
     padded = isinstance(denoiser, FIXED_LENGTH) or not denoiser.mask_padding
     words = (
         {"buckets": encoder.buckets, "max_words": encoder.max_words}
         if isinstance(encoder, LearnedTokens)
         else {}
     )
+    context = {}
+    if denoiser.context_frames:
+        start = torch.from_numpy(standing(representation, denoiser.context_frames).features)
+        context["start"] = representation.normalize(start.to(model.device)).tolist()
     content = {
         "format": FORMAT,
         "experiment": model.config["experiment"],
         "reads": model.conditioned_on,
         **words,
+        **context,
         "actions": list(facts.get("actions", ())),
         "vocabulary": list(facts.get("vocabulary", ())),
         "captions": list(facts.get("captions", ())),
@@ -248,7 +255,7 @@ class Call(nn.Module):
 
     Inputs are x_t (B, F, D), the time t (B,) as the denoiser gets it, lengths (B,) int64, and the
     condition: actions (B,) int64, or rows of the word table (B, S, 2) int64 with the `counts`
-    (B,) of each caption.
+    (B,) of each caption. `ContinuingCall` also reads the frames before the motion.
     """
 
     def __init__(self, model: MotionGenerator):
@@ -280,6 +287,17 @@ class Call(nn.Module):
                 unconditional model.
             counts: (B,), tokens of each text.
         """
+        return self._output(x_t, t, lengths, condition, counts, None)
+
+    def _output(
+        self,
+        x_t: Tensor,
+        t: Tensor,
+        lengths: Tensor,
+        condition: Tensor | None,
+        counts: Tensor | None,
+        prefix: Tensor | None,
+    ) -> Tensor:
         mask = length_mask(lengths, x_t.shape[1])
         if (
             isinstance(self.condition, LearnedTokens)
@@ -289,10 +307,32 @@ class Call(nn.Module):
             cond = self.condition.encode(condition, counts)
         else:
             cond = self.condition(MotionBatch(x_t, mask, [], action=condition))
+        cond = replace(cond, prefix=prefix)
         denoise = self.denoiser
         if self.scale is not None and cond.null is not None:
             denoise = classifier_free_guidance(denoise, self.scale, self.features)
         return denoise(x_t, t, mask, cond)[..., : self.features]
+
+
+class ContinuingCall(Call):
+    """One call of a denoiser that continues frames, which are a further input."""
+
+    def forward(
+        self,
+        x_t: Tensor,
+        t: Tensor,
+        lengths: Tensor,
+        prefix: Tensor,
+        condition: Tensor | None = None,
+        counts: Tensor | None = None,
+    ) -> Tensor:
+        """Returns the guided output (B, F, features) of the denoiser.
+
+        Args:
+            x_t: see `Call.forward`, also for `t`, `lengths`, `condition` and `counts`.
+            prefix: (B, C, D), normalized features of the frames before the motion.
+        """
+        return self._output(x_t, t, lengths, condition, counts, prefix)
 
 
 class Function(nn.Module):
@@ -311,9 +351,16 @@ def graphs(model: MotionGenerator) -> list[Graph]:
     batch = torch.export.Dim("batch", max=1024)
     frames = torch.export.Dim("frames", min=4, max=max(longest, 5))
     x = torch.randn(2, min(longest, 9), representation.features)
-    fixed = isinstance(model.denoiser, FIXED_LENGTH)
-    inputs = {"x_t": torch.randn(2, longest, representation.features) if fixed else x}
-    inputs |= {"t": torch.tensor([7.0, 3.0]), "lengths": torch.tensor([x.shape[1], 2])}
+    context = model.denoiser.context_frames
+    fixed = isinstance(model.denoiser, FIXED_LENGTH) or context > 0
+    of_call = longest - context if fixed else x.shape[1]
+    inputs = {
+        "x_t": torch.randn(2, of_call, representation.features),
+        "t": torch.tensor([7.0, 3.0]),
+        "lengths": torch.tensor([min(of_call, x.shape[1]), 2]),
+    }
+    if context:
+        inputs["prefix"] = torch.randn(2, context, representation.features)
     dimensions: dict[str, dict[int, Any]] = {name: {0: batch} for name in inputs}
     if not fixed:
         dimensions["x_t"][1] = frames
@@ -330,7 +377,8 @@ def graphs(model: MotionGenerator) -> list[Graph]:
         inputs["condition"] = torch.tensor([0, len(model.facts["actions"]) - 1])
         dimensions["condition"] = {0: batch}
     to_joints = Function(representation.to_joints)
-    graphs = [Graph("denoiser", Call(model), inputs, dimensions, ["output"])]
+    call = ContinuingCall(model) if context else Call(model)
+    graphs = [Graph("denoiser", call, inputs, dimensions, ["output"])]
     graphs += [Graph("joints", to_joints, {"x": x}, {"x": {0: batch, 1: frames}}, ["joints"])]
     if representation.skeleton.name == SMPL22.name:
         solver = Function(partial(solve_checked, fps=representation.fps))

@@ -3,13 +3,15 @@
 python runner.py FOLDER "a person walks forward" motion.npz seconds=3 seed=0
 
 The same caption, length and seed give the same motion as `flame_mdm.generate`, which also
-understands other sentences than captions of the training data.
+understands other sentences than captions of the training data. A model that continues frames
+starts from a person who stands.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import math
 import re
 import secrets
 import sys
@@ -41,6 +43,7 @@ NUMBERS = frozenset(
     ]
 )
 MASK = (1 << 64) - 1
+LONGEST = 600  # seconds of a motion of a model that continues frames
 GRAPHS = ("denoiser.onnx", "joints.onnx", "poses.onnx")  # the last one only for SMPL's joints
 MAX_DESCRIPTION = 64 * 2**20  # bytes of model.json
 MAX_GRAPH = 2**31  # bytes of an ONNX file, whose format has no larger ones
@@ -84,6 +87,7 @@ SCHEMA = _object(
     fps=_number(1, 1000, "number"),
     max_frames=_number(2, 10_000),
     padded_frames=_number(0, 10_000),
+    start=_array(_array(_number(-1e9, 1e9, "number"), 2000, 1), 9_999, 1),
     skeleton=_object(
         ["joints", "parents", "feet"],
         joints=_array({"type": "string"}, 1000, 1),
@@ -158,6 +162,12 @@ def check(content: Any) -> None:
         wrong += [name for name in ("buckets", "max_words") if name not in content]
     if not wrong and content["padded_frames"] not in (0, content["max_frames"]):
         wrong.append("padded_frames")
+    start = content.get("start", [])
+    if not wrong and (
+        len(start) > content["max_frames"] - 2
+        or any(len(row) != content["features"] for row in start)
+    ):
+        wrong.append("start")
     if wrong:
         raise ValueError(f"model.json is damaged: {', '.join(wrong)}")
 
@@ -242,21 +252,44 @@ class Sampler:
     ) -> np.ndarray:
         """Returns normalized features (F, D) of one motion, for a text or an action; "" for an unconditional model.
 
-        `sample` numbers the motions of one text; `seconds` is by default up to 3. Raises
-        `ValueError` for an unknown length or action, and if the result is not finite.
+        `sample` numbers the motions of one text; `seconds` is by default up to 3, and at most 600
+        for a model that continues frames. Raises `ValueError` for an unknown length or action,
+        and if the result is not finite.
         """
         content = self.content
-        longest, fps = content["max_frames"], content["fps"]
+        fps = content["fps"]
+        longest = round(LONGEST * fps) if "start" in content else content["max_frames"]
         if seconds is None:
             frames = min(round(3 * fps), longest)
         else:
             frames = round(min(seconds * fps, longest + 1)) if seconds > 0 else 0
         if not 2 <= frames <= longest:
             raise ValueError(f"seconds={seconds}: give {2 / fps:g} to {longest / fps:g} seconds")
-        padded = max(frames, content["padded_frames"])
-        inputs = {"lengths": np.array([frames]), **self._condition(prompt)}
-        number = key("noise", seed, 0, f"{prompt}#{sample}")
-        x, draw = normal(number, padded, content["features"]), 1
+
+        condition, name = self._condition(prompt), f"{prompt}#{sample}"
+        if "start" not in content:
+            padded = max(frames, content["padded_frames"])
+            inputs = condition | {"lengths": np.array([frames])}
+            x = self._sample(inputs, padded, key("noise", seed, 0, name))[:frames]
+        else:
+            x = np.array(content["start"], np.float32)
+            context, block = len(x), content["max_frames"] - len(x)
+            inputs = condition | {"lengths": np.array([block])}
+            for number in range(math.ceil(frames / block)):
+                prefix = {"prefix": x[None, -context:]}
+                noise = key("noise", seed, 0, f"{name}\x1f{number}")
+                x = np.concatenate([x, self._sample(inputs | prefix, block, noise)])
+            x = x[context : context + frames]
+        if not np.isfinite(x).all():
+            raise ValueError(
+                f"the model returned non-finite numbers for '{prompt}'. Export it again"
+            )
+        return x
+
+    def _sample(self, inputs: dict[str, np.ndarray], frames: int, number: int) -> np.ndarray:
+        """Returns normalized features (F, D) of frames that are sampled together, from noise of a key."""
+        content = self.content
+        x, draw = normal(number, frames, content["features"]), 1
         before = np.zeros_like(x)
         for t, of_x, of_output, keep, clean, last, noise in content["steps"]:
             values = {"x_t": x[None], "t": np.array([t], np.float32), **inputs}
@@ -267,15 +300,11 @@ class Sampler:
             x = np.float32(keep) * x + np.float32(clean) * x0_hat + np.float32(last) * before
             if noise:
                 x, draw = (
-                    x + np.float32(noise) * normal(number + draw, padded, content["features"]),
+                    x + np.float32(noise) * normal(number + draw, frames, content["features"]),
                     draw + 1,
                 )
             before = x0_hat
-        if not np.isfinite(x).all():
-            raise ValueError(
-                f"the model returned non-finite numbers for '{prompt}'. Export it again"
-            )
-        return x[:frames]
+        return x
 
     def decode(self, x: np.ndarray) -> np.ndarray:
         """Returns joints (F, J, 3) in meters, y up, of normalized features (F, D)."""

@@ -16,14 +16,13 @@ from flame_mdm.batch import Condition, Edit, MotionBatch
 from flame_mdm.conditions.language.reading import Reader
 from flame_mdm.conditions.target import SLOTS
 from flame_mdm.conditions.vocabulary import check_known
-from flame_mdm.data.synthetic_motions.body import Body
+from flame_mdm.data.standing import standing
 from flame_mdm.errors import UserError
 from flame_mdm.formats.cleanup import cleanup as clean_joints
 from flame_mdm.formats.motion import Motion
 from flame_mdm.generator import Blocks, MotionGenerator
 from flame_mdm.representations import Representation
 from flame_mdm.representations.rotation import rotate_y
-from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.sampling.keywords import SamplerKeywords
 from flame_mdm.sampling.motion_request import check_length
@@ -464,14 +463,3 @@ def starting_point(
     features = torch.from_numpy(motion.features[-context:]).to(model.device)
     last = torch.from_numpy(motion.joints[-1:]).to(model.device)
     return representation.normalize(features)[None], step_after(representation, features[-1:], last)
-
-
-def standing(representation: Representation, frames: int) -> Motion:
-    """Returns a person who stands still, with the features of a representation.
-
-    The person is the one of the synthetic motions, so that no data is needed.
-    """
-    body = Body(np.random.default_rng(0), np.zeros(frames + 1))
-    still = Motion(body.joints(), representation.fps, SMPL22, "a person stands still", "standing")
-    motion = with_features(representation, still)
-    return replace(motion, features=motion.features[:frames], joints=motion.joints[:frames])

@@ -31,13 +31,22 @@ export function check(content) { // throws an error if the page cannot sample wi
   if (!wrong.length) {
     wrong.push(...["buckets", "max_words"].filter((name) => !(name in content)));
     if (![0, content.max_frames].includes(content.padded_frames)) wrong.push("padded_frames");
+    const { start = [], features } = content;
+    if (start.length > content.max_frames - 2 || start.some((row) => row.length !== features)) wrong.push("start");
     if (content.reads !== "text") wrong.push("reads");
     if (!content.sha256["poses.onnx"]) wrong.push("sha256.poses.onnx");
   }
   if (wrong.length) throw new Error(`model.json is damaged: ${wrong.join(", ")}`);
 }
 
-export function frameCount(seconds, { fps, max_frames: longest }) {
+const LONGEST = 600; // seconds of a motion of a model that continues frames
+
+export function longestOf({ fps, max_frames: longest, start }) { // frames
+  return start ? Math.round(LONGEST * fps) : longest;
+}
+
+export function frameCount(seconds, content) {
+  const { fps } = content, longest = longestOf(content);
   const frames = Math.round(seconds * fps);
   if (!(frames >= 2 && frames <= longest)) throw new Error(`seconds=${seconds}: give ${2 / fps} to ${longest / fps} seconds`);
   return frames;

@@ -1,0 +1,30 @@
+"""A person who stands still: the frames that a stream continues at its start."""
+
+import numpy as np
+from torch import Tensor
+
+from flame_mdm.data.synthetic_motions.body import Body
+from flame_mdm.formats.conversion import raw_motion
+from flame_mdm.formats.motion import Motion
+from flame_mdm.representations import Representation
+from flame_mdm.representations.skeleton import SMPL22
+
+
+def standing(representation: Representation, frames: int) -> Motion:
+    """Returns a person who stands still, with the features of a representation.
+
+    The person is the one of the synthetic motions, so that no data is needed.
+    """
+    # Some representations have one row per step between frames, and none for the last frame.
+    body = Body(np.random.default_rng(0), np.zeros(frames + 1))
+    still = Motion(body.joints(), representation.fps, SMPL22, "a person stands still", "standing")
+    features: Tensor = representation.encode(raw_motion(still, representation).values)[:frames]
+    return Motion(
+        representation.decode(features).numpy(),
+        representation.fps,
+        representation.skeleton,
+        still.text,
+        still.id,
+        features=features.numpy(),
+        representation=representation.name,
+    )

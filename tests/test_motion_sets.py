@@ -17,7 +17,15 @@ from flame_mdm.__main__ import main
 from flame_mdm.data.synthetic import Attributes, example
 from flame_mdm.formats import fbx, fbx_scene, glb, glb_animation
 from flame_mdm.formats.gaits import Clip, find_cycle, gait, turn
-from flame_mdm.formats.grounding import GroundedMotion, grounded, planted, repeated, slide
+from flame_mdm.formats.grounding import (
+    GroundedMotion,
+    grounded,
+    jolt,
+    pivot,
+    planted,
+    repeated,
+    slide,
+)
 from flame_mdm.formats.motion import Motion
 from flame_mdm.representations.skeleton import JOINT
 from flame_mdm.safe_io import read_yaml
@@ -132,6 +140,51 @@ def test_planted_feet_stay_where_a_fixed_pose_has_them(walk: GroundedMotion):
     assert slide(fixed) < 0.2 * CENTIMETER
     for frame in (0, -1):
         np.testing.assert_allclose(fixed.world()[frame], farther.world()[frame], atol=1e-5)
+
+
+@pytest.mark.parametrize("at_end", [False, True])
+def test_a_foot_that_lands_right_after_a_fixed_pose_does_not_jump(
+    walk: GroundedMotion, at_end: bool
+):
+    local = np.tile(walk.local[:1], (20, 1, 1))
+    # the right foot is in the air in the two frames next to the fixed pose, 5 cm from where it is
+    # on average
+    contacts = np.ones((20, 2), bool)
+    contacts[slice(-2, None) if at_end else slice(None, 2), 1] = False
+    drift = np.linspace(0.1, 0, 20)[:: -1 if at_end else 1]
+    local[:, [JOINT["right_ankle"], JOINT["right_foot"]], 2] += drift[:, None]
+    drifting = GroundedMotion(local, np.zeros((20, 2)), np.zeros(20), contacts, 30.0)
+    fixed = planted(drifting, fixed_start=not at_end, fixed_end=at_end)
+    assert slide(fixed) < 0.2 * CENTIMETER
+    assert jolt(fixed) < 6
+
+
+def test_toes_are_not_below_the_floor(walk: GroundedMotion):
+    sunk = walk.local.copy()
+    sunk[10:40, :, 1] -= 0.03
+    motion = GroundedMotion(sunk, walk.path, walk.heading, walk.contacts, walk.fps)
+    toes = [JOINT["left_foot"], JOINT["right_foot"]]
+    assert motion.world()[:, toes, 1].min() < -CENTIMETER
+    assert planted(motion).world()[:, toes, 1].min() > -0.001
+
+
+def test_a_planted_foot_that_turns_and_a_foot_that_jerks_are_measured(walk: GroundedMotion):
+    standing = walk.cut(0, 10)
+    angles = np.radians(np.linspace(0, 30, len(standing)))
+    turning = GroundedMotion(
+        np.tile(standing.local[:1], (len(standing), 1, 1)),
+        0 * standing.path,
+        angles,
+        np.ones_like(standing.contacts),
+        10.0,
+    )
+    assert pivot(turning) == pytest.approx(30)
+    local = np.tile(standing.local[:1], (len(standing), 1, 1))
+    local[5, JOINT["left_foot"], 1] += 0.01
+    jerking = GroundedMotion(local, 0 * turning.path, 0 * angles, turning.contacts, 10.0)
+    # 1 cm up and down again: -2 cm per squared tenth of a second
+    assert jolt(jerking) == pytest.approx(2)
+    assert pivot(jerking) == 0
 
 
 @pytest.fixture(scope="module")

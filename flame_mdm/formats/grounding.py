@@ -165,7 +165,7 @@ def runs(flags: np.ndarray) -> list[tuple[int, int]]:
 def planted(
     motion: GroundedMotion, *, fixed_start: bool = False, fixed_end: bool = False
 ) -> GroundedMotion:
-    """Returns the motion with toes that do not move during their contacts.
+    """Returns the motion with toes that do not move during their contacts, and are never below the floor.
 
     The body is lowered where a leg would be too short. With `fixed_start` and `fixed_end`, the
     first and the last pose do not change: a foot that is planted there stays where this pose has
@@ -174,10 +174,16 @@ def planted(
     # Each toe is moved to one footprint per contact. If a leg is too short for its footprint, the
     # whole body is lowered for a moment, smoothly, before the legs bend to reach the footprints.
     world = motion.world()
+    near = round(SHORT * motion.fps)
     shifts = [
-        _shift(world[:, leg[-1]], flags, fixed_start, fixed_end)
+        _shift(world[:, leg[-1]], flags, fixed_start, fixed_end, near)
         for leg, flags in zip(FEET, motion.contacts.T, strict=True)
     ]
+    # A blend of two poses that stand on the floor may be lower. A fixed pose stays where it is.
+    fixed = [0] * fixed_start + [-1] * fixed_end
+    for leg, shift in zip(FEET, shifts, strict=True):
+        height = world[:, leg[-1], 1]
+        shift[:, 1] = np.maximum(min([0.0, *height[fixed]]) - height, 0)
     lack = np.max(
         [_lack(world, leg, shift) for leg, shift in zip(FEET, shifts, strict=True)], axis=0
     )
@@ -212,23 +218,27 @@ def _lack(world: np.ndarray, leg: tuple[int, ...], shift: np.ndarray) -> np.ndar
     return np.maximum(height - highest, 0)
 
 
-def _shift(toe: np.ndarray, flags: np.ndarray, fixed_start: bool, fixed_end: bool) -> np.ndarray:
+def _shift(
+    toe: np.ndarray, flags: np.ndarray, fixed_start: bool, fixed_end: bool, near: int
+) -> np.ndarray:
     """Returns how far a toe (F, 3) is moved over the floor, (F, 3): smoothly from each contact to the next."""
     # Within a contact, the shift brings the toe to its mean position, or to the position in a
-    # fixed pose. Between contacts, the shift of one becomes the shift of the next.
+    # fixed pose. Between contacts, the shift of one becomes the shift of the next. A contact that
+    # begins or ends fewer than `near` frames from a fixed pose keeps the toe where it is then:
+    # there is no time to move it.
     last = len(toe) - 1
     floor = np.array([1.0, 0.0, 1.0])
     frames, shifts = [], []
     if fixed_start and not flags[0]:
         frames, shifts = [0], [np.zeros(3)]
     for begin, end in runs(flags):
-        at_start, at_end = fixed_start and begin == 0, fixed_end and end == last
+        at_start, at_end = fixed_start and begin < near, fixed_end and last - end < near
         footprint = toe[begin : end + 1].mean(0)
         if at_start or at_end:
-            footprint = toe[0] if at_start else toe[last]
+            footprint = toe[begin] if at_start else toe[end]
         target = np.tile(footprint, (end + 1 - begin, 1))
         if at_start and at_end:  # it cannot stay in place between two given poses
-            target = np.linspace(toe[0], toe[last], len(target))
+            target = np.linspace(toe[begin], toe[end], len(target))
         frames += range(begin, end + 1)
         shifts += list((target - toe[begin : end + 1]) * floor)
     if fixed_end and not flags[last]:
@@ -296,3 +306,22 @@ def slide(motion: GroundedMotion) -> float:
                 )
             )
     return max(distances)
+
+
+def pivot(motion: GroundedMotion) -> float:
+    """Returns the largest angle in degrees by which a foot turns about the vertical during one contact."""
+    joints = motion.world()
+    angles = [0.0]
+    for foot, (_, _, ankle, toe) in enumerate(FEET):
+        x, _, z = (joints[:, toe] - joints[:, ankle]).T
+        turned_by = np.degrees(np.unwrap(np.arctan2(x, z)))
+        for begin, end in runs(motion.contacts[:, foot]):
+            angles.append(float(np.ptp(turned_by[begin : end + 1])))
+    return max(angles)
+
+
+def jolt(motion: GroundedMotion) -> float:
+    """Returns the largest acceleration of an ankle or of toes in m/s²."""
+    feet = motion.world()[:, [joint for leg in FEET for joint in leg[2:]]]
+    changes = np.diff(feet, 2, axis=0) * motion.fps**2
+    return float(np.linalg.norm(changes, axis=-1).max(initial=0.0))

@@ -16,7 +16,14 @@ from flame_mdm.formats.body import fit_body
 from flame_mdm.formats.cleanup import cleaned
 from flame_mdm.formats.faults import find_faults
 from flame_mdm.formats.gaits import Clip
-from flame_mdm.formats.grounding import GroundedMotion, grounded, slide, with_lengths
+from flame_mdm.formats.grounding import (
+    GroundedMotion,
+    grounded,
+    jolt,
+    pivot,
+    slide,
+    with_lengths,
+)
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.retarget import preset, presets
 from flame_mdm.formats.rigged import RiggedClip, contact_events, rigged
@@ -45,6 +52,8 @@ WRITERS: dict[str, Callable[[Path, RiggedClip], None]] = {
 """Format -> function that writes a clip."""
 # Score per meter that a foot slides, relative to the score per meter of difference between poses
 SLIDING = 200.0
+PIVOTING = 0.1  # score per degree that a planted foot turns
+JOLTING = 0.1  # score per m/s² by which a foot accelerates
 FAULTY = 0.2  # score of a frame with a fault
 
 
@@ -130,7 +139,7 @@ def make_set(model: MotionGenerator, content: MotionSet, seed: int = 0, **option
     """Generates the motions of a set and cuts them into clips, with a progress bar.
 
     Of the candidates for each motion, the one whose clips fit best is kept: poses that differ little where the clips
-    are cut, feet that stay in place, few faults. A motion that the model cannot do is left out.
+    are cut, feet that stay in place and do not jerk, few faults. A motion that the model cannot do is left out.
 
     Args:
         model: a model of SMPL's 22 joints that samples texts in windows.
@@ -224,7 +233,10 @@ def _clips(
     faulty = sum(
         fault.end - fault.start for clip in clips for fault in find_faults(motion_of(clip))
     )
-    return score + SLIDING * max(slide(clip.motion) for clip in clips) + FAULTY * faulty, clips
+    motions = [clip.motion for clip in clips]
+    score += SLIDING * max(map(slide, motions)) + PIVOTING * max(map(pivot, motions))
+    score += JOLTING * max(map(jolt, motions))
+    return score + FAULTY * faulty, clips
 
 
 def _missing(motion: SetMotion) -> str:

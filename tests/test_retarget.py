@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support.fixtures import blender
-from support.glb import Glb, changed, odd_character, write_names
+from support.glb import Glb, changed, odd_character, skinned, write_names
 from support.motions import largest_step, synthetic
 
 from flame_mdm.__main__ import main
@@ -201,6 +201,18 @@ def own_bvh(path: Path, kick: Motion, changes: str) -> bvh.Bvh:
         file = replace(file, offsets=offsets, channels=tuple(channels), frames=frames)
     bvh.write(file, path)
     return bvh.read(path)
+
+
+def test_the_skin_of_a_persons_legs_is_not_twisted_when_the_person_is_a_character(
+    kick: Motion, tmp_path: Path
+):
+    """The knees of SMPL's body bend sideways at rest, which must not be taken for the axis of the joint."""
+    kick.save(tmp_path / "person.glb")
+    kick.save(tmp_path / "again.glb", character=tmp_path / "person.glb")
+    first, again = (skinned(tmp_path / f"{name}.glb", 0) for name in ("person", "again"))
+    legs = first[:, 1] < 0.6
+    assert legs.sum() > 400
+    assert np.linalg.norm(again - first, axis=1)[legs].max() < 0.002
 
 
 @pytest.mark.parametrize("changes", ["first frame", "z up", "root alone moves"])

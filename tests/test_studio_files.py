@@ -16,7 +16,7 @@ import pytest
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from support.fixtures import ROOT, blender, python_with, script
-from support.glb import odd_character, write_names
+from support.glb import odd_character, skinned, write_names
 from support.motions import synthetic
 from support.npm import node
 from support.usd import opened, pxr
@@ -217,27 +217,6 @@ def test_the_surface_in_autodesk_is_that_of_pictures(node_modules: Path, tmp_pat
     for first, second in (surfaces, surfaces[::-1]):
         nearest, _ = KDTree(first).query(second)
         assert nearest.max() < 0.02 * MILLIMETER
-
-
-def skinned(path: Path, frame: int) -> np.ndarray:
-    """Vertices (V, 3) of all skinned meshes of a .glb file in a frame of its first animation."""
-    file = glb.read(path)
-    worlds = glb_animation.world_matrices_of(path)[frame]
-    points = []
-    for item in file.document["nodes"]:
-        if "mesh" not in item or "skin" not in item:
-            continue
-        skin = file.skins[item["skin"]]
-        for primitive in file.document["meshes"][item["mesh"]]["primitives"]:
-            attributes = primitive["attributes"]
-            local = glb.numbers(file, attributes["POSITION"], "VEC3")
-            joints = glb.numbers(file, attributes["JOINTS_0"], "VEC4").astype(int)
-            weights = glb.numbers(file, attributes["WEIGHTS_0"], "VEC4")
-            moves = worlds[skin.joints] @ skin.binds
-            homogeneous = np.pad(local, ((0, 0), (0, 1)), constant_values=1)
-            moved = np.einsum("vkij,vj->vki", moves[joints], homogeneous)[..., :3]
-            points.append((weights[..., None] * moved).sum(1) / weights.sum(1, keepdims=True))
-    return np.concatenate(points)
 
 
 @pytest.mark.tools

@@ -19,8 +19,9 @@ SPINE = ("spine1", "spine2", "spine3")
 TILT = 45  # degrees between trunk and vertical at which a rest pose is refused
 SNAP = 8  # largest angle in degrees between the facing direction and an axis that it is taken for
 # Minimum sine of the bend of an elbow or knee in the rest pose. The twist of a straighter limb
-# cannot be read.
-BEND = 0.15
+# cannot be read: the limbs of people also bend sideways, by 7 degrees at the knees and 5 degrees at
+# the elbows of SMPL's body, so that a small bend is far from the axis of the joint.
+BEND = 0.25
 GROUND = 0.1  # largest height in meters at which the lowest joint of a clip counts as on the floor
 # Distance of the knee from the line of the leg, in thighs, at which bend and thigh weigh the same
 STRAIGHT = 0.05

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from flame_mdm.formats import glb, glb_animation
 from flame_mdm.formats.glb import Binary
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.retarget import joint_names, presets
@@ -161,3 +162,24 @@ def write_names(path: Path, **other: str | None) -> None:
     }
     lines = (f"{joint}: {json.dumps(name)}\n" for joint, name in {**names, **other}.items())
     path.write_text("".join(lines))
+
+
+def skinned(path: Path, frame: int) -> np.ndarray:
+    """Vertices (V, 3) of all skinned meshes of a .glb file in a frame of its first animation."""
+    file = glb.read(path)
+    worlds = glb_animation.world_matrices_of(path)[frame]
+    points = []
+    for item in file.document["nodes"]:
+        if "mesh" not in item or "skin" not in item:
+            continue
+        skin = file.skins[item["skin"]]
+        for primitive in file.document["meshes"][item["mesh"]]["primitives"]:
+            attributes = primitive["attributes"]
+            local = glb.numbers(file, attributes["POSITION"], "VEC3")
+            joints = glb.numbers(file, attributes["JOINTS_0"], "VEC4").astype(int)
+            weights = glb.numbers(file, attributes["WEIGHTS_0"], "VEC4")
+            moves = worlds[skin.joints] @ skin.binds
+            homogeneous = np.pad(local, ((0, 0), (0, 1)), constant_values=1)
+            moved = np.einsum("vkij,vj->vki", moves[joints], homogeneous)[..., :3]
+            points.append((weights[..., None] * moved).sum(1) / weights.sum(1, keepdims=True))
+    return np.concatenate(points)

@@ -31,8 +31,9 @@ def recipes_page() -> str:
 Each row of the papers' tables that FLAME (Kim et al., AAAI 2023, arXiv:2209.00349), MDM (Tevet et al., ICLR 2023,
 arXiv:2209.14916) or Motion Flow Matching (Hu et al., 2023, arXiv:2312.08895) fill has a recipe: `make train
 EXP=humanml3d/mdm`. Recipes that name no table are not rows of a paper; their files list how they deviate. "As in
-mdm" means the deviations of the recipe `mdm` in the same folder. Some hold for all recipes: a batch contains motions of
-about the same length, every sample of a batch has the same weight, and checkpoints are chosen on validation clips.
+mdm" means the deviations of the recipe `mdm` in the same folder. Some deviations hold for all recipes: a batch contains
+motions of about the same length, every sample of a batch has the same weight, and checkpoints are chosen on validation
+clips.
 """
     page += "\n| recipe | what it reproduces |\n|---|---|\n"
     for name in sorted(recipes(), key=lambda name: ("/" in name, name)):

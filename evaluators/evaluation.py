@@ -170,11 +170,9 @@ class Evaluation:
     def _measure_real(
         self, source: Source | None, ground_truth: bool
     ) -> tuple[list[tuple[Rows, Rows]], Outcome]:
-        """Measures real motions; also returns for each replication those that the source's
-        motions are compared with.
+        """Measures real motions; also returns what the source's motions of each replication are compared with.
 
-        The first of each pair are the real motions of the same clips, the second are for
-        comparisons of sets.
+        The first entry has the real motions of the same clips, the second a set for comparisons of sets.
         """
         scores = []
         real_sets = []

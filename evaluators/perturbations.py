@@ -39,7 +39,7 @@ def jitter(joints: Joints, millimeters: float, draws: Draws) -> Joints:
 
 
 def wobble(joints: Joints, millimeters: float, draws: Draws, fps: float) -> Joints:
-    """Moves each joint along a line of its own, as a sine of 1 Hz with this amplitude."""
+    """Moves each joint along a line in a random direction, as a sine of 1 Hz with this amplitude."""
     along = draws.standard_normal(joints.shape[1:])
     phase = draws.uniform(0, 2 * np.pi, (1, joints.shape[1]))
     sine = np.sin(2 * np.pi * WOBBLE / fps * np.arange(len(joints))[:, None] + phase)
@@ -97,7 +97,7 @@ def freeze(joints: Joints, percent: float) -> Joints:
 
 
 def play(joints: Joints, factor: float, fps: float) -> Joints:
-    """Plays faster, which shortens the motion, or slower, and cuts what exceeds its length."""
+    """Plays the motion faster, which shortens it, or slower, and then cuts it to its length."""
     return resample(joints, fps * factor, fps)[: len(joints)]
 
 

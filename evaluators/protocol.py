@@ -289,7 +289,7 @@ class Protocol(ClosedSchema):
         return self.replications * rows + again
 
     def check(self, clips: Clips, model: MotionGenerator | None) -> None:
-        """Raises `UserError` if there is no clip, one lacks the caption or label, or the model another condition."""
+        """Raises `UserError` if there is no clip, a clip lacks its caption or label, or the condition is not the model's."""
         rows, condition, fault = self.rows(clips, 0, 0), self.condition, ""
         drawn = {
             "text": [row.caption for row in rows],

@@ -218,7 +218,7 @@ class SampleFolder:
         return sha256_of_samples(self.files)
 
     def __call__(self, name: str, rows: list[DrawnClip], replication: int) -> Samples:
-        """Returns the motions of one file that belong to the rows; `UserError` if it names other clips."""
+        """Returns the motions of one file for the rows; raises `UserError` if the file names other clips."""
         path = self.files[replication]
         content = read_samples(path)
         ids = content["ids"].tolist()

@@ -51,7 +51,7 @@ class MotionBatch:
         return replace(self, x=sent(self.x, device), mask=sent(self.mask, device), action=action)
 
     def pin_memory(self) -> MotionBatch:
-        """Returns the batch in memory that is copied to a GPU without waiting; the data loader calls this."""
+        """Returns the batch in pinned memory, which is copied to a GPU without waiting; the data loader calls this."""
         action = None if self.action is None else self.action.pin_memory()
         return replace(self, x=self.x.pin_memory(), mask=self.mask.pin_memory(), action=action)
 
@@ -229,7 +229,7 @@ def ceil_div(count: int, size: int) -> int:
 
 
 def padded_length(length: int, multiple: int, most: int) -> int:
-    """Returns `length` rounded up to a multiple, but at most `most`."""
+    """Returns `length` rounded up to a multiple of `multiple`, but at most `most`."""
     return min(ceil_div(length, multiple) * multiple, max(most, length))
 
 

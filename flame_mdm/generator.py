@@ -81,7 +81,7 @@ def sampling_defaults(
 
 
 class Model:
-    """What all models have that checkpoints hold."""
+    """Base class of the models that checkpoints hold."""
 
     noun = "a model"  # what its checkpoints hold, for messages
     config: Config  # the recipe, saved in checkpoints

@@ -22,7 +22,7 @@ class Value(Schema):
     per_replication: list[Number | None] = Field(default_factory=list)
     n_per_replication: list[Int] = Field(default_factory=list)
     n_real: Int | None = (
-        None  # real motions that a set of motions is compared with; None = no comparison of sets
+        None  # number of real motions in a comparison of sets; None = no such comparison
     )
     unit: str = ""
     # Values of the motions of the first replication, drawn again and again

@@ -51,7 +51,7 @@ def tube(origin: np.ndarray, axes: np.ndarray, stations: str, power: float = 2.0
 
     Args:
         origin: where the length is 0.
-        axes: (3, 3) rows: the direction of the length, and those of the two half widths.
+        axes: (3, 3) rows: the directions of the length and of the two half widths.
         stations: length, the two coordinates of the center and the two half widths, in millimeters, of several cross
             sections, separated by semicolons; interpolated without overshoot.
         power: 2 = ellipses; larger ones are more like rectangles.
@@ -104,7 +104,7 @@ def bone(start: str, end: str, u: Sequence[float]) -> tuple[np.ndarray, np.ndarr
 
 
 def model() -> dict[str, Field]:
-    """Returns the parts of the left half; the legs and the arm are those of the left side."""
+    """Returns the parts of the left half; the legs and the arm are on the left side."""
     return {**trunk(), **leg(), **arm(), "head": head()}
 
 

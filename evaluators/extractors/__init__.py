@@ -121,8 +121,7 @@ class MotionCLIPExtractor(OwnExtractor[MotionCLIPTask]):
     def fit(self, motions: Sequence[Motion]) -> list[float]:
         """Returns how well motions fit their texts: the cosine similarity, its mean over the parts of a motion.
 
-        Motions that were selected by a motion-CLIP have a better score of it: evaluate them with
-        a different one.
+        A motion-CLIP overrates motions that it has selected: evaluate such motions with a different one.
         """
         scores = []
         for motion in motions:

@@ -25,11 +25,10 @@ NEAR_MISSES = 2  # Near-miss captions per motion and step, of different attribut
 JITTER = (
     0.02  # standard deviation of joint positions, in meters, at which the strength of noise is 1
 )
-# Standard deviation of normalized features at which it is 1: joints err by about 20 mm, too
+# Standard deviation of normalized features at which the strength is 1; joints then err by about 20 mm, too.
 FEATURE_NOISE = 0.3
 WEIGHT = 5.0  # weight of `calibration_error`, compared with `info_nce`
-# Of all features: the FID of noise of strength s, which moves all motions alike, is about (10
-# s)^2
+# Length of all features. With it, the FID of noise of strength s, which moves all motions alike, is about (10 s)^2.
 LENGTH = 10.0
 
 

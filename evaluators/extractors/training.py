@@ -84,7 +84,10 @@ class ExtractorTask(Task, Generic[Network]):
         torch.manual_seed(key("step", self.seed, batch_idx, self.global_rank))
 
     def update_samples(self, batch: MotionBatch, **inputs: Tensor) -> None:
-        """Updates the metrics of samples; with fewer clips than processes, each has all and only the first counts."""
+        """Adds a batch to the validation metrics.
+
+        With fewer clips than processes, each process has all clips, and only the first process counts.
+        """
         if self.global_rank and len(self.trainer.datamodule.val) < self.trainer.world_size:  # type: ignore[attr-defined]
             return
         for name, kind, names in (
@@ -100,7 +103,7 @@ class ExtractorTask(Task, Generic[Network]):
         update_metrics(of_samples, **inputs)
 
     def on_validation_epoch_end(self) -> None:
-        """Logs and resets the metrics of a validation, without those other than the loss with too few samples."""
+        """Logs and resets the validation metrics. Metrics with too few samples are skipped, except the loss."""
         for name, metric in self.val_metrics.items():
             assert isinstance(metric, Metric)
             try:

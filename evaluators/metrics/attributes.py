@@ -1,7 +1,7 @@
 # pyright: standard
 """Attributes of a motion, read from its joints by geometric rules: action, side, count, direction, speed, amount.
 
-They read what a person would see in a clip of a few seconds that shows one action of the
+The rules read what a person would see in a clip of a few seconds that shows one action of the
 synthetic set; each threshold is stated next to its rule. The joints are the 22 of SMPL.
 """
 
@@ -158,7 +158,7 @@ def _lowered(
     the tilt of the trunk.
 
     A standing pelvis is higher than 78 cm, a seated one at 35 to 72 cm, a lying one below 35 cm.
-    The trunk of who lies or crawls is tilted by more than 55 degrees.
+    The trunk of a person who lies or crawls is tilted by more than 55 degrees.
     """
     pelvis, tilt = smooth[:, PELVIS, 1] - floor, tilt_of(smooth)
     first, last = (slice(0, max(1, round(0.1 * fps))), slice(-max(1, round(0.1 * fps)), None))

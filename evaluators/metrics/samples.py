@@ -59,7 +59,7 @@ class Declared:
     def readings(self, motions: Rows) -> dict[str, np.ndarray]:
         """Returns what the metric reads from motions without their conditions, by name, as arrays of N rows.
 
-        Metrics of features read nothing else.
+        Metrics of features need no readings.
         """
         return {}
 

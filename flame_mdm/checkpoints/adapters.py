@@ -55,7 +55,7 @@ Paths = str | Path | Sequence[str | Path]  # one file, or several
 
 
 class About(TypedDict):
-    """Description of an adapter: `rows` of the word table are changed, one for each of `words`; `base` is a hash."""
+    """Description of an adapter. It changes `rows` of the word table, one per word; `base` is the hash of its base."""
 
     name: str
     action: bool
@@ -67,7 +67,7 @@ class About(TypedDict):
 
 
 class Change(nn.Module):
-    """Changes a weight in training, see `changed`; adapter files contain the parts if they are `kept`."""
+    """A change of a weight in training (see `changed`). Adapter files contain its parts if `kept` is True."""
 
     def __init__(self, rows: Sequence[int] = (), *, is_kept: bool = True, **parts: Tensor):
         super().__init__()
@@ -91,7 +91,7 @@ def changed(
 
 
 def word_rows(encoder: LearnedTokens, words: Iterable[str], vocabulary: Iterable[str]) -> list[int]:
-    """Returns for each word one of its two rows of the table, if possible one that no word of the vocabulary has."""
+    """Returns one of the two table rows of each word: if possible, a row that no word of the vocabulary uses."""
     used = {row for word in (START, *vocabulary) for row in hashed(word, encoder.buckets)}
     pairs = (hashed(word, encoder.buckets) for word in words)
     return [second if first in used and second not in used else first for first, second in pairs]

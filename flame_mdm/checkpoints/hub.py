@@ -86,7 +86,7 @@ def push(
 
 
 def _check_written(folder: Path) -> None:
-    """Raises `UserError` if a folder has a file that `push` would overwrite, but has not written."""
+    """Raises `UserError` if a folder has a file that `push` would overwrite but did not write."""
     for name, mark in WRITTEN.items():
         path = folder / name
         if path.exists() and mark not in read_text(path):

@@ -35,14 +35,14 @@ GENERATORS = {
     "flame_mdm.training.adaptation.AdaptationTask": MotionGenerator,
     "flame_mdm.training.distillation.DistillationTask": DistilledGenerator,
 }
-"""Classes of the task in recipes, and the generators that they train, which are loaded without Lightning."""
+"""Task classes in recipes, and the generators that they train. Generators are loaded without Lightning."""
 Trained = TypeVar("Trained", bound="Task | MotionGenerator")
 NO_GPU = (
     "PyTorch finds no GPU"
     if torch.version.cuda or torch.version.hip
     else "this PyTorch was built without CUDA"
 )
-"""Why no GPU can be used, if PyTorch has none."""
+"""The reason why no GPU can be used, for machines on which PyTorch has none."""
 
 
 def load(

@@ -336,7 +336,7 @@ class ContinuingCall(Call):
 
 
 class Function(nn.Module):
-    """A function as a module, which PyTorch's exporter takes."""
+    """Wraps a function as a module, as PyTorch's exporter requires."""
 
     def __init__(self, function: Callable[..., Any]):
         super().__init__()
@@ -403,7 +403,7 @@ def traced(graph: Graph) -> torch.export.ExportedProgram:
 
 
 def write_graph(graph: Graph, path: Path, half: bool) -> None:
-    """Writes a graph; raises `UserError` if it computes something else than PyTorch, for a batch of two or of one."""
+    """Writes a graph; raises `UserError` if it does not compute what PyTorch does, for a batch of two or of one."""
     import onnxruntime
 
     examples = list(graph.examples.values())

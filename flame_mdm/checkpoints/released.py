@@ -49,7 +49,7 @@ class Released(NamedTuple):
     action_embedding: Tensor | None = None  # (actions, C), of the condition encoder
 
     def checked(self) -> Self:
-        """Returns this; raises `UserError` unless the network has these weights and no others."""
+        """Returns itself; raises `UserError` unless the network has exactly these weights."""
         with torch.device("meta"):
             network = self.network(*self.features, **self.options)
         theirs.load_strictly(network, self.state, "released weights", assign=True)
@@ -126,7 +126,7 @@ def _target_options(ours: Mapping[str, Tensor]) -> dict[str, Any]:
 
 
 def import_flame(state: Mapping[str, Tensor], *, num_heads: int = 8) -> Released:
-    """Converts FLAME's network, without its RoBERTa; its 8 attention heads cannot be read from the weights."""
+    """Converts FLAME's network without RoBERTa. Its number of attention heads (8) cannot be read from the weights."""
     learned = {key: value for key, value in state.items() if not key.startswith("lm.")}
     names, num_layers = theirs.layer_names(learned, "tf_decoder", theirs.DECODER_LAYER)
     ours = theirs.renamed(learned, theirs.NAMES["flame"] | names)

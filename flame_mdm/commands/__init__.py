@@ -53,7 +53,7 @@ def motion_file(key: str, source: str) -> None:
 
 
 def finish(failures: Sequence[str], total: int, done: str) -> None:
-    """Prints the errors of files of a folder, of which the others were `done`, and exits with 1 if there are any."""
+    """Prints the errors of the files in a folder that failed. If there are any, exits with 1; the others are `done`."""
     if failures:
         say(*(f"error: {failure}" for failure in failures), error=True)
         say(f"error: {len(failures)} of {total} motions could not be {done}", error=True)
@@ -247,7 +247,7 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
     device: str | None = option(None, "cpu or cuda; default: cuda if available", device_name)
 
     def conditions(self) -> list[str]:
-        """Returns the keys given that say what motions show."""
+        """Returns the given keys that say what the motions show."""
         names = [name for name in ("text", "action") if getattr(self, name) is not None]
         return names + (["unconditioned"] if self.unconditioned else [])
 

@@ -39,11 +39,10 @@ class CompareSettings(BodySettings):
 
     Compares runs side by side on one page: configuration differences, curves, evaluations and motions for the same
     prompts. If the runs have results of the same protocol, data and extractor, prints the difference of each metric
-    with its 95 % interval, and whether it is shown.
-    A run may also be a FOLDER of motion files, such as real motions (`browse motions=FOLDER`) or motions of another
-    program. The runs are then sampled for the captions of its motions, at their lengths.
-    rate=true writes a blind user study instead: a page that asks which of two motions fits a text better. ratings=
-    counts the answers.
+    with its 95 % interval, and says whether the interval contains 0. A run may also be a FOLDER of motion files, such
+    as real motions (`browse motions=FOLDER`) or motions of another program. The runs are then sampled for the
+    captions of its motions, at their lengths. rate=true writes a blind user study instead: a page that asks which of
+    two motions fits a text better. ratings= counts the answers.
     """
 
     OBJECTS: ClassVar = ("runs",)

@@ -32,8 +32,8 @@ class TargetConditions:
     Args:
         joints: names of the joints of the skeleton, in the order of its positions.
         facing: numbers of right hip, left hip, right shoulder and left shoulder.
-        choices: sets of slots; each training motion draws one of them, with equal probability. An
-            empty set is the target that requests nothing, which is not the same as none.
+        choices: sets of slots; each training motion draws one of them, with equal probability. An empty set is a
+        target that requests nothing, which differs from having no target.
         drop_prob: probability that a training motion has no target.
         weight: weight of the error in the loss.
         heading_modulo_pi: the error of the heading is taken modulo pi, as in MDM's code, so that

@@ -1,4 +1,4 @@
-"""Vocabulary of the training captions: unknown words of a text, what it may mean, and sentences of several actions."""
+"""Vocabulary of the training captions: unknown words, suggestions, and sentences of several actions."""
 
 import difflib
 import re
@@ -152,7 +152,7 @@ def unknown_words(text: str, facts: Mapping[str, Any]) -> list[str]:
 
 
 def _suggested(text: str, facts: Mapping[str, Any]) -> str:
-    """Returns " Did you mean '...'?": the text with known words for unknown ones, or the nearest training caption.
+    """Returns " Did you mean '...'?" with known words in place of unknown ones, or with the nearest training caption.
 
     Words that are not English are replaced by known words with a similar spelling, English words
     only by known words with a similar meaning (never "shelf" by "she"). A caption is near if it
@@ -232,7 +232,7 @@ def _before_verb(verbs: tuple[str, ...]) -> tuple[re.Pattern[str], re.Pattern[st
 
 
 def plainest(captions: Iterable[str]) -> list[str]:
-    """Returns captions in order: captions about "a person" come first, shorter captions before longer ones."""
+    """Returns captions sorted from plain to elaborate: captions about "a person" first, shorter before longer ones."""
     return sorted(
         captions, key=lambda caption: (not caption.startswith("a person "), len(caption), caption)
     )

@@ -79,7 +79,7 @@ def plain(config: Any, where: str | Path, *, but: str = "") -> None:
 
 
 def renamed(config: Config) -> Config:
-    """Returns a configuration, which an earlier version may have written, with today's names of the classes."""
+    """Returns a configuration with the current names of its classes; an earlier version may have written it."""
     task = config.get("task")
     if not isinstance(task, Mapping):
         return config

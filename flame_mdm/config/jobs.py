@@ -1,4 +1,4 @@
-"""Command lines of one command that are several jobs: a sweep over values of its keys, and jobs for a launcher."""
+"""Command lines that run several jobs: sweeps over values of their keys, and jobs for a launcher."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -23,7 +23,7 @@ from flame_mdm.safe_io.paths import check_tree
 Settings = TypeVar("Settings")
 
 FOLDER = Path("runs") / "sweeps"
-"""Folder of the output of jobs that a launcher starts; their results are where each job writes them."""
+"""Folder of the logs of jobs that a launcher starts; each job writes its results where it would without a launcher."""
 
 
 def run_jobs(command: Callable[[Settings], None], kind: type[Settings], argv: Sequence[str]) -> int:

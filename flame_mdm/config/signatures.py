@@ -72,7 +72,7 @@ DERIVED = ("to_joints", "feet", "edges")  # arguments of these classes that no r
 
 
 def check_top_level(config: Config) -> None:
-    """Raises `UserError` if a key of a recipe that is no argument of a `_target_` is unknown, or has a wrong value."""
+    """Raises `UserError` for unknown keys and wrong values outside of the mappings with a `_target_`."""
     for key, annotation in TOP_LEVEL.items():
         group, _, name = key.rpartition(".")
         node = config.get(group) if group else config

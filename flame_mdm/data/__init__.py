@@ -36,8 +36,7 @@ class Clip:
     split: Split  # mirrored copies and cuts of a take belong to the split of that take
     source: str  # the take the clip comes from; clips of one source are never in two splits
     action: int | None = None  # index into the data set's `actions`, or None
-    # Exact facts about the motion, such as side, count and direction, or tagged words. The values
-    # are such that JSON can hold them.
+    # Exact facts about the motion, such as side, count and direction, or tagged words, as JSON values.
     attributes: Mapping[str, Any] = field(default_factory=dict)
     # Name of a representation if the release contains its features: `motion` (F, D) is then
     # stored unchanged. Empty if `motion` is raw.
@@ -64,16 +63,18 @@ class MotionSource(ABC):
     """Arguments of the constructor that define the data, as JSON values. Paths and numbers of workers are
     not among them. They are saved in the store, and commands compare them with those in the recipe."""
     actions: tuple[str, ...] = ()  # names of the action labels, in the order of their numbers
-    # All forms of the verbs in the captions, at which sentences are split into actions. Empty if
-    # sentences are not split.
+    # All forms of the verbs in the captions. Sentences are split into actions at these verbs;
+    # empty if they are not split.
     verbs: tuple[str, ...] = ()
     license: str = ""
     """License of all motions, a key of `licenses.yaml` such as "MIT"; empty if unknown, or if clips have their own."""
     # Whether the license allows checkpoints to contain captions.
     captions_may_be_shared: bool = False
     published_split: bool = False
-    """Whether the split is the one used in papers although it tests on clips seen in training or leaves no validation
-    clips. Saved in the store and in every result."""
+    """Whether the papers' split is used, although it tests on training clips or has no validation clips.
+
+    Saved in the store and in every result.
+    """
     version: int = 1
     """Version of the code that reads the motions. It is part of the fingerprint, and stores of another version
     are not used."""
@@ -114,7 +115,7 @@ class MotionSource(ABC):
         return []
 
     def changed(self, store: Path) -> list[str]:
-        """Returns a line if files were added or changed after they were prepared as the file `store`."""
+        """Returns a line if files were added or changed since the file `store` was prepared from them."""
         return []
 
     def may_share_captions(self, license: str) -> bool:
@@ -187,7 +188,7 @@ def name_hash(name: str) -> int:
 
 
 def hashed_split(name: str, val: int, test: int) -> Split:
-    """Returns a split that depends on the name alone, so that adding names moves no other name.
+    """Returns a split that depends on the name alone, so new names do not move other names.
 
     Args:
         name: name of a motion or of its source.

@@ -1,4 +1,4 @@
-"""The CMU motion capture database with the sentences of HumanML3D and KIT-ML, or with captions of one's own.
+"""The CMU motion capture database with the sentences of HumanML3D and KIT-ML, or with the user's captions.
 
 Motions: http://mocap.cs.cmu.edu, free for all uses, as ASF/AMC or converted to BVH. Captions: Guo
 et al., CVPR 2022 (HumanML3D), and Plappert et al., Big Data 2016 (KIT-ML). `docs/cmu.md` says
@@ -408,9 +408,7 @@ def _is_in(fact: str, trial: str) -> bool:
 
 
 def _rank(path: Path) -> int:
-    """Returns 0 for original files, 1 for conversions, 2 for Daz-friendly ones, whose legs often
-    jump.
-    """
+    """Returns the rank of a file: 0 = original, 1 = converted, 2 = Daz-friendly conversion, whose legs often jump."""
     if path.suffix.lower() == ".amc":
         return 0
     return 2 if "daz" in str(path).lower() else 1

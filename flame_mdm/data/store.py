@@ -261,7 +261,7 @@ def _write(folder: Path, source: MotionSource, representation: Representation, t
 
 
 def _line(entry: Entry) -> str:
-    """Returns the line of a clip. A clip without a license has no such key, as in all stores before there was one."""
+    """Returns the line of a clip. A clip without a license lacks the key, as in stores of earlier versions."""
     values = asdict(entry)
     if not entry.license:
         del values["license"]

@@ -110,7 +110,7 @@ def lines(content: dict[str, Any]) -> list[str]:
 
 
 def deviations(content: dict[str, Any]) -> list[str]:
-    """Returns which figures of a report differ from the published ones, and by how much."""
+    """Returns the figures of a report that differ from the published ones, with the differences."""
     differing = [
         (name, f["found"], f["published"])
         for name, f in content["figures"].items()
@@ -123,9 +123,9 @@ def deviations(content: dict[str, Any]) -> list[str]:
 
 
 def _figures(store: Store) -> dict[str, dict[str, Any]]:
-    """Returns figures of the store, and figures of the raw data when it was prepared.
+    """Returns figures of the store and of the raw data that it was prepared from.
 
-    If both have a name, it stands for the raw data.
+    A figure that both have is of the raw data.
     """
     labeled = [clip for clip in store.clips if clip.action is not None]
     counted: dict[str, float] = {"clips": len(store.clips), **store.info["clips"]}

@@ -33,7 +33,7 @@ from flame_mdm.errors import UserError, first_line, one_line, say
 # Open pages that gradio remembers; it keeps half a megabyte for each, and the page needs none of
 # it
 SESSIONS = 64
-# Numbers of motion files that may be written, and that may wait to be written, at a time.
+# Maximum number of motion files that are written at the same time, and of requests that wait for a file.
 WRITERS = 2
 WAITING_FILES = 32
 FONT, MONO = ("system-ui", "sans-serif"), ("ui-monospace", "monospace")

@@ -23,7 +23,7 @@ from flame_mdm.sampling.resolution import resolve
 
 # Number of requests whose motions stay in memory; a download or an edit of them needs no model
 KEPT = 64
-TIME_LIMIT = 300.0  # maximum number of seconds of one request on the model
+TIME_LIMIT = 300.0  # maximum number of seconds that one request may occupy the model
 # Files to download, and their names on the page
 FORMATS = {
     ".bvh": "BVH",

@@ -38,7 +38,7 @@ JOINTS_IN_JSON = re.compile(rb'"(joints|posed_joints)"\s*:\s*\[\s*\[')  # as oth
 
 
 def unread(path: Path) -> UserError:
-    """Returns the error for a file whose ending is none of a motion file."""
+    """Returns the error for a file whose ending is not an ending of motion files."""
     advice = ADVICE.get(path.suffix.lower(), f"Use one of {', '.join(ENDINGS)}")
     return UserError(
         f"{path}: {path.suffix or 'a file without ending'} is not read as a motion. {advice}"
@@ -55,7 +55,7 @@ def motions_in(folder: Path) -> list[Path]:
 
 
 def motion_files(folder: Path) -> list[Path]:
-    """Returns the same files; raises `UserError` if there are none."""
+    """Returns the files of `motions_in`; raises `UserError` if there are none."""
     files = motions_in(folder)
     if not files:
         raise UserError(f"{folder}: no motion files ({', '.join(ENDINGS)})")

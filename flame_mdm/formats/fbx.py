@@ -48,7 +48,7 @@ ARRAYS = {
     "b": "<u1",
     "c": "<u1",
 }
-DEFLATED = 128  # size of an array in bytes from which it is written compressed
+DEFLATED = 128  # arrays of this many bytes or more are compressed
 
 # Constants at the end of each file, equal in all files without a password.
 FOOTER_ID = bytes.fromhex("fabcab09d0c8d466b176fb831cf7267e")

@@ -34,10 +34,9 @@ LEG, USUAL_LEG = (
 )
 CHILD = 0.25  # shortest leg of a child in meters, at about one year
 FOOT = 0.02  # shortest foot in meters, ankle to toes
-# Ratio of the left and right bones of limbs above which joints are not in the assumed order
+# If left and right limbs differ by more than this ratio, the joints are not in the assumed order.
 UNEQUAL = 1.5
-# Standard deviation of the lengths of limbs over their mean, above which joints are not in the
-# assumed order either.
+# If the lengths of limbs vary by more than this share of their mean, the joints are not in the assumed order either.
 CHANGING = 0.25
 LIMBS = (("hip", "knee"), ("knee", "ankle"), ("shoulder", "elbow"), ("elbow", "wrist"))
 SIDES = ("left_", "right_")  # prefixes of SMPL's joints
@@ -104,7 +103,7 @@ class Layout(BaseModel):
         return layout
 
     def ending(self, **ends: str) -> dict[str, Source]:
-        """Returns a map with the end sites of joints instead of the joints that follow: SMPL's joint=its parent."""
+        """Returns a map in which joints of SMPL, such as the toes, are the end sites of their parents: joint=parent."""
         return {
             side + joint: f"{self.map[side + parent]}.end"
             for joint, parent in ends.items()

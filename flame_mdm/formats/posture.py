@@ -96,7 +96,7 @@ def _flat_foot(ankle: np.ndarray, toe: np.ndarray, offset: np.ndarray) -> np.nda
 
 
 def _toes(foot: np.ndarray, height: np.ndarray) -> np.ndarray:
-    """Returns rotations (F, 3, 3) of the toes relative to the foot, which has rotations (F, 3, 3) in the world."""
+    """Returns the rotations (F, 3, 3) of the toes relative to a foot, whose world rotations are `foot` (F, 3, 3)."""
     low, high, most = TOES
     down = np.clip(np.arcsin(np.clip(-foot[:, 1, 2], -1, 1)), 0, most)
     near = np.clip((high - height) / (high - low), 0, 1)

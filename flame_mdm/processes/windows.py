@@ -23,7 +23,7 @@ class Windows:
     batch: MotionBatch
     #: (W,) int64, the motion of each window.
     rows: Tensor
-    #: (W, L) int64, the frame of the motion at each frame of a window.
+    #: (W, L) int64, the number of the motion's frame at each frame of a window.
     frames: Tensor
     #: (W, L), 0 past the end of a window; they sum to 1 at each frame of a motion.
     weights: Tensor

@@ -127,7 +127,7 @@ class Representation(nn.Module, ABC):
         return None if columns is None else features[..., columns]
 
     def rebase(self, features: Features) -> Features:
-        """Adapts features (..., F, D) of cuts so that they start like complete motions; by default, returns them."""
+        """Adapts features (..., F, D) of cuts to start like complete motions; by default, returns them unchanged."""
         return features
 
     def normalize(self, features: Tensor) -> Tensor:

@@ -281,9 +281,8 @@ def _continued(
 ) -> tuple[Tensor | None, Edit | None, tuple[str, ...]]:
     """Returns the features (F, D) of the motion to continue, the edit that keeps its last frames, and its notes.
 
-    These frames are generated again, so that the new frames fit to them. A model that continues frames reads them, and
-    needs no edit. A motion in memory has no notes, because
-    whoever read it has them.
+    These frames are generated again, so that the new frames fit to them. A model that continues frames reads these
+    frames and needs no edit. The notes of a motion in memory are left out: its reader has shown them.
     """
     if request.after is None:
         return None, None, ()

@@ -50,9 +50,9 @@ def stream(
             frames count. Default: a person who stands still.
         seed: seed of the noise.
         block: number of frames per block, up to what the model predicts at once. Shorter blocks react sooner to a new
-            text, and cost more per second of motion. Default: what the model predicts at once.
-        cleanup: smooth motions, constant bone lengths, feet that do not slide. A block is returned after the next block
-            was computed, because it must fit that block.
+            text, and cost more per second of motion. Default: as many as the model predicts at once.
+        cleanup: smooth motions, constant bone lengths, feet that do not slide. A block is returned after the next
+            block was computed, because it must fit that block.
         options: `guidance_scale`, `sampler`, `num_inference_steps`, `eta` and `spacing`; default: the model's.
 
     Returns:

@@ -60,7 +60,7 @@ class AdaptationTask(GeneratorTask):
     def dropped(self, batch: MotionBatch) -> Tensor:
         """Draws as in other training, but keeps the captions of the user's clips.
 
-        With the null condition for them, guidance would lead away from the clips that are taught.
+        If they got the null condition, guidance would lead away from the taught clips.
         """
         is_kept = torch.tensor([name.startswith(KEPT) for name in batch.ids])
         return super().dropped(batch) & sent(is_kept, self.device)

@@ -76,7 +76,7 @@ def read_armature(armature):
     """Returns the rest pose of an armature at the origin, and its size.
 
     Raises:
-        ValueError: If its bones are not those of a known skeleton, or it is mirrored, scaled unevenly or not upright.
+        ValueError: If its bones belong to no known skeleton, or it is mirrored, scaled unevenly or not upright.
     """
     bones = sorted(armature.data.bones, key=lambda bone: len(bone.parent_recursive))
     names = [bone.name for bone in bones]

@@ -1,1 +1,1 @@
-"""English of prompts: the actions, attributes and order that a sentence asks for, whatever model reads it."""
+"""Understanding of English prompts: actions, attributes and their order, the same for every model."""

@@ -30,11 +30,11 @@ WORDS_OF_VALUES: dict[Value, tuple[str, ...]] = {
     "backward": ("back", "reverse"),
     "circle": ("circle",),
 }
-"""Parts of words, one of which a caption contains that states a value."""
+"""Parts of words by value of an attribute. A caption that states the value contains one of them."""
 
 
 class Abilities:
-    """Actions and attributes of a model whose captions name one of a list of actions each.
+    """Actions and attributes that a model knows, if each of its captions names one action of a list.
 
     Args:
         facts: facts of the model: "actions", "vocabulary" and, if it has them, "captions".
@@ -119,7 +119,7 @@ class Abilities:
         return sorted(self.actions, key=lambda other: -similarity(action, other))
 
     def nearest(self, understood: Understanding) -> list[str]:
-        """Returns captions of three known actions: those with the meanings nearest to a sentence, or the first ones."""
+        """Returns captions of three known actions: the actions nearest in meaning to a sentence, or the first ones."""
         names = [action for action in understood.nearest if action in self.actions]
         ranked = nearest_to([word for word in understood.text.lower().split() if word.isalpha()])
         names += [action for action, _ in ranked if action in self.actions and action not in names]

@@ -117,7 +117,7 @@ def _connector(tokens: Sequence[Token], number: int) -> tuple[str, ...]:
 
 
 def joined(clauses: Sequence[Clause]) -> list[Clause]:
-    """Returns clauses with an action each: words without an action belong to the clause before, or after if first.
+    """Merges clauses so that each has an action: words without one join the clause before, the first ones the next.
 
     A clause such as "then faster" stays, because it repeats the action before.
     """

@@ -10,7 +10,7 @@ from flame_mdm.conditions.language.tokens import Token
 # Maximum number of words for a gap in a phrase
 LONGEST_GAP = 4
 WEAK_PHRASES = (("stand", "still"), ("take", "step"), ("stand", "around"), ("stand", "there"))
-"""Phrases of several words that are no actions if the sentence has another one."""
+"""Phrases of several words that count as actions only if the sentence has no other action."""
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Match:
     Attributes:
         phrase: the phrase.
         used: numbers of its tokens in the sentence, increasing.
-        is_weak: whether it is no action if the sentence has another one, such as "go".
+        is_weak: whether it counts as an action only if the sentence has no other one, such as "go".
     """
 
     phrase: Phrase

@@ -9,18 +9,18 @@ from flame_mdm.conditions.language.tables import actions, words_of
 from flame_mdm.conditions.language.vectors import word_table
 
 SIMILAR = 0.65
-"""Similarity from which a word acts as the nearest action. Calibrated: docs/language.md has precision and recall."""
-NEIGHBORS = 5  # words for actions and things that decide whether a word is a thing
+"""Minimum similarity at which a word stands for the nearest action; docs/language.md has precision and recall."""
+NEIGHBORS = 5  # number of nearest listed words that decide whether a word is a thing
 
 
 def nearest_actions(word: str) -> list[tuple[str, float]]:
-    """Returns the actions by the similarity of a word, the nearest first; () if the table lacks the word."""
+    """Returns the actions and their similarities to a word, the nearest first; () if the table lacks the word."""
     vector = word_table().vector(word)
     return [] if vector is None else _ranked(vector)
 
 
 def nearest_to(words: list[str]) -> list[tuple[str, float]]:
-    """Returns the actions by the similarity of the mean of several words, the nearest first."""
+    """Returns the actions and their similarities to the mean of several words, the nearest first."""
     vector = word_table().mean(words)
     return [] if vector is None else _ranked(vector)
 

@@ -65,7 +65,7 @@ def is_explained(word: str) -> bool:
 
 
 def _nearest(tokens: Sequence[Token]) -> tuple[str, ...]:
-    """Returns the actions with the meanings nearest to the words of a sentence that are in no table, or to all."""
+    """Returns the actions nearest in meaning to the words of a sentence that no table has, or else to all words."""
     words = [token.word for token in tokens if token.is_word]
     free = [word for word in words if not is_explained(word)] or words
     return tuple(action for action, _ in nearest_to(free)[:NEAREST])
@@ -200,7 +200,7 @@ class _Sentence:
         )
 
     def _again(self, clause: Clause, steps: Sequence[Step]) -> list[Step]:
-        """Returns the action before with the attributes of a clause without an action: "then faster"."""
+        """Returns the previous action with the attributes of a clause that names no action: "then faster"."""
         if not steps or len(steps[-1]) > 1:
             return []
         before = steps[-1][0]

@@ -51,7 +51,7 @@ class Reading:
 
 
 class Reader:
-    """Reads sentences for a model whose captions name one of a list of actions each.
+    """Reads sentences for a model in which each caption names one action of a list.
 
     Args:
         facts: facts of the model: "actions", "vocabulary" and, if it has them, "captions".

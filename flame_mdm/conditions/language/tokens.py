@@ -101,7 +101,7 @@ def is_english(word: str) -> bool:
 
 
 def corrected(tokens: Sequence[Token]) -> list[Token]:
-    """Returns the tokens with typos corrected: unknown words for which few similar words come into question."""
+    """Returns the tokens with typos corrected. Typos are unknown words with only a few similar known words."""
     return [
         _corrected(token) if token.is_word and not is_known(token.word) else token
         for token in tokens

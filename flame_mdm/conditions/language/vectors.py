@@ -14,7 +14,7 @@ from flame_mdm.conditions.language.morphology import base_forms
 from flame_mdm.safe_io import read_npz
 
 FILE = Path(__file__).with_name("word_vectors.npz")
-SMOOTHING = 1e-4  # frequency from which words count less in a mean
+SMOOTHING = 1e-4  # words above this frequency count less in a mean
 
 
 class WordTable:

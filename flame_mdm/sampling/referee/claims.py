@@ -75,7 +75,7 @@ def falsified(claim: Claim) -> list[tuple[str, Claim]]:
 
 
 def unique(claims: Sequence[Claim]) -> list[Claim]:
-    """Returns the claims without repetitions that differ in their words alone."""
+    """Returns the claims without repetitions: claims that differ only in their words are the same."""
     kept: dict[Claim, Claim] = {}
     for claim in claims:
         kept.setdefault(_without_words(claim), claim)

@@ -30,7 +30,7 @@ from flame_mdm.sampling.referee.readings import (
 )
 
 MOVING = 0.25  # speed of the pelvis in m/s from which the body travels
-SECTOR = np.cos(np.radians(50))  # travel counts for a direction up to this angle from it
+SECTOR = np.cos(np.radians(50))  # maximum angle between the travel and a direction
 SEEN = {"left": (1.0, 0.0), "right": (-1.0, 0.0), "forward": (0.0, 1.0), "backward": (0.0, -1.0)}
 
 
@@ -52,7 +52,7 @@ def travel(body: Body, claim: Claim) -> Reading:
 
 
 def veer(body: Body, claim: Claim) -> Reading:
-    """Measures how far the body gets to the left or right, as seen from its start, more than to the other side."""
+    """Measures how much farther the body gets to one side, as seen from its start, than to the other side."""
     ground = (body.joints[:, PELVIS] - body.joints[0, PELVIS])[:, [0, 2]]
     sign = 1.0 if claim.direction == "left" else -1.0
     start = body.forward[: max(1, round(0.3 * RATE))].mean(0)

@@ -9,7 +9,7 @@ from flame_mdm.sampling.referee.body import RATE
 
 Spans = tuple[tuple[float, float], ...]
 
-# Units of distances, of which less speaks for a claim
+# Units of distances: a smaller distance speaks for a claim
 AWAY = ("m above the floor", "m apart", "m from")
 
 
@@ -109,7 +109,7 @@ def cycles(signal: np.ndarray, depth: float) -> list[int]:
 def counted(
     signal: np.ndarray, depths: tuple[float, float], amount: int | None, joint: str, unit: str
 ) -> Reading:
-    """Returns a reading of a count of repetitions: of the peaks of a signal, with a lower and a higher depth.
+    """Returns a reading of how often a signal repeats: it counts the peaks, with a lower and a higher depth.
 
     The score is minus the distance between the claimed count and the counts for both depths: 0 if both are the claimed
     one, -0.5 if one of them is, at most -1 if the claimed count is outside of them.

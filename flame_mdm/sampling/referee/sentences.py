@@ -260,10 +260,10 @@ def _is_event(claim: Claim) -> bool:
 
 
 def _consistent(claims: Sequence[Claim], plain: str) -> list[Claim]:
-    """Returns the claims without those that the rest of the sentence makes doubtful.
+    """Removes the claims that the rest of the sentence makes doubtful.
 
-    A body that also travels does not stand still all the time, who stands up after a bow was standing, and if both
-    sides are named, one does not move more.
+    A body that also travels does not stand still all the time, a person who stands up after a bow
+    was standing before, and if both sides are named, neither moves more.
     """
     doubtful: set[str] = set()
     kinds = {claim.kind for claim in claims}

@@ -1,6 +1,11 @@
-"""Writes recipes.md and hyperparameters.md from the recipes: `make docs`."""
+"""Writes recipes.md and hyperparameters.md from the recipes, and draws the parts of the code: `make docs`."""
 
+import ast
 import re
+import textwrap
+from collections.abc import Mapping
+from functools import cache
+from html import escape
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
@@ -138,7 +143,152 @@ def _cell(ours: Any, papers: Any) -> str:
     return text if papers is None else f"{text} (paper: {setting_text(papers)})"
 
 
-PAGES = {"recipes.md": recipes_page, "hyperparameters.md": hyperparameters_page}
+ROOT = Path(__file__).parent.parent
+FLOOR = "config"  # the room of the picture that stands for all parts on the ground
+ROOM, GAP, STOREY, MARGIN = (168, 58), 22, 104, 30  # pixels
+PACKAGES = {"__init__": "flame_mdm", "__main__": "flame-mdm"}
+"""Names in the picture that differ from the names of the modules."""
+ROOMS = {
+    "representations": (0, "motions as features, and back"),
+    "schemas": (1, "typed schemas of files"),
+    "denoisers": (2, "networks: FLAME, MDM's five backbones, DiP"),
+    "processes": (3, "diffusion, flow matching, samplers"),
+    "conditions": (4, "texts and actions as vectors"),
+    "visualize": (0, "players, pictures, videos"),
+    "records": (1.9, "result files of evaluations"),
+    "generator": (3, "a model: four parts, and how to sample from them"),
+    "formats": (0, "motion files, cleanup, characters"),
+    "runs": (1.9, "run directories"),
+    "data": (0.5, "data sets, stores, batches"),
+    "reporting": (1.6, "reports, comparisons, tables"),
+    "task": (3, "Lightning modules: training of a model"),
+    "sampling": (3, "requests, edits, sequences, streams, referee"),
+    "checkpoints": (4, "model files, released weights, ONNX"),
+    "training": (2.2, "callbacks, safeguards, distillation, adapters"),
+    "demo": (4, "the page in the browser"),
+    "__init__": (1, "the Python API"),
+    "evaluators": (2.2, "protocols, metrics, extractors, audits"),
+    "commands": (3.1, "one module per command"),
+    "__main__": (3.1, "the command line"),
+}
+"""Column and content of each room in the picture. The columns are chosen so that no line crosses a room."""
+
+
+def import_rules() -> tuple[dict[str, set[str]], set[str]]:
+    """Returns what each part of the code may import, and the parts on the ground, from the test of the rules."""
+    tree = ast.parse((ROOT / "tests" / "test_architecture.py").read_text(encoding="utf-8"))
+    values: dict[str, Any] = {}
+    for node in tree.body:
+        if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
+            target = node.targets[0] if isinstance(node, ast.Assign) else node.target
+            if isinstance(target, ast.Name) and target.id in {
+                "AXES",
+                "GROUND",
+                "MODELS",
+                "ALL",
+                "MAY_IMPORT",
+            }:
+                code = compile(ast.Expression(node.value), "rules", "eval")
+                values[target.id] = eval(code, dict(values))
+    return values["MAY_IMPORT"], values["GROUND"]
+
+
+def storeys(rules: Mapping[str, set[str]]) -> list[list[str]]:
+    """Returns the rooms of each storey, from the bottom up: a room is above all rooms that it may import."""
+
+    @cache
+    def height(name: str) -> int:
+        return max((height(other) + 1 for other in rules[name]), default=0)
+
+    return [
+        [name for name in rules if height(name) == level]
+        for level in range(max(map(height, rules)) + 1)
+    ]
+
+
+def stairs(rules: Mapping[str, set[str]]) -> list[tuple[str, str]]:
+    """Returns the imports from which all others follow: A may import C if A may import B and B may import C."""
+
+    @cache
+    def below(name: str) -> frozenset[str]:
+        return frozenset(rules[name]).union(*(below(other) for other in rules[name]))
+
+    return [
+        (name, other)
+        for name in rules
+        for other in sorted(rules[name])
+        if not any(other in below(between) for between in rules[name] - {other})
+    ]
+
+
+def house() -> str:
+    """Draws the parts of the code as a house: a room may import the rooms to which lines lead downward."""
+    rules, ground = import_rules()
+    # The parts on the ground, which all others may import, are drawn as one wide room.
+    merged = {
+        name: {FLOOR if other in ground else other for other in others} - {name}
+        for name, others in rules.items()
+        if name not in ground
+    } | {FLOOR: set()}
+    levels = storeys(merged)
+    width = (
+        int(max(column for column, _ in ROOMS.values()) + 1) * (ROOM[0] + GAP) - GAP + 2 * MARGIN
+    )
+    top = 120
+    height = top + len(levels) * STOREY + 20
+    places = {}
+    for number, level in enumerate(levels):
+        y = top + (len(levels) - 1 - number) * STOREY + (STOREY - ROOM[1]) / 2
+        for name in level:
+            if name == FLOOR:
+                places[name] = (MARGIN, y, width - 2 * MARGIN)
+            else:
+                places[name] = (MARGIN + ROOMS[name][0] * (ROOM[0] + GAP), y, ROOM[0])
+    parts = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" '
+        f'width="{width}" height="{height}" font-family="sans-serif">',
+        f'<rect width="{width}" height="{height}" fill="#fff"/>',
+        f'<path d="M{width / 2:g} 12L{width - 8} {top - 6}H8Z" fill="#b5544d"/>',
+        f'<rect x="14" y="{top - 6}" width="{width - 28}" height="{height - top - 6}" '
+        f'fill="#f6f1e7" stroke="#c9bfae"/>',
+    ]
+    for name, other in stairs(merged):
+        x, y, across = places[name]
+        x2, y2, across2 = places[other]
+        begin = x + across / 2
+        end = min(max(begin, x2 + 12), x2 + across2 - 12) if other == FLOOR else x2 + across2 / 2
+        bottom = y + ROOM[1]
+        middle = (bottom + y2) / 2
+        parts.append(
+            f'<path d="M{begin:g} {bottom:g}C{begin:g} {middle:g} {end:g} {middle:g} '
+            f'{end:g} {y2:g}" fill="none" stroke="#8a93a3" stroke-width="1.4"/>'
+        )
+    for name, (x, y, across) in places.items():
+        if name == FLOOR:
+            title, lines = "the ground", [", ".join(sorted(ground))]
+        else:
+            title, lines = PACKAGES.get(name, name), textwrap.wrap(ROOMS[name][1], 28)
+        parts.append(
+            f'<rect x="{x:g}" y="{y:g}" width="{across:g}" height="{ROOM[1]}" rx="5" '
+            f'fill="#fffdf8" stroke="#6b7585"/>'
+        )
+        parts.append(_line(x + across / 2, y + 19, title, 'font-size="14" font-weight="bold"'))
+        parts += [
+            _line(x + across / 2, y + 35 + 13 * row, line, 'font-size="10.5"')
+            for row, line in enumerate(lines)
+        ]
+    return "\n".join([*parts, "</svg>"]) + "\n"
+
+
+def _line(x: float, y: float, text: str, style: str) -> str:
+    return f'<text x="{x:g}" y="{y:g}" text-anchor="middle" fill="#1f2733" {style}>{escape(text)}</text>'
+
+
+PAGES = {
+    "recipes.md": recipes_page,
+    "hyperparameters.md": hyperparameters_page,
+    "assets/house.svg": house,
+}
 
 if __name__ == "__main__":
     for name, write in PAGES.items():

@@ -289,7 +289,7 @@ class Protocol(ClosedSchema):
         return self.replications * rows + again
 
     def check(self, clips: Clips, model: MotionGenerator | None) -> None:
-        """Raises `UserError` if there is no clip, a clip lacks its caption or label, or the condition is not the model's."""
+        """Raises `UserError` if there is no clip, a caption or label is missing, or the model has another condition."""
         rows, condition, fault = self.rows(clips, 0, 0), self.condition, ""
         drawn = {
             "text": [row.caption for row in rows],

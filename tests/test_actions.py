@@ -67,20 +67,21 @@ CONTENT = {
 }
 
 
-def test_arrays_and_plain_values_are_read(tmp_path: Path):
+def test_arrays_and_plain_values_are_read(tmp_path: Path, subtests):
     for protocol, core in product(range(6), (b"core", b"_core")):
-        data = pickle.dumps(CONTENT, protocol)
-        if protocol < 4:  # where names are lines, and not counted
-            data = data.replace(b"numpy._core.", b"numpy.%s." % core)
-        (tmp_path / "x.pkl").write_bytes(data)
-        content = restricted_pickle.read(tmp_path / "x.pkl")
-        assert all(content[key] == CONTENT[key] for key in ("number", "raw", "y"))
-        assert (content["big"].tolist(), content["texts"].tolist()) == ([0, 1, 2], ["a", "bc"])
-        for one, other in zip(
-            [*content["poses"], *content["ragged"]], [*CONTENT["poses"], *ragged], strict=True
-        ):
-            np.testing.assert_array_equal(one, other)
-            assert one.dtype == other.dtype
+        with subtests.test(protocol=protocol, core=core):
+            data = pickle.dumps(CONTENT, protocol)
+            if protocol < 4:  # where names are lines, and not counted
+                data = data.replace(b"numpy._core.", b"numpy.%s." % core)
+            (tmp_path / "x.pkl").write_bytes(data)
+            content = restricted_pickle.read(tmp_path / "x.pkl")
+            assert all(content[key] == CONTENT[key] for key in ("number", "raw", "y"))
+            assert (content["big"].tolist(), content["texts"].tolist()) == ([0, 1, 2], ["a", "bc"])
+            for one, other in zip(
+                [*content["poses"], *content["ragged"]], [*CONTENT["poses"], *ragged], strict=True
+            ):
+                np.testing.assert_array_equal(one, other)
+                assert one.dtype == other.dtype
     numbers = np.array([1.5, -2.5])  # as Python 2 wrote it
     head = b"\x80\x02cnumpy.core.multiarray\n_reconstruct\ncnumpy\nndarray\nK\x00\x85U\x01b\x87R(K\x01K\x02\x85"
     dtype = b"cnumpy\ndtype\nU\x02f8K\x00K\x01\x87R(K\x03U\x01<NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\x00tb"
@@ -98,15 +99,16 @@ ATTACKS = {
 
 
 @pytest.mark.parametrize("named", ATTACKS)
-def test_anything_else_is_refused_before_it_runs(named: str, tmp_path: Path):
+def test_anything_else_is_refused_before_it_runs(named: str, tmp_path: Path, subtests):
     for protocol in (0, 2, 4, 5):
-        path = written(tmp_path / "x.pkl", ATTACKS[named](tmp_path / "run"), protocol)
-        with pytest.raises(
-            ValueError, match=rf"x\.pkl: not read as a pickle: it names .*{named}"
-        ) as error:
-            restricted_pickle.read(path)
-        assert "\n" not in str(error.value)
-        assert os.listdir(tmp_path) == ["x.pkl"]  # noqa: PTH208
+        with subtests.test(protocol=protocol):
+            path = written(tmp_path / "x.pkl", ATTACKS[named](tmp_path / "run"), protocol)
+            with pytest.raises(
+                ValueError, match=rf"x\.pkl: not read as a pickle: it names .*{named}"
+            ) as error:
+                restricted_pickle.read(path)
+            assert "\n" not in str(error.value)
+            assert os.listdir(tmp_path) == ["x.pkl"]  # noqa: PTH208
 
 
 def test_every_byte_may_be_wrong(tmp_path: Path):
@@ -168,7 +170,7 @@ def test_samples_are_those_of_actor(stem: str, tmp_path: Path):
     assert numbers
 
 
-def test_another_humanact12_file_is_named(tmp_path: Path):
+def test_another_humanact12_file_is_named(tmp_path: Path, subtests):
     columns = {
         r"humanact12poses\.pkl: poses, joints3D, y are not lists of equal length": {"y": [0]},
         "clip 0: label 12, not one of 0 to 11": {"y": [12]},
@@ -176,9 +178,10 @@ def test_another_humanact12_file_is_named(tmp_path: Path):
         "clip humanact12_0000: .* not finite": {"poses": [np.full((20, 72), np.nan)]},
     }
     for k, (message, changed) in enumerate(columns.items()):
-        path = write_humanact12(tmp_path / f"raw{k}", 1 + ("equal" in message), **changed)
-        with pytest.raises(ValueError, match=message):
-            write_store(tmp_path / "store", HumanAct12(str(path)), Rot6D())
+        with subtests.test(k=k):
+            path = write_humanact12(tmp_path / f"raw{k}", 1 + ("equal" in message), **changed)
+            with pytest.raises(ValueError, match=message):
+                write_store(tmp_path / "store", HumanAct12(str(path)), Rot6D())
     with pytest.raises(ValueError, match="it contains list"):
         HumanAct12(str(written(tmp_path / "humanact12poses.pkl", [1]))).count()
     with pytest.raises(
@@ -221,7 +224,9 @@ def smpl_model(**changed) -> dict:
     return model | {"bs_style": "lbs"} | changed
 
 
-def test_smpls_offsets_come_from_its_file_without_running_code(tmp_path: Path, monkeypatch):
+def test_smpls_offsets_come_from_its_file_without_running_code(
+    tmp_path: Path, monkeypatch, subtests
+):
     model = smpl_model()
     np.savez(tmp_path / "SMPL.npz", **model)
     positions = model["J_regressor"] @ model["v_template"]
@@ -253,7 +258,10 @@ def test_smpls_offsets_come_from_its_file_without_running_code(tmp_path: Path, m
         ("v_template", attack, "not read as"),
         *((*item, wrong) for item in wrongs.items()),
     ):
-        with pytest.raises(ValueError, match=rf"bad\.pkl: {message}"):
+        with (
+            subtests.test(name=name, value=value, message=message),
+            pytest.raises(ValueError, match=rf"bad\.pkl: {message}"),
+        ):
             load_offsets(written(tmp_path / "bad.pkl", smpl_model(**{name: value})))
     assert not (tmp_path / "run").exists()
 
@@ -341,16 +349,17 @@ def test_front_view_is_actors_camera():
         np.testing.assert_allclose(motion[:, 6:], pose[:, 3:], atol=1e-6)
 
 
-def test_damaged_lists_are_named(tmp_path: Path):
+def test_damaged_lists_are_named(tmp_path: Path, subtests):
     folder = write_uestc(tmp_path / "uestc")
     for text, message in (
         ("a0_p001.avi\n", r"names\.txt, line 1: 'a0_p001\.avi' is not the name of a video"),
         ("a40_d0_p001_c1_color.avi\n", r"names\.txt, line 1: .* one of the 40 actions"),
         ("\n".join(VIDEOS[:3]), r"num_frames_min\.txt \d+ and vibe_cache_refined\.pkl 60 clips"),
     ):
-        (folder / "info/names.txt").write_text(text)
-        with pytest.raises(UserError, match=message):
-            list(UESTC(str(folder)).clips(20.0))
+        with subtests.test(text=text, message=message):
+            (folder / "info/names.txt").write_text(text)
+            with pytest.raises(UserError, match=message):
+                list(UESTC(str(folder)).clips(20.0))
     (folder / "info/names.txt").unlink()
     with pytest.raises(
         FileNotFoundError, match=r"info/names\.txt: not found; it is published with the poses"
@@ -471,13 +480,14 @@ def test_data_without_labels_is_refused(monkeypatch, tmp_path, capsys):
     )
 
 
-def test_recipes_build_the_sizes_of_their_data():
+def test_recipes_build_the_sizes_of_their_data(subtests):
     for words in (["synthetic"], ["synthetic", "task=classifier_stgcn"], ["humanact12"], ["uestc"]):
-        config = compose(f"classifier/{words[0]}", words[1:])
-        task = ClassifierTask.build(
-            config, instantiate(config["representation"]), actions=list("abcdefg")
-        )
-        joints = torch.randn(2, 12, len(task.representation.skeleton.parents), 3)
-        mask = length_mask(torch.tensor([12, 7]))
-        assert task.network.logits(joints, mask).shape == (2, 7)
-        assert len(task(joints, mask)) == 2
+        with subtests.test(words=words):
+            config = compose(f"classifier/{words[0]}", words[1:])
+            task = ClassifierTask.build(
+                config, instantiate(config["representation"]), actions=list("abcdefg")
+            )
+            joints = torch.randn(2, 12, len(task.representation.skeleton.parents), 3)
+            mask = length_mask(torch.tensor([12, 7]))
+            assert task.network.logits(joints, mask).shape == (2, 7)
+            assert len(task(joints, mask)) == 2

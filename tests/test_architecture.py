@@ -173,14 +173,15 @@ def test_strings_outside_commands_name_no_module_of_the_evaluators():
     } == {}
 
 
-def test_these_checks_can_fail(tmp_path):
+def test_these_checks_can_fail(tmp_path, subtests):
     for name, line in (
         ("flame_mdm.denoisers.mdm", "from flame_mdm.conditions.text import TextEncoder"),
         ("flame_mdm.formats.readers", "def f():\n    from flame_mdm.data.folder import read_bvh"),
         ("flame_mdm", "import flame_mdm.reporting.report"),
         ("flame_mdm.__main__", "if TYPE_CHECKING:\n    from evaluators import evaluation"),
     ):
-        assert len(upward(imports({name: line}))) == 1
+        with subtests.test(name=name, line=line):
+            assert len(upward(imports({name: line}))) == 1
     text = "from flame_mdm import config\nimport flame_mdm.task\nfrom flame_mdm.data.store import Store\nimport torch\n"
     assert imports({"a": text})["a"] == {
         "flame_mdm.config",

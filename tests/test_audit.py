@@ -124,7 +124,7 @@ def test_values_without_resampling_are_those_of_an_evaluation(scene):
     assert not any(name.startswith("edge") for name in found), "not defined at 20 frames per second"
 
 
-def test_retrieval_is_the_mean_over_pools(scene):
+def test_retrieval_is_the_mean_over_pools(scene, subtests):
     measure, sets, texts, _, extracted = scene
     values = measure(sets[BASE], texts)
     rows = {name: extracted[name] for name in ("generated", "text", "text_keys", "keys")}
@@ -132,12 +132,13 @@ def test_retrieval_is_the_mean_over_pools(scene):
         ("texts_for_motion", TextsForMotion),
         ("motions_for_text", partial(MotionsForText, normalize=True)),
     ):
-        drawn = []
-        for seed in range(60):
-            one = metric(seed=seed)
-            one.update(**rows)
-            drawn.append(one.compute()["top3"])
-        assert values[f"{name}/top3"][0] == pytest.approx(np.mean(drawn), abs=0.02)
+        with subtests.test(name=name, metric=metric):
+            drawn = []
+            for seed in range(60):
+                one = metric(seed=seed)
+                one.update(**rows)
+                drawn.append(one.compute()["top3"])
+            assert values[f"{name}/top3"][0] == pytest.approx(np.mean(drawn), abs=0.02)
 
 
 def test_intervals_are_those_of_a_bootstrap_over_motions(scene):
@@ -373,7 +374,7 @@ CARDS = sorted((ROOT / "docs" / "benchmarks" / "audit").glob("*.json"))
 
 
 @pytest.mark.parametrize("path", CARDS, ids=lambda path: path.stem)
-def test_committed_cards_are_listed_complete_and_small(path, tmp_path):
+def test_committed_cards_are_listed_complete_and_small(path, tmp_path, subtests):
     listed = json.loads((ROOT / "flame_mdm" / "reporting" / "audited.json").read_text())
     assert [card["name"] for card in listed] == [p.stem for p in CARDS]
     card = read_card(path)
@@ -392,11 +393,12 @@ def test_committed_cards_are_listed_complete_and_small(path, tmp_path):
     assert card.motions >= 368
     by_name = {perturbation.name: perturbation for perturbation in card.perturbations}
     for name in ("wrong captions", "near misses"):
-        responses = {metric: seen(card, by_name[name], metric) for metric in card.metrics}
-        noticed = {
-            metric
-            for metric, response in responses.items()
-            if response and response.grade is not None
-        }
-        assert "fid" not in noticed
-        assert bool(noticed) == any(fact.sees_meaning for fact in card.facts.values())
+        with subtests.test(name=name):
+            responses = {metric: seen(card, by_name[name], metric) for metric in card.metrics}
+            noticed = {
+                metric
+                for metric, response in responses.items()
+                if response and response.grade is not None
+            }
+            assert "fid" not in noticed
+            assert bool(noticed) == any(fact.sees_meaning for fact in card.facts.values())

@@ -139,7 +139,7 @@ def test_the_official_training_set_stays_whole_and_val_is_divided_by_motion(tmp_
     assert flames["val"] + flames["test"] == 4 * 37
 
 
-def test_absent_and_damaged_files_are_named(small: tuple[Path, Path]):
+def test_absent_and_damaged_files_are_named(small: tuple[Path, Path], subtests):
     path = small[1] / "CMU/03/03_01_poses.npz"
     path.write_bytes(path.read_bytes()[:-1])
     with pytest.raises(ValueError, match=r"03_01_poses\.npz: damaged"):
@@ -156,9 +156,10 @@ def test_absent_and_damaged_files_are_named(small: tuple[Path, Path]):
         ("[1]", r"val\.json: not in the layout of BABEL"),
         ('{"1": {"feat_p": "a/b"}}', r"val\.json: not in the layout of BABEL v1\.0: 'frame_ann'"),
     ):
-        (small[0] / "val.json").write_text(content)
-        with pytest.raises(UserError, match=message):
-            open_babel(*small).count()
+        with subtests.test(content=content, message=message):
+            (small[0] / "val.json").write_text(content)
+            with pytest.raises(UserError, match=message):
+                open_babel(*small).count()
     (small[0] / "val.json").unlink()
     with pytest.raises(FileNotFoundError, match=r"BABEL v1\.0 is published at"):
         open_babel(*small).count()

@@ -271,7 +271,7 @@ def test_archives_give_the_same_clips_and_leave_no_files(tiny, tmp_path, monkeyp
     assert sorted(tmp_path.iterdir()) == [*packed, temporary]
 
 
-def test_wrong_input_is_explained(tiny, tmp_path):
+def test_wrong_input_is_explained(tiny, tmp_path, subtests):
     (tmp_path / "notes.txt").write_text("walk")
     for name in ("swim/dataset-1_swim_happy_001", f"twice/one/{HAPPY}", f"twice/two/{HAPPY}"):
         path = tmp_path / f"{name}.bvh"
@@ -291,7 +291,10 @@ def test_wrong_input_is_explained(tiny, tmp_path):
         ),
         (tmp_path / "twice", [], f"{HAPPY} exists twice, as .*one/.* and .*two/"),
     ):
-        with pytest.raises(UserError, match=message):
+        with (
+            subtests.test(path=path, exclude=exclude, message=message),
+            pytest.raises(UserError, match=message),
+        ):
             Bandai(str(path), exclude=exclude).count()
 
 
@@ -332,18 +335,19 @@ def test_real_takes_against_the_joints_of_the_fixture(case, originals):
 @needs_third_party
 @pytest.mark.golden
 @pytest.mark.parametrize("case", CASES, ids=lambda case: f"hml263_bandai-{case}")
-def test_limbs_of_real_takes_point_the_same_way_on_smpls_body(case, originals):
+def test_limbs_of_real_takes_point_the_same_way_on_smpls_body(case, originals, subtests):
     """Bones of arms and legs keep their directions, elbows bend inwards and knees do not twist."""
     joints, motion = (bandai.convert(originals[case], 20, kind) for kind in ("joints", "smpl"))
     one, other = (x[:, 1:22] - x[:, SMPL22.parents[1:]] for x in (joints, decoded(motion)))
     cosines = (one * other).sum(-1) / np.linalg.norm(one, axis=-1) / np.linalg.norm(other, axis=-1)
     vectors = dict(zip(SMPL24.joints, motion[:, 3:].reshape(-1, 24, 3).swapaxes(0, 1), strict=True))
     for side, sign in (("left", -1), ("right", 1)):
-        for name in ("shoulder", "elbow", "wrist", "knee", "ankle"):
-            assert cosines[:, SMPL22.joints.index(f"{side}_{name}") - 1].min() > 1 - 1e-5, (
-                side,
-                name,
-            )
-        elbow = vectors[f"{side}_elbow"]
-        assert sign * elbow[:, 1].mean() > 0.8 * np.linalg.norm(elbow, axis=1).mean()
-        assert np.abs(vectors[f"{side}_knee"][:, 1]).max() < 0.2  # the shin does not twist
+        with subtests.test(side=side, sign=sign):
+            for name in ("shoulder", "elbow", "wrist", "knee", "ankle"):
+                assert cosines[:, SMPL22.joints.index(f"{side}_{name}") - 1].min() > 1 - 1e-5, (
+                    side,
+                    name,
+                )
+            elbow = vectors[f"{side}_elbow"]
+            assert sign * elbow[:, 1].mean() > 0.8 * np.linalg.norm(elbow, axis=1).mean()
+            assert np.abs(vectors[f"{side}_knee"][:, 1]).max() < 0.2  # the shin does not twist

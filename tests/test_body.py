@@ -111,7 +111,7 @@ def test_the_nearest_triangle_is_drawn_and_pictures_show_the_body_in_its_clothes
     assert skin.min() < blue.min()  # the face is above the shirt
 
 
-def test_a_motion_that_no_body_fits_says_why():
+def test_a_motion_that_no_body_fits_says_why(subtests):
     drawn = posed().try_fit()[0]
     for motion, reason in (
         (
@@ -121,14 +121,15 @@ def test_a_motion_that_no_body_fits_says_why():
         (sway(3, skeleton=KIT21), "computed only for the 22 joints of SMPL"),
         (Motion(np.zeros((3, 22, 3)), 20), "has no length"),
     ):
-        with pytest.raises(ValueError, match=reason):
-            fit_body(motion)
-        assert motion.try_fit()[0] is None
-        assert frames_array(motion, 64).shape == (len(motion.joints), 64, 64, 3)  # its skeleton
-        assert render._lines(motion, None, 200, 200) == [
-            *render._lines(motion, drawn, 200, 200),
-            "(no body fits)",
-        ]
+        with subtests.test(reason=reason):
+            with pytest.raises(ValueError, match=reason):
+                fit_body(motion)
+            assert motion.try_fit()[0] is None
+            assert frames_array(motion, 64).shape == (len(motion.joints), 64, 64, 3)  # its skeleton
+            assert render._lines(motion, None, 200, 200) == [
+                *render._lines(motion, drawn, 200, 200),
+                "(no body fits)",
+            ]
 
 
 @pytest.mark.parametrize(
@@ -158,18 +159,19 @@ def test_errors_that_are_not_the_motions_are_not_taken_for_a_reason(monkeypatch)
         posed().try_fit()
 
 
-def test_bodies_in_files_are_drawn_and_damaged_ones_named(tmp_path):
+def test_bodies_in_files_are_drawn_and_damaged_ones_named(tmp_path, subtests):
     stored: dict[str, Any] = mannequin().stored
     motion = posed(left_knee=(60, 0, 0), left_hip=(-30, 0, 0))
     np.savez(tmp_path / "other.npz", **stored | {"colors": 255 - stored["colors"]})
     body = load_body(str(tmp_path / "other.npz"))
     assert fit_body(motion, body).mesh is body
     for name in ("a.glb", "a.gif"):
-        assert motion.save(tmp_path / name, body=body).startswith(
-            f"{tmp_path / name}: 1 frames at 20 per second, "
-        )
-        motion.save(tmp_path / f"mannequin_{name}")
-        assert (tmp_path / name).read_bytes() != (tmp_path / f"mannequin_{name}").read_bytes()
+        with subtests.test(name=name):
+            assert motion.save(tmp_path / name, body=body).startswith(
+                f"{tmp_path / name}: 1 frames at 20 per second, "
+            )
+            motion.save(tmp_path / f"mannequin_{name}")
+            assert (tmp_path / name).read_bytes() != (tmp_path / f"mannequin_{name}").read_bytes()
     assert player_page([motion], body=body) != player_page([motion])
     (tmp_path / "a.npz").write_bytes(b"PK")
     np.savez(tmp_path / "b.npz", **stored | {"bones": stored["bones"] + 30})
@@ -223,7 +225,7 @@ class StandIn:
         }
 
 
-def test_anny_is_made_once_and_fitted_like_the_mannequin(tmp_path, monkeypatch):
+def test_anny_is_made_once_and_fitted_like_the_mannequin(tmp_path, monkeypatch, subtests):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setitem(sys.modules, "anny", SimpleNamespace(Anny=StandIn))
     body = load_body("anny height=0.9 gender=1")
@@ -237,12 +239,13 @@ def test_anny_is_made_once_and_fitted_like_the_mannequin(tmp_path, monkeypatch):
         drawn.starts[0, :22] - [0, drawn.lift, 0], motion.joints[0], atol=1e-6
     )
     for name in ("a.glb", "a.gif"):
-        motion.save(tmp_path / name, body=body)
-        motion.save(tmp_path / f"mannequin_{name}")
-        assert (tmp_path / name).read_bytes() != (tmp_path / f"mannequin_{name}").read_bytes()
+        with subtests.test(name=name):
+            motion.save(tmp_path / name, body=body)
+            motion.save(tmp_path / f"mannequin_{name}")
+            assert (tmp_path / name).read_bytes() != (tmp_path / f"mannequin_{name}").read_bytes()
 
 
-def test_shapes_that_anny_cannot_have_are_refused(tmp_path, monkeypatch):
+def test_shapes_that_anny_cannot_have_are_refused(tmp_path, monkeypatch, subtests):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setitem(sys.modules, "anny", None)
     for name, message in (
@@ -253,6 +256,6 @@ def test_shapes_that_anny_cannot_have_are_refused(tmp_path, monkeypatch):
         ("anny age=1.1", r"age=1\.1 is not one of"),
         ("anny", r'body=anny needs the package anny\. Run pip install "flame-mdm\[body\]"'),
     ):
-        with pytest.raises(UserError, match=message):
+        with subtests.test(name=name, message=message), pytest.raises(UserError, match=message):
             load_body(name)
     assert not list(tmp_path.iterdir())

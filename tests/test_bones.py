@@ -87,13 +87,16 @@ def changed(tmp_path: Path) -> Callable[..., Motion]:
 
 @pytest.mark.parametrize("rest_pose", [False, True])
 @pytest.mark.parametrize("rig", [None, *presets()])
-def test_rotations_of_our_files_come_back(rig: str | None, rest_pose: bool, tmp_path: Path):
+def test_rotations_of_our_files_come_back(
+    rig: str | None, rest_pose: bool, tmp_path: Path, subtests
+):
     for motion in (twisting(), synthetic("kick")):
-        motion.save(tmp_path / "a.bvh", rig=rig, rest_pose=rest_pose)
-        again = read(tmp_path / "a.bvh")
-        kept = len(again.joints)
-        assert kept >= len(motion.joints) - 1
-        assert largest_angle(again, rotations(motion)[-kept:]) < 1e-4
+        with subtests.test(motion=motion):
+            motion.save(tmp_path / "a.bvh", rig=rig, rest_pose=rest_pose)
+            again = read(tmp_path / "a.bvh")
+            kept = len(again.joints)
+            assert kept >= len(motion.joints) - 1
+            assert largest_angle(again, rotations(motion)[-kept:]) < 1e-4
 
 
 def test_a_twist_of_the_forearm_arrives_in_features_although_no_joint_moves(tmp_path: Path):

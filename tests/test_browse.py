@@ -23,7 +23,7 @@ def entry(name: str, split: str = "train", *captions: str) -> Entry:
     return Entry(name, 0, 40, split, name.lstrip("M"), list(captions), None)  # type: ignore[arg-type]
 
 
-def test_clips_are_found_by_words_and_split_with_their_mirrored_copies():
+def test_clips_are_found_by_words_and_split_with_their_mirrored_copies(subtests):
     # No clip matches the search for arch.
     entries = [
         *(entry("Ma", "train", "waves the left hand"), entry("a", "train", "waves the right hand")),
@@ -43,19 +43,21 @@ def test_clips_are_found_by_words_and_split_with_their_mirrored_copies():
         (None, "left right", []),
         (None, "mc", [["c", "Mc"]]),
     ):
-        assert [
-            [clip.id for clip in family] for family in find(entries, split, search)
-        ] == expected, (split, search)
+        with subtests.test(split=split, search=search, expected=expected):
+            assert [
+                [clip.id for clip in family] for family in find(entries, split, search)
+            ] == expected, (split, search)
 
 
-def test_clips_are_chosen_evenly_and_not_too_many():
+def test_clips_are_chosen_evenly_and_not_too_many(subtests):
     families = [[entry(f"{k}"), entry(f"M{k}")] if k % 2 else [entry(f"{k}")] for k in range(100)]
     for most in (1, 2, 7, 50, 149, 150, 1000):
-        chosen = choose(families, most)
-        assert min(most, 150) * 0.5 <= sum(map(len, chosen)) <= most
-        assert chosen[0] == families[0]
-        gaps = np.diff([int(family[0].id) for family in chosen])
-        assert len(gaps) == 0 or gaps.max() - gaps.min() <= 1
+        with subtests.test(most=most):
+            chosen = choose(families, most)
+            assert min(most, 150) * 0.5 <= sum(map(len, chosen)) <= most
+            assert chosen[0] == families[0]
+            gaps = np.diff([int(family[0].id) for family in chosen])
+            assert len(gaps) == 0 or gaps.max() - gaps.min() <= 1
     assert choose(families, 150) == families
     assert choose([families[1]], 1) == [families[1]]
 

@@ -103,7 +103,7 @@ def test_names_of_channels_may_be_written_in_any_case(parse):
     np.testing.assert_array_equal(other.positions(), motion.positions())
 
 
-def test_fps_is_the_one_the_rounded_frame_time_stands_for(parse):
+def test_fps_is_the_one_the_rounded_frame_time_stands_for(parse, subtests):
     for time, fps in (
         *(
             ("0.0333333", 30),
@@ -114,7 +114,8 @@ def test_fps_is_the_one_the_rounded_frame_time_stands_for(parse):
         ),
         *(("0.016666", 60), ("0.01668335", 1 / 0.01668335), (".25", 4), ("2", 0.5)),
     ):
-        assert parse(ARM.replace("0.0333333", time)).fps == fps, time
+        with subtests.test(time=time, fps=fps):
+            assert parse(ARM.replace("0.0333333", time)).fps == fps, time
 
 
 def test_what_is_written_reads_back(tmp_path):
@@ -156,7 +157,7 @@ def test_resampling_turns_at_a_constant_rate_and_keeps_bones_and_the_last_frame(
     np.testing.assert_allclose(lengths, np.tile([5, 2], (5, 1)), rtol=1e-14)
 
 
-def test_damaged_files_are_named_with_the_line(parse):
+def test_damaged_files_are_named_with_the_line(parse, subtests):
     for content, line, reason in (
         ("\0\1", 1, "not a BVH file"),
         (b"HIERARCHY\nROOT \xff", 2, "not UTF-8"),
@@ -191,7 +192,10 @@ def test_damaged_files_are_named_with_the_line(parse):
         (ARM.replace("50 60 9.5", "50 60 oops"), 19, "expected 10 finite"),
         (ARM.replace("0 90 -3 90", "0 90 inf 90"), 18, "expected 10 finite"),
     ):
-        with pytest.raises(UserError, match=rf"arm\.bvh, line {line}: .*{reason}.*\Z"):
+        with (
+            subtests.test(content=content, line=line, reason=reason),
+            pytest.raises(UserError, match=rf"arm\.bvh, line {line}: .*{reason}.*\Z"),
+        ):
             parse(content)
     whole = ARM.rstrip("\n")
     for end in range(len(whole) - 3):  # what follows could be the shorter number that was meant

@@ -401,7 +401,7 @@ def small_state(features: int = 3) -> dict[str, torch.Tensor]:
     }
 
 
-def test_every_weight_is_used_or_the_import_fails() -> None:
+def test_every_weight_is_used_or_the_import_fails(subtests) -> None:
     state = small_state()
     lacking = {
         key: value for key, value in state.items() if key != "seqTransEncoder.layers.0.linear2.bias"
@@ -422,7 +422,10 @@ def test_every_weight_is_used_or_the_import_fails() -> None:
         ({}, Options(), r"output\.weight is missing"),
         (short, Options(), r"size mismatch for .*feed_forward\.0\.bias: .*\[2\].*\[16\]"),
     ):
-        with pytest.raises(ValueError, match=message):
+        with (
+            subtests.test(weights_=weights_, message=message),
+            pytest.raises(ValueError, match=message),
+        ):
             import_mdm(weights_, options)
 
 
@@ -563,7 +566,7 @@ def test_options_of_mdm(tmp_path):
     )
 
 
-def test_options_of_mfm(tmp_path):
+def test_options_of_mfm(tmp_path, subtests):
     text = "log_dir: ./outputs/${name}/${now:%d}\nname: x\nnum_frames: null\ndataset: humanact12\n"
     text += "guidance_param: null\nmodel: {num_heads: 2, cond_mask_prob: 0, lambda_rcxyz: 1}\n"
     for solver, sampler, steps, odeint_grid in (
@@ -572,16 +575,17 @@ def test_options_of_mfm(tmp_path):
         ({"method": "euler_raw", "step_size": 0.1}, "euler", 10, False),
         ({"method": "dopri5"}, "dopri5", 100, False),
     ):
-        options = f"{text}training: {{num_frames: 30}}\node_kwargs: {json.dumps(solver)}\n"
-        assert main(["import", "mfm", *released_file(tmp_path, small_state(150), options)]) == 0
-        model = load(tmp_path)
-        process, losses = model.config["process"], model.config["losses"]
-        assert (model.sampler_options.sampler, model.sampler_options.num_inference_steps) == (
-            sampler,
-            steps,
-        )
-        assert (process["odeint_grid"], process["quantize_time"]) == (odeint_grid, True)
-        assert (model.config["denoiser"]["num_heads"], losses["joints"]) == (2, 1)
+        with subtests.test(solver=solver, sampler=sampler, steps=steps, odeint_grid=odeint_grid):
+            options = f"{text}training: {{num_frames: 30}}\node_kwargs: {json.dumps(solver)}\n"
+            assert main(["import", "mfm", *released_file(tmp_path, small_state(150), options)]) == 0
+            model = load(tmp_path)
+            process, losses = model.config["process"], model.config["losses"]
+            assert (model.sampler_options.sampler, model.sampler_options.num_inference_steps) == (
+                sampler,
+                steps,
+            )
+            assert (process["odeint_grid"], process["quantize_time"]) == (odeint_grid, True)
+            assert (model.config["denoiser"]["num_heads"], losses["joints"]) == (2, 1)
 
 
 def test_averaged_weights_are_taken_and_models_that_attend_to_padding_are_sampled_at_their_length(
@@ -674,7 +678,7 @@ def test_pickles_of_objects_are_read_on_demand_only(refused, bad):
         refused("import", *words, says="model.pt: damaged, or not a ")
 
 
-def test_a_model_file_is_the_checkpoint(trained, data_root, tmp_path, capsys):
+def test_a_model_file_is_the_checkpoint(trained, data_root, tmp_path, capsys, subtests):
     file, half = tmp_path / "model" / "mine.safetensors", tmp_path / "half.safetensors"
     assert main(["export", str(trained), f"out={file}"]) == 0
     assert str(file) in capsys.readouterr().out
@@ -693,7 +697,8 @@ def test_a_model_file_is_the_checkpoint(trained, data_root, tmp_path, capsys):
     )
     assert (content["origin"]["steps"], content["config"]["data"]["root"]) == (2, "data")
     for path in (trained.parent.parent, data_root, tmp_path):
-        assert str(path).encode() not in file.read_bytes(), "it tells where it was made"
+        with subtests.test(path=path):
+            assert str(path).encode() not in file.read_bytes(), "it tells where it was made"
     assert main(["export", str(trained), str(half), "half=true"]) == 0
     assert half.stat().st_size < 0.6 * file.stat().st_size
     assert {value.dtype for value in load_file(half).values() if value.ndim > 1} == {torch.float16}
@@ -701,7 +706,7 @@ def test_a_model_file_is_the_checkpoint(trained, data_root, tmp_path, capsys):
     assert model_files.read_model_file(half)["origin"]["half_precision"]
 
 
-def test_damaged_foreign_and_absent_files_are_one_line(trained, tmp_path):
+def test_damaged_foreign_and_absent_files_are_one_line(trained, tmp_path, subtests):
     file = hub.export(trained, tmp_path / "whole")
     whole = file.read_bytes()
     flipped = bytearray(whole)
@@ -723,10 +728,11 @@ def test_damaged_foreign_and_absent_files_are_one_line(trained, tmp_path):
         ),
         (whole.replace(b'\\"origin\\"', b'\\"oregon\\"'), "its recipe cannot be read"),
     ):
-        assert content != whole
-        file.write_bytes(content)
-        with one_line_error(f"{re.escape(str(file))}.*{message}"):
-            load(file)
+        with subtests.test(content=content, message=message):
+            assert content != whole
+            file.write_bytes(content)
+            with one_line_error(f"{re.escape(str(file))}.*{message}"):
+                load(file)
     for name in ("a", "b"):
         save_file({"w": torch.zeros(1)}, tmp_path / f"{name}.safetensors")
     (tmp_path / "empty").mkdir()

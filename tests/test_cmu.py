@@ -179,7 +179,7 @@ def test_rotations_are_those_of_the_positions(folder):
     )
 
 
-def test_rates_of_1200_frames():
+def test_rates_of_1200_frames(subtests):
     """KIT-ML's duration decides, then HumanML3D's last frame, then CMU's list, then the file."""
     cases = [
         (120.0, 10.0, None, True, 120),
@@ -192,7 +192,8 @@ def test_rates_of_1200_frames():
         (60.0, None, 390, False, 60),
     ]
     for *evidence, rate in [*cases, (None, None, None, False, 120)]:
-        assert cmu.decide_rate(1200, *evidence) == rate, evidence
+        with subtests.test(rate=rate):
+            assert cmu.decide_rate(1200, *evidence) == rate, evidence
 
 
 def test_bad_recordings_are_listed_and_the_good_ones_prepared(folder, capsys):
@@ -291,13 +292,16 @@ def test_faults_in_captions_of_ones_own_are_named(row: str, message: str, folder
         _ = cmu.CMU(str(folder / "motions")).items
 
 
-def test_wrong_folders_get_one_line(folder):
+def test_wrong_folders_get_one_line(folder, subtests):
     for path, captions, message in [
         ("none", "clone", "no recording such as 02_01.bvh or 02_01.amc in it; clone https"),
         ("motions", "none", "none: not found; it is the folder of the captions"),
         ("motions", "motions", "index.csv"),
     ]:
-        with pytest.raises(FileNotFoundError, match=message):
+        with (
+            subtests.test(path=path, captions=captions, message=message),
+            pytest.raises(FileNotFoundError, match=message),
+        ):
             cmu.CMU(str(folder / path), str(folder / captions)).count()
     for name in ("texts/000002.txt", "train.txt"):
         (folder / "clone/HumanML3D" / name).unlink()

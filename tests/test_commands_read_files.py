@@ -112,32 +112,39 @@ def test_every_command_reads_or_refuses_a_file_alike(name: str, row: Row, tmp_pa
 EDITED = ("f03_z_up.bvh", "f03_swapped_sides.bvh", "f12_thirty_joints.npz")
 
 
-def test_edit_says_the_same(trained: Path, tmp_path: Path, capsys):
+def test_edit_says_the_same(trained: Path, tmp_path: Path, capsys, subtests):
     for name in EDITED:
-        COLLECTED[name](tmp_path / name)
-        words = ["region=in_between", "unconditioned=true", "samples=1", f"out={tmp_path / 'out'}"]
-        code = main(["edit", str(trained), str(tmp_path / name), *words])
-        printed = "".join(capsys.readouterr())
-        assert re.search(ROWS[name][0].says, printed, re.DOTALL), printed
-        assert code == (0 if ROWS[name][0].result else 1)
+        with subtests.test(name=name):
+            COLLECTED[name](tmp_path / name)
+            words = [
+                "region=in_between",
+                "unconditioned=true",
+                "samples=1",
+                f"out={tmp_path / 'out'}",
+            ]
+            code = main(["edit", str(trained), str(tmp_path / name), *words])
+            printed = "".join(capsys.readouterr())
+            assert re.search(ROWS[name][0].says, printed, re.DOTALL), printed
+            assert code == (0 if ROWS[name][0].result else 1)
 
 
-def test_a_character_that_is_compressed_is_refused(tmp_path: Path, capsys):
+def test_a_character_that_is_compressed_is_refused(tmp_path: Path, capsys, subtests):
     COLLECTED["f09_smpl_capital.bvh"](tmp_path / "a.bvh")
     COLLECTED["f11_meshopt.glb"](tmp_path / "b.glb")
     for character in [tmp_path / "b.glb", *([FILES / "f11_meshopt.glb"] if FILES.exists() else [])]:
-        assert (
-            main(
-                [
-                    "convert",
-                    str(tmp_path / "a.bvh"),
-                    str(tmp_path / "o.glb"),
-                    f"character={character}",
-                ]
+        with subtests.test(character=character):
+            assert (
+                main(
+                    [
+                        "convert",
+                        str(tmp_path / "a.bvh"),
+                        str(tmp_path / "o.glb"),
+                        f"character={character}",
+                    ]
+                )
+                == 1
             )
-            == 1
-        )
-        assert "it requires EXT_meshopt_compression" in capsys.readouterr().err
+            assert "it requires EXT_meshopt_compression" in capsys.readouterr().err
 
 
 # Words and exit code of the check, then the motions that `convert` writes and its exit code.

@@ -35,7 +35,7 @@ def page(folders: list[Path], out: Path, *words: str) -> str:
     return out.read_text()
 
 
-def test_a_page_puts_runs_side_by_side(three, tmp_path):
+def test_a_page_puts_runs_side_by_side(three, tmp_path, subtests):
     put(three[0])
     put(three[1], values={"fid": {"mean": 7.5, "ci": 0.5, "replications": 2, "n": 64}}, quick=True)
     put(three[1], "y", split="val")
@@ -58,7 +58,8 @@ def test_a_page_puts_runs_side_by_side(three, tmp_path):
     )
     assert text.count("<h3>p version 3") == 2, "splits are not compared"
     for words in ("7.5 ± 0.5", "Quick run — not for publication", "mine/one 0.001953"):
-        assert words in text, words
+        with subtests.test(words=words):
+            assert words in text, words
     assert page(three, tmp_path / "again.html") == text
 
 
@@ -104,7 +105,7 @@ def test_differences_and_values_have_their_units(three, tmp_path, capsys):
     assert any(line.startswith("jitter (m/s^3) ") for line in capsys.readouterr().out.splitlines())
 
 
-def test_what_is_not_paired_has_no_difference(three, tmp_path, capsys):
+def test_what_is_not_paired_has_no_difference(three, tmp_path, capsys, subtests):
     values = {"fid": of(4.5, [4.4, 4.6])}
     put(three[0], values=values)
     for changes, message in (
@@ -126,13 +127,14 @@ def test_what_is_not_paired_has_no_difference(three, tmp_path, capsys):
         ({"protocol": {"name": "q", "version": 3}}, "q version 3, synthetic test, data abc"),
         ({"extractor": {"sha256": "0" * 64}}, "No evaluation in common"),
     ):
-        if changes is not None:
-            put(three[1], **{"values": values, **changes})
-        text = page(three[:2], tmp_path / "out.html")
-        printed = capsys.readouterr().out
-        assert message in printed
-        assert message in unescape(text)
-        assert "95 %" not in printed
+        with subtests.test(changes=changes, message=message):
+            if changes is not None:
+                put(three[1], **{"values": values, **changes})
+            text = page(three[:2], tmp_path / "out.html")
+            printed = capsys.readouterr().out
+            assert message in printed
+            assert message in unescape(text)
+            assert "95 %" not in printed
 
 
 @pytest.mark.slow

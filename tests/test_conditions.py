@@ -140,23 +140,24 @@ def word_ids(caption: str, start: bool, limit: int) -> Tensor:
     return torch.tensor([[*ids[: limit - 1], 31]])
 
 
-def test_every_recipe_constructs_without_network(monkeypatch):
+def test_every_recipe_constructs_without_network(monkeypatch, subtests):
     def refuse(*_, **__):
         raise AssertionError("loaded a language model")
 
     monkeypatch.setattr(Pretrained, "_load", refuse)
     widths = {"none": 0, "action": 24, "learned": 256, "minilm": 384, "clip": 512, "t5": 1024}
     for path in sorted((EXPERIMENTS / "condition").glob("*.yaml")):
-        with initialize_config_dir(str(EXPERIMENTS), version_base=None):
-            config = compose(f"condition/{path.stem}", overrides=["+denoiser.latent_dim=24"])
-        encoder = instantiate(
-            config.condition, **({"num_actions": 5} if path.stem == "action" else {})
-        )
-        assert isinstance(encoder, ConditionEncoder), path
-        assert encoder.features == widths.get(path.stem.split("_")[0], 768), path
-        if isinstance(encoder, PretrainedText):
-            assert not list(encoder.parameters()), path
-            assert len(encoder._pretrained.revision or "") == 40, path
+        with subtests.test(path=path):
+            with initialize_config_dir(str(EXPERIMENTS), version_base=None):
+                config = compose(f"condition/{path.stem}", overrides=["+denoiser.latent_dim=24"])
+            encoder = instantiate(
+                config.condition, **({"num_actions": 5} if path.stem == "action" else {})
+            )
+            assert isinstance(encoder, ConditionEncoder), path
+            assert encoder.features == widths.get(path.stem.split("_")[0], 768), path
+            if isinstance(encoder, PretrainedText):
+                assert not list(encoder.parameters()), path
+                assert len(encoder._pretrained.revision or "") == 40, path
 
 
 def test_actions_are_rows_of_a_table_of_unit_normal_numbers_and_their_null_is_zero():
@@ -244,7 +245,7 @@ def test_pretraining_draws_captions_of_the_same_clip_together():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_gives_what_the_model_gives_for_each_caption_alone(kind: str, models):
+def test_gives_what_the_model_gives_for_each_caption_alone(kind: str, models, subtests):
     import transformers as tf
 
     limit, pooling = 9, "projection" if kind == "clip" else "mean"
@@ -254,13 +255,14 @@ def test_gives_what_the_model_gives_for_each_caption_alone(kind: str, models):
     )
     network = loader.from_pretrained(models[kind]).eval()
     for i, caption in enumerate(CAPTIONS):
-        output = network(input_ids=word_ids(caption, start=kind != "t5", limit=limit))
-        hidden = output.last_hidden_state[0]
-        pooled = output.text_embeds[0] if kind == "clip" else hidden.mean(0)
-        torch.testing.assert_close(cond.pooled[i], pooled, rtol=1e-4, atol=1e-5)
-        torch.testing.assert_close(cond.tokens[i, : len(hidden)], hidden, rtol=1e-3, atol=1e-3)
-        assert real_tokens(cond)[i].sum() == len(hidden)
-        assert not cond.tokens[i, len(hidden) :].any()
+        with subtests.test(i=i, caption=caption):
+            output = network(input_ids=word_ids(caption, start=kind != "t5", limit=limit))
+            hidden = output.last_hidden_state[0]
+            pooled = output.text_embeds[0] if kind == "clip" else hidden.mean(0)
+            torch.testing.assert_close(cond.pooled[i], pooled, rtol=1e-4, atol=1e-5)
+            torch.testing.assert_close(cond.tokens[i, : len(hidden)], hidden, rtol=1e-3, atol=1e-3)
+            assert real_tokens(cond)[i].sum() == len(hidden)
+            assert not cond.tokens[i, len(hidden) :].any()
     assert (cond.pooled[0] - cond.pooled[1]).abs().max() > 0.05
     # The zero null keeps the mask of the sample
     dropped = cond.drop(torch.ones(4, dtype=torch.bool))
@@ -362,7 +364,7 @@ def test_each_caption_is_encoded_once_and_the_cache_gives_the_live_values(
     assert len(list(tmp_path.iterdir())) == 4
 
 
-def test_damage_is_found_and_repaired_aloud(models, tmp_path):
+def test_damage_is_found_and_repaired_aloud(models, tmp_path, subtests):
     encoder = cached_encoder(models)
     encoder.precompute(CAPTIONS, tmp_path)
     (path,) = tmp_path.iterdir()
@@ -373,12 +375,13 @@ def test_damage_is_found_and_repaired_aloud(models, tmp_path):
         intact.replace(b'"tokens"', b'"nekots"'),
         intact.replace(b"F16", b"F99"),
     ):
-        path.write_bytes(damaged)
-        with pytest.raises(UserError, match="damaged"):
-            encoder.load_cache(CAPTIONS, tmp_path)
-        with pytest.warns(UserWarning, match=f"{path.name} is damaged .*; rebuilding it"):
-            encoder.precompute(CAPTIONS, tmp_path)
-        assert path.read_bytes() == intact
+        with subtests.test(damaged=damaged):
+            path.write_bytes(damaged)
+            with pytest.raises(UserError, match="damaged"):
+                encoder.load_cache(CAPTIONS, tmp_path)
+            with pytest.warns(UserWarning, match=f"{path.name} is damaged .*; rebuilding it"):
+                encoder.precompute(CAPTIONS, tmp_path)
+            assert path.read_bytes() == intact
     with pytest.raises(UserError, match="damaged"):
         encoder.load_cache(CAPTIONS[:1], tmp_path)
 

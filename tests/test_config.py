@@ -94,7 +94,9 @@ def test_a_wrong_override_is_one_line_with_the_nearest_names():
             compose("quickstart", [override])
 
 
-def test_what_lightning_checks_late_is_checked_before_the_data(capsys, tmp_path, monkeypatch):
+def test_what_lightning_checks_late_is_checked_before_the_data(
+    capsys, tmp_path, monkeypatch, subtests
+):
     monkeypatch.setattr(os, "cpu_count", lambda: 3)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
     for word, reason in (
@@ -104,9 +106,10 @@ def test_what_lightning_checks_late_is_checked_before_the_data(capsys, tmp_path,
             f"this machine has 3 CPU cores, and {NO_GPU}. Give at most trainer.devices=3",
         ),
     ):
-        folders = [f"run.dir={tmp_path / 'run'}", f"data_root={tmp_path}"]
-        assert main(["train", "quickstart", *folders, "trainer.accelerator=auto", word]) == 1
-        assert one_error(capsys) == f"error: {word}: {reason}"
+        with subtests.test(word=word, reason=reason):
+            folders = [f"run.dir={tmp_path / 'run'}", f"data_root={tmp_path}"]
+            assert main(["train", "quickstart", *folders, "trainer.accelerator=auto", word]) == 1
+            assert one_error(capsys) == f"error: {word}: {reason}"
     assert list(tmp_path.iterdir()) == []
 
 
@@ -125,7 +128,7 @@ def test_parts_are_swapped_whole_except_in_a_saved_configuration(tmp_path):
         compose(str(tmp_path / "config.yaml"), ["denoiser=mdm_encoder"])
 
 
-def test_recipes_outside_the_repository(tmp_path):
+def test_recipes_outside_the_repository(tmp_path, subtests):
     text = "# @package _global_\n# Mine.\ndefaults:\n  - /quickstart\n  - _self_\nseed: 5\n"
     (tmp_path / "mine.yaml").write_text(text)
     composed = compose(str(tmp_path / "mine.yaml"))
@@ -136,7 +139,7 @@ def test_recipes_outside_the_repository(tmp_path):
         (str(tmp_path / "absent.yaml"), "no such file"),
         ("quikstart", r"unknown experiment 'quikstart'\. Did you mean quickstart"),
     ):
-        with pytest.raises(UserError, match=message):
+        with subtests.test(message=message), pytest.raises(UserError, match=message):
             compose(name)
 
 
@@ -181,7 +184,7 @@ def test_a_recipe_file_may_have_keys_of_its_own_to_which_others_refer(tmp_path):
 
 
 @pytest.mark.parametrize("name", [name for name in dir(torch.optim) if is_optimizer(name)])
-def test_each_argument_of_an_optimizer_of_a_wrong_type_is_named_with_its_value(name):
+def test_each_argument_of_an_optimizer_of_a_wrong_type_is_named_with_its_value(name, subtests):
     target = f"torch.optim.{name}"
     # The arguments that are left out are texts.
     for key in parameters(target) - {
@@ -192,9 +195,10 @@ def test_each_argument_of_an_optimizer_of_a_wrong_type_is_named_with_its_value(n
         with pytest.raises(UserError, match=rf"^optimizer\.{key}=abc: must be "):
             check({"optimizer": {"_target_": target, key: "abc"}})
     for value in ([0.9], [0.9, "x"], 0.9):
-        if "betas" in parameters(target) and name != "Adafactor":
-            with pytest.raises(UserError, match=r"^optimizer\.betas=.*: must be a list"):
-                check({"optimizer": {"_target_": target, "betas": value}})
+        with subtests.test(value=value):
+            if "betas" in parameters(target) and name != "Adafactor":
+                with pytest.raises(UserError, match=r"^optimizer\.betas=.*: must be a list"):
+                    check({"optimizer": {"_target_": target, "betas": value}})
     check(
         {
             "optimizer": {
@@ -217,7 +221,7 @@ def test_signatures_are_read_through_reexports_bases_and_dataclasses():
         check({"a": [{"_target_": "torch.optim.AdamW", "lrr": 1}]})
 
 
-def test_values_are_checked_against_annotations():
+def test_values_are_checked_against_annotations(subtests):
     for annotation, legal, illegal in (
         ("int", [3], [True, 3.0, "3", None]),
         ("float | None", [3, 0.5, None], [True, float("nan"), float("-inf"), "x"]),
@@ -237,11 +241,12 @@ def test_values_are_checked_against_annotations():
         ("dict[str, Any]", [{}, {"a": 1}], [3, "x", None]),
         ("", [None, 3], []),
     ):
-        for value in legal:
-            check_kind("key", value, annotation)
-        for value in illegal:
-            with pytest.raises(UserError, match="must be "):
+        with subtests.test(annotation=annotation, legal=legal, illegal=illegal):
+            for value in legal:
                 check_kind("key", value, annotation)
+            for value in illegal:
+                with pytest.raises(UserError, match="must be "):
+                    check_kind("key", value, annotation)
 
 
 ENCODER = {"_target_": "flame_mdm.denoisers.mdm.MDMEncoder"}
@@ -272,14 +277,14 @@ UNTRUSTED = [
 ]
 
 
-def test_a_checkpoint_names_only_own_classes_and_those_that_the_user_trusts(monkeypatch):
+def test_a_checkpoint_names_only_own_classes_and_those_that_the_user_trusts(monkeypatch, subtests):
     for wrong in (
         {"num_heads": True},
         {"latent_dim": ENCODER},
         {"latent_dims": 3},
         {"dropout": float("nan")},
     ):
-        with pytest.raises(UserError, match=r"denoiser\."):
+        with subtests.test(wrong=wrong), pytest.raises(UserError, match=r"denoiser\."):
             trust({"denoiser": ENCODER | wrong})
     for name in recipes():
         trust({part: recipe(name)[part] for part in PARTS if part in recipe(name)})
@@ -299,7 +304,7 @@ def test_a_checkpoint_names_only_own_classes_and_those_that_the_user_trusts(monk
     trust({"denoiser": {"_target_": "fractions.Fraction"}})
 
 
-def test_no_class_path_names_a_file_outside_of_packages(tmp_path, monkeypatch):
+def test_no_class_path_names_a_file_outside_of_packages(tmp_path, monkeypatch, subtests):
     (tmp_path / "evil.py").write_text("class MDMEncoder: pass")
     monkeypatch.setattr("ast.parse", lambda *_: pytest.fail("a file was parsed"))
     for module in (
@@ -307,9 +312,10 @@ def test_no_class_path_names_a_file_outside_of_packages(tmp_path, monkeypatch):
         "flame_mdm.denoisers.../../evil",
         "flame_mdm/denoisers",
     ):
-        assert source_file(module) is None
-        with pytest.raises(UserError, match="Its code is only run if you"):
-            trust({"denoiser": {"_target_": f"{module}.MDMEncoder"}})
+        with subtests.test(module=module):
+            assert source_file(module) is None
+            with pytest.raises(UserError, match="Its code is only run if you"):
+                trust({"denoiser": {"_target_": f"{module}.MDMEncoder"}})
 
 
 def test_own_classes_outside_the_repository_need_no_registration(tmp_path, monkeypatch):
@@ -344,7 +350,7 @@ class Example:
     loop: bool = option(False, "true or false")
 
 
-def test_words_become_typed_settings():
+def test_words_become_typed_settings(subtests):
     for words, values in (
         (["a b", "n", "m o"], {"file": "a b", "names": ["n", "m o"]}),
         (["file=x", "names=a 'b c'"], {"file": "x", "names": ["a", "b c"]}),
@@ -355,12 +361,13 @@ def test_words_become_typed_settings():
         ),
         (["rate=null", "steps=5"], {"rate": None, "steps": 5}),
     ):
-        seen: list[Example] = []
-        assert run(seen.append, Example, words) == 0
-        assert {key: getattr(seen[0], key) for key in values} == values
+        with subtests.test(words=words, values=values):
+            seen: list[Example] = []
+            assert run(seen.append, Example, words) == 0
+            assert {key: getattr(seen[0], key) for key in values} == values
 
 
-def test_wrong_words_are_one_line(capsys):
+def test_wrong_words_are_one_line(capsys, subtests):
     for words, message in (
         (["flie=x"], "unknown config key 'flie'. Did you mean file?"),
         (["x", "file=y"], "file is given twice"),
@@ -374,8 +381,9 @@ def test_wrong_words_are_one_line(capsys):
         (["=", "x"], "'=' has no key. Write key=value, without spaces around the = sign"),
         (["=x"], "'=x' has no key"),
     ):
-        assert run(lambda _: pytest.fail("it ran"), Example, words) == 1
-        assert message in one_error(capsys)
+        with subtests.test(words=words, message=message):
+            assert run(lambda _: pytest.fail("it ran"), Example, words) == 1
+            assert message in one_error(capsys)
 
 
 def test_a_sweep_runs_each_combination(capsys):
@@ -397,7 +405,7 @@ def test_a_sweep_runs_each_combination(capsys):
     assert seen[-1].rate == 3
 
 
-def test_evaluations_are_swept_and_launched(tmp_path, monkeypatch, capsys):
+def test_evaluations_are_swept_and_launched(tmp_path, monkeypatch, capsys, subtests):
     monkeypatch.chdir(tmp_path)
     Path("model.ckpt").touch()
     evaluated, started = [], []
@@ -430,27 +438,31 @@ def test_evaluations_are_swept_and_launched(tmp_path, monkeypatch, capsys):
         (["--fast", "--multirun"], "unknown option --fast"),
         ([], "guidance_scale=1,2.5: several values make a sweep, one job for each. Add --multirun"),
     ):
-        assert main([*words, *extra]) == 1
-        assert message in one_error(capsys)
+        with subtests.test(extra=extra, message=message):
+            assert main([*words, *extra]) == 1
+            assert message in one_error(capsys)
     assert len(evaluated) == 5
     assert len(started) == 1
 
 
-def test_every_command_lists_its_keys_with_defaults_and_help(capsys):
+def test_every_command_lists_its_keys_with_defaults_and_help(capsys, subtests):
     for command in COMMANDS:
-        module = import_module(
-            f"flame_mdm.commands.{'import_released' if command == 'import' else command}"
-        )
-        assert main([command, "--help"]) == 0
-        shown = capsys.readouterr().out
-        assert shown.startswith(f"usage: flame-mdm {command} ")
-        if command != "train":
-            kind = get_type_hints(module.main)["settings"]
-            listed = [
-                line for line in shown.partition("defaults:\n")[2].splitlines() if line[2:3] != " "
-            ]
-            names = {entry.name for entry in fields(kind)} - {"composed"}
-            assert {line.split("=")[0].strip() for line in listed} == names
+        with subtests.test(command=command):
+            module = import_module(
+                f"flame_mdm.commands.{'import_released' if command == 'import' else command}"
+            )
+            assert main([command, "--help"]) == 0
+            shown = capsys.readouterr().out
+            assert shown.startswith(f"usage: flame-mdm {command} ")
+            if command != "train":
+                kind = get_type_hints(module.main)["settings"]
+                listed = [
+                    line
+                    for line in shown.partition("defaults:\n")[2].splitlines()
+                    if line[2:3] != " "
+                ]
+                names = {entry.name for entry in fields(kind)} - {"composed"}
+                assert {line.split("=")[0].strip() for line in listed} == names
 
 
 def test_make_variables_are_read_without_a_shell(monkeypatch):
@@ -469,7 +481,7 @@ def test_make_variables_are_read_without_a_shell(monkeypatch):
     assert make_variables() == []
 
 
-def test_settings_with_a_data_set_compose_it(tmp_path):
+def test_settings_with_a_data_set_compose_it(tmp_path, subtests):
     nodes = compose_data(
         "synthetic", ["representation=smpl", "data.source.clips=5"], data_root=f"{tmp_path}/${{a}}"
     )
@@ -483,7 +495,7 @@ def test_settings_with_a_data_set_compose_it(tmp_path):
         ("data.x=5", "none is named"),
         ("data=syntetic", "no data is called 'syntetic'"),
     ):
-        with pytest.raises(UserError, match=message):
+        with subtests.test(line=line, message=message), pytest.raises(UserError, match=message):
             read_settings(EvaluateSettings, line.split())
 
 
@@ -553,7 +565,7 @@ def test_help_and_wrong_words_do_not_wait_for_torch():
     assert dir(flame_mdm) == ["Motion", "adapt", "edit", "generate", "judge", "load", "stream"]
 
 
-def test_only_errors_that_the_user_can_fix_are_one_line(capsys, monkeypatch):
+def test_only_errors_that_the_user_can_fix_are_one_line(capsys, monkeypatch, subtests):
     def fail() -> None:
         raise error
 
@@ -574,11 +586,12 @@ def test_only_errors_that_the_user_can_fix_are_one_line(capsys, monkeypatch):
         (OSError(24, "Too many open files"), None),
         (KeyError("x"), None),
     ):
-        assert guarded(fail) == (70 if line is None else 1)
-        shown = capsys.readouterr().err
-        assert shown.startswith(line or "Traceback")
-        assert ("bug in flame_mdm. Please report it" in shown) == (line is None)
-        assert line is None or shown.count("\n") == 1
+        with subtests.test(line=line):
+            assert guarded(fail) == (70 if line is None else 1)
+            shown = capsys.readouterr().err
+            assert shown.startswith(line or "Traceback")
+            assert ("bug in flame_mdm. Please report it" in shown) == (line is None)
+            assert line is None or shown.count("\n") == 1
     monkeypatch.setenv("FLAME_MDM_TRACEBACK", "1")
     error = UserError("wrong")
     guarded(fail)

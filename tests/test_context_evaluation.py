@@ -56,14 +56,17 @@ def test_the_frames_before_the_measured_ones_are_the_context(protocol, clips, mo
     )
 
 
-def test_expected_values_of_whole_motions_are_not_those_of_cut_ones(protocol, clips, model):
+def test_expected_values_of_whole_motions_are_not_those_of_cut_ones(
+    protocol, clips, model, subtests
+):
     bounds = {"expected": {"synthetic": {"foot_skating": [-1.0, 0.0]}}}
     cut = protocol.model_copy(update=bounds)
     whole = cut.model_copy(update={"context": "start"})
     values = {"foot_skating": Value(mean=0.5, ci=None, replications=1, n=1)}
     for measured, count in ((cut, 0), (whole, 1)):
-        evaluation = Evaluation(measured, clips, None, model.representation)
-        assert len(evaluation._unexpected(values)) == count
+        with subtests.test(measured=measured, count=count):
+            evaluation = Evaluation(measured, clips, None, model.representation)
+            assert len(evaluation._unexpected(values)) == count
     lines = Evaluation(cut, clips, None, model.representation)._conditions()
     assert any("the first frames are not measured" in line for line in lines)
 

@@ -176,13 +176,14 @@ def test_crops_follow_the_rule_of_the_field_or_repeat_the_last_frame():
     np.testing.assert_array_equal(Whole(1, 10)(30, generator), np.arange(10))
 
 
-def test_integers_are_uniform_and_independent():
+def test_integers_are_uniform_and_independent(subtests):
     below = integers(np.arange(60_000))
     first, second, many = below(6), below(6), below(np.tile([1, 2, 3], 20_000))
     for a, b in ((first, second), (first[:-1], first[1:])):
-        expected, counts = len(a) / 36, np.bincount(6 * a + b, minlength=36)
-        # Chi-squared with 35 degrees: p < 0.0005 beyond
-        assert ((counts - expected) ** 2 / expected).sum() < 70
+        with subtests.test(a=a, b=b):
+            expected, counts = len(a) / 36, np.bincount(6 * a + b, minlength=36)
+            # Chi-squared with 35 degrees: p < 0.0005 beyond
+            assert ((counts - expected) ** 2 / expected).sum() < 70
     assert [set(many[k::3].tolist()) for k in range(3)] == [{0}, {0, 1}, {0, 1, 2}]
 
 
@@ -208,7 +209,9 @@ def test_batches_are_a_function_of_their_number_and_processes_share_them():
         )
 
 
-def test_statistics_of_frames_read_in_parts_are_those_of_all_frames(tmp_path, monkeypatch):
+def test_statistics_of_frames_read_in_parts_are_those_of_all_frames(
+    tmp_path, monkeypatch, subtests
+):
     rng = np.random.default_rng(0)
     frames = (
         rng.normal(size=(997, 64)) * 10 ** rng.uniform(-2, 2, 64) + rng.normal(size=64)
@@ -218,9 +221,11 @@ def test_statistics_of_frames_read_in_parts_are_those_of_all_frames(tmp_path, mo
     parts = Frames(lambda: np.split(frames, np.sort(rng.integers(0, 997, 30))), 997)
     whole = torch.from_numpy(frames)
     for size in (1, 7, 64, 996, 997, 5000):
-        assert all(
-            torch.equal(*pair) for pair in zip(parts.split(size), whole.split(size), strict=True)
-        )
+        with subtests.test(size=size):
+            assert all(
+                torch.equal(*pair)
+                for pair in zip(parts.split(size), whole.split(size), strict=True)
+            )
     mean, std = Rifke().statistics(parts)
     whole = whole.double()
     assert torch.equal(mean, whole.mean(0).float())
@@ -274,15 +279,20 @@ def assert_equal(first: Iterable[MotionBatch], second: Iterable[MotionBatch]) ->
 
 
 @pytest.mark.parametrize("crop", CROPS, ids=lambda crop: type(crop).__name__)
-def test_batches_are_those_of_the_data_loader(root, crop):
+def test_batches_are_those_of_the_data_loader(root, crop, subtests):
     for (rank, world, step), kind in product(((0, 1, 0), (0, 1, 17), (1, 2, 5)), ("train", "val")):
-        on, off = (
-            loader(module(root, crop, resident=r), kind, step, rank, world) for r in (True, False)
-        )
-        assert (isinstance(on, ResidentLoader), isinstance(off, ResidentLoader)) == (True, False)
-        assert_equal(islice(on, 30), islice(off, 30))
-        if kind != "train":
-            assert len(on) == len(off) > 0
+        with subtests.test(kind=kind):
+            on, off = (
+                loader(module(root, crop, resident=r), kind, step, rank, world)
+                for r in (True, False)
+            )
+            assert (isinstance(on, ResidentLoader), isinstance(off, ResidentLoader)) == (
+                True,
+                False,
+            )
+            assert_equal(islice(on, 30), islice(off, 30))
+            if kind != "train":
+                assert len(on) == len(off) > 0
 
 
 def test_workers_change_nothing(root):
@@ -301,17 +311,19 @@ def test_a_store_of_another_representation_is_refused(root):
         data.open()
 
 
-def test_cuts_of_adapted_features_labels_and_missing_captions(tmp_path):
+def test_cuts_of_adapted_features_labels_and_missing_captions(tmp_path, subtests):
     for kind in ("train", "val"):
-        first, second = (
-            list(islice(loader(rotations(tmp_path, resident=r), kind), 12)) for r in (True, False)
-        )
-        assert_equal(first, second)
-        assert all(batch.action is not None for batch in first)
-        moved = torch.cat([batch.x[:, 0, 144:147] for batch in first])
-        torch.testing.assert_close(moved, torch.full_like(moved, -0.3 / 1.7))
-        if kind == "train":
-            assert {batch.text is None for batch in first} == {True, False}
+        with subtests.test(kind=kind):
+            first, second = (
+                list(islice(loader(rotations(tmp_path, resident=r), kind), 12))
+                for r in (True, False)
+            )
+            assert_equal(first, second)
+            assert all(batch.action is not None for batch in first)
+            moved = torch.cat([batch.x[:, 0, 144:147] for batch in first])
+            torch.testing.assert_close(moved, torch.full_like(moved, -0.3 / 1.7))
+            if kind == "train":
+                assert {batch.text is None for batch in first} == {True, False}
 
 
 def test_batches_are_padded_to_few_lengths(root):

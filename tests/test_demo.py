@@ -49,14 +49,17 @@ def parsed(query: str) -> DemoRequest:
     return parse_query(parse_qsl(query))
 
 
-def test_a_link_reproduces_its_request_and_names_every_option_that_is_not_left_to_the_model():
+def test_a_link_reproduces_its_request_and_names_every_option_that_is_not_left_to_the_model(
+    subtests,
+):
     for request in (
         DemoRequest(text="a person walks"),
         EDITED,
         PATH,
         DemoRequest(text="ü & = # % + ' \" <b>"),
     ):
-        assert parsed(request.query()) == parsed(request.query() + "&__theme=dark") == request
+        with subtests.test(request=request):
+            assert parsed(request.query()) == parsed(request.query() + "&__theme=dark") == request
     sampling = ["guidance_scale", "num_inference_steps", "sampler", "cleanup", "split"]
     keys = ["model", "text", "seconds", "samples", "seed", *sampling, "edit", "edit"]
     assert [key for key, _ in parse_qsl(EDITED.query())] == keys
@@ -116,7 +119,9 @@ def studio() -> making.Studio:
     return making.Studio(["quickstart"], "cpu")
 
 
-def test_the_python_lines_and_the_files_give_the_same_motions(studio, tmp_path, monkeypatch):
+def test_the_python_lines_and_the_files_give_the_same_motions(
+    studio, tmp_path, monkeypatch, subtests
+):
     monkeypatch.chdir(tmp_path)
     for request in (
         PATH.model_copy(update={"edits": (DemoEdit(strength=0.5, samples=2),)}),
@@ -132,13 +137,14 @@ def test_the_python_lines_and_the_files_give_the_same_motions(studio, tmp_path, 
         np.testing.assert_array_equal(file["joints"], ours[1].joints)
     assert all(studio.file(EDITED, 1, ".bvh", rig).startswith(b"HIERARCHY") for rig in presets())
     for rig in ("unreal", "unity", "mixamo"):
-        assert studio.file(EDITED, 1, ".fbx", rig).startswith(b"Kaydara FBX Binary")
+        with subtests.test(rig=rig):
+            assert studio.file(EDITED, 1, ".fbx", rig).startswith(b"Kaydara FBX Binary")
     for wrong, says in (
         ((2, ".bvh"), "there are 2 motions"),
         ((0, ".exe"), "not a format"),
         ((0, ".bvh", "no"), "no"),
     ):
-        with pytest.raises(UserError, match=says):
+        with subtests.test(wrong=wrong, says=says), pytest.raises(UserError, match=says):
             studio.file(EDITED, *wrong)
 
 
@@ -159,23 +165,24 @@ def test_a_request_stops_within_a_step_and_the_next_one_runs(studio, monkeypatch
         studio.motions(request.model_copy(update={"seed": 1}))
 
 
-def test_refusals_of_files_name_no_temporary_folder(studio):
+def test_refusals_of_files_name_no_temporary_folder(studio, subtests):
     request = DemoRequest(text="a person walks", **FAST)
     studio.motions(request)
     for extension in (".npz", ".mp4"):
-        with pytest.raises(UserError) as error:
-            studio.file(request, 0, extension, "unreal")
-        assert str(error.value).startswith(f"motion{extension}")
-        assert tempfile.gettempdir() not in str(error.value)
+        with subtests.test(extension=extension):
+            with pytest.raises(UserError) as error:
+                studio.file(request, 0, extension, "unreal")
+            assert str(error.value).startswith(f"motion{extension}")
+            assert tempfile.gettempdir() not in str(error.value)
 
 
-def test_an_invalid_origin_is_refused():
+def test_an_invalid_origin_is_refused(subtests):
     guard = pytest.importorskip("flame_mdm.demo.guard", reason="gradio is not installed")
     headers = pytest.importorskip("starlette.datastructures").Headers
     checked = guard.Guard(None, (), {}, bool)
     checked._check_sender(headers({"host": "localhost", "origin": "http://localhost"}), "/")
     for origin in ("http://[", "http://[::1", "[", "null"):
-        with pytest.raises(guard.HTTPException, match="another site"):
+        with subtests.test(origin=origin), pytest.raises(guard.HTTPException, match="another site"):
             checked._check_sender(headers({"host": "localhost", "origin": origin}), "/")
 
 
@@ -405,13 +412,14 @@ def test_no_function_and_no_route_opens_a_file(normal, tmp_path):
     assert "<iframe" in generated(normal.address, query_of("seed=3"))[0]
 
 
-def test_requests_of_other_sites_and_for_other_names_are_refused(server):
+def test_requests_of_other_sites_and_for_other_names_are_refused(server, subtests):
     motion = f"{server}/motion.npz?{EDITED.query()}"
     assert get(server, Host="evil.example")[0] == get(motion, Host="evil.example:80")[0] == 421
     assert get(server, Host="localhost:1")[0] == 200
     assert get(server, Host="demo.example", Origin="https://demo.example")[0] == 200
     for origin in ("http://evil.example", "null", "http://127.0.0.1:1"):
-        assert get(server, Origin=origin)[0] == 403
+        with subtests.test(origin=origin):
+            assert get(server, Origin=origin)[0] == 403
     assert (
         get(motion, Sec_Fetch_Site="cross-site")[0]
         == get(motion, Sec_Fetch_Site="same-site")[0]
@@ -450,7 +458,7 @@ def test_a_link_with_too_many_options_is_refused_on_the_page(server):
     assert "the link has 51 options. Give at most 50" in notes
 
 
-def test_bodies_are_counted_as_they_arrive(server):
+def test_bodies_are_counted_as_they_arrive(server, subtests):
     host, port = server.removeprefix("http://").split(":")
     head, sent = (
         f"POST /gradio_api/queue/join HTTP/1.1\r\nHost: {host}\r\nTransfer-Encoding: chunked\r\n\r\n",
@@ -464,7 +472,8 @@ def test_bodies_are_counted_as_they_arrive(server):
                 sent += 1
     assert sent < 30, f"the server read {sent} MiB"
     for route, size, status in (("queue/join", 70_000, 413), ("upload", 10, 404)):
-        assert get(f"{server}/gradio_api/{route}", b"x" * size)[0] == status
+        with subtests.test(route=route, size=size, status=status):
+            assert get(f"{server}/gradio_api/{route}", b"x" * size)[0] == status
 
 
 def test_files_come_from_memory_while_the_model_works_and_old_sessions_are_forgotten(normal):
@@ -502,7 +511,7 @@ LINKS = "[...document.querySelectorAll('#files a')]"
 
 
 @in_chromium
-def test_a_person_uses_the_page(server, tmp_path):
+def test_a_person_uses_the_page(server, tmp_path, subtests):
     with browser(tmp_path / "profile") as tab:
         tab.open(server)
         tab.wait("document.querySelectorAll('#player iframe').length === 1", 60)
@@ -526,14 +535,15 @@ def test_a_person_uses_the_page(server, tmp_path):
         assert np.abs(after[36:] - shown[36:]).max() > 0.2
 
         for address, expected in ((link, shown), (edited, after)):  # a link gives the same motion
-            tab.open("about:blank")
-            tab.open(address)
-            query = tab.wait("document.querySelector('#files a')?.href").partition("?")[2]
-            assert (
-                tab.run("document.querySelector('#ask textarea').value")
-                == "a person waves with the right hand"
-            )
-            np.testing.assert_array_equal(joints_of(f"{server}/motion.npz?{query}"), expected)
+            with subtests.test(address=address, expected=expected):
+                tab.open("about:blank")
+                tab.open(address)
+                query = tab.wait("document.querySelector('#files a')?.href").partition("?")[2]
+                assert (
+                    tab.run("document.querySelector('#ask textarea').value")
+                    == "a person waves with the right hand"
+                )
+                np.testing.assert_array_equal(joints_of(f"{server}/motion.npz?{query}"), expected)
         assert [
             url for url in tab.requested if not url.startswith((server, "data:", "blob:", "about:"))
         ] == []

@@ -172,7 +172,7 @@ def test_flame_returns_zeros_past_the_end_and_knows_lengths_up_to_max_frames() -
         flame(*batch([12, 3], frames=14))
 
 
-def test_flame_rounds_lengths_down_to_those_of_its_training() -> None:
+def test_flame_rounds_lengths_down_to_those_of_its_training(subtests) -> None:
     flame, exact = (
         FLAME(D, D, C, **TRANSFORMER, max_frames=20, length_unit=unit).double() for unit in (4, 1)
     )
@@ -184,7 +184,7 @@ def test_flame_rounds_lengths_down_to_those_of_its_training() -> None:
     table[[3, 15]] = table[[4, 12]]
     assert torch.equal(flame(*other), exact(*other))
     for unit in (0, -4, 1.5, "4", True):
-        with pytest.raises(UserError, match="length_unit"):
+        with subtests.test(unit=unit), pytest.raises(UserError, match="length_unit"):
             FLAME(D, D, C, **TRANSFORMER, max_frames=20, length_unit=unit)  # type: ignore[arg-type]
 
 
@@ -202,7 +202,7 @@ def test_token_positions_do_not_move_the_frames() -> None:
         encoder(*batch(tokens=6))
 
 
-def test_the_prefix_acts_on_every_frame_and_has_no_output() -> None:
+def test_the_prefix_acts_on_every_frame_and_has_no_output(subtests) -> None:
     decoder = (
         MDMDecoder(D, D, C, **TRANSFORMER, token_memory=True, context_frames=3).double().eval()
     )
@@ -215,13 +215,17 @@ def test_the_prefix_acts_on_every_frame_and_has_no_output() -> None:
     assert y.shape == x_t.shape
     assert ((y - moved).abs().amax(-1)[mask] > 1e-6).all()
     for prefix, frames in ((None, 0), (cond.prefix[:, 1:], 2)):
-        with pytest.raises(
-            UserError, match=f"a prefix of {frames} frames: this denoiser continues 3 clean frames"
+        with (
+            subtests.test(prefix=prefix, frames=frames),
+            pytest.raises(
+                UserError,
+                match=f"a prefix of {frames} frames: this denoiser continues 3 clean frames",
+            ),
         ):
             decoder(x_t, t, mask, replace(cond, prefix=prefix))
 
 
-def test_guidance_and_dropping_keep_prefix_and_target() -> None:
+def test_guidance_and_dropping_keep_prefix_and_target(subtests) -> None:
     *_, cond = batch()
     cond = replace(cond, target_mask=torch.tensor([True, False, True]))
     assert cond.prefix is not None
@@ -231,10 +235,11 @@ def test_guidance_and_dropping_keep_prefix_and_target() -> None:
     assert torch.equal(dropped.prefix, cond.prefix)  # type: ignore[arg-type]
     assert torch.equal(dropped.target, cond.target)  # type: ignore[arg-type]
     for name in ("prefix", "target", "target_mask"):
-        assert torch.equal(getattr(twice, name), torch.cat([getattr(cond, name)] * 2))
+        with subtests.test(name=name):
+            assert torch.equal(getattr(twice, name), torch.cat([getattr(cond, name)] * 2))
 
 
-def test_bad_options_are_named() -> None:
+def test_bad_options_are_named(subtests) -> None:
     decoder = MDMDecoder(D, D, C, **TRANSFORMER, token_memory=True).double()
     unet = {"latent_dim": 16, "channels": [8], "dropout": 0.0}
     three_heads: dict[str, Any] = TRANSFORMER | {"num_heads": 3}
@@ -256,5 +261,5 @@ def test_bad_options_are_named() -> None:
             "target_layers=0",
         ),
     ):
-        with pytest.raises(UserError, match=message):
+        with subtests.test(message=message), pytest.raises(UserError, match=message):
             build()

@@ -245,15 +245,16 @@ def test_training_equals_the_loop_in_plain_pytorch(data_root, tmp_path, steps):
         assert (parameter - averaged).abs().max() > 1e-6
 
 
-def test_windows_are_uniform_over_all_places_of_a_clip():
+def test_windows_are_uniform_over_all_places_of_a_clip(subtests):
     crop = Units(min_frames=60, max_frames=60, unit=60)
     for frames in (60, 61, 199):
-        below = integers(np.arange(20_000))
-        first, length = crop.draw(np.full(20_000, frames), below)
-        assert (length == 60).all()
-        counts = np.bincount(first, minlength=frames - 59)
-        assert len(counts) == frames - 59
-        assert counts.min() > 0.5 * counts.mean()
+        with subtests.test(frames=frames):
+            below = integers(np.arange(20_000))
+            first, length = crop.draw(np.full(20_000, frames), below)
+            assert (length == 60).all()
+            counts = np.bincount(first, minlength=frames - 59)
+            assert len(counts) == frames - 59
+            assert counts.min() > 0.5 * counts.mean()
 
 
 def test_clips_without_a_frame_to_predict_are_refused_before_training(tmp_path, data_root, capsys):

@@ -109,17 +109,18 @@ def test_the_exact_student_of_gaussian_data_has_no_loss(process):
 
 
 @pytest.mark.parametrize("process", PROCESSES[1:], ids=name)
-def test_fine_grids_lead_to_the_data_and_so_do_one_two_and_four_calls(process):
+def test_fine_grids_lead_to_the_data_and_so_do_one_two_and_four_calls(process, subtests):
     times = torch.tensor(process.grid(400)).double()
     a, s = (value[:, 0] for value in coefficients(process, times))
     torch.testing.assert_close(gains(process, times), path(a, s), atol=0.02, rtol=0)
     for steps in (1, 2, 4):
-        counted = CountedDenoise(denoiser(process, path))
-        noise = drawn((1000, 20, 3), torch.float64)
-        x = sample(process, counted, noise, sampler="consistency", num_inference_steps=steps)
-        assert counted.calls == steps
-        torch.testing.assert_close(x.mean((0, 1)), MEAN, atol=0.05, rtol=0)
-        torch.testing.assert_close(x.var((0, 1)), VARIANCE, atol=0.01, rtol=0.05)
+        with subtests.test(steps=steps):
+            counted = CountedDenoise(denoiser(process, path))
+            noise = drawn((1000, 20, 3), torch.float64)
+            x = sample(process, counted, noise, sampler="consistency", num_inference_steps=steps)
+            assert counted.calls == steps
+            torch.testing.assert_close(x.mean((0, 1)), MEAN, atol=0.05, rtol=0)
+            torch.testing.assert_close(x.var((0, 1)), VARIANCE, atol=0.01, rtol=0.05)
 
 
 SHORT = ["callbacks.checkpoints.every_n_steps=2", "trainer.max_steps=4"]
@@ -278,7 +279,7 @@ def test_two_processes_are_one_with_both_batches(student, tmp_path):
 
 
 def test_a_model_that_cannot_be_a_teacher_gets_one_line(
-    trained, student, data_root, tmp_path, capsys, monkeypatch
+    trained, student, data_root, tmp_path, capsys, monkeypatch, subtests
 ):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("FLAME_MDM_DATA", str(data_root))
@@ -303,7 +304,8 @@ def test_a_model_that_cannot_be_a_teacher_gets_one_line(
             "distillation.teacher=gone.ckpt: no such checkpoint",
         ),
     ):
-        assert says in error_of(capsys, "distill", *words)
+        with subtests.test(words=words, says=says):
+            assert says in error_of(capsys, "distill", *words)
     assert {path.stem for path in tmp_path.iterdir()} == {"untrained", "process", "representation"}
 
 
@@ -423,7 +425,7 @@ def test_several_adapters_add_up_and_export_merges_them(taught, tmp_path):
     assert torch.equal(sampled(flame_mdm.load(merged)), sampled(both))
 
 
-def test_what_is_no_adapter_of_the_base_is_refused(taught, tmp_path):
+def test_what_is_no_adapter_of_the_base_is_refused(taught, tmp_path, subtests):
     with safe_open(taught / "limp.safetensors", "pt") as file:
         about = json.loads(file.metadata()["flame_mdm_adapter"])
     for change, message in (
@@ -432,10 +434,11 @@ def test_what_is_no_adapter_of_the_base_is_refused(taught, tmp_path):
         ({"rows": [10**6]}, "does not fit the weights"),
         (None, "not an adapter"),
     ):
-        metadata = {} if change is None else {"flame_mdm_adapter": json.dumps(about | change)}
-        save_file(load_file(taught / "limp.safetensors"), tmp_path / "x.safetensors", metadata)
-        with pytest.raises(UserError, match=message):
-            flame_mdm.load(taught / "base.safetensors", adapter=tmp_path / "x.safetensors")
+        with subtests.test(change=change, message=message):
+            metadata = {} if change is None else {"flame_mdm_adapter": json.dumps(about | change)}
+            save_file(load_file(taught / "limp.safetensors"), tmp_path / "x.safetensors", metadata)
+            with pytest.raises(UserError, match=message):
+                flame_mdm.load(taught / "base.safetensors", adapter=tmp_path / "x.safetensors")
     with pytest.raises(UserError, match="give one number, or one for each of 1 adapters"):
         flame_mdm.load(
             taught / "base.safetensors", adapter=taught / "limp.safetensors", strength=[1, 2]

@@ -248,17 +248,21 @@ REFUSED = {
 }
 
 
-def test_what_is_wrong_is_told_before_anything_is_submitted(tmp_path, capsys, monkeypatch):
+def test_what_is_wrong_is_told_before_anything_is_submitted(
+    tmp_path, capsys, monkeypatch, subtests
+):
     monkeypatch.chdir(tmp_path)
     for line, message in REFUSED.items():
-        assert main(line.split()) == 1
-        assert message in one_error(capsys)
+        with subtests.test(line=line, message=message):
+            assert main(line.split()) == 1
+            assert message in one_error(capsys)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_launchers_are_found_for_recipes_in_folders_or_named_by_their_extra(monkeypatch):
+def test_launchers_are_found_for_recipes_in_folders_or_named_by_their_extra(monkeypatch, subtests):
     for recipe, launcher in (("humanml3d/mdm", "local"), ("motion_clip/synthetic", "slurm")):
-        assert compose(recipe, [f"launch={launcher}"]) == compose(recipe)
+        with subtests.test(recipe=recipe, launcher=launcher):
+            assert compose(recipe, [f"launch={launcher}"]) == compose(recipe)
     monkeypatch.setattr("flame_mdm.config.composition.source_file", lambda module: None)
     with pytest.raises(UserError, match=r"launch=slurm needs .*: pip install flame-mdm\[slurm\]"):
         compose("quickstart", ["launch=slurm"])

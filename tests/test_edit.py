@@ -68,7 +68,7 @@ def motion(diffusion) -> Motion:
 
 
 @pytest.mark.parametrize("length", [8, 37])
-def test_regions(diffusion, motion, length):
+def test_regions(diffusion, motion, length, subtests):
     part = replace(
         motion,
         joints=motion.joints[:1].repeat(length, 0),
@@ -83,8 +83,9 @@ def test_regions(diffusion, motion, length):
         ([2, 5], lambda i: not 2 <= i < 5),
         ([[0, 1], [4, 8]], lambda i: not (i < 1 or 4 <= i < 8)),
     ):
-        keep = edit(diffusion, part, region=region, num_inference_steps=2)[0].keep
-        assert keep.tolist() == [[kept(i)] * 263 for i in range(length)], region
+        with subtests.test(region=region):
+            keep = edit(diffusion, part, region=region, num_inference_steps=2)[0].keep
+            assert keep.tolist() == [[kept(i)] * 263 for i in range(length)], region
 
 
 def test_frames_and_joints_meet_and_the_upper_body_is_what_mdm_resamples(diffusion, motion):

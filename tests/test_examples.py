@@ -81,9 +81,10 @@ def test_the_example_of_streams_runs_with_a_model_that_continues_frames(tmp_path
     assert "until second" in run(ROOT / "examples" / f"{STREAM}.py", str(model))
 
 
-def test_examples_are_short_numbered_and_say_what_they_show():
+def test_examples_are_short_numbered_and_say_what_they_show(subtests):
     assert [int(path.stem.partition("_")[0]) for path in EXAMPLES] == list(range(1, 11))
     for path in EXAMPLES:
-        text = path.read_text()
-        assert text.count("\n") <= 60, path.stem
-        assert text.startswith('"""'), path.stem
+        with subtests.test(path=path):
+            text = path.read_text()
+            assert text.count("\n") <= 60, path.stem
+            assert text.startswith('"""'), path.stem

@@ -79,14 +79,15 @@ def test_recorded_motion_comes_out_exactly_and_neither_limbs_flip_nor_angles_jum
     assert torch.rad2deg(angles.diff(dim=0).abs().max()) < 100
 
 
-def test_turns_and_backward_walks_do_not_flip_and_bent_limbs_show_their_twist():
+def test_turns_and_backward_walks_do_not_flip_and_bent_limbs_show_their_twist(subtests):
     start, way = np.array([0, 0.95, 0]), np.linspace(0, 2, 60)[:, None] * [0, 0, 1]
     for made in (two_circles(), walking(0.0, start - way), walking(np.pi, start + way)):
-        poses = solve(made.joints(), FPS)
-        torch.testing.assert_close(poses.joints(), made.joints(), rtol=0, atol=1e-9)
-        assert largest_step(poses.rotations) < 1.3 * largest_step(made.rotations) < 20
-        # Pelvis and chest are exact
-        assert degrees(made.rotations.mT @ poses.rotations)[:, [0, 9]].max() < 5e-5
+        with subtests.test(made=made):
+            poses = solve(made.joints(), FPS)
+            torch.testing.assert_close(poses.joints(), made.joints(), rtol=0, atol=1e-9)
+            assert largest_step(poses.rotations) < 1.3 * largest_step(made.rotations) < 20
+            # Pelvis and chest are exact
+            assert degrees(made.rotations.mT @ poses.rotations)[:, [0, 9]].max() < 5e-5
     # bent limbs show their twist
     turns: dict[str, Any]
     for side, sign in (("left", 1), ("right", -1)):
@@ -118,7 +119,7 @@ def test_bones_that_change_length_are_met_on_average_and_joints_without_rotation
         solve(joints, FPS)
 
 
-def test_files_bring_joints_back_and_angles_of_bvh_do_not_jump(tmp_path, circle):
+def test_files_bring_joints_back_and_angles_of_bvh_do_not_jump(tmp_path, circle, subtests):
     features = np.arange(6, dtype=np.float32).reshape(3, 2)
     for ending in (".bvh", ".json", ".npy", ".npz"):
         replace(circle, features=features, representation="mine").save(
@@ -151,8 +152,11 @@ def test_files_bring_joints_back_and_angles_of_bvh_do_not_jump(tmp_path, circle)
     yaw = file.frames[:, file.channels[0].index("Yrotation")]
     assert yaw[-1] - yaw[0] == pytest.approx(720, abs=1)
     for unit in (1.0, 0.005):
-        with pytest.raises(
-            UserError, match=r"the legs are .* m long .*The unit may be 0\.01 \(centimeters\)"
+        with (
+            subtests.test(unit=unit),
+            pytest.raises(
+                UserError, match=r"the legs are .* m long .*The unit may be 0\.01 \(centimeters\)"
+            ),
         ):
             read(tmp_path / "circle.bvh", unit=unit)
 
@@ -275,7 +279,7 @@ def test_glb_holds_the_motion_and_a_body_on_its_joints(tmp_path, circle):
     assert "skins" not in Glb(tmp_path / "giant.glb").document
 
 
-def test_what_does_not_fit_a_file_is_refused(tmp_path, circle):
+def test_what_does_not_fit_a_file_is_refused(tmp_path, circle, subtests):
     options: dict[str, Any]
     kit = sway(5, 12.5, KIT21)
     for motion, name, options, message in (
@@ -295,7 +299,10 @@ def test_what_does_not_fit_a_file_is_refused(tmp_path, circle):
             "unknown kind of motion file. Use one of .bvh, .glb, .fbx, .usda",
         ),
     ):
-        with pytest.raises(UserError, match=message):
+        with (
+            subtests.test(motion=motion, name=name, options=options, message=message),
+            pytest.raises(UserError, match=message),
+        ):
             motion.save(tmp_path / name, **options)
     assert not list(tmp_path.iterdir())
     kit.save(tmp_path / "a.json")

@@ -138,7 +138,7 @@ def test_recipes_of_t2m_have_the_sizes_of_the_released_networks(features):
         assert shapes == manifest[theirs]["keys"]
 
 
-def test_t2m_normalizes_with_its_own_statistics_and_sees_nothing_past_the_end():
+def test_t2m_normalizes_with_its_own_statistics_and_sees_nothing_past_the_end(subtests):
     torch.manual_seed(0)
     plain = T2MEvaluator(torch.zeros(20), torch.ones(20), **TINY).eval()
     mean, std = torch.randn(20), torch.rand(20) + 0.5
@@ -150,8 +150,11 @@ def test_t2m_normalizes_with_its_own_statistics_and_sees_nothing_past_the_end():
     assert torch.equal(plain(contacts, mask), plain(x, mask))
     assert_padding_is_not_seen(scaled, x, [12, 8])
     for length in (3, 200):
-        with pytest.raises(
-            UserError, match=f"motions of 4 to 196 frames, but these have {length} to {length}"
+        with (
+            subtests.test(length=length),
+            pytest.raises(
+                UserError, match=f"motions of 4 to 196 frames, but these have {length} to {length}"
+            ),
         ):
             plain(torch.zeros(1, length, 20), torch.ones(1, length, dtype=torch.bool))
 
@@ -171,7 +174,7 @@ def slots(words: Words, caption: int) -> list[tuple[int, str]]:
     return [(row, PARTS_OF_SPEECH[part]) for row, part in zip(rows, parts, strict=True)]
 
 
-def test_words_have_vectors_and_parts_of_speech(tmp_path):
+def test_words_have_vectors_and_parts_of_speech(tmp_path, subtests):
     write_words(tmp_path, WORDS, VECTORS)
     vectors = WordVectors.read(tmp_path)
     captions = [
@@ -198,9 +201,10 @@ def test_words_have_vectors_and_parts_of_speech(tmp_path):
         (pickle.dumps({"a": 0}), "not the released GloVe vectors: sos, eos, unk"),
         (pickle.dumps({"unk": 0, "sos": 1, "eos": 99}), "each with a row"),
     ):
-        index.write_bytes(content)
-        with pytest.raises(UserError, match=message):
-            WordVectors.read(tmp_path)
+        with subtests.test(content=content, message=message):
+            index.write_bytes(content)
+            with pytest.raises(UserError, match=message):
+                WordVectors.read(tmp_path)
 
 
 @pytest.fixture
@@ -327,19 +331,20 @@ def test_the_gru_gives_the_authors_features_and_logits(start):
         assert_within(network.linear2(features), arrays, f"out/logits{start}", like="out/logits")
 
 
-def test_classifiers_of_joints_stop_at_the_end_and_do_not_see_where_the_motion_stands():
+def test_classifiers_of_joints_stop_at_the_end_and_do_not_see_where_the_motion_stands(subtests):
     torch.manual_seed(0)
     for network, joints in ((ActionGRU().eval(), 24), (small().eval(), 4)):
-        x, mask = torch.randn(3, 60, joints, 3), length_mask(torch.tensor([60, 31, 1]))
-        assert_padding_is_not_seen(network, x, [60, 31, 1])
-        features = network(x, mask)
-        torch.testing.assert_close(
-            network(x + torch.tensor([3.0, -1, 2]), mask), features, atol=1e-4, rtol=0
-        )
-        path = torch.linspace(0, 1, 60)[:, None, None]
-        assert not torch.allclose(network(x + path, mask), features, atol=1e-3), (
-            "but which way it goes"
-        )
+        with subtests.test(joints=joints):
+            x, mask = torch.randn(3, 60, joints, 3), length_mask(torch.tensor([60, 31, 1]))
+            assert_padding_is_not_seen(network, x, [60, 31, 1])
+            features = network(x, mask)
+            torch.testing.assert_close(
+                network(x + torch.tensor([3.0, -1, 2]), mask), features, atol=1e-4, rtol=0
+            )
+            path = torch.linspace(0, 1, 60)[:, None, None]
+            assert not torch.allclose(network(x + path, mask), features, atol=1e-3), (
+                "but which way it goes"
+            )
 
 
 NETWORKS = {"uestc": UESTC, "unconstrained": Unconstrained}
@@ -405,18 +410,19 @@ def small() -> JointSTGCN:
     return JointSTGCN((-1, 0, 1, 0), 5, widths=(4, 6), strides=(1, 2))
 
 
-def test_stgcn_classifies_and_sees_nothing_past_the_end():
+def test_stgcn_classifies_and_sees_nothing_past_the_end(subtests):
     for make, shape, actions in ((UESTC, (150,), 40), (Unconstrained, (24, 3), 12)):
-        torch.manual_seed(0)
-        network = make().eval()
-        x, mask = torch.randn(3, 20, *shape), torch.ones(3, 20, dtype=torch.bool)
-        with torch.no_grad():
-            features, logits = network(x, mask), network.logits(x, mask)
-        assert (features.shape, logits.shape) == ((3, network.fcn.in_channels), (3, actions))
-        torch.testing.assert_close(
-            logits, features @ network.fcn.weight.flatten(1).T + network.fcn.bias
-        )
-        assert_padding_is_not_seen(network, x, [20, 13, 1])
+        with subtests.test(make=make, shape=shape, actions=actions):
+            torch.manual_seed(0)
+            network = make().eval()
+            x, mask = torch.randn(3, 20, *shape), torch.ones(3, 20, dtype=torch.bool)
+            with torch.no_grad():
+                features, logits = network(x, mask), network.logits(x, mask)
+            assert (features.shape, logits.shape) == ((3, network.fcn.in_channels), (3, actions))
+            torch.testing.assert_close(
+                logits, features @ network.fcn.weight.flatten(1).T + network.fcn.bias
+            )
+            assert_padding_is_not_seen(network, x, [20, 13, 1])
 
 
 class _Runs:
@@ -425,7 +431,7 @@ class _Runs:
 
 
 @pytest.mark.parametrize("kind", CLASSIFIERS)
-def test_released_weights_are_loaded_whole_or_not_at_all(tmp_path, kind):
+def test_released_weights_are_loaded_whole_or_not_at_all(tmp_path, kind, subtests):
     make, key, _ = CLASSIFIERS[kind]
     path, state = tmp_path / "weights.tar", make().state_dict()
     name = next(iter(state))
@@ -461,9 +467,10 @@ def test_released_weights_are_loaded_whole_or_not_at_all(tmp_path, kind):
         ({**state, "extra": torch.zeros(1)}, "Unexpected key.*extra"),
         ({**state, "extra": _Runs()}, r"holds Python objects \(_pytest"),
     ):
-        write(content)
-        with pytest.raises(UserError, match=rf"weights\.tar: .*{message}"):
-            ClassifierExtractor(kind, str(path))
+        with subtests.test(content=content, message=message):
+            write(content)
+            with pytest.raises(UserError, match=rf"weights\.tar: .*{message}"):
+                ClassifierExtractor(kind, str(path))
     path.write_bytes(path.read_bytes()[:500])
     with pytest.raises(UserError, match=r"weights\.tar: damaged"):
         ClassifierExtractor(kind, str(path))
@@ -471,7 +478,7 @@ def test_released_weights_are_loaded_whole_or_not_at_all(tmp_path, kind):
         ClassifierExtractor(kind, str(tmp_path / "absent.tar"))
 
 
-def test_a_random_start_is_a_function_of_the_motion(tmp_path):
+def test_a_random_start_is_a_function_of_the_motion(tmp_path, subtests):
     torch.save({"model": ActionGRU().state_dict()}, tmp_path / "gru")
     path = str(tmp_path / "gru")
     plain, legacy = (
@@ -487,9 +494,10 @@ def test_a_random_start_is_a_function_of_the_motion(tmp_path):
         alone = legacy.motions(x[1:2, :9], joints[1:2, :9], mask[1:2, :9])
         zero = plain.motions(x, joints, mask)
     for name in ("features", "logits"):
-        torch.testing.assert_close(drawn[name], again[name].flip(0))
-        torch.testing.assert_close(drawn[name][1:2], alone[name])
-        assert not torch.allclose(drawn[name], zero[name], atol=1e-3)
+        with subtests.test(name=name):
+            torch.testing.assert_close(drawn[name], again[name].flip(0))
+            torch.testing.assert_close(drawn[name][1:2], alone[name])
+            assert not torch.allclose(drawn[name], zero[name], atol=1e-3)
     network: Any = legacy.network
     assert not torch.allclose(network.linear2(drawn["features"]), drawn["logits"], atol=1e-3), (
         "two draws"

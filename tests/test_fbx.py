@@ -95,7 +95,7 @@ def test_root_motion_needs_a_root():
         clip("mixamo", root_motion=True)
 
 
-def test_the_scene_has_what_single_programs_need(tmp_path: Path):
+def test_the_scene_has_what_single_programs_need(tmp_path: Path, subtests):
     """Each of these details is missing in files that one program reads without an error, but incompletely."""
     synthetic("kick").save(tmp_path / "kick.fbx", rig="unreal")
     root = fbx.read(tmp_path / "kick.fbx")
@@ -110,9 +110,10 @@ def test_the_scene_has_what_single_programs_need(tmp_path: Path):
     # assimp finds no animation without a block in its stack and layer: 13 zero bytes before the end of the record
     content = (tmp_path / "kick.fbx").read_bytes()
     for name in (b"AnimationStack", b"AnimationLayer"):
-        start = content.index(bytes([len(name)]) + name) - 12
-        (end,) = struct.unpack_from("<I", content, start)
-        assert content[end - 13 : end] == bytes(13)
+        with subtests.test(name=name):
+            start = content.index(bytes([len(name)]) + name) - 12
+            (end,) = struct.unpack_from("<I", content, start)
+            assert content[end - 13 : end] == bytes(13)
     # other readers fail on negative ids
     assert min(record.properties[0] for record in objects.children) > 0
     # Blender keeps a pelvis in place that begins where its root ends

@@ -48,7 +48,9 @@ def test_arrays_that_are_not_needed_are_never_opened(tmp_path: Path):
         read(tmp_path / "b.npz")
 
 
-def test_shapes_are_read_by_their_layout_and_rates_of_one_element_are_rates(tmp_path: Path):
+def test_shapes_are_read_by_their_layout_and_rates_of_one_element_are_rates(
+    tmp_path: Path, subtests
+):
     path, expected = tmp_path / "a.npz", walk().joints
     for numbers in (66, 72, 156, 165):
         parts = amass(walk(), numbers=numbers)
@@ -64,9 +66,10 @@ def test_shapes_are_read_by_their_layout_and_rates_of_one_element_are_rates(tmp_
         (144, "6D rotations"),
         (69, "not 66, 72, 156, 165"),
     ):
-        np.savez(path, poses=np.zeros((40, numbers)), **parts)
-        with pytest.raises(UserError, match=advice):
-            read(path)
+        with subtests.test(numbers=numbers, advice=advice):
+            np.savez(path, poses=np.zeros((40, numbers)), **parts)
+            with pytest.raises(UserError, match=advice):
+                read(path)
     np.savez(path, poses=poses, trans=parts["trans"], mocap_framerate=np.array([60.0]))
     assert read(path).fps == 60
     with warnings.catch_warnings():
@@ -184,7 +187,7 @@ def test_up_of_commands_and_of_json_files_acts(tmp_path: Path):
         read(tmp_path / "ours.npz", up="z")
 
 
-def test_every_entrance_checks_sides_size_and_orientation(tmp_path: Path, capsys):
+def test_every_entrance_checks_sides_size_and_orientation(tmp_path: Path, capsys, subtests):
     folder = tmp_path / "in"
     folder.mkdir()
     path = folder / "a.bvh"
@@ -214,10 +217,11 @@ def test_every_entrance_checks_sides_size_and_orientation(tmp_path: Path, capsys
             assert words in said(enter), name
     write_bvh(path, walk(), turn="z")
     for name, enter in entrances.items():
-        assert re.search("lying down.*up", said(enter), re.DOTALL), name
+        with subtests.test(name=name, enter=enter):
+            assert re.search("lying down.*up", said(enter), re.DOTALL), name
 
 
-def test_a_rest_pose_in_front_is_left_out_and_said(tmp_path: Path, capsys):
+def test_a_rest_pose_in_front_is_left_out_and_said(tmp_path: Path, capsys, subtests):
     motion, rest = walk(30), posed(1).joints[0]
     write_bvh(tmp_path / "a.bvh", motion, first=rest)
     np.savez(tmp_path / "b.npz", joints=np.concatenate([rest[None], motion.joints]), fps=20)
@@ -230,9 +234,10 @@ def test_a_rest_pose_in_front_is_left_out_and_said(tmp_path: Path, capsys):
     np.savez(tmp_path / "c.npz", **(parts | still))
     motion.save(tmp_path / "d.bvh", rest_pose=True, rig="lafan1")
     for name in ("a.bvh", "b.npz", "c.npz", "d.bvh"):
-        again = read(tmp_path / name)
-        assert any("the first frame is a rest pose" in note for note in again.notes), name
-        np.testing.assert_allclose(again.joints, motion.joints, atol=0.01)
+        with subtests.test(name=name):
+            again = read(tmp_path / name)
+            assert any("the first frame is a rest pose" in note for note in again.notes), name
+            np.testing.assert_allclose(again.joints, motion.joints, atol=0.01)
     check_clips(tmp_path, 20.0)
     assert "4 motions: the first frame is a rest pose and is left out" in capsys.readouterr().out, (
         "adapt says it"
@@ -266,7 +271,7 @@ def test_legs_that_flip_are_noticed(tmp_path: Path):
 
 
 def test_check_and_preparation_agree_and_one_bad_file_stops_nothing(
-    tmp_path: Path, monkeypatch, capsys
+    tmp_path: Path, monkeypatch, capsys, subtests
 ):
     monkeypatch.chdir(tmp_path)
     Path("mine").mkdir()
@@ -287,9 +292,10 @@ def test_check_and_preparation_agree_and_one_bad_file_stops_nothing(
     assert main(words) == 1
     prepared = capsys.readouterr().out
     for said in (checked, prepared):
-        assert "mine/b.bvh, line 1" in said
-        assert "mine/one.npz: 1 frames at 20 per second, but a motion has at least 3" in said
-        assert "error: 2 of 4 motions of mine cannot be prepared" in said
+        with subtests.test(said=said):
+            assert "mine/b.bvh, line 1" in said
+            assert "mine/one.npz: 1 frames at 20 per second, but a motion has at least 3" in said
+            assert "error: 2 of 4 motions of mine cannot be prepared" in said
     store = Store(Path("data/ours-humanml-clean-smpl22"))
     assert [clip.id for clip in store.clips] == ["a", "c"]
     assert store.info["excluded"] == {"motions that cannot be read": 2}
@@ -345,25 +351,27 @@ def test_files_of_other_kinds_are_refused_with_a_way_out(
     assert says in capsys.readouterr().err
 
 
-def test_pointers_of_git_lfs_are_named(tmp_path: Path):
+def test_pointers_of_git_lfs_are_named(tmp_path: Path, subtests):
     for name in ("a.bvh", "a.npz", "a.json", "a.npy", "a.amc", "a.glb"):
-        (tmp_path / name).write_text(POINTER)
-        with pytest.raises(UserError, match=r"a Git LFS pointer .*git lfs pull"):
-            (glb.read if name.endswith("glb") else read)(tmp_path / name)
+        with subtests.test(name=name):
+            (tmp_path / name).write_text(POINTER)
+            with pytest.raises(UserError, match=r"a Git LFS pointer .*git lfs pull"):
+                (glb.read if name.endswith("glb") else read)(tmp_path / name)
 
 
-def test_extensions_that_compress_a_character_are_named(tmp_path: Path):
+def test_extensions_that_compress_a_character_are_named(tmp_path: Path, subtests):
     synthetic("kick").save(tmp_path / "a.glb", rig="mixamo")
     for name, is_read in (("EXT_meshopt_compression", False), ("KHR_materials_unlit", True)):
-        shutil.copy(tmp_path / "a.glb", tmp_path / "b.glb")
-        changed(tmp_path / "b.glb", partial(dict.update, extensionsRequired=[name]))
-        if is_read:
-            glb.read(tmp_path / "b.glb")
-            continue
-        with pytest.raises(
-            UserError, match=rf"b\.glb: it requires {name}, .* without this compression\Z"
-        ):
-            glb.read(tmp_path / "b.glb")
+        with subtests.test(name=name, is_read=is_read):
+            shutil.copy(tmp_path / "a.glb", tmp_path / "b.glb")
+            changed(tmp_path / "b.glb", partial(dict.update, extensionsRequired=[name]))
+            if is_read:
+                glb.read(tmp_path / "b.glb")
+                continue
+            with pytest.raises(
+                UserError, match=rf"b\.glb: it requires {name}, .* without this compression\Z"
+            ):
+                glb.read(tmp_path / "b.glb")
 
 
 def test_two_people_and_rates_of_cmu_are_said(tmp_path: Path):

@@ -297,7 +297,9 @@ def test_motions_are_excluded_by_name(arrays: Path):
         Folder(str(arrays), exclude=["won"]).count()
 
 
-def test_wrong_units_are_refused_with_the_unit_that_fits(tmp_path: Path, monkeypatch, capsys):
+def test_wrong_units_are_refused_with_the_unit_that_fits(
+    tmp_path: Path, monkeypatch, capsys, subtests
+):
     monkeypatch.chdir(tmp_path)
     mixamo(tmp_path / "mine" / "a.bvh", INCH)
     message = (
@@ -310,8 +312,9 @@ def test_wrong_units_are_refused_with_the_unit_that_fits(tmp_path: Path, monkeyp
     ] == [1, 0]
     assert re.search(message, capsys.readouterr().err)
     for content in ({"children": True}, {"unit": 0.0254}):
-        skeleton(tmp_path / "mine", **content)
-        assert only(tmp_path / "mine").shape[1:] == (22, 3)
+        with subtests.test(content=content):
+            skeleton(tmp_path / "mine", **content)
+            assert only(tmp_path / "mine").shape[1:] == (22, 3)
 
 
 def test_convert_and_edit_read_files_as_prepare_does(tmp_path: Path, monkeypatch):
@@ -386,26 +389,27 @@ def test_a_first_frame_in_an_unusual_pose_is_not_an_error(tmp_path: Path):
     assert "the toes point backwards" in Folder(str(tmp_path)).check(20)[0]
 
 
-def test_from_ten_motions_on_each_split_has_some(tmp_path: Path):
+def test_from_ten_motions_on_each_split_has_some(tmp_path: Path, subtests):
     for motions, begin in product((10, 20), range(3)):
-        folder = tmp_path / f"{motions}-{begin}"
-        folder.mkdir()
-        for number in range(motions):
-            (folder / f"walk_{begin}_{number}.npz").touch()
-        splits = Folder(str(folder)).splits
-        hashed = {name: hashed_split(name, val=5, test=10) for name in splits}
-        assert set(splits.values()) == {"train", "val", "test"}
-        if set(hashed.values()) == {"train", "val", "test"}:
-            assert splits == hashed
-        assert sum(splits[name] != hashed[name] for name in splits) <= 2
-        write_table(
-            folder,
-            [{"id": n, "text": "a", "source": f"take {k % 4}"} for k, n in enumerate(splits)],
-        )
-        taken = Folder(str(folder))
-        of_source = {(taken.notes[name].source, split) for name, split in taken.splits.items()}
-        assert len(of_source) == 4, "a source stays in one split"
-        assert len({split for _, split in of_source}) == 3
+        with subtests.test(motions=motions, begin=begin):
+            folder = tmp_path / f"{motions}-{begin}"
+            folder.mkdir()
+            for number in range(motions):
+                (folder / f"walk_{begin}_{number}.npz").touch()
+            splits = Folder(str(folder)).splits
+            hashed = {name: hashed_split(name, val=5, test=10) for name in splits}
+            assert set(splits.values()) == {"train", "val", "test"}
+            if set(hashed.values()) == {"train", "val", "test"}:
+                assert splits == hashed
+            assert sum(splits[name] != hashed[name] for name in splits) <= 2
+            write_table(
+                folder,
+                [{"id": n, "text": "a", "source": f"take {k % 4}"} for k, n in enumerate(splits)],
+            )
+            taken = Folder(str(folder))
+            of_source = {(taken.notes[name].source, split) for name, split in taken.splits.items()}
+            assert len(of_source) == 4, "a source stays in one split"
+            assert len({split for _, split in of_source}) == 3
 
 
 def test_what_a_folder_lacks_is_reported(tmp_path: Path, monkeypatch, capsys):
@@ -451,10 +455,13 @@ def test_the_skeleton_file_in_the_documentation_is_legal(tmp_path: Path):
     assert set(read_skeleton(tmp_path / "skeleton.yaml")["map"]) == set(SMPL22.joints)
 
 
-def test_an_empty_folder_and_a_missing_one_are_told_apart(tmp_path):
+def test_an_empty_folder_and_a_missing_one_are_told_apart(tmp_path, subtests):
     (tmp_path / "empty").mkdir()
     for name, says in (("empty", "no motions in this folder"), ("absent", "no such folder")):
-        with pytest.raises(FileNotFoundError, match=rf"{name}: {says}\. Give a folder of"):
+        with (
+            subtests.test(name=name, says=says),
+            pytest.raises(FileNotFoundError, match=rf"{name}: {says}\. Give a folder of"),
+        ):
             Folder(str(tmp_path / name)).count()
 
 
@@ -466,7 +473,7 @@ def test_an_empty_folder_and_a_missing_one_are_told_apart(tmp_path):
     ],
 )
 def test_every_representation_is_prepared_from_every_kind_of_file(
-    name, motion, features, tmp_path, capsys
+    name, motion, features, tmp_path, capsys, subtests
 ):
     folder = tmp_path / "in"
     folder.mkdir()
@@ -500,9 +507,12 @@ def test_every_representation_is_prepared_from_every_kind_of_file(
 
     other = "joints" if motion == "smpl" else "smpl"
     for check in ("check=true", "check=false"):
-        root = f"data_root={tmp_path / 'other'}"
-        assert (
-            main(["prepare", *words[:2], root, *words[3:], check, f"data.source.motion={other}"])
-            == 1
-        )
-        assert "data.source.motion=smpl" in one_error(capsys)
+        with subtests.test(check=check):
+            root = f"data_root={tmp_path / 'other'}"
+            assert (
+                main(
+                    ["prepare", *words[:2], root, *words[3:], check, f"data.source.motion={other}"]
+                )
+                == 1
+            )
+            assert "data.source.motion=smpl" in one_error(capsys)

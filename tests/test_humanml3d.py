@@ -287,14 +287,15 @@ def test_damaged_motions_can_be_excluded(folder, tmp_path):
         HumanML3D(str(folder), exclude=["7"]).count()
 
 
-def test_keys_do_not_depend_on_how_a_subset_is_called():
+def test_keys_do_not_depend_on_how_a_subset_is_called(subtests):
     key = "BioMotionLab_NTroje/rub001/0000_treadmill_norm_poses"
     for path in (
         f"./pose_data/{key}.npy",
         f"BMLrub/{key}.npz",
         "some/BMLrub/rub001/0000 treadmill_norm_poses.npz",
     ):
-        assert key_of(path) == key
+        with subtests.test(path=path):
+            assert key_of(path) == key
     assert key_of("./pose_data/Transitions_mocap/a/b_poses.npy") == key_of(
         "Transitionsmocap/a/b_poses.npz"
     )

@@ -118,15 +118,16 @@ def test_the_command_prints_faults_marks_them_and_exits_with_3(tmp_path, capsys,
     assert not shown[1]["marks"]
 
 
-def test_nothing_to_inspect_is_an_error(tmp_path, capsys):
+def test_nothing_to_inspect_is_an_error(tmp_path, capsys, subtests):
     for words, message in (
         ([str(tmp_path)], "no motion files (.npz, "),
         ([str(tmp_path / "absent.npz")], "absent.npz: no such file"),
         (["bandia"], "bandia"),
         ([str(tmp_path), "clips=0"], "clips=0: must be at least 1"),
     ):
-        assert main(["inspect", *words]) in (1, 2)
-        assert message in capsys.readouterr().err
+        with subtests.test(words=words, message=message):
+            assert main(["inspect", *words]) in (1, 2)
+            assert message in capsys.readouterr().err
 
 
 def test_the_worst_clips_of_a_data_set_are_shown(tmp_path, capsys):
@@ -189,7 +190,7 @@ def test_skating_resizing_wrists_drawn_in_and_pops(walk):
         assert np.ptp(offset[frame], axis=0).max() < 1e-12
 
 
-def test_freezing_cropping_speeds_frame_rates_and_another_half(walk):
+def test_freezing_cropping_speeds_frame_rates_and_another_half(walk, subtests):
     for percent, moving in ((10, 18), (50, 10), (100, 1)):
         frozen = p.freeze(walk[:20], percent)
         np.testing.assert_array_equal(frozen[:moving], walk[:moving])
@@ -203,9 +204,10 @@ def test_freezing_cropping_speeds_frame_rates_and_another_half(walk):
     np.testing.assert_allclose(p.play(ramp[:21], 2, 20.0)[:, 0, 0], np.arange(0, 21, 2))
     np.testing.assert_allclose(p.play(ramp[:21], 0.5, 20.0)[:, 0, 0], np.arange(21) / 2)
     for rate in (30, 15, 10):
-        back = p.through_rate(ramp, rate, 20.0)
-        assert len(back) == len(ramp)
-        np.testing.assert_allclose(back[:20], ramp[:20], atol=1e-9)
+        with subtests.test(rate=rate):
+            back = p.through_rate(ramp, rate, 20.0)
+            assert len(back) == len(ramp)
+            np.testing.assert_allclose(back[:20], ramp[:20], atol=1e-9)
 
     other = walk[::-1] + 1.0
     joined = p.continue_with(walk[:40], other, 20.0)

@@ -141,11 +141,12 @@ def expected() -> dict[str, Any]:
 
 @pytest.mark.parametrize("size", [7, 32])
 def test_values_depend_neither_on_the_batch_size_nor_on_the_order(
-    size: int, expected: dict[str, Any]
+    size: int, expected: dict[str, Any], subtests
 ):
     order = torch.randperm(COUNT, generator=torch.Generator().manual_seed(1))
     for indices in (torch.arange(COUNT), order):
-        assert measure(all_metrics(), batches(evaluation(), indices.split(size))) == expected
+        with subtests.test(indices=indices):
+            assert measure(all_metrics(), batches(evaluation(), indices.split(size))) == expected
 
 
 def test_draws_depend_on_the_seed(expected: dict[str, Any]):
@@ -182,7 +183,7 @@ def test_without_samples_values_are_none_never_0(expected: dict[str, Any]):
     assert measure(all_metrics(), []) == none
 
 
-def test_too_few_samples_and_wrong_inputs_are_errors():
+def test_too_few_samples_and_wrong_inputs_are_errors(subtests):
     values = evaluation()
     wrong = values | {"joints": values["joints"][:, :, :20]}
     kept = values | {"kept": values["kept"] | True}
@@ -224,7 +225,10 @@ def test_too_few_samples_and_wrong_inputs_are_errors():
         (reconstruction.TemosPositionErrors(), wrong, "20 joints, but defined only"),
         (reconstruction.TemosPositionErrors(), short, "got 1 frames"),
     ):
-        with pytest.raises(UserError, match=f"{type(metric).__name__}: {message}"):
+        with (
+            subtests.test(inputs=inputs, message=message),
+            pytest.raises(UserError, match=f"{type(metric).__name__}: {message}"),
+        ):
             measure({"metric": metric}, [evaluation(inputs) if isinstance(inputs, int) else inputs])
     with pytest.raises(ValueError, match="MultimodalDistance: got 45 keys, 45 generated, 44 text"):
         measure(

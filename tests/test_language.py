@@ -227,9 +227,10 @@ def test_numbers_are_no_typos_and_no_forms_of_other_words():
     assert understand("kicks four times").mentions[0].attributes["count"] == 4
 
 
-def test_a_word_is_not_corrected_if_it_is_english():
+def test_a_word_is_not_corrected_if_it_is_english(subtests):
     for text in ("a person walks to the shelf", "a person is talking", "stairs", "reaction"):
-        assert not understand(text).corrected
+        with subtests.test(text=text):
+            assert not understand(text).corrected
 
 
 def test_the_table_of_vectors_is_small_and_has_its_license_beside_it():

@@ -106,11 +106,12 @@ def raised(side: str, turn: float) -> np.ndarray:
     return rotated
 
 
-def test_sides_are_read_from_the_motion():
+def test_sides_are_read_from_the_motion(subtests):
     left, right = raised("left", 60), raised("right", -60)
     for content in ("wave-left-hand", "wave-right-hand", "walk-turn-left", "walk-left"):
-        assert read_side(left, content, 20) == "left"
-        assert read_side(right, content, 20) == "right"
+        with subtests.test(content=content):
+            assert read_side(left, content, 20) == "left"
+            assert read_side(right, content, 20) == "right"
     metric = SideAccuracy(fps=20)
     joints = torch.from_numpy(np.stack([left, left, right, right]))
     hands = {

@@ -82,7 +82,7 @@ one = golden_case("metrics")
 
 @pytest.mark.golden
 @pytest.mark.parametrize("case", cases("exact_f64", "fid/"))
-def test_frechet_distance_equals_the_authors(case: str):
+def test_frechet_distance_equals_the_authors(case: str, subtests):
     a, b = torch.from_numpy(array(f"{case}/a")), torch.from_numpy(array(f"{case}/b"))
     value = computed(
         FrechetMotionDistance(), generated=a, keys=keys(len(a)), real=b, real_keys=keys(len(b))
@@ -90,7 +90,8 @@ def test_frechet_distance_equals_the_authors(case: str):
     # the square roots of eigenvalues that should be 0 leave 1e-8 in the reference
     assert value == pytest.approx(float(array(f"{case}/exact_f64")), rel=1e-7, abs=1e-9)
     for official in ("official_scipy117", "official_scipy110"):  # takes means in float32
-        assert value == pytest.approx(float(array(f"{case}/{official}")), rel=1e-6, abs=1e-9)
+        with subtests.test(official=official):
+            assert value == pytest.approx(float(array(f"{case}/{official}")), rel=1e-6, abs=1e-9)
 
 
 @one
@@ -238,7 +239,7 @@ def test_mid_equals_the_authors(case: str):
 
 
 @one
-def test_flame_metrics_and_position_errors_equal_the_authors(stem: str):
+def test_flame_metrics_and_position_errors_equal_the_authors(stem: str, subtests):
     text, fake, real = (
         tensor("flame/text_feat"),
         tensor("flame/gen_motion_feat"),
@@ -256,7 +257,8 @@ def test_flame_metrics_and_position_errors_equal_the_authors(stem: str):
     }
     update_metrics(metrics, generated=fake, text=text, keys=own, real=real, real_keys=own)
     for name, metric in metrics.items():
-        assert metric.compute() == pytest.approx(float(array(f"flame/{name}")), rel=2e-6)
+        with subtests.test(name=name, metric=metric):
+            assert metric.compute() == pytest.approx(float(array(f"flame/{name}")), rel=2e-6)
 
     metric, pairs = FlamePositionErrors(SMPL22.parents), []
     for clip in groups(
@@ -407,27 +409,33 @@ def test_mid_of_normal_distributions():
     assert mid(real, text, real.roll(1, 0), 0.0) < 0 < value
 
 
-def test_r_precision_of_perfect_random_and_blind_features():
+def test_r_precision_of_perfect_random_and_blind_features(subtests):
     count, generator = 1000, torch.Generator().manual_seed(0)
     text, random = torch.randn(2, count, 8, generator=generator)
     ids, blind = keys(count), torch.ones(count, 8)
     for metric in (TextsForMotion, MotionsForText):
-        perfect = computed(metric(), generated=text, text=text, text_keys=ids, keys=ids)
-        assert perfect == {"top1": 1.0, "top2": 1.0, "top3": 1.0}
-        for motion, seen in ((random, text), (blind, blind)):
-            values = computed(metric(), generated=motion, text=seen, text_keys=ids, keys=ids)
-            for chance, value in zip((1 / 32, 2 / 32, 3 / 32), values.values(), strict=True):
-                assert value == pytest.approx(
-                    chance, abs=4 * (chance * (1 - chance) / count) ** 0.5
-                )
+        with subtests.test(metric=metric):
+            perfect = computed(metric(), generated=text, text=text, text_keys=ids, keys=ids)
+            assert perfect == {"top1": 1.0, "top2": 1.0, "top3": 1.0}
+            for motion, seen in ((random, text), (blind, blind)):
+                values = computed(metric(), generated=motion, text=seen, text_keys=ids, keys=ids)
+                for chance, value in zip((1 / 32, 2 / 32, 3 / 32), values.values(), strict=True):
+                    assert value == pytest.approx(
+                        chance, abs=4 * (chance * (1 - chance) / count) ** 0.5
+                    )
 
 
-def test_texts_for_motion_never_draw_the_own_caption_and_motions_for_text_count_every_text_once():
+def test_texts_for_motion_never_draw_the_own_caption_and_motions_for_text_count_every_text_once(
+    subtests,
+):
     # Two captions, far from one another; each motion lies on its own, so a pool of 2 must never hold it twice.
     captions, which = torch.tensor([[0.0], [10.0]]), torch.arange(40) % 2
     for own, top1 in ((which, 1.0), (1 - which, 0.0)):
-        texts = {"text": captions[which], "text_keys": which, "keys": keys(40)}
-        assert computed(TextsForMotion(pool=2), generated=captions[own], **texts)["top1"] == top1
+        with subtests.test(own=own, top1=top1):
+            texts = {"text": captions[which], "text_keys": which, "keys": keys(40)}
+            assert (
+                computed(TextsForMotion(pool=2), generated=captions[own], **texts)["top1"] == top1
+            )
     # 33 motions that are mixed up in pairs but for one: whatever the pools, at most the one is right.
     text = torch.arange(33.0)[:, None]
     motion = text.clone()
@@ -441,7 +449,7 @@ def test_texts_for_motion_never_draw_the_own_caption_and_motions_for_text_count_
     assert 1 <= round(hits) <= 2  # the one, and one whose partner an incomplete pool may leave out
 
 
-def test_ties_and_directions_in_retrieval():
+def test_ties_and_directions_in_retrieval(subtests):
     candidates, query = (
         torch.tensor([[0.0], [1.0], [1.0], [2.0]]),
         torch.tensor([[1.0], [1.0], [0.4]]),
@@ -455,21 +463,25 @@ def test_ties_and_directions_in_retrieval():
     lengths = torch.linspace(1, 10, 64)[:, None]
     rows = {"generated": lengths * text, "text": text, "keys": torch.arange(64)}
     for alone in (True, False):
-        top1 = computed(MotionsForText(normalize=alone), text_keys=rows["keys"], **rows)["top1"]
-        assert (top1 == 1) if alone else (top1 < 0.9)
-        distance = computed(MultimodalDistance(normalize=alone), **rows)
-        assert distance == pytest.approx(
-            0 if alone else float((lengths - 1).mean()), rel=1e-6, abs=1e-6
-        )
+        with subtests.test(alone=alone):
+            top1 = computed(MotionsForText(normalize=alone), text_keys=rows["keys"], **rows)["top1"]
+            assert (top1 == 1) if alone else (top1 < 0.9)
+            distance = computed(MultimodalDistance(normalize=alone), **rows)
+            assert distance == pytest.approx(
+                0 if alone else float((lengths - 1).mean()), rel=1e-6, abs=1e-6
+            )
 
 
-def test_diversity_of_two_points():
+def test_diversity_of_two_points(subtests):
     features = torch.tensor([[0.0, 0.0], [3.0, 4.0]]).repeat(500, 1)
     for replace in (False, True):
-        value = computed(
-            diversity.Diversity(pairs=1000, replace=replace), generated=features, keys=keys(1000)
-        )
-        assert value == pytest.approx(2.5, abs=0.4)  # half of the pairs are 5 apart
+        with subtests.test(replace=replace):
+            value = computed(
+                diversity.Diversity(pairs=1000, replace=replace),
+                generated=features,
+                keys=keys(1000),
+            )
+            assert value == pytest.approx(2.5, abs=0.4)  # half of the pairs are 5 apart
     line = {"generated": torch.arange(1000.0)[:, None], "keys": torch.arange(1000)}
     assert computed(diversity.Diversity(pairs=1000, replace=False), **line) == pytest.approx(
         1000 / 3, rel=0.1
@@ -547,7 +559,7 @@ def test_displacement_and_drift_of_shifted_frames_and_joints():
     assert values == {"mean": None, "largest": None}
 
 
-def test_best_and_worst_of_several_are_chosen_by_the_root():
+def test_best_and_worst_of_several_are_chosen_by_the_root(subtests):
     """Three motions for each of two texts, the root off by 1, 2 and 3 m; the others the more, the less the root is."""
     real = wander(21, 12, 0)
     off = torch.tensor([2.0, 1.0, 3.0, 3.0, 1.0, 2.0])
@@ -567,8 +579,9 @@ def test_best_and_worst_of_several_are_chosen_by_the_root():
         values |= computed(FlamePositionErrors(KIT21.parents, samples=samples), **motions)
     joints = {"best": (1 + 20 * 4) / 21, "worst": (3 + 20 * 2) / 21}
     for which, root in (("best", 1), ("worst", 3)):
-        assert values[f"{which}_ape_root"] == pytest.approx(root, rel=1e-5)
-        assert values[f"{which}_ape_mean_global"] == pytest.approx(joints[which], rel=1e-5)
+        with subtests.test(which=which, root=root):
+            assert values[f"{which}_ape_root"] == pytest.approx(root, rel=1e-5)
+            assert values[f"{which}_ape_mean_global"] == pytest.approx(joints[which], rel=1e-5)
     assert values["ape_root"] == pytest.approx(2, rel=1e-5)
     with pytest.raises(UserError, match="2 of 2 prompts do not have 2 motions"):
         computed(FlamePositionErrors(KIT21.parents, samples=2), **motions)

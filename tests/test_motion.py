@@ -111,14 +111,15 @@ def test_a_motion_is_shown(walk: Motion, monkeypatch):
 
 
 def test_arrays_are_edited_and_what_cannot_be_edited_is_refused_in_one_line(
-    walk: Motion, model: MotionGenerator
+    walk: Motion, model: MotionGenerator, subtests
 ):
     how: dict[str, Any] = {"region": "prediction", "num_inference_steps": 2}
     expected, joints = edit(model, walk, "a person jumps", **how)[0], walk.joints
     for array in (joints, torch.from_numpy(joints), joints.tolist()):
-        result = edit(model, array, "a person jumps", fps=30, **how)[0]
-        np.testing.assert_array_equal(result.joints, expected.joints)
-        assert result.feature_error == 0
+        with subtests.test(array=array):
+            result = edit(model, array, "a person jumps", fps=30, **how)[0]
+            np.testing.assert_array_equal(result.joints, expected.joints)
+            assert result.feature_error == 0
     cases: list[tuple[Any, Any, str]] = [
         (joints, None, "an array has no frame rate: set it, for example with fps=20"),
         (joints, "fast", "fps is fast, not a number of frames per second"),

@@ -103,12 +103,13 @@ def test_a_walk_becomes_a_start_a_loop_and_a_stop_that_fit_together(
     assert 1.5 < steps[0] * 20 < 2
 
 
-def test_no_joint_jumps_where_clips_meet(parts: list[GroundedMotion]):
+def test_no_joint_jumps_where_clips_meet(parts: list[GroundedMotion], subtests):
     start, loop, stop = parts
     steps = np.abs(np.diff(repeated(loop).world(), axis=0)).max()
     for before, after in ((start, loop), (loop, stop)):
-        move = after.local[1] - after.local[0]
-        assert np.abs(move - (before.local[-1] - before.local[-2])).max() < steps
+        with subtests.test(before=before, after=after):
+            move = after.local[1] - after.local[0]
+            assert np.abs(move - (before.local[-1] - before.local[-2])).max() < steps
 
 
 def test_a_gait_in_another_direction_is_not_taken(walk: GroundedMotion):

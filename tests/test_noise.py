@@ -6,7 +6,7 @@ from scipy import stats
 from flame_mdm.seeds import key, normal, seeded_noise, uniform
 
 
-def test_numbers_are_uniform_in_0_to_1_and_noise_is_standard_normal_and_uncorrelated():
+def test_numbers_are_uniform_in_0_to_1_and_noise_is_standard_normal_and_uncorrelated(subtests):
     for draws in uniform(torch.arange(500), (100,)):
         assert 0 < draws.min() < draws.max() <= 1
         assert stats.kstest(draws.flatten().numpy(), "uniform").pvalue > 1e-3
@@ -20,18 +20,20 @@ def test_numbers_are_uniform_in_0_to_1_and_noise_is_standard_normal_and_uncorrel
         *((first, second), (first[0], first[1]), (first[:, 1:], first[:, :-1])),
         *((first[..., 1:], first[..., :-1]), (first[..., ::2][..., :131], first[..., 1::2])),
     ):
-        assert abs((a * b).mean().item()) < 0.01
+        with subtests.test(a=a, b=b):
+            assert abs((a * b).mean().item()) < 0.01
 
 
-def test_noise_of_a_motion_depends_on_its_name_alone():
+def test_noise_of_a_motion_depends_on_its_name_alone(subtests):
     like = torch.zeros(1, dtype=torch.float64)
     together = seeded_noise(["a", "b"], 20, 7, seed=3, replication=1, like=like)(2)
     alone = seeded_noise(["b"], 11, 7, seed=3, replication=1, like=like)(2)
     assert torch.equal(together[1, :11], alone[0])
     assert together.dtype == torch.float64
     for seed, replication, draw in ((4, 1, 2), (3, 2, 2), (3, 1, 3)):
-        other = seeded_noise(["b"], 11, 7, seed=seed, replication=replication, like=like)(draw)
-        assert not torch.isclose(other, alone).any()
+        with subtests.test(seed=seed, replication=replication, draw=draw):
+            other = seeded_noise(["b"], 11, 7, seed=seed, replication=replication, like=like)(draw)
+            assert not torch.isclose(other, alone).any()
 
 
 def test_keys_and_values_are_the_same_on_every_machine():

@@ -108,26 +108,27 @@ CASES = [
 ]
 
 
-def test_a_plan_leads_to_the_motion_of_the_sampler() -> None:
+def test_a_plan_leads_to_the_motion_of_the_sampler(subtests) -> None:
     like, mask = torch.zeros(1, 5, 4, dtype=torch.float64), torch.ones(1, 5, dtype=torch.bool)
     noise = seeded_noise(["a"], 5, 4, seed=1, replication=0, like=like)
     for process, sampler, options in CASES:
-        requested = SamplerOptions(**{"sampler": sampler, "num_inference_steps": 8} | options)
-        denoise = partial(network, width=process.out_features(4))
-        expected = process.sample(denoise, noise, mask, NOTHING, requested)
-        plan = onnx.sampling_plan(process, requested)
-        assert np.shape(plan)[1] == 7
-        ours = followed(plan, getattr(process, "clip_x0", False), noise)
-        torch.testing.assert_close(
-            ours, expected, atol=1e-9, rtol=1e-7, msg=f"{process} {requested}"
-        )
+        with subtests.test(process=process, sampler=sampler, options=options):
+            requested = SamplerOptions(**{"sampler": sampler, "num_inference_steps": 8} | options)
+            denoise = partial(network, width=process.out_features(4))
+            expected = process.sample(denoise, noise, mask, NOTHING, requested)
+            plan = onnx.sampling_plan(process, requested)
+            assert np.shape(plan)[1] == 7
+            ours = followed(plan, getattr(process, "clip_x0", False), noise)
+            torch.testing.assert_close(
+                ours, expected, atol=1e-9, rtol=1e-7, msg=f"{process} {requested}"
+            )
     for process, sampler, says in (
         (GaussianDiffusion(50, variance="learned_range"), "ancestral", "learned variance"),
         (FlowMatching(), "rk4", "combines more than two"),
         (FlowMatching(), "dopri5", "dopri5 cannot edit"),
         (FlowMatching(), "ddim", "unknown sampler"),
     ):
-        with pytest.raises(UserError, match=says):
+        with subtests.test(sampler=sampler, says=says), pytest.raises(UserError, match=says):
             onnx.sampling_plan(process, SamplerOptions(sampler=sampler, num_inference_steps=6))
 
 

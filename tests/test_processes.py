@@ -78,10 +78,11 @@ def test_schedules_sampling_steps_and_their_betas(stem):
         np.testing.assert_allclose(betas.numpy(), expected, rtol=1e-9, err_msg=key)
 
 
-def test_the_linear_schedule_has_the_ends_of_ho_et_al():
+def test_the_linear_schedule_has_the_ends_of_ho_et_al(subtests):
     for total, first, last in ((1000, 1e-4, 0.02), (500, 2e-4, 0.04), (10, 0.01, 0.999)):
-        betas = build_schedule("linear", total).numbers["betas"]
-        assert (betas[0], betas[-1]) == pytest.approx((first, last))
+        with subtests.test(total=total, first=first, last=last):
+            betas = build_schedule("linear", total).numbers["betas"]
+            assert (betas[0], betas[-1]) == pytest.approx((first, last))
 
 
 def pointwise_output(x_t: Tensor, learned: bool) -> Tensor:
@@ -337,19 +338,20 @@ def sees_condition(x_t, t, mask, cond):
 
 
 @pytest.mark.parametrize("scale", [0.0, 2.5, torch.tensor([2.5, 0.0]), torch.tensor([1.0, 8.0])])
-def test_guidance_is_two_passes_in_one_except_for_a_learned_variance_and_scale_one(scale):
+def test_guidance_is_two_passes_in_one_except_for_a_learned_variance_and_scale_one(scale, subtests):
     x_t, t = torch.randn(2, 4, 2), torch.tensor([3.0, 5.0])
     with_cond = sees_condition(x_t, t, MASK, COND)
     null = sees_condition(x_t, t, MASK, COND.drop(torch.tensor([True, True])))
     strength = scale[:, None, None] if isinstance(scale, torch.Tensor) else scale
     expected = torch.cat([(null + strength * (with_cond - null))[..., :2], with_cond[..., 2:]], -1)
     for channels in (4, 2):
-        denoise = CountedDenoise(
-            lambda *args, channels=channels: sees_condition(*args)[..., :channels]
-        )
-        guided = classifier_free_guidance(denoise, scale, features=2)(x_t, t, MASK, COND)
-        torch.testing.assert_close(guided, expected[..., :channels])
-        assert denoise.calls == 1
+        with subtests.test(channels=channels):
+            denoise = CountedDenoise(
+                lambda *args, channels=channels: sees_condition(*args)[..., :channels]
+            )
+            guided = classifier_free_guidance(denoise, scale, features=2)(x_t, t, MASK, COND)
+            torch.testing.assert_close(guided, expected[..., :channels])
+            assert denoise.calls == 1
     assert classifier_free_guidance(sees_condition, 1, 2) is sees_condition
 
 

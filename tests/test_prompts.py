@@ -86,7 +86,7 @@ def test_a_chosen_folder_gets_a_folder_per_prompt_without_files_of_an_earlier_re
     ]
 
 
-def test_a_bad_request_is_one_line_and_writes_nothing(here, trained, capsys, monkeypatch):
+def test_a_bad_request_is_one_line_and_writes_nothing(here, trained, capsys, monkeypatch, subtests):
     monkeypatch.setitem(sys.modules, "av", None)
     for content, words, message in (
         (None, [], "p.txt: no such file"),
@@ -111,11 +111,12 @@ def test_a_bad_request_is_one_line_and_writes_nothing(here, trained, capsys, mon
         ),
         (b"\nwalks", ["seconds=30"], "p.txt: 1 of 1 prompts cannot be sampled"),
     ):
-        Path("p.txt").unlink(missing_ok=True)
-        if content is not None:
-            Path("p.txt").write_bytes(content)
-        assert message in error_of(capsys, "sample", trained, "prompts=p.txt", *words)
-        assert not Path("samples").exists()
+        with subtests.test(content=content, words=words, message=message):
+            Path("p.txt").unlink(missing_ok=True)
+            if content is not None:
+                Path("p.txt").write_bytes(content)
+            assert message in error_of(capsys, "sample", trained, "prompts=p.txt", *words)
+            assert not Path("samples").exists()
 
 
 @pytest.mark.slow
@@ -215,7 +216,7 @@ def test_requests_for_different_motions_share_no_folder():
     )
 
 
-def test_no_checkpoint_leads_out_of_the_folder(here):
+def test_no_checkpoint_leads_out_of_the_folder(here, subtests):
     names = [
         "../../x",
         "/etc/x",
@@ -232,10 +233,13 @@ def test_no_checkpoint_leads_out_of_the_folder(here):
         ". .",
     ]
     for name in names:
-        path = Path(folder(name, "../../../etc passwd\0", sampler="../../x", joints=["/a", ".."]))
-        assert ".." not in path.parts
-        assert "\0" not in str(path)
-        assert path.resolve().is_relative_to(here / "samples")
+        with subtests.test(name=name):
+            path = Path(
+                folder(name, "../../../etc passwd\0", sampler="../../x", joints=["/a", ".."])
+            )
+            assert ".." not in path.parts
+            assert "\0" not in str(path)
+            assert path.resolve().is_relative_to(here / "samples")
 
 
 @pytest.mark.slow

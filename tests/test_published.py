@@ -67,7 +67,7 @@ def _measures(protocol: str, representation: str) -> tuple[Any, set[str]]:
     return loaded, set(evaluator.score(nothing, nothing, nothing, 0)[0])
 
 
-def test_there_is_a_table_for_each_of_the_papers(tmp_path):
+def test_there_is_a_table_for_each_of_the_papers(tmp_path, subtests):
     tables = {
         f"{paper}_{n}"
         for paper, last in (("flame", 10), ("mdm", 8), ("mfm", 5))
@@ -78,8 +78,9 @@ def test_there_is_a_table_for_each_of_the_papers(tmp_path):
     }
     assert set(PAPERS) == tables | figures
     for name in PAPERS:
-        table = builder.build(name, SPECS[name], tmp_path)
-        assert [part.name for part in table.parts] == list(SPECS[name]["parts"]), name
+        with subtests.test(name=name):
+            table = builder.build(name, SPECS[name], tmp_path)
+            assert [part.name for part in table.parts] == list(SPECS[name]["parts"]), name
 
 
 def test_published_rows_are_whole():
@@ -165,23 +166,26 @@ def needed_extractor(protocol: Any, config: Config) -> tuple[str, str]:
     return protocol.extractor["_target_"].rpartition(".")[2], data
 
 
-def test_rows_are_checkpoints_of_recipes_that_fit():
+def test_rows_are_checkpoints_of_recipes_that_fit(subtests):
     for name, part in MEASURED.items():
-        if name.partition(":")[0] not in PAPERS:
-            continue
-        for row in part["rows"]:
-            config = recipe(trained(row))
-            chosen = Path(row["ckpt"]).stem == "best"
-            assert chosen == bool(config["callbacks"]["best"]), (
-                f"{name}: best.ckpt only where clips are validated"
-            )
-            protocol, _ = measures(part["protocol"], trained(row))
-            labels = config["condition"].get("_target_", "").endswith("ActionLabels")
-            assert protocol.condition in ("none", "action" if labels else "text"), name
-            assert extracted(part.get("extractor", "")) == needed_extractor(protocol, config), name
-        for column in part["columns"].values():  # papers time one motion
-            if column["value"] == "seconds_per_sample":
-                assert column.get("protocol", part["protocol"]) == "latency", name
+        with subtests.test(name=name, part=part):
+            if name.partition(":")[0] not in PAPERS:
+                continue
+            for row in part["rows"]:
+                config = recipe(trained(row))
+                chosen = Path(row["ckpt"]).stem == "best"
+                assert chosen == bool(config["callbacks"]["best"]), (
+                    f"{name}: best.ckpt only where clips are validated"
+                )
+                protocol, _ = measures(part["protocol"], trained(row))
+                labels = config["condition"].get("_target_", "").endswith("ActionLabels")
+                assert protocol.condition in ("none", "action" if labels else "text"), name
+                assert extracted(part.get("extractor", "")) == needed_extractor(protocol, config), (
+                    name
+                )
+            for column in part["columns"].values():  # papers time one motion
+                if column["value"] == "seconds_per_sample":
+                    assert column.get("protocol", part["protocol"]) == "latency", name
 
 
 def test_papers_checkpoints_are_chosen_by_fid():
@@ -201,20 +205,21 @@ def test_papers_checkpoints_are_chosen_by_fid():
         )
 
 
-def test_real_motions_have_what_protocols_expect():
+def test_real_motions_have_what_protocols_expect(subtests):
     names = {"mm_dist": "MM-Dist", "diversity": "Diversity", "fid": "FID"}
     names["motions_for_text/top3"] = "R precision (top 3)"
     values = yaml.safe_load((EXPERIMENTS / "evaluation" / "text_to_motion_t2m.yaml").read_text())[
         "expected"
     ]
     for table, part, data in (("mdm_1", "HumanML3D", "humanml3d"), ("mdm_2", "KIT-ML", "kit")):
-        real = next(
-            row["values"] for row in PUBLISHED[table][part]["rows"] if row["label"] == "Real"
-        )
-        expected = values[data]
-        assert {n: float(real[c].split()[0]) for n, c in names.items()} == {
-            n: expected[n][0] for n in names
-        }
+        with subtests.test(table=table, part=part, data=data):
+            real = next(
+                row["values"] for row in PUBLISHED[table][part]["rows"] if row["label"] == "Real"
+            )
+            expected = values[data]
+            assert {n: float(real[c].split()[0]) for n, c in names.items()} == {
+                n: expected[n][0] for n in names
+            }
 
 
 ROWS: dict[str, list[int]] = {
@@ -248,7 +253,7 @@ ROWS: dict[str, list[int]] = {
 """Reported rows of the parts of each table; four rows of mdm_1 are the authors' corrections."""
 
 
-def test_rows_are_those_of_the_papers():
+def test_rows_are_those_of_the_papers(subtests):
     counts = {
         name: [len(part["rows"]) for part in parts.values()] for name, parts in PUBLISHED.items()
     }
@@ -261,6 +266,7 @@ def test_rows_are_those_of_the_papers():
         "the paper's arrow"
     )
     for name, part in (("mdm_1", "HumanML3D"), ("mdm_2", "KIT-ML")):
-        assert SPECS[name]["parts"][part]["columns"]["Multimodality"]["better"] == "higher", (
-            "the paper's arrow"
-        )
+        with subtests.test(name=name, part=part):
+            assert SPECS[name]["parts"][part]["columns"]["Multimodality"]["better"] == "higher", (
+                "the paper's arrow"
+            )

@@ -81,7 +81,7 @@ def mean_over(metric: Metric, fixture: dict[str, np.ndarray], names: list[str]) 
 
 @pytest.mark.golden
 @pytest.mark.parametrize("case", cases(MBENCH, "", "mbench_quality"))
-def test_mbench_equals_the_authors(case: str):
+def test_mbench_equals_the_authors(case: str, subtests):
     motion, toes = y_up(MBENCH[f"in/{case}/joints"]), [10, 11]
     contact = mbench_contact(motion[:, toes])
     np.testing.assert_array_equal(contact, MBENCH[f"out/{case}/contact"])
@@ -90,9 +90,12 @@ def test_mbench_equals_the_authors(case: str):
         np.testing.assert_array_equal(parts, MBENCH[f"aux/{case}/floating_parts"])
     ours = MBenchQuality(20.0).measure(motion)
     for name, theirs in MBENCH_NAMES.items():
-        # The fixture has no value where the authors' code fails.
-        expected = float(MBENCH.get(f"f64/{case}/{theirs}", math.nan))
-        assert float(ours[name]) == pytest.approx(expected, rel=1e-8, abs=1e-8, nan_ok=True), name
+        with subtests.test(name=name, theirs=theirs):
+            # The fixture has no value where the authors' code fails.
+            expected = float(MBENCH.get(f"f64/{case}/{theirs}", math.nan))
+            assert float(ours[name]) == pytest.approx(expected, rel=1e-8, abs=1e-8, nan_ok=True), (
+                name
+            )
 
 
 @pytest.mark.golden
@@ -182,7 +185,7 @@ def kimodo_errors(case: str) -> dict[str, Tensor]:
 
 
 @one
-def test_kimodos_percentile_retrieval_distances_and_angles_equal_the_authors(stem: str):
+def test_kimodos_percentile_retrieval_distances_and_angles_equal_the_authors(stem: str, subtests):
     metric, config = KimodoConstraints(), meta(KIMODO)["config"]["constraint_cases"]
     metric.add(torch.arange(len(config)), [kimodo_errors(case) for case in config])
     expected = float(KIMODO["out/constraint_root2d_err_p95"])
@@ -212,9 +215,10 @@ def test_kimodos_percentile_retrieval_distances_and_angles_equal_the_authors(ste
         ("gen_text", motion, text),
         ("gt_text", real, text),
     ):
-        assert float(frechet_distance(a, b)) == pytest.approx(
-            float(KIMODO[f"f64/tmr/FID/{name}"]), abs=1e-6
-        )
+        with subtests.test(name=name, a=a, b=b):
+            assert float(frechet_distance(a, b)) == pytest.approx(
+                float(KIMODO[f"f64/tmr/FID/{name}"]), abs=1e-6
+            )
     pred, target = (
         torch.from_numpy(KIMODO[f"in/geodesic/{name}"]).double() for name in ("pred", "target")
     )
@@ -359,7 +363,7 @@ def test_equal_captions_count_as_correct_and_the_classic_value_stays():
     assert values["chance_top1"] == pytest.approx(values["positives"] / 32)
 
 
-def test_windows_of_transitions():
+def test_windows_of_transitions(subtests):
     """A step of 1 m in one coordinate has third differences 1, -2, 1 around it; only whole windows count."""
     joints = torch.zeros(2, 40, 22, 3)
     joints[:, 20:, 3, 0] = 1
@@ -368,9 +372,10 @@ def test_windows_of_transitions():
     kept[1, 3:] = True  # its window would begin before the motion
     real = JERK_OF_REAL_MOTIONS[20]
     for fps, area in ((20.0, 4 - 3 * real + 4 * real), (60.0, None)):
-        metric = TransitionJerk(fps, window=10)
-        metric.update(joints, torch.ones(2, 40, dtype=torch.bool), kept, torch.arange(2))
-        assert metric.compute() == pytest.approx({"peak": 2, "area": area, "windows": 1})
+        with subtests.test(fps=fps, area=area):
+            metric = TransitionJerk(fps, window=10)
+            metric.update(joints, torch.ones(2, 40, dtype=torch.bool), kept, torch.arange(2))
+            assert metric.compute() == pytest.approx({"peak": 2, "area": area, "windows": 1})
 
 
 @pytest.mark.parametrize(("step", "is_inside"), [(15, False), (16, True), (24, True), (25, False)])

@@ -63,31 +63,32 @@ def test_recipes_of_the_papers_sets_name_paper_and_deviations():
             assert whole, name
 
 
-def test_samplers_steps_and_prompts_suit_process_and_condition():
+def test_samplers_steps_and_prompts_suit_process_and_condition(subtests):
     for name in GENERATION:
-        config = recipe(name)
-        task, total = config["task"], config["process"].get("num_train_timesteps")
-        steps = task["num_inference_steps"]
-        if total is None:
-            assert task["sampler"] in FlowMatching.samplers, name
-        else:
-            assert task["sampler"] in GaussianDiffusion.samplers, name
-            assert 2 <= (len(steps) if isinstance(steps, list) else steps) <= total, name
-            assert not isinstance(steps, list) or (
-                steps == sorted(set(steps)) and 0 <= steps[0] <= steps[-1] < total
+        with subtests.test(name=name):
+            config = recipe(name)
+            task, total = config["task"], config["process"].get("num_train_timesteps")
+            steps = task["num_inference_steps"]
+            if total is None:
+                assert task["sampler"] in FlowMatching.samplers, name
+            else:
+                assert task["sampler"] in GaussianDiffusion.samplers, name
+                assert 2 <= (len(steps) if isinstance(steps, list) else steps) <= total, name
+                assert not isinstance(steps, list) or (
+                    steps == sorted(set(steps)) and 0 <= steps[0] <= steps[-1] < total
+                )
+            frames = instantiate(config["data"]["crop"]).longest()
+            assert config["denoiser"].get("max_frames", frames) >= frames, name
+            guided = task["guidance_scale"] != 1
+            assert not guided or task["cond_drop_prob"] > 0, (
+                f"{name}: guided, but never trained without condition"
             )
-        frames = instantiate(config["data"]["crop"]).longest()
-        assert config["denoiser"].get("max_frames", frames) >= frames, name
-        guided = task["guidance_scale"] != 1
-        assert not guided or task["cond_drop_prob"] > 0, (
-            f"{name}: guided, but never trained without condition"
-        )
-        prompts = config["callbacks"]["samples"]["prompts"]
-        kind = config["condition"]["_target_"].rpartition(".")[2]
-        assert (prompts is None) == (kind == "Unconditional"), name
-        # UESTC's names are in its files
-        if kind == "ActionLabels" and not name.startswith("uestc"):
-            assert set(prompts) <= set(instantiate(config["data"]["source"]).actions), name
+            prompts = config["callbacks"]["samples"]["prompts"]
+            kind = config["condition"]["_target_"].rpartition(".")[2]
+            assert (prompts is None) == (kind == "Unconditional"), name
+            # UESTC's names are in its files
+            if kind == "ActionLabels" and not name.startswith("uestc"):
+                assert set(prompts) <= set(instantiate(config["data"]["source"]).actions), name
 
 
 class Drawn(ConditionEncoder):

@@ -91,11 +91,13 @@ def test_a_falsified_claim_differs_in_one_attribute():
     assert [str(other) for _, other in falsified(order)] == ["jump, then sit"]
 
 
-def test_every_pattern_has_a_kind_and_every_threshold_is_a_band():
+def test_every_pattern_has_a_kind_and_every_threshold_is_a_band(subtests):
     for text in ("walks", "jumps twice", "kneels", "lies down", "leans to the left"):
-        assert all(claim.parts or claim.kind in KINDS for claim in read_claims(text))
+        with subtests.test(text=text):
+            assert all(claim.parts or claim.kind in KINDS for claim in read_claims(text))
     for name, kind in KINDS.items():
-        assert kind.no < kind.yes, name
+        with subtests.test(name=name, kind=kind):
+            assert kind.no < kind.yes, name
     for name, values in thresholds().items():
         assert values["no"] < values["yes"], name
     assert band(Claim("order", parts=(Claim("sit"), Claim("jump")))) == (-0.3, 0.3)

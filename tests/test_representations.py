@@ -130,23 +130,24 @@ def test_skeleton_constants_and_mirrored_joints(stem: str):
             assert np.array_equal(SMPL22.mirror(joints), arrays(stem)[f"{clip}/joints_in"])
 
 
-def test_skeletons_are_trees():
+def test_skeletons_are_trees(subtests):
     for name, skeleton in SKELETONS.items():
-        assert (
-            len(set(skeleton.joints))
-            == len(skeleton.parents)
-            == len(skeleton.raw_offsets)
-            == len(skeleton)
-        ), name
-        assert skeleton.parents[0] == -1
-        assert all(0 <= parent < joint for parent, joint in skeleton.edges)
-        in_chains = [edge for chain in skeleton.chains for edge in itertools.pairwise(chain)]
-        assert sorted(in_chains) == sorted(skeleton.edges), "the chains walk every bone once"
-        joints = wander(name)
-        assert torch.equal(skeleton.mirror(skeleton.mirror(joints)), joints)
-        exchanged = sum(a != b for a, b in enumerate(skeleton.mirrored))
-        assert exchanged == 2 * sum("left" in joint for joint in skeleton.joints)
-        close(skeleton.assemble(skeleton.bones(joints), joints[:, 0]), joints, 1e-12)
+        with subtests.test(name=name, skeleton=skeleton):
+            assert (
+                len(set(skeleton.joints))
+                == len(skeleton.parents)
+                == len(skeleton.raw_offsets)
+                == len(skeleton)
+            ), name
+            assert skeleton.parents[0] == -1
+            assert all(0 <= parent < joint for parent, joint in skeleton.edges)
+            in_chains = [edge for chain in skeleton.chains for edge in itertools.pairwise(chain)]
+            assert sorted(in_chains) == sorted(skeleton.edges), "the chains walk every bone once"
+            joints = wander(name)
+            assert torch.equal(skeleton.mirror(skeleton.mirror(joints)), joints)
+            exchanged = sum(a != b for a, b in enumerate(skeleton.mirrored))
+            assert exchanged == 2 * sum("left" in joint for joint in skeleton.joints)
+            close(skeleton.assemble(skeleton.bones(joints), joints[:, 0]), joints, 1e-12)
 
 
 @pytest.mark.golden
@@ -244,15 +245,16 @@ def test_clean_motions_are_canonical_and_come_back_also_with_bones_opposite_to_t
         assert HumanML(variant="legacy").encode(joints).isfinite().all()
 
 
-def test_many_motions_at_once_are_encoded_as_one_by_one():
+def test_many_motions_at_once_are_encoded_as_one_by_one(subtests):
     motions = [wander(frames=frames, seed=frames, turns=frames / 30) for frames in (3, 41, 20)]
     for representation in (
         HumanML(bone_lengths=[0.2] * 22),
         HumanML(variant="legacy"),
         Essential(),
     ):
-        for many, motion in zip(representation.encode_many(motions), motions, strict=True):
-            assert torch.equal(many, representation.encode(motion))
+        with subtests.test(representation=representation):
+            for many, motion in zip(representation.encode_many(motions), motions, strict=True):
+                assert torch.equal(many, representation.encode(motion))
 
 
 def test_statistics():
@@ -270,7 +272,7 @@ def test_statistics():
         close(std[columns], torch.full_like(std[columns], expected), 1e-6)
 
 
-def test_bad_motions_and_options():
+def test_bad_motions_and_options(subtests):
     bent, raw = torch.zeros(5, 22, 3), torch.zeros(4, 75)
     for representation, motion, message in (
         (HumanML(), bent[:2], "2 frames"),
@@ -285,11 +287,12 @@ def test_bad_motions_and_options():
         (Motion272(), raw[:1], "1 frame, but encoding needs at least 2"),
         (Rifke(), bent, r"shape \(5, 22, 3\), but rifke takes \(frames, 21, 3\)"),
     ):
-        with pytest.raises(UserError, match=message):
-            representation.encode(motion)
-        if isinstance(representation, HumanML):
-            with pytest.raises(UserError, match=f"motion 1: .*{message}"):
-                representation.encode_many([wander(), motion])
+        with subtests.test(motion=motion, message=message):
+            with pytest.raises(UserError, match=message):
+                representation.encode(motion)
+            if isinstance(representation, HumanML):
+                with pytest.raises(UserError, match=f"motion 1: .*{message}"):
+                    representation.encode_many([wander(), motion])
     with pytest.raises(UserError, match="bone_lengths: 2 numbers for the 22 joints"):
         HumanML(bone_lengths=[1.0, 2.0])
     with pytest.raises(UserError, match=r"smpl23.*smpl22"):
@@ -327,24 +330,27 @@ def test_flame_features_and_action_features_of_consecutive_skipped_and_all_frame
         close(Rot6D().encode(motion), expected, 2e-6)
 
 
-def test_every_recipe_builds_decodes_and_passes_gradients():
+def test_every_recipe_builds_decodes_and_passes_gradients(subtests):
     for path in sorted(ROOT.glob("experiments/representation/*.yaml")):
-        representation = instantiate(OmegaConf.load(path))
-        assert isinstance(representation, Representation), path
-        size, joints = representation.features, len(representation.skeleton)
-        assert representation.mean.shape == representation.std.shape == (size,)
-        x = torch.randn(2, 5, size, requires_grad=True)
-        decoded = representation.to_joints(x)
-        assert decoded.shape == (2, 5, joints, 3)
-        longer = representation.to_joints(torch.cat([x, torch.randn(2, 3, size)], 1))
-        close(longer[:, :5], decoded, 1e-5)  # padding does not reach the frames before it
-        close(representation.to_joints(x[1]), decoded[1], 1e-5)
-        (gradient,) = torch.autograd.grad(decoded.square().sum(), x)
-        assert gradient.isfinite().all()
-        assert gradient.any()
-        owners = torch.stack([representation.joint_features([joint]) for joint in range(joints)])
-        assert owners.shape == (joints, size)
-        assert (owners.sum(0) >= 1).all()
+        with subtests.test(path=path):
+            representation = instantiate(OmegaConf.load(path))
+            assert isinstance(representation, Representation), path
+            size, joints = representation.features, len(representation.skeleton)
+            assert representation.mean.shape == representation.std.shape == (size,)
+            x = torch.randn(2, 5, size, requires_grad=True)
+            decoded = representation.to_joints(x)
+            assert decoded.shape == (2, 5, joints, 3)
+            longer = representation.to_joints(torch.cat([x, torch.randn(2, 3, size)], 1))
+            close(longer[:, :5], decoded, 1e-5)  # padding does not reach the frames before it
+            close(representation.to_joints(x[1]), decoded[1], 1e-5)
+            (gradient,) = torch.autograd.grad(decoded.square().sum(), x)
+            assert gradient.isfinite().all()
+            assert gradient.any()
+            owners = torch.stack(
+                [representation.joint_features([joint]) for joint in range(joints)]
+            )
+            assert owners.shape == (joints, size)
+            assert (owners.sum(0) >= 1).all()
 
 
 def test_features_of_a_joint_of_motion272_are_its_position_velocity_and_rotation():

@@ -46,18 +46,19 @@ ORDERS = {
 }
 
 
-def test_each_skeleton_has_the_euler_order_of_its_program(tmp_path):
+def test_each_skeleton_has_the_euler_order_of_its_program(tmp_path, subtests):
     """In the order of the channels of a BVH file."""
     assert ORDERS.keys() == presets().keys()
     for rig, order in ORDERS.items():
-        synthetic("kick").save(tmp_path / "a.bvh", rig=rig)
-        channels = bvh.read(tmp_path / "a.bvh").channels
-        written = {
-            "".join(name[0] for name in names if name.endswith("rotation"))
-            for names in channels
-            if names
-        }
-        assert written == {order}, rig
+        with subtests.test(rig=rig, order=order):
+            synthetic("kick").save(tmp_path / "a.bvh", rig=rig)
+            channels = bvh.read(tmp_path / "a.bvh").channels
+            written = {
+                "".join(name[0] for name in names if name.endswith("rotation"))
+                for names in channels
+                if names
+            }
+            assert written == {order}, rig
 
 
 def test_a_known_skeleton_brings_the_joints_back_also_as_a_character_and_does_not_change_the_body(
@@ -155,7 +156,9 @@ def limbs_off(at: dict[str, np.ndarray], joints: np.ndarray, *limbs: str) -> flo
 
 
 @pytest.mark.parametrize("turned", [False, True])
-def test_a_character_with_odd_names_scale_and_rest_pose(kick: Motion, tmp_path: Path, turned: bool):
+def test_a_character_with_odd_names_scale_and_rest_pose(
+    kick: Motion, tmp_path: Path, turned: bool, subtests
+):
     hero = tmp_path / "hero.glb"
     odd_character(hero, kick, turned)
     write_names(tmp_path / "hero.yaml")
@@ -171,8 +174,9 @@ def test_a_character_with_odd_names_scale_and_rest_pose(kick: Motion, tmp_path: 
     before = Glb(hero).document
     assert all(file.document[part] == before[part] for part in ("meshes", "materials", "skins"))
     for side in SIDES:
-        # The character faces +z, as the motion does.
-        assert np.median((at[f"{side}_foot"] - at[f"{side}_ankle"])[standing, 2]) > 0
+        with subtests.test(side=side):
+            # The character faces +z, as the motion does.
+            assert np.median((at[f"{side}_foot"] - at[f"{side}_ankle"])[standing, 2]) > 0
     world = characters.moved(characters.read(hero), kick)[0]
     # No limb flips
     assert largest_step(world) < largest_step(world_rotations(kick.posed().rotations.numpy())) + 10
@@ -240,7 +244,9 @@ def test_a_bvh_character_keeps_its_skeleton(kick: Motion, tmp_path: Path, change
     np.testing.assert_allclose(walked, kick.joints[-1, 0] - kick.joints[0, 0], atol=0.01)
 
 
-def test_a_bvh_character_whose_body_cannot_turn_or_move_is_refused(kick: Motion, tmp_path: Path):
+def test_a_bvh_character_whose_body_cannot_turn_or_move_is_refused(
+    kick: Motion, tmp_path: Path, subtests
+):
     hero = tmp_path / "hero.bvh"
     own_bvh(hero, kick, "first frame")
     with pytest.raises(UserError, match=r"out\.glb: this character is a \.bvh file without meshes"):
@@ -263,14 +269,15 @@ def test_a_bvh_character_whose_body_cannot_turn_or_move_is_refused(kick: Motion,
         (numbers, r"lowerarm_l \(left_elbow\) has 2 rotation channels"),
         (fixed, "pelvis and the joints above it have no position channels"),
     ):
-        hero.write_text("\n".join(changed_lines) + "\n")
-        with pytest.raises(UserError, match=message):
-            kick.save(tmp_path / "out.bvh", character=hero)
-        assert not (tmp_path / "out.bvh").exists()
+        with subtests.test(changed_lines=changed_lines, message=message):
+            hero.write_text("\n".join(changed_lines) + "\n")
+            with pytest.raises(UserError, match=message):
+                kick.save(tmp_path / "out.bvh", character=hero)
+            assert not (tmp_path / "out.bvh").exists()
 
 
 def test_names_of_joints_are_read_from_a_file(
-    kick: Motion, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    kick: Motion, tmp_path: Path, capsys: pytest.CaptureFixture[str], subtests
 ):
     hero, names, out = tmp_path / "hero.glb", tmp_path / "hero.yaml", str(tmp_path / "out.glb")
     odd_character(hero, kick)
@@ -295,9 +302,10 @@ def test_names_of_joints_are_read_from_a_file(
         ({"left_knee": None}, r"no joint found for left_knee\. Write"),
         ({"left_knee": "Rig Bone-l_hgiht", "left_hip": "Rig Bone-l_eflac"}, "upright|has no joint"),
     ):
-        write_names(names, **other)
-        with pytest.raises(UserError, match=message):
-            characters.read(hero)
+        with subtests.test(other=other, message=message):
+            write_names(names, **other)
+            with pytest.raises(UserError, match=message):
+                characters.read(hero)
     write_names(names)
     assert main(["convert", str(tmp_path / "a.npz"), out, f"character={hero}"]) == 0
 
@@ -335,7 +343,7 @@ def unskinned(document: dict[str, Any]) -> None:
         node.pop("skin", None)
 
 
-def test_characters_that_cannot_be_used_are_refused(kick: Motion, tmp_path: Path):
+def test_characters_that_cannot_be_used_are_refused(kick: Motion, tmp_path: Path, subtests):
     kick.save(tmp_path / "mixamo.glb", rig="mixamo")
     hero = tmp_path / "hero.glb"
     for change, message in (
@@ -361,11 +369,12 @@ def test_characters_that_cannot_be_used_are_refused(kick: Motion, tmp_path: Path
         (exchanged, "the toes point backward"),
         (lambda d: d["buffers"][0].update(uri="hero.bin"), r"in one file: buffers\.0\.uri"),
     ):
-        hero.write_bytes((tmp_path / "mixamo.glb").read_bytes())
-        changed(hero, change)
-        with pytest.raises(UserError, match=message):
-            kick.save(tmp_path / "out.glb", character=hero)
-        assert not (tmp_path / "out.glb").exists()
+        with subtests.test(change=change, message=message):
+            hero.write_bytes((tmp_path / "mixamo.glb").read_bytes())
+            changed(hero, change)
+            with pytest.raises(UserError, match=message):
+                kick.save(tmp_path / "out.glb", character=hero)
+            assert not (tmp_path / "out.glb").exists()
     with pytest.raises(UserError, match=r"out\.bvh: this character is a \.glb file"):
         kick.save(tmp_path / "out.bvh", character=tmp_path / "mixamo.glb")
 

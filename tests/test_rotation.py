@@ -87,14 +87,15 @@ def test_quaternion_algebra_and_euler_angles_are_the_authors(stem: str):
         same(rotation.matrix_to_euler(matrix, order), file[f"euler/{order}_back"], 1e-4)
 
 
-def test_euler_angles_in_gimbal_lock_and_of_unknown_orders():
+def test_euler_angles_in_gimbal_lock_and_of_unknown_orders(subtests):
     for order, sign in itertools.product(ORDERS, (1, -1)):
-        matrix = euler_to_matrix(
-            torch.tensor([0.4, sign * torch.pi / 2, -1.1], dtype=torch.float64), order
-        )
-        back = rotation.matrix_to_euler(matrix, order)
-        assert back[2] == 0
-        same(euler_to_matrix(back, order), matrix, 1e-7)
+        with subtests.test(order=order, sign=sign):
+            matrix = euler_to_matrix(
+                torch.tensor([0.4, sign * torch.pi / 2, -1.1], dtype=torch.float64), order
+            )
+            back = rotation.matrix_to_euler(matrix, order)
+            assert back[2] == 0
+            same(euler_to_matrix(back, order), matrix, 1e-7)
     with pytest.raises(ValueError, match="'XYX'"):
         rotation.matrix_to_euler(torch.eye(3), "XYX")
 
@@ -125,28 +126,30 @@ def test_round_trips(axis_angle: Tensor):
         )
 
 
-def test_opposite_directions_and_small_angles_have_finite_and_right_gradients():
+def test_opposite_directions_and_small_angles_have_finite_and_right_gradients(subtests):
     directions = ([1.0, 0, 0], [0, -1.0, 0], [0, 0, 1.0], [0.6, 0.0, -0.8])
     for direction, tilt in itertools.product(directions, (0.0, 1e-12, 1e-9, 1e-7, 1e-4)):
-        start = torch.tensor(direction, dtype=torch.float64, requires_grad=True)
-        end = -start.detach() + tilt * torch.tensor([0.3, 0.4, 0.5], dtype=torch.float64)
-        quaternion = rotation.between(start, end)
-        same(rotation.rotate(quaternion, start).detach(), end / end.norm(), 1e-7)
-        quaternion.sum().backward()
-        assert start.grad is not None
-        assert start.grad.isfinite().all()
+        with subtests.test(direction=direction, tilt=tilt):
+            start = torch.tensor(direction, dtype=torch.float64, requires_grad=True)
+            end = -start.detach() + tilt * torch.tensor([0.3, 0.4, 0.5], dtype=torch.float64)
+            quaternion = rotation.between(start, end)
+            same(rotation.rotate(quaternion, start).detach(), end / end.norm(), 1e-7)
+            quaternion.sum().backward()
+            assert start.grad is not None
+            assert start.grad.isfinite().all()
 
     def through_everything(axis_angle: Tensor) -> Tensor:
         return rotation.matrix_to_rot6d(rotation.axis_angle_to_matrix(axis_angle), "columns")
 
     for angle in (0.0, 1e-9, 1e-5, 1.0, np.pi):
-        axis_angle = torch.tensor([[angle, 0.0, 0.0]], dtype=torch.float64, requires_grad=True)
-        assert torch.autograd.gradcheck(through_everything, axis_angle)
-        back = rotation.matrix_to_axis_angle(rotation.axis_angle_to_matrix(axis_angle))
-        (gradient,) = torch.autograd.grad(back.sum(), axis_angle)
-        assert gradient.isfinite().all()
-        if angle < 3:
-            assert gradient[0, 0].item() == pytest.approx(1)
+        with subtests.test(angle=angle):
+            axis_angle = torch.tensor([[angle, 0.0, 0.0]], dtype=torch.float64, requires_grad=True)
+            assert torch.autograd.gradcheck(through_everything, axis_angle)
+            back = rotation.matrix_to_axis_angle(rotation.axis_angle_to_matrix(axis_angle))
+            (gradient,) = torch.autograd.grad(back.sum(), axis_angle)
+            assert gradient.isfinite().all()
+            if angle < 3:
+                assert gradient[0, 0].item() == pytest.approx(1)
 
 
 def gram_schmidt(rot6d: Tensor) -> Tensor:
@@ -200,19 +203,20 @@ def test_vectors_that_define_no_rotation_are_completed(
     )
 
 
-def test_vectors_beside_degenerate_ones_keep_every_bit_of_value_and_gradient():
+def test_vectors_beside_degenerate_ones_keep_every_bit_of_value_and_gradient(subtests):
     generator = torch.Generator().manual_seed(1)
     ordinary = torch.randn(len(degenerate_pairs()), 6, generator=generator)
     weights = torch.randn(len(ordinary), 3, 3, generator=generator)
     for others in (ordinary, degenerate_pairs()):
-        rot6d = torch.stack([ordinary, others], 1).requires_grad_()
-        matrix = rotation.rot6d_to_matrix(rot6d, "rows")[:, 0]
-        alone = ordinary.clone().requires_grad_()
-        expected = gram_schmidt(alone)
-        assert torch.equal(matrix, expected)
-        (gradient,) = torch.autograd.grad((weights * matrix).sum(), rot6d)
-        (expected_gradient,) = torch.autograd.grad((weights * expected).sum(), alone)
-        assert torch.equal(gradient[:, 0], expected_gradient)
+        with subtests.test(others=others):
+            rot6d = torch.stack([ordinary, others], 1).requires_grad_()
+            matrix = rotation.rot6d_to_matrix(rot6d, "rows")[:, 0]
+            alone = ordinary.clone().requires_grad_()
+            expected = gram_schmidt(alone)
+            assert torch.equal(matrix, expected)
+            (gradient,) = torch.autograd.grad((weights * matrix).sum(), rot6d)
+            (expected_gradient,) = torch.autograd.grad((weights * expected).sum(), alone)
+            assert torch.equal(gradient[:, 0], expected_gradient)
 
 
 def test_exported_graphs_and_vmap_complete_vectors_too():

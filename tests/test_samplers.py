@@ -561,15 +561,18 @@ REFUSED: dict[type[Process], list[tuple[dict[str, Any], str]]] = {
 
 
 @pytest.mark.parametrize("build", REFUSED)
-def test_the_impossible_is_refused_in_one_line(build):
+def test_the_impossible_is_refused_in_one_line(build, subtests):
     known = torch.zeros(1, 4, 2)
     for changed, message in REFUSED[build]:
-        options = {"sampler": "ancestral", "num_inference_steps": 5} | changed
-        if "edit" in options:
-            options["edit"] = Edit(**({"known": known, "keep": half_kept(known)} | changed["edit"]))
-        with pytest.raises(UserError, match=message) as error:
-            sample(build(), pulled, drawn((1, 4, 2)), **options)
-        assert "\n" not in str(error.value)
+        with subtests.test(changed=changed, message=message):
+            options = {"sampler": "ancestral", "num_inference_steps": 5} | changed
+            if "edit" in options:
+                options["edit"] = Edit(
+                    **({"known": known, "keep": half_kept(known)} | changed["edit"])
+                )
+            with pytest.raises(UserError, match=message) as error:
+                sample(build(), pulled, drawn((1, 4, 2)), **options)
+            assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(("build", "sampler"), EVERY)
@@ -591,16 +594,17 @@ def test_padding_changes_no_real_frame(build, sampler):
 
 
 @pytest.mark.parametrize(("build", "sampler"), EVERY)
-def test_no_loop_waits_for_the_device(build, sampler):
+def test_no_loop_waits_for_the_device(build, sampler, subtests):
     """Tensors on the meta device have no values: a loop that read one would fail."""
     known = torch.zeros(2, 6, 3, device="meta")
     for edit in (None, *(Edit(known, known > 0, mode) for mode in build.edit_modes)):
-        how = {"sampler": sampler, "num_inference_steps": 5, "edit": edit, "trajectory": []}
-        assert sample(build(), pulled, lambda draw: torch.zeros_like(known), **how).shape == (
-            2,
-            6,
-            3,
-        )
+        with subtests.test(edit=edit):
+            how = {"sampler": sampler, "num_inference_steps": 5, "edit": edit, "trajectory": []}
+            assert sample(build(), pulled, lambda draw: torch.zeros_like(known), **how).shape == (
+                2,
+                6,
+                3,
+            )
 
 
 def test_half_precision_denoisers_are_sampled_in_float32():

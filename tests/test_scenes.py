@@ -90,7 +90,7 @@ def test_splines_of_a_glb_file_have_a_slope_before_and_another_one_after_each_ke
 @pytest.mark.parametrize(
     "name", ["mixamo_prerotation.fbx", "mixamo_not_tpose.fbx", "mixamo_not_tpose.glb"]
 )
-def test_joints_of_other_writers_are_those_of_the_file(name: str):
+def test_joints_of_other_writers_are_those_of_the_file(name: str, subtests):
     motion = read(FILES / name)
     with np.load(FILES / "mixamo_not_tpose_expected.npz") as expected:
         names = [str(joint).removeprefix("mixamorig:") for joint in expected["names"]]
@@ -101,8 +101,9 @@ def test_joints_of_other_writers_are_those_of_the_file(name: str):
         ("right_wrist", "RightHand"),
         ("spine2", "Spine1"),
     ):
-        ours = motion.joints[:, SMPL22.joints.index(joint)]
-        assert np.abs(ours - walk[:, names.index(bone)]).max() < 0.01 * MILLIMETER
+        with subtests.test(joint=joint, bone=bone):
+            ours = motion.joints[:, SMPL22.joints.index(joint)]
+            assert np.abs(ours - walk[:, names.index(bone)]).max() < 0.01 * MILLIMETER
 
 
 @needs_third_party

@@ -259,7 +259,9 @@ def test_bad_targets_give_one_clear_line(model, tmp_path):
             flame_mdm.generate(model, TEXT, seconds=2, targets=tmp_path / "t.json")
 
 
-def test_the_command_prints_the_distance_and_bad_words_are_one_line(tmp_path, monkeypatch, capsys):
+def test_the_command_prints_the_distance_and_bad_words_are_one_line(
+    tmp_path, monkeypatch, capsys, subtests
+):
     monkeypatch.chdir(tmp_path)
     words = [f"text={TEXT}", "samples=1", "seconds=2", "num_inference_steps=4"]
     assert main(["sample", "quickstart", *words, "path=0,0.5 0.5,0.5"]) == 0
@@ -271,7 +273,8 @@ def test_the_command_prints_the_distance_and_bad_words_are_one_line(tmp_path, mo
         (["text=walks", "path=0,1 2"], "path=0,1 2: give way points as x,z in meters"),
         (["text=walks", "path=0,1", "targets=t.json"], "targets cannot be given with a path"),
     ):
-        assert message in error_of(capsys, "sample", "quickstart", *options)
+        with subtests.test(options=options, message=message):
+            assert message in error_of(capsys, "sample", "quickstart", *options)
 
 
 @pytest.mark.slow
@@ -308,7 +311,7 @@ def test_a_vocabulary_holds_every_word_once_and_captions_only_if_they_may_be_sha
     assert vocabulary.vocabulary([], []) == {"vocabulary": [], "captions": []}
 
 
-def test_unseen_and_unread_words_are_named_once_with_one_suggestion():
+def test_unseen_and_unread_words_are_named_once_with_one_suggestion(subtests):
     facts = vocabulary.vocabulary(CAPTIONS, CAPTIONS)
     # The words are forms of walk, and function words.
     assert vocabulary.advice("A person WAVES, with the hand! They were walking", facts) == []
@@ -324,7 +327,8 @@ def test_unseen_and_unread_words_are_named_once_with_one_suggestion():
     ]
     assert vocabulary.advice(text, {}, max_words=7) == []
     for text, first in (("walks", 0), ("jumps", 2), ("the left hand of a person", 1)):
-        assert vocabulary.nearest(text, CAPTIONS)[0] == CAPTIONS[first]
+        with subtests.test(text=text, first=first):
+            assert vocabulary.nearest(text, CAPTIONS)[0] == CAPTIONS[first]
 
 
 def test_a_text_without_a_known_word_is_refused(model, tmp_path, monkeypatch, capsys):
@@ -372,9 +376,10 @@ SENTENCES = {
 }  # fmt: skip
 
 
-def test_sentences_of_several_actions_are_split_at_their_verbs():
+def test_sentences_of_several_actions_are_split_at_their_verbs(subtests):
     for text, parts in SENTENCES.items():
-        assert vocabulary.in_parts(text, Synthetic.verbs) == (parts or [text])
+        with subtests.test(text=text, parts=parts):
+            assert vocabulary.in_parts(text, Synthetic.verbs) == (parts or [text])
     assert vocabulary.in_parts("walks forward, turns left. Then waves", ()) == [
         "walks forward, turns left",
         "waves",

@@ -26,23 +26,25 @@ from flame_mdm.training.speed import CheapDropout, attention
 CPU = torch.device("cpu")
 
 
-def test_cheap_dropout_drops_with_its_probability():
+def test_cheap_dropout_drops_with_its_probability(subtests):
     for p in (0.1, 0.5, 1e-3):
-        layer, x = CheapDropout(p), torch.ones(1000, 1001)
-        seed_generator(1, CPU)
-        y = layer(x)
-        dropped = float((y == 0).double().mean())
-        assert abs(dropped - p) < 5 * math.sqrt(p * (1 - p) / x.numel()) + 2**-17
-        torch.testing.assert_close(y[y != 0].unique(), torch.tensor([1 / (1 - p)]))
+        with subtests.test(p=p):
+            layer, x = CheapDropout(p), torch.ones(1000, 1001)
+            seed_generator(1, CPU)
+            y = layer(x)
+            dropped = float((y == 0).double().mean())
+            assert abs(dropped - p) < 5 * math.sqrt(p * (1 - p) / x.numel()) + 2**-17
+            torch.testing.assert_close(y[y != 0].unique(), torch.tensor([1 / (1 - p)]))
 
 
-def test_the_decisions_of_cheap_dropout_are_independent():
+def test_the_decisions_of_cheap_dropout_are_independent(subtests):
     layer = CheapDropout(0.5)
     seed_generator(2, CPU)
     keep = (layer(torch.ones(4_000_000)) != 0).double() - 0.5
     for lag in (1, 2, 3, 4, 5, 8, 1024):  # four neighbors share one random number
-        correlation = float((keep[:-lag] * keep[lag:]).mean() * 4)
-        assert abs(correlation) < 5 / math.sqrt(len(keep)), lag
+        with subtests.test(lag=lag):
+            correlation = float((keep[:-lag] * keep[lag:]).mean() * 4)
+            assert abs(correlation) < 5 / math.sqrt(len(keep)), lag
     again = (layer(torch.ones(4_000_000)) != 0).double() - 0.5
     assert abs(float((again * keep).mean() * 4)) < 5 / math.sqrt(len(keep))
 
@@ -209,18 +211,19 @@ def test_fast_is_reproducible_resumes_exactly_and_is_recorded(tiny, tmp_path, mo
     ]
 
 
-def test_bfloat16_is_chosen_where_the_processor_computes_with_it(monkeypatch):
+def test_bfloat16_is_chosen_where_the_processor_computes_with_it(monkeypatch, subtests):
     cases = (
         ("amx_bf16", "32-true", "bf16-mixed"),
         ("avx2", "32-true", "32-true"),
         ("amx_bf16", *["16-mixed"] * 2),
     )
     for has, precision, chosen in cases:
-        monkeypatch.setattr(torch.cpu, "get_capabilities", lambda has=has: {has: True})
-        config = compose(
-            "quickstart", ["trainer.accelerator=cpu", f"trainer.precision={precision}"]
-        )
-        assert speed.accelerate(*parts(config), config) == chosen
+        with subtests.test(has=has, precision=precision, chosen=chosen):
+            monkeypatch.setattr(torch.cpu, "get_capabilities", lambda has=has: {has: True})
+            config = compose(
+                "quickstart", ["trainer.accelerator=cpu", f"trainer.precision={precision}"]
+            )
+            assert speed.accelerate(*parts(config), config) == chosen
 
 
 def parts(config: Config) -> tuple[GeneratorTask, MotionDataModule]:

@@ -339,7 +339,7 @@ def test_online_cleanup_waits_for_one_block_and_has_no_jump_between_blocks(walk)
     assert jumps(clean).mean() < 0.8 * jumps(raw).mean()
 
 
-def test_what_such_a_model_cannot_do_is_said_in_one_line(model, walk):
+def test_what_such_a_model_cannot_do_is_said_in_one_line(model, walk, subtests):
     short = decoded(model.representation, torch.from_numpy(walk.features[:4]), "", "short")
     ordinary = untrained(["denoiser.latent_dim=16", "denoiser.num_layers=1"], 60)
     for call, message in (
@@ -379,9 +379,10 @@ def test_what_such_a_model_cannot_do_is_said_in_one_line(model, walk):
         ),
         (lambda: generate(model, "a person walks", seconds=0), "0 seconds are too short"),
     ):
-        with pytest.raises((UserError, FileNotFoundError), match=message) as error:
-            call()
-        assert "\n" not in str(error.value)
+        with subtests.test(message=message):
+            with pytest.raises((UserError, FileNotFoundError), match=message) as error:
+                call()
+            assert "\n" not in str(error.value)
 
 
 def test_streams_are_public():

@@ -268,7 +268,9 @@ def test_blender_reads_usd_files(rig: str, tmp_path: Path):
         )
 
 
-def test_a_vrm_animation_has_the_positions_of_the_motion_and_the_rest_pose_of_vrm(tmp_path: Path):
+def test_a_vrm_animation_has_the_positions_of_the_motion_and_the_rest_pose_of_vrm(
+    tmp_path: Path, subtests
+):
     motion = synthetic("kick")
     motion.save(tmp_path / "kick.vrma")
     read = glb_animation.read(tmp_path / "kick.vrma")
@@ -282,17 +284,18 @@ def test_a_vrm_animation_has_the_positions_of_the_motion_and_the_rest_pose_of_vr
     rest = glb.read(tmp_path / "kick.vrma")
     place = {name: rest.worlds[number, :3, 3] for number, name in enumerate(rest.names)}
     for side, sign in (("left", 1), ("right", -1)):
-        for first, second, direction in (
-            ("UpperArm", "LowerArm", (sign, 0, 0)),
-            ("LowerArm", "Hand", (sign, 0, 0)),
-            ("UpperLeg", "LowerLeg", (0, -1, 0)),
-            ("LowerLeg", "Foot", (0, -1, 0)),
-        ):
-            bone = place[side + second] - place[side + first]
-            np.testing.assert_allclose(bone / np.linalg.norm(bone), direction, atol=1e-6)
-        foot = place[f"{side}Toes"] - place[f"{side}Foot"]
-        assert abs(foot[0]) < 1e-9
-        assert foot[2] > 0
+        with subtests.test(side=side, sign=sign):
+            for first, second, direction in (
+                ("UpperArm", "LowerArm", (sign, 0, 0)),
+                ("LowerArm", "Hand", (sign, 0, 0)),
+                ("UpperLeg", "LowerLeg", (0, -1, 0)),
+                ("LowerLeg", "Foot", (0, -1, 0)),
+            ):
+                bone = place[side + second] - place[side + first]
+                np.testing.assert_allclose(bone / np.linalg.norm(bone), direction, atol=1e-6)
+            foot = place[f"{side}Toes"] - place[f"{side}Foot"]
+            assert abs(foot[0]) < 1e-9
+            assert foot[2] > 0
     # nodes turn nothing at rest and have no scale, and only the hips move
     document = rest.document
     assert all("rotation" not in item and "scale" not in item for item in document["nodes"])
@@ -441,7 +444,9 @@ def test_the_file_of_the_page_has_the_joints_of_the_page(
 
 
 @of_page
-def test_autodesk_reads_the_file_of_the_page(from_page: tuple[Written, Motion], node_modules: Path):
+def test_autodesk_reads_the_file_of_the_page(
+    from_page: tuple[Written, Motion], node_modules: Path, subtests
+):
     file, motion = from_page
     converted = autodesk(node_modules, file.path)
     other, scene = glb_animation.read(converted), glb.read(converted)
@@ -451,9 +456,10 @@ def test_autodesk_reads_the_file_of_the_page(from_page: tuple[Written, Motion], 
     motion.save(file.path.with_name("python.glb"))
     surfaces = [skinned(file.path.with_name("python.glb"), 20), skinned(converted, 30)]
     for first, second in (surfaces, surfaces[::-1]):
-        nearest, _ = KDTree(first).query(second)
-        # head, hands and feet keep the template's size, which is 3 % smaller
-        assert nearest.max() < 20 * MILLIMETER
+        with subtests.test(first=first, second=second):
+            nearest, _ = KDTree(first).query(second)
+            # head, hands and feet keep the template's size, which is 3 % smaller
+            assert nearest.max() < 20 * MILLIMETER
 
 
 @of_page
@@ -481,7 +487,9 @@ def test_blender_reads_the_file_of_the_page(from_page: tuple[Written, Motion], t
 
 
 @pytest.mark.parametrize("ending", [".usda", ".usdc", ".usdz"])
-def test_usd_files_are_valid_and_have_the_positions_of_the_motion(ending: str, tmp_path: Path):
+def test_usd_files_are_valid_and_have_the_positions_of_the_motion(
+    ending: str, tmp_path: Path, subtests
+):
     Usd, UsdGeom, UsdSkel = (pxr(name) for name in ("Usd", "UsdGeom", "UsdSkel"))
     motion = synthetic("kick")
     motion.save(tmp_path / f"kick{ending}", rig="mixamo")
@@ -501,9 +509,10 @@ def test_usd_files_are_valid_and_have_the_positions_of_the_motion(ending: str, t
     ]
     nodes = [expected.names.index(name) for name in names]
     for frame in FRAMES:
-        matrices = query.ComputeJointSkelTransforms(frame)
-        positions = np.array([list(matrix.ExtractTranslation()) for matrix in matrices])
-        assert np.abs(positions - expected.positions[frame, nodes]).max() < 0.01 * MILLIMETER
+        with subtests.test(frame=frame):
+            matrices = query.ComputeJointSkelTransforms(frame)
+            positions = np.array([list(matrix.ExtractTranslation()) for matrix in matrices])
+            assert np.abs(positions - expected.positions[frame, nodes]).max() < 0.01 * MILLIMETER
 
 
 def test_without_usd_core_the_error_says_how_to_install_it(

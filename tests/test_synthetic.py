@@ -235,7 +235,7 @@ def test_a_mirrored_motion_shows_the_other_side(clips: list[Clip]):
         )
 
 
-def test_noise_and_frozen_bodies_do_not_score(clips: list[Clip]):
+def test_noise_and_frozen_bodies_do_not_score(clips: list[Clip], subtests):
     rng, clips = (
         np.random.default_rng(0),
         [clip for clip in clips[:120] if clip.attributes["action"] != "stand"],
@@ -245,7 +245,8 @@ def test_noise_and_frozen_bodies_do_not_score(clips: list[Clip]):
     walk = [rng.normal(0, 0.05, (50, 22, 3)).cumsum(0) for _ in clips]
     shaking = [clips[0].motion[:1] + rng.normal(0, 0.08, (50, 22, 3)) for _ in clips]
     for motions in (noise, walk, shaking, [np.zeros((50, 22, 3))] * len(clips)):
-        assert set(accuracy(motions, requested).values()) == {0.0}
+        with subtests.test(motions=motions):
+            assert set(accuracy(motions, requested).values()) == {0.0}
     way = np.linspace(0, 2.5, 50)[:, None, None] * np.array([0, 0, 1])
     assert [read_attributes(clip.motion[:1] + way, FPS) for clip in clips[:20]] == [{}] * 20, (
         "gliding is no walk"
@@ -296,7 +297,7 @@ def test_padding_and_batching_do_not_matter(clips: list[Clip]):
     )
 
 
-def test_planted_feet_do_not_skate_and_sliding_feet_do():
+def test_planted_feet_do_not_skate_and_sliding_feet_do(subtests):
     """Of a body whose left toes move while all else stands; the limits belong to the fault of that name."""
     way = np.arange(40)[:, None] * np.array([0.6, 0, 0.8])
     half = np.where(np.arange(40)[:, None] <= 13, 0, way - way[13])
@@ -310,15 +311,16 @@ def test_planted_feet_do_not_skate_and_sliding_feet_do():
         (0.05 * half, FPS, 14, 0),
         (way, FPS, 1, None),
     ):
-        joints = np.pad(toe[:, None], ((0, 0), (10, 11), (0, 0)))
-        metric = FootSkating(fps)
-        metric.update(
-            torch.tensor(joints[None], dtype=torch.float32),
-            torch.arange(40)[None] < real,
-            torch.tensor([0]),
-        )
-        assert metric.compute() == expected
-        if real == 40:
-            assert any(fault.kind == "skating" for fault in find_faults(Motion(joints, fps))) == (
-                expected != 0
+        with subtests.test(toe=toe, fps=fps, real=real, expected=expected):
+            joints = np.pad(toe[:, None], ((0, 0), (10, 11), (0, 0)))
+            metric = FootSkating(fps)
+            metric.update(
+                torch.tensor(joints[None], dtype=torch.float32),
+                torch.arange(40)[None] < real,
+                torch.tensor([0]),
             )
+            assert metric.compute() == expected
+            if real == 40:
+                assert any(
+                    fault.kind == "skating" for fault in find_faults(Motion(joints, fps))
+                ) == (expected != 0)

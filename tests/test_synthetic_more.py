@@ -58,7 +58,7 @@ def test_the_clips_of_the_core_do_not_change():
     [*({"action": name} for name in MORE), *SIMULTANEOUS, *CYCLIC],
     ids=lambda row: " ".join(map(str, row.values())),
 )
-def test_bones_are_constant_and_feet_on_the_floor_do_not_move(attributes: Attributes):
+def test_bones_are_constant_and_feet_on_the_floor_do_not_move(attributes: Attributes, subtests):
     motion = example(attributes, FPS).astype(np.float64)
     bones = np.linalg.norm(motion[:, 1:] - motion[:, PARENTS[1:]], axis=-1)
     standing = example({"action": "stand"}, FPS).astype(np.float64)[0]
@@ -79,10 +79,11 @@ def test_bones_are_constant_and_feet_on_the_floor_do_not_move(attributes: Attrib
 
     ahead = motion[:, 1] - motion[:, 2]
     for side in (0, 1):
-        hip, knee, ankle = (motion[:, joint + side] for joint in (1, 4, 7))
-        assert (((knee - (hip + ankle) / 2) * np.cross(ankle - hip, ahead)).sum(-1) > 0).all(), (
-            "a knee bends backward"
-        )
+        with subtests.test(side=side):
+            hip, knee, ankle = (motion[:, joint + side] for joint in (1, 4, 7))
+            assert (
+                ((knee - (hip + ankle) / 2) * np.cross(ankle - hip, ahead)).sum(-1) > 0
+            ).all(), "a knee bends backward"
     assert np.linalg.norm(np.diff(motion, axis=0), axis=-1).max() * FPS < 13
 
 
@@ -116,12 +117,13 @@ def test_two_actions_at_once_move_legs_like_one_and_an_arm_like_the_other():
     assert np.ptp(seated[:, 0, 1]) < 0.02
 
 
-def test_who_sits_stays_seated_and_who_picks_up_ends_upright():
+def test_who_sits_stays_seated_and_who_picks_up_ends_upright(subtests):
     assert example({"action": "seated"}, FPS)[:, 0, 1].max() < 0.6
     assert example({"action": "sit"}, FPS)[-5:, 0, 1].max() < 0.6
     assert MORE["seated"].share == CORE["sit"].share
     for action in ("pick", "lift"):
-        assert example({"action": action}, FPS)[-1, 0, 1] > 0.9
+        with subtests.test(action=action):
+            assert example({"action": action}, FPS)[-1, 0, 1] > 0.9
 
 
 WORDS = {

@@ -195,7 +195,7 @@ def test_cells_ranks_and_real_motions(folder):
     )
 
 
-def test_rows_of_another_evaluator_are_marked_and_not_compared(folder):
+def test_rows_of_another_evaluator_are_marked_and_not_compared(folder, subtests):
     for changes in (
         {"extractor": {"sha256": "d" * 64}},
         {"protocol": {"name": "synthetic", "version": 2}},
@@ -205,14 +205,15 @@ def test_rows_of_another_evaluator_are_marked_and_not_compared(folder):
         {"seed": 1},
         {"quick": True},
     ):
-        put(request_of(folder, "MFM"), folder, measured(0.410, 0.7, 9.4) | changes)
-        part = made(folder).parts[0]
-        lines = {line.label: line for line in part.lines if line.kind == "measured"}
-        assert lines["MDM"].marks == lines["FLAME <b>"].marks == "a", changes
-        assert lines["MFM"].marks == "b", changes
-        assert all(cell is None or cell.rank == 0 for cell in lines["MFM"].cells), changes
-        assert [cell.rank for cell in lines["MDM"].cells if cell] == [1, 2, 2, 1], changes
-        assert [line.marks for line in part.lines if line.kind == "real"] == ["a", "b"], changes
+        with subtests.test(changes=changes):
+            put(request_of(folder, "MFM"), folder, measured(0.410, 0.7, 9.4) | changes)
+            part = made(folder).parts[0]
+            lines = {line.label: line for line in part.lines if line.kind == "measured"}
+            assert lines["MDM"].marks == lines["FLAME <b>"].marks == "a", changes
+            assert lines["MFM"].marks == "b", changes
+            assert all(cell is None or cell.rank == 0 for cell in lines["MFM"].cells), changes
+            assert [cell.rank for cell in lines["MDM"].cells if cell] == [1, 2, 2, 1], changes
+            assert [line.marks for line in part.lines if line.kind == "real"] == ["a", "b"], changes
 
 
 def test_a_recipe_changed_in_place_is_not_ranked_beside_the_recipe(folder):
@@ -230,12 +231,13 @@ def test_a_recipe_changed_in_place_is_not_ranked_beside_the_recipe(folder):
     assert ("b", f"as a, but {changes}") in part.notes
 
 
-def test_changes_of_a_recipe_are_found_in_the_configuration_of_a_model():
+def test_changes_of_a_recipe_are_found_in_the_configuration_of_a_model(subtests):
     for same in (
         [],
         ["seed=3", "run.name=mine", "data_root=/x", "trainer.max_steps=5", "selection=loss"],
     ):
-        assert recipe_changes(compose("quickstart", same)) == [], same
+        with subtests.test(same=same):
+            assert recipe_changes(compose("quickstart", same)) == [], same
     config = compose("quickstart", ["denoiser=mdm_unet", "optimizer.lr=0.1", "+process.min_snr=5"])
     network = "denoiser._target_=flame_mdm.denoisers.unet.MDMUNet"
     assert recipe_changes(config) == [network, "optimizer.lr=0.1", "process.min_snr=5"]
@@ -449,7 +451,7 @@ def test_rows_are_measured_from_their_checkpoint(trained, data_root, tmp_path, m
     assert files(Path("runs/tables")) == first
 
 
-def test_published_numbers_are_marked_and_ranked_among_themselves(folder, monkeypatch):
+def test_published_numbers_are_marked_and_ranked_among_themselves(folder, monkeypatch, subtests):
     published = folder / "published.yaml"
     printed = [
         {
@@ -487,9 +489,10 @@ def test_published_numbers_are_marked_and_ranked_among_themselves(folder, monkey
         ),
         ("Txt: {evaluator: e, source: s, rows: []}", "parts that are not in its spec: Txt"),
     ):
-        published.write_text(f"spec: {{{wrong}}}")
-        with pytest.raises(UserError, match=message):
-            made(folder)
+        with subtests.test(wrong=wrong, message=message):
+            published.write_text(f"spec: {{{wrong}}}")
+            with pytest.raises(UserError, match=message):
+                made(folder)
 
 
 @pytest.mark.usefixtures("composed_once")
@@ -539,13 +542,14 @@ def test_a_corrected_table_is_ranked_by_its_own_real_row_and_names_its_own_evalu
     assert "††: as reported: their repository; measured with a corrected evaluator" in text
 
 
-def test_a_legend_names_the_rows_that_are_not_ranked(folder):
+def test_a_legend_names_the_rows_that_are_not_ranked(folder, subtests):
     legend = "of the rows with the same mark"
     table = made(folder)
     assert f"{legend}." in rendered(table, "html")
     table.parts[0].lines[1].facts["baseline"] = "real"
     for suffix in ("md", "html", "tex"):
-        assert f"{legend}, except sanity-check baselines." in rendered(table, suffix), suffix
+        with subtests.test(suffix=suffix):
+            assert f"{legend}, except sanity-check baselines." in rendered(table, suffix), suffix
     table.parts[0].lines[2].state = "QUICK"
     both = f"{legend}, except sanity-check baselines and rows that are not valid or quick."
     assert both in rendered(table, "md")
@@ -602,7 +606,7 @@ def test_multimodality_is_measured_for_tables_that_show_it_alone(folder):
     assert "differs from the protocol: samples = 5" in rendered(made(folder), "md")
 
 
-def test_ranks():
+def test_ranks(subtests):
     for values, better, real, expected in (
         ([3.0, 1.0, None, 2.0], "lower", None, [0, 1, 0, 2]),
         ([3.0, 1.0, 2.0], "higher", None, [1, 0, 2]),
@@ -613,7 +617,8 @@ def test_ranks():
         ([3.0], "higher", None, [0]),
         ([3.0, 4.0], "none", None, [0, 0]),
     ):
-        assert ranks(values, better, real) == expected, (values, better)
+        with subtests.test(values=values, better=better, real=real, expected=expected):
+            assert ranks(values, better, real) == expected, (values, better)
 
 
 def test_numbers_have_the_decimals_of_their_column_and_are_never_all_zeros():
@@ -644,7 +649,7 @@ def clip_file(folder: Path, weight: float, steps: int) -> str:
     return weights_sha256(folder / "clip.ckpt")
 
 
-def test_a_result_is_outdated_when_checkpoint_or_extractor_are_others_now(folder):
+def test_a_result_is_outdated_when_checkpoint_or_extractor_are_others_now(folder, subtests):
     request = request_of(folder, "MDM")
     content = json.loads(request.path(folder / "results").read_text())
     content["checkpoint"]["sha256"] = hashlib.sha256((folder / "mdm.ckpt").read_bytes()).hexdigest()
@@ -657,11 +662,14 @@ def test_a_result_is_outdated_when_checkpoint_or_extractor_are_others_now(folder
     assert outdated(path, request)
     clip_file(folder, 1.0, 600)
     for stand_in in (True, False):
-        put(request, folder, content | {"skeleton": {"stand_in": stand_in, "smpl_sha256": None}})
-        assert not outdated(path, request)
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setenv("FLAME_MDM_SMPL", "SMPL_NEUTRAL.pkl")
-            assert outdated(path, request) == stand_in
+        with subtests.test(stand_in=stand_in):
+            put(
+                request, folder, content | {"skeleton": {"stand_in": stand_in, "smpl_sha256": None}}
+            )
+            assert not outdated(path, request)
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setenv("FLAME_MDM_SMPL", "SMPL_NEUTRAL.pkl")
+                assert outdated(path, request) == stand_in
     (folder / "mdm.ckpt").write_bytes(b"trained again")
     assert outdated(path, request)
 
@@ -692,7 +700,7 @@ parts:
 """
 
 
-def test_multimodality_is_computed_if_a_column_shows_it(folder, monkeypatch):
+def test_multimodality_is_computed_if_a_column_shows_it(folder, monkeypatch, subtests):
     requests = []
 
     def evaluate(request: EvaluationRequest) -> None:
@@ -716,9 +724,10 @@ def test_multimodality_is_computed_if_a_column_shows_it(folder, monkeypatch):
         (more, [False, True]),
         ("", [False, True]),
     ):
-        spec.write_text(SEVERAL.format(folder=folder, more=text))
-        assert main(words) == 0
-        assert requests == expected
+        with subtests.test(text=text, expected=expected):
+            spec.write_text(SEVERAL.format(folder=folder, more=text))
+            assert main(words) == 0
+            assert requests == expected
     page = (folder / "out" / "several.md").read_text()
     assert "differs from the protocol" not in page
 

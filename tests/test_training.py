@@ -156,7 +156,7 @@ def test_progress_counts_all_steps_and_shows_losses(tiny, tmp_path, capfd, monke
     )
 
 
-def test_waiting_threads_soon_sleep():
+def test_waiting_threads_soon_sleep(subtests):
     """Importing the package says so to OpenMP before torch is loaded, unless the user has said otherwise."""
     code = "import os, sys, flame_mdm; assert 'torch' not in sys.modules; print(os.environ.get('GOMP_SPINCOUNT'))"
     environment = {
@@ -167,10 +167,11 @@ def test_waiting_threads_soon_sleep():
         ({"GOMP_SPINCOUNT": "7"}, "7"),
         ({"OMP_WAIT_POLICY": "ACTIVE"}, "None"),
     ):
-        printed = subprocess.check_output(
-            [sys.executable, "-c", code], text=True, env=environment | own
-        )
-        assert printed.strip() == expected
+        with subtests.test(own=own, expected=expected):
+            printed = subprocess.check_output(
+                [sys.executable, "-c", code], text=True, env=environment | own
+            )
+            assert printed.strip() == expected
 
 
 @pytest.mark.slow

@@ -142,7 +142,7 @@ def test_faults_of_documents_are_named(heroes: list[Path], tmp_path: Path):
     assert not surprises
 
 
-def test_faults_of_the_parts_of_a_file_are_named(heroes: list[Path], tmp_path: Path):
+def test_faults_of_the_parts_of_a_file_are_named(heroes: list[Path], tmp_path: Path, subtests):
     path, whole = tmp_path / "a.glb", heroes[0].read_bytes()
     tiny = json.dumps({"asset": {"version": "2.0"}, "nodes": [{"children": [-1]}]}).encode()
     for content, message in (
@@ -158,8 +158,9 @@ def test_faults_of_the_parts_of_a_file_are_named(heroes: list[Path], tmp_path: P
         (packed(b" " * (glb.DOCUMENT_LIMIT + 4)), "a first part"),
         (whole[:12] + b"\xff\xff\xff\xff" + whole[16:], "a first part"),
     ):
-        path.write_bytes(content)
-        assert message in outcome(path, tmp_path / "out.glb"), content[:40]
+        with subtests.test(content=content, message=message):
+            path.write_bytes(content)
+            assert message in outcome(path, tmp_path / "out.glb"), content[:40]
 
 
 VALUES = [

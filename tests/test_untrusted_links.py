@@ -533,8 +533,11 @@ def test_errors_in_an_archive_name_the_archive_and_not_its_unpacked_copy(tmp_pat
     assert capsys.readouterr().err == f"{archive}/deep/walk.bvh: damaged\n"
 
 
-def test_an_error_of_a_motion_names_the_file_that_was_typed(tmp_path, capsys):
+def test_an_error_of_a_motion_names_the_file_that_was_typed(tmp_path, capsys, subtests):
     Motion(np.zeros((20, 21, 3), np.float32), 20.0, KIT21).save(tmp_path / "kit.npz")
     for ending in ("bvh", "glb"):
-        assert main(["convert", str(tmp_path / "kit.npz"), str(tmp_path / f"out.{ending}")]) == 1
-        assert capsys.readouterr().err.startswith(f"error: {tmp_path}/kit.npz: ")
+        with subtests.test(ending=ending):
+            assert (
+                main(["convert", str(tmp_path / "kit.npz"), str(tmp_path / f"out.{ending}")]) == 1
+            )
+            assert capsys.readouterr().err.startswith(f"error: {tmp_path}/kit.npz: ")

@@ -234,7 +234,7 @@ def with_external_data(key: bytes) -> bytes:
 
 
 def test_a_graph_that_reads_other_files_is_refused(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
+    folder: Path, monkeypatch: pytest.MonkeyPatch, subtests
 ) -> None:
     monkeypatch.chdir(folder)
     (folder / "weights.bin").write_bytes(np.float32(0.5).tobytes())
@@ -242,7 +242,8 @@ def test_a_graph_that_reads_other_files_is_refused(
     with pytest.raises(ValueError, match=r"denoiser\.onnx reads data from other files"):
         runner.Sampler(folder)
     for length in (b"\x08", b"\x88\x00", b"\x88\x80\x80\x00"):
-        assert runner.EXTERNAL_DATA.search(b"k" + length + b"locationv")
+        with subtests.test(length=length):
+            assert runner.EXTERNAL_DATA.search(b"k" + length + b"locationv")
     assert runner.EXTERNAL_DATA.search(b"allocation of locations") is None
 
 

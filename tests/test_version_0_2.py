@@ -44,19 +44,22 @@ def checkpoint(tmp_path) -> Path:
     return path
 
 
-def test_a_checkpoint_loads_with_its_averaged_weights_under_the_same_names(checkpoint):
+def test_a_checkpoint_loads_with_its_averaged_weights_under_the_same_names(checkpoint, subtests):
     saved = torch.load(checkpoint, weights_only=True)
     assert saved["config"]["task"]["_target_"] == OLD_TASK
     for kind in (MotionGenerator, GeneratorTask):
-        model = load_task(checkpoint, kind)
-        assert type(model) is kind
-        assert (model.steps, model.facts) == (2, saved["facts"])
-        state = model.state_dict()
-        assert list(state) == list(saved["state_dict"])
-        assert all(torch.equal(value, saved["state_dict"][name]) for name, value in state.items())
-        assert model.config["task"] == saved["config"]["task"] | {
-            "_target_": "flame_mdm.task.GeneratorTask"
-        }
+        with subtests.test(kind=kind):
+            model = load_task(checkpoint, kind)
+            assert type(model) is kind
+            assert (model.steps, model.facts) == (2, saved["facts"])
+            state = model.state_dict()
+            assert list(state) == list(saved["state_dict"])
+            assert all(
+                torch.equal(value, saved["state_dict"][name]) for name, value in state.items()
+            )
+            assert model.config["task"] == saved["config"]["task"] | {
+                "_target_": "flame_mdm.task.GeneratorTask"
+            }
     (motion,) = flame_mdm.generate(
         flame_mdm.load(checkpoint), saved["facts"]["captions"][0], frames=20
     )

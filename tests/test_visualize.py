@@ -50,7 +50,7 @@ def test_player_holds_the_joints_to_half_a_millimetre_and_huge_ones_coarser(tmp_
     )
 
 
-def test_player_is_one_file_that_escapes_all_texts(tmp_path):
+def test_player_is_one_file_that_escapes_all_texts(tmp_path, subtests):
     write_player(tmp_path / "p.html", [sway(text=HOSTILE, id="a\u2066b")], HOSTILE)
     page = Page(tmp_path / "p.html")
     assert not {"link", "img", "iframe"} & set(page.tags)
@@ -65,7 +65,8 @@ def test_player_is_one_file_that_escapes_all_texts(tmp_path):
         "fetch(",
         "XMLHttpRequest",
     ):
-        assert reference not in page.source, reference
+        with subtests.test(reference=reference):
+            assert reference not in page.source, reference
     assert page.tags.count("script") == 3
     assert page.texts["title"] == page.texts["h1"] == HOSTILE
     # The page does not rearrange texts.
@@ -189,18 +190,19 @@ def test_writers_give_the_same_bytes_and_leave_nothing_where_they_fail(tmp_path,
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
-def test_frames_show_both_sides_and_height_of_a_skeleton():
+def test_frames_show_both_sides_and_height_of_a_skeleton(subtests):
     motion = sway(3, skeleton=SKELETONS["kit21"])
     frames = frames_array(motion, size=128)
     assert frames.shape == (3, 128, 128, 3)
     motion.joints[:, :, 1] += 0.3
     images = [frames[0].astype(int), frames_array(motion, size=128)[0].astype(int)]
     for side in (-1, 1):
-        rows, lifted = (
-            np.nonzero((np.abs(image - SIDE_COLORS[side]) < 12).all(-1))[0] for image in images
-        )
-        assert len(rows) > 30
-        assert rows.mean() - lifted.mean() == pytest.approx(0.3 * 2.05 * 128 / 5, rel=0.2)
+        with subtests.test(side=side):
+            rows, lifted = (
+                np.nonzero((np.abs(image - SIDE_COLORS[side]) < 12).all(-1))[0] for image in images
+            )
+            assert len(rows) > 30
+            assert rows.mean() - lifted.mean() == pytest.approx(0.3 * 2.05 * 128 / 5, rel=0.2)
 
 
 def test_contact_sheet_shows_first_to_last_pose_of_each_motion(tmp_path):
@@ -261,7 +263,7 @@ def test_mp4_without_its_package_says_what_to_install(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_bad_motions_are_refused_by_name():
+def test_bad_motions_are_refused_by_name(subtests):
     joints = sway(4).joints
     joints[2, 5, 1] = np.nan
     good = {"joints": np.zeros((4, 22, 3)), "fps": 20, "skeleton": SKELETONS["smpl22"], "id": "m"}
@@ -276,5 +278,5 @@ def test_bad_motions_are_refused_by_name():
         ({"fps": float("nan")}, "'m': fps is nan"),
         ({"contacts": np.zeros((3, 4))}, r"contacts have shape \(3, 4\), expected \(4, 4\)"),
     ):
-        with pytest.raises(UserError, match=message):
+        with subtests.test(change=change, message=message), pytest.raises(UserError, match=message):
             Motion(**{**good, **change})

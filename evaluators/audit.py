@@ -227,7 +227,7 @@ class _Measure:
             _named(name, part): x for part, x in computed.items() if _is_audited(metric, part)
         }
         if inputs is self.inputs[BASE] and not OF_TEXTS.intersection(required_inputs(metric)):
-            self.of_motions[name] = values  # the same for other captions
+            self.of_motions[name] = values  # values of motions do not depend on captions
         return values
 
     def scores(self, inputs: Inputs, texts: Sequence[Text]) -> dict[str, np.ndarray]:

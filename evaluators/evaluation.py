@@ -75,12 +75,11 @@ class Evaluation:
     clips: Clips  # the split
     # An opened extractor; None = metrics that need features have no value
     extractor: Extractor | None
-    representation: Representation  # of the motions, on the device to compute on
-    seed: int = 0  # of all random draws
-    batch_size: int = 64  # of the extractor
-    training: Clips | None = (
-        None  # the training split, for metrics that look for copies of its motions
-    )
+    representation: Representation  # representation of the motions, on the device to compute on
+    seed: int = 0  # seed of all random draws
+    batch_size: int = 64  # batch size of the extractor
+    # the training split, for metrics that look for copies of its motions
+    training: Clips | None = None
 
     def run(
         self,

@@ -60,7 +60,7 @@ class EvaluationKeys:
     until: float | None = same_option(EditRequest, "until")
     strength: float | None = same_option(EditRequest, "strength")
     batch_size: int | None = option(
-        None, "motions at once: 64, or what a protocol that measures time says"
+        None, "motions per batch; default: 64, or the number in a protocol that measures time"
     )
     device: str | None = option(None, "default: cuda if available")
     data_root: str = option(

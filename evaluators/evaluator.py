@@ -45,15 +45,13 @@ class Motions:
 
     ids: list[str]  # unique names
     features: list[np.ndarray]  # (F, D) float32 each, in the data's units
-    captions: list[str] | None = None  # of motions with text
-    tokens: list[list[str] | None] | None = (
-        None  # "word/PART" tokens of the captions, if the data has them
-    )
+    captions: list[str] | None = None  # captions of motions with text
+    # "word/PART" tokens of the captions, if the data has them
+    tokens: list[list[str] | None] | None = None
     # Further inputs, by the names in `evaluators.metrics`
     inputs: dict[str, Any] = field(default_factory=dict)
-    edit: Mapping[str, Any] | None = (
-        None  # parts kept from real motions: `region` and `joints` of `kept_parts`
-    )
+    # parts kept from real motions: `region` and `joints` of `kept_parts`
+    edit: Mapping[str, Any] | None = None
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -84,12 +82,10 @@ class Evaluator:
     metrics: Mapping[str, Config]  # mappings with the `_target_` of a metric, by name
     representation: Representation
     batch_size: int = 64
-    skip_features: bool = (
-        False  # whether metrics of features have no value, instead of raising for lack of input
-    )
-    training: TrainingMotions | None = (
-        None  # motions that generated ones may be copies of; None = not measured
-    )
+    # whether metrics of features have no value, instead of raising for lack of input
+    skip_features: bool = False
+    # motions that generated ones may be copies of; None = not measured
+    training: TrainingMotions | None = None
 
     @torch.no_grad()
     def extract(self, motions: Motions) -> Rows:
@@ -231,9 +227,8 @@ class Evaluator:
         """Returns all metrics, updated with the motions, and the metrics that can be computed."""
         metrics = make_metrics(self.metrics, seed=key("metric", seed) % 2**32)
         for metric in metrics.values():
-            metric.distributed_available_fn = (
-                bool  # returns False: no synchronization, this process has all motions
-            )
+            # returns False: no synchronization, this process has all motions
+            metric.distributed_available_fn = bool
         count = len(generated["keys"])
         usable = self.check(generated, metrics) if count else {}
         sets = {name: metric for name, metric in usable.items() if isinstance(metric, TwoSets)}

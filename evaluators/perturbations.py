@@ -144,7 +144,7 @@ class Perturbation:
     name: str
     group: str  # joints, meaning, set or plumbing
     about: str
-    unit: str = ""  # of the grades
+    unit: str = ""  # unit of the grades
     grades: Sequence[float] = (1,)  # from weak to strong
 
     def offered(self, scene: Scene, captioned: bool) -> Sequence[Perturbation]:

@@ -29,7 +29,7 @@ from flame_mdm.seeds import key
 
 FOLDER = EXPERIMENTS / "evaluation"
 QUICK_REPLICATIONS, QUICK_SAMPLES = 2, 64
-CONTEXT_STARTS = 5  # number of frames of a clip at which the context may begin in DiP's code
+CONTEXT_STARTS = 5  # in DiP's code, the context begins at one of this number of first frames
 Count = Annotated[Int, Field(ge=1)]
 
 

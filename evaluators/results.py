@@ -32,19 +32,20 @@ from flame_mdm.training.start import recipe_changes
 class Scores:
     """Values of all metrics in one replication."""
 
-    values: Mapping[str, float | None]  # by name, `metric` or `metric/part`; None if not computable
+    # values by name, `metric` or `metric/part`; None if not computable
+    values: Mapping[str, float | None]
     reasons: Mapping[str, str]  # why a value is missing, by metric
     count: int  # motions
     # Real motions that sets are compared with, by the names of such values
     real_counts: Mapping[str, int]
-    units: Mapping[str, str]  # by name
+    units: Mapping[str, str]  # units of the values by name
 
 
 @dataclass(frozen=True)
 class Outcome:
     """What a part of an evaluation measured: real motions, generated ones, or several per prompt."""
 
-    scores: Sequence[Scores] = ()  # by replication
+    scores: Sequence[Scores] = ()  # scores by replication
     # By name, see `Value`
     resampled: Mapping[str, list[float | None]] = field(default_factory=dict)
     warnings: Sequence[str] = ()

@@ -85,7 +85,7 @@ class Model:
 
     noun = "a model"  # what its checkpoints hold, for messages
     config: Config  # the recipe, saved in checkpoints
-    facts: dict[str, Any]  # of the training data: actions, maximum length, fingerprint
+    facts: dict[str, Any]  # facts about the training data: actions, maximum length, fingerprint
     steps: int | None = None  # number of training steps of the loaded checkpoint; None if unknown
 
     def add_facts(self, facts: Mapping[str, Any]) -> None:
@@ -324,7 +324,7 @@ class Blocks:
             )
         self.model, self.ids, self.prefix, self.options = model, list(ids), prefix, options
         self.seed, self.replication, self.unconditioned = seed, replication, unconditioned
-        self.number = 0  # of the next block
+        self.number = 0  # number of the next block
 
     @torch.no_grad()
     def sample(

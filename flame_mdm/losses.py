@@ -62,9 +62,8 @@ class MotionLosses(nn.Module):
         foot_contact: weight of the squared velocity of feet in contact in the data (eq. 4). The
             mean includes feet that are not in contact, whose entries are 0, like the sum over all
             frames in the paper.
-        bone_length: weight of the squared error of the bone lengths, in square meters; the bone
-            length loss of InterGen (arXiv:2304.05684), which applies it only up to a noise level; here, it applies at
-            all levels.
+        bone_length: weight of the squared error of the bone lengths, in square meters. This is the bone length loss
+        of InterGen (arXiv:2304.05684). InterGen applies it only up to a noise level; here, it applies at all levels.
         root_relative: subtract the first joint from all joints, as in MDM's code.
         velocity_features: number of features, from the first, that `velocity` uses, as in MDM's
             code (144 of 25 x 6, 262 of 263: the last row of the feature matrix is left out). None

@@ -14,9 +14,8 @@ class ProgressBar(tqdm):
     """tqdm's bar in a terminal; elsewhere, a plain line at the beginning, about every 30 seconds, and at the end."""
 
     SECONDS = 30.0
-    monitor_interval = (
-        0  # tqdm would swallow the exception of a signal that comes while its monitor thread starts
-    )
+    # tqdm would swallow the exception of a signal that comes while its monitor thread starts
+    monitor_interval = 0
 
     def __init__(self, *args: Any, **options: Any):
         rare = {} if sys.stderr.isatty() else {"mininterval": self.SECONDS}

@@ -21,9 +21,8 @@ class Value(Schema):
     n: Int | None  # motions per replication; None if replications have different numbers
     per_replication: list[Number | None] = Field(default_factory=list)
     n_per_replication: list[Int] = Field(default_factory=list)
-    n_real: Int | None = (
-        None  # number of real motions in a comparison of sets; None = no such comparison
-    )
+    # number of real motions in a comparison of sets; None = no such comparison
+    n_real: Int | None = None
     unit: str = ""
     # Values of the motions of the first replication, drawn again and again
     resampled: list[Number | None] = Field(default_factory=list)
@@ -143,7 +142,7 @@ class Measured(Schema):
     forced: bool = False
     warnings: list[str] = Field(default_factory=list)
     cost: Cost | None = None
-    seeds: list[Int] = Field(default_factory=list)  # of metrics, by replication
+    seeds: list[Int] = Field(default_factory=list)  # seeds of the metrics, by replication
 
 
 class Result(Measured):
@@ -153,14 +152,13 @@ class Result(Measured):
     protocol: ProtocolVersion
     changed: dict[str, Plain] = Field({})  # options that differ from the protocol
     split: str
-    published_split: bool = (
-        False  # whether it tests on clips seen in training, or has no validation clips
-    )
+    # whether it tests on clips seen in training, or has no validation clips
+    published_split: bool = False
     data: Data
     seed: Int
     extractor: ExtractorRecord | None
     checkpoint: Checkpoint | None
-    samples_sha256: str | None = None  # of motion files from another system
+    samples_sha256: str | None = None  # hash of the motion files from another system
     baseline: str | None = None
     audit: str | None = None  # path of the audit card of the extractor; None = not audited
     audit_motions: Int | None = None  # number of motions that the card is about
@@ -218,9 +216,8 @@ class AuditedMetric(ClosedSchema):
     """What a metric declares about one of its values."""
 
     unit: str = ""
-    sees_meaning: bool = (
-        True  # whether it may see that a motion shows something other than requested
-    )
+    # whether it may see that a motion shows something other than requested
+    sees_meaning: bool = True
     sums_up: bool = True  # whether the value sums up the other values of the metric
     exact: bool = False  # whether it reads attributes from the joints, without a network
     depends_on_count: bool = False  # whether it is biased by the number of motions

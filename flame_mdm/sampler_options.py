@@ -46,7 +46,7 @@ class SamplerOptions:
     )
     eta: float | None = option(None, "randomness of the sampler ddim, from 0 (default) to 1")
     spacing: str | None = option(
-        None, "how diffusion places a number of steps: linspace (default) or stride"
+        None, "how diffusion spaces the sampling steps: linspace (default) or stride"
     )
 
     def __post_init__(self) -> None:

@@ -10,9 +10,8 @@ from multiprocessing import active_children
 from types import FrameType
 from typing import Any, NoReturn
 
-_received: BaseException | None = (
-    None  # the exception of the first signal that the running command received
-)
+# The exception of the first signal that the running command received
+_received: BaseException | None = None
 
 
 @contextmanager
@@ -25,7 +24,8 @@ def stoppable(signums: Sequence[int]) -> Iterator[None]:
 
     def stop(number: int, frame: FrameType | None) -> NoReturn:
         global _received
-        sys.unraisablehook = lambda _: None  # of objects that were being created or deleted
+        # no message about objects that were being created or deleted
+        sys.unraisablehook = lambda _: None
         _received = _received or exception(number)
         raise exception(number)
 

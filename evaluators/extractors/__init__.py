@@ -36,7 +36,8 @@ class Extractor(ABC):
 
     # Of its weights or files. Values of extractors with different hashes are not comparable.
     sha256: str
-    fingerprint: str | None = None  # of the data it was trained on, if known
+    # fingerprint of the data that the network was trained on, if known
+    fingerprint: str | None = None
 
     @abstractmethod
     def check(self, representation: Representation, dataset: str) -> None:

@@ -22,9 +22,8 @@ from flame_mdm.representations.humanml import HumanML
 from flame_mdm.seeds import key
 
 NEAR_MISSES = 2  # Near-miss captions per motion and step, of different attributes if possible
-JITTER = (
-    0.02  # standard deviation of joint positions, in meters, at which the strength of noise is 1
-)
+# Standard deviation of joint positions, in meters, at which the strength of noise is 1
+JITTER = 0.02
 # Standard deviation of normalized features at which the strength is 1; joints then err by about 20 mm, too.
 FEATURE_NOISE = 0.3
 WEIGHT = 5.0  # weight of `calibration_error`, compared with `info_nce`

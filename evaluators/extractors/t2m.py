@@ -25,7 +25,7 @@ from flame_mdm.data.t2m import MAX_TOKENS, frame_tokens
 from flame_mdm.errors import UserError
 from flame_mdm.safe_io import read_npy
 
-SLOTS = MAX_TOKENS + 2  # of a caption, with start and end marks
+SLOTS = MAX_TOKENS + 2  # number of tokens of a caption, with start and end marks
 UNIT = 4  # frames per vector of the movement encoder
 CONTACTS = 4  # number of features at the end of each frame that the evaluator ignores
 PARTS_OF_SPEECH = (

@@ -142,7 +142,7 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
         self.words: WordVectors | LearnedWords | None = (
             LearnedWords() if words == "learned" else None
         )
-        self.tokens: dict[str, dict[str, list[str]]] = {}  # of the captions of each clip
+        self.tokens: dict[str, dict[str, list[str]]] = {}  # tokens of the captions of each clip
 
     @classmethod
     def parts(

@@ -39,9 +39,8 @@ class PublishedPhysics(Timed, JointMean):
 
     higher_is_better = False
     summary = None
-    required_fps: float | None = (
-        None  # the only frame rate at which the values are defined; None = any
-    )
+    # the only frame rate at which the values are defined; None = any
+    required_fps: float | None = None
 
     def __init__(self, fps: float, feet: Sequence[int] = FEET):
         super().__init__(fps)

@@ -107,7 +107,7 @@ def load_task(
     try:
         return _build(checkpoint, kind).eval().to(device)
     except Exception as error:  # a nonsensical recipe may fail anywhere
-        if isinstance(error, FileNotFoundError):  # of a text encoder
+        if isinstance(error, FileNotFoundError):  # the missing file is a text encoder's
             raise
         kind_of_error = (
             ""

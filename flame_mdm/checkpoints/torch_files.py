@@ -13,7 +13,8 @@ from flame_mdm.safe_io import ZIP_ERRORS, naming, opened_zip, regular_file
 LARGEST_KEY = 2**60
 """Integer keys must be smaller: any number of larger integers may share one hash."""
 LEGACY_PICKLES = 5  # pickles at the beginning of a file of PyTorch before 1.6, which is no archive
-CODECS = ("latin1", "latin-1")  # with which PyTorch writes bytes; others may take quadratic time
+# Names of the codec with which PyTorch writes bytes; other codecs may take quadratic time
+CODECS = ("latin1", "latin-1")
 
 
 def read_torch(path: Path) -> Any:

@@ -108,7 +108,7 @@ def _convert(
                 out, settings.rest_pose, settings.rig, character, body, settings.root_motion
             )
         )
-    except UserError as error:  # of the motion, if not of the output
+    except UserError as error:  # the motion is at fault, if not the output
         if str(out) in str(error):
             raise
         raise UserError(f"{path}: {error}") from error

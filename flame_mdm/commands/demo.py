@@ -25,7 +25,8 @@ class DemoSettings:
         list, "adapters of the first model to choose from, separated by spaces"
     )
     host: str = option(
-        "127.0.0.1", "address to listen on: this computer alone; 0.0.0.0 = all networks"
+        "127.0.0.1",
+        "address to listen on; the default is this computer alone, 0.0.0.0 = all networks",
     )
     port: int = option(7860, "port to listen on; 0 = any free port")
     hosts: list[str] = option(

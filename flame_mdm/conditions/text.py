@@ -297,9 +297,8 @@ class Pretrained:
         return network
 
     def _load(self, loader: Any, **options: Any) -> Any:
-        options["trust_remote_code"] = (
-            False  # never execute code of a model; without this, transformers asks
-        )
+        # never execute code of a model; without this, transformers asks
+        options["trust_remote_code"] = False
         if self.package or Path(self.model).is_dir():
             return loader.from_pretrained(self._folder(), local_files_only=True, **options)
         if not re.fullmatch("[0-9a-f]{40}", self.revision or ""):

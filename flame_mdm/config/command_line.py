@@ -231,9 +231,8 @@ def guarded(action: Callable[[], None], signums: Sequence[int] = ()) -> int:
     except Exception as error:
         verbose = os.environ.get("FLAME_MDM_TRACEBACK") == "1"
         if isinstance(error, MemoryError) and not verbose:
-            error.__traceback__ = (
-                None  # frees what the frames hold: printing a line takes memory, too
-            )
+            # frees what the frames hold: printing a line takes memory, too
+            error.__traceback__ = None
         line = explanation(error)
         if line is None or verbose:
             traceback.print_exc()

@@ -300,7 +300,8 @@ def _top_level(node: ast.AST) -> Iterator[ast.AST]:
 
 def source_file(module: str) -> Path | None:
     """Returns the source file of a module; None if there is none, or the name is not one of a module."""
-    if not all(part.isidentifier() for part in module.split(".")):  # a slash would name any file
+    # with a slash, a name could be any file's
+    if not all(part.isidentifier() for part in module.split(".")):
         return None
     relative = Path(*module.split("."))
     for entry in [str(Path(__file__).parent.parent.parent), *sys.path]:

@@ -12,7 +12,7 @@ from flame_mdm.safe_io import naming, read_text
 
 TABLE = "captions.csv"
 COLUMNS = ("id", "text", "action", "split", "source", "license")
-SPLITTABLE = 10  # number of motions from which on each split has at least one
+SPLITTABLE = 10  # with this number of motions, each split has at least one
 
 
 def table_rows(

@@ -28,8 +28,8 @@ Below = Callable[[Any], Any]
 class Crop(ABC):
     """A rule that selects the frames of a training sample from a clip of any length."""
 
-    min_frames: int  # of a clip
-    max_frames: int  # of a sample
+    min_frames: int  # minimum length of a clip
+    max_frames: int  # maximum length of a sample
 
     def longest(self) -> int:
         """Returns the maximum number of frames of a sample."""

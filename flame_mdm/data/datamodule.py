@@ -26,9 +26,8 @@ from flame_mdm.data.store import Store, write_store
 from flame_mdm.errors import UserError, say
 from flame_mdm.representations import Representation
 
-MAX_FRAMES = (
-    100_000  # maximum number of frames of a sample; one hour at 20 frames per second has 72,000
-)
+# Maximum number of frames of a sample; one hour at 20 frames per second has 72,000
+MAX_FRAMES = 100_000
 # Permitted name of a data set. It begins the name of a folder, which must neither leave `root`
 # nor be hidden.
 NAME = r"\w[\w .-]*"

@@ -31,7 +31,8 @@ from flame_mdm.representations.smpl import SMPL
 from flame_mdm.safe_io import naming, read_text
 
 SHORTEST = 3  # frames that representations need at least
-MOST_COPIES = 16  # of a clip in a balanced set; more would only be learned by heart
+# Maximum number of copies of a clip in a balanced set; more would only be learned by heart
+MOST_COPIES = 16
 
 
 class MotionFile(NamedTuple):
@@ -105,9 +106,8 @@ class Folder(MotionSource):
         # How upright the bodies of the motions read so far are, by layout.
         self._uprights: defaultdict[str, list[float]] = defaultdict(list)
         self._notes: Counter[str] = Counter()  # lines about the motions read so far
-        self._representation: Representation | None = (
-            None  # whose raw motions are yielded; see `suit`
-        )
+        # the representation whose raw motions are yielded; see `suit`
+        self._representation: Representation | None = None
 
     def suit(self, representation: Representation) -> None:
         """Makes `clips` yield raw motions of a representation; raises `UserError` if `motion`

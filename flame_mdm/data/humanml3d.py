@@ -207,7 +207,7 @@ class HumanML3D(T2MFolder):
                         write(row, _read_joints(self.humanact12_files[row.key]))
                         progress.update()
         finally:
-            remove_abandoned(folder)  # of workers that were stopped
+            remove_abandoned(folder)  # temporary files of workers that were stopped
 
     def _write_statistics(self) -> None:
         """Writes mean and std over all motions of any length and split, including mirrored ones."""

@@ -126,9 +126,8 @@ def _first(pending: deque[Future[Result]]) -> Result:
 
 def _start_worker() -> None:
     """Sets up a worker: one thread, ignores Ctrl-C (the parent handles it), and exits when the parent dies."""
-    os.environ["OMP_NUM_THREADS"] = (
-        "1"  # read when a task imports torch; importing it for tasks that do not takes long
-    )
+    # read when a task imports torch; importing it for tasks that do not takes long
+    os.environ["OMP_NUM_THREADS"] = "1"
 
     def follow() -> None:
         parent = parent_process()

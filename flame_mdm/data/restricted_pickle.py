@@ -76,7 +76,8 @@ class _Unpickler(pickle._Unpickler):
     read: Callable[[int], bytes]
 
     def __init__(self, file: IO[bytes], size: int, opaque: tuple[str, ...]):
-        super().__init__(file, encoding="latin1")  # as Python 2 wrote the bytes of arrays
+        # the encoding in which Python 2 wrote the bytes of arrays
+        super().__init__(file, encoding="latin1")
         self._file_read = self.read_file
         self.file, self.size, self.opaque, self.expanded = file, size, opaque, 0
 

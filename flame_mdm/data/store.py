@@ -277,7 +277,7 @@ def _pack(
     its motion, has the id of another clip, or is in another split than a clip of its source.
     """
     entries: dict[str, Entry] = {}
-    split_of: dict[str, Split] = {}  # by source
+    split_of: dict[str, Split] = {}  # split of each source
     begin, frames, motion, references = 0, 0, None, None
     with ExitStack() as stack:
         packed = stack.enter_context((folder / "features.npy").open("wb"))

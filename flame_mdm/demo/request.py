@@ -25,7 +25,7 @@ MAX_SAMPLES = 4
 MAX_STEPS = 1000
 MAX_EDITS = 8
 MAX_SEED = 2**31 - 1
-MAX_FIELDS = 50  # of a query string
+MAX_FIELDS = 50  # maximum number of fields of a query string
 MAX_WAY_POINTS, FAR = 16, 20.0  # a path: way points, and meters along x and z
 PLUS = " + "  # between the names of a model and of its adapter
 PLAIN = r"^[^\x00-\x1f\x7f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]*$"
@@ -179,7 +179,7 @@ def checked(values: dict[str, Any]) -> DemoRequest:
         )
     except ValidationError as error:
         first: Any = error.errors()[0]
-        if first["type"] == "value_error":  # of `read_path`
+        if first["type"] == "value_error":  # an error of `read_path`
             raise first["ctx"]["error"] from None
         name = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":

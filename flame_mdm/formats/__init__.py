@@ -6,10 +6,12 @@ from pathlib import Path
 from flame_mdm.errors import UserError
 
 SCENES = (".fbx", ".glb", ".vrm", ".vrma")  # files with a scene of nodes, and animations of them
-ENDINGS = (".npz", ".bvh", *SCENES, ".amc", ".json", ".npy")  # of motion files that are read
-TREES = (".bvh", ".amc")  # of those that contain a tree of joints and their rotations
+# Endings of motion files that are read
+ENDINGS = (".npz", ".bvh", *SCENES, ".amc", ".json", ".npy")
+TREES = (".bvh", ".amc")  # Endings of files with a tree of joints and their rotations
 USD = (".usda", ".usdc", ".usdz")  # Universal Scene Description
-RIGGED = (".bvh", ".glb", ".fbx", *USD)  # of files that can have the skeleton of another program
+# Endings of files that can have the skeleton of another program
+RIGGED = (".bvh", ".glb", ".fbx", *USD)
 # Endings of the files that `Motion.save` writes.
 WRITTEN = (
     *RIGGED,
@@ -34,7 +36,8 @@ ADVICE = {
 
 NO_MOTIONS = ("shape.npz", "_stagei.npz")
 """Ends of the names of AMASS's files that contain the shape of a body and no motion."""
-JOINTS_IN_JSON = re.compile(rb'"(joints|posed_joints)"\s*:\s*\[\s*\[')  # as other JSON files lack
+# The array of joints that only motions in JSON have
+JOINTS_IN_JSON = re.compile(rb'"(joints|posed_joints)"\s*:\s*\[\s*\[')
 
 
 def unread(path: Path) -> UserError:

@@ -22,7 +22,7 @@ from flame_mdm.formats.rig import LIMBS, SIDES, rest_pose
 from flame_mdm.representations.skeleton import JOINT, SMPL22
 from flame_mdm.representations.smpl import ADULT
 
-APART = 0.03  # mean distance in meters of joints above which rotations and positions disagree
+APART = 0.03  # maximum mean distance in meters of joints whose rotations and positions agree
 # Largest angle between a limb of a known skeleton in its T-pose and SMPL's, as a cosine
 ALIKE = np.cos(np.radians(30))
 VERTICALS = ((0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))

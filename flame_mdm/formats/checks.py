@@ -5,14 +5,15 @@ import numpy as np
 from flame_mdm.formats.layouts import UP, Layout, check_feet, check_size
 from flame_mdm.representations.skeleton import SMPL22
 
-LYING = 0.3  # mean vertical component of the direction of the trunk below which a body lies
-STANDING = 0.7  # the same, above which it would stand with another axis up
-FASTEST = 15.0  # m/s of the pelvis, above which a file is damaged; sprinters reach 12
+# a body lies if the direction of its trunk has a smaller vertical component on average
+LYING = 0.3
+STANDING = 0.7  # with another axis up, the body would stand if the component is larger than this
+FASTEST = 15.0  # maximum speed of the pelvis in m/s; faster files are damaged, sprinters reach 12
 AVERAGED = 0.05  # seconds over which the speed of the pelvis is averaged
 # Speed of an ankle relative to the pelvis, in m/s, above which a leg has flipped between frames.
 # The fastest kicks reach 20.
 KICK = 30.0
-UNDER = 0.02  # depth in meters below the floor at which the file's body is called smaller
+UNDER = 0.02  # a body this many meters below the floor is called smaller than an adult
 
 # Seconds from a rest pose in front of a motion to the motion: some conversions blend a few
 # frames.
@@ -24,7 +25,7 @@ JUMP = (
     0.15,
     3.0,
 )
-STRAIGHT = np.cos(np.radians(25))  # of arms and legs in a rest pose
+STRAIGHT = np.cos(np.radians(25))  # cosine of the largest bend of arms and legs in a rest pose
 # Arms in a rest pose are raised from the trunk by at least 25 degrees
 HANGING = np.cos(np.radians(25))
 SYMMETRIC = 0.2  # largest difference of the cosines of left and right arm
@@ -125,9 +126,8 @@ def _is_rest_pose(pose: np.ndarray) -> bool:
             if upper @ lower < STRAIGHT:
                 return False
             raised.append(-upper @ trunk)
-    left_arm, left_leg, right_arm, right_leg = (
-        raised  # cosine of the angle to the direction down the trunk
-    )
+    # cosine of the angle to the direction down the trunk
+    left_arm, left_leg, right_arm, right_leg = raised
     legs_hang = min(left_leg, right_leg) > STRAIGHT
     return bool(
         legs_hang and max(left_arm, right_arm) < HANGING and abs(left_arm - right_arm) < SYMMETRIC

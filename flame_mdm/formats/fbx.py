@@ -21,7 +21,7 @@ from flame_mdm.safe_io import MEBIBYTE, atomic_write, regular_file
 MAGIC = b"Kaydara FBX Binary  \x00\x1a\x00"
 # FBX 7.4 of 2014: the newest version whose records have 32-bit offsets, read by all programs
 VERSION = 7400
-WIDE_VERSION = 7500  # the version from which records have 64-bit offsets
+WIDE_VERSION = 7500  # first version whose records have 64-bit offsets
 OLDEST_VERSION = 7000  # earlier files store animations in another structure
 LIMIT = 512 * MEBIBYTE  # maximum size of a file that is read
 # Maximum size of all arrays of a file together, after decompression

@@ -25,7 +25,7 @@ from flame_mdm.formats.grounding import (
 
 Kind = Literal["loop", "start", "stop", "turn"]
 CYCLE = (0.5, 1.8)  # shortest and longest cycle of a gait in seconds
-STEADY = 0.85  # share of the full speed from which a gait is steady
+STEADY = 0.85  # a gait is steady above this share of its full speed
 EVEN = 0.2  # seconds over which the speed is averaged, because side steps stop and go
 SLOWEST = 0.2  # m/s; a slower motion is no gait
 ASIDE = 35.0  # degrees by which a gait may go in another direction than requested

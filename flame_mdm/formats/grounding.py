@@ -19,13 +19,12 @@ from flame_mdm.representations.skeleton import JOINT, SMPL22
 
 # Seconds over which the path of the root is smoothed, so that it does not follow single steps
 SMOOTHNESS = 0.15
-LOW = 0.05  # height in meters above its lowest height at which a toe touches the floor
-SLOW = 0.25  # speed in m/s of a toe over the floor below which it is planted
+LOW = 0.05  # a toe this many meters above its lowest position still touches the floor
+SLOW = 0.25  # a planted toe is slower than this, in m/s over the floor
 SHORT = 0.1  # seconds; shorter contacts, and shorter gaps between contacts, are left out
 LOWERING = 0.2  # seconds in which the body is lowered for a leg that is too short
-COPIES = (
-    3  # repetitions of a loop that are planted together; the middle one has neighbors on both sides
-)
+# Repetitions of a loop that are planted together; the middle one has neighbors on both sides
+COPIES = 3
 FEET = tuple(
     tuple(JOINT[f"{side}_{name}"] for name in ("hip", "knee", "ankle", "foot"))
     for side in ("left", "right")

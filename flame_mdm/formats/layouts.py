@@ -62,9 +62,8 @@ class Layout(BaseModel):
     joints: list[str] = []  # names of the joints of arrays, in order; BVH files contain their own
     unit: Annotated[FiniteFloat, Field(gt=0)] = 1.0  # meters per unit of length in the files
     up: Literal["y", "z", "-y"] = "y"  # the axis that points up
-    fps: Annotated[float, Field(ge=RATES[0], le=RATES[1])] | None = (
-        None  # of files that do not contain it
-    )
+    # frame rate of files that do not contain it
+    fps: Annotated[float, Field(ge=RATES[0], le=RATES[1])] | None = None
     mirrored: bool = False  # the files contain mirrored motion; the sign of x is changed
     children: bool = False  # whether children may be among the bodies
     _name: str = PrivateAttr("own map")

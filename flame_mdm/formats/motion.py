@@ -291,14 +291,13 @@ def _write_bvh(motion: Motion, path: Path, rest_pose: bool, rig: str | None) -> 
     channels, columns = [], []
     for joint, order in enumerate(skeleton.orders):
         channels.append(tuple(f"{axis}rotation" for axis in order))
-        if joint <= skeleton.hips:  # and a root below which the hips move
+        if joint <= skeleton.hips:  # also a root, below which the hips move
             channels[joint] = (*bvh.CHANNELS[:3], *channels[joint])
             at_rest = np.tile(offsets[joint], (len(angles), 1))
             columns.append(np.round(root / skeleton.unit, 5) if joint == skeleton.hips else at_rest)
         columns.append(angles[:, joint])
-    offsets[skeleton.hips] = (
-        0  # programs disagree on whether the channels replace the offset or add to it
-    )
+    # programs disagree on whether the channels replace the offset or add to it
+    offsets[skeleton.hips] = 0
     ends = {
         skeleton.sources.index(SMPL22.joints.index(name)): site for name, site in END_SITES.items()
     }

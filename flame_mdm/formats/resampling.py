@@ -11,9 +11,8 @@ RATES = (0.1, 1000.0)  # lowest and highest frame rate of a motion file, in fram
 MAX_FRAMES = 500_000  # maximum number of frames of a motion: 70 minutes at 120 frames per second
 # Maximum frames times joints of a tree: an hour of 57 joints at 120 frames per second
 MAX_POSITIONS = 25_000_000
-FEW_POSITIONS = (
-    1_000_000  # frames times joints that a file of any size may have: 300 MB while it is read
-)
+# Frames times joints that a file of any size may have: 300 MB while it is read
+FEW_POSITIONS = 1_000_000
 BYTES_PER_POSITION = 4
 """Smallest number of bytes of a larger file per frame and joint. A joint with three numbers of one digit takes 6 bytes
 in each frame, but end sites take none."""

@@ -16,13 +16,13 @@ LEGS = (("hip", "knee"), ("knee", "ankle"))
 LIMBS = {"hip": "knee", "knee": "ankle", "shoulder": "elbow", "elbow": "wrist"}
 """Joints whose bone takes the direction of the motion's bone -> the joint at the end of this bone."""
 SPINE = ("spine1", "spine2", "spine3")
-TILT = 45  # degrees between trunk and vertical at which a rest pose is refused
+TILT = 45  # maximum angle in degrees between the trunk of a rest pose and the vertical
 SNAP = 8  # largest angle in degrees between the facing direction and an axis that it is taken for
 # Minimum sine of the bend of an elbow or knee in the rest pose. The twist of a straighter limb
 # cannot be read: the limbs of people also bend sideways, by 7 degrees at the knees and 5 degrees at
 # the elbows of SMPL's body, so that a small bend is far from the axis of the joint.
 BEND = 0.25
-GROUND = 0.1  # largest height in meters at which the lowest joint of a clip counts as on the floor
+GROUND = 0.1  # maximum height in meters of the lowest joint of a clip that stands on the floor
 # Distance of the knee from the line of the leg, in thighs, at which bend and thigh weigh the same
 STRAIGHT = 0.05
 REACH = 0.999  # maximum distance from hip to ankle relative to the length of the straight leg
@@ -40,7 +40,7 @@ class Rig:
     sources: tuple[int, ...]
     # (J, 3, 3), rotations of these joints in the world while SMPL is in its rest pose
     neutral: np.ndarray
-    orders: tuple[str, ...]  # of the Euler angles of each joint in BVH files
+    orders: tuple[str, ...]  # order of the Euler angles of each joint in BVH files
     unit: float = CENTIMETER  # meters per unit of length in BVH files
     # (3, 3), rotation from the world of the file
     frame: np.ndarray = field(default_factory=lambda: np.eye(3))

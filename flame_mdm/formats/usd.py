@@ -164,9 +164,8 @@ def _extent(stage: Any, root: Any, clip: RiggedClip) -> None:
 
     positions, _ = clip.world()  # scales are ignored: the box only has to be large enough
     positions[..., 1] += clip.lift
-    margin = (
-        0.25  # meters from joints to the farthest point of the surface, the tips of hands and head
-    )
+    # meters from joints to the farthest point of the surface, the tips of hands and head
+    margin = 0.25
     boxes = UsdGeom.Boundable(root.GetPrim()).CreateExtentAttr()
     for frame, points in enumerate(positions):
         box = np.stack([points.min(0) - margin, points.max(0) + margin]).astype("f4")

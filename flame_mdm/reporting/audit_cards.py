@@ -32,8 +32,10 @@ LEGEND = (
 class Seen:
     """How a metric responds to a perturbation; None = at no grade."""
 
-    grade: float | None  # from which on the paired difference from real motions is not 0
-    outside: float | None  # from which on values are outside the 95 % interval of real motions
+    # weakest grade from which on the paired difference from real motions is not 0
+    grade: float | None
+    # weakest grade from which on values are outside the 95 % interval of real motions
+    outside: float | None
     rewarded: bool  # whether the strongest grade is rated better than real motions
     monotone: bool  # whether every stronger grade differs at least as much, within its interval
 

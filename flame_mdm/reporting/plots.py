@@ -16,9 +16,8 @@ if TYPE_CHECKING:
 WIDE, HIGH = 460, 230
 LEFT, RIGHT, TOP, BOTTOM = 58, 10, 8, 24
 ROW = 16  # height of a line of text
-MOST = (
-    300  # maximum number of segments per curve; the lowest and the highest point of each are drawn
-)
+# Maximum number of segments per curve; the lowest and the highest point of each are drawn
+MOST = 300
 LOG_RANGE = 15  # positive values that span more than this factor get a logarithmic axis
 COLORS = 8
 # Numbers closer to 0 are treated as 0 on axes, since steps between ticks would underflow

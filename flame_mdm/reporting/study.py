@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 QUESTION = "Which animation better fits the following description?"
 """As in Tevet et al. 2023 (MDM), appendix D."""
 
-NORMAL_QUANTILE = 1.96  # of 97.5 %, for intervals of 95 %
+# The 97.5 % quantile of the standard normal distribution, for 95 % intervals
+NORMAL_QUANTILE = 1.96
 
 Name = Annotated[str, Field(min_length=1)]
 

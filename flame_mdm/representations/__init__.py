@@ -150,9 +150,8 @@ def check_finite(motion: Tensor, name: str = "motion") -> None:
         raise UserError(f"{name}: numbers in frame {frame} are not finite; leave the motion out")
 
 
-SMALLEST_STD = (
-    1e-4  # of a group of features that is not constant; positions in KIT's units round to 3e-5
-)
+# Smallest standard deviation of a group of features that is not constant; positions in KIT's units round to 3e-5
+SMALLEST_STD = 1e-4
 
 
 def grouped_statistics(features: Tensor | Frames, groups: Iterable[slice]) -> tuple[Tensor, Tensor]:

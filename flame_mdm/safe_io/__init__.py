@@ -35,9 +35,8 @@ TEXT_LIMIT = 512 * MEBIBYTE
 """Maximum size of a text or JSON file. The largest known, BABEL's annotations, has 175 MiB."""
 YAML_LIMIT = MEBIBYTE // 4
 """Maximum size of a YAML file: recipes, skeletons, protocols and table specs are far smaller, and parsing is slow."""
-YAML_NODES = (
-    100_000  # maximum number of keys and values in a YAML file after its aliases are expanded
-)
+# Maximum number of keys and values in a YAML file after its aliases are expanded
+YAML_NODES = 100_000
 YAML_DIGITS = 20  # maximum number of characters of an integer in a YAML file; 2^63 has 19
 ARRAYS_LIMIT = 128 * MEBIBYTE
 """Total size that the arrays of a compressed file may always have. Beyond that, they may have up to `INFLATION` times
@@ -45,7 +44,7 @@ the size of the file; motion data compresses less than 10 times."""
 INFLATION = 20
 # Beginning of the file that replaces one in Git LFS
 GIT_LFS = b"version https://git-lfs.github.com/spec/"
-POINTER_LIMIT = 1024  # size in bytes below which such files are
+POINTER_LIMIT = 1024  # pointer files are smaller than this number of bytes
 
 ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError)
 """Errors that `zipfile` raises for damaged, encrypted and unusually compressed archives."""

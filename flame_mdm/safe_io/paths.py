@@ -133,7 +133,7 @@ def remove_abandoned(folder: Path, path: Path | None = None, *, is_locked: bool 
             and match[3] not in _tokens
             and (is_locked or (match[1] == _machine() and not _lives(int(match[2]))))
         ):
-            with suppress(PermissionError):  # of another user
+            with suppress(PermissionError):  # a file of another user
                 _remove(entry)
 
 
@@ -145,7 +145,7 @@ def _lives(process: int) -> bool:
         os.kill(process, 0)
     except (ProcessLookupError, OverflowError):
         return False
-    except PermissionError:  # of another user
+    except PermissionError:  # a process of another user
         return True
     return True
 

@@ -254,7 +254,7 @@ def _new_frames(length: int, fps: float, editing: EditRequest) -> Tensor:
         }
         return new[editing.region]
     name, scale = ("region", 1.0) if editing.region_seconds is None else ("region_seconds", fps)
-    new = torch.full((length,), editing.ranges is None)  # by default, all frames
+    new = torch.full((length,), editing.ranges is None)  # without ranges, all frames are new
     for begin, end in editing.ranges or ():
         first, last = round(begin * scale), round(end * scale)
         if not 0 <= first < last <= length:

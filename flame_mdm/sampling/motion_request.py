@@ -19,12 +19,10 @@ from flame_mdm.sampler_options import SamplerOptions
 if TYPE_CHECKING:
     from flame_mdm.formats.motion import Motion
 
-MAX_SAMPLES = (
-    10_000  # maximum number of samples per request; they are kept in memory until all are complete
-)
-MAX_TEXT_LENGTH = (
-    2000  # maximum number of characters of a text; captions of the data sets are far shorter
-)
+# Maximum number of samples per request; they are kept in memory until all are complete
+MAX_SAMPLES = 10_000
+# Maximum number of characters of a text; captions of the data sets are far shorter
+MAX_TEXT_LENGTH = 2000
 TRAINED_ON = {
     "text": ("was trained on captions", 'text="a person walks"'),
     "action": ("was trained on action labels", "action=NAME"),
@@ -183,7 +181,7 @@ class SamplingRequest:
     samples: int = option(1, "motions per text or action")
     candidates: int = option(
         1,
-        "motions generated for each one that is kept: the best one without faults or, if all have faults, the best",
+        "motions generated for each kept motion: the best one without faults is kept, or the best if all have faults",
     )
     seed: int = option(0, "seed of the noise")
     after: str | Path | Motion | None = option(

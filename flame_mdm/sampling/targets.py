@@ -84,7 +84,7 @@ class PositionGuide:
     positions: Positions
     bones: Tensor  # (3, N) frame, parent and child of the bones that keep their lengths
     poses: Tensor  # (1, F, D) features that are imposed in any case
-    keep: Tensor  # and where
+    keep: Tensor  # (1, F, D) bool, where features are imposed
 
     def steer(self, clean: Callable[[Tensor], Tensor], x_t: Tensor) -> Tensor:
         """Returns the noisy motion `x_t`, changed such that its clean estimate approaches the

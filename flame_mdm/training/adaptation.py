@@ -136,7 +136,7 @@ def adapt(
         )
     if not force:
         check_clips(source, model.representation.fps)
-    check_tree(out)  # the motions of `_prior` are written there before the training begins
+    check_tree(out)  # `_prior` writes its motions there before the training begins
     config = _recipe(model, captions, name, out, overrides)
     config["base"], config["adapter"] = (
         str(base),

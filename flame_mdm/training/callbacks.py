@@ -452,9 +452,8 @@ class SampleMotions(Callback):
         values: dict[str, float] = {}
         for name, metric in self.metrics.items():
             metric.reset()
-            metric.distributed_available_fn = (
-                bool  # returns False: no synchronization, this process has all motions
-            )
+            # returns False: no synchronization, this process has all motions
+            metric.distributed_available_fn = bool
             for key, (motion, attributes) in enumerate(zip(motions, requested, strict=True)):
                 mask = torch.ones(1, len(motion), dtype=torch.bool)
                 inputs = {

@@ -25,8 +25,9 @@ LINE = (205, 211, 219)
 TEXT = (28, 36, 48)
 FAINT = (102, 112, 133)
 SHADOW, TRAIL, CONTACT = (212, 216, 222), (122, 91, 208), (15, 157, 107)
-NEAR = 0.3  # distance from the camera in meters below which nothing is drawn
-YAW, PITCH = 0.6, 0.24  # of the camera, which is in front of the body, to the left and above
+NEAR = 0.3  # nothing nearer to the camera than this, in meters, is drawn
+# Angles of the camera, which is in front of the body, to the left and above
+YAW, PITCH = 0.6, 0.24
 TOWARD = np.array(
     [math.sin(YAW) * math.cos(PITCH), math.sin(PITCH), math.cos(YAW) * math.cos(PITCH)]
 )
@@ -78,7 +79,7 @@ def write_mp4(
         av.open(str(temporary), "w", "mp4", {"movflags": "+faststart"}) as file,
     ):
         stream = file.add_stream("libx264", Fraction(fps).limit_denominator(1001), {"crf": "20"})
-        stream.thread_count = 1  # the same bytes on any number of cores
+        stream.thread_count = 1  # makes the bytes independent of the number of cores
         context = stream.codec_context
         context.colorspace = context.color_primaries = context.color_trc = BT709
         for image in _video(motions, fps, size, body):

@@ -187,7 +187,7 @@ class Body:
             shoulder, elbow, wrist = (out[:, joint + side] for joint in (16, 18, 20))
             origin, axes = frames[frame]
             goal = wrist + weight * (origin + (axes @ target[..., None])[..., 0] - wrist)
-            # Elbows point outward and, of an upright body, backward rather than forward.
+            # Elbows point outward. Those of an upright body point backward rather than forward.
             toward = (
                 elbow
                 - shoulder

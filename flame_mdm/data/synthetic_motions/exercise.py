@@ -82,7 +82,8 @@ def push_ups(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Att
         pulse(t, s, s + 0.42 * d, s + 0.5 * d, s + d)
         for s, d in events(rng, t, int(requested["count"]), 1.2)
     )
-    slope = 0.27 - rng.uniform(0.17, 0.2) * down  # of the line from the feet to the shoulders
+    # slope of the line from the feet to the shoulders
+    slope = 0.27 - rng.uniform(0.17, 0.2) * down
     body.foot_pitch += LYING_HEEL
     body.foot_yaw *= 0.2
     body.ankles[..., 0] = 0.09 * SIGN[:, None]

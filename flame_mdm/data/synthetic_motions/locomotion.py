@@ -49,7 +49,7 @@ def walk_along(
     # be in the middle of the foot's next stance, aside by the width of the gait: feet are under
     # the body on average.
     t, start = body.t, rng.uniform(0.08, 0.18)
-    seconds = t[-1] - rng.uniform(0.06, 0.16) - start  # until the last foot is down
+    seconds = t[-1] - rng.uniform(0.06, 0.16) - start  # time until the last foot is down
     # A run ends with the steps of a walk, whose feet never leave the ground together.
     landing = min(gait.swing, 0.82)
     count = max(1, round(seconds / gait.step - landing))

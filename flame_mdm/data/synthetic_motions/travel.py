@@ -137,7 +137,7 @@ def _tread(
     """
     t = body.t
     phases = max(2, round((t[-1] - 0.2) * 2 * frequency))
-    half = (t[-1] - 0.2) / phases  # of a period, from one foot to the other
+    half = (t[-1] - 0.2) / phases  # half a period, from one foot to the other
     going = pulse(t, 0.0, 0.3, t[-1] - 0.3, t[-1])
     wave = np.where((t > 0.1) & (t < t[-1] - 0.1), np.sin(np.pi * (t - 0.1) / half), 0)
     for side, sign in enumerate(SIGN):

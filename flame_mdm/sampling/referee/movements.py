@@ -29,7 +29,7 @@ from flame_mdm.sampling.referee.readings import (
     spans_of,
 )
 
-MOVING = 0.25  # speed of the pelvis in m/s from which the body travels
+MOVING = 0.25  # the body travels if its pelvis is faster than this, in m/s
 SECTOR = np.cos(np.radians(50))  # maximum angle between the travel and a direction
 SEEN = {"left": (1.0, 0.0), "right": (-1.0, 0.0), "forward": (0.0, 1.0), "backward": (0.0, -1.0)}
 
@@ -318,7 +318,7 @@ def use_foot(body: Body, claim: Claim) -> Reading:
 
 
 def lean(body: Body, claim: Claim) -> Reading:
-    """Measures how far the middle of the shoulders is to a side of the hips."""
+    """Measures how far the middle of the shoulders is to the left or right of the hips."""
     aside = body.seen[:, SHOULDERS, 0].mean(1) - body.seen[:, HIPS, 0].mean(1)
     signal = aside if claim.direction == "left" else -aside
     return existence(signal, f"m to the {claim.direction}", "trunk", 0.2)

@@ -26,7 +26,7 @@ class Parts:
     """The four parts of a model.
 
     Raises:
-        UserError: If `denoiser` is no `flame_mdm.denoisers.Denoiser`.
+        UserError: If `denoiser` is not a `flame_mdm.denoisers.Denoiser`.
     """
 
     #: Network that predicts the target of the process.
@@ -41,7 +41,9 @@ class Parts:
     def __post_init__(self) -> None:
         if not isinstance(self.denoiser, Denoiser):
             kind = type(self.denoiser).__name__
-            raise UserError(f"{kind} is no denoiser: derive it from flame_mdm.denoisers.Denoiser")
+            raise UserError(
+                f"{kind} is not a denoiser: derive it from flame_mdm.denoisers.Denoiser"
+            )
 
     @classmethod
     def build(cls, config: Config, representation: Representation, num_actions: int) -> Self:

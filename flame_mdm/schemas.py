@@ -86,7 +86,7 @@ def _too_large(content: Any) -> str:
 def _first_error(error: ValidationError, content: Any) -> str:
     first: Any = error.errors(include_url=False)[0]
     keys, kind, context = [], first["type"], first.get("ctx", {})
-    for key in first["loc"]:  # pydantic also lists the members of unions, which are no keys
+    for key in first["loc"]:  # pydantic also lists the members of unions, which are not keys
         if (isinstance(content, dict) and key in content) or (
             isinstance(content, list) and isinstance(key, int)
         ):

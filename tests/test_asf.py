@@ -92,7 +92,7 @@ def test_joints_in_closed_form_and_missing_skeletons_and_rates(files):
         (":DEGREES", ":RADIANS", "07_01.amc, line 3: angles in radians are not supported"),
         ("angle deg", "angle rad", "07.asf, line 4: angles in radians are not supported"),
         ("arm 40 50", "arm 40", r"07_01.amc, line 12: expected 2 finite number\(s\), found 40"),
-        ("arm 40 50", "leg 40 50", "line 12: leg is no moving bone"),
+        ("arm 40 50", "leg 40 50", "line 12: leg is not a moving bone"),
         ("arm 40 50\n", "", "line 11: frame 3 ends without arm"),
         (MOTION, "", "line 1: not an AMC file"),
         (

@@ -210,7 +210,7 @@ def test_bad_recordings_are_listed_and_the_good_ones_prepared(folder, capsys):
     assert main(["prepare", *words, f"data.source.captions={folder / 'clone'}"]) == 0
     output = capsys.readouterr().out
     assert re.search(r"left out: \S*/02_01\.amc", output)
-    assert "lshin is no moving bone of the skeleton" in output
+    assert "lshin is not a moving bone of the skeleton" in output
     assert "excluded: 1 recordings known to be bad" in output
     assert Store(folder / "cmu-humanml-legacy-smpl22").info["clips"] == {
         "train": 2,

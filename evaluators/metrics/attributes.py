@@ -311,7 +311,7 @@ class AttributeAccuracy(Timed, MotionMean):
         >>> metric, joints = AttributeAccuracy(fps=20), torch.zeros(1, 40, 22, 3)
         >>> mask, requested = torch.ones(1, 40, dtype=torch.bool), [{"action": "walk"}]
         >>> metric.update(joints, mask, requested, keys=torch.tensor([0]))
-        >>> metric.compute()["action"]  # 22 joints in one point are no walk
+        >>> metric.compute()["action"]  # 22 joints in one point are not a walk
         0.0
     """
 

@@ -67,7 +67,7 @@ def read_safetensors(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
 
     try:
         with safe_open(path, framework="pt") as file:
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (it is no mapping)
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
             return file.metadata() or {}, tensors
     except (SafetensorError, OSError, ValueError) as error:
         raise UserError(f"{path}: damaged, or not a .safetensors file") from error

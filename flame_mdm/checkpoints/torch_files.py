@@ -12,7 +12,7 @@ from flame_mdm.safe_io import ZIP_ERRORS, naming, opened_zip, regular_file
 
 LARGEST_KEY = 2**60
 """Integer keys must be smaller: any number of larger integers may share one hash."""
-LEGACY_PICKLES = 5  # pickles at the beginning of a file of PyTorch before 1.6, which is no archive
+LEGACY_PICKLES = 5  # pickles at the beginning of a file of PyTorch before 1.6, not an archive
 # Names of the codec with which PyTorch writes bytes; other codecs may take quadratic time
 CODECS = ("latin1", "latin-1")
 

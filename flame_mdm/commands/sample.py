@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from flame_mdm.sampling.targets import Targets
     from flame_mdm.visualize.body import Mesh
 
-# Maximum number of motions on the page of a file of prompts, which has about 20 kB for each
+# Maximum number of motions on the page of a file of prompts; each takes about 20 kB
 GALLERY = 200
 CLAIMS = "claims"  # scorer that judges the claims of the text: docs/referee.md
 

@@ -94,7 +94,7 @@ def known_form(word: str, seen: Collection[str]) -> str | None:
     """Returns the word, or the same word with another ending (walked, walks), if it is known; otherwise None."""
     if word in seen:
         return word
-    if word in NUMBERS:  # "four" is no form of "fours"
+    if word in NUMBERS:  # "four" is not a form of "fours"
         return None
     stems = [word.removesuffix(suffix) for suffix in SUFFIXES if word.endswith(suffix)]
     # The stem of "waving" is "wave", of "hopping" "hop".

@@ -62,7 +62,7 @@ def plain(config: Any, where: str | Path, *, but: str = "") -> None:
         if isinstance(value, dict | list | tuple):
             for name, child in value.items() if isinstance(value, dict) else enumerate(value):
                 if not isinstance(name, str | int):
-                    raise UserError(f"{where}: {'.'.join(path)} has a key that is no text")
+                    raise UserError(f"{where}: {'.'.join(path)} has a key that is not text")
                 check_value(child, (*path, str(name)))
                 check_value(name, path)
         elif isinstance(value, str) and "${" in value.removeprefix(but):

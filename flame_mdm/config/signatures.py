@@ -60,7 +60,7 @@ TOP_LEVEL = {
     "ema": "dict[str, Any] | None",
     "logger": "dict[str, Any] | None",
 }
-"""The kinds of values of the keys of a recipe that are no argument of a `_target_`."""
+"""The kinds of values of the keys of a recipe that are not arguments of a `_target_`."""
 
 ARGUMENTS = {
     "losses": "flame_mdm.losses.MotionLosses",

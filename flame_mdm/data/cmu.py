@@ -46,7 +46,7 @@ SUFFIXES = (
     ".zip",
 )
 RATES = (120.0, 60.0)  # frame rates of the recordings, the usual one first
-SLACK = 0.05  # seconds, one frame at 20 fps, by which durations may differ
+SLACK = 0.05  # durations may differ by this many seconds, one frame at 20 fps
 SHORTEST = 40  # rows of features of a clip, as in HumanML3D
 BLENDED = 3  # frames after the T-pose of a Daz-friendly file that are blended with it
 # Columns of a table of the user's captions.

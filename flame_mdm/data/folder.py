@@ -30,7 +30,7 @@ from flame_mdm.representations.skeleton import KIT21, SMPL22
 from flame_mdm.representations.smpl import SMPL
 from flame_mdm.safe_io import naming, read_text
 
-SHORTEST = 3  # frames that representations need at least
+SHORTEST = 3  # minimum number of frames that representations need
 # Maximum number of copies of a clip in a balanced set; more would only be learned by heart
 MOST_COPIES = 16
 

@@ -31,8 +31,7 @@ class Mixture(MotionSource):
 
     name = "mixture"
     named_by_recipe = True
-    # Increase it with the version of any data set, whose motions are then read differently here,
-    # too
+    # Increase it with the version of any data set, since its motions are then read differently here, too.
     version = 1
 
     def __init__(self, parts: Mapping[str, MotionSource], use: Use = "any"):

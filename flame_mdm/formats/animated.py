@@ -1,7 +1,7 @@
 """Node hierarchies in motion, as FBX and GLB files contain them: the positions of all nodes in each frame.
 
 Only positions are used. Rotations of the motion are solved for afterward, so that a rest pose
-that is no T-pose, and local axes that differ between programs, do not matter.
+that is not a T-pose, and local axes that differ between programs, do not matter.
 """
 
 from collections.abc import Sequence

@@ -15,7 +15,11 @@ from flame_mdm.safe_io import MEBIBYTE, read_json, read_npy, read_npz
 
 # Maximum size of a `.json` motion; parsed, it takes many times its size
 JSON_LIMIT = 128 * MEBIBYTE
-RATES = ("fps", "mocap_framerate", "mocap_frame_rate")  # names of the frame rate
+RATES = (
+    "fps",
+    "mocap_framerate",
+    "mocap_frame_rate",
+)  # names under which files store the frame rate
 BODY = ("root_orient", "pose_body")  # names of parts of `poses` in AMASS's SMPL-X files
 NEEDED = {
     "joints",

@@ -181,7 +181,7 @@ def _angles(lines: Lines, bones: dict[str, Bone], joints: int) -> dict[str, np.n
             frames += 1
         elif words[0] not in rows or len(rows[words[0]]) != frames - 1:
             lines.fail(
-                f"{words[0][:40]} is no moving bone of the skeleton, outside of a frame, or there twice"
+                f"{words[0][:40]} is not a moving bone of the skeleton, outside of a frame, or there twice"
             )
         else:
             rows[words[0]].append(lines.numbers(words[1:], len(bones[words[0]].freedoms)))

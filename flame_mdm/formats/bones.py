@@ -3,7 +3,7 @@
 Joint positions do not show how a forearm or a head turns about its own axis; the bones of a file do. A joint of SMPL
 turns as its bone has turned since the rest pose. Three rest poses are known, in this order: the pose of the file
 without rotations, a rest pose in front of the motion, and the axes of a known skeleton in a T-pose. Arms and legs of a
-rest pose that is no T-pose are raised, by the smallest rotation, to the directions of SMPL's.
+rest pose that is not a T-pose are raised, by the smallest rotation, to the directions of SMPL's.
 """
 
 from collections.abc import Sequence

@@ -234,7 +234,7 @@ def _listed(
     for joint, name in chosen.items():
         if joint not in JOINT:
             raise UserError(
-                f"{listed}: {joint} is no joint of SMPL.{did_you_mean(str(joint), JOINT)}"
+                f"{listed}: {joint} is not a joint of SMPL.{did_you_mean(str(joint), JOINT)}"
             )
         if name is not None:
             candidates[joint] = [number for number, label in names.items() if label == name]

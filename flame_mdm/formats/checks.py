@@ -35,7 +35,7 @@ _LIMBS = (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle"))
 
 
 def check_body(joints: np.ndarray, layout: Layout) -> None:
-    """Raises `UserError` if joints (F, 22, 3) are no person: wrong size, or feet of no length or backwards.
+    """Raises `UserError` if joints (F, 22, 3) are not a person: wrong size, or feet without length or backwards.
 
     The `layout` of the file has its unit, its axis that points up, and whether the body may be a
     child's. The advice on the size also names the axis if the body lies, so that one correction
@@ -72,7 +72,7 @@ def lying(joints: np.ndarray, up: str, axes: np.ndarray) -> str:
 def jump(joints: np.ndarray, fps: float) -> str:
     """Returns a line if the pelvis or a leg of joints (F, 22, 3) moves faster than people do, or ""."""
     ankles = joints[:, [_NUMBER["left_ankle"], _NUMBER["right_ankle"]]] - joints[:, :1]
-    # a body that shakes for a frame is no jump, but a leg that flips does so within a frame
+    # a body that shakes for a frame is not a jump, but a leg that flips does so within a frame
     apart = max(1, round(fps * AVERAGED))
     for verb, points, frames, fastest in (
         ("the body jumps", joints[:, :1], apart, FASTEST),

@@ -21,8 +21,7 @@ from flame_mdm.formats.fbx_scene import hermite
 from flame_mdm.formats.resampling import MAX_FRAMES, RATES
 
 MAX_CELLS = 4_000_000  # maximum number of frames times nodes
-# Keys that are farther apart than at this rate were placed by hand: sampled motions have more of
-# them.
+# Keys at a lower rate than this were placed by hand: sampled motions have denser keys.
 SPARSE_RATE = 24.0
 USUAL_RATE = 30.0  # rate at which motions with keys placed by hand are sampled
 # Numbers per key of the properties that move nodes

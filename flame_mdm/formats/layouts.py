@@ -351,7 +351,7 @@ def head_height(joints: np.ndarray) -> float:
 
 
 def check_size(joints: np.ndarray, unit: float, children: bool = False, doubt: str = "") -> None:
-    """Raises `UserError` if legs are no person's, and says which unit would fit.
+    """Raises `UserError` if legs are not a person's, and says which unit would fit.
 
     `unit` of the file is in meters. `doubt` is a line about another fault of the motion, for the message.
     """
@@ -399,9 +399,9 @@ def check_feet(joints: np.ndarray) -> None:
             raise UserError(
                 f"the {side} foot has no length. Map {side}_foot in skeleton.yaml {advice}"
             )
-    # The toes of a foot in the air may point backwards, as while running: of each frame, the
-    # lower foot counts. So do the toes of one foot of a person who kneels: both feet point
-    # backwards in a part of the frames.
+    # The toes of a foot in the air may point backwards, as in a run, so only the lower foot of
+    # each frame counts. The toes of one foot of a person who kneels point backwards, too, so
+    # both feet must point backwards in a share of the frames.
     across, trunk = at["left_hip"] - at["right_hip"], at["neck"] - at["pelvis"]
     depths = [
         ((at[f"{side}_hip"] - at[f"{side}_ankle"]) * trunk).sum(1) for side in ("left", "right")

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 SIDES = (("left", "l"), ("right", "r"))  # marks of the left and of the right side in names
-SHARED = 10  # joints that have a prefix at least; a skeleton without hands has about 20
+SHARED = 10  # minimum number of joints with a prefix; a skeleton without hands has about 20 joints
 PREFIXES = 16  # maximum number of prefixes that are tried
 JOINED = re.compile(r"mixamorig\d*")  # a prefix that may lack a separator
 

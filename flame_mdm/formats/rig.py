@@ -17,13 +17,13 @@ LIMBS = {"hip": "knee", "knee": "ankle", "shoulder": "elbow", "elbow": "wrist"}
 """Joints whose bone takes the direction of the motion's bone -> the joint at the end of this bone."""
 SPINE = ("spine1", "spine2", "spine3")
 TILT = 45  # maximum angle in degrees between the trunk of a rest pose and the vertical
-SNAP = 8  # largest angle in degrees between the facing direction and an axis that it is taken for
+SNAP = 8  # a facing direction within this angle of an axis, in degrees, is taken for the axis
 # Minimum sine of the bend of an elbow or knee in the rest pose. The twist of a straighter limb
 # cannot be read: the limbs of people also bend sideways, by 7 degrees at the knees and 5 degrees at
 # the elbows of SMPL's body, so that a small bend is far from the axis of the joint.
 BEND = 0.25
 GROUND = 0.1  # maximum height in meters of the lowest joint of a clip that stands on the floor
-# Distance of the knee from the line of the leg, in thighs, at which bend and thigh weigh the same
+# Distance of the knee from the line of the leg, in lengths of the thigh, at which bend and thigh weigh the same
 STRAIGHT = 0.05
 REACH = 0.999  # maximum distance from hip to ankle relative to the length of the straight leg
 

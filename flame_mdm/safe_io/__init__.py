@@ -2,7 +2,7 @@
 
 Every file that may come from other people is read or checked here first: it must be a regular
 file of limited size, and the sizes that it declares must match its bytes. Functions that read a
-path raise `FileNotFoundError` if it does not exist, and `UserError` if it is no regular file or
+path raise `FileNotFoundError` if it does not exist, and `UserError` if it is not a regular file or
 its content is refused.
 """
 

@@ -212,7 +212,7 @@ class SamplingRequest:
     ) -> SamplingRequest:
         """Returns the request of the keywords of a function, `generate` or `edit`.
 
-        Raises `UserError` if a keyword is no field of this class, of `SamplerOptions` or, with
+        Raises `UserError` if a keyword is not a field of this class, of `SamplerOptions` or, with
         `editing`, of `EditRequest`.
         """
         request_names = _names(cls) - {"options", "editing"}

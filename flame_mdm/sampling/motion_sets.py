@@ -99,7 +99,7 @@ def read_set(source: str) -> MotionSet:
     stand = content.motions.get(content.stand)
     if stand is None or stand.kind != "loop":
         raise UserError(
-            f"{path}: stand is {content.stand}, which is no motion with kind: loop. Name such a motion"
+            f"{path}: stand is {content.stand}, which is not a motion with kind: loop. Name such a motion"
         )
     for name, motion in content.motions.items():
         if motion.kind == "turn" and not motion.degrees:

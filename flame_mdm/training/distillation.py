@@ -80,7 +80,7 @@ class DistillationTask(GeneratorTask):
         self.facts["teacher"] = weights_sha256(path)
         scale = options["guidance_scale"]
         self.teacher_guidance = teacher.sampler_options.guidance_scale if scale is None else scale
-        # In lists, since they are no parts of the student.
+        # In lists, since they are not parts of the student.
         denoiser = self.generator.denoiser
         self.teacher, self.target = [copy.deepcopy(denoiser).requires_grad_(False)], [denoiser]
 

@@ -50,7 +50,7 @@ def understand(text: str) -> Understanding:
 
 
 def is_explained(word: str) -> bool:
-    """Returns whether a word is in a table of words that are no actions."""
+    """Returns whether a word is in a table of words that are not actions."""
     if (
         word.isdecimal()
         or word in phrases()["numbers"]

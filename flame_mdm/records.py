@@ -245,7 +245,7 @@ class AuditCard(ClosedSchema):
     # Whether higher values are better; None = values are best if near the values of real motions
     metrics: dict[str, bool | None]
     facts: dict[str, AuditedMetric] = Field({})  # by metric; earlier versions wrote none
-    # And half widths of intervals
+    # values of real motions and half widths of their intervals, by metric
     real: dict[str, Annotated[list[Number | None], Field(min_length=2, max_length=2)]]
     perturbations: Annotated[list[AuditedPerturbation], Field(min_length=1)]
     not_computed: dict[str, str]

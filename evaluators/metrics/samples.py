@@ -22,7 +22,7 @@ Rows = Mapping[str, Any]
 
 
 class Declared:
-    """What a metric declares about its values, and its values for single samples and for resamples of them.
+    """Base class of metrics: what a metric declares about its values, and values of single samples and of resamples.
 
     Attributes:
         unit: unit of the values; "" = a number without a unit.

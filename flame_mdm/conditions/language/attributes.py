@@ -31,7 +31,7 @@ class Reader:
         entry: the action.
         tokens: tokens of the sentence.
         own: numbers of the tokens that belong to the action.
-        verb: numbers of the tokens of the phrase for the action, whose meaning is used.
+        verb: numbers of the tokens of the phrase that names the action.
     """
 
     def __init__(

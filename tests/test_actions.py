@@ -436,7 +436,7 @@ def test_a_model_of_actions_is_measured_by_it(trained, data, tmp_path):
 
 
 @pytest.mark.slow
-def test_what_was_not_made_for_one_another_is_refused(trained, data, tmp_path, capsys):
+def test_what_was_not_made_for_one_another_is_refused(trained, data, tmp_path, capsys, subtests):
     extractor = OwnClassifierExtractor(str(trained))
     own = extractor.task.representation
     extractor.check(own, "synthetic")
@@ -455,9 +455,10 @@ def test_what_was_not_made_for_one_another_is_refused(trained, data, tmp_path, c
         ("action_to_motion", trained, "contains no weights under 'model'"),
         ("action_to_motion_own", released, f"{released}: not a checkpoint of this framework"),
     ):
-        words = ["baseline=real", *DATA, data, f"protocol={protocol}", f"extractor={file}"]
-        assert main(["evaluate", *words]) == 1
-        assert message in capsys.readouterr().err
+        with subtests.test(protocol=protocol, file=file, message=message):
+            words = ["baseline=real", *DATA, data, f"protocol={protocol}", f"extractor={file}"]
+            assert main(["evaluate", *words]) == 1
+            assert message in capsys.readouterr().err
 
 
 def test_data_without_labels_is_refused(monkeypatch, tmp_path, capsys):

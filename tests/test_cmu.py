@@ -342,7 +342,7 @@ def test_angles_are_those_of_the_public_conversion(real):
 
 @needs_third_party
 @pytest.mark.slow
-def test_the_archive(real):
+def test_the_archive(real, subtests):
     """Rates as CMU lists them; Daz-friendly files agree with the original ones at the same bone lengths."""
     listed = json.loads((real / "cmu_fps.json").read_text())
     assert {t for t, entry in listed.items() if entry["fps"] == 60} == {
@@ -350,14 +350,19 @@ def test_the_archive(real):
     }
     names = ["02_04", "02_05", "02_07", "02_08", "02_09"]
     for name in names:
-        whole = cmu.Item("a", "test", "a", [])
-        files = (real / "asf_amc" / f"{name}.amc", real / "daz_bvh" / f"{name}.bvh")
-        both = [cmu._read("joints", ([file], (None, None, False), [whole]))[0] for file in files]
-        bones = [SMPL22.bones(torch.from_numpy(joints).double()) for joints in both]
-        lengths = torch.linalg.vector_norm(bones[0], dim=-1, keepdim=True)
-        same = [torch.nn.functional.normalize(bone, dim=-1) * lengths for bone in bones]
-        joints = [SMPL22.assemble(bone, torch.zeros(len(bone), 3).double()) for bone in same]
-        assert float(torch.linalg.vector_norm(joints[0] - joints[1], dim=-1).mean()) < 0.02, name
+        with subtests.test(name=name):
+            whole = cmu.Item("a", "test", "a", [])
+            files = (real / "asf_amc" / f"{name}.amc", real / "daz_bvh" / f"{name}.bvh")
+            both = [
+                cmu._read("joints", ([file], (None, None, False), [whole]))[0] for file in files
+            ]
+            bones = [SMPL22.bones(torch.from_numpy(joints).double()) for joints in both]
+            lengths = torch.linalg.vector_norm(bones[0], dim=-1, keepdim=True)
+            same = [torch.nn.functional.normalize(bone, dim=-1) * lengths for bone in bones]
+            joints = [SMPL22.assemble(bone, torch.zeros(len(bone), 3).double()) for bone in same]
+            assert float(torch.linalg.vector_norm(joints[0] - joints[1], dim=-1).mean()) < 0.02, (
+                name
+            )
     clips = {clip.id: clip for clip in cmu.CMU(str(real), workers=1).clips(20)}
     assert {"000327", "M000327", "kit02278"} & clips.keys() == {"000327", "M000327"}, (
         "02_06 takes 18 seconds"

@@ -88,9 +88,12 @@ WRONG = {
 
 
 @pytest.mark.slow
-def test_a_wrong_override_is_one_line_with_the_nearest_names():
+def test_a_wrong_override_is_one_line_with_the_nearest_names(subtests):
     for override, message in WRONG.items():
-        with pytest.raises(UserError, match=rf"\A[^\n]*{re.escape(message)}[^\n]*\Z"):
+        with (
+            subtests.test(override=override, message=message),
+            pytest.raises(UserError, match=rf"\A[^\n]*{re.escape(message)}[^\n]*\Z"),
+        ):
             compose("quickstart", [override])
 
 

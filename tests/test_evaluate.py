@@ -239,7 +239,7 @@ def test_a_result_says_what_it_is_and_where_it_comes_from(runs, full):
     assert value["generated multimodality"] > 0
 
 
-def test_quick_results_few_motions_and_clips_left_out_are_marked(runs, tmp_path, capsys):
+def test_quick_results_few_motions_and_clips_left_out_are_marked(runs, tmp_path, capsys, subtests):
     root = Path(shutil.copytree(runs.root, tmp_path / "data"))
     (path,) = root.glob("*/store.json")
     path.write_text(
@@ -274,7 +274,8 @@ def test_quick_results_few_motions_and_clips_left_out_are_marked(runs, tmp_path,
         "QUICK RUN, NOT FOR PUBLICATION",
         biased,
     ):
-        assert words in out
+        with subtests.test(words=words):
+            assert words in out
 
 
 def test_clips_that_may_have_been_seen_in_training_are_marked():
@@ -384,7 +385,9 @@ def test_a_bootstrap_measures_each_motion_as_often_as_it_is_drawn(runs):
     assert drawn["fid"][0] != drawn["fid"][1]
 
 
-def test_a_single_replication_has_no_interval_but_the_one_over_motions(runs, tmp_path, capsys):
+def test_a_single_replication_has_no_interval_but_the_one_over_motions(
+    runs, tmp_path, capsys, subtests
+):
     words = ["baseline=noisy", "extractor=none", "replications=1", "resamples=100"]
     result = runs.of_others(tmp_path / "result.json", *words)
     jitter = result.values["jitter"]
@@ -404,7 +407,8 @@ def test_a_single_replication_has_no_interval_but_the_one_over_motions(runs, tmp
         "replications=1",
         "synthetic test",
     ):
-        assert words in out
+        with subtests.test(words=words):
+            assert words in out
 
 
 def test_each_number_carries_its_own_number_of_motions(runs, full, tmp_path):
@@ -525,7 +529,7 @@ def test_motions_of_others_are_measured_alike(runs, full, tmp_path):
         SampleFolder(folder, data.representation)("rep_0", rows, 0)
 
 
-def test_every_protocol_can_be_read_and_one_is_the_default_for_condition_and_data():
+def test_every_protocol_can_be_read_and_one_is_the_default_for_condition_and_data(subtests):
     nothing = {"keys": torch.zeros(0, dtype=torch.long)}
     for name in protocol_names():
         protocol = load_protocol(name, HumanML())
@@ -540,9 +544,10 @@ def test_every_protocol_can_be_read_and_one_is_the_default_for_condition_and_dat
         **{"action uestc": "action_to_motion_uestc", "action bandai": "action_to_motion_own"},
         **{"text synthetic": "synthetic", "text humanml3d": "text_to_motion"},
     }.items():
-        condition, dataset = model.split()
-        trained: Any = SimpleNamespace(conditioned_on=condition, facts={"dataset": dataset})
-        assert default_protocol(trained) == name
+        with subtests.test(model=model, name=name):
+            condition, dataset = model.split()
+            trained: Any = SimpleNamespace(conditioned_on=condition, facts={"dataset": dataset})
+            assert default_protocol(trained) == name
 
 
 def test_variants_replace_options_of_their_file(tmp_path):
@@ -648,7 +653,7 @@ def own(folder: Path, old: str, new: str) -> str:
     return str(folder / "mine.yaml")
 
 
-def test_what_does_not_fit_is_refused(runs, tmp_path):
+def test_what_does_not_fit_is_refused(runs, tmp_path, subtests):
     for message, keys in (
         ("resamples=20: give 0, or 100 or more", {"resamples": 20}),
         ("needs a feature extractor", {"extractor": None, "protocol": "text_to_motion"}),
@@ -660,10 +665,11 @@ def test_what_does_not_fit_is_refused(runs, tmp_path):
         ("give exactly one of", {"baseline": "real"}),
         ("needs a protocol", {"ckpt": None, "baseline": "real", "data": {"name": "synthetic"}}),
     ):
-        values: Any = {"ckpt": str(runs.model), "extractor": "none"} | keys
-        with pytest.raises((UserError, FileNotFoundError)) as refusal:
-            Plan(EvaluationRequest(**values), "cpu")
-        assert message in str(refusal.value)
+        with subtests.test(message=message, keys=keys):
+            values: Any = {"ckpt": str(runs.model), "extractor": "none"} | keys
+            with pytest.raises((UserError, FileNotFoundError)) as refusal:
+                Plan(EvaluationRequest(**values), "cpu")
+            assert message in str(refusal.value)
     for old, new, message in (
         (
             "normalize: true",
@@ -679,7 +685,10 @@ def test_what_does_not_fit_is_refused(runs, tmp_path):
             "called fidd. Did you mean fid",
         ),
     ):
-        with pytest.raises(UserError, match=message):
+        with (
+            subtests.test(old=old, new=new, message=message),
+            pytest.raises(UserError, match=message),
+        ):
             load_protocol(own(tmp_path, old, new), HumanML())
     accuracy, drift = "accuracy.ActionAccuracy", "reconstruction.KeptDrift"
     clip = "extractor: {_target_: evaluators.extractors.MotionCLIPExtractor, path: motion_clip_synthetic}"
@@ -699,11 +708,12 @@ def test_what_does_not_fit_is_refused(runs, tmp_path):
         ("physics.Floating", drift, True, r"metric floating \(KeptDrift\): missing input: kept"),
         (clip, "extractor: null", False, "missing input: generated"),
     ):
-        evaluation = runs.evaluation(own(tmp_path, old, new), features, multimodality=True)
-        with pytest.raises(UserError, match=message):
-            evaluation.run(unused)
+        with subtests.test(old=old, new=new, features=features, message=message):
+            evaluation = runs.evaluation(own(tmp_path, old, new), features, multimodality=True)
+            with pytest.raises(UserError, match=message):
+                evaluation.run(unused)
     for representation, dataset in ((HumanML(variant="clean"), "bandai"), (Rot6D(), "synthetic")):
-        with pytest.raises(UserError, match="the motions are"):
+        with subtests.test(dataset=dataset), pytest.raises(UserError, match="the motions are"):
             MotionCLIPExtractor(str(runs.clip)).check(representation, dataset)
 
 

@@ -73,26 +73,27 @@ def test_a_full_disk_leaves_the_checkpoint_before(tmp_path):
     assert (tmp_path / LAST).read_bytes() == before
 
 
-def test_a_preparation_without_room_leaves_nothing(tmp_path, capsys):
+def test_a_preparation_without_room_leaves_nothing(tmp_path, capsys, subtests):
     for size in (0, 100_000):
-        with file_limit(size):
-            assert (
-                main(
-                    [
-                        "prepare",
-                        "data=synthetic",
-                        "data.source.clips=60",
-                        f"data_root={tmp_path / 'data'}",
-                    ]
+        with subtests.test(size=size):
+            with file_limit(size):
+                assert (
+                    main(
+                        [
+                            "prepare",
+                            "data=synthetic",
+                            "data.source.clips=60",
+                            f"data_root={tmp_path / 'data'}",
+                        ]
+                    )
+                    == 1
                 )
-                == 1
+            line = capsys.readouterr().err.splitlines()[-1]
+            assert line.startswith(
+                f"error: {tmp_path / 'data' / STORE}: cannot be written: File too large. "
             )
-        line = capsys.readouterr().err.splitlines()[-1]
-        assert line.startswith(
-            f"error: {tmp_path / 'data' / STORE}: cannot be written: File too large. "
-        )
-        assert f" are free on the disk of {tmp_path / 'data'}" in line
-        assert list(tmp_path.iterdir()) == []
+            assert f" are free on the disk of {tmp_path / 'data'}" in line
+            assert list(tmp_path.iterdir()) == []
 
 
 def test_a_killed_loading_process_is_named_in_one_line(tmp_path, data_root, monkeypatch, capsys):
@@ -116,18 +117,18 @@ def test_a_killed_loading_process_is_named_in_one_line(tmp_path, data_root, monk
     assert train.main([*line, f"trainer.max_steps={resumed.step + 2}"]) == 0
 
 
-def test_which_second_signal_ends_a_run_at_once(monkeypatch):
+def test_which_second_signal_ends_a_run_at_once(monkeypatch, subtests):
     request = StopRequest()
     monkeypatch.setattr("flame_mdm.signals.kill_children", lambda: None)
     for signum in (signal.SIGUSR1, signal.SIGTERM, signal.SIGTERM):
         request.note(signum, None)
     request.time -= 2
     for signum, code in ((signal.SIGTERM, "143"), (signal.SIGINT, "130")):
-        with pytest.raises(SystemExit, match=code):
+        with subtests.test(signum=signum, code=code), pytest.raises(SystemExit, match=code):
             request.note(signum, None)
 
 
-def test_torch_messages_about_lost_workers_are_understood(tmp_path, monkeypatch):
+def test_torch_messages_about_lost_workers_are_understood(tmp_path, monkeypatch, subtests):
     assert lost_worker(RuntimeError("Caught ValueError in DataLoader worker process 0.")) is None
     assert "ended unexpectedly" in str(
         lost_worker(ConnectionResetError(104, "Connection reset by peer"))
@@ -137,14 +138,15 @@ def test_torch_messages_about_lost_workers_are_understood(tmp_path, monkeypatch)
         "DataLoader worker (pid(s) 12, 13) exited unexpectedly",
         "DataLoader worker (pid 12) exited unexpectedly with exit code 1. Details",
     ):
-        assert str(lost_worker(RuntimeError(message))).startswith(
-            "a data loading process was killed"
-        )
-        monkeypatch.setattr("torch.save", Mock(side_effect=RuntimeError(message)))
-        with pytest.raises(UserError) as caught:
-            AtomicCheckpoints(tmp_path).save_checkpoint({"global_step": 1}, tmp_path / LAST)
-        assert lost_worker(caught.value) is not None
-        assert list(tmp_path.iterdir()) == []
+        with subtests.test(message=message):
+            assert str(lost_worker(RuntimeError(message))).startswith(
+                "a data loading process was killed"
+            )
+            monkeypatch.setattr("torch.save", Mock(side_effect=RuntimeError(message)))
+            with pytest.raises(UserError) as caught:
+                AtomicCheckpoints(tmp_path).save_checkpoint({"global_step": 1}, tmp_path / LAST)
+            assert lost_worker(caught.value) is not None
+            assert list(tmp_path.iterdir()) == []
 
 
 def prepare(folder: Path, log: Path) -> None:

@@ -228,29 +228,30 @@ def test_damaged_motions(refused, bad):
         )
 
 
-def test_strange_texts_are_legal(trained, tmp_path, monkeypatch):
+def test_strange_texts_are_legal(trained, tmp_path, monkeypatch, subtests):
     monkeypatch.chdir(tmp_path)
     strange = (
         "walk\x07b\x1b[31m c\x7f {a: [b \u202e '; $(rm) `x` \\<script>alert(1)</script> & </style>"
     )
     for text in ("walk " * 390, strange):
-        out = tmp_path / str(len(text))
-        assert (
-            main(
-                [
-                    "sample",
-                    f"ckpt={trained}",
-                    f"text={text}",
-                    "samples=1",
-                    "seconds=0.5",
-                    f"out={out}",
-                ]
+        with subtests.test(text=text):
+            out = tmp_path / str(len(text))
+            assert (
+                main(
+                    [
+                        "sample",
+                        f"ckpt={trained}",
+                        f"text={text}",
+                        "samples=1",
+                        "seconds=0.5",
+                        f"out={out}",
+                    ]
+                )
+                == 0
             )
-            == 0
-        )
-        assert "<script>alert(1)" not in (out / "player.html").read_text(encoding="utf-8")
-        with np.load(out / "motion_000.npz") as file:
-            assert str(file["text"]) == text
+            assert "<script>alert(1)" not in (out / "player.html").read_text(encoding="utf-8")
+            with np.load(out / "motion_000.npz") as file:
+                assert str(file["text"]) == text
 
 
 def test_a_text_in_another_script_is_refused_in_one_line(trained, tmp_path, monkeypatch, capsys):
@@ -347,26 +348,28 @@ def reader(name: str, folder: Path) -> tuple[Path, Callable[[], object]]:
 
 
 @pytest.mark.parametrize("name", CASES["files"])
-def test_files_of_results_and_runs(name, tmp_path):
+def test_files_of_results_and_runs(name, tmp_path, subtests):
     path, read = reader(name, tmp_path)
     content = CASES["files"][name].get("content") or json.loads(path.read_text())
     path.write_text(json.dumps(content))
     if name != "wandb":  # which would start a run
         read()
     for text in (*malformed(name, content), *(NO_YAML if path.suffix == ".yaml" else [])):
-        path.write_text(text, encoding="utf-8")
-        with pytest.raises(UserError) as error:
-            print(text[:200], read())
-        assert "\n" not in str(error.value), text[:200]
+        with subtests.test(text=text):
+            path.write_text(text, encoding="utf-8")
+            with pytest.raises(UserError) as error:
+                print(text[:200], read())
+            assert "\n" not in str(error.value), text[:200]
 
 
-def test_histories(tmp_path):
+def test_histories(tmp_path, subtests):
     run, line = a_run(tmp_path / "run"), '{"step": 3, "train/loss": 1.5}\n'
     wrong = ('"x"', "null", "[]", "{}", "true", "1_0", "'1'")
     broken = [line.replace("1.5", value) for value in wrong] + ["\n", line.replace("step", "stop")]
     broken += [line.replace("3", step) for step in (*wrong, "-1", "1.5", "NaN", "1e999", "9" * 400)]
     for text in (*broken, *(f"{text}\n" for text in NO_JSON if text != "null")):
-        for content in (text, line + text, text + line):
-            (run / "metrics.jsonl").write_text(content, encoding="utf-8")
-            with pytest.raises(UserError, match=r"metrics\.jsonl"):
-                read_history(run)
+        with subtests.test(text=text):
+            for content in (text, line + text, text + line):
+                (run / "metrics.jsonl").write_text(content, encoding="utf-8")
+                with pytest.raises(UserError, match=r"metrics\.jsonl"):
+                    read_history(run)

@@ -159,17 +159,20 @@ def test_draws_depend_on_the_seed(expected: dict[str, Any]):
 
 
 @pytest.mark.slow
-def test_values_do_not_depend_on_the_number_of_processes(pool: GlooPool, expected: dict[str, Any]):
+def test_values_do_not_depend_on_the_number_of_processes(
+    pool: GlooPool, expected: dict[str, Any], subtests
+):
     """Samples dealt in turn, all to one of the two, and none at all."""
     values = evaluation()
     for first in (range(0, COUNT, 2), range(COUNT)):
-        shares = [
-            torch.tensor(list(share), dtype=torch.long)
-            for share in (first, set(range(COUNT)) - set(first))
-        ]
-        inputs = [batches(values, share.split(7)) if len(share) else [] for share in shares]
-        results = pool.run(measure, *[(all_metrics(), batch) for batch in inputs])
-        assert results == [expected, expected], first
+        with subtests.test(first=first):
+            shares = [
+                torch.tensor(list(share), dtype=torch.long)
+                for share in (first, set(range(COUNT)) - set(first))
+            ]
+            inputs = [batches(values, share.split(7)) if len(share) else [] for share in shares]
+            results = pool.run(measure, *[(all_metrics(), batch) for batch in inputs])
+            assert results == [expected, expected], first
     empty = measure(all_metrics(), [])
     assert pool.run(measure, (all_metrics(), []), (all_metrics(), [])) == [empty, empty]
 
@@ -286,17 +289,20 @@ def loss_and_gradients(
 
 
 @pytest.mark.slow
-def test_two_processes_learn_what_one_learns_from_all_pairs(pool: GlooPool):
+def test_two_processes_learn_what_one_learns_from_all_pairs(pool: GlooPool, subtests):
     for hard in (False, True):
-        loss, gradients = loss_and_gradients(0, 6, hard)
-        (loss_a, a), (loss_b, b) = pool.run(loss_and_gradients, (0, 3, hard), (3, 6, hard))
-        assert (loss_a + loss_b) / 2 == pytest.approx(loss, abs=1e-6)
-        for name, gradient in gradients.items():
-            torch.testing.assert_close(
-                (a[name] + b[name]) / 2, gradient, atol=1e-6, rtol=1e-4, msg=name
-            )
-        alone, _ = loss_and_gradients(0, 3, hard)
-        assert abs(alone - loss_a) > 0.05  # without the others' negatives the loss is another one
+        with subtests.test(hard=hard):
+            loss, gradients = loss_and_gradients(0, 6, hard)
+            (loss_a, a), (loss_b, b) = pool.run(loss_and_gradients, (0, 3, hard), (3, 6, hard))
+            assert (loss_a + loss_b) / 2 == pytest.approx(loss, abs=1e-6)
+            for name, gradient in gradients.items():
+                torch.testing.assert_close(
+                    (a[name] + b[name]) / 2, gradient, atol=1e-6, rtol=1e-4, msg=name
+                )
+            alone, _ = loss_and_gradients(0, 3, hard)
+            assert (
+                abs(alone - loss_a) > 0.05
+            )  # without the others' negatives the loss is another one
 
 
 def validate(rank: int, world: int) -> tuple[float, ...]:

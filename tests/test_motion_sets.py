@@ -429,21 +429,29 @@ def contacts(entry: dict[str, Any], foot: str) -> list[tuple[int, int]]:
 
 @pytest.mark.tools
 @pytest.mark.slow
-def test_in_three_the_clips_blend_without_sliding_feet(locomotion: Path, node_modules: Path):
+def test_in_three_the_clips_blend_without_sliding_feet(
+    locomotion: Path, node_modules: Path, subtests
+):
     """Stands, starts to walk, walks, runs, stops: a foot that all blended clips have on the floor hardly moves."""
     clips = described(locomotion)
     fps = json.loads((locomotion / "set.json").read_text())["fps"]
     scene = node("three_set.mjs", node_modules, locomotion)
     for foot, name in enumerate(("left", "right")):
-        footprint = None
-        for frame in scene["frames"]:
-            shown = [(clips[item["name"]], round(item["time"] * fps)) for item in frame["playing"]]
-            stands = all(
-                any(first <= time <= last for first, last in contacts(entry, name))
-                for entry, time in shown
-            )
-            toe = np.array(frame["toes"][foot])[[0, 2]]
-            footprint = (toe if footprint is None else footprint) if stands else None
-            if footprint is not None:
-                assert np.linalg.norm(toe - footprint) < 3 * CENTIMETER, (name, frame["playing"])
+        with subtests.test(foot=foot, name=name):
+            footprint = None
+            for frame in scene["frames"]:
+                shown = [
+                    (clips[item["name"]], round(item["time"] * fps)) for item in frame["playing"]
+                ]
+                stands = all(
+                    any(first <= time <= last for first, last in contacts(entry, name))
+                    for entry, time in shown
+                )
+                toe = np.array(frame["toes"][foot])[[0, 2]]
+                footprint = (toe if footprint is None else footprint) if stands else None
+                if footprint is not None:
+                    assert np.linalg.norm(toe - footprint) < 3 * CENTIMETER, (
+                        name,
+                        frame["playing"],
+                    )
     assert 4 < scene["place"][2] < 12

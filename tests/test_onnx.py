@@ -235,7 +235,7 @@ def test_graphs_of_each_denoiser_compute_what_pytorch_does(
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_the_runner_samples_the_motions_of_the_package_without_pytorch_and_refuses_a_changed_folder(
-    trained: Path, tmp_path: Path, capfd: Any
+    trained: Path, tmp_path: Path, capfd: Any, subtests
 ) -> None:
     exported, out = tmp_path / "model", tmp_path / "out.npz"
     assert main(["export", str(trained), str(exported), "format=onnx", "half=true"]) == 0
@@ -255,7 +255,10 @@ def test_the_runner_samples_the_motions_of_the_package_without_pytorch_and_refus
     torch.testing.assert_close(matrices.double(), poses.rotations, atol=2e-3, rtol=0)
     assert sampler.unknown("a person walks backflipping") == ["backflipping"]
     for seconds in (9, 0):
-        with pytest.raises(ValueError, match=r"give 0\.1 to 3 seconds"):
+        with (
+            subtests.test(seconds=seconds),
+            pytest.raises(ValueError, match=r"give 0\.1 to 3 seconds"),
+        ):
             sampler.generate(TEXT, seconds)
 
     description, graph = ((exported / name).read_bytes() for name in ("model.json", "joints.onnx"))
@@ -270,11 +273,12 @@ def test_the_runner_samples_the_motions_of_the_package_without_pytorch_and_refus
         ),
         ("joints.onnx", graph[:-9] + b"x" * 9, "joints.onnx has changed since it was exported"),
     ):
-        (exported / "model.json").write_bytes(description)
-        (exported / name).write_bytes(content)
-        assert runner.main([str(exported), "walk", str(out)]) == 1
-        assert says in (error := capfd.readouterr().err)
-        assert error.count("\n") == 1
+        with subtests.test(name=name, content=content, says=says):
+            (exported / "model.json").write_bytes(description)
+            (exported / name).write_bytes(content)
+            assert runner.main([str(exported), "walk", str(out)]) == 1
+            assert says in (error := capfd.readouterr().err)
+            assert error.count("\n") == 1
 
 
 @pytest.fixture(scope="module")

@@ -63,7 +63,7 @@ def evaluated(tmp_path_factory, data_root, printed) -> Path:
         )
 
 
-def test_the_history_holds_what_a_step_does_and_costs(evaluated):
+def test_the_history_holds_what_a_step_does_and_costs(evaluated, subtests):
     curves = read_history(evaluated)
     for name in (
         "loss",
@@ -74,7 +74,8 @@ def test_the_history_holds_what_a_step_does_and_costs(evaluated):
         "samples_per_second",
         "seconds_per_step",
     ):
-        assert list(curves[f"train/{name}"]) == [1, 3, 5, 7], name
+        with subtests.test(name=name):
+            assert list(curves[f"train/{name}"]) == [1, 3, 5, 7], name
     assert list(curves["val/loss"]) == [3, 7]
     clips = 108  # of 120
     assert curves["train/epochs"][7] == pytest.approx(8 * 8 / clips, rel=0.1)
@@ -171,7 +172,7 @@ def test_wandb_has_one_run_through_resume(tmp_path, data_root, monkeypatch):
     assert losses == pytest.approx(read_history(folder)["train/loss"])
 
 
-def test_training_ends_with_a_report_that_needs_nothing_else(evaluated):
+def test_training_ends_with_a_report_that_needs_nothing_else(evaluated, subtests):
     text = (evaluated / "report.html").read_text()
     for words in (
         "Samples at step 8",
@@ -181,7 +182,8 @@ def test_training_ends_with_a_report_that_needs_nothing_else(evaluated):
         "grad_norm",
         "fingerprint",
     ):
-        assert words in text, words
+        with subtests.test(words=words):
+            assert words in text, words
     assert not re.findall(
         r"""(?:src|href)=["'](?!data:)|url\(|@import|https?://(?!www\.w3\.org)""", text
     )
@@ -190,7 +192,7 @@ def test_training_ends_with_a_report_that_needs_nothing_else(evaluated):
     assert (evaluated / "report.html").read_text() == text
 
 
-def test_a_report_shows_evaluations_and_why_training_stopped(tmp_path):
+def test_a_report_shows_evaluations_and_why_training_stopped(tmp_path, subtests):
     folder = a_run(tmp_path / "run")
     put(folder, invalid_because=["real motions are off"], changed={"samples": 64})
     batches = [{"rank": 0, "batch": 7, "ids": ["<b>walk"], "loss": "nan"}]
@@ -212,7 +214,8 @@ def test_a_report_shows_evaluations_and_why_training_stopped(tmp_path):
         ),
         *("Training stopped at step 8", "&lt;b&gt;walk"),
     ):
-        assert words in text, words
+        with subtests.test(words=words):
+            assert words in text, words
     assert "<b>" not in text
 
 
@@ -230,14 +233,15 @@ def test_names_are_text_not_html(tmp_path):
     assert not re.search("<[ibu]>", text)
 
 
-def test_missing_files_are_named(tmp_path, capsys):
+def test_missing_files_are_named(tmp_path, capsys, subtests):
     folder = a_run(tmp_path / "run")
     (folder / "metrics.jsonl").unlink()
     assert "there is no metrics.jsonl in the folder" in write_report(folder).read_text()
     assert read_run(folder).label == "mine"
     for words, message in (([str(tmp_path)], "contains no config.yaml"), ([], "no runs given")):
-        assert main(["report", *words]) == 1
-        assert message in capsys.readouterr().err
+        with subtests.test(words=words, message=message):
+            assert main(["report", *words]) == 1
+            assert message in capsys.readouterr().err
 
 
 def test_training_ends_with_what_its_numbers_mean(evaluated, printed, tmp_path):

@@ -185,7 +185,7 @@ def test_bad_numbers_of_candidates_are_one_line(model, options, message):
 
 
 @pytest.mark.slow
-def test_the_command_chooses_by_a_motion_clip(tmp_path, monkeypatch, capsys):
+def test_the_command_chooses_by_a_motion_clip(tmp_path, monkeypatch, capsys, subtests):
     monkeypatch.chdir(tmp_path)
     words = [f"text={TEXT}", "seconds=1.5", "num_inference_steps=4", "samples=1"]
     assert main(["sample", "quickstart", *words, "samples=4", "out=all"]) == 0
@@ -214,7 +214,8 @@ def test_the_command_chooses_by_a_motion_clip(tmp_path, monkeypatch, capsys):
         (["scorer=none.ckpt", "candidates=2"], "scorer: none.ckpt: no such checkpoint. Give a run"),
         (["scorer=quickstart", "candidates=2"], "holds a motion generator, not a motion-CLIP"),
     ):
-        assert message in error_of(capsys, "sample", "quickstart", *words, *options)
+        with subtests.test(options=options, message=message):
+            assert message in error_of(capsys, "sample", "quickstart", *words, *options)
 
 
 def test_edit_takes_a_part_of_any_motion(model, tmp_path):

@@ -131,16 +131,17 @@ JUNK: list[tuple[tuple[Any, ...], Any]] = [
 ]
 
 
-def test_junk_in_the_state_of_training_is_one_line(resume, best, tmp_path, capsys):
+def test_junk_in_the_state_of_training_is_one_line(resume, best, tmp_path, capsys, subtests):
     (tmp_path / "run" / "checkpoints" / PREVIOUS).unlink()
     config = (tmp_path / "run" / "config.yaml").read_bytes()
     for keys, value in JUNK:
-        changed: Any = copy.deepcopy(best[0])
-        *above, last = keys
-        reduce(lambda node, key: node[key], above, changed)[last] = value
-        capsys.readouterr()
-        assert resume(changed) == 1, keys
-        assert f"{LAST}: " in one_error(capsys), keys
+        with subtests.test(keys=keys, value=value):
+            changed: Any = copy.deepcopy(best[0])
+            *above, last = keys
+            reduce(lambda node, key: node[key], above, changed)[last] = value
+            capsys.readouterr()
+            assert resume(changed) == 1, keys
+            assert f"{LAST}: " in one_error(capsys), keys
     assert (tmp_path / "run" / "config.yaml").read_bytes() == config
 
 
@@ -191,7 +192,7 @@ def test_a_run_does_not_resume_on_other_data(run, tmp_path, data_root, capsys, m
     assert tree(run, root) == before
 
 
-def test_a_store_of_other_options_is_refused_everywhere(tmp_path, trained, capsys):
+def test_a_store_of_other_options_is_refused_everywhere(tmp_path, trained, capsys, subtests):
     root, run = tmp_path / "data", tmp_path / "run"
     assert main(["prepare", *prepared(root, 61)]) == 0
     capsys.readouterr()
@@ -204,8 +205,9 @@ def test_a_store_of_other_options_is_refused_everywhere(tmp_path, trained, capsy
         ["browse", *prepared(root, 120, f"out={tmp_path / 'page.html'}")],
         ["evaluate", f"ckpt={trained}", "extractor=none", "quick=true", f"data_root={root}"],
     ):
-        assert main(line) == 1
-        assert one_error(capsys).startswith(message)
+        with subtests.test(line=line):
+            assert main(line) == 1
+            assert one_error(capsys).startswith(message)
     assert tree(root) == before
     assert [path.name for path in tmp_path.iterdir()] == ["data"]
     assert main(["prepare", *prepared(root, 120, "force=true")]) == 0
@@ -219,7 +221,7 @@ def test_options_that_decide_the_data_count_but_paths_do_not():
     assert Synthetic(3).options == {"clips": 3, "seed": 0}
 
 
-def test_a_damaged_checkpoint_gives_way_to_the_one_before(resume, tmp_path, capsys):
+def test_a_damaged_checkpoint_gives_way_to_the_one_before(resume, tmp_path, capsys, subtests):
     assert resume() == 0
     folder = tmp_path / "run" / "checkpoints"
     whole = (folder / LAST).read_bytes()
@@ -229,10 +231,11 @@ def test_a_damaged_checkpoint_gives_way_to_the_one_before(resume, tmp_path, caps
     flipped = bytearray(whole)
     flipped[len(whole) // 2] ^= 1  # in the middle of a weight, where the structure is intact
     for content in (whole[: len(whole) // 2], bytes(flipped), b""):
-        (folder / LAST).write_bytes(content)
-        capsys.readouterr()
-        assert newest(folder)[:2] == (folder / PREVIOUS, 4)  # type: ignore[index]
-        assert f"{folder / LAST}: damaged" in capsys.readouterr().out
+        with subtests.test(content=content):
+            (folder / LAST).write_bytes(content)
+            capsys.readouterr()
+            assert newest(folder)[:2] == (folder / PREVIOUS, 4)  # type: ignore[index]
+            assert f"{folder / LAST}: damaged" in capsys.readouterr().out
     provenance = tmp_path / "run" / "provenance.json"
     provenance.write_text(json.dumps(json.loads(provenance.read_text()) | {"commit": "0" * 40}))
     assert resume() == 0

@@ -290,7 +290,10 @@ def test_names_of_joints_are_read_from_a_file(
     assert "no joint found for pelvis, left_hip" in printed.err
     other: dict[str, Any]
     for other, message in (
-        ({"left_nee": "x"}, r"hero\.yaml: left_nee is not a joint of SMPL\. Did you mean left_knee"),
+        (
+            {"left_nee": "x"},
+            r"hero\.yaml: left_nee is not a joint of SMPL\. Did you mean left_knee",
+        ),
         (
             {"left_knee": "Rig Bone-l_flak"},
             r"left_knee: .*hero\.glb has no joint Rig Bone-l_flak\. Did you mean Rig",

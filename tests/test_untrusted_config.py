@@ -101,7 +101,9 @@ def test_interpolations_in_models_are_refused(attacked, trained, changed, bad, t
     assert not marker.exists()
 
 
-def test_interpolations_in_saved_runs_and_protocols_are_refused(attacked, trained, bad, tmp_path):
+def test_interpolations_in_saved_runs_and_protocols_are_refused(
+    attacked, trained, bad, tmp_path, subtests
+):
     marker, says = tmp_path / "owned", "holds an interpolation"
     saved, own = (trained.parent.parent / "config.yaml").read_text(), bad / "protocol.yaml"
     assert "${run.dir}" in saved
@@ -118,12 +120,13 @@ def test_interpolations_in_saved_runs_and_protocols_are_refused(attacked, traine
         "x${representation.fps}",
         "${run.dir}${seed}",
     ):
-        (bad / "config.yaml").write_text(f"{saved}\nx: {value}\n")
-        own.write_text(f"{protocol}\nsmoothing: {value}\n")
-        with pytest.raises(UserError, match=f"config.yaml: x {says}"):
-            compose(str(bad / "config.yaml"))
-        with pytest.raises(UserError, match=says):
-            load_protocol(str(own), representation)
+        with subtests.test(value=value):
+            (bad / "config.yaml").write_text(f"{saved}\nx: {value}\n")
+            own.write_text(f"{protocol}\nsmoothing: {value}\n")
+            with pytest.raises(UserError, match=f"config.yaml: x {says}"):
+                compose(str(bad / "config.yaml"))
+            with pytest.raises(UserError, match=says):
+                load_protocol(str(own), representation)
     for words in (["train", "quickstart", *TINY, f"run.dir={bad}"], ["report", str(bad)]):
         attacked(*words, says=f"config.yaml: x {says}")
     # Checkpoints of such a run would be refused.
@@ -131,7 +134,7 @@ def test_interpolations_in_saved_runs_and_protocols_are_refused(attacked, traine
     assert not marker.exists()
 
 
-def test_parts_are_built_as_hydra_builds_them_without_resolving_anything(tmp_path):
+def test_parts_are_built_as_hydra_builds_them_without_resolving_anything(tmp_path, subtests):
     node = {"_target_": "builtins.dict", "a": exploit(tmp_path / "owned"), "b": ["${oc.env:HOME}"]}
     assert instantiate({"_target_": "collections.OrderedDict", "x": {"y": "${z}"}}) == {
         "x": {"y": "${z}"}
@@ -146,15 +149,15 @@ def test_parts_are_built_as_hydra_builds_them_without_resolving_anything(tmp_pat
     kept = instantiate({"_target_": "builtins.dict", "_recursive_": False, "a": inner})
     assert (kept, kept["a"] is inner) == ({"a": inner}, False)
     for key in ("_args_", "_partial_", "_convert_"):
-        with pytest.raises(UserError, match=key):
+        with subtests.test(key=key), pytest.raises(UserError, match=key):
             instantiate({"_target_": "fractions.Fraction", key: [3, 4]})
     assert instantiate({"_target_": "builtins.dict", "a": {"_target_": "no.such"}}, a=1) == {"a": 1}
     for node in ({}, {"_target_": 3}, {"_target_": "os.none"}, {"_target_": "x"}, {"_target_": ""}):
-        with pytest.raises(UserError):
+        with subtests.test(node=node), pytest.raises(UserError):
             instantiate(node)
 
 
-def test_text_encoders_of_models_run_no_code(attacked, bad, trained, monkeypatch):
+def test_text_encoders_of_models_run_no_code(attacked, bad, trained, monkeypatch, subtests):
     """Neither a package that is imported to look for a part of it, nor code beside a language model."""
     Path("lm").mkdir()
     for path in ("evil_package.py", "lm/evil.py"):
@@ -178,14 +181,15 @@ def test_text_encoders_of_models_run_no_code(attacked, bad, trained, monkeypatch
         {"freeze": False} | package,
         {"freeze": False},
     ):
-        condition = text | {"pooling": "mean"} | options
-        torch.save(whole | {"config": whole["config"] | {"condition": condition}}, path)
-        attacked("sample", f"ckpt={path}", TEXT)
-        attacked("sample", f"ckpt={path}", "unconditioned=true")
-        assert not Path("RAN").exists()
+        with subtests.test(options=options):
+            condition = text | {"pooling": "mean"} | options
+            torch.save(whole | {"config": whole["config"] | {"condition": condition}}, path)
+            attacked("sample", f"ckpt={path}", TEXT)
+            attacked("sample", f"ckpt={path}", "unconditioned=true")
+            assert not Path("RAN").exists()
 
 
-def test_plain_values():
+def test_plain_values(subtests):
     deep: Any = []
     for _ in range(100_000):
         deep = [deep]
@@ -199,7 +203,7 @@ def test_plain_values():
         {"a": deep},
         {"a": itself},
     ):
-        with pytest.raises(UserError, match="the file"):
+        with subtests.test(value=value), pytest.raises(UserError, match="the file"):
             plain(value, "the file")
     with pytest.raises(UserError, match=r"\$\{oc"):
         plain({"a": "${run.dir}${oc.env:HOME}"}, "x", but="${run.dir}")
@@ -360,7 +364,7 @@ def test_incomplete_checkpoints(attacked, trained, changed, bad):
     )
 
 
-def test_bombs_of_yaml(bad):
+def test_bombs_of_yaml(bad, subtests):
     """Aliases that multiply, and nesting, are cases of table specs, which are read by the same function."""
     path = bad / "config.yaml"
     for text, says in (
@@ -369,9 +373,10 @@ def test_bombs_of_yaml(bad):
         (f"{10**20}: x", "a whole number of more than 20 digits"),
         ("a: [" + "1," * 2**17 + "]", "at most 256 KiB"),
     ):
-        path.write_text(text)
-        with bounded(), pytest.raises(UserError, match=says):
-            compose(str(path))
+        with subtests.test(text=text, says=says):
+            path.write_text(text)
+            with bounded(), pytest.raises(UserError, match=says):
+                compose(str(path))
 
 
 def test_options_and_weights_of_released_models(attacked, bad):
@@ -472,7 +477,7 @@ def test_containers_are_made_of_checked_keys_only(kind, bad):
     refuses(bad / "made.ckpt", "made.ckpt: damaged")
 
 
-def test_ten_thousand_states_of_an_optimizer_are_read(bad):
+def test_ten_thousand_states_of_an_optimizer_are_read(bad, subtests):
     weights = {
         number: {"step": torch.tensor(1.0), "exp_avg": torch.zeros(2)} for number in range(10_000)
     }
@@ -482,8 +487,9 @@ def test_ten_thousand_states_of_an_optimizer_are_read(bad):
         "seed": 2**63,
     }
     for legacy in (False, True):
-        torch.save(content, bad / "large.ckpt", _use_new_zipfile_serialization=not legacy)
-        assert len(read_torch(bad / "large.ckpt")["optimizer"]["state"]) == 10_000
+        with subtests.test(legacy=legacy):
+            torch.save(content, bad / "large.ckpt", _use_new_zipfile_serialization=not legacy)
+            assert len(read_torch(bad / "large.ckpt")["optimizer"]["state"]) == 10_000
 
 
 def test_files_of_torch_with_many_members_are_refused(bad, monkeypatch):

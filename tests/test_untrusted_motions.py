@@ -219,9 +219,12 @@ def test_links_pipes_and_folders(tmp_path: Path, folder: Callable):
         refuses(shown, of_folder, path)
 
 
-def test_long_motions_are_not_resampled_without_end():
+def test_long_motions_are_not_resampled_without_end(subtests):
     for rate, fps, joints in ((0.1, 20, 22), (1, 1000, 22), (1, 20, 5000)):
-        with pytest.raises(ValueError, match="would become"):
+        with (
+            subtests.test(rate=rate, fps=fps, joints=joints),
+            pytest.raises(ValueError, match="would become"),
+        ):
             resampling.frame_pairs(10_000, rate, fps, joints)
     with pytest.raises(ValueError, match="at most 500,000"):
         resampling.frame_pairs(10**6, 120, 20, 22)

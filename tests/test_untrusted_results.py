@@ -136,7 +136,7 @@ def test_unreadable_files(attacked, bad, trained):
     attacked("compare", *words, says=f"{bad / 'texts.txt'}: ")
 
 
-def test_numbers_at_the_ends_of_the_range_are_drawn(bad):
+def test_numbers_at_the_ends_of_the_range_are_drawn(bad, subtests):
     folder = a_run(bad / "run")
     lines = [
         {"step": 0},
@@ -153,8 +153,11 @@ def test_numbers_at_the_ends_of_the_range_are_drawn(bad):
     (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     assert main(["report", str(folder)]) == 0
     for low, high in ((0, 5e-324), (5e-324, 5e-324), (1e299, 1e299), (-5e-324, 0), (5e-324, 1)):
-        points = [Series("a", [(low, low), (high, high)])]
-        assert svg("a", [Panel(points), Panel(points, from_zero=True), Panel(points, log_x=True)])
+        with subtests.test(low=low, high=high):
+            points = [Series("a", [(low, low), (high, high)])]
+            assert svg(
+                "a", [Panel(points), Panel(points, from_zero=True), Panel(points, log_x=True)]
+            )
 
 
 def test_long_names_and_many_texts(attacked, bad, tmp_path, trained, capfd):
@@ -318,7 +321,7 @@ def test_a_file_that_is_half_written_when_the_disk_is_full_leaves_the_old_one(
 HOSTILE = "x\n# Heading\n\n<b>|`[a](http://b)\r\x1b[31m\u202e\t~~_*"
 
 
-def test_tables_hold_text_not_markup_and_no_formulas():
+def test_tables_hold_text_not_markup_and_no_formulas(subtests):
     facts = {
         "device": "=HYPERLINK(1)",
         "seed": "-5",
@@ -340,7 +343,8 @@ def test_tables_hold_text_not_markup_and_no_formulas():
     assert not [line for line in text.splitlines() if re.match(r"\s*(# Heading|<b>|\|`)", line)]
     assert all(escaped in text for escaped in ("\\[a\\]", "&lt;b&gt;", "\\`"))
     for form in (text, tex, comma_separated(table)):
-        assert not re.search("[\x00-\x09\x0b-\x1f\u202e]", form)
+        with subtests.test(form=form):
+            assert not re.search("[\x00-\x09\x0b-\x1f\u202e]", form)
     assert not [line for line in tex.splitlines() if line.lstrip().startswith(("#", "<b>", "["))]
     cells = [cell for row in csv.reader(io.StringIO(comma_separated(table))) for cell in row]
     formulas = [
@@ -373,7 +377,7 @@ def test_all_that_is_printed_is_printable():
     assert wrong == [], "use errors.say"
 
 
-def test_pages_use_no_network_and_play_the_motions_not_the_pages_of_others(tmp_path):
+def test_pages_use_no_network_and_play_the_motions_not_the_pages_of_others(tmp_path, subtests):
     assert "Content-Security-Policy" in player_page([Motion(np.zeros((2, 22, 3)), 20.0, SMPL22)])
     runs = [
         motions(a_run(tmp_path / name, name=name) / "samples" / "step_0000009").parent.parent
@@ -389,10 +393,11 @@ def test_pages_use_no_network_and_play_the_motions_not_the_pages_of_others(tmp_p
         == 0
     )
     for path in (tmp_path / "out.html", tmp_path / "rate.html", report, _table(tmp_path)):
-        assert (
-            """<meta http-equiv="Content-Security-Policy" content="default-src 'none'; """
-            in path.read_text()
-        )
+        with subtests.test(path=path):
+            assert (
+                """<meta http-equiv="Content-Security-Policy" content="default-src 'none'; """
+                in path.read_text()
+            )
     assert "example.com" not in report.read_text()
     assert "a person jumps" in report.read_text()
 

@@ -30,7 +30,8 @@ class DemoSettings:
     )
     port: int = option(7860, "port to listen on; 0 = any free port")
     hosts: list[str] = option(
-        list, "names of this server, such as motion.example.org; localhost and IP addresses always work"
+        list,
+        "names of this server, such as motion.example.org; localhost and IP addresses always work",
     )
     device: str | None = option(None, "cpu or cuda; default: cuda if available")
 

@@ -54,8 +54,7 @@ def _axes(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def _limb(name: str, bone: Sequence[float] | np.ndarray, y: np.ndarray) -> dict[str, np.ndarray]:
-    """Returns the axes of a joint of the left limb, and their mirror image for the right limb, whose bone lies on -x.
-    """
+    """Returns the axes of a joint of the left limb, and, mirrored, of the right limb, whose bone lies on -x."""
     left = _axes(np.asarray(bone), y)
     return {f"{name}_L": left, f"{name}_R": np.diag([1.0, -1.0, -1.0]) @ left}
 

@@ -14,7 +14,7 @@ __version__ = "0.3.0"
 
 # Before torch is imported: a thread that waits for others spins briefly, then sleeps. By default
 # it spins much longer, and when other programs use the cores, a training step takes three to
-# twenty times as long. Without any spinning, a second thread brings nothing.
+# twenty times as long. Without any spinning, a second thread brings no speedup.
 if "OMP_WAIT_POLICY" not in os.environ:
     os.environ.setdefault("GOMP_SPINCOUNT", "2000")
 

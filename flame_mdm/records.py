@@ -29,7 +29,7 @@ class Value(Schema):
 
     @property
     def half(self) -> float | None:
-        """Half width of the 95 % interval: over replications or, of a single one, over motions; None if not known."""
+        """Half width of the 95 % interval over replications, or over motions for a single one; None if unknown."""
         if (self.replications or 0) > 1:
             return self.ci
         drawn = [value for value in self.resampled if value is not None]

@@ -99,7 +99,7 @@ def _check_written(folder: Path) -> None:
 
 
 def card(model: Mapping[str, Any], repository: str, file_sha256: str) -> str:
-    """Returns the model card of the content of a model file, with the hash of the file."""
+    """Returns the model card for the content of a model file, with the hash of the file."""
     from jinja2 import Template
 
     config, facts = model["config"], model["facts"]

@@ -99,7 +99,7 @@ SCHEMA = _object(
     sha256=_object(GRAPHS[:2], **dict.fromkeys(GRAPHS, HASH)),
     digest=HASH,
 )
-"""JSON schema of `model.json`, within the part of the language that `faults` reads. The web page has the same."""
+"""JSON schema of `model.json`, in the subset of JSON Schema that `faults` reads. The web page has the same."""
 TYPES: dict[str, type | tuple[type, ...]] = {
     "object": dict,
     "array": list,

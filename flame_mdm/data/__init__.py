@@ -119,7 +119,7 @@ class MotionSource(ABC):
         return []
 
     def may_share_captions(self, license: str) -> bool:
-        """Returns whether a checkpoint may contain the captions of a clip with this license of its own, or ""."""
+        """Returns whether a checkpoint may contain the captions of a clip with this license; "" = the data set's."""
         return self.captions_may_be_shared
 
     def licenses(self) -> set[str]:

@@ -25,8 +25,8 @@ class Mixture(MotionSource):
 
     Args:
         parts: the data sets, by a name of your choice.
-        use: what the trained model is for. "any" refuses data sets of which a motion has an
-            unknown license, or one that allows research only; "research" takes all.
+        use: what the trained model is for. "any" refuses data sets with motions whose license is unknown or allows
+            research only; "research" takes all.
     """
 
     name = "mixture"

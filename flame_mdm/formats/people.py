@@ -178,8 +178,8 @@ def _joints(heads: dict[str, np.ndarray]) -> np.ndarray:
 def _turns(joints: np.ndarray) -> np.ndarray:
     """Returns rotations (22, 3, 3) in the world from the rest pose of SMPL to joints (22, 3) in Anny's rest pose.
 
-    Pelvis, chest and head keep their direction, and feet stay level; arms are twisted so that
-    elbows bend as SMPL's.
+    Pelvis, chest and head keep their direction, and feet stay level; arms are twisted so that elbows bend like
+    SMPL's.
     """
     turns = np.tile(np.eye(3), (len(SMPL22), 1, 1))
     usual = np.array(ADULT)

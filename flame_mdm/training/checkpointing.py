@@ -151,7 +151,7 @@ def _misfits(content: dict[str, Any], optimizer: torch.optim.Optimizer) -> Itera
 
 
 def _is_alike(value: Any, usual: Any) -> bool:
-    """Returns whether a saved option of an optimizer has the kind of the usual value."""
+    """Returns whether a saved option of an optimizer has the same kind as the usual value."""
     if isinstance(usual, bool) or usual is None:
         return value is None or isinstance(value, bool)
     if isinstance(usual, int | float):

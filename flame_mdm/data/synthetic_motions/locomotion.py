@@ -24,7 +24,7 @@ Path = Callable[[np.ndarray, float], tuple[np.ndarray, np.ndarray, np.ndarray]]
 class Gait:
     """Parameters of steps, in seconds, meters and radians."""
 
-    step: float  # time from one footprint to the next, about
+    step: float  # approximate time from one footprint to the next
     # Time of a foot in the air, in steps. Above 1, both feet are in the air between two steps, as
     # in a run.
     swing: float

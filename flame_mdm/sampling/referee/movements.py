@@ -144,7 +144,7 @@ def walk(body: Body, claim: Claim) -> Reading:
 
 
 def pace(body: Body, claim: Claim) -> Reading:
-    """Measures the median speed of travel, against 1.1 m/s; slower speaks for "slow"."""
+    """Measures the median speed of travel, against 1.1 m/s; a lower speed speaks for "slow"."""
     moving = body.speed[body.speed > MOVING]
     if len(moving) < 0.4 * RATE:
         return Reading(np.nan, 0.0, "m/s", "pelvis", (), "it hardly travels")

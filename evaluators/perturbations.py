@@ -112,6 +112,27 @@ def crop(joints: Joints, percent: float) -> Joints:
     return joints[: max(3, round(len(joints) * (1 - percent / 100)))]
 
 
+def drop_repetition(joints: Joints, count: int) -> Joints:
+    """Cuts one of `count` repetitions out of a motion, which becomes shorter.
+
+    The cut joins the two frames about one period apart, by 20 % at most, whose poses are nearest. The rest moves on
+    from the place before the cut.
+    """
+    poses = joints - joints[:, :1] * GROUND
+    change = np.linalg.norm(np.diff(poses, axis=0), axis=-1).mean(1)
+    moving = np.flatnonzero(change > 0.2 * change.max())
+    first, last = int(moving[0]), int(moving[-1]) + 1
+    period = (last - first) / count
+    cuts = [
+        (float(np.linalg.norm(poses[start + length] - poses[start], axis=-1).mean()), start, length)
+        for length in range(max(1, round(0.8 * period)), round(1.2 * period) + 1)
+        for start in range(first, last - length + 1)
+    ]
+    _, start, length = min(cuts)
+    rest = joints[start + length :]
+    return np.concatenate([joints[:start], rest + (joints[start, 0] - rest[0, 0]) * GROUND])
+
+
 def continue_with(joints: Joints, other: Joints, fps: float) -> Joints:
     """Replaces the second half by the second half of another motion, from the same place.
 
@@ -241,6 +262,15 @@ class ReplacedShare(ChangedSet):
 
 
 @dataclass(frozen=True)
+class DroppedRepetition(ReplacedShare):
+    """Cuts one repetition out of a share of the motions; motions without repetitions stay as they are."""
+
+    def offered(self, scene: Scene, captioned: bool) -> Sequence[Perturbation]:
+        """Returns the perturbation if a motion has repetitions."""
+        return [self] if any(repetitions(row) > 1 for row in scene.rows) else []
+
+
+@dataclass(frozen=True)
 class ReplacedCaptions(Perturbation):
     """Replaces a share of the captions by wrong ones of the kind `name` in `Scene.wrong`, in percent."""
 
@@ -327,6 +357,20 @@ def _reversed(scene: Scene) -> list[np.ndarray]:
     return encode(scene.representation, [x[::-1].copy() for x in scene.joints])
 
 
+def repetitions(row: DrawnClip) -> int:
+    """Returns the number of repetitions that the data set states for a clip; 1 if it states none."""
+    count = row.clip.attributes.get("count", 1)
+    return count if isinstance(count, int) else 1
+
+
+def _with_a_repetition_less(scene: Scene) -> list[np.ndarray]:
+    shorter = [
+        drop_repetition(joints, repetitions(row)) if repetitions(row) > 1 else joints
+        for row, joints in zip(scene.rows, scene.joints, strict=True)
+    ]
+    return encode(scene.representation, shorter)
+
+
 def _other_half(scene: Scene) -> list[np.ndarray]:
     order = scene.draws("other half").permutation(len(scene))
     other = dict(zip(order.tolist(), np.roll(order, 1).tolist(), strict=True))
@@ -402,6 +446,9 @@ PERTURBATIONS: list[Perturbation] = [
     ChangedJoints("slower", "meaning", "played at this speed", "x", (0.9, 0.75, 0.5), play, ["fps"]),
     ChangedJoints("faster", "meaning", "played at this speed", "x", (1.1, 1.25, 1.5, 2), play, ["fps"]),
     ChangedJoints("frozen", "meaning", "held up to the end", "% of time", (10, 25, 50, 75, 100), freeze),
+    DroppedRepetition(
+        "dropped repetition", "meaning", "one repetition less, of those with several", make=_with_a_repetition_less
+    ),
     ReplacedShare("other half", "meaning", "second half of another motion", make=_other_half),
     ReplacedCaptions(RANDOM, "meaning", "captions of random other motions"),
     ReplacedCaptions(NEAR, "meaning", "captions wrong in one attribute"),

@@ -11,6 +11,7 @@ from support.motions import Page, posed, synthetic
 
 import flame_mdm
 from evaluators.metrics.claims import ClaimAccuracy
+from evaluators.perturbations import drop_repetition
 from flame_mdm.__main__ import main
 from flame_mdm.errors import UserError
 from flame_mdm.formats.motion import Motion
@@ -45,6 +46,16 @@ FPS = 20.0
         ("the man takes four steps forward", ["step", "step: forward", "count steps: 4"]),
         ("a person waves with their right hand", ["use hand: right"]),
         ("stands still with crossed arms", ["stand still", "arms crossed"]),
+        ("a man starts standing and ends seated", ["upright: at the start", "sit", "sit: at the end"]),
+        ("jumps and ends with the right arm up", ["jump", "raise hand: right, at the end"]),
+        ("begins by walking, finally jumps", ["walk", "walk: at the start", "jump", "jump: at the end"]),
+        ("someone starts to walk", ["walk"]),
+        ("squats and returns to a standing position", ["crouch", "upright: at the end"]),
+        ("a man returns to the starting pose", ["return pose"]),
+        ("walks back to where he started", ["walk", "return place"]),
+        ("stands still for about five seconds", ["stand still", "stand still: for 5 s"]),
+        ("dances kicking his legs", ["kick"]),
+        ("holds still for a moment at the end of the road", []),
     ],
 )  # fmt: skip
 def test_a_sentence_is_read_as_claims(text, claims):
@@ -87,6 +98,13 @@ def test_a_falsified_claim_differs_in_one_attribute():
         ("count", "count kicks: left, 1"),
         ("count", "count kicks: left, 3"),
     }
+    lasting = falsified(Claim("walk", seconds=4))
+    assert [str(other) for _, other in lasting] == ["walk: for 8 s", "walk: for 2 s"]
+    seated = {(change, str(other)) for change, other in falsified(Claim("sit", when="end"))}
+    assert seated == {
+        ("posture", "upright: at the end"),
+        ("start or end", "sit: at the start"),
+    }
     order = Claim("order", parts=(Claim("sit"), Claim("jump")))
     assert [str(other) for _, other in falsified(order)] == ["jump, then sit"]
 
@@ -115,6 +133,18 @@ def raising(side: str, frames: int = 60) -> Motion:
         f"{other}_shoulder": np.stack([zero, zero, -sign * (-75 + zero)], 1),
     }
     return posed(frames, **turns)
+
+
+def holding(seconds: float, until_end: bool = False) -> Motion:
+    """A body that raises the left arm after a second, and holds it."""
+    rise = np.linspace(0, 1, 6)
+    parts = [np.zeros(20), rise, np.ones(round(seconds * FPS))]
+    swing = np.concatenate(parts if until_end else [*parts, rise[::-1], np.zeros(20)])
+    zero = 0 * swing
+    left = np.stack([zero, zero, -75 + 155 * swing], 1)
+    return posed(
+        len(swing), left_shoulder=left, right_shoulder=np.stack([zero, zero, 75 + zero], 1)
+    )
 
 
 def answers(motion: Motion, text: str) -> dict[str, str]:
@@ -161,6 +191,8 @@ SENTENCES = (
     "a person jumps twice, crouches and sits down",
     "a person takes four steps forward and bends over",
     "a person lies down with crossed arms on all fours",
+    "a person starts standing and ends with the left arm raised",
+    "a person walks for two seconds and returns to the starting pose",
 )
 
 
@@ -231,6 +263,20 @@ def test_mirroring_reversal_freezing_and_a_dropped_repetition_are_noticed():
     assert answers(raised, "raises the left arm twice")[claim] == "no"
 
 
+@pytest.mark.parametrize("count", [2, 3])
+def test_the_perturbation_of_an_audit_drops_one_repetition(count):
+    pause = np.repeat(raising("left").joints[:1], 10, 0)
+    parts = [raising("left", 40).joints] * count
+    joints = np.concatenate([pause, *parts, pause])
+    fewer = drop_repetition(joints, count)
+    assert 0.7 * 40 < len(joints) - len(fewer) < 1.3 * 40
+    for repeated, number in ((joints, count), (fewer, count - 1)):
+        (verdict,) = verdicts(repeated, FPS, [Claim("count raises", side="left", amount=number)])
+        assert verdict.answer == "yes"
+    largest_step = np.abs(np.diff(joints, axis=0)).max()
+    assert np.abs(np.diff(fewer, axis=0)).max() < 2 * largest_step
+
+
 def test_an_order_is_right_in_one_direction_only():
     raised, jump = raising("left"), synthetic("jump")
     parts = []
@@ -242,6 +288,48 @@ def test_an_order_is_right_in_one_direction_only():
     assert answers(joined, text)["raise hand: left, then jump"] == "yes"
     text = "a person jumps, then raises the left arm"
     assert answers(joined, text)["jump, then raise hand: left"] == "no"
+
+
+@pytest.mark.parametrize("seconds", [2, 4])
+def test_a_duration_is_true_for_its_own_seconds_alone(seconds):
+    motion = holding(seconds)
+    for claimed, answer in ((seconds, "yes"), (2 * seconds, "no"), (seconds // 2, "no")):
+        text = f"raises the left arm for {claimed} seconds"
+        assert answers(motion, text)[f"raise hand: left, for {claimed} s"] == answer
+    assert "2 s" in str(Claim("sit", seconds=2))
+
+
+def test_the_start_is_told_from_the_end():
+    motion = holding(1, until_end=True)
+    backward = Motion(motion.joints[::-1], FPS)
+    image = Motion(SMPL22.mirror(torch.from_numpy(motion.joints)).numpy(), FPS)
+    for when, other in (("start", "end"), ("end", "start")):
+        text = f"a person {when}s with the left arm raised"
+        claim = f"raise hand: left, at the {when}"
+        right, wrong = (motion, backward) if when == "end" else (backward, motion)
+        assert answers(right, text)[claim] == "yes"
+        assert answers(wrong, text)[claim] == "no"
+        assert answers(image, text)[claim] == "no"
+        ((first, last),) = flame_mdm.judge(right, text).verdicts[0].reading.spans
+        assert (first == 0) == (when == "start"), other
+        assert last - first == pytest.approx(0.6)
+    always = Motion(np.repeat(motion.joints[-1:], 60, 0), FPS)
+    assert answers(always, text)[claim] == "cannot tell"
+
+
+def test_a_body_that_walks_off_has_not_returned_to_its_start():
+    motion = holding(1)
+    assert answers(motion, "returns to the starting pose")["return pose"] == "yes"
+    risen = holding(1, until_end=True)
+    assert answers(risen, "returns to the starting pose")["return pose"] == "no"
+    seconds = np.arange(len(motion.joints))[:, None, None] / FPS
+    away = Motion(motion.joints + seconds * np.array([0.0, 0.0, 1.2]), FPS)
+    there = np.minimum(seconds, seconds[::-1])
+    back = Motion(motion.joints + there * np.array([0.0, 0.0, 1.2]), FPS)
+    text = "walks back to where he started"
+    assert answers(away, text)["return place"] == "no"
+    assert answers(back, text)["return place"] == "yes"
+    assert answers(motion, text)["return place"] == "cannot tell"
 
 
 def test_the_metric_counts_true_and_decided_claims():

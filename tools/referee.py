@@ -5,17 +5,23 @@
 docs/benchmarks/referee_calibration.json holds the figures of this repository, and `tools/referee_page.py` shows them.
 
 Takes prepared data sets on SMPL's 22 joints. Recordings are split in two halves by a hash of their names: thresholds
-come from one half, figures from the other. Procedural motions set no thresholds, their figures are separate.
+come from one half, figures from the other. Sums over both halves are "crossed": each half is judged with thresholds of
+the other one. Procedural motions set no thresholds, their figures are separate.
 
 A claim of a caption is taken to be true of its motion, and a falsified claim (another side, direction or speed, one
-repetition more or fewer, the reverse order) to be false. Captions are sometimes wrong, which the figures include.
+repetition more or fewer, the reverse order, another duration, the other end of the motion) to be false. Captions are
+sometimes wrong, which the figures include.
+
+Captions hardly state durations. A recording whose captions state nothing but that the body walks, runs or stands still
+is cut to two, three and four seconds, so that "for three seconds" is true of it. A body that walks is taken to stand at
+the start and at the end. Claims about durations and ends set no thresholds.
 """
 
 import re
 import sys
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +33,7 @@ from flame_mdm.config import EXPERIMENTS, instantiate
 from flame_mdm.data.store import Store
 from flame_mdm.safe_io import read_yaml, write_json, write_text
 from flame_mdm.sampling.referee import kinds
-from flame_mdm.sampling.referee.body import Body
+from flame_mdm.sampling.referee.body import RATE, Body
 from flame_mdm.sampling.referee.claims import Claim, falsified
 from flame_mdm.sampling.referee.judging import decide
 from flame_mdm.sampling.referee.sentences import read_claims
@@ -38,6 +44,10 @@ FEWEST = 10  # claims from which thresholds are calibrated
 MOST_REFUSED = 0.015  # share of true claims of the first half that may be judged false
 LEAST_REFUSED = 0.95  # share of decided falsified claims of the first half to be judged false
 SYNTHETIC = "synthetic"
+UNCALIBRATED = ("count", "duration", "start", "end")
+LASTING = ("walk", "run", "stand still")
+BESIDE = {"travel", "veer", "pace"}
+"""Claims beside which a body may walk or run from the first to the last frame."""
 MOST_SYNTHETIC = 600  # procedural motions, of the test split
 HEAD = """# Thresholds of the referee by kind of claim, written by `tools/referee.py`: the score up to which a claim is
 # false, the score from which it is true, and the numbers of true and falsified claims that they come from. The units
@@ -58,21 +68,28 @@ class Example:
 
 @dataclass(frozen=True)
 class Case:
-    """A claim about a motion, and what was changed in it: "" = nothing, so that it is true."""
+    """A claim about a motion, and what was changed in it: "" = nothing, so that it is true.
+
+    `is_built` says that the claim is from `built_cases`, not from a caption.
+    """
 
     example: Example
     claim: Claim
     change: str
+    is_built: bool = False
 
 
 def main(folders: Sequence[Path], figures: Path | None) -> None:
     examples = [example for folder in folders for example in read(folder)]
     cases = [case for example in examples for case in cases_of(example)]
-    calibrate([case for case in cases if case.example.half == 0])
-    kinds.thresholds.cache_clear()
-
-    held_out = [case for case in cases if case.example.half == 1]
-    rows = tally(held_out)
+    cases += [case for example in examples for case in built_cases(example)]
+    halves = [[case for case in cases if case.example.half == half] for half in (0, 1)]
+    # The last calibration is the one that stays
+    calibrate(halves[1])
+    other = tally(halves[0])
+    calibrate(halves[0])
+    rows = tally(halves[1])
+    rows += crossed(rows, other)
     rows += [{"set": name, **coverage(group)} for name, group in by_set(examples).items()]
     if figures is not None:
         write_json(figures, {"format": 1, "rows": rows})
@@ -121,13 +138,42 @@ def cases_of(example: Example) -> list[Case]:
     return cases
 
 
+def built_cases(example: Example) -> list[Case]:
+    """Returns claims about durations, the start and the end that are true by construction, and falsified ones."""
+    if example.dataset == SYNTHETIC:
+        return []
+    sets = [{claim.kind for claim in read_claims(text)} for text in example.captions]
+    stated = set[str]().union(*sets)
+    built: list[tuple[Example, Claim]] = []
+    base = next((kind for kind in LASTING if kind in stated and stated <= {kind, *BESIDE}), None)
+    for seconds in (2, 3, 4):
+        if base is not None and example.body.seconds >= seconds + 0.5:
+            built.append((cut(example, seconds), Claim(base, seconds=seconds)))
+    if "walk" in stated and stated <= {"walk", "turn", "turn angle", *BESIDE}:
+        built += [(example, Claim("upright", when=when)) for when in ("start", "end")]
+    return [
+        Case(body, claim, change, is_built=True)
+        for body, true in built
+        for change, claim in [("", true), *falsified(true)]
+    ]
+
+
+def cut(example: Example, seconds: int) -> Example:
+    """Returns the middle of a motion."""
+    body = example.body
+    frames = round(seconds * RATE)
+    first = (len(body) - frames) // 2
+    joints = body.joints[first : first + frames] / body.scale
+    return replace(example, body=Body(joints, RATE))
+
+
 def calibrate(cases: Sequence[Case]) -> None:
     """Writes the thresholds of all kinds for which there are enough claims."""
     kinds.FILE.unlink(missing_ok=True)
     kinds.thresholds.cache_clear()
     scores: defaultdict[str, tuple[list[float], list[float]]] = defaultdict(lambda: ([], []))
     for case in cases:
-        if case.claim.parts or kinds.group_of(case.claim) == "count":
+        if case.claim.parts or kinds.group_of(case.claim) in UNCALIBRATED:
             continue
         verdict = decide(case.example.body, case.claim)
         if case.change or not verdict.reading.unclear:
@@ -144,6 +190,7 @@ def calibrate(cases: Sequence[Case]) -> None:
             thresholds[name] = {"no": no, "yes": yes, "true": len(true), "falsified": len(wrong)}
     text = yaml.safe_dump({"thresholds": thresholds}, sort_keys=True, default_flow_style=None)
     write_text(kinds.FILE, HEAD + text)
+    kinds.thresholds.cache_clear()
 
 
 def chosen(true: np.ndarray, wrong: np.ndarray, no: float, yes: float) -> tuple[float, float]:
@@ -180,13 +227,38 @@ def tally(cases: Sequence[Case]) -> list[dict[str, Any]]:
             (case.example.dataset, verdict.group),
             (case.example.dataset, "all"),
             *([("real", verdict.group), ("real", "all")] if is_real else []),
-            *([("real", f"kind {case.claim.kind}")] if is_real else []),
+            *([("real", f"kind {name_of(case.claim)}")] if is_real else []),
         ]
+        if case.is_built:
+            named = [("built", f"{case.claim.kind}, {verdict.group}"), ("built", "all")]
         for name in named:
             counts[name][side] += 1
             counts[name][f"{side}_decided"] += verdict.answer != "cannot tell"
             counts[name][f"{side}_right"] += verdict.answer == right
     return [{"set": name, "group": group, **row} for (name, group), row in sorted(counts.items())]
+
+
+def name_of(claim: Claim) -> str:
+    """Returns the kind of a claim, and whether it is about a duration, the start or the end."""
+    if claim.seconds is not None:
+        return f"{claim.kind}, duration"
+    return f"{claim.kind}, {claim.when}" if claim.when else claim.kind
+
+
+def crossed(
+    rows: Sequence[dict[str, Any]], other: Sequence[dict[str, Any]]
+) -> list[dict[str, Any]]:
+    """Returns the sums of `tally` over both halves, each with the thresholds of the other one."""
+    sums: defaultdict[tuple[str, str], dict[str, int]] = defaultdict(lambda: defaultdict(int))
+    for row in (*rows, *other):
+        for name, value in row.items():
+            if isinstance(value, int):
+                sums[row["set"], row["group"]][name] += value
+    return [
+        {"set": f"{name}, crossed", "group": group, **row}
+        for (name, group), row in sorted(sums.items())
+        if group == "all"
+    ]
 
 
 def by_set(examples: Sequence[Example]) -> dict[str, list[Example]]:

@@ -4,12 +4,25 @@ python tools/referee_page.py
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 FOLDER = Path(__file__).resolve().parents[1] / "docs" / "benchmarks"
-GROUPS = ("movement", "direction", "side", "count", "speed", "posture", "contact", "order", "all")
+GROUPS = (
+    "movement",
+    "direction",
+    "side",
+    "count",
+    "speed",
+    "posture",
+    "contact",
+    "order",
+    "duration",
+    "start",
+    "end",
+    "all",
+)
 SETS = {"cmu": "CMU", "package": "free motion capture", "bandai": "Bandai-Namco", "synthetic": "synthetic"}  # fmt: skip
 INTRODUCTION = """# The referee, measured
 
@@ -19,9 +32,11 @@ this folder.
 ## Right verdicts on real motions
 
 Thresholds come from one half of the recordings, these figures from the other half. A claim of a caption is taken to be
-true of its motion. A falsified claim states the other side, direction or speed, one repetition more or fewer, or the
-reverse order, and is taken to be false. Wrong captions count as errors. Patterns and measurements were corrected while
-the errors on both halves were known, so that the figures are optimistic for other data.
+true of its motion. A falsified claim states the other side, direction or speed, one repetition more or fewer, the
+reverse order, another duration, or the other end of the motion, and is taken to be false. Wrong captions count as
+errors. Patterns and measurements were corrected while the errors on both halves were known, so that the figures are
+optimistic for other data. The last correction concerns CMU: "kicking his legs" was read as both legs at the same time,
+which made one of 30 decided claims false (96.7 %). It was corrected after it had been seen.
 
 CMU's captions come from HumanML3D's test split and from KIT-ML, for the recordings at hand. Bandai-Namco's captions
 are templates of its labels, so that its many clips have few different sentences. Read the sets one by one.
@@ -69,7 +84,10 @@ def calibration_tables(rows: list[dict[str, Any]]) -> list[str]:
             count = row["captions"]
             claim, decided = (100 * row[name] / count for name in ("with_claim", "with_decided"))
             lines.append(f"| {SETS[row['set']]} | {count} | {claim:.0f} % | {decided:.0f} % |")
-    kinds = [row for row in rows if row.get("group", "").startswith("kind ")]
+    lines += crossed_table(by_name)
+    lines += built_table(rows)
+    kinds = [row for row in rows if row["set"] == "real" and row["group"].startswith("kind ")]
+    lines += below_the_targets(kinds)
     lines += ["", "By kind, over all real sets:", ""]
     lines += [
         "| kind | true claims judged true | falsified claims judged false |",
@@ -82,14 +100,83 @@ def calibration_tables(rows: list[dict[str, Any]]) -> list[str]:
     return lines
 
 
+def crossed_table(by_name: Mapping[tuple[str, str], dict[str, Any]]) -> list[str]:
+    """Returns the figures over both halves of the recordings, each with the thresholds of the other half."""
+    lines = [
+        "",
+        "Both halves of the recordings, each judged with thresholds from the other half:",
+        "",
+    ]
+    lines += [
+        "| set | true claims judged true | falsified claims judged false |",
+        "|---|---:|---:|",
+    ]
+    for name, title in {"real": "all real sets", **SETS}.items():
+        row = by_name[f"{name}, crossed", "all"]
+        if name != "synthetic":
+            lines.append(f"| {title} | {both_shares(row)} |")
+    lines += [
+        "",
+        "CMU's figures are below the targets. Three of its four falsified claims that are not judged false state the",
+        "other direction of motions that go both ways; the fourth is about squats, of which the referee counts two",
+        "where the caption states three. True claims that are judged false: these squats, and a jog in place.",
+    ]
+    return lines
+
+
+def built_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Returns the figures of claims about durations and ends that are true by construction."""
+    lines = [
+        "",
+        "Captions hardly state a duration, a start or an end. These claims are built, not written by people: a",
+        "recording whose captions state nothing but that the body walks, runs or stands still is cut to two, three and",
+        "four seconds, and falsified claims state twice or half of the duration. A body that walks stands at the start",
+        "and at the end, and it does not lie there. The claims are not in the other tables.",
+        "",
+        "| claim | true claims judged true | falsified claims judged false |",
+        "|---|---:|---:|",
+    ]
+    names = {"upright": "stands", "lie": "lies (false)"}
+    for row in rows:
+        if row["set"] == "built":
+            kind, _, group = row["group"].partition(", ")
+            claim = f"{names.get(kind, kind)}, {group}" if group else kind
+            lines.append(f"| {claim} | {both_shares(row)} |")
+    return lines
+
+
+def below_the_targets(kinds: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Returns the kinds of which fewer than 97 % of true, or 90 % of falsified claims, are judged rightly."""
+    missed = [
+        f"{row['group'].removeprefix('kind ')} ({side}: {share(right, decided)})"
+        for row in kinds
+        for side, least in (("true", 0.97), ("falsified", 0.9))
+        for prefix in (side.replace("falsified", "false"),)
+        for right, decided in ((row[f"{prefix}_right"], row[f"{prefix}_decided"]),)
+        if decided and right < least * decided
+    ]
+    return [
+        "",
+        f"Below the targets of 97 % of true claims and 90 % of falsified claims: {', '.join(missed)}.",
+    ]
+
+
+def both_shares(row: Mapping[str, Any]) -> str:
+    """Returns two cells: true claims judged true, and falsified claims judged false."""
+    true = share(row["true_right"], row["true_decided"])
+    return f"{true} | {share(row['false_right'], row['false_decided'])}"
+
+
 def systems_table(content: Mapping[str, Any]) -> list[str]:
     lines = ["", "## Systems", ""]
     both = sum(row["top3"] is not None for row in content["rows"])
     lines += [
         "Shares of decided claims that are true, and R-precision (`MotionsForText`, top 3, motion-CLIP of the",
         f"package) on the same motions, at most {content['motions']} per row. Over the {both} rows that have both,",
-        f"the rank correlation is {content['rank_correlation']:.2f}. FLAME, MDM, MFM and DiP on Bandai-Namco and",
-        "CMU have no row: no checkpoints were at hand.",
+        f"the rank correlation is {content['rank_correlation']:.2f}. Motions of models are at most three seconds",
+        "long, which is too short for some turns. The model on Bandai-Namco is small and was trained for eleven",
+        "minutes on one thread. A model on CMU has no row: the recordings at hand have only 23 clips to train on.",
+        "FLAME, MFM and DiP have no row: no checkpoints were at hand.",
     ]
     groups = ("all", "side", "direction", "count", "movement", "posture", "contact")
     lines += ["", f"| data | motions | {' | '.join(groups)} | decided | R-precision |"]

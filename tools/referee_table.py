@@ -1,10 +1,10 @@
 """Compares systems by the referee and by R-precision: writes docs/benchmarks/referee_systems.json.
 
-    python tools/referee_table.py [data/bandai-humanml-clean-smpl22 ...]
+    python tools/referee_table.py [data/bandai-humanml-clean-smpl22 ... runs/bandai/mdm_small/default ...]
 
 On clips of the synthetic test split: motions of the package's model, the real motions, their mirror images, and real
 motions with the captions of others. R-precision is `MotionsForText` with the package's motion-CLIP. Prepared data sets
-on SMPL's 22 joints are added without a model and without R-precision.
+on SMPL's 22 joints are added without R-precision, and runs trained on them as rows of models.
 """
 
 import sys
@@ -52,12 +52,19 @@ def main(folders: Sequence[Path]) -> None:
         {"data": "synthetic", "system": name, **measured(ids, *motions, extractor)}
         for name, motions in sets.items()
     ]
+    runs = [folder for folder in folders if not (folder / "store.json").exists()]
     for folder in folders:
+        if folder in runs:
+            continue
         ids, joints, captions = stored(folder)
         name = folder.name.partition("-")[0]
+        sets = {
+            label(run): (sampled(run, joints, captions), captions) for run in runs_of(name, runs)
+        }
+        sets |= baselines(joints, captions)
         rows += [
             {"data": name, "system": system, **measured(ids, *motions, None)}
-            for system, motions in baselines(joints, captions).items()
+            for system, motions in sets.items()
         ]
     both = [row for row in rows if row["top3"] is not None]
     pairs = [(row["claims"]["all"], row["top3"]) for row in both]
@@ -89,6 +96,25 @@ def stored(folder: Path) -> tuple[list[str], list[np.ndarray], list[str]]:
         representation.decode(torch.from_numpy(store.motion(clip).copy())).numpy() for clip in clips
     ]
     return [clip.id for clip in clips], motions, [clip.captions[0] for clip in clips]
+
+
+def runs_of(name: str, runs: Sequence[Path]) -> list[Path]:
+    """Returns the runs that were trained on a data set."""
+    return [run for run in runs if read_yaml(run / "config.yaml")["data"]["name"] == name]
+
+
+def label(run: Path) -> str:
+    """Returns the recipe of a run, and its number of steps."""
+    config = read_yaml(run / "config.yaml")
+    return f"{config['experiment']}, {config['trainer']['max_steps']} steps"
+
+
+def sampled(run: Path, joints: Joints, captions: Sequence[str]) -> list[np.ndarray]:
+    """Returns motions (F, 22, 3) of a run for captions, each as long as a motion, up to `LONGEST` seconds."""
+    seconds = [min(LONGEST, len(motion) / FPS) for motion in joints]
+    model = flame_mdm.load(run)
+    motions = flame_mdm.generate(model, captions, seconds=seconds, seed=0, split=False)
+    return [motion.joints for motion in motions]
 
 
 def baselines(joints: Joints, captions: list[str]) -> Mapping[str, tuple[Joints, list[str]]]:

@@ -11,6 +11,9 @@ MIRRORED = {
 }
 FLIPPED = {**MIRRORED, "forward": "backward", "backward": "forward"}
 FLIPPED_SPEED = {"slow": "fast", "fast": "slow"}
+FLIPPED_END = {"start": "end", "end": "start"}
+EXCLUDED = {"upright": "lie", "sit": "upright", "kneel": "upright", "lie": "upright"}
+"""Posture -> a posture that a body cannot have at the same time."""
 
 
 @dataclass(frozen=True)
@@ -24,6 +27,8 @@ class Claim:
         direction: "forward", "backward", "left", "right", "clockwise" or "counterclockwise"; "" = any.
         speed: "slow" or "fast"; "" = any.
         amount: number of repetitions or steps, or angle of a turn in degrees; None = not stated.
+        when: "start" or "end" of the motion, if it is claimed to be so there; "" = at any time.
+        seconds: how long it lasts; None = not stated.
         parts: the two claims of an order, the first one first.
     """
 
@@ -33,13 +38,17 @@ class Claim:
     direction: str = ""
     speed: str = ""
     amount: int | None = None
+    when: str = ""
+    seconds: int | None = None
     parts: tuple["Claim", ...] = ()
 
     def __str__(self) -> str:
         if self.parts:
             return f"{self.parts[0]}, then {self.parts[1]}"
         amount = "" if self.amount is None else str(self.amount)
-        values = (self.side, self.direction, self.speed, amount)
+        seconds = "" if self.seconds is None else f"for {self.seconds} s"
+        when = f"at the {self.when}" if self.when else ""
+        values = (self.side, self.direction, self.speed, amount, when, seconds)
         stated = ", ".join(value for value in values if value)
         return f"{self.kind}: {stated}" if stated else self.kind
 
@@ -57,7 +66,8 @@ class Claim:
 def falsified(claim: Claim) -> list[tuple[str, Claim]]:
     """Returns claims that are wrong if `claim` is right, and what was changed in each.
 
-    The changes are "side", "direction", "speed", "count" (one more, and one fewer) and "order".
+    The changes are "side", "direction", "speed", "count" (one more, and one fewer), "duration" (twice and half of
+    it), "start or end" (the other one), "posture" (one that excludes the claimed one at that time) and "order".
     """
     if claim.parts:
         return [("order", replace(claim, parts=claim.parts[::-1]))]
@@ -71,6 +81,14 @@ def falsified(claim: Claim) -> list[tuple[str, Claim]]:
     if claim.amount is not None and claim.kind.startswith("count"):
         counts = (claim.amount - 1, claim.amount + 1)
         wrong += [("count", replace(claim, amount=count)) for count in counts if count > 0]
+    if claim.seconds is not None:
+        durations = (claim.seconds * 2, claim.seconds // 2)
+        wrong += [("duration", replace(claim, seconds=value)) for value in durations if value > 0]
+    if claim.when and claim.kind in EXCLUDED:
+        wrong.append(("posture", replace(claim, kind=EXCLUDED[claim.kind])))
+    # A body stands at both ends of most motions
+    if claim.when and claim.kind not in ("upright", "return pose", "return place"):
+        wrong.append(("start or end", replace(claim, when=FLIPPED_END[claim.when])))
     return wrong
 
 

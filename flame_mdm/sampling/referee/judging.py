@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -11,13 +11,16 @@ from flame_mdm.errors import UserError, shortened
 from flame_mdm.formats.motion import Motion
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.sampling.referee.body import RATE, Body
-from flame_mdm.sampling.referee.claims import Claim
+from flame_mdm.sampling.referee.claims import FLIPPED_END, Claim
 from flame_mdm.sampling.referee.kinds import KINDS, band, group_of
-from flame_mdm.sampling.referee.readings import Reading
+from flame_mdm.sampling.referee.readings import AWAY, Reading, held, spans_of
 from flame_mdm.sampling.referee.sentences import read_claims
 
 Answer = Literal["yes", "no", "cannot tell"]
 SHORTEST = 0.4  # seconds of the shortest motion that is judged
+END = 0.6  # seconds of the start and of the end, in which a posture is looked for
+HELD = 0.2  # seconds for which the posture is held there
+BREAK = 0.5  # the longest break of something that lasts, in seconds
 
 
 @dataclass(frozen=True)
@@ -167,7 +170,14 @@ def verdicts(joints: np.ndarray, fps: float, claims: Sequence[Claim]) -> list[Ve
 
 def decide(body: Body, claim: Claim) -> Verdict:
     """Returns the verdict on a claim about a body."""
-    reading = _order(body, claim) if claim.parts else KINDS[claim.kind].measure(body, claim)
+    if claim.parts:
+        reading = _order(body, claim)
+    elif claim.seconds is not None:
+        reading = _duration(body, claim)
+    elif claim.when:
+        reading = _at_an_end(body, claim)
+    else:
+        reading = KINDS[claim.kind].measure(body, claim)
     no, yes = band(claim)
     answer: Answer = "cannot tell"
     if reading.score <= no:
@@ -194,3 +204,53 @@ def _order(body: Body, claim: Claim) -> Reading:
         second.reading.spans[seconds.index(max(seconds))],
     )
     return Reading(later, later, "s later", "body", spans, unclear)
+
+
+def _at_an_end(body: Body, claim: Claim) -> Reading:
+    """Measures a claim at the start or the end: postures and contacts in `END` seconds, movements in half the motion.
+
+    It is unclear if the other end shows the same, except for standing, which is usual at both ends.
+    """
+    kind = KINDS[claim.kind]
+    reading = kind.measure(body, replace(claim, when=""))
+    if reading.signal is None:
+        return reading
+    width = max(1, len(body) // 2)
+    if kind.group in ("posture", "contact"):
+        width = min(width, round(END * RATE))
+    parts = {"start": reading.signal[:width], "end": reading.signal[-width:]}
+    score = held(parts[claim.when], HELD)
+    other = held(parts[FLIPPED_END[claim.when]], HELD)
+    unclear = reading.unclear
+    if claim.kind != "upright" and other >= sum(band(claim)) / 2:
+        unclear = "the other end of the motion shows the same"
+    seconds = width / RATE
+    span = (0.0, seconds) if claim.when == "start" else (body.seconds - seconds, body.seconds)
+    number = -score if reading.unit.startswith(AWAY) else score
+    return replace(reading, score=score, number=number, spans=(span,), unclear=unclear)
+
+
+def _duration(body: Body, claim: Claim) -> Reading:
+    """Measures how long a claim is true without a break of more than `BREAK` seconds.
+
+    The score is minus the difference from the claimed seconds, in doublings. It is undecided unless the claim without
+    its duration is true.
+    """
+    verdict = decide(body, replace(claim, seconds=None))
+    reading = verdict.reading
+    undecided = Reading(math.nan, 0.0, "s", reading.joint, (), "it is not clearly there")
+    if verdict.answer != "yes" or reading.signal is None or claim.seconds is None:
+        return undecided
+    level = sum(verdict.band) / 2 if reading.level is None else reading.level
+    joined: list[tuple[float, float]] = []
+    for start, end in spans_of(reading.signal >= level, 0.1):
+        if joined and start - joined[-1][1] <= BREAK:
+            joined[-1] = (joined[-1][0], end)
+        else:
+            joined.append((start, end))
+    if not joined:
+        return undecided
+    longest = max(joined, key=lambda span: span[1] - span[0])
+    lasting = longest[1] - longest[0]
+    score = -abs(math.log2(lasting / claim.seconds))
+    return Reading(score, lasting, "s", reading.joint, (longest,))

@@ -18,8 +18,21 @@ from flame_mdm.sampling.referee.claims import Claim
 from flame_mdm.sampling.referee.readings import Reading
 
 FILE = Path(__file__).with_name("thresholds.yaml")
-GROUPS = ("movement", "direction", "side", "count", "speed", "posture", "contact", "order")
+GROUPS = (
+    "movement",
+    "direction",
+    "side",
+    "count",
+    "speed",
+    "posture",
+    "contact",
+    "order",
+    "duration",
+    "start",
+    "end",
+)
 ORDER = "order"
+DURATION = (-0.7, -0.4)  # band of the score of a duration, in doublings of the claimed seconds
 
 
 @dataclass(frozen=True)
@@ -27,7 +40,8 @@ class Kind:
     """A kind of claims.
 
     Attributes:
-        group: what it is about, one of `GROUPS`. A claim with a side, a direction or a speed is in that group instead.
+        group: what it is about, one of `GROUPS`. A claim about a start, an end, a duration, a side, a direction or a
+            speed is in that group instead.
         measure: function of a body and the claim.
         no, yes: scores up to which a claim is false, and from which it is true, by hand; in between, it is undecided.
         is_timed: whether the reading's spans say when it happens, so that an order can be read from them.
@@ -71,6 +85,9 @@ KINDS: dict[str, Kind] = {
     "stand up": Kind("posture", postures.stand_up, 0.1, 0.25),
     "get down": Kind("posture", postures.get_down, 0.1, 0.25),
     "stand still": Kind("posture", postures.stand_still, -0.8, -0.35, is_timed=False),
+    "upright": Kind("posture", postures.upright, 0.66, 0.76),
+    "return pose": Kind("end", postures.return_pose, -0.45, -0.2, is_timed=False),
+    "return place": Kind("end", postures.return_place, -0.6, -0.3, is_timed=False),
     # contact and height
     "raise hand": Kind("contact", postures.raise_hand, -0.3, 0.0),
     "hand above head": Kind("contact", postures.hand_above_head, -0.3, -0.05),
@@ -106,6 +123,10 @@ def group_of(claim: Claim) -> str:
     """Returns what a claim is about, one of `GROUPS`."""
     if claim.parts:
         return ORDER
+    if claim.seconds is not None:
+        return "duration"
+    if claim.when:
+        return claim.when
     kind = KINDS[claim.kind]
     if kind.group == "count":
         return "count"
@@ -134,7 +155,12 @@ def thresholds() -> dict[str, Any]:
 
 
 def band(claim: Claim) -> tuple[float, float]:
-    """Returns the score up to which a claim is false, and from which it is true."""
+    """Returns the score up to which a claim is false, and from which it is true.
+
+    A start and an end have the band of the kind at any time.
+    """
+    if claim.seconds is not None:
+        return DURATION
     calibrated = thresholds().get(threshold_key(claim))
     if calibrated is not None:
         return calibrated["no"], calibrated["yes"]

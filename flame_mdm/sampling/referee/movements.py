@@ -18,7 +18,7 @@ from flame_mdm.sampling.referee.body import (
     rate_of,
 )
 from flame_mdm.sampling.referee.claims import Claim
-from flame_mdm.sampling.referee.postures import SIDES, STANDING
+from flame_mdm.sampling.referee.postures import MOVING, SIDES, STANDING
 from flame_mdm.sampling.referee.readings import (
     Reading,
     counted,
@@ -29,7 +29,6 @@ from flame_mdm.sampling.referee.readings import (
     spans_of,
 )
 
-MOVING = 0.25  # the body travels if its pelvis is faster than this, in m/s
 SECTOR = np.cos(np.radians(50))  # maximum angle between the travel and a direction
 SEEN = {"left": (1.0, 0.0), "right": (-1.0, 0.0), "forward": (0.0, 1.0), "backward": (0.0, -1.0)}
 
@@ -140,7 +139,9 @@ def walk(body: Body, claim: Claim) -> Reading:
     """Measures the distance traveled at a speed below a run's, 2.2 m/s."""
     is_walk = (body.speed > MOVING) & (body.speed < 2.2)
     distance = float(body.speed[is_walk].sum() / RATE)
-    return Reading(distance, distance, "m", "pelvis", spans_of(is_walk, 0.3))
+    spans = spans_of(is_walk, 0.3)
+    signal = np.where(is_walk, body.speed, 0.0)
+    return Reading(distance, distance, "m", "pelvis", spans, signal=signal, level=MOVING)
 
 
 def pace(body: Body, claim: Claim) -> Reading:

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.sampling.referee.body import (
     ANKLES,
     HEAD,
@@ -19,6 +20,7 @@ from flame_mdm.sampling.referee.claims import Claim
 from flame_mdm.sampling.referee.readings import Reading, existence, of_side, spans_of
 
 SIDES = ("left", "right")
+MOVING = 0.25  # the body travels if its pelvis is faster than this, in m/s
 STANDING = 0.9  # height of the pelvis of a standing body of the usual size, in meters
 
 
@@ -26,6 +28,12 @@ def thighs(body: Body) -> np.ndarray:
     """Returns the angle (F, 2) between each thigh and the vertical in degrees; 90 is level."""
     thigh = body.joints[:, KNEES] - body.joints[:, HIPS]
     return np.degrees(np.arctan2(np.linalg.norm(thigh[..., [0, 2]], axis=-1), -thigh[..., 1]))
+
+
+def upright(body: Body, claim: Claim) -> Reading:
+    """Measures the height of the pelvis while the trunk is upright."""
+    height = np.where(body.tilt < 45, body.height[:, PELVIS], 0.0)
+    return existence(height, "m high", "pelvis", 0.2)
 
 
 def sit(body: Body, claim: Claim) -> Reading:
@@ -105,7 +113,38 @@ def stand_still(body: Body, claim: Claim) -> Reading:
     ground = body.joints[:, PELVIS][:, [0, 2]]
     away = np.linalg.norm(ground - np.median(ground, axis=0), axis=-1)
     farthest = float(np.percentile(away, 98))
-    return Reading(-farthest, farthest, "m from its place", "pelvis", ((0.0, body.seconds),))
+    spans = ((0.0, body.seconds),)
+    signal, level = -body.speed, -MOVING
+    return Reading(
+        -farthest, farthest, "m from its place", "pelvis", spans, signal=signal, level=level
+    )
+
+
+def return_pose(body: Body, claim: Claim) -> Reading:
+    """Measures the largest distance of a joint at the end from its place at the start, as seen by the body."""
+    ends = max(1, round(0.2 * RATE))
+    first, last = body.seen[:ends].mean(0), body.seen[-ends:].mean(0)
+    away = np.linalg.norm(last - first, axis=-1)
+    farthest = float(away.max())
+    joint = SMPL22.joints[int(away.argmax())].replace("_", " ")
+    unit = "m from its place at the start"
+    return Reading(-farthest, farthest, unit, joint, (last_part(body),))
+
+
+def return_place(body: Body, claim: Claim) -> Reading:
+    """Measures how far the body is at the end from its start, as a share of its largest distance from it."""
+    ground = body.joints[:, PELVIS][:, [0, 2]]
+    away = np.linalg.norm(ground - ground[0], axis=-1)
+    farthest, last = float(away.max()), float(away[-1])
+    if farthest < 0.5:
+        reason = "it hardly leaves its place"
+        return Reading(np.nan, last, "m from the start", "pelvis", (), reason)
+    return Reading(-last / farthest, last, "m from the start", "pelvis", (last_part(body),))
+
+
+def last_part(body: Body) -> tuple[float, float]:
+    """Returns first and last second of the end of a motion."""
+    return max(0.0, body.seconds - 0.3), body.seconds
 
 
 def raise_hand(body: Body, claim: Claim) -> Reading:

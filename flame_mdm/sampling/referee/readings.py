@@ -1,7 +1,7 @@
 """`Reading`, the evidence for or against a claim, and helpers that find it in signals over time."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -23,6 +23,8 @@ class Reading:
         joint: joint or part of the body.
         spans: first and last second of each time at which the claim is true, or nearly.
         unclear: reason why a high score does not make the claim true; "" = none.
+        signal: values (F,) that show by frame whether it is so; None if single frames do not show it.
+        level: value of `signal` from which it is so; None = the middle of the band of the kind.
     """
 
     score: float
@@ -31,6 +33,8 @@ class Reading:
     joint: str = "body"
     spans: Spans = ()
     unclear: str = ""
+    signal: np.ndarray | None = field(default=None, compare=False, repr=False)
+    level: float | None = None
 
 
 def spans_of(flags: np.ndarray, shortest: float = 0.0) -> Spans:
@@ -62,7 +66,7 @@ def existence(
     bound = low + share * (score - low)
     # a signal of a distance is negative: less speaks for the claim
     number = -score if unit.startswith(AWAY) else score
-    return Reading(score, number, unit, joint, spans_of(signal >= bound))
+    return Reading(score, number, unit, joint, spans_of(signal >= bound), signal=signal)
 
 
 def of_side(readings: Sequence[Reading], side: str, margin: float) -> Reading:
@@ -75,7 +79,10 @@ def of_side(readings: Sequence[Reading], side: str, margin: float) -> Reading:
     if side == "both":
         lower = min(readings, key=lambda reading: reading.score)
         limb = lower.joint.partition(" ")[2]
-        return replace(lower, joint="both feet" if limb == "foot" else f"both {limb}s")
+        joint = "both feet" if limb == "foot" else f"both {limb}s"
+        if left.signal is None or right.signal is None:
+            return replace(lower, joint=joint)
+        return replace(lower, joint=joint, signal=np.minimum(left.signal, right.signal))
     if side == "":
         return max(readings, key=lambda reading: reading.score)
     chosen, other = (left, right) if side == "left" else (right, left)

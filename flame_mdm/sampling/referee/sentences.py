@@ -36,6 +36,23 @@ COUNT_NOUNS = {
     "steps": "(?:\\w+ )?(?:steps|paces|strides)",
 }
 MOVING = {"walk", "run", "travel", "step", "jump", "hop", "veer", "circle", "turn around"}
+POSTURES = {
+    "sit",
+    "kneel",
+    "lie",
+    "all fours",
+    "crouch",
+    "bend",
+    "raise hand",
+    "hand above head",
+    "hand on hip",
+    "arms out",
+    "arms crossed",
+}
+LASTING = {"walk", "run", "stand still", *POSTURES}
+"""Kinds of claims that may state seconds."""
+AT_AN_END = {"walk", "run", "jump", "hop", "kick", "strike", *POSTURES}
+"""Kinds of claims that may be about the start or the end."""
 DIRECTIONS = {
     "forward": "forwards?|forewards?|ahead|straight ahead",
     "backward": "backwards?|backwords?",
@@ -69,8 +86,11 @@ def read_claims(text: str) -> list[Claim]:
     claims: list[Claim] = []
     orders: list[Claim] = []
     before: list[Claim] = []
-    for clause in _clauses(plain):
+    clauses = _clauses(plain)
+    for place, clause in enumerate(clauses):
         current = _of_clause(clause.text)
+        claims += _at_ends(clause, is_last=place == len(clauses) - 1)
+        claims += _lasting(clause.text, current)
         if not current:
             continue
         if clause.is_later:
@@ -118,6 +138,46 @@ def _of_clause(text: str) -> list[Claim]:
     if len({claim.kind for claim in counts}) > 1:
         claims = [claim for claim in claims if claim not in counts]
     return claims
+
+
+def _at_ends(clause: Clause, *, is_last: bool) -> list[Claim]:
+    """Returns the claims of a clause about the start or the end of the motion: "ends seated"."""
+    text, returns = clause.text, _content()["returns"]
+    for kind in ("return pose", "return place"):
+        if re.search(rf"\b(?:{returns[kind]})\b", text):
+            return [Claim(kind, text)]
+    when = ""
+    if _has(text, "end") or (is_last and _has(text, "return")):
+        when = "end"
+    elif not clause.is_later and _has(text, "start"):
+        when = "start"
+    if not when:
+        return []
+    claims: list[Claim] = []
+    for state in _states():
+        if state.when.search(text) and not (state.unless and state.unless.search(text)):
+            claims += _claims(state, text)
+    # "Starts to walk" may mean that it stood before
+    if not claims and (when == "end" or _has(text, "by")):
+        claims = [claim for claim in _of_clause(text) if claim.kind in AT_AN_END]
+    return [replace(claim, when=when) for claim in claims]
+
+
+def _has(text: str, words: str) -> bool:
+    """Returns whether a clause has words of `ends` in `sentences.yaml`."""
+    return re.search(rf"\b(?:{_content()['ends'][words]})\b", text) is not None
+
+
+def _lasting(text: str, claims: Sequence[Claim]) -> list[Claim]:
+    """Returns the claims of a clause with the seconds that it states: "stands still for three seconds"."""
+    numbers = {word: int(value) for word, value in phrases()["numbers"].items()}
+    number = "|".join([r"\d{1,2}", *numbers])
+    match = re.search(rf"\bfor (?:\w+ )?({number}) (?:\w+ )?(?:seconds?|secs?|s)\b", text)
+    if match is None:
+        return []
+    seconds = numbers[match[1]] if match[1] in numbers else int(match[1])
+    lasting = [claim for claim in claims if claim.kind in LASTING and not claim.direction]
+    return [replace(claim, seconds=seconds) for claim in lasting] if seconds else []
 
 
 def _claims(pattern: Pattern, text: str) -> list[Claim]:
@@ -215,10 +275,10 @@ def _side(text: str, limb: str) -> str | None:
         return None
     if stated:
         return stated.pop()
-    plural = "hands|arms|fists|wrists" if limb == "hands" else "legs|feet|knees"
-    if re.search(r"\bone of\b", text):
+    # "Kicks his legs" does not mean both at the same time
+    if limb == "legs" or re.search(r"\bone of\b", text):
         return ""
-    return "both" if re.search(rf"\b(?:{plural})\b", text) else ""
+    return "both" if re.search(r"\b(?:hands|arms|fists|wrists)\b", text) else ""
 
 
 def _amount(text: str, kind: str) -> int | None:
@@ -256,6 +316,8 @@ def _orders(before: Sequence[Claim], after: Sequence[Claim]) -> list[Claim]:
 
 
 def _is_event(claim: Claim) -> bool:
+    if claim.when or claim.seconds is not None:
+        return False
     return not claim.parts and KINDS[claim.kind].is_timed and claim.kind not in ("step", "use hand")
 
 
@@ -271,6 +333,9 @@ def _consistent(claims: Sequence[Claim], plain: str) -> list[Claim]:
         doubtful.add("stand still")
     if kinds & {"bend", "head down"} and not kinds & {"sit", "kneel", "crouch", "lie", "all fours"}:
         doubtful.add("stand up")
+    if kinds & MOVING:
+        # After a walk, the "starting position" may be a place
+        doubtful.add("return pose")
     for kind, limb in (("use hand", "hands"), ("use foot", "legs")):
         sides = re.findall(rf"\b(left|right)(?: \w+)? (?:{_content()[limb]})\b", plain)
         if len(set(sides)) > 1 or "other" in plain.split():
@@ -305,14 +370,20 @@ def _forms(verb: str) -> str:
 
 @cache
 def _patterns() -> tuple[Pattern, ...]:
-    return tuple(
-        Pattern(
-            row["kind"],
-            _expanded(row["when"]),
-            tuple(row["take"] if isinstance(row["take"], list) else ()),
-            _expanded(row["unless"]) if "unless" in row else None,
-        )
-        for row in _content()["claims"]
+    return tuple(_pattern(row) for row in _content()["claims"])
+
+
+@cache
+def _states() -> tuple[Pattern, ...]:
+    return tuple(_pattern(row) for row in _content()["states"])
+
+
+def _pattern(row: dict[str, Any]) -> Pattern:
+    return Pattern(
+        row["kind"],
+        _expanded(row["when"]),
+        tuple(row["take"] if isinstance(row["take"], list) else ()),
+        _expanded(row["unless"]) if "unless" in row else None,
     )
 
 

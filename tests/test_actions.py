@@ -367,8 +367,8 @@ def test_damaged_lists_are_named(tmp_path: Path, subtests):
         list(UESTC(str(folder)).clips(20.0))
 
 
-DATA = ("data=synthetic", "data.source.clips=600")
-RUN = ["data.source.clips=600", "data.batch_size=32", "logger=csv", "trainer.accelerator=cpu"]
+DATA = ("data=synthetic", "data.source.clips=300")
+RUN = ["data.source.clips=300", "data.batch_size=32", "logger=csv", "trainer.accelerator=cpu"]
 RUN += ["trainer.enable_progress_bar=false", "trainer.log_every_n_steps=5"]
 
 

@@ -336,13 +336,13 @@ def test_an_audit_resumes_and_gives_the_same_card(tmp_path, monkeypatch, capsys)
     monkeypatch.setattr(
         Evaluator, "extract", lambda self, x: passes.append(len(x)) or extract(self, x)
     )
-    assert main(["prepare", "synthetic", "data.source.clips=400", f"data_root={tmp_path}"]) == 0
+    assert main(["prepare", "synthetic", "data.source.clips=200", f"data_root={tmp_path}"]) == 0
     (path,) = tmp_path.glob("synthetic-*/clips.jsonl")
     clips = path.read_text().count('"test"')
     words = [
         "audit",
         "data=synthetic",
-        "data.source.clips=400",
+        "data.source.clips=200",
         f"data_root={tmp_path}",
         "resamples=100",
     ]

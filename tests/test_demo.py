@@ -501,10 +501,10 @@ def test_requests_from_eight_clients_are_answered_in_constant_memory(normal):
         )
 
     with ThreadPoolExecutor(8) as clients:
-        assert all(clients.map(ask, range(20)))  # fills the memory of results
+        assert all(clients.map(ask, range(16)))  # fills the memory of results
         before = resident()
-        assert all(clients.map(ask, range(100, 130)))
-    assert resident() - before < 30_000
+        assert all(clients.map(ask, range(100, 116)))
+    assert resident() - before < 16_000, "a MiB per request"
 
 
 LINKS = "[...document.querySelectorAll('#files a')]"

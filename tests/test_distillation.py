@@ -477,7 +477,12 @@ def test_new_words_get_rows_that_no_known_word_has():
 
 STYLED = "A person hobbles in limp style"
 STEPS = ["data.batch_size=4", "trainer.accelerator=cpu", "trainer.enable_progress_bar=false"]
-STEPS += ["callbacks.checkpoints.every_n_steps=2", "trainer.val_check_interval=2", "lr_decay=0"]
+STEPS += [
+    "callbacks.samples.seconds=0.5",
+    "callbacks.checkpoints.every_n_steps=2",
+    "trainer.val_check_interval=2",
+    "lr_decay=0",
+]
 
 
 @pytest.fixture

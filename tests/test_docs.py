@@ -9,7 +9,6 @@ import shlex
 import subprocess
 import tempfile
 from collections.abc import Iterator, Sequence
-from copy import deepcopy
 from functools import cache
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -24,7 +23,7 @@ from support.runs import TINY_DIP, untrained
 
 from flame_mdm.__main__ import COMMANDS
 from flame_mdm.checkpoints.model_files import write_model_file
-from flame_mdm.config import composition, guarded, sweeps
+from flame_mdm.config import guarded, sweeps
 from flame_mdm.config.command_line import make_variables, read_settings
 from flame_mdm.config.jobs import run_jobs
 
@@ -140,23 +139,8 @@ def is_composed(program: str, command: str, words: Sequence[str]) -> bool:
         return not words or guarded(lambda: read_settings(settings, words)) == 0
 
 
-@pytest.fixture
-def resolved_once(monkeypatch):
-    """Hydra composes once what several commands name."""
-    resolve, known = composition.resolve, {}
-
-    def once(
-        source: composition.ConfigSource, overrides: list[str], base: Any = None
-    ) -> dict[str, Any]:
-        key = repr((source, overrides, base is None))
-        known[key] = known.get(key) or resolve(source, overrides, base)
-        return deepcopy(known[key])
-
-    monkeypatch.setattr(composition, "resolve", once)
-
-
 @pytest.mark.slow
-def test_links_names_paths_and_commands_exist(tmp_path, monkeypatch, resolved_once):
+def test_links_names_paths_and_commands_exist(tmp_path, monkeypatch):
     # launch=slurm is refused on a machine without the commands of SLURM
     monkeypatch.setenv("PATH", f"{ROOT / 'tests/support/slurm'}{os.pathsep}{os.environ['PATH']}")
     wrong, commands = {}, {}

@@ -308,7 +308,7 @@ def test_only_representations_of_joints_are_calibrated():
 
 
 RUN = [
-    "data.source.clips=1100",
+    "data.source.clips=800",
     "data.batch_size=32",
     "condition=learned",
     "condition.features=32",

@@ -40,7 +40,7 @@ def test_each_prompt_of_a_file_is_sampled_as_if_alone(here, trained, capsys):
     Path("p.txt").write_bytes(
         b"\xef\xbb\xbf" + "\r\n\r\n".join(f" {text} " for text in PROMPTS).encode()
     )
-    assert main(["sample", str(trained), "prompts=p.txt", "seconds=[1,1.5,1]", "samples=2"]) == 0
+    assert main(["sample", str(trained), "prompts=p.txt", "seconds=[0.5,1,0.5]", "samples=2"]) == 0
     lines = capsys.readouterr().out.splitlines()
     page = lines[-1].removeprefix("6 motions for 3 prompts, a folder for each: ")
     assert page == "samples/quickstart/p.html"
@@ -53,7 +53,7 @@ def test_each_prompt_of_a_file_is_sampled_as_if_alone(here, trained, capsys):
     text, file = PROMPTS[1], together[PROMPTS[1]] / "motion_001.npz"
     kept, before = set(here.rglob("*")), read(file)
     assert len(list(together[text].iterdir())) == 5
-    assert main(["sample", str(trained), f"text={text}", "seconds=1.5", "samples=2"]) == 0
+    assert main(["sample", str(trained), f"text={text}", "seconds=1", "samples=2"]) == 0
     np.testing.assert_allclose(read(file).joints, before.joints, atol=1e-4)  # in the same folder
     assert set(here.rglob("*")) == kept
 
@@ -63,7 +63,7 @@ def test_a_chosen_folder_gets_a_folder_per_prompt_without_files_of_an_earlier_re
     here, trained
 ):
     Path("p.txt").write_text("a person walks\na person jumps\na person walks\n")
-    words, videos = ["prompts=p.txt", "seconds=1", "samples=1", "out=mine"], bool(find_spec("av"))
+    words, videos = ["prompts=p.txt", "seconds=0.5", "samples=1", "out=mine"], bool(find_spec("av"))
     assert main(["sample", str(trained), *words, "trajectory=true", f"mp4={videos}".lower()]) == 0
     jumps, walks, page = sorted(Path("mine").iterdir())
     assert [jumps.name[:-7], walks.name[:-7], page.name] == [

@@ -478,9 +478,8 @@ def test_containers_are_made_of_checked_keys_only(kind, bad):
 
 
 def test_ten_thousand_states_of_an_optimizer_are_read(bad, subtests):
-    weights = {
-        number: {"step": torch.tensor(1.0), "exp_avg": torch.zeros(2)} for number in range(10_000)
-    }
+    step = torch.tensor(1.0)
+    weights = {number: {"step": step, "exp_avg": torch.zeros(2)} for number in range(10_000)}
     content = {
         "state_dict": OrderedDict(weight=torch.zeros(2)),
         "optimizer": {"state": weights},

@@ -206,6 +206,16 @@ def resolve(source: ConfigSource, overrides: list[str], base: Config | None = No
     If `base` is given, checks the configuration: values must have the types of the values in
     `base`.
     """
+    config = compose_unchecked(source, overrides)
+    if base is not None:
+        check_same_kinds(base, config)
+        check_top_level(config)
+        check(config)
+    return config
+
+
+def compose_unchecked(source: ConfigSource, overrides: list[str]) -> Config:
+    """Composes a configuration with prepared overrides; raises `UserError` if Hydra cannot."""
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(version_base="1.3", config_dir=str(source.folder)):
@@ -213,12 +223,7 @@ def resolve(source: ConfigSource, overrides: list[str], base: Config | None = No
             resolved = OmegaConf.to_container(composed, resolve=True, throw_on_missing=True)
     except (HydraException, OmegaConfBaseException, ValueError, TypeError, RecursionError) as error:
         raise UserError(f"{source.stem or 'data'}: {first_line(error)}") from error
-    config: Config = renamed({str(key): value for key, value in resolved.items()})  # type: ignore[union-attr]
-    if base is not None:
-        check_same_kinds(base, config)
-        check_top_level(config)
-        check(config)
-    return config
+    return renamed({str(key): value for key, value in resolved.items()})  # type: ignore[union-attr]
 
 
 def _legal(config: Config, override: Override) -> str:

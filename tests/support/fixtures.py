@@ -13,7 +13,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterable
 from copy import deepcopy
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -65,28 +65,33 @@ def script(path: str) -> Any:
 
 @cache
 def recipe(name: str) -> dict[str, Any]:
-    """The composed recipe; composed once for all test processes, since this takes a third of a second."""
-    file = ROOT / ".pytest_cache" / f"recipes-{_digest()}" / f"{name.replace('/', '.')}.json"
-    if not file.exists():
-        write_json(file, compose(name))
-    return json.loads(file.read_text())
+    """The composed recipe."""
+    return compose(name)
 
 
-def bases_once(resolve: Callable[..., Config]) -> Callable[..., Config]:
-    """Makes `composition.resolve` compose once what overrides of a recipe are compared with.
+def compositions_once(compose_unchecked: Callable[..., Config]) -> Callable[..., Config]:
+    """Makes `composition.compose_unchecked` compose a recipe once for all test processes, and a command once for each.
 
-    Nearly every command of the tests does it, and it takes a quarter of a second.
+    Nearly every command composes the recipe that its overrides are compared with. A composition
+    takes a quarter of a second.
     """
-    composed: dict[Any, Config] = {}
 
-    def once(source: ConfigSource, overrides: list[str], base: Config | None = None) -> Config:
-        if base is not None or source.folder != EXPERIMENTS:
-            return resolve(source, overrides, base)
+    @lru_cache(200)
+    def composed(source: ConfigSource, overrides: tuple[str, ...], data_root: str | None) -> Config:
+        if data_root is not None or overrides != (f"experiment={source.stem}",):
+            return compose_unchecked(source, list(overrides))
+        name = f"{str(source.stem).replace('/', '.')}.json"
+        file = ROOT / ".pytest_cache" / f"recipes-{_digest()}" / name
+        if not file.exists():
+            write_json(file, compose_unchecked(source, list(overrides)))
+        return json.loads(file.read_text())
+
+    def once(source: ConfigSource, overrides: list[str]) -> Config:
+        if source.folder != EXPERIMENTS:
+            return compose_unchecked(source, overrides)
         # The only variable of the environment that a recipe reads
-        key = (source, *overrides, os.environ.get("FLAME_MDM_DATA"))
-        if key not in composed:
-            composed[key] = resolve(source, overrides)
-        return deepcopy(composed[key])
+        data_root = os.environ.get("FLAME_MDM_DATA")
+        return deepcopy(composed(source, tuple(overrides), data_root))
 
     return once
 

@@ -44,8 +44,8 @@ TINY = [
     *("denoiser.num_layers=1", "denoiser.num_heads=2", "process.num_train_timesteps=10"),
     *("task.num_inference_steps=5", "trainer.accelerator=cpu", "trainer.enable_progress_bar=false"),
     *("condition.features=16", "condition.pretrain_steps=10"),
-    "callbacks.samples.seconds=1.5",
-    # Files of all prompts of the recipe would take most of the time
+    # Pictures of all prompts and of seconds would take most of the time
+    "callbacks.samples.seconds=0.5",
     "callbacks.samples.prompts.count=3",
     "lr_decay=0",  # it depends on trainer.max_steps, which tests raise to resume
 ]

@@ -24,7 +24,7 @@ TEXT = "a person walks forward, then waves with the left hand"
 COUNT = 8  # pictures per row
 SIZE = (90, 125)  # of one picture
 SMALL = (84, 112)  # of one picture of a sheet with every frame
-COLORS = 24
+COLORS = 20
 LABEL = (20, 20, 20)
 CLIPS = ("Walk_Fwd_Start", "Walk_Fwd_Loop", "Walk_Fwd_Stop", "Run_Fwd_Loop", "Turn_90_Left")
 

@@ -351,7 +351,7 @@ class Handler(http.server.SimpleHTTPRequestHandler):
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("web") / "page"
-    script("tools/web.py").build("quickstart", out)
+    script("tools/web.py").build(flame_mdm.load("quickstart"), out)
     return out
 
 

@@ -201,6 +201,24 @@ def test_texts_at_times_give_the_same_motion_whenever_they_are_typed(model):
         late.change("a person jumps", at=1)
 
 
+def test_frames_that_were_not_used_can_be_replaced(model):
+    early, late = stream(model, "a person walks"), stream(model, "a person walks")
+    early.change("a person sits down", at=2.25)
+    expected = joints(islice(early, 4))
+    ahead = list(islice(late, 3))
+    late.change("a person jumps", at=6)
+    late.go_back(2.25)
+    late.change("a person sits down")
+    assert late.frames == 45
+    assert_same(joints([*ahead[:1], *islice(late, 2)]), np.delete(expected, slice(30, 45), 0))
+    assert next(late).text == "a person sits down"
+    for at in (0, 30):
+        with pytest.raises(UserError, match=r"is not in the last 4 blocks, which end at 135\."):
+            late.go_back(at)
+    with pytest.raises(UserError, match="cleanup=true: a block depends on the block after it"):
+        stream(model, "a person walks", cleanup=True).go_back(1)
+
+
 @pytest.mark.parametrize("frames", [2, 30, 75])
 def test_generate_is_a_cut_of_the_stream(model, frames):
     motion = generate(model, "a person walks", frames=frames, seed=5)[0]

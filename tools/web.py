@@ -23,7 +23,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import flame_mdm
-from flame_mdm.checkpoints.onnx_export import export_onnx
+import flame_mdm.demo
+from flame_mdm.checkpoints.onnx_export import write_folder
 from flame_mdm.checkpoints.runner import SCHEMA
 from flame_mdm.conditions.language import (
     abilities,
@@ -47,6 +48,7 @@ from flame_mdm.errors import UserError, say
 from flame_mdm.formats.body import fit_body
 from flame_mdm.formats.motion import END_SITES, Motion
 from flame_mdm.formats.posture import TOES
+from flame_mdm.generator import MotionGenerator
 from flame_mdm.representations.skeleton import JOINT, SMPL22
 from flame_mdm.safe_io import read_npz, write_json, write_text
 from flame_mdm.visualize.body import HELPERS
@@ -54,6 +56,8 @@ from flame_mdm.visualize.player import player_page
 from flame_mdm.visualize.render import thumbnail
 
 SOURCE = Path(__file__).with_suffix("")
+# The stream on a page, which the demo may share
+LIVE = [Path(flame_mdm.demo.__file__).with_name(name) for name in ("live.js", "live.css")]
 RUNTIME, INTEGRITY = (
     "onnxruntime-web@1.30.0",
     "q0y+JrrtukXSzsBWEMccVfqX25LRmosXHF+CaRJmg8pZClzcV7svNc4rKY3jL02Vb7QmRMDs1SigqR4CXAfKYQ==",
@@ -65,26 +69,26 @@ POLICY = (
 )
 
 
-def build(model: str, out: Path) -> None:
+def build(model: MotionGenerator, out: Path) -> None:
     """Writes the page of a model with a learned text encoder, captions of single actions and SMPL's 22 joints.
 
     Raises:
         UserError: If the model's captions do not name single actions, or onnxruntime-web cannot be fetched.
     """
-    loaded = flame_mdm.load(model)
-    if not reading.Reader.fits(loaded.facts):
+    if not reading.Reader.fits(model.facts):
+        experiment = model.config["experiment"]
         raise UserError(
-            f"{model}: its captions do not name single actions. Use a model like quickstart"
+            f"{experiment}: its captions do not name single actions. Use a model like quickstart"
         )
-    export_onnx(model, out, half=True)
+    write_folder(model, out, half=True)
     (out / "runner.py").unlink()
-    for path in SOURCE.iterdir():
+    for path in (*SOURCE.iterdir(), *LIVE):
         shutil.copy(path, out)
     write_text(out / "schema.js", f"export const SCHEMA = {json.dumps(SCHEMA)};\n")
     fetch_runtime(out / "ort")
     write_language(out)
-    write_pictures(out, abilities.Abilities(loaded.facts).actions)
-    example = flame_mdm.generate(loaded, loaded.facts["captions"][0])[0]
+    write_pictures(out, abilities.Abilities(model.facts).actions)
+    example = flame_mdm.generate(model, model.facts["captions"][0])[0]
     for ending in ("glb", "fbx"):
         example.save(out / f"template.{ending}")
     page = player_page([example], "")
@@ -225,7 +229,8 @@ def fetch_runtime(folder: Path) -> None:
 
 if __name__ == "__main__":
     try:
-        build("quickstart", Path("build/web"))
+        name = sys.argv[1] if len(sys.argv) > 1 else "quickstart"
+        build(flame_mdm.load(name), Path("build/web"))
         say("written: build/web. To see it: python3 -m http.server -d build/web")
     except UserError as error:
         say(f"error: {error}", error=True)

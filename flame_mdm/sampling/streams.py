@@ -3,10 +3,11 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Self, Unpack
+from typing import NamedTuple, Self, Unpack
 
 import numpy as np
 import torch
@@ -29,6 +30,9 @@ from flame_mdm.sampling.motion_request import check_length
 from flame_mdm.sampling.placement import Placement, step_after
 from flame_mdm.sampling.reading import read_motion, with_features
 from flame_mdm.sampling.targets import Targets
+
+# Number of blocks of a stream that can be cut, such as those that a page has not shown yet
+HELD = 4
 
 
 def stream(
@@ -133,6 +137,22 @@ class Stream(Iterator[Motion]):
         self._streams.texts[condition] = text
         self._streams.schedules[0].add(frame, condition)
 
+    def go_back(self, at: float) -> None:
+        """Drops the frames from a time on, which were not used yet: the next block continues the frames before.
+
+        A text is then seen at once, although blocks were computed ahead. The result is the stream whose text changes
+        at that time. Texts that were to change later are dropped, too.
+
+        Args:
+            at: time in seconds since the start of the stream, in one of the last four blocks.
+
+        Raises:
+            UserError: If the time is not in these blocks, or the stream is cleaned up.
+        """
+        if self._cleanup is not None:
+            raise UserError("cleanup=true: a block depends on the block after it. Omit cleanup")
+        self._streams.go_back(round(at * self._streams.model.representation.fps))
+
     def __next__(self) -> Motion:
         while True:
             (block,) = next(self._streams)
@@ -184,6 +204,16 @@ class OnlineCleanup:
         )
 
 
+class PastBlock(NamedTuple):
+    """A block of a single stream that can be cut: `begin` is its first frame, `number` the number of its noise."""
+
+    begin: int
+    number: int
+    prefix: Tensor
+    x: Tensor
+    joints: Tensor
+
+
 class Schedule:
     """The conditions of a stream over its frames."""
 
@@ -207,6 +237,10 @@ class Schedule:
     def at(self, frame: int) -> str:
         """Returns the condition of a frame."""
         return [condition for begin, condition in self.changes if begin <= frame][-1]
+
+    def drop(self, frame: int) -> None:
+        """Drops the changes from a frame on; the first condition stays."""
+        self.changes = [entry for entry in self.changes if entry[0] < max(frame, 1)]
 
     def until_change(self, frame: int) -> int | None:
         """Returns the number of frames from a frame to the next change; None if there is none."""
@@ -268,6 +302,7 @@ class Streams(Iterator[list[Motion]]):
         self.targets: Targets | None = None
         self._root = [0.0, 0.0]  # x and z in the world of the last frame of the first stream
         self._encoded: tuple[list[str], Condition] | None = None
+        self._past: deque[PastBlock] = deque(maxlen=HELD)
 
     def __next__(self) -> list[Motion]:
         """Returns the next block of each stream; it ends where the next condition begins."""
@@ -281,6 +316,31 @@ class Streams(Iterator[list[Motion]]):
             )
             for row, (count, condition) in enumerate(zip(kept, conditions, strict=True))
         ]
+
+    def go_back(self, frame: int) -> None:
+        """Drops the frames of a single stream from `frame` on, and the changes of its text from then on.
+
+        Raises:
+            UserError: If the frame is not in one of the last `HELD` blocks.
+        """
+        self.schedules[0].drop(frame)
+        if frame == self.frames[0]:
+            return
+        blocks = [block for block in self._past if block.begin < frame]
+        if not blocks or frame > self.frames[0]:
+            raise UserError(
+                f"frame {frame} is not in the last {HELD} blocks, which end at {self.frames[0]}. Give a later time"
+            )
+        self._past = deque(blocks, maxlen=HELD)
+        block = blocks[-1]
+        kept = frame - block.begin
+        context = block.prefix.shape[1]
+        self.blocks.number = block.number + 1
+        self.blocks.prefix = torch.cat([block.prefix, block.x], 1)[:, kept : kept + context]
+        last = self.model.representation.denormalize(block.x[:, kept - 1].float())
+        self.placement = step_after(self.model.representation, last, block.joints[:, kept - 1])
+        self._root = block.joints[0, kept - 1, 0, [0, 2]].tolist()
+        self.frames = [frame]
 
     def take(self, lengths: Sequence[int]) -> list[Tensor]:
         """Returns the next frames (F, D) of each stream, normalized, as many as `lengths` says."""
@@ -319,6 +379,7 @@ class Streams(Iterator[list[Motion]]):
         if was_training:
             self.model.eval()
         cond, edit = self._aimed(self._encode(self._conditions()))
+        number, prefix = self.blocks.number, self.blocks.prefix
         x = self.blocks.sample(cond, count, edit)
         if was_training:
             self.model.train()
@@ -333,6 +394,8 @@ class Streams(Iterator[list[Motion]]):
             turn, torch.where(moved[:, None], after.shift, self.placement.shift)
         )
         self._root = joints[0, last[0], 0, [0, 2]].tolist()
+        if len(self.frames) == 1:
+            self._past.append(PastBlock(self.frames[0], number, prefix, x, joints))
         self.frames = [frame + new for frame, new in zip(self.frames, kept, strict=True)]
         return x, joints
 

@@ -1,5 +1,6 @@
 // The page: form, player, downloads, and a link that holds the request.
 import { Sampler, json, words } from "./sampling.js";
+import { longestOf } from "./check.js";
 import { NotUnderstood } from "./language_reading.js";
 import { chips, languageFiles, openLanguage } from "./language.js";
 import { bvh, glb, shown } from "./figure.js";
@@ -99,7 +100,8 @@ async function open() {
     [sampler, figure, page, files] = await Promise.all([Sampler.open(), json("figure.json"), fetch("player.html"), languageFiles()]);
     player = await page.text();
     language = openLanguage(sampler.content, files);
-    const { fps, max_frames: longest, captions } = sampler.content, request = new URLSearchParams(location.hash.slice(1));
+    element("stream").hidden = !sampler.content.start;
+    const { fps, captions } = sampler.content, longest = longestOf(sampler.content), request = new URLSearchParams(location.hash.slice(1));
     Object.assign(element("seconds"), { min: 2 / fps, max: longest / fps, value: Math.min(3, longest / fps) });
     element("text").value = captions.find((caption) => caption.startsWith("a person")) ?? captions[0] ?? "";
     for (const field of fields) if (request.get(field.id)) field.value = request.get(field.id);

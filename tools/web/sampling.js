@@ -73,6 +73,11 @@ export function normal(key, draw, frames, features) { // key: 64 bits; standard 
   return noise;
 }
 
+async function noiseKey(seed, name) { // 63 bits
+  const bytes = await digest(new TextEncoder().encode(["noise", seed, 0, name].join("\x1f")));
+  return bytes.slice(0, 8).reduce((sum, byte) => sum << 8n | BigInt(byte), 0n) >> 1n;
+}
+
 // ---- the model ----
 export async function download(name) {
   const answer = await fetch(name);
@@ -86,7 +91,8 @@ export async function json(name) {
 }
 
 export class Sampler {
-  static async open() { // the graph of rotations is opened when it is first used
+  // The graph of rotations is opened when it is first used.
+  static async open() {
     if (!globalThis.crypto?.subtle) throw new Error("this page needs https, or http://localhost");
     const sampler = new Sampler();
     sampler.content = await json("model.json");
@@ -103,16 +109,28 @@ export class Sampler {
 
   // Normalized features (frames * D). The model reads the text; its noise depends on the name.
   async generate(text, seconds, seed, progress = () => {}, name = text) {
-    const frames = frameCount(seconds, this.content);
-    const { features, steps, clip_x0: clip, padded_frames: least, buckets, max_words: most } = this.content;
-    const bytes = await digest(new TextEncoder().encode(["noise", seed, 0, `${name}#0`].join("\x1f")));
-    const key = bytes.slice(0, 8).reduce((sum, byte) => sum << 8n | BigInt(byte), 0n) >> 1n;
+    const frames = frameCount(seconds, this.content), { features, start, padded_frames: least } = this.content;
+    if (start) {
+      const stream = new Stream(this, seed, `${name}#0`), blocks = Math.ceil(frames / stream.size);
+      const x = new Float32Array(blocks * stream.size * features);
+      for (let k = 0; k < blocks; k++) {
+        x.set(await stream.features(text, (share) => progress((k + share) / blocks)), k * stream.size * features);
+      }
+      return x.slice(0, frames * features);
+    }
+    const x = await this.sample(text, Math.max(frames, least), frames, await noiseKey(seed, `${name}#0`), {}, progress);
+    return x.slice(0, frames * features);
+  }
+
+  // Normalized features (padded * D) of frames that are sampled together, from noise of a key.
+  async sample(text, padded, frames, key, more = {}, progress = () => {}) {
+    const { features, steps, clip_x0: clip, buckets, max_words: most } = this.content;
     const seen = new Set(this.content.vocabulary);
     const read = seen.size ? words(text).map((word) => knownForm(word, seen)).filter(Boolean) : words(text);
     const rows = ["<start>", ...read.slice(0, most)].map((word) => hashed(word, buckets)), count = rows.length;
     while (rows.length < MIN_WORDS) rows.push([0, 0]);
-    const fixed = { lengths: integers([frames], [1]), counts: integers([count], [1]), condition: integers(rows.flat(), [1, rows.length, 2]) };
-    const padded = Math.max(frames, least), shape = [1, padded, features];
+    const fixed = { lengths: integers([frames], [1]), counts: integers([count], [1]), condition: integers(rows.flat(), [1, rows.length, 2]), ...more };
+    const shape = [1, padded, features];
     let x = normal(key, 0, padded, features), draw = 1;
     const before = new Float32Array(x.length);
     for (const [number, [t, p, q, a, b, c, d]] of steps.entries()) {
@@ -127,7 +145,7 @@ export class Sampler {
       progress((number + 1) / steps.length);
     }
     if (!x.every(Number.isFinite)) throw new Error("the model returned non-finite numbers");
-    return x.slice(0, frames * features);
+    return x;
   }
 
   async decode(x) { // joints (frames * J * 3) in meters, y up
@@ -140,4 +158,78 @@ export class Sampler {
     const { offsets, quaternions } = await this.poses.run({ joints: new ort.Tensor("float32", joints, [joints.length / 66, 22, 3]) });
     return { offsets: offsets.data, quaternions: quaternions.data };
   }
+}
+
+const HELD = 4; // blocks that can be replaced
+
+// A motion without an end: flame_mdm/sampling/streams.py in JavaScript. Frames that were not shown yet can be replaced.
+export class Stream {
+  constructor(sampler, seed, name) {
+    const { start, max_frames: longest, features } = sampler.content;
+    const prefix = Float32Array.from(start.flat());
+    Object.assign(this, { sampler, seed, name, context: start.length, size: longest - start.length, width: features });
+    Object.assign(this, { prefix, number: 0, frames: 0, world: null, blocks: [] });
+  }
+
+  // Normalized features of the next block.
+  async features(text, progress) {
+    const { sampler, size, context, width } = this;
+    this.name ??= `${text}#0`;
+    const key = await noiseKey(this.seed, `${this.name}\x1f${this.number}`);
+    const prefix = { prefix: new ort.Tensor("float32", this.prefix, [1, context, width]) };
+    const x = await sampler.sample(text, size, size, key, prefix, progress);
+    this.blocks = [...this.blocks.slice(1 - HELD), { begin: this.frames, number: this.number, prefix: this.prefix, x, world: this.world }];
+    this.#continueAfter(size);
+    return x;
+  }
+
+  // Joints of the next block in the world.
+  async block(text) {
+    const { width, world: before } = this, last = this.prefix.slice(-width), x = await this.features(text);
+    const joints = await this.sampler.decode(Float32Array.of(...last, ...x)), one = joints.length / (this.size + 1);
+    let placed = before ? inPlace(joints, one, before) : (await this.sampler.decode(x)).slice();
+    if (before) placed = placed.subarray(one);
+    this.blocks.at(-1).joints = placed;
+    this.world = placed.slice(-one);
+    return placed;
+  }
+
+  // Drops the frames from a frame on: the next block continues the frames before.
+  goBack(frame) {
+    if (frame === this.frames) return;
+    while (this.blocks.length && this.blocks.at(-1).begin >= frame) this.blocks.pop();
+    const block = this.blocks.at(-1);
+    if (!block || frame > this.frames) throw new Error(`frame ${frame} is not one of the last ${HELD} blocks`);
+    const kept = frame - block.begin, one = block.joints.length / this.size;
+    Object.assign(this, { prefix: block.prefix, number: block.number, frames: block.begin });
+    this.#continueAfter(kept);
+    this.world = block.joints.slice((kept - 1) * one, kept * one);
+  }
+
+  #continueAfter(kept) {
+    const { width, context } = this, all = Float32Array.of(...this.prefix, ...this.blocks.at(-1).x);
+    this.prefix = all.slice(kept * width, (kept + context) * width);
+    this.number += 1;
+    this.frames += kept;
+  }
+}
+
+// Joints of frames whose first one is moved, about the vertical and over the floor, to a pose of the world.
+function inPlace(joints, one, world) {
+  const mean = (pose, k) => pose.reduce((sum, value, i) => (i % 3 === k ? sum + value : sum), 0) / (one / 3);
+  const first = joints.subarray(0, one), [ax, az, bx, bz] = [mean(first, 0), mean(first, 2), mean(world, 0), mean(world, 2)];
+  let sine = 0, cosine = 0;
+  for (let i = 0; i < one; i += 3) {
+    const [x, z, u, v] = [first[i] - ax, first[i + 2] - az, world[i] - bx, world[i + 2] - bz];
+    sine += z * u - x * v;
+    cosine += x * u + z * v;
+  }
+  const turn = Math.atan2(sine, cosine), [s, c] = [Math.sin(turn), Math.cos(turn)];
+  const placed = new Float32Array(joints);
+  for (let i = 0; i < joints.length; i += 3) {
+    const [x, z] = [joints[i] - ax, joints[i + 2] - az];
+    placed[i] = c * x + s * z + bx;
+    placed[i + 2] = c * z - s * x + bz;
+  }
+  return placed;
 }

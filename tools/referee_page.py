@@ -119,7 +119,8 @@ def crossed_table(by_name: Mapping[tuple[str, str], dict[str, Any]]) -> list[str
         "",
         "CMU's figures are below the targets. Three of its four falsified claims that are not judged false state the",
         "other direction of motions that go both ways; the fourth is about squats, of which the referee counts two",
-        "where the caption states three. True claims that are judged false: these squats, and a jog in place.",
+        "where the caption states three. True claims that are judged false: these squats, a jog in place, and a walk",
+        "at 1.8 m/s that one caption calls slow and another one brisk.",
     ]
     return lines
 

@@ -139,8 +139,8 @@ def _template(rng: np.random.Generator, attributes: Attributes) -> str:
     """Returns a template of the captions; for two actions at once, with the templates of both inserted."""
     grammar = content()
     if "while" not in attributes:
-        return _one(rng, _entry(grammar["captions"], attributes))
-    parts = {"main": _one(rng, _entry(grammar["mains"], attributes))}
+        return _one(rng, entry(grammar["captions"], attributes))
+    parts = {"main": _one(rng, entry(grammar["mains"], attributes))}
     parts["gesture"] = _one(rng, grammar["gestures"][attributes["while"]])
     template = _one(rng, grammar["simultaneous"])
     for name, part in parts.items():
@@ -164,7 +164,7 @@ def _conjugated(rng: np.random.Generator, text: str, tenses: Sequence[tuple[str,
     return re.sub(r"\ba (?=[aeio])", "an ", VERB.sub(form, text))
 
 
-def _entry(table: Mapping[str, Any], attributes: Attributes) -> Any:
+def entry(table: Mapping[str, Any], attributes: Attributes) -> Any:
     """Returns the entry for the action and one of its attributes, such as "walk left", or for the action, or None."""
     action = str(attributes["action"])
     keys = [f"{action} {value}" for value in attributes.values()] + [action]
@@ -179,7 +179,7 @@ def _joints(rng: np.random.Generator, t: np.ndarray, attributes: Attributes) -> 
     """Returns the joints (F, 22, 3) of a motion with these attributes at times (F,) in seconds."""
     margin = round(MARGIN / (t[1] - t[0])) if attributes.get("ends") == "cycle" else 0
     times = np.arange(len(t) + 2 * margin) * (t[1] - t[0]) if margin else t
-    body = Body(rng, times, _entry(content()["widths"], attributes))
+    body = Body(rng, times, entry(content()["widths"], attributes))
     move(body, rng, times, attributes)
     joints = body.joints()[margin : margin + len(t)]
 

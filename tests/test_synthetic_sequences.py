@@ -1,0 +1,131 @@
+"""Synthetic clips in which one motion goes over into the next: no jump where they meet, true captions, one body."""
+
+import numpy as np
+import pytest
+
+from flame_mdm.data import Clip
+from flame_mdm.data.synthetic import Synthetic
+from flame_mdm.data.synthetic_motions.body import Body
+from flame_mdm.data.synthetic_motions.joining import frames_of, join
+from flame_mdm.data.synthetic_sequences import SyntheticSequences
+from flame_mdm.representations.skeleton import SMPL22
+
+FPS = 20
+PARENTS = list(SMPL22.parents)
+
+
+@pytest.fixture(scope="module")
+def clips() -> list[Clip]:
+    return list(SyntheticSequences(80, seed=2, workers=1).clips(FPS))
+
+
+def walking(seconds: float) -> Body:
+    """A body that stands, and whose place, heading and feet move at an even speed."""
+    t = np.arange(round(seconds * FPS) + 1) / FPS
+    body = Body(np.random.default_rng(0), t)
+    body.position[:, 2] = t
+    body.ankles[..., 2] += t
+    body.heading = 0.5 * t
+    return body
+
+
+def test_the_second_motion_goes_on_from_the_place_and_heading_of_the_first():
+    first, second = walking(1.0), walking(2.0)
+    joined = join(first, second)
+    assert len(joined.t) == len(first.t) + len(second.t) - 1
+    np.testing.assert_allclose(joined.heading[[20, 60]], [0.5, 1.5], atol=1e-12)
+    np.testing.assert_array_equal(joined.position[:20], first.position[:20])
+    # The second motion walks 2 m ahead, in the heading of 0.5 in which the first one ends.
+    moved = joined.position[-1] - joined.position[20]
+    np.testing.assert_allclose(moved[[0, 2]], [2 * np.sin(0.5), 2 * np.cos(0.5)], atol=0.02)
+
+
+def test_a_difference_of_angles_fades_and_heights_are_not_added():
+    first, second = walking(1.0), walking(2.0)
+    first.arms[0, 0] = 1.0
+    second.arms[0, 0] = 0.2
+    first.position[:, 1], second.position[:, 1] = 0.6, 0.9
+    joined = join(first, second, blend=0.5)
+    np.testing.assert_allclose(joined.arms[0, 0, [0, 20, 31, 60]], [1.0, 1.0, 0.2, 0.2], atol=1e-9)
+    np.testing.assert_allclose(joined.position[[0, 20, 31, 60], 1], [0.6, 0.6, 0.9, 0.9], atol=1e-9)
+
+
+def test_a_foot_that_stands_elsewhere_takes_a_step():
+    first, second = walking(0.5), walking(2.0)
+    second.ankles[1, :, 0] -= 0.2
+    joined = join(first, second, blend=0.5)
+    start = first.ankles[1, -1]
+    rise = joined.ankles[1, :, 1].max() - start[1]
+    assert 0.05 < rise < 0.08
+    assert joined.ankles[0, :, 1].max() == pytest.approx(start[1])
+
+
+def test_a_body_that_is_played_backward_shows_the_same_poses():
+    body = walking(1.0)
+    backward = frames_of(body, np.arange(len(body.t))[::-1])
+    np.testing.assert_array_equal(backward.joints(), body.joints()[::-1])
+
+
+def test_a_clip_depends_on_seed_and_number_alone(clips: list[Clip]):
+    again = SyntheticSequences(10, seed=2, workers=1).clip(7, FPS)
+    assert (again.id, again.captions) == (clips[7].id, clips[7].captions)
+    np.testing.assert_array_equal(again.motion, clips[7].motion)
+    other = SyntheticSequences(10, seed=3, workers=1).clip(7, FPS)
+    assert other.id != clips[7].id
+
+
+def test_nothing_jumps_where_motions_meet(clips: list[Clip]):
+    """Speed and jerk of all joints are at most those of clips with one motion, which have no seam."""
+    single = [Synthetic(120, seed=2, actions="all").clip(n, FPS).motion for n in range(120)]
+
+    def largest(motions: list[np.ndarray], order: int) -> float:
+        steps = [np.linalg.norm(np.diff(m, n=order, axis=0), axis=-1).max() for m in motions]
+        return max(steps) * FPS**order
+
+    joined = [clip.motion for clip in clips]
+    assert largest(joined, 1) < 1.2 * largest(single, 1)
+    assert largest(joined, 3) < 1.2 * largest(single, 3)
+
+
+def test_one_body_that_begins_at_the_origin_and_stays_above_the_floor(clips: list[Clip]):
+    first: np.ndarray | None = None
+    for clip in clips:
+        assert len(clip.motion) >= 55, clip.id
+        np.testing.assert_allclose(clip.motion[0, 0, [0, 2]], 0, atol=1e-6)
+        assert clip.motion[..., 1].min() > -0.07, clip.id
+        bones = np.linalg.norm(clip.motion[:, 1:] - clip.motion[:, PARENTS[1:]], axis=-1)
+        first = bones[0] if first is None else first
+        # A leg that stretches into a plank is up to 3 cm too long, as in clips of one motion.
+        np.testing.assert_allclose(bones, np.tile(first, (len(bones), 1)), atol=0.06)
+
+
+def test_planted_feet_do_not_slide(clips: list[Clip]):
+    """Of all frames in which a toe joint rests on the floor, nearly none moves it by more than a centimeter."""
+    moved = []
+    for clip in clips:
+        toes = clip.motion[:, [10, 11]]
+        resting = (toes[1:, :, 1] < 1e-4) & (toes[:-1, :, 1] < 1e-4)
+        moved.append(np.linalg.norm(np.diff(toes[..., [0, 2]], axis=0), axis=-1)[resting])
+    assert len(np.concatenate(moved)) > 80 * FPS
+    assert (np.concatenate(moved) > 0.01).mean() < 0.01
+
+
+def test_who_walks_does_not_stop_and_who_sits_stays_seated(clips: list[Clip]):
+    walks = [clip for clip in clips if clip.attributes.get("direction") == "forward"]
+    walks = [c for c in walks if c.attributes["action"] == "walk" and "while" not in c.attributes]
+    assert len(walks) > 2
+    for clip in walks:
+        speed = np.linalg.norm(np.diff(clip.motion[-12:, 0, [0, 2]], axis=0), axis=-1) * FPS
+        assert speed.min() > 0.3, clip.id
+    sits = [clip for clip in clips if clip.attributes["action"] in ("sit", "seated", "type")]
+    assert len(sits) > 2
+    for clip in sits:
+        assert (clip.motion[-5:, 0, 1] < 0.65).all(), clip.id
+
+
+def test_motions_follow_others_in_every_posture(clips: list[Clip]):
+    heights = np.array([clip.motion[0, 0, 1] for clip in clips])
+    assert (heights < 0.3).any(), "nobody lies at the beginning"
+    assert ((heights > 0.5) & (heights < 0.65)).any(), "nobody sits at the beginning"
+    moving = [np.linalg.norm(np.diff(c.motion[:6], axis=0), axis=-1).max() * FPS for c in clips]
+    assert np.mean(np.array(moving) > 1.0) > 0.2, "few clips begin in motion"

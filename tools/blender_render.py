@@ -16,8 +16,8 @@ import bpy  # pyright: ignore[reportMissingImports]
 import mathutils  # pyright: ignore[reportMissingImports]
 
 OPERATORS = {".fbx": bpy.ops.import_scene.fbx, ".glb": bpy.ops.import_scene.gltf}
-BONE = (0.93, 0.5, 0.18, 1)  # color of bones
-THICK = 0.12  # width of a bone relative to its length
+BONE = (0.75, 0.18, 0.03, 1)  # color of bones
+THICK = 0.16  # width of a bone relative to its length
 TILE = 0.5  # meters, size of the squares of the floor
 CAMERA = mathutils.Vector((2.9, -2.9, 1.6))  # meters from the person, who faces -y in Blender
 

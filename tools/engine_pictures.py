@@ -22,9 +22,9 @@ ASSETS = Path(__file__).parents[1] / "docs" / "assets" / "engines"
 RENDER = Path(__file__).with_name("blender_render.py")
 TEXT = "a person walks forward, then waves with the left hand"
 COUNT = 8  # pictures per row
-SIZE = (90, 125)  # of one picture
+SIZE = (108, 150)  # of one picture
 SMALL = (84, 112)  # of one picture of a sheet with every frame
-COLORS = 20
+QUALITY = 82  # of the WebP files
 LABEL = (20, 20, 20)
 CLIPS = ("Walk_Fwd_Start", "Walk_Fwd_Loop", "Walk_Fwd_Stop", "Run_Fwd_Loop", "Turn_90_Left")
 
@@ -67,7 +67,7 @@ def sheet(path: Path, rows: Sequence[Sequence[Path]], labels: Sequence[str]) -> 
             whole.paste(Image.open(picture).convert("RGB"), (column * width, row * height))
         draw.text((4, row * height + 3), label, fill=LABEL)
     path.parent.mkdir(exist_ok=True)
-    whole.quantize(COLORS, dither=Image.Dither.NONE).save(path, optimize=True)
+    whole.save(path, quality=QUALITY, method=6)
 
 
 def draw_files() -> None:
@@ -86,7 +86,7 @@ def draw_files() -> None:
             path = folder / f"motion{number}{ending}"
             motion.save(path, rig=rig)
             files.append({"path": str(path), "count": COUNT, "bones": bones})
-        sheet(ASSETS / "blender.png", rendered(files, SIZE, 16, folder), list(versions))
+        sheet(ASSETS / "blender.webp", rendered(files, SIZE, 16, folder), list(versions))
 
 
 def draw_set() -> None:
@@ -96,7 +96,7 @@ def draw_set() -> None:
         if main(["sample", "quickstart", "set=locomotion", f"out={folder / 'set'}"]):
             raise UserError("the set cannot be written")
         files = [{"path": str(folder / "set" / f"{name}.fbx"), "count": COUNT} for name in CLIPS]
-        sheet(ASSETS / "set.png", rendered(files, SIZE, 16, folder), CLIPS)
+        sheet(ASSETS / "set.webp", rendered(files, SIZE, 16, folder), CLIPS)
 
 
 def draw_frames(folder: Path) -> None:
@@ -109,7 +109,7 @@ def draw_frames(folder: Path) -> None:
         for path, pictures in zip(paths, drawn, strict=True):
             rows = [pictures[k : k + 15] for k in range(0, len(pictures), 15)]
             labels = [f"{path.stem} {15 * k}" for k in range(len(rows))]
-            sheet(folder / "frames" / f"{path.stem}.png", rows, labels)
+            sheet(folder / "frames" / f"{path.stem}.webp", rows, labels)
 
 
 if __name__ == "__main__":

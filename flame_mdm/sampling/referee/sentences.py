@@ -87,9 +87,9 @@ def read_claims(text: str) -> list[Claim]:
     orders: list[Claim] = []
     before: list[Claim] = []
     clauses = _clauses(plain)
-    for place, clause in enumerate(clauses):
+    for number, clause in enumerate(clauses):
         current = _of_clause(clause.text)
-        claims += _at_ends(clause, is_last=place == len(clauses) - 1)
+        claims += _at_ends(clause, is_last=number == len(clauses) - 1)
         claims += _lasting(clause.text, current)
         if not current:
             continue

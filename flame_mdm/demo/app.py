@@ -18,17 +18,21 @@ os.environ |= {
 import gradio as gr
 import uvicorn
 from fastapi import FastAPI
-from fastapi.responses import PlainTextResponse, Response
+from fastapi.responses import HTMLResponse, JSONResponse, PlainTextResponse, Response
 from gradio import themes
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 
+from flame_mdm.conditions.language.reading import NotUnderstood
+from flame_mdm.data.standing import standing
 from flame_mdm.demo.connections import ConnectionLimits, server_settings
-from flame_mdm.demo.guard import Guard
+from flame_mdm.demo.guard import Guard, LiveCall
+from flame_mdm.demo.live import LiveStreams
 from flame_mdm.demo.request import parse_query, query_pairs
 from flame_mdm.demo.studio import Studio
 from flame_mdm.demo.studio_page import build_page
 from flame_mdm.errors import UserError, first_line, one_line, say
+from flame_mdm.visualize import player_page
 
 # Open pages that gradio remembers; it keeps half a megabyte for each, and the page needs none of
 # it
@@ -36,6 +40,8 @@ SESSIONS = 64
 # Maximum number of motion files that are written at the same time, and of requests that wait for a file.
 WRITERS = 2
 WAITING_FILES = 32
+WAITING_BLOCKS = 32
+FOLDER = Path(__file__).parent
 FONT, MONO = ("system-ui", "sans-serif"), ("ui-monospace", "monospace")
 
 
@@ -82,6 +88,46 @@ class Server(uvicorn.Server):
         await super().shutdown(sockets)
 
 
+def source(name: str) -> str:
+    """Returns the text of a file next to this one."""
+    return (FOLDER / name).read_text(encoding="utf-8")
+
+
+def add_live(app: FastAPI, live: LiveStreams) -> None:
+    """Adds the blocks of streams at `/live`, their files, and the page of their player."""
+    waiting = 0
+
+    @app.get("/live.html")
+    async def player() -> Response:
+        still = standing(live.model.representation, 10)
+        return HTMLResponse(player_page([still], "Live"))
+
+    @app.post("/live")
+    async def block(web: Request) -> Response:
+        nonlocal waiting
+        if waiting >= WAITING_BLOCKS:
+            return JSONResponse({"error": "too many streams wait. Try again in a minute"}, 503)
+        waiting += 1
+        try:
+            call = LiveCall.model_validate_json(await web.body())
+            content = await run_in_threadpool(live.block, call.stream, call.text, call.begin)
+            return JSONResponse(content)
+        except NotUnderstood as error:
+            return JSONResponse({"error": error.message, "nearest": list(error.nearest)}, 400)
+        except UserError as error:
+            return JSONResponse({"error": first_line(error)}, 400)
+        finally:
+            waiting -= 1
+
+    @app.get("/live{ending}")
+    async def file(ending: str, stream: str = "") -> Response:
+        try:
+            content = await run_in_threadpool(live.file, stream, ending)
+        except UserError as error:
+            return PlainTextResponse(first_line(error), 400)
+        return Response(content, media_type="application/octet-stream")
+
+
 def web_app(studio: Studio, hosts: Collection[str] = ()) -> Guard:
     """Returns the application: the page at `/`, files at `/motion.bvh?...` with the query string of a link."""
     app = FastAPI(openapi_url=None)
@@ -118,6 +164,8 @@ def web_app(studio: Studio, hosts: Collection[str] = ()) -> Guard:
         headers = {"Content-Disposition": f'attachment; filename="{name}"'}
         return Response(content, media_type="application/octet-stream", headers=headers)
 
+    if studio.live is not None:
+        add_live(app, studio.live)
     blocks = build_page(studio)
     blocks.state_session_capacity = SESSIONS
     blocks.has_launched = True  # otherwise gradio does not check which files it may read
@@ -126,8 +174,9 @@ def web_app(studio: Studio, hosts: Collection[str] = ()) -> Guard:
         blocks,
         path="/",
         theme=themes.Default(primary_hue="blue", font=FONT, font_mono=MONO),
-        css_paths=Path(__file__).with_name("page.css"),
-        head=f"<script>{Path(__file__).with_name('page.js').read_text(encoding='utf-8')}</script>",
+        css_paths=[FOLDER / "page.css", FOLDER / "live.css"],
+        head=f"<script>{source('page.js')}</script>"
+        f'<script type="module">{source("live.js")}{source("live_page.js")}</script>',
         footer_links=[],
         ssr_mode=False,
         run_history=False,

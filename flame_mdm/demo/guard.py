@@ -15,12 +15,14 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from flame_mdm.demo.request import MAX_TEXT, PLAIN
+
 MAX_BODY = 64 * 1024  # maximum number of bytes of a request's body, counted as they arrive
 BODY_TIME = 10.0  # maximum number of seconds in which a body arrives
 MAX_PATH = 200  # maximum number of characters of an address's path; names of files have at most 255
 READ = re.compile(
     r"/|/theme\.css|/favicon\.ico|/manifest\.json|/(assets|static)(/[\w-]+(\.[\w-]+)*)+|/motion\.\w{3}"
-    r"|/gradio_api/(queue/data|heartbeat/\w{1,40})",
+    r"|/live\.(html|bvh|glb)|/gradio_api/(queue/data|heartbeat/\w{1,40})",
     re.ASCII,
 )
 """Paths that the page reads with GET."""
@@ -66,7 +68,16 @@ class Cancellation(Reset):
     fn_index: int
 
 
+class LiveCall(Post):
+    """A request for the frames of a stream from frame `begin` on; `stream` is "" for a new stream."""
+
+    stream: Annotated[str, StringConstraints(pattern=r"^([0-9a-f]{32})?$")]
+    text: Annotated[str, StringConstraints(min_length=1, max_length=MAX_TEXT, pattern=PLAIN)]
+    begin: Annotated[int, Field(ge=0, le=10_000_000)]
+
+
 POSTS: dict[str, type[Post]] = {
+    "/live": LiveCall,
     "/gradio_api/cancel": Cancellation,
     "/gradio_api/reset": Reset,
     "/gradio_api/queue/join": Call,

@@ -5,12 +5,13 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from threading import Event, Lock
+from threading import Event, Lock, get_ident
 from typing import Any
 
 from flame_mdm.checkpoints.loading import find, load
 from flame_mdm.conditions.language.reading import Reader, Reading
 from flame_mdm.conditions.vocabulary import advice
+from flame_mdm.demo.live import LiveStreams
 from flame_mdm.demo.request import MAX_SECONDS, PLUS, DemoRequest, checked
 from flame_mdm.errors import UserError, did_you_mean, one_line
 from flame_mdm.formats.cleanup import cleaned
@@ -47,7 +48,8 @@ class Studio:
         self._readers: dict[str, Reader] = {}
         self._made: OrderedDict[tuple[Any, ...], Sequence[Motion]] = OrderedDict()
         self._working, self._memory = Lock(), Lock()
-        self.model(sources[0])
+        model = self.model(sources[0])
+        self.live = LiveStreams(model) if model.denoiser.context_frames else None
 
     def model(self, name: str) -> MotionGenerator:
         """Returns a model by its name on the page, loaded at its first use; raises `UserError`
@@ -85,10 +87,13 @@ class Studio:
         with self._working:
             model = self.model(request.model)
             steps, cleanup = _plan(model, request)
-            calls, deadline = 0, time.monotonic() + TIME_LIMIT
+            calls, deadline, thread = 0, time.monotonic() + TIME_LIMIT, get_ident()
 
             def before(*_: object) -> None:
                 nonlocal calls
+                # A stream of another visitor may use the model at the same time.
+                if get_ident() != thread:
+                    return
                 if stop is not None and stop.is_set():
                     raise UserError("canceled")
                 if time.monotonic() > deadline:

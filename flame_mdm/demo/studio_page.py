@@ -102,7 +102,7 @@ def build_page(studio: Studio) -> gr.Blocks:
         return [_buttons(_examples(model)), samplers, _vocabulary(model)]
 
     with gr.Blocks(title="flame_mdm", analytics_enabled=False) as blocks:
-        ui = _layout(studio)
+        ui = _with_live(studio) if studio.live else _layout(studio)
         fields = [vars(ui)[name] for name in FORM]
         edit = [ui.query, ui.chosen, ui.new, ui.begin, ui.end, ui.parts, ui.again]
         quick: dict[str, Any] = {
@@ -145,6 +145,20 @@ def build_page(studio: Studio) -> gr.Blocks:
         blocks.unload(leave)
     blocks.queue(max_size=QUEUE, default_concurrency_limit=1)
     return blocks
+
+
+def _with_live(studio: Studio) -> SimpleNamespace:
+    """Returns the components of the page after placing them in a tab, next to the tab of the stream."""
+    fps = studio.model(next(iter(studio.files))).representation.fps
+    with gr.Tabs():
+        with gr.Tab("Motion"):
+            ui = _layout(studio)
+        with gr.Tab("Live"):
+            gr.HTML(
+                f'<div id="live" class="live" data-fps="{fps:g}">'
+                '<button type="button" class="start">Begin a stream</button></div>'
+            )
+    return ui
 
 
 def _layout(studio: Studio) -> SimpleNamespace:

@@ -92,12 +92,18 @@ def player_page(
     return re.sub("__(TITLE|ABOUT|COLUMNS|BODY|DATA)__", lambda match: content[match[1]], template)
 
 
+def packed_motion(motion: Figure, begin: int = 0) -> dict[str, Any]:
+    """Returns the frames of a motion from `begin` on for the player; frames before only determine rotations."""
+    return _packed(motion, "", "", (), None, begin)
+
+
 def _packed(
     motion: Figure,
     group: str,
     beside: str,
     marks: Sequence[tuple[int, int, str, str]],
     mesh: Mesh | None,
+    begin: int = 0,
 ) -> dict[str, Any]:
     low, high = motion.joints.min((0, 1)).astype(float), motion.joints.max((0, 1)).astype(float)
     center = (low + high) / 2
@@ -110,28 +116,30 @@ def _packed(
         "beside": beside,
         "marks": list(marks),
         "fps": motion.fps,
-        "frames": len(motion.joints),
+        "frames": len(motion.joints) - begin,
         "parents": list(motion.skeleton.parents),
         "sides": sides(motion.skeleton),
         "radii": radii(motion.skeleton),
         "head": head(motion.skeleton),
         "center": center.tolist(),
         "step": step,
-        "joints": _base64(np.rint((motion.joints - center) / step).astype("<i2")),
-        "body": body and _packed_body(body),
+        "joints": _base64(np.rint((motion.joints[begin:] - center) / step).astype("<i2")),
+        "body": body and _packed_body(body, begin),
         "why": reason,
         "feet": [] if motion.contacts is None else list(motion.skeleton.feet),
-        "contacts": "" if motion.contacts is None else _base64(motion.contacts.astype("u1")),
+        "contacts": ""
+        if motion.contacts is None
+        else _base64(motion.contacts[begin:].astype("u1")),
     }
 
 
-def _packed_body(body: FittedBody) -> dict[str, Any]:
+def _packed_body(body: FittedBody, begin: int) -> dict[str, Any]:
     """Returns proportions, and for each frame and bone a quaternion in 32 bits, exact to about 0.1 degrees.
 
     The two highest bits tell which of x, y, z, w is largest; the others, from -0.71 to 0.71,
     follow in 10 bits each.
     """
-    quaternions = Rotation.from_matrix(body.turns.reshape(-1, 3, 3)).as_quat()
+    quaternions = Rotation.from_matrix(body.turns[begin:].reshape(-1, 3, 3)).as_quat()
     largest = np.abs(quaternions).argmax(1)
     quaternions *= np.sign(np.take_along_axis(quaternions, largest[:, None], 1))
     others = quaternions[np.arange(4) != largest[:, None]].reshape(-1, 3)

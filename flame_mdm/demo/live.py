@@ -1,0 +1,139 @@
+"""Streams of motion for visitors: a bounded number, one block at a time, with files of the last minute."""
+
+import secrets
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from threading import Lock
+from typing import Any
+
+import numpy as np
+
+from flame_mdm.errors import UserError
+from flame_mdm.formats.motion import Motion
+from flame_mdm.generator import MotionGenerator
+from flame_mdm.sampling.streams import Stream, read_text, stream
+from flame_mdm.visualize.player import packed_motion
+
+MAX_STREAMS = 16
+IDLE = 120.0  # seconds without a request after which a stream ends
+LONGEST = 3600.0  # seconds of one stream
+# Blocks that a stream may compute at once, and per second on average
+BURST, RATE = 8.0, 2.0
+KEPT = 60.0  # seconds of a stream that can be downloaded
+BEFORE = 10  # frames before a block that the rotations of its first frames depend on
+ENDINGS = (".bvh", ".glb")
+
+
+@dataclass
+class LiveStream:
+    """A stream of a visitor, and what is kept of it.
+
+    Attributes:
+        stream: the stream.
+        used: time in seconds of the last request.
+        joints: (F, J, 3) the last minute.
+        text: the current text.
+        allowance: number of blocks that it may compute now.
+    """
+
+    stream: Stream
+    used: float
+    joints: np.ndarray
+    text: str
+    allowance: float = field(default=BURST)
+
+
+class LiveStreams:
+    """The streams of all visitors on one model.
+
+    Args:
+        model: a model that continues frames.
+        clock: returns the time in seconds.
+    """
+
+    def __init__(self, model: MotionGenerator, clock: Callable[[], float] = time.monotonic):
+        self.model, self.clock = model, clock
+        self._streams: dict[str, LiveStream] = {}
+        self._working = Lock()
+
+    def block(self, name: str, text: str, begin: int) -> dict[str, Any]:
+        """Returns the frames of a stream from a frame on, in the format of the player.
+
+        Args:
+            name: the stream; "" begins a new one, whose name is in the result.
+            text: what the person does.
+            begin: number of the first frame; later frames of the stream are dropped.
+
+        Raises:
+            UserError: If the text is not understood, the stream has ended, or a limit is reached.
+        """
+        with self._working:
+            read_text(self.model, text)
+            name, live = self._opened(name, text)
+            self._count(live)
+            first = live.stream.frames - len(live.joints)
+            if begin != live.stream.frames:
+                live.stream.go_back(begin / self.model.representation.fps)
+            if text != live.text:
+                live.stream.change(text)
+                live.text = text
+            block = next(live.stream)
+
+            before = live.joints[: begin - first]
+            live.joints = np.concatenate([before, block.joints])[-round(KEPT * block.fps) :]
+        context = before[-BEFORE:]
+        joints = np.concatenate([context, block.joints])
+        motion = packed_motion(Motion(joints, block.fps, block.skeleton, text), len(context))
+        return {"stream": name, "from": begin, "frames": len(block.joints), "motion": motion}
+
+    def file(self, name: str, ending: str) -> bytes:
+        """Returns a file of the last minute of a stream.
+
+        Raises:
+            UserError: If the stream has ended, or files do not have this ending.
+        """
+        if ending not in ENDINGS:
+            raise UserError(f"{ending[:20]}: not a format of a stream. Use {', '.join(ENDINGS)}")
+        with self._working:
+            live = self._found(name)
+            joints, text = live.joints, live.text
+        representation = self.model.representation
+        motion = Motion(joints, representation.fps, representation.skeleton, text)
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder, f"stream{ending}")
+            motion.save(path)
+            return path.read_bytes()
+
+    def _opened(self, name: str, text: str) -> tuple[str, LiveStream]:
+        """Returns a stream and its name, after ending the streams that nobody reads."""
+        now = self.clock()
+        self._streams = {
+            other: live for other, live in self._streams.items() if now - live.used <= IDLE
+        }
+        if name:
+            return name, self._found(name)
+        if len(self._streams) >= MAX_STREAMS:
+            raise UserError("too many streams run at the moment. Try again in two minutes")
+        name = secrets.token_hex(16)
+        nothing = np.zeros((0, len(self.model.representation.skeleton), 3), np.float32)
+        self._streams[name] = LiveStream(stream(self.model, text), now, nothing, text)
+        return name, self._streams[name]
+
+    def _found(self, name: str) -> LiveStream:
+        if name not in self._streams:
+            raise UserError("this stream has ended. Reload the page to begin another one")
+        return self._streams[name]
+
+    def _count(self, live: LiveStream) -> None:
+        """Counts a block; raises `UserError` if a stream computes more blocks than anybody can watch."""
+        now = self.clock()
+        live.allowance = min(BURST, live.allowance + RATE * (now - live.used))
+        live.used = now
+        if live.allowance < 1:
+            raise UserError("too many changes in a short time. Wait a few seconds")
+        live.allowance -= 1
+        if live.stream.frames > LONGEST * self.model.representation.fps:
+            raise UserError("this stream has lasted for an hour. Reload the page")

@@ -1,0 +1,145 @@
+"""The demo's streams: blocks for the player, texts, files of the last minute, and limits for visitors."""
+
+import base64
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from support.runs import TINY_DIP, untrained
+
+from flame_mdm import stream
+from flame_mdm.data.standing import standing
+from flame_mdm.demo import live as making
+from flame_mdm.demo.live import LiveStreams
+from flame_mdm.errors import UserError
+from flame_mdm.generator import MotionGenerator
+
+WALK, SIT = "a person walks", "a person sits down"
+
+
+@pytest.fixture(scope="module")
+def model() -> MotionGenerator:
+    """A tiny model with random weights, whose motions are almost a person who stands."""
+    model = untrained(TINY_DIP, 40, "synthetic/dip")
+    still = standing(model.representation, 10).features[0]
+    model.representation.mean.copy_(torch.from_numpy(still))
+    model.representation.std.fill_(0.01)
+    return model
+
+
+class Clock:
+    """A clock that a test sets."""
+
+    time = 0.0
+
+    def __call__(self) -> float:
+        return self.time
+
+
+def joints_of(motion: dict[str, Any]) -> np.ndarray:
+    packed = np.frombuffer(base64.b64decode(motion["joints"]), "<i2").reshape(-1, 22, 3)
+    return np.array(motion["center"]) + packed * motion["step"]
+
+
+def test_blocks_are_those_of_the_stream_and_a_new_text_replaces_frames_that_were_not_shown(model):
+    live = LiveStreams(model)
+    first = live.block("", WALK, 0)
+    name = first["stream"]
+    live.block(name, WALK, 30)
+    changed = live.block(name, SIT, 42)
+    running = stream(model, WALK)
+    running.change(SIT, at=2.1)
+    expected = [next(running).joints for _ in range(3)]
+    for block, joints in ((first, expected[0]), (changed, expected[2])):
+        assert block["frames"] == len(joints) == 30
+        assert np.abs(joints_of(block["motion"]) - joints).max() < 0.001 + block["motion"]["step"]
+    turns = base64.b64decode(changed["motion"]["body"]["turns"])
+    assert len(turns) == 30 * 28 * 4
+    assert json.dumps(changed)
+    assert live.file(name, ".bvh").startswith(b"HIERARCHY")
+    assert b"Frames: 72" in live.file(name, ".bvh")
+    with pytest.raises(UserError, match="not a format of a stream"):
+        live.file(name, ".exe")
+
+
+def test_a_text_that_is_refused_leaves_the_stream_as_it_was(model):
+    live = LiveStreams(model)
+    name = live.block("", WALK, 0)["stream"]
+    with pytest.raises(UserError, match="give a text that says what happens"):
+        live.block(name, " ", 20)
+    assert live.block(name, WALK, 30)["from"] == 30
+
+
+def test_streams_are_bounded_and_end_when_nobody_reads_them(model, monkeypatch):
+    monkeypatch.setattr(making, "MAX_STREAMS", 2)
+    clock = Clock()
+    live = LiveStreams(model, clock)
+    first = live.block("", WALK, 0)["stream"]
+    clock.time = 100.0
+    live.block("", WALK, 0)
+    with pytest.raises(UserError, match="too many streams run"):
+        live.block("", WALK, 0)
+    clock.time = 130.0
+    live.block("", WALK, 0)
+    with pytest.raises(UserError, match="this stream has ended"):
+        live.block(first, WALK, 30)
+
+
+def test_a_stream_computes_no_more_blocks_than_anybody_can_watch(model):
+    clock = Clock()
+    live = LiveStreams(model, clock)
+    name = live.block("", WALK, 0)["stream"]
+    for begin in (30, 60, 90, 120, 150, 180, 210):
+        live.block(name, WALK, begin)
+    with pytest.raises(UserError, match="too many changes in a short time"):
+        live.block(name, WALK, 240)
+    clock.time = 0.5
+    assert live.block(name, WALK, 240)["from"] == 240
+
+
+def test_the_last_minute_is_kept(model, monkeypatch):
+    monkeypatch.setattr(making, "KEPT", 2.0)
+    live = LiveStreams(model)
+    name = live.block("", WALK, 0)["stream"]
+    for begin in (30, 60):
+        live.block(name, WALK, begin)
+    assert b"Frames: 40" in live.file(name, ".bvh")
+
+
+def test_the_server_sends_blocks_within_the_rules_of_the_guard(model):
+    pytest.importorskip("gradio", reason="gradio is not installed")
+    from fastapi import FastAPI
+    from starlette.testclient import TestClient
+
+    from flame_mdm.demo.app import add_live
+    from flame_mdm.demo.guard import Guard
+
+    app = FastAPI(openapi_url=None)
+    add_live(app, LiveStreams(model))
+    call = {"stream": "", "text": WALK, "begin": 0}
+    with TestClient(Guard(app, (), {}, bool), "http://localhost") as client:
+        block = client.post("/live", json=call).json()
+        assert (block["from"], block["frames"]) == (0, 30)
+        name = block["stream"]
+        assert client.post("/live", json={**call, "stream": name, "begin": 30}).json()["from"] == 30
+        assert client.get(f"/live.bvh?stream={name}").content.startswith(b"HIERARCHY")
+        assert client.get("/live.html").status_code == 200
+        for wrong in (
+            {"stream": "../etc"},
+            {"text": ""},
+            {"text": "x" * 301},
+            {"text": "walks \u202e"},
+            {"begin": -1},
+            {"begin": "0"},
+            {"file": "/etc/passwd"},
+        ):
+            assert client.post("/live", json=call | wrong).status_code == 400
+        unknown = client.post("/live", json=call | {"stream": "0" * 32})
+        assert unknown.json() == {
+            "error": "this stream has ended. Reload the page to begin another one"
+        }
+        assert client.get("/live.exe?stream=x").status_code == 404
+        headers = {"Origin": "http://evil.example"}
+        assert client.post("/live", json=call, headers=headers).status_code == 403

@@ -22,7 +22,7 @@ from flame_mdm.data import Clip, hashed_split
 from flame_mdm.data.folder import Folder
 from flame_mdm.data.store import Store, write_store
 from flame_mdm.data.synthetic import Synthetic
-from flame_mdm.formats import bvh
+from flame_mdm.formats import bvh, fbx, fbx_scene
 from flame_mdm.formats.layouts import LAYOUTS, read_skeleton
 from flame_mdm.formats.readers import PELVIS, read
 from flame_mdm.representations.humanml import HumanML
@@ -463,6 +463,70 @@ def test_an_empty_folder_and_a_missing_one_are_told_apart(tmp_path, subtests):
             pytest.raises(FileNotFoundError, match=rf"{name}: {says}\. Give a folder of"),
         ):
             Folder(str(tmp_path / name)).count()
+
+
+BIPED = {  # Mixamo's names without their prefix -> the names of a Biped, as in Rocketbox
+    "Hips": "Bip01 Pelvis",
+    "Spine": "Bip01 Spine",
+    "Spine1": "Bip01 Spine1",
+    "Spine2": "Bip01 Spine2",
+    "Neck": "Bip01 Neck",
+    "Head": "Bip01 Head",
+    **{
+        f"{side}{name}": f"Bip01 {side[0]} {biped}"
+        for side in ("Left", "Right")
+        for name, biped in {
+            "Shoulder": "Clavicle",
+            "Arm": "UpperArm",
+            "ForeArm": "Forearm",
+            "Hand": "Hand",
+            "UpLeg": "Thigh",
+            "Leg": "Calf",
+            "Foot": "Foot",
+            "ToeBase": "Toe0",
+        }.items()
+    },
+}
+
+
+def rename(path: Path, names: dict[str, str]) -> None:
+    """Gives the nodes of an FBX file other names."""
+    root = fbx.read(path)
+    objects = root.first("Objects")
+    assert objects is not None
+    for record in objects.children:
+        name, separator, kind = str(record.properties[1]).partition("\x00\x01")
+        if new := names.get(name.removeprefix("mixamorig:")):
+            record.properties[1] = new + separator + kind
+    fbx.write(path, root)
+
+
+def test_fbx_files_with_names_of_mixamo_rocketbox_and_unreal_go_in_and_come_out(
+    tmp_path: Path, capsys, subtests
+):
+    folder, motion = tmp_path / "in", synthetic("kick")
+    folder.mkdir()
+    for name, rig in (("mixamo", "mixamo"), ("rocketbox", "mixamo"), ("unreal", "unreal")):
+        motion.save(folder / f"{name}.fbx", rig=rig)
+    rename(folder / "rocketbox.fbx", BIPED)
+    assert "Bip01 L Thigh" in fbx_scene.read(folder / "rocketbox.fbx").names
+
+    words = [f"source={folder}", f"data_root={tmp_path}", "data.source.workers=1"]
+    assert main(["prepare", "folder", *words]) == 0, capsys.readouterr().err
+    (path,) = tmp_path.glob("folder-*/store.json")
+    store = Store(path.parent)
+    assert sorted(clip.id for clip in store.clips) == ["mixamo", "rocketbox", "unreal"]
+
+    limbs = [SMPL22.joints.index(name) for name in ("left_wrist", "right_ankle", "head")]
+    for name in ("mixamo", "rocketbox", "unreal"):
+        with subtests.test(name=name):
+            out = tmp_path / f"{name}.fbx"
+            assert main(["convert", str(folder / f"{name}.fbx"), f"out={out}", "rig=unity"]) == 0
+            joints = read(out).joints
+            moved = joints[:, limbs] - joints[:, :1]
+            expected = motion.joints[:, limbs] - motion.joints[:, :1]
+            # Rigs keep the lengths of their bones, so that limbs end a few centimeters elsewhere.
+            assert np.linalg.norm(moved - expected, axis=-1).mean() < 0.06
 
 
 @pytest.mark.parametrize(

@@ -88,17 +88,31 @@ class Task(Model, LightningModule):
         return instantiate(self.optimizer, params=[p for p in self.parameters() if p.requires_grad])
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
-        """Returns the optimizer, and the decay of its learning rate over the last share `lr_decay` of the training."""
+        """Returns the optimizer, and the course of its learning rate.
+
+        The rate rises linearly over the first `lr_warmup` steps, and falls linearly to 0 over the
+        last share `lr_decay` of the training.
+        """
         optimizer = self.make_optimizer()
         share = self.config.get("lr_decay") or 0.0
         if not 0 <= share <= 1:
             raise UserError(f"lr_decay={share}: give the share of the training, from 0 to 1")
+        warmup = self.config.get("lr_warmup") or 0
+        if warmup < 0:
+            raise UserError(f"lr_warmup={warmup}: give a number of steps from 0 on")
+
         steps = self.trainer.max_steps
         falling = share * steps
-        if not falling:
+        if not falling and not warmup:
             return optimizer
-        decay = LambdaLR(optimizer, lambda step: min(1.0, max(0, steps - step) / falling))
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": decay, "interval": "step"}}
+
+        def factor(step: int) -> float:
+            rising = (step + 1) / warmup if warmup else 1.0
+            remaining = max(0, steps - step) / falling if falling else 1.0
+            return min(1.0, rising, remaining)
+
+        schedule = {"scheduler": LambdaLR(optimizer, factor), "interval": "step"}
+        return {"optimizer": optimizer, "lr_scheduler": schedule}
 
     def on_train_start(self) -> None:
         """Enables clipping for fused optimizers in bfloat16, whose gradients are not scaled; Lightning refuses it."""

@@ -159,6 +159,7 @@ def test_recipes_outside_the_repository(tmp_path, subtests):
         ("seed: abc", "seed=abc: must be a whole number"),
         ("seed: -1", "seed=-1: must be from 0 to"),
         ("lr_decay: x", "lr_decay=x: must be a finite number or null"),
+        ("lr_warmup: 1.5", "lr_warmup=1.5: must be a whole number or null"),
         ("data_root: [a]", "data_root=['a']: must be a text"),
         ("run: {dir: 3}", "run.dir=3: must be a text"),
         ("callbacks: 3", "callbacks=3: must be a mapping"),

@@ -122,6 +122,7 @@ def test_a_decaying_learning_rate_resumes_where_it_was(tiny, tmp_path):
     overrides = [
         *tiny,
         *STEPS,
+        "lr_warmup=2",
         "lr_decay=0.5",
         "optimizer.lr=0.008",
         "callbacks.best=null",
@@ -131,7 +132,7 @@ def test_a_decaying_learning_rate_resumes_where_it_was(tiny, tmp_path):
     overrides += ["trainer.accumulate_grad_batches=2", "data.num_workers=1", "ema=null"]
     whole = run(overrides, 8, tmp_path / "whole")
     rates = read_history(tmp_path / "whole")["train/lr"]
-    assert list(rates.values()) == pytest.approx([0.008] * 5 + [0.006, 0.004, 0.002])
+    assert list(rates.values()) == pytest.approx([0.004] + [0.008] * 4 + [0.006, 0.004, 0.002])
     parts = tmp_path / "parts" / "checkpoints" / "last.ckpt"
     parts.parent.mkdir(parents=True)
     parts.write_bytes((whole.parent / "step=0000006.ckpt").read_bytes())

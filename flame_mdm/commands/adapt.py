@@ -17,7 +17,7 @@ class AdaptSettings(ModelSettings):
     """
 
     OBJECTS: ClassVar = ("ckpt", "out")
-    COMPOSED: ClassVar = ("ema", "logger", "lr_decay", "seed")
+    COMPOSED: ClassVar = ("ema", "logger", "lr_decay", "lr_warmup", "seed")
     source: str = required("folder of motions with captions: docs/own-data.md")
     name: str = required("one word for prompts: 'a person walks in NAME style'")
     out: str | None = option(None, "run directory; default runs/adapt/NAME")

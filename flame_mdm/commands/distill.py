@@ -35,7 +35,7 @@ class DistillSettings(ModelSettings):
     """
 
     OBJECTS: ClassVar = ("ckpt", "out")
-    COMPOSED: ClassVar = ("seed", "lr_decay", "ema", "launch", "-m", "--multirun")
+    COMPOSED: ClassVar = ("seed", "lr_decay", "lr_warmup", "ema", "launch", "-m", "--multirun")
     out: str | None = option(None, "run directory. Default: runs/RECIPE_distilled/default")
     composed: tuple[str, ...] = ()
 

@@ -188,6 +188,7 @@ def test_a_missing_source_or_another_set_is_refused_with_where_to_get_it(
         *WHERE,
         "synthetic",
         "package",
+        "package_dip",
         "humanact12_unconstrained",
         "bandai_compositional",
     }

@@ -162,9 +162,9 @@ class Edit:
             the equally noisy known part (FLAME, RePaint); "trajectory" overwrites the early part
             of the flow's path (MFM).
         until: for "trajectory", the last flow time at which the path is overwritten.
-        blend: for "x_t", replace the kept part "after" each step (FLAME, eq. 6), which ends in
-            the known motion itself, or "before" each call of the denoiser (FLAME's code), which
-            ends in the model's version of it.
+        blend: for "x_t", when the kept part is replaced. "after" each step (FLAME, eq. 6): the
+            result contains the known motion itself. "before" each call of the denoiser (FLAME's
+            code): the result contains the model's version of the known motion.
         resample: for "x_t", how many times each step is repeated, after adding noise again
             (RePaint, algorithm 1).
         guide: for "x0", leads the motion to a goal in each step, before the kept part overwrites

@@ -184,8 +184,10 @@ class ReleasedExtractor(Extractor, Generic[Network]):
 
     FILES: tuple[str, ...] = ()
     network: Network
-    made_for: tuple[str, str]  # names of the representation and the data set that it was trained on
-    used = 0  # number of features that it reads, from the first
+    # Names of the representation and the data set that the network was trained on
+    made_for: tuple[str, str]
+    # The network reads this many features, starting with the first.
+    used = 0
 
     def __init__(self, path: str):
         self.path = Path(path)

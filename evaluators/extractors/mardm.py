@@ -23,7 +23,7 @@ def _transformer(width: int, heads: int, hidden: int, layers: int) -> nn.Transfo
 
 
 class _MotionEncoder(nn.Module):
-    """A transformer whose first token, which is learned, becomes the vector of the motion."""
+    """A transformer with a learned first token; the output for this token is the embedding of the motion."""
 
     def __init__(self, features: int, width: int, transformer: nn.TransformerEncoder):
         super().__init__()

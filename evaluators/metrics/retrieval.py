@@ -20,7 +20,7 @@ from flame_mdm.errors import UserError
 from flame_mdm.safe_io import MEBIBYTE, read_text
 from flame_mdm.seeds import key
 
-# Cosine above which TMR considers captions the same: its threshold 0.95 is of (cosine + 1) / 2
+# Captions with a larger cosine are the same. TMR's threshold of 0.95 applies to (cosine + 1) / 2.
 SAME = 0.9
 # The k of recall
 TMR_TOP = (1, 2, 3, 5, 10)

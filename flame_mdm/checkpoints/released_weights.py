@@ -36,7 +36,7 @@ def read_released(
         raise
     except ImportError as error:
         raise UserError(
-            f"{path}: {error}. The objects in this file need this package: install it"
+            f"{path}: {error}. The file contains objects of this package. Install the package"
         ) from error
     except Exception as error:  # torch raises many kinds for damaged files
         unsafe = re.search(r"Unsupported global: GLOBAL (\S+)", str(error))

@@ -117,7 +117,7 @@ class AdaptedSettings(ModelSettings):
     """Keys that name a model and its adapters."""
 
     adapter: list[str] | None = option(
-        None, "files of `flame-mdm adapt` for this model, separated by spaces"
+        None, "adapters of this model, written by `flame-mdm adapt`, separated by spaces"
     )
     adapter_strength: float | Sequence[float] = option(
         1.0, "strength of all adapters, or a list with one per adapter; 0 = the model without them"
@@ -236,7 +236,7 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
 
     text: str | None = same_option(SamplingRequest, "texts")
     action: str | None = same_option(SamplingRequest, "actions")
-    unconditioned: bool = option(False, "true = motions of no text and no action")
+    unconditioned: bool = option(False, "true = generate motions without a text or an action")
     seed: int = same_option(SamplingRequest, "seed")
     cleanup: bool = same_option(SamplingRequest, "cleanup")
     targets: str | None = same_option(SamplingRequest, "targets", existing)

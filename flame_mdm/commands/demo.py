@@ -26,7 +26,7 @@ class DemoSettings:
     )
     host: str = option(
         "127.0.0.1",
-        "address to listen on; the default is this computer alone, 0.0.0.0 = all networks",
+        "address to listen on; the default accepts only this computer, 0.0.0.0 = all networks",
     )
     port: int = option(7860, "port to listen on; 0 = any free port")
     hosts: list[str] = option(

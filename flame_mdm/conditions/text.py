@@ -153,7 +153,10 @@ class PretrainedText(ConditionEncoder):
         del self._pretrained.network  # frees its memory
 
     def load_cache(self, captions: Sequence[str], folder: Path) -> int:
-        """Opens the file of `precompute` and returns its bytes; raises `UserError` if it is missing or damaged."""
+        """Opens the file that `precompute` wrote and returns its size in bytes.
+
+        Raises `UserError` if the file is missing or damaged.
+        """
         if not self.freeze:
             return 0
         self._cache = EncodedCaptions.open(self._cache_path(captions, folder))

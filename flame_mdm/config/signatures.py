@@ -98,7 +98,7 @@ def check_kind(key: str, value: Any, annotation: str) -> None:
     """Raises `UserError` if the annotation of a parameter rules out a value. Unknown annotations allow any value."""
     required = []
     kinds = _alternatives(ast.parse(annotation or "Any", mode="eval").body)
-    # Configurations hold no tensors, so that a union with Tensor is checked without it.
+    # A configuration cannot contain a tensor: in a union, only the other types are checked.
     for kind in [kind for kind in kinds if _name(kind) != "Tensor"]:
         description = _mismatch(value, kind)
         if not description:

@@ -135,7 +135,7 @@ class Folder(MotionSource):
 
     @cached_property
     def copies(self) -> dict[str, int]:
-        """How often each motion occurs in the set, see `balance`; a mirrored copy occurs as often."""
+        """Number of times that each motion occurs in the set (see `balance`); a mirrored copy occurs equally often."""
         sizes = Counter(
             note.action for name, note in self.notes.items() if self.splits[name] == "train"
         )

@@ -125,7 +125,7 @@ def _first(pending: deque[Future[Result]]) -> Result:
 
 
 def _start_worker() -> None:
-    """Sets up a worker: one thread, ignores Ctrl-C (the parent handles it), and exits when the parent dies."""
+    """Sets up a worker: it uses one thread, ignores Ctrl-C (the parent handles it) and exits when the parent dies."""
     # read when a task imports torch; importing it for tasks that do not takes long
     os.environ["OMP_NUM_THREADS"] = "1"
 

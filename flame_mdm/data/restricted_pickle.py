@@ -7,7 +7,7 @@ are not used for that, because a wrong byte in a dtype crashes them.
 
 Python's C unpickler allocates as much memory as a file of ten bytes requests. Therefore this
 reader is based on the unpickler in Python. No read may request more bytes than are left in the
-file, and content that a pickle repeats counts each time.
+file, and content that a pickle repeats is counted at each repetition.
 """
 
 import pickle

@@ -37,7 +37,7 @@ from flame_mdm.visualize import player_page
 # Open pages that gradio remembers; it keeps half a megabyte for each, and the page needs none of
 # it
 SESSIONS = 64
-# Maximum number of motion files that are written at the same time, and of requests that wait for a file.
+# Maximum number of motion files written at the same time, and maximum number of requests that wait for a file
 WRITERS = 2
 WAITING_FILES = 32
 WAITING_BLOCKS = 32

@@ -35,7 +35,7 @@ ADVICE = {
 """Ending of motion files that are not read -> what to do."""
 
 NO_MOTIONS = ("shape.npz", "_stagei.npz")
-"""Ends of the names of AMASS's files that contain the shape of a body and no motion."""
+"""Suffixes of AMASS files that contain a body shape and no motion."""
 # The array of joints that only motions in JSON have
 JOINTS_IN_JSON = re.compile(rb'"(joints|posed_joints)"\s*:\s*\[\s*\[')
 

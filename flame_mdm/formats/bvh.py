@@ -209,7 +209,10 @@ class _Node:
 
 
 class Lines:
-    """Lines of a text file as words, without blank lines and comments (#); tracks the line number for errors."""
+    """Splits the lines of a text file into words; skips blank lines and comments (#).
+
+    Tracks the line number for error messages.
+    """
 
     def __init__(self, data: bytes, name: str):
         self.name, self.size, self.line, self.row = name, len(data), 1, list[str]()

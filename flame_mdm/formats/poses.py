@@ -176,9 +176,9 @@ def _fit(offsets: Tensor, bones: Tensor) -> Tensor:
     Bones without length give the identity.
     """
     (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in (offsets.mT @ bones).unbind(-2))
-    # The rotation is the eigenvector of the largest eigenvalue of this symmetric matrix. Powers
-    # of a matrix approach it, and repeated squaring takes few operations that ONNX has, unlike
-    # eigenvectors.
+    # The rotation is the eigenvector of the largest eigenvalue of this symmetric matrix. ONNX
+    # has no operator for eigenvectors. The columns of high powers of a matrix approach this
+    # eigenvector, and repeated squaring takes few operations.
     rows = (
         torch.stack((a + e + i, f - h, g - c, b - d), -1),
         torch.stack((f - h, a - e - i, b + d, g + c), -1),

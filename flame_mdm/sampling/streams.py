@@ -165,8 +165,9 @@ class Stream(Iterator[Motion]):
 class OnlineCleanup:
     """Cleanup of a motion that comes in blocks: each is cleaned together with the block before it and the one after.
 
-    A block is cleaned twice, as the last one of three and as the middle one. The result goes from the first version,
-    which continues the block before without a jump, over to the second, which fits the block after.
+    A block is cleaned twice: as the last of three blocks, and as the middle one. The first version continues the
+    previous block without a jump. The second version fits the next block. The result blends from the first version to
+    the second.
     """
 
     def __init__(self, representation: Representation):
@@ -455,7 +456,10 @@ def in_world(representation: Representation, placement: Placement, x: Tensor) ->
 
 
 def root_target(window: Targets, frames: int, placement: Placement) -> Tensor | None:
-    """Returns the target condition (1, 8, 4) of the root's position in the last frame of a block, if there is one."""
+    """Returns the target condition (1, 8, 4) for the position of the root in the last frame of a block.
+
+    Returns None if the window has no such target.
+    """
     goal = window.positions
     of_root = (goal.joints == 0) & (goal.frames == frames - 1)
     values = dict(zip(goal.axes[of_root].tolist(), goal.values[of_root].tolist(), strict=True))

@@ -116,8 +116,9 @@ class Measurements(Callback):
 
     The norm of all gradients is measured before clipping. Seconds per step leave out validation.
     Adds `facts.training` to checkpoints: `hours` of training so far, including validation;
-    `processes`, their number; `device`, `speed` and `precision`; and `memory_gib`, the peak
-    memory of tensors on CUDA, otherwise of the first process.
+    `processes`, the number of processes; `device`, `speed` and `precision`; and `memory_gib`, the
+    peak memory. On CUDA, this is the memory of tensors; on other devices, the memory of the first
+    process.
     """
 
     def __init__(self) -> None:

@@ -187,7 +187,7 @@ def _check_version(version: Any, path: Path) -> None:
         supported = False
     if not supported:
         raise UserError(
-            f"{path}: written by version {str(version)[:40]} of Lightning, not {OLDEST_LIGHTNING} or later"
+            f"{path}: written by Lightning {str(version)[:40]}. Use a checkpoint of {OLDEST_LIGHTNING} or later"
         )
 
 

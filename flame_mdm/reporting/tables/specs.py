@@ -34,7 +34,7 @@ SWEPT = (
 )
 """Options of a row that may be lists; each value makes one row."""
 MOST_ROWS, MOST_COLUMNS, MOST_FIGURES = 1_000, 100, 100
-"""Limits of a table: rows after expanding lists of options, columns, and plots. Tables of papers have about 20 rows."""
+"""Limits of a table: rows (with lists of options expanded), columns and plots. Tables of papers have about 20 rows."""
 
 
 class Options(ClosedSchema):

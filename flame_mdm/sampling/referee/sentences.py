@@ -22,7 +22,8 @@ BOUNDARY = re.compile(
 )
 LATER = ("then", "followed by", "before", "|")
 SIDES = re.compile(r"\b(left|right)\b")
-LONGEST = 600  # characters of a sentence that are read
+# Maximum length of a sentence, in characters; the rest is not read
+LONGEST = 600
 COUNT_NOUNS = {
     "count jumps": "jumps?|hops?|leaps?",
     "count squats": "squats?",

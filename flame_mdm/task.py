@@ -111,8 +111,8 @@ class Task(Model, LightningModule):
             remaining = max(0, steps - step) / falling if falling else 1.0
             return min(1.0, rising, remaining)
 
-        schedule = {"scheduler": LambdaLR(optimizer, factor), "interval": "step"}
-        return {"optimizer": optimizer, "lr_scheduler": schedule}
+        schedule = LambdaLR(optimizer, factor)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def on_train_start(self) -> None:
         """Enables clipping for fused optimizers in bfloat16, whose gradients are not scaled; Lightning refuses it."""

@@ -80,6 +80,8 @@ class Body:
             [rng.normal(0.03, 0.05), rng.uniform(0.14, 0.24), -0.4, rng.uniform(0.2, 0.4)]
         )[:, None]
         self.shoulders = np.zeros((2, len(t)))  # the girdle raised, beyond its rise with the arm
+        # Whether a foot that is too far from its hip is drawn toward it, instead of a longer shin
+        self.keeps_legs = False
         self.reaches: list[tuple[int, np.ndarray, np.ndarray, str]] = []
 
         self.ankles = np.zeros((2, len(t), 3))
@@ -149,7 +151,8 @@ class Body:
             yaw = (self.heading + self.foot_yaw[side]) / 2
             forward = np.cross(ankle - hip, np.stack([np.cos(yaw), 0 * yaw, -np.sin(yaw)], -1))
             out[:, 1 + side] = hip
-            out[:, 4 + side], _ = bent(hip, ankle, THIGH, SHIN, forward)
+            out[:, 4 + side], reached = bent(hip, ankle, THIGH, SHIN, forward)
+            ankle = reached if self.keeps_legs else ankle
             out[:, 7 + side] = ankle
             out[:, 10 + side] = ankle + toe_offset[side]
 

@@ -32,6 +32,8 @@ def join(first: Body, second: Body, overlap: float = 0.0, blend: float = 0.4) ->
     start = len(first.t) - min(round(overlap / spacing), len(first.t) - 1) - 1
     frames = start + len(second.t)
     joined = copy.copy(first)
+    # Between a plank and a standing body, a leg may be too short for its foot's way.
+    joined.keeps_legs = True
     joined.t = np.arange(frames) * spacing
     end = (len(first.t) - 1) * spacing
     fade = ease(joined.t, start * spacing, end + blend)

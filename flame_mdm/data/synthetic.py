@@ -250,18 +250,26 @@ class Synthetic(MotionSource):
         repeating = 0.35 + 0.8 * int(attributes.get("count", 0))
         seconds = rng.uniform(max(MIN_SECONDS, repeating, ACTIONS[action].seconds), MAX_SECONDS)
         name = f"synthetic_{'all_' if self.everything else ''}{self.seed}_{index:06d}"
-        split = hashed_split(name, val=5, test=10)
+        motion = _joints(rng, np.arange(round(seconds * fps) + 1) / fps, attributes)
         # Words have their own generator, so that a change of the grammar changes no motion.
-        words = np.random.default_rng((self.seed, index, 1))
+        return self.described(
+            name, motion, attributes, np.random.default_rng((self.seed, index, 1))
+        )
+
+    def described(
+        self, name: str, motion: np.ndarray, attributes: Attributes, words: np.random.Generator
+    ) -> Clip:
+        """Returns the clip of a motion (F, 22, 3), with captions drawn by `words` and its split, drawn by its name."""
+        split = hashed_split(name, val=5, test=10)
         incomplete = split == "train" and words.random() < PARTIAL
         texts, stated = draw_captions(words, attributes, CAPTIONS, incomplete)
         return Clip(
             id=name,
-            motion=_joints(rng, np.arange(round(seconds * fps) + 1) / fps, attributes),
+            motion=motion,
             captions=texts,
             split=split,
             source=name,
-            action=self.actions.index(action),
+            action=self.actions.index(str(attributes["action"])),
             attributes=stated,
         )
 

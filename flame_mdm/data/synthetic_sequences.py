@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from flame_mdm.data import Clip, hashed_split
-from flame_mdm.data.synthetic import CAPTIONS, PARTIAL, Synthetic, content, draw_captions, entry
+from flame_mdm.data import Clip
+from flame_mdm.data.synthetic import Synthetic, content, entry
 from flame_mdm.data.synthetic_actions import ACTIONS, move
 from flame_mdm.data.synthetic_motions.body import Attributes, Body
 from flame_mdm.data.synthetic_motions.joining import frames_of, join
@@ -64,25 +64,11 @@ class SyntheticSequences(Synthetic):
         attributes = self.attributes(rng)
         while attributes.get("ends"):
             attributes = self.attributes(rng)
-        action = str(attributes["action"])
-        body = _joined(rng, attributes, fps)
-        joints = body.joints()
+        joints = _joined(rng, attributes, fps).joints()
         joints -= joints[0, 0] * np.array([1, 0, 1])
-
         name = f"{self.name}_{self.seed}_{index:06d}"
-        split = hashed_split(name, val=5, test=10)
         words = np.random.default_rng((self.seed, index, 3))
-        incomplete = split == "train" and words.random() < PARTIAL
-        texts, stated = draw_captions(words, attributes, CAPTIONS, incomplete)
-        return Clip(
-            id=name,
-            motion=joints.astype(np.float32),
-            captions=texts,
-            split=split,
-            source=name,
-            action=self.actions.index(action),
-            attributes=stated,
-        )
+        return self.described(name, joints.astype(np.float32), attributes, words)
 
 
 def _joined(rng: np.random.Generator, attributes: Attributes, fps: float) -> Body:
@@ -97,7 +83,7 @@ def _joined(rng: np.random.Generator, attributes: Attributes, fps: float) -> Bod
     tail = frames[-round(rng.uniform(*EARLIER_SECONDS) * fps) :]
 
     if posture != start and posture == ENDS.get(action):
-        # Who sits already stays seated.
+        # A person who already sits stays seated.
         hold = round(rng.uniform(*SECONDS) * fps)
         return frames_of(before, np.concatenate([tail, np.repeat(tail[-1], hold)]))
     before = frames_of(before, tail)

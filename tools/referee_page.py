@@ -8,21 +8,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from flame_mdm.sampling.referee.kinds import GROUPS
+
 FOLDER = Path(__file__).resolve().parents[1] / "docs" / "benchmarks"
-GROUPS = (
-    "movement",
-    "direction",
-    "side",
-    "count",
-    "speed",
-    "posture",
-    "contact",
-    "order",
-    "duration",
-    "start",
-    "end",
-    "all",
-)
 SETS = {"cmu": "CMU", "package": "free motion capture", "bandai": "Bandai-Namco", "synthetic": "synthetic"}  # fmt: skip
 INTRODUCTION = """# The referee, measured
 
@@ -69,7 +57,7 @@ def calibration_tables(rows: list[dict[str, Any]]) -> list[str]:
     lines.append("|---|---|---:|---:|---:|")
     by_name = {(row["set"], row["group"]): row for row in rows if "group" in row}
     for name, title in {"real": "all real sets", **SETS}.items():
-        for group in GROUPS:
+        for group in (*GROUPS, "all"):
             row = by_name.get((name, group))
             if row is None or (name != "real" and group != "all"):
                 continue

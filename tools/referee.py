@@ -139,7 +139,7 @@ def cases_of(example: Example) -> list[Case]:
 
 
 def built_cases(example: Example) -> list[Case]:
-    """Returns claims about durations, the start and the end that are true by construction, and falsified ones."""
+    """Returns claims about durations, the start and the end that are assumed to be true, and falsified ones."""
     if example.dataset == SYNTHETIC:
         return []
     sets = [{claim.kind for claim in read_claims(text)} for text in example.captions]

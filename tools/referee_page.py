@@ -114,13 +114,14 @@ def crossed_table(by_name: Mapping[tuple[str, str], dict[str, Any]]) -> list[str
 
 
 def built_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Returns the figures of claims about durations and ends that are true by construction."""
+    """Returns the figures of built claims about durations, starts and ends."""
     lines = [
         "",
         "Captions hardly state a duration, a start or an end. These claims are built, not written by people: a",
         "recording whose captions state nothing but that the body walks, runs or stands still is cut to two, three and",
-        "four seconds, and falsified claims state twice or half of the duration. A body that walks stands at the start",
-        "and at the end, and it does not lie there. The claims are not in the other tables.",
+        "four seconds. Falsified claims state twice the duration, or half of it. In recordings of walks, the person is",
+        "assumed to stand upright at the start and at the end, so that lying there is a falsified claim. The other",
+        "tables do not contain these claims.",
         "",
         "| claim | true claims judged true | falsified claims judged false |",
         "|---|---:|---:|",

@@ -152,7 +152,9 @@ def unknown_words(text: str, facts: Mapping[str, Any]) -> list[str]:
 
 
 def _suggested(text: str, facts: Mapping[str, Any]) -> str:
-    """Returns " Did you mean '...'?" with known words in place of unknown ones, or with the nearest training caption.
+    """Returns the question " Did you mean '...'?" for a text with unknown words.
+
+    It quotes the text with known words in place of the unknown ones, or the nearest training caption.
 
     Words that are not English are replaced by known words with a similar spelling, English words
     only by known words with a similar meaning (never "shelf" by "she"). A caption is near if it

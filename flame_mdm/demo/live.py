@@ -98,7 +98,7 @@ class LiveStreams:
         if ending not in ENDINGS:
             raise UserError(f"{ending[:20]}: not a format of a stream. Use {', '.join(ENDINGS)}")
         with self._working:
-            live = self._found(name)
+            live = self._running(name)
             joints, text = live.joints, live.text
         representation = self.model.representation
         motion = Motion(joints, representation.fps, representation.skeleton, text)
@@ -114,7 +114,7 @@ class LiveStreams:
             other: live for other, live in self._streams.items() if now - live.used <= IDLE
         }
         if name:
-            return name, self._found(name)
+            return name, self._running(name)
         if len(self._streams) >= MAX_STREAMS:
             raise UserError("too many streams run at the moment. Try again in two minutes")
         name = secrets.token_hex(16)
@@ -122,7 +122,8 @@ class LiveStreams:
         self._streams[name] = LiveStream(stream(self.model, text), now, nothing, text)
         return name, self._streams[name]
 
-    def _found(self, name: str) -> LiveStream:
+    def _running(self, name: str) -> LiveStream:
+        """Returns a stream by its name; raises `UserError` if it has ended."""
         if name not in self._streams:
             raise UserError("this stream has ended. Reload the page to begin another one")
         return self._streams[name]

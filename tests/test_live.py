@@ -113,11 +113,12 @@ def test_the_server_sends_blocks_within_the_rules_of_the_guard(model):
     from fastapi import FastAPI
     from starlette.testclient import TestClient
 
-    from flame_mdm.demo.app import add_live
+    from flame_mdm.demo.app import WAITING_FILES, Writers, add_live
     from flame_mdm.demo.guard import Guard
 
     app = FastAPI(openapi_url=None)
-    add_live(app, LiveStreams(model))
+    writers = Writers()
+    add_live(app, LiveStreams(model), writers)
     call = {"stream": "", "text": WALK, "begin": 0}
     with TestClient(Guard(app, (), {}, bool), "http://localhost") as client:
         block = client.post("/live", json=call).json()
@@ -125,6 +126,10 @@ def test_the_server_sends_blocks_within_the_rules_of_the_guard(model):
         name = block["stream"]
         assert client.post("/live", json={**call, "stream": name, "begin": 30}).json()["from"] == 30
         assert client.get(f"/live.bvh?stream={name}").content.startswith(b"HIERARCHY")
+        writers.waiting = WAITING_FILES
+        busy = client.get(f"/live.bvh?stream={name}")
+        assert (busy.status_code, busy.text[:14]) == (503, "too many files")
+        writers.waiting = 0
         assert client.get("/live.html").status_code == 200
         for wrong in (
             {"stream": "../etc"},

@@ -40,7 +40,8 @@ SESSIONS = 64
 # Maximum number of motion files written at the same time, and maximum number of requests that wait for a file
 WRITERS = 2
 WAITING_FILES = 32
-WAITING_BLOCKS = 32
+WAITING_BLOCKS = 32  # maximum number of requests that wait for the frames of a stream
+BUSY = "too many files are being written. Try again in a minute"
 FOLDER = Path(__file__).parent
 FONT, MONO = ("system-ui", "sans-serif"), ("ui-monospace", "monospace")
 
@@ -93,7 +94,25 @@ def source(name: str) -> str:
     return (FOLDER / name).read_text(encoding="utf-8")
 
 
-def add_live(app: FastAPI, live: LiveStreams) -> None:
+class Writers:
+    """Bounds the number of motion files that are written at the same time.
+
+    Attributes:
+        turns: held while a file is written.
+        waiting: number of requests for a file, including the requests that hold a turn.
+    """
+
+    def __init__(self) -> None:
+        self.turns = asyncio.Semaphore(WRITERS)
+        self.waiting = 0
+
+    @property
+    def is_full(self) -> bool:
+        """Whether no further request may wait."""
+        return self.waiting >= WAITING_FILES
+
+
+def add_live(app: FastAPI, live: LiveStreams, writers: Writers) -> None:
     """Adds the blocks of streams at `/live`, their files, and the page of their player."""
     waiting = 0
 
@@ -121,24 +140,29 @@ def add_live(app: FastAPI, live: LiveStreams) -> None:
 
     @app.get("/live{ending}")
     async def file(ending: str, stream: str = "") -> Response:
+        if writers.is_full:
+            return PlainTextResponse(BUSY, 503)
+        writers.waiting += 1
         try:
-            content = await run_in_threadpool(live.file, stream, ending)
+            async with writers.turns:
+                content = await run_in_threadpool(live.file, stream, ending)
         except UserError as error:
             return PlainTextResponse(first_line(error), 400)
+        finally:
+            writers.waiting -= 1
         return Response(content, media_type="application/octet-stream")
 
 
 def web_app(studio: Studio, hosts: Collection[str] = ()) -> Guard:
     """Returns the application: the page at `/`, files at `/motion.bvh?...` with the query string of a link."""
     app = FastAPI(openapi_url=None)
-    writers, waiting = asyncio.Semaphore(WRITERS), 0
+    writers = Writers()
 
     @app.get("/motion{extension}")
     async def motion_file(extension: str, web: Request) -> Response:
-        nonlocal waiting
-        if waiting >= WAITING_FILES:
-            return PlainTextResponse("too many files are being written. Try again in a minute", 503)
-        waiting += 1
+        if writers.is_full:
+            return PlainTextResponse(BUSY, 503)
+        writers.waiting += 1
         try:
             pairs = query_pairs(web.url.query)
             options = {key: value for key, value in pairs if key in ("motion", "rig")}
@@ -146,7 +170,7 @@ def web_app(studio: Studio, hosts: Collection[str] = ()) -> Guard:
             if not number.isdecimal() or len(number) > 3:
                 raise UserError(f"motion={one_line(number[:20])}: not a number of a motion")
             request = parse_query([pair for pair in pairs if pair[0] not in options])
-            async with writers:
+            async with writers.turns:
                 await web.body()  # a disconnection is reported after the body
                 if await web.is_disconnected():
                     return Response(status_code=499)
@@ -156,7 +180,7 @@ def web_app(studio: Studio, hosts: Collection[str] = ()) -> Guard:
         except UserError as error:
             return PlainTextResponse(first_line(error), 400)
         finally:
-            waiting -= 1
+            writers.waiting -= 1
         words = "-".join(re.findall(r"[a-z0-9]+", request.text.lower()))[:60]
         # The rig is part of the name of the file.
         rig = f"-{options['rig']}" if options.get("rig") else ""
@@ -165,7 +189,7 @@ def web_app(studio: Studio, hosts: Collection[str] = ()) -> Guard:
         return Response(content, media_type="application/octet-stream", headers=headers)
 
     if studio.live is not None:
-        add_live(app, studio.live)
+        add_live(app, studio.live, writers)
     blocks = build_page(studio)
     blocks.state_session_capacity = SESSIONS
     blocks.has_launched = True  # otherwise gradio does not check which files it may read

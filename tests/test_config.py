@@ -158,6 +158,7 @@ def test_recipes_outside_the_repository(tmp_path, subtests):
         ("ema: {decays: 0.9}", "unknown config key 'ema.decays'"),
         ("seed: abc", "seed=abc: must be a whole number"),
         ("seed: -1", "seed=-1: must be from 0 to"),
+        ("initial_weights: 3", "initial_weights=3: must be a text or null"),
         ("lr_decay: x", "lr_decay=x: must be a finite number or null"),
         ("lr_warmup: 1.5", "lr_warmup=1.5: must be a whole number or null"),
         ("data_root: [a]", "data_root=['a']: must be a text"),

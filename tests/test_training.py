@@ -140,6 +140,41 @@ def test_a_decaying_learning_rate_resumes_where_it_was(tiny, tmp_path):
     assert same_weights(parts, whole)
 
 
+def test_training_starts_from_the_weights_of_another_model(tiny, trained, tmp_path, capsys):
+    """One step with a rate of 0 leaves them as they are. A deeper network gets what fits."""
+    overrides = [
+        *tiny,
+        *STEPS,
+        "optimizer.lr=0.0",
+        "condition.pretrain_steps=0",
+        "ema=null",
+        "denoiser.num_layers=2",
+        f"initial_weights={trained}",
+    ]
+    state = read_checkpoint(run(overrides, 1, tmp_path / "run"))["state_dict"]
+    source = read_checkpoint(trained)["state_dict"]
+    weights = source.keys() - {"representation.mean", "representation.std"}
+    assert all(torch.equal(state[name], source[name]) for name in weights)
+    assert len(state) > len(source)
+    count = len(state) - 2
+    assert (
+        f"initial weights: {len(weights)} of {count} tensors from {trained}"
+        in capsys.readouterr().out
+    )
+
+
+@pytest.mark.parametrize(
+    ("source", "says"),
+    [
+        ("absent/run.ckpt", "initial_weights=absent/run.ckpt: no such checkpoint"),
+        ("motion_clip_synthetic", "initial_weights=motion_clip_synthetic: no weight has the name"),
+    ],
+)
+def test_initial_weights_that_cannot_be_used_are_refused(tiny, capsys, source, says):
+    assert main(["train", "quickstart", *tiny, *STEPS, f"initial_weights={source}"]) == 1
+    assert says in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_progress_counts_all_steps_and_shows_losses(tiny, tmp_path, capfd, monkeypatch):
     """Also after a resume; in a log file as plain lines, here one per step."""

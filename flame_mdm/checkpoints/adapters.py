@@ -132,6 +132,39 @@ def copy_weights(model: MotionGenerator, base: str | Path) -> None:
         ) from error
 
 
+def copy_matching_weights(model: MotionGenerator, source: str | Path) -> tuple[int, int]:
+    """Copies the trained weights of another model that have the same name and shape.
+
+    The statistics of the features are not copied, since they belong to the data.
+
+    Args:
+        model: receives the weights; its other weights stay as they are.
+        source: a path or name, as `find` takes it.
+
+    Returns:
+        Number of copied tensors, and number of trained tensors of the model.
+
+    Raises:
+        UserError: If no tensor fits.
+    """
+    weights = read_merged(find(source))["state_dict"]
+    parameters = dict(model.named_parameters())
+    fitting = [
+        name
+        for name, parameter in parameters.items()
+        if name in weights and weights[name].shape == parameter.shape
+    ]
+    if not fitting:
+        raise UserError(
+            f"initial_weights={source}: no weight has the name and the shape of a weight of this recipe. Name a model "
+            "with the same network and width"
+        )
+    with torch.no_grad():
+        for name in fitting:
+            parameters[name].copy_(weights[name])
+    return len(fitting), len(parameters)
+
+
 def write_adapter(path: Path, trained: Path) -> None:
     """Writes the adapter in a checkpoint of its training, atomically."""
     from safetensors.torch import save

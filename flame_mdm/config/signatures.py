@@ -56,6 +56,7 @@ TOP_LEVEL = {
     "run.speed": "str",
     "callbacks": "dict[str, Any]",
     "losses": "dict[str, Any] | None",
+    "initial_weights": "str | None",
     "lr_warmup": "int | None",
     "lr_decay": "float | None",
     "ema": "dict[str, Any] | None",

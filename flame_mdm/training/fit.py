@@ -15,7 +15,7 @@ from lightning.fabric.plugins.environments.slurm import SLURMEnvironment
 from lightning.fabric.plugins.environments.torchelastic import TorchElasticEnvironment
 from lightning.pytorch.utilities import rank_zero_only
 
-from flame_mdm.checkpoints.adapters import attach, copy_weights
+from flame_mdm.checkpoints.adapters import attach, copy_matching_weights, copy_weights
 from flame_mdm.checkpoints.loading import NO_GPU
 from flame_mdm.config import Config, instantiate
 from flame_mdm.data.datamodule import MotionDataModule
@@ -57,6 +57,8 @@ def fit(folder: Path, config: Config) -> None:
             attach(task.generator, config["adapter"])
         if config.get("base") and not resumed:
             copy_weights(task.generator, config["base"])
+        if config.get("initial_weights") and not resumed:
+            _start_from(task, config["initial_weights"])
     precision = config["trainer"]["precision"]
     if config["run"].get("speed") == "fast":
         precision = accelerate(task, data, config)
@@ -128,6 +130,17 @@ def check_devices(trainer: Config) -> None:
             f"GPU{'s' * (most > 1)}" if gpus else f"CPU cores, and {NO_GPU}"
         )
         raise UserError(f"trainer.devices={devices}: {there}. Give at most trainer.devices={most}")
+
+
+def _start_from(task: GeneratorTask, source: str) -> None:
+    try:
+        copied, count = copy_matching_weights(task.generator, source)
+    except FileNotFoundError as error:
+        raise UserError(
+            f"initial_weights={error}. Train it first, name another model, or start from random weights: "
+            "initial_weights=null"
+        ) from error
+    say(f"initial weights: {copied} of {count} tensors from {source}")
 
 
 def _requeue(job: str) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from flame_mdm.reporting.page import number, render, short
+from flame_mdm.reporting.page import TEMPLATES, number, render, short
 
 if TYPE_CHECKING:
     from markupsafe import Markup
@@ -66,6 +66,12 @@ def svg(title: str, panels: Sequence[Panel]) -> Markup | None:
     return render(
         "plot.svg", title=title, panels=drawn, width=WIDE, high=high, left=LEFT, right=WIDE - RIGHT
     )
+
+
+def svg_file(drawing: Markup) -> str:
+    """Returns the text of a file that shows a drawing outside of a page: the styles are in it."""
+    style = (TEMPLATES / "plot.css").read_text(encoding="utf-8")
+    return str(drawing).replace(">", f"><style>{style}</style>", 1)
 
 
 def chart(

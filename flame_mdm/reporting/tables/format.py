@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flame_mdm.errors import one_line, shortened
-from flame_mdm.reporting.page import TEMPLATES, page, render
-from flame_mdm.reporting.plots import Histogram, Panel, Series, svg
+from flame_mdm.reporting.page import page, render
+from flame_mdm.reporting.plots import Histogram, Panel, Series, svg, svg_file
 from flame_mdm.reporting.tables.specs import ABOUT, Figure
 from flame_mdm.safe_io import write_text
 
@@ -105,10 +105,7 @@ def write(table: Table, out: Path) -> None:
         ]
         for name, plot in part.drawn:
             if plot:
-                style = (TEMPLATES / "plot.css").read_text(encoding="utf-8")
-                write_text(
-                    out / f"{name}.svg", str(plot).replace(">", f"><style>{style}</style>", 1)
-                )
+                write_text(out / f"{name}.svg", svg_file(plot))
     texts = {
         "md": rendered(table, "md"),
         "tex": rendered(table, "tex"),

@@ -20,6 +20,7 @@ from flame_mdm.checkpoints.released_options import Options
 from flame_mdm.conditions import Unconditional
 from flame_mdm.conditions.target import SLOTS, TargetConditions, requested
 from flame_mdm.denoisers import Denoiser
+from flame_mdm.denoisers.mdm import MDMDecoder
 from flame_mdm.errors import UserError
 from flame_mdm.generator import Blocks, MotionGenerator, Parts
 from flame_mdm.processes.diffusion import GaussianDiffusion
@@ -430,3 +431,19 @@ def test_each_choice_of_targets_is_drawn_equally_often():
         TargetConditions(
             [name for name in SMPL22.joints if name != "head"], SMPL22.facing, choices=[[]]
         )
+
+
+def test_time_and_condition_can_be_added_to_the_noisy_frames():
+    """Clean frames get neither. The input layer is the identity, so that adding to the input is the same."""
+    torch.manual_seed(0)
+    sizes = {"latent_dim": 8, "ff_size": 8, "num_layers": 1, "num_heads": 2, "dropout": 0.0}
+    plain = MDMDecoder(8, 8, 4, context_frames=3, **sizes)
+    torch.nn.init.eye_(plain.input.weight)
+    torch.nn.init.zeros_(plain.input.bias)
+    adding = MDMDecoder(8, 8, 4, context_frames=3, condition_frames=True, **sizes)
+    adding.load_state_dict(plain.state_dict())
+    x_t, t, mask = torch.randn(2, 5, 8), torch.tensor([1.0, 7.0]), torch.ones(2, 5) > 0
+    cond = Condition(torch.randn(2, 4), torch.ones(2, 0, 4), None, prefix=torch.randn(2, 3, 8))
+    added = plain.condition(t, cond.pooled)[:, None]
+    torch.testing.assert_close(adding(x_t, t, mask, cond), plain(x_t + added, t, mask, cond))
+    assert not torch.allclose(adding(x_t, t, mask, cond), plain(x_t, t, mask, cond))

@@ -125,6 +125,8 @@ class MDMDecoder(Denoiser):
         target_encoder: network that embeds `Condition.target`, which is added to the time; "none"
             ignores targets.
         target_layers: number of hidden layers of the target encoders "single" and "split".
+        condition_frames: also add time + condition to every noisy frame: a small network follows
+            the text after fewer steps, and noisy frames differ from clean ones.
 
     Raises:
         UserError: If arguments contradict each other.
@@ -157,8 +159,10 @@ class MDMDecoder(Denoiser):
         context_frames: int = 0,
         target_encoder: Literal["none", "single", "split", "multi"] = "none",
         target_layers: int = 1,
+        condition_frames: bool = False,
     ):
         super().__init__()
+        self.condition_frames = condition_frames
         if memory == "concat" and not token_memory:
             raise UserError(
                 "denoiser.memory=concat: a token of the time needs the other tokens. Set token_memory=true"
@@ -191,6 +195,9 @@ class MDMDecoder(Denoiser):
             time = time + self.target(cond).to(time)
 
         x = self.input(self._with_context(x_t, cond))
+        if self.condition_frames:
+            clean, noisy = x[:, : self.context_frames], x[:, self.context_frames :]
+            x = torch.cat([clean, noisy + self.condition.add(time, cond.pooled)[:, None]], 1)
         if self.input_token == "condition":
             x = torch.cat([self.condition.add(time, cond.pooled)[:, None], x], 1)
         elif self.input_token == "time":

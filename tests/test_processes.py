@@ -85,6 +85,16 @@ def test_the_linear_schedule_has_the_ends_of_ho_et_al(subtests):
             assert (betas[0], betas[-1]) == pytest.approx((first, last))
 
 
+@pytest.mark.parametrize("total", [10, 50, 1000])
+def test_more_noise_scales_the_ratio_of_noise_to_signal_at_each_step(total: int):
+    """The last step of the cosine schedule is clipped, so that it is left out."""
+    plain, noisy = build_schedule("cosine", total), build_schedule("cosine", total, 4.0)
+    ratios = [schedule.tables["noise"] / schedule.tables["signal"] for schedule in (plain, noisy)]
+    np.testing.assert_allclose(ratios[1][:-1], 4 * ratios[0][:-1], rtol=1e-9)
+    assert len(noisy) == total
+    assert noisy.tables["betas"].max() <= 0.999
+
+
 def pointwise_output(x_t: Tensor, learned: bool) -> Tensor:
     A, b = (GAUSSIAN[f"lin4/{name}2" if learned else f"lin4/{name}"] for name in "Ab")
     t = torch.tensor(GAUSSIAN["pw/t"]).float()
@@ -253,6 +263,7 @@ def test_unknown_options_and_impossible_steps_are_refused():
         (lambda: GaussianDiffusion(num_train_timesteps=1), "1"),
         (lambda: GaussianDiffusion(skip=True), "epsilon"),
         (lambda: GaussianDiffusion(min_snr=-1.0), "min_snr=-1.0"),
+        (lambda: GaussianDiffusion(noise_scale=0.0), "noise_scale=0.0"),
         (lambda: FlowMatching(sigma_min=1.0), "1.0"),
         (lambda: timesteps(1000, 0), "choose"),
         (lambda: timesteps(1000, 1001), "choose"),

@@ -45,9 +45,12 @@ class GaussianDiffusion(Process):
         min_snr: weights each step's squared error as if the clean motion was predicted with
             weight min(SNR, min_snr) (Hang et al. 2023, eq. 4; they use 5). None = weight 1,
             whatever is predicted.
+        noise_scale: factor of the ratio of noise to signal at each step. With 263 features that
+            depend on each other, the text matters only where there is much noise; a factor above
+            1 gives more steps to it (Hoogeboom et al. 2023, section 2.2).
 
     Raises:
-        UserError: If T is out of range, `skip` is combined with another prediction, or `min_snr`
+        UserError: If T or `noise_scale` is out of range, `skip` is combined with another prediction, or `min_snr`
             is not above 0.
 
     Example:
@@ -80,13 +83,14 @@ class GaussianDiffusion(Process):
         timestep_sampling: Literal["uniform"] = "uniform",
         skip: bool = False,
         min_snr: float | None = None,
+        noise_scale: float = 1.0,
     ):
         super().__init__()
         if prediction != "epsilon" and skip:
             raise UserError("skip=true needs prediction=epsilon")
         if min_snr is not None and not 0 < min_snr < math.inf:
             raise UserError(f"min_snr={min_snr}: give a number above 0, such as 5, or null")
-        self.schedule = build_schedule(schedule, num_train_timesteps)
+        self.schedule = build_schedule(schedule, num_train_timesteps, noise_scale)
         self.prediction, self.skip, self.min_snr = prediction, skip, min_snr
         self.variance, self.vlb_weight = variance, vlb_weight
         self.average_padding, self.clip_x0 = average_padding, clip_x0

@@ -48,6 +48,24 @@ def linear_betas(num_train_timesteps: int) -> Tensor:
     return betas.clamp(max=0.999)
 
 
+def with_more_noise(betas: Tensor, noise_scale: float) -> Tensor:
+    """Returns noise variances (T,) whose ratio of noise to signal is `noise_scale` times as large at each step.
+
+    This shifts the logarithm of the signal-to-noise ratio (Hoogeboom et al. 2023, "simple
+    diffusion", section 2.2). The variances are clipped at 0.999.
+
+    Example:
+        >>> before, after = (Schedule(b) for b in (cosine_betas(50), with_more_noise(cosine_betas(50), 4)))
+        >>> round(before.log_snr(20) - after.log_snr(20), 6) == round(math.log(4), 6)
+        True
+    """
+    alphas_cumprod = (1 - betas).cumprod(0)
+    noise_to_signal = noise_scale**2 * (1 - alphas_cumprod) / alphas_cumprod
+    shifted = 1 / (1 + noise_to_signal)
+    previous = torch.cat([shifted.new_ones(1), shifted[:-1]])
+    return (1 - shifted / previous).clamp(max=0.999)
+
+
 class Schedule:
     """Coefficients of a Gaussian diffusion, by step i = 0 (least noise) to N - 1.
 
@@ -127,15 +145,16 @@ class Schedule:
         return self.factor("posterior_x0", i, x_t) * x0 + self.factor("posterior_x_t", i, x_t) * x_t
 
 
-def build_schedule(name: str, num_train_timesteps: int) -> Schedule:
+def build_schedule(name: str, num_train_timesteps: int, noise_scale: float = 1.0) -> Schedule:
     """Returns a noise schedule by name.
 
     Args:
         name: "cosine" or "linear".
         num_train_timesteps: T, 2 to `MAX_STEPS`.
+        noise_scale: see `with_more_noise`; 1 = the schedule itself.
 
     Raises:
-        UserError: If the number of steps is out of range.
+        UserError: If the number of steps is out of range, or `noise_scale` is not above 0.
 
     Example:
         >>> len(build_schedule("linear", 50))
@@ -145,7 +164,12 @@ def build_schedule(name: str, num_train_timesteps: int) -> Schedule:
         raise UserError(
             f"num_train_timesteps is {num_train_timesteps}: a diffusion has 2 to {MAX_STEPS:,} steps"
         )
-    return Schedule({"cosine": cosine_betas, "linear": linear_betas}[name](num_train_timesteps))
+    if not 0 < noise_scale < math.inf:
+        raise UserError(
+            f"noise_scale={noise_scale}: give a number above 0; 1 = as much noise as usual"
+        )
+    betas = {"cosine": cosine_betas, "linear": linear_betas}[name](num_train_timesteps)
+    return Schedule(betas if noise_scale == 1 else with_more_noise(betas, noise_scale))
 
 
 def timesteps(

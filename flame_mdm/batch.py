@@ -15,15 +15,15 @@ from torch import Tensor
 
 @dataclass
 class MotionBatch:
-    """Motions of mixed lengths, padded to the longest.
+    """Motions of different lengths, padded to the longest one.
 
     Attributes:
         x: (B, F, D) float32, normalized features, 0 past the end of each motion.
         mask: (B, F) bool, True = real frame.
-        ids: B names, unique in the data set; they seed the noise of each sample and are keys for
-            joining tables.
-        text: one caption per motion, or None if the data has none.
-        action: (B,) int64 class labels, or None.
+        ids: B names, unique in the data set. They seed the noise of each sample, and tables are
+            joined by them.
+        text: one caption per motion. None: the data has no captions.
+        action: (B,) int64 class labels. None: the data has no classes.
 
     Example:
         >>> batch = collate([("a", torch.ones(4, 2), "walks", None), ("b", torch.ones(2, 2), "sits", None)])
@@ -46,12 +46,18 @@ class MotionBatch:
         return len(self.ids)
 
     def to(self, device: torch.device) -> MotionBatch:
-        """Returns the batch on a device, without waiting for the copy; Lightning calls this."""
+        """Returns the batch on a device.
+
+        Lightning calls this. The copy runs in the background.
+        """
         action = None if self.action is None else sent(self.action, device)
         return replace(self, x=sent(self.x, device), mask=sent(self.mask, device), action=action)
 
     def pin_memory(self) -> MotionBatch:
-        """Returns the batch in pinned memory, which is copied to a GPU without waiting; the data loader calls this."""
+        """Returns the batch in pinned memory, from which copies to a GPU run in the background.
+
+        The data loader calls this.
+        """
         action = None if self.action is None else self.action.pin_memory()
         return replace(self, x=self.x.pin_memory(), mask=self.mask.pin_memory(), action=action)
 
@@ -62,16 +68,16 @@ class Condition:
 
     Attributes:
         pooled: (B, C), one vector per sample.
-        tokens: (B, S, C), one vector per word piece; (B, 0, C) if the encoder has none.
-        token_mask: (B, S) bool, True = real token. In a null, None means: keep the mask of the
-            replaced sample.
-        null: the condition that means "no condition", with batch size 1; None if there is none.
-        prefix: (B, P, D), normalized features of the P clean frames before the motion; None if
-            there are none.
-        target: (B, 8, 4), where the motion should end: `flame_mdm.conditions.target`; None =
-            anywhere.
-        target_mask: (B,) bool, False = this sample's target is left out; None = all samples have
-            theirs.
+        tokens: (B, S, C), one vector per word piece; (B, 0, C) if the encoder returns none.
+        token_mask: (B, S) bool, True = real token. None in a null condition means that a sample
+            keeps its mask when its condition is replaced.
+        null: the condition that means "no condition", with batch size 1. None: the encoder has no
+            null condition.
+        prefix: (B, P, D), normalized features of the P clean frames before the motion. None: no
+            frames come before it.
+        target: (B, 8, 4), where the motion should end; see `flame_mdm.conditions.target`. None:
+            it may end anywhere.
+        target_mask: (B,) bool, False = this sample has no target. None: every sample has one.
 
     Example:
         >>> null = Condition(torch.zeros(1, 3), torch.zeros(1, 0, 3), None)
@@ -89,9 +95,12 @@ class Condition:
     target_mask: Tensor | None = None
 
     def drop(self, drop: Tensor) -> Condition:
-        """Returns conditions in which samples with `drop` (B,) bool True are replaced by the null condition.
+        """Returns conditions in which some samples have the null condition.
 
-        The null replaces text or action alone: prefix and target stay.
+        Only text or action is replaced: prefix and target stay.
+
+        Args:
+            drop: (B,) bool, True = replace the condition of this sample.
         """
         if self.null is None:
             raise ValueError("this condition has no null to drop to")
@@ -115,7 +124,10 @@ class Condition:
         return replace(self, pooled=pooled, tokens=tokens, token_mask=token_mask)
 
     def with_null(self) -> Condition:
-        """Returns the batch followed by its null conditions (2B), for classifier-free guidance in one forward pass."""
+        """Returns the batch followed by its null conditions (2B).
+
+        Classifier-free guidance then needs only one forward pass.
+        """
         batch = self.pooled.shape[0]
         rows = torch.arange(batch, device=self.pooled.device)
         twice = self.select(torch.cat([rows, rows]))
@@ -139,10 +151,15 @@ class Condition:
 
 
 class Guide(Protocol):
-    """Leads motions (B, F, D) to a goal, such as positions in the world."""
+    """Leads motions (B, F, D) to a goal, for example positions in the world."""
 
     def steer(self, clean: Callable[[Tensor], Tensor], x_t: Tensor) -> Tensor:
-        """Returns a noisy motion like `x_t` whose clean estimate, returned by `clean`, is nearer to the goal."""
+        """Returns a noisy motion like `x_t`, but with a clean estimate nearer to the goal.
+
+        Args:
+            clean: returns the clean estimate of a noisy motion.
+            x_t: (B, F, D), the noisy motion.
+        """
         ...
 
     def reach(self, x0_hat: Tensor) -> Tensor:
@@ -152,26 +169,29 @@ class Guide(Protocol):
 
 @dataclass
 class Edit:
-    """Parts of a motion to keep; in-betweening, prediction, interpolation and body-part editing
-    differ only in `keep`.
+    """The part of a motion to keep while the rest is generated.
+
+    In-betweening, prediction, interpolation and body-part editing differ only in `keep`.
 
     Attributes:
         known: (B, F, D) normalized features of the motion.
         keep: (B, F, D) bool, True = keep this feature of this frame.
-        mode: "x0" overwrites the clean estimate (MDM); "x_t" replaces part of the noisy sample by
-            the equally noisy known part (FLAME, RePaint); "trajectory" overwrites the early part
-            of the flow's path (MFM).
+        mode: how the kept part is imposed. "x0" overwrites the clean estimate (MDM). "x_t"
+            replaces the kept part of the noisy sample by the known motion with the same amount of
+            noise (FLAME, RePaint). "trajectory" overwrites the early part of the flow's path
+            (MFM).
         until: for "trajectory", the last flow time at which the path is overwritten.
         blend: for "x_t", when the kept part is replaced. "after" each step (FLAME, eq. 6): the
             result contains the known motion itself. "before" each call of the denoiser (FLAME's
             code): the result contains the model's version of the known motion.
-        resample: for "x_t", how many times each step is repeated, after adding noise again
+        resample: for "x_t", how many times each step is repeated, after noise is added again
             (RePaint, algorithm 1).
         guide: for "x0", leads the motion to a goal in each step, before the kept part overwrites
             the clean estimate.
-        strength: fraction of the sampling steps to take, in (0, 1]. Sampling starts from `known`,
-            as noisy as the first of these steps (SDEdit; of N steps, MDM's code skips
-            `skip_timesteps` = (1 - strength) N). None: from noise.
+        strength: fraction of the sampling steps to take, in (0, 1]. Sampling starts from `known`
+            with the noise of the first of these steps (SDEdit). MDM's code gives the number of
+            skipped steps instead: of N steps, `skip_timesteps` = (1 - strength) N. None: sampling
+            starts from pure noise.
 
     Example:
         >>> known, keep = torch.ones(1, 4, 2), torch.zeros(1, 4, 2, dtype=torch.bool)
@@ -190,7 +210,10 @@ class Edit:
     guide: Guide | None = None
 
     def impose(self, x0_hat: Tensor) -> Tensor:
-        """Returns the clean estimate (B, F, D) of mode "x0"."""
+        """Returns the clean estimate (B, F, D) in which known features replace the kept ones.
+
+        This is mode "x0".
+        """
         x0_hat = x0_hat if self.guide is None else self.guide.reach(x0_hat)
         return torch.where(self.keep, self.known, x0_hat)
 
@@ -200,10 +223,16 @@ class Edit:
 
 
 Denoise = Callable[[Tensor, Tensor, Tensor, Condition], Tensor]
-"""A denoiser, guided or not: (x_t (B, F, D), t (B,) in [0, 1000), mask (B, F), cond) -> (B, F, out_features)."""
+"""The function (x_t (B, F, D), t (B,) in [0, 1000), mask (B, F), cond) -> (B, F, out_features).
+
+It is a denoiser, with or without guidance.
+"""
 
 Noise = Callable[[int], Tensor]
-"""Returns noise number 0, 1, 2, ... of a sampling run, each (B, F, D); sampling starts from number 0."""
+"""Returns noise number 0, 1, 2, ... of a sampling run, each (B, F, D).
+
+Sampling starts from number 0.
+"""
 
 
 def pad_to(x: Tensor, size: int) -> Tensor:
@@ -213,7 +242,7 @@ def pad_to(x: Tensor, size: int) -> Tensor:
 
 
 def length_mask(lengths: Tensor, frames: int | None = None) -> Tensor:
-    """Returns the mask (B, F) bool of lengths (B,); F is `frames` or the maximum length.
+    """Returns the mask (B, F) bool of lengths (B,). Default of `frames` F: the maximum length.
 
     Example:
         >>> length_mask(torch.tensor([1, 2])).tolist()
@@ -224,7 +253,7 @@ def length_mask(lengths: Tensor, frames: int | None = None) -> Tensor:
 
 
 def ceil_div(count: int, size: int) -> int:
-    """Returns the number of groups of `size` that hold `count` things."""
+    """Returns how many groups of `size` things are needed for `count` things."""
     return -(-count // size)
 
 
@@ -234,7 +263,10 @@ def padded_length(length: int, multiple: int, most: int) -> int:
 
 
 def sent(x: Tensor, device: torch.device) -> Tensor:
-    """Returns a tensor on a device; a copy to a GPU does not wait for the GPU to complete earlier work."""
+    """Returns a tensor on a device.
+
+    A copy to a GPU does not wait until the GPU has completed earlier work.
+    """
     copied = device.type == "cuda" and x.device.type == "cpu"
     return (x.pin_memory() if copied else x).to(device, non_blocking=copied)
 
@@ -246,9 +278,9 @@ def collate(
 
     Args:
         samples: id, normalized features (F, D), caption and action of each motion.
-        multiple: the length of the longest sample is rounded up to a multiple of this number of
-            frames.
-        most: maximum number of frames after rounding; a longer sample is never cut.
+        multiple: number of frames; the length of the longest sample is rounded up to a multiple
+            of it.
+        most: maximum number of frames after rounding. A longer sample is never cut.
     """
     ids, motions, texts, actions = zip(*samples, strict=True)
     lengths = torch.tensor([len(x) for x in motions])

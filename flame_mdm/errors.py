@@ -11,17 +11,23 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TextIO
 
 MAX_LINE = 2_000
-"""Maximum length of an error line, whose middle is left out beyond; the framework's own messages are shorter."""
+"""Maximum length of an error line. Longer lines lose their middle. Own messages are shorter."""
 # Bidirectional control characters of Unicode
 DIRECTIONS = re.compile("[\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]")
 
 
 class UserError(ValueError):
-    """An error that the user can fix; commands print its message in one line and exit with code 1."""
+    """An error that the user can fix.
+
+    Commands print its message in one line and exit with code 1.
+    """
 
 
 def first_line(error: BaseException) -> str:
-    """Returns the first line of an error's message; joins it with the second if it ends with a colon."""
+    """Returns the first line of an error's message.
+
+    If this line ends with a colon, the second line is appended.
+    """
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     if len(lines) > 1 and lines[0].endswith(":"):
         return f"{lines[0]} {lines[1]}"
@@ -29,19 +35,28 @@ def first_line(error: BaseException) -> str:
 
 
 def did_you_mean(name: str, names: Iterable[str]) -> str:
-    """Returns " Did you mean a, b?" with up to three of the most similar `names`, or "" if none is similar."""
+    """Returns " Did you mean a, b?" with the names most similar to `name`.
+
+    It suggests up to three of `names`; "" if none is similar.
+    """
     near = difflib.get_close_matches(name, list(names), 3, 0.5)
     return f" Did you mean {', '.join(near)}?" if near else ""
 
 
 def shortened(text: str, most: int = MAX_LINE) -> str:
-    """Returns a text of at most `most` characters, direction characters escaped; a longer one ends in an ellipsis."""
+    """Returns a text of at most `most` characters, with escaped direction characters.
+
+    A longer text ends in an ellipsis.
+    """
     text = DIRECTIONS.sub(lambda match: _escaped(match[0]), text[: most + 1])
     return text if len(text) <= most else f"{text[: most - 1]}…"
 
 
 def printable(text: str) -> str:
-    r"""Returns the text with control and direction characters escaped (`\x1b`); it cannot control a terminal."""
+    r"""Returns the text with control and direction characters escaped (`\x1b`).
+
+    It can then not control a terminal.
+    """
     return "".join(
         char
         if char == "\t" or unicodedata.category(char) not in ("Cc", "Cf", "Cs", "Zl", "Zp")
@@ -51,7 +66,7 @@ def printable(text: str) -> str:
 
 
 def one_line(text: str) -> str:
-    """Returns a text, which may come from a result file, as one `printable` line."""
+    """Returns a text as one `printable` line. The text may come from an untrusted file."""
     return printable(re.sub(r"[\t\n\v\f\r\x1c-\x1e\x85\u2028\u2029]+", " ", text))
 
 
@@ -64,14 +79,17 @@ _shown: dict[str, str] = {}
 
 
 def show_as(path: str, name: str) -> None:
-    """Prints a name instead of a path from now on: what the user typed instead of a temporary copy of it."""
+    """Makes messages show a name for a path from now on.
+
+    It is for temporary copies: the user sees the name that he typed.
+    """
     _shown[path] = name
 
 
 def say(*lines: object, error: bool = False) -> None:
-    """Prints each argument as one `printable` line, because any name or text may come from an untrusted file.
+    """Prints each argument as one `printable` line; texts may come from untrusted files.
 
-    If the reader of the output has ended, as `head` does, further lines are dropped, and the
+    If the reader of the output has ended, for example `head`, further lines are dropped, and the
     command finishes its work.
     """
     stream = sys.stderr if error else sys.stdout
@@ -88,7 +106,7 @@ def say(*lines: object, error: bool = False) -> None:
 
 
 def drop(stream: TextIO) -> None:
-    """Sends what is written to a standard stream from now on, and what it still holds, to the null device."""
+    """Redirects a standard stream to the null device, with the text that it still buffers."""
     null = os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, stream.fileno())
     os.close(null)
@@ -99,7 +117,9 @@ def _escaped(char: str) -> str:
 
 
 def renamed_names(module: str, names: Mapping[str, str], since: str) -> Callable[[str], Any]:
-    """Returns a `__getattr__` for a module in which names were changed; the old ones work for one minor version.
+    """Returns a `__getattr__` for a module with renamed names.
+
+    Old names keep working for one minor version, with a warning.
 
     Args:
         module: `__name__` of the module.

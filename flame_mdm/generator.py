@@ -1,5 +1,8 @@
 # pyright: standard
-"""Models that generate motions, without Lightning, whose import takes longer than sampling; `flame_mdm.task` trains."""
+"""Models that generate motions, independent of Lightning.
+
+Importing Lightning takes longer than sampling a motion. `flame_mdm.task` trains the models.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -47,7 +50,7 @@ class Parts:
 
     @classmethod
     def build(cls, config: Config, representation: Representation, num_actions: int) -> Self:
-        """Builds the parts of a recipe, with the sizes that depend on other parts."""
+        """Builds the parts of a recipe. Sizes that depend on other parts are set here."""
         features = representation.features
         process: Process = instantiate(config["process"])
         out_features = process.out_features(features)
@@ -63,7 +66,7 @@ class Parts:
 
 
 def _length_unit(config: Config) -> int:
-    """Returns the number of frames of which all lengths in training are multiples."""
+    """Returns the number of frames that divides every length in training."""
     crop = config.get("data", {}).get("crop")
     return crop.get("unit", 1) if isinstance(crop, dict) else 1
 
@@ -71,7 +74,11 @@ def _length_unit(config: Config) -> int:
 def sampling_defaults(
     *, guidance_scale: float, sampler: str, num_inference_steps: int | Sequence[int] | None
 ) -> SamplerOptions:
-    """Returns the sampling options in the section `task` of a recipe; raises `UserError` for invalid values."""
+    """Returns the sampling options in the section `task` of a recipe.
+
+    Raises:
+        UserError: If a value is invalid.
+    """
     if num_inference_steps is None:  # a recipe may come from a file
         raise UserError("task.num_inference_steps=null: give the number of sampling steps")
     try:
@@ -85,9 +92,9 @@ def sampling_defaults(
 class Model:
     """Base class of the models that checkpoints hold."""
 
-    noun = "a model"  # what its checkpoints hold, for messages
+    noun = "a model"  # what its checkpoints contain, for messages
     config: Config  # the recipe, saved in checkpoints
-    facts: dict[str, Any]  # facts about the training data: actions, maximum length, fingerprint
+    facts: dict[str, Any]  # about the training data: actions, maximum length, fingerprint
     steps: int | None = None  # number of training steps of the loaded checkpoint; None if unknown
 
     def add_facts(self, facts: Mapping[str, Any]) -> None:
@@ -96,7 +103,7 @@ class Model:
 
 
 class MotionGenerator(Model, nn.Module):
-    """A denoiser, a process, a condition encoder and a representation, and how to sample from them.
+    """A denoiser, a process, a condition encoder and a representation, with the code to sample.
 
     Args:
         parts: the four parts.
@@ -127,7 +134,7 @@ class MotionGenerator(Model, nn.Module):
     def build(
         cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()
     ) -> Self:
-        """Builds the generator of a recipe; `actions` are the names of the actions in its data."""
+        """Builds the generator of a recipe; `actions` are the names of the data's actions."""
         parts = Parts.build(config, representation, len(actions))
         section = config["task"]
         defaults = sampling_defaults(
@@ -140,7 +147,7 @@ class MotionGenerator(Model, nn.Module):
         return generator
 
     def add_facts(self, facts: Mapping[str, Any]) -> None:
-        """Adds facts about the training data, and tells its vocabulary to the text encoder."""
+        """Adds facts about the training data. The text encoder gets the vocabulary among them."""
         super().add_facts(facts)
         if "vocabulary" in facts:
             self.condition.seen = frozenset(facts["vocabulary"])
@@ -160,7 +167,11 @@ class MotionGenerator(Model, nn.Module):
         return self.condition.reads if self.condition.features else "none"
 
     def check_request(self, options: SamplerOptions | None, unconditioned: bool) -> None:
-        """Raises `UserError` if this kind of model cannot sample with these arguments of `generate`."""
+        """Checks arguments of `generate`; some kinds of models override this.
+
+        Raises:
+            UserError: If this kind of model cannot sample with these arguments.
+        """
 
     @torch.no_grad()
     def generate(
@@ -179,24 +190,25 @@ class MotionGenerator(Model, nn.Module):
     ) -> Tensor:
         """Samples motions for the conditions, lengths and ids of a batch.
 
-        The noise of a motion is a function of (seed, replication, id), so the motion is the same
-        in any batch.
+        The noise of a motion is a function of (seed, replication, id), so a motion is the same in
+        any batch.
 
         Args:
             batch: conditions, `mask` and `ids` of B motions; its `x` is ignored.
-            options: options of the sampler; options that are None have the values of the recipe.
+            options: options of the sampler. An option that is None has the value of the recipe.
             seed: seed of the noise.
-            replication: number of the repetition, for several motions per id.
+            replication: number of the repetition, to sample several motions per id.
             edit: part of a motion to keep.
-            windows: windows that cover motions longer than the motions in training; their
-                conditions replace the conditions of the batch.
+            windows: windows that cover motions longer than the motions in training. The
+                conditions of the windows replace the conditions of the batch.
             prefix: (B, C, D) normalized features of the frames before the motions. A model with
-                `context_frames` C needs it and continues it block by block, without edit, windows
-                and trajectory.
+                `context_frames` C needs it. Such a model continues the prefix block by block and
+                takes no edit, no windows and no trajectory.
             unconditioned: sample a conditional model with its null condition.
-            shared_noise: the noise does not depend on the id, but on (seed, replication) alone.
-            trajectory: list that gets the normalized clean estimate (B, F, D) of each call of the
-                denoiser.
+            shared_noise: the noise does not depend on the id: it is a function of (seed,
+                replication) alone.
+            trajectory: list to which the normalized clean estimate (B, F, D) of each call of the
+                denoiser is added.
 
         Returns:
             Normalized features (B, F, D), 0 past the end of each motion.
@@ -234,7 +246,7 @@ class MotionGenerator(Model, nn.Module):
 
         mask, frames = batch.mask, batch.mask.shape[1]
         if windows is None and not self.denoiser.mask_padding:
-            # This denoiser attends to padding, so the padded length must be the same as in
+            # This denoiser attends to padding, so motions are padded to the same length as in
             # training.
             mask = pad_to(mask, max(frames, self.facts.get("max_frames", 0)))
             if edit is not None:
@@ -259,7 +271,7 @@ class MotionGenerator(Model, nn.Module):
         return x[:, :frames]
 
     def encode(self, batch: MotionBatch, unconditioned: bool = False) -> Condition:
-        """Returns the condition of a batch, or the null condition if a conditional model samples without one."""
+        """Returns the condition of a batch, or the null condition if `unconditioned`."""
         if not (unconditioned and self.condition.features):
             return self.condition(batch)
         nothing = torch.zeros(len(batch), dtype=torch.long, device=batch.x.device)
@@ -267,7 +279,7 @@ class MotionGenerator(Model, nn.Module):
         return self.condition(empty).drop(nothing == 0)
 
     def guided(self, cond: Condition, options: SamplerOptions, unconditioned: bool) -> Denoise:
-        """Returns the denoiser with the guidance of the options, if there is a condition to guide by."""
+        """Returns the denoiser, guided if there is a condition to guide by."""
         scale = options.guidance_scale
         if scale is None or cond.null is None or not self.condition.features or unconditioned:
             return self.denoiser
@@ -279,7 +291,10 @@ class MotionGenerator(Model, nn.Module):
         return self.facts["max_frames"] - self.denoiser.context_frames
 
     def split_prefix(self, batch: MotionBatch) -> tuple[Tensor | None, MotionBatch]:
-        """Splits motions into the clean frames (B, C, D) that the denoiser reads, if it reads any, and the rest."""
+        """Splits motions into the clean frames that the denoiser reads, and the rest.
+
+        The clean frames are (B, C, D); None if the denoiser reads none.
+        """
         context = self.denoiser.context_frames
         if not context:
             return None, batch
@@ -289,19 +304,19 @@ class MotionGenerator(Model, nn.Module):
 
 
 class Blocks:
-    """Motions that grow by blocks, each of which continues the last frames before it (Tevet et al. 2025, "CLoSD").
+    """Motions that grow by blocks; each block continues the last frames of the one before.
 
-    The noise of a block is a function of (seed, replication, id, number of the block): later
-    conditions change later blocks alone.
+    Source: Tevet et al. 2025, "CLoSD". The noise of a block is a function of (seed, replication,
+    id, number of the block). A change of a condition therefore changes only the later blocks.
 
     Args:
         model: a model whose denoiser has `context_frames` C.
-        ids: B names of the motions, which seed their noise.
+        ids: B names of the motions; they seed the noise.
         prefix: (B, C, D) normalized features of the frames before the first block.
-        options: all options of the sampler.
+        options: options of the sampler; all of them have a value.
         seed: seed of the noise.
-        replication: number of the repetition, for several motions per id.
-        unconditioned: whether conditions are null conditions already.
+        replication: number of the repetition, to sample several motions per id.
+        unconditioned: the conditions are null conditions already.
 
     Raises:
         UserError: If the prefix is missing or has another shape.
@@ -336,8 +351,8 @@ class Blocks:
 
         Args:
             cond: the conditions of this block.
-            kept: (B,) int64, number of frames of the block that stay; the next block continues
-                these. Default: all.
+            kept: (B,) int64, number of frames of the block to keep; the next block continues
+                these frames. Default: all frames.
             edit: part of the block to keep.
         """
         model, prefix = self.model, self.prefix
@@ -361,17 +376,20 @@ class Blocks:
 
 
 class DistilledGenerator(MotionGenerator):
-    """A student of `flame_mdm.training.distillation`, with the guidance built in."""
+    """A student of `flame_mdm.training.distillation`; the guidance is built into its weights."""
 
     def __init__(self, parts: Parts, sampler_options: SamplerOptions):
         super().__init__(parts, sampler_options)
-        # Edits cannot rewrite a path, since the sampler of students forgets it.
+        # Edits cannot rewrite a path, because the sampler of students has no path.
         self.process.edit_modes = tuple(
             mode for mode in self.process.edit_modes if mode != "trajectory"
         )
 
     def check_request(self, options: SamplerOptions | None, unconditioned: bool) -> None:
-        """Raises `UserError` for guidance and motions without condition, which a student has not learned."""
+        """Raises `UserError` for guidance and for motions without condition.
+
+        A student has learned neither.
+        """
         scale = None if options is None else options.guidance_scale
         if scale not in (None, 1):
             raise UserError(

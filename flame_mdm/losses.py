@@ -10,10 +10,10 @@ CONTACT_SPEED = 0.01
 
 
 def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
-    """Returns the mean (B,) of x (B, F, ...) over the real frames of each sample; 0 if a sample has none.
+    """Returns the mean (B,) of x (B, F, ...) over the real frames of each sample.
 
-    Unlike in MDM's code, 1e-8 is not added to the number of entries: it is below the resolution
-    of float32.
+    The mean of a sample without real frames is 0. MDM's code adds 1e-8 to the number of entries.
+    This function does not: 1e-8 is below the resolution of float32.
 
     Example:
         >>> x, mask = torch.tensor([[[1.0], [3.0], [9.0]]]), torch.tensor([[True, True, False]])
@@ -26,10 +26,10 @@ def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
 
 
 def masked_mse(a: Tensor, b: Tensor, mask: Tensor) -> Tensor:
-    """Returns the squared error (B,) of a and b (B, F, ...), averaged over the entries of real frames (mask (B, F)).
+    """Returns the squared error (B,) of a and b (B, F, ...), averaged over real frames.
 
-    All samples have equal weight, regardless of length (Tevet et al. 2022, eq. 2, averaged as in
-    their code).
+    `mask` is (B, F). All samples have equal weight, regardless of length (Tevet et al. 2022,
+    eq. 2, averaged as in their code).
 
     Example:
         >>> masked_mse(torch.zeros(1, 2, 3), torch.full((1, 2, 3), 2.0), torch.ones(1, 2) > 0).tolist()
@@ -39,18 +39,20 @@ def masked_mse(a: Tensor, b: Tensor, mask: Tensor) -> Tensor:
 
 
 def bone_lengths(joints: Tensor, edges: Sequence[tuple[int, int]] | Tensor) -> Tensor:
-    """Returns the lengths (..., N) of bones, given by `edges` (N, 2), parent and child, from joints (..., J, 3)."""
+    """Returns the lengths (..., N) of N bones, from joints (..., J, 3).
+
+    `edges` (N, 2) are the indices of the parent and the child of each bone.
+    """
     parents, children = torch.as_tensor(edges).T
     return (joints[..., children, :] - joints[..., parents, :]).norm(dim=-1)
 
 
 class MotionLosses(nn.Module):
-    """Weighted geometric losses of MDM (Tevet et al. 2022, eq. 3-5), and of bone lengths (Liang
-    et al. 2024, InterGen).
+    """Weighted geometric losses of MDM, and a loss of bone lengths.
 
-    All are means over real frames and entries: the norms in the paper are divided by the number
-    of entries per frame, as in its code. Velocities are per frame. Terms with weight 0 are not
-    computed.
+    Sources: Tevet et al. 2022, eq. 3-5, and Liang et al. 2024, InterGen. All losses are means
+    over real frames and entries: the norms in the paper are divided by the number of entries per
+    frame, as in its code. Velocities are per frame. Losses with weight 0 are not computed.
 
     Args:
         to_joints: differentiable map from normalized features (B, F, D) to joint positions (B, F,
@@ -59,15 +61,16 @@ class MotionLosses(nn.Module):
         edges: (parent, child) of each bone, for `bone_length`.
         joints: weight of the squared error of the joint positions (eq. 3).
         velocity: weight of the squared error of the features' velocity (eq. 5).
-        foot_contact: weight of the squared velocity of feet in contact in the data (eq. 4). The
-            mean includes feet that are not in contact, whose entries are 0, like the sum over all
+        foot_contact: weight of the squared velocity of the feet that are in contact in the data
+            (eq. 4). Feet that are not in contact count in the mean with 0, as in the sum over all
             frames in the paper.
-        bone_length: weight of the squared error of the bone lengths, in square meters. This is the bone length loss
-        of InterGen (arXiv:2304.05684). InterGen applies it only up to a noise level; here, it applies at all levels.
+        bone_length: weight of the squared error of the bone lengths, in square meters. This is
+            InterGen's bone length loss (arXiv:2304.05684). InterGen applies it only up to a noise
+            level; here, it applies at all levels.
         root_relative: subtract the first joint from all joints, as in MDM's code.
-        velocity_features: number of features, from the first, that `velocity` uses, as in MDM's
-            code (144 of 25 x 6, 262 of 263: the last row of the feature matrix is left out). None
-            = all.
+        velocity_features: number of features that `velocity` uses, counted from the first. MDM's
+            code uses 144 of 25 x 6 and 262 of 263: it leaves out the last row of the feature
+            matrix. None = all.
 
     Example:
         >>> losses = MotionLosses(lambda x: x.unflatten(-1, (-1, 3)), feet=[1], joints=2.0)
@@ -101,9 +104,15 @@ class MotionLosses(nn.Module):
         self.root_relative, self.velocity_features = root_relative, velocity_features
 
     def forward(self, x0_hat: Tensor, x: Tensor, mask: Tensor) -> dict[str, Tensor]:
-        """Returns weighted losses (B,) by name, from clean estimate and data (B, F, D) and mask (B, F)."""
+        """Returns the weighted losses (B,) by name.
+
+        Args:
+            x0_hat: (B, F, D), the clean estimate.
+            x: (B, F, D), the data.
+            mask: (B, F) bool, True = real frame.
+        """
         # The first frame has no velocity. Padding is at the end, so a velocity is real if its
-        # second frame is.
+        # second frame is real.
         moving = mask[:, 1:]
         losses: dict[str, Tensor] = {}
         if self.velocity:

@@ -11,10 +11,13 @@ from flame_mdm.signals import raise_received
 
 
 class ProgressBar(tqdm):
-    """tqdm's bar in a terminal; elsewhere, a plain line at the beginning, about every 30 seconds, and at the end."""
+    """Shows tqdm's bar in a terminal, and plain lines elsewhere.
+
+    Plain lines are printed at the beginning, about every 30 seconds, and at the end.
+    """
 
     SECONDS = 30.0
-    # tqdm would swallow the exception of a signal that comes while its monitor thread starts
+    # tqdm would swallow an exception raised by a signal while its monitor thread starts
     monitor_interval = 0
 
     def __init__(self, *args: Any, **options: Any):
@@ -27,13 +30,13 @@ class ProgressBar(tqdm):
             yield item
 
     def update(self, n: float | None = 1) -> bool | None:
-        """Advances the bar by `n`; first raises the exception of a received signal."""
+        """Advances the bar by `n`, unless a signal was received: then raises its exception."""
         raise_received()
         return super().update(n)
 
     @staticmethod
     def status_printer(file: IO[str]) -> Callable[[str], None]:
-        """Returns the function that writes the bar to a file; tqdm itself ends the last line."""
+        """Returns the function that writes the bar to a file. tqdm itself ends the last line."""
         if file.isatty():
             return tqdm.status_printer(file)
         end = ""
@@ -41,7 +44,7 @@ class ProgressBar(tqdm):
         def write(text: str) -> None:
             nonlocal end
             if text:
-                # The reader of the output has ended, as `head` does
+                # The reader of the output may have ended, for example `head`
                 with suppress(BrokenPipeError):
                     file.write(end + text.rstrip())
                     file.flush()

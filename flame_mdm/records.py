@@ -1,4 +1,4 @@
-"""Records of evaluations and audits: the schemas of their files, which evaluators write and reporting reads."""
+"""Records of evaluations and audits: schemas of the files that evaluators write."""
 
 import hashlib
 import json
@@ -13,23 +13,26 @@ from flame_mdm.schemas import ClosedSchema, Int, Number, Plain, Schema, read_jso
 
 
 class Value(Schema):
-    """A metric over replications, with the number of motions that it was computed from."""
+    """A metric's value over replications, with the number of motions it was computed from."""
 
     mean: Number | None  # None if it cannot be computed
-    ci: Number | None  # half width of its 95 % interval over replications; None for a single one
+    ci: Number | None  # half width of the 95 % interval over replications; None if there is one
     replications: Int | None
     n: Int | None  # motions per replication; None if replications have different numbers
     per_replication: list[Number | None] = Field(default_factory=list)
     n_per_replication: list[Int] = Field(default_factory=list)
-    # number of real motions in a comparison of sets; None = no such comparison
+    # Number of real motions if the metric compares two sets; otherwise None
     n_real: Int | None = None
     unit: str = ""
-    # Values of the motions of the first replication, drawn again and again
+    # Bootstrap values: the metric of motions drawn with repetition from the first replication
     resampled: list[Number | None] = Field(default_factory=list)
 
     @property
     def half(self) -> float | None:
-        """Half width of the 95 % interval over replications, or over motions for a single one; None if unknown."""
+        """Half width of the 95 % interval over replications; None if unknown.
+
+        For a single replication, it is the interval over the motions.
+        """
         if (self.replications or 0) > 1:
             return self.ci
         drawn = [value for value in self.resampled if value is not None]
@@ -40,18 +43,18 @@ class Value(Schema):
 
     @property
     def counts(self) -> str:
-        """Numbers of motions as text: "3 x 64", or "64 + 5" of replications with different numbers."""
+        """Numbers of motions as text: "3 x 64", or "64 + 5" if the numbers differ."""
         if len(set(self.n_per_replication)) > 1:
             return " + ".join(map(str, self.n_per_replication))
         return f"{self.replications} x {self.n}"
 
 
 def percentiles(drawn: Sequence[float], value: float) -> tuple[float, float]:
-    """Returns the 95 % interval of a value from its bootstrap, shifted so that it is centered at the value.
+    """Returns the 95 % interval of a value from its bootstrap values, centered at the value.
 
-    Efron and Tibshirani 1993, section 13.3. The shift is for values such as Fréchet distances,
-    which are larger for sets with repetitions (section 10.6); the interval belongs to the value
-    for the same number of motions.
+    See Efron and Tibshirani 1993, section 13.3. Values such as Fréchet distances are larger for
+    sets with repetitions (section 10.6), so the interval is shifted to the value. It is valid for
+    the same number of motions.
 
     Example:
         >>> percentiles([1.0, 2.0, 3.0], 5.0)
@@ -72,7 +75,10 @@ class ProtocolVersion(Schema):
 
 
 class Data(Schema):
-    """The data set of an evaluation or audit; `frames` are the limits of its clips, `excluded` counts by reason."""
+    """The data set of an evaluation or audit.
+
+    `frames` are the limits of the clips' lengths. `excluded` counts excluded clips by reason.
+    """
 
     dataset: str
     fingerprint: str
@@ -82,7 +88,7 @@ class Data(Schema):
 
 
 class ExtractorRecord(Schema):
-    """A feature extractor, and the fingerprint of the data it was trained on, if known."""
+    """A feature extractor and, if known, the fingerprint of the data that it was trained on."""
 
     sha256: str
     path: str = ""
@@ -102,7 +108,7 @@ class Checkpoint(Schema):
     edit: dict[str, Plain] = Field({})
     experiment: str | None = None
     config_sha256: str = ""
-    # "key=value" of keys that differ from the recipe's
+    # Keys that differ from the recipe, each "key=value"
     recipe_changes: list[str] = Field(default_factory=list)
     selected_by: str = ""
     averaged_weights: bool | None = None
@@ -117,14 +123,17 @@ class Checkpoint(Schema):
 
 
 class UsedSkeleton(Schema):
-    """The bones of joints computed from SMPL's rotations: from SMPL's model file, or from a stand-in."""
+    """Origin of the bones if joints are computed from SMPL's rotations.
+
+    The bones come from SMPL's model file or from a stand-in.
+    """
 
     stand_in: bool
     smpl_sha256: str | None = None
 
 
 class Cost(Schema):
-    """Cost per motion; None if no model was used."""
+    """Cost per motion. Values are None if no model was used."""
 
     nfe: Number | None = None
     seconds_per_sample: Number | None = None
@@ -132,11 +141,14 @@ class Cost(Schema):
 
 
 class Measured(Schema):
-    """What an evaluation measures: `values` and, of real motions, `ground_truth`, by metric; None = not measured."""
+    """The values that an evaluation measures, by metric.
+
+    `values` are of the evaluated motions, `ground_truth` of real motions; None = not measured.
+    """
 
     ground_truth: dict[str, Value | None] | None
     values: dict[str, Value | None] | None
-    not_computed: dict[str, str]  # reasons by metric
+    not_computed: dict[str, str]  # metric -> reason
     invalid_because: list[str]  # [] if the values are valid
     # Whether motions were generated although real motions do not have the expected values
     forced: bool = False
@@ -146,13 +158,14 @@ class Measured(Schema):
 
 
 class Result(Measured):
-    """A result of `flame-mdm evaluate`: what was evaluated, how and where, and the values."""
+    """A result of `flame-mdm evaluate`: values, and what was evaluated with which settings."""
 
     quick: bool  # not for publication
     protocol: ProtocolVersion
     changed: dict[str, Plain] = Field({})  # options that differ from the protocol
     split: str
-    # whether it tests on clips seen in training, or has no validation clips
+    # Whether the data has its published splits, which test on clips seen in training or lack
+    # validation clips
     published_split: bool = False
     data: Data
     seed: Int
@@ -161,7 +174,7 @@ class Result(Measured):
     samples_sha256: str | None = None  # hash of the motion files from another system
     baseline: str | None = None
     audit: str | None = None  # path of the audit card of the extractor; None = not audited
-    audit_motions: Int | None = None  # number of motions that the card is about
+    audit_motions: Int | None = None  # number of motions in the audit
     skeleton: UsedSkeleton | None = None  # None if the data has joint positions
     device: str
     precision: str = ""
@@ -176,7 +189,7 @@ class Result(Measured):
 
     @property
     def origin(self) -> str:
-        """Hash of what the values were computed from: motions or checkpoint, extractor, data and protocol."""
+        """Hash of all inputs: motions or checkpoint, extractor, data and protocol."""
         parts = [
             self.checkpoint.sha256 if self.checkpoint else self.samples_sha256 or self.baseline,
             self.extractor.sha256 if self.extractor else None,
@@ -189,13 +202,16 @@ class Result(Measured):
 
     @property
     def stand_in_skeleton(self) -> bool:
-        """Whether the bones of the joints come from a stand-in for SMPL's model file."""
+        """Whether the joints have the bones of a stand-in for SMPL's model file."""
         return self.skeleton is not None and self.skeleton.stand_in
 
 
 class AuditedGrade(ClosedSchema):
-    """One grade of a perturbation; by metric: value, half width of its 95 % interval, difference
-    from real motions, and half width of the interval of that difference; None if not computable.
+    """One grade of a perturbation.
+
+    Each metric has four numbers: its value, the half width of the value's 95 % interval, the
+    difference from real motions, and the half width of the difference's interval. None = not
+    computable.
     """
 
     grade: Number
@@ -203,7 +219,7 @@ class AuditedGrade(ClosedSchema):
 
 
 class AuditedPerturbation(ClosedSchema):
-    """A perturbation of real motions, and its grades from weak to strong."""
+    """A perturbation of real motions and its grades, from weak to strong."""
 
     name: str
     group: str
@@ -213,25 +229,25 @@ class AuditedPerturbation(ClosedSchema):
 
 
 class AuditedMetric(ClosedSchema):
-    """What a metric declares about one of its values."""
+    """Properties that a metric declares about one of its values."""
 
     unit: str = ""
-    # whether it may see that a motion shows something other than requested
+    # Whether it can detect that a motion shows something other than requested
     sees_meaning: bool = True
-    sums_up: bool = True  # whether the value sums up the other values of the metric
+    sums_up: bool = True  # whether the value sums up the metric's other values
     exact: bool = False  # whether it reads attributes from the joints, without a network
     depends_on_count: bool = False  # whether it is biased by the number of motions
 
 
 class AuditedExtractor(Schema):
-    """The extractor of an audit, by its recipe or file."""
+    """The feature extractor of an audit, by its recipe or file."""
 
     sha256: str
     name: str
 
 
 class AuditCard(ClosedSchema):
-    """An evaluator audit, as `flame-mdm audit` writes it."""
+    """An evaluator audit, as written by `flame-mdm audit`."""
 
     format: Int
     extractor: AuditedExtractor | None
@@ -242,19 +258,19 @@ class AuditCard(ClosedSchema):
     seed: Int
     resamples: Int
     packages: dict[str, str]
-    # Whether higher values are better; None = values are best if near the values of real motions
+    # Whether higher values are better. None = the best values are near the values of real motions
     metrics: dict[str, bool | None]
     facts: dict[str, AuditedMetric] = Field({})  # by metric; earlier versions wrote none
-    # values of real motions and half widths of their intervals, by metric
+    # By metric, the value of real motions and the half width of its interval
     real: dict[str, Annotated[list[Number | None], Field(min_length=2, max_length=2)]]
     perturbations: Annotated[list[AuditedPerturbation], Field(min_length=1)]
     not_computed: dict[str, str]
-    # Agreement with exact attributes: `auc` and `correlation`, by metric
+    # Agreement with exact attributes, by metric: `auc` and `correlation`
     truth: dict[str, dict[str, Number | None]]
 
 
 def read_result(path: Path) -> Result:
-    """Reads the result file of an evaluation; raises `UserError` if it is damaged."""
+    """Reads the result file of an evaluation. Raises `UserError` if it is damaged."""
     return read_json(
         path, Result, "delete it, then run `flame-mdm evaluate` or `flame-mdm tables` again"
     )

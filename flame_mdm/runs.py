@@ -1,4 +1,4 @@
-"""Run directories: layout, typed schemas of their files, and readers."""
+"""Run directories: their layout, typed schemas of their files, and readers."""
 
 import json
 import re
@@ -15,14 +15,17 @@ from flame_mdm.records import Result, read_result
 from flame_mdm.schemas import Int, Number, Schema, check_shape, read_json
 
 CONFIG, PROVENANCE, FAULT = "config.yaml", "provenance.json", "bad_batch.json"
-HISTORY = "metrics.jsonl"  # training curves, one line per log step
+HISTORY = "metrics.jsonl"  # training curves; one line per logged step
 RESULTS = "evaluation/**/result*.json"
 HISTORY_LIMIT = 256 * safe_io.MEBIBYTE
-"""Maximum size of a history; a million steps logged every 50 steps take about 20 MiB."""
+"""Maximum size of a history in bytes.
+
+A million steps, logged every 50 steps, take about 20 MiB.
+"""
 
 
 class RunConfig(Schema):
-    """The keys of the configuration of a run that pages read."""
+    """The keys of a run's configuration that pages read."""
 
     experiment: str | None
     name: Annotated[str | Int | Number, Field(validation_alias=AliasPath("run", "name"))] = (
@@ -32,14 +35,14 @@ class RunConfig(Schema):
 
 
 class TrainedOn(Schema):
-    """The key `data` of a provenance file, which may contain other facts about the data."""
+    """The key `data` of a provenance file. It may contain other facts about the data."""
 
     model_config = ConfigDict(strict=True, extra="allow")
     fingerprint: str = "–"
 
 
 class Provenance(Schema):
-    """Command, code, machine, versions, device, parameters and data of a run."""
+    """Provenance of a run: command, code, machine, versions, device, parameters and data."""
 
     command: list[str]
     commit: str | None
@@ -53,7 +56,7 @@ class Provenance(Schema):
 
 
 class FaultyBatch(Schema):
-    """The part of a batch in one process."""
+    """One process's part of a batch."""
 
     rank: Int
     batch: Int
@@ -70,7 +73,10 @@ class Fault(Schema):
 
 
 def made_by(path: str | Path) -> str:
-    """Returns how to get a missing checkpoint or extractor: the command that creates it, or where to find it."""
+    """Returns how to get a missing checkpoint or extractor.
+
+    This is the command that creates it or, for other files, the page that says where to find it.
+    """
     name = Path(path).as_posix()
     recipe = re.fullmatch(r"runs/(.+)/default/checkpoints/.+", name)
     where = f"{name} is missing" + '; see "Extractors" in docs/evaluation.md' * name.startswith(
@@ -81,7 +87,11 @@ def made_by(path: str | Path) -> str:
 
 @dataclass
 class Run:
-    """Content of a run directory: curves are name -> step -> value, results are by their path in the folder."""
+    """Content of a run directory.
+
+    Curves are a mapping from name to step to value. Results are stored by their path in the
+    directory.
+    """
 
     folder: Path
     config: Config
@@ -91,13 +101,13 @@ class Run:
 
     @property
     def label(self) -> str:
-        """Recipe and name of the run; only the recipe for a run with the default name."""
+        """Recipe and name of the run; only the recipe if the run has the default name."""
         name = self.config["run"].get("name", "default")
         return str(self.config["experiment"]) + (f"/{name}" if name != "default" else "")
 
     @property
     def samples(self) -> Path | None:
-        """Folder of the samples of the last step, None if there are none."""
+        """Folder of the samples of the last step; None if there are no samples."""
         folders = [path.parent for path in self.folder.glob("samples/step_*/motion_000.npz")]
         return max(
             (path for path in folders if path.name.removeprefix("step_").isdecimal()), default=None
@@ -105,7 +115,7 @@ class Run:
 
     @property
     def steps(self) -> int:
-        """Number of training steps that the curves cover."""
+        """Number of training steps in the curves."""
         trained = (
             curve for name, curve in self.curves.items() if name.startswith(("train/", "samples/"))
         )
@@ -113,7 +123,7 @@ class Run:
 
 
 def check_run(folder: Path) -> None:
-    """Raises `UserError` if a folder is not the directory of a run."""
+    """Raises `UserError` if a folder is not a run directory."""
     if not (folder / CONFIG).exists():
         raise UserError(
             f"{folder}: contains no {CONFIG}; give a run directory, such as runs/synthetic/mdm/default"
@@ -121,7 +131,11 @@ def check_run(folder: Path) -> None:
 
 
 def read_run(folder: Path) -> Run:
-    """Returns the content of a run directory; raises `UserError` if it is none, or a file is damaged."""
+    """Returns the content of a run directory.
+
+    Raises:
+        UserError: If the folder is not a run directory, or a file is damaged.
+    """
     check_run(folder)
     config = read_saved(folder / CONFIG)
     try:
@@ -139,7 +153,11 @@ def read_run(folder: Path) -> Run:
 
 
 def read_history(folder: Path) -> dict[str, dict[int, float]]:
-    """Returns the sorted curves of a run, name -> step -> value; raises `UserError` if the file is damaged."""
+    """Returns the curves of a run by name, each a mapping from step to value, sorted by step.
+
+    Raises:
+        UserError: If the file is damaged.
+    """
     curves: dict[str, dict[int, float]] = {}
     for record in records(folder / HISTORY):
         for name, value in record.items():
@@ -149,7 +167,7 @@ def read_history(folder: Path) -> dict[str, dict[int, float]]:
 
 
 def records(path: Path) -> list[dict[str, Any]]:
-    """Returns the lines of a history; ignores an incomplete last line, left by a killed process."""
+    """Returns the lines of a history. Ignores an incomplete last line of a killed process."""
     if not path.exists():
         return []
     *lines, _ = safe_io.read_text(path, HISTORY_LIMIT).split("\n")
@@ -159,7 +177,7 @@ def records(path: Path) -> list[dict[str, Any]]:
             record: dict[str, Any] = check_shape(json.loads(line), dict[str, float | int])
             if type(record.get("step")) is not int or record["step"] < 0:
                 raise ValueError("it has no integer step")
-            "".join(record).encode()  # a lone surrogate cannot be written again
+            "".join(record).encode()  # fails for a lone surrogate, which cannot be written again
         except (ValueError, RecursionError) as error:
             raise UserError(
                 f"{path}: line {number} is damaged; delete that line ({error})"

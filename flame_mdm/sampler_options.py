@@ -10,7 +10,7 @@ from flame_mdm.errors import UserError
 
 # Maximum number of steps of a diffusion or sampler
 MAX_STEPS = 100_000
-# How diffusion places steps; see `flame_mdm.processes.schedules.timesteps`
+# How diffusion spaces its sampling steps; see `flame_mdm.processes.schedules.timesteps`
 SPACINGS = (
     "linspace",
     "stride",
@@ -19,10 +19,11 @@ SPACINGS = (
 
 @dataclass(frozen=True, kw_only=True)
 class SamplerOptions:
-    """How motions are sampled. None = the value of the recipe or, if the recipe has none, of the sampler.
+    """How motions are sampled.
 
-    A sampler declares which of the options it has (`flame_mdm.processes.samplers`);
-    `flame_mdm.processes.Process` refuses the others.
+    An option that is None has the value of the recipe. If the recipe has no value, the sampler's
+    default applies. A sampler declares its options (`flame_mdm.processes.samplers`), and
+    `flame_mdm.processes.Process` refuses other options.
 
     Raises:
         UserError: If a value is invalid for every model.

@@ -1,4 +1,4 @@
-"""Typed schemas of files, and readers whose errors name file and key."""
+"""Typed schemas of files, and readers whose errors name the file and the key."""
 
 import functools
 import json
@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError,
 from flame_mdm import safe_io
 from flame_mdm.errors import UserError, did_you_mean
 
-# Maximum integer in a file; larger ones overflow when they are plotted or logged
+# Maximum integer in a file. Larger integers overflow when they are plotted or logged.
 MAX_INTEGER = 2**63 - 1
 LIMIT = 4 * safe_io.MEBIBYTE
 """Maximum size of a file of results, lengths or provenance. Typical files have 10 to 300 KiB."""
@@ -22,13 +22,19 @@ Plain = str | bool | Int | Number | None
 
 
 class Schema(BaseModel):
-    """Content of a file. Types are not converted: "1" is not a number. Unlisted keys are ignored."""
+    """Content of a file.
+
+    Types are not converted: "1" is not a number. Unknown keys are ignored.
+    """
 
     model_config = ConfigDict(strict=True)
 
 
 class ClosedSchema(Schema):
-    """Content of a file written by people: unknown keys are errors, except overrides such as data.crop.max_frames."""
+    """Content of a file that people write.
+
+    Unknown keys are errors, except overrides such as data.crop.max_frames.
+    """
 
     @model_validator(mode="before")
     @classmethod
@@ -55,15 +61,18 @@ EXPECTED = {
         "too_long": "a shorter list",
     },
 }
-"""Expected content, by the type of a pydantic error or its first word."""
+"""Descriptions of the expected content, by the type of a pydantic error or its first word."""
 
 _adapter = functools.cache(TypeAdapter)
 
 
 def check_shape(content: Any, kind: type[T] | Any, strict: bool = True) -> T:
-    """Returns content of a file converted to a `Schema` or another type that pydantic supports.
+    """Converts the content of a file to a `Schema` or another type that pydantic supports.
 
-    Raises `ValueError`, with key, found value and expected type. Dataclasses need `strict` = False: "1" is a number.
+    Dataclasses need `strict` = False, with which "1" is a number.
+
+    Raises:
+        ValueError: If the content has another shape; names key, found value and expected type.
     """
     if large := _too_large(content):
         raise ValueError(
@@ -76,7 +85,7 @@ def check_shape(content: Any, kind: type[T] | Any, strict: bool = True) -> T:
 
 
 def _too_large(content: Any) -> str:
-    """Returns the first integer beyond `MAX_INTEGER` in some content, as text; "" if there is none."""
+    """Returns the first integer above `MAX_INTEGER` in the content, as text; "" if none is."""
     if isinstance(content, dict | list):
         values = content.values() if isinstance(content, dict) else content
         return next(filter(None, map(_too_large, values)), "")
@@ -86,7 +95,7 @@ def _too_large(content: Any) -> str:
 def _first_error(error: ValidationError, content: Any) -> str:
     first: Any = error.errors(include_url=False)[0]
     keys, kind, context = [], first["type"], first.get("ctx", {})
-    for key in first["loc"]:  # pydantic also lists the members of unions, which are not keys
+    for key in first["loc"]:  # pydantic also lists the members of unions; they are not keys
         if (isinstance(content, dict) and key in content) or (
             isinstance(content, list) and isinstance(key, int)
         ):
@@ -94,7 +103,7 @@ def _first_error(error: ValidationError, content: Any) -> str:
             keys.append(str(key))
     name = ".".join(keys) or "the file"
     if first["loc"] and first["loc"][-1] == "[key]":
-        return f"{name}: a key is not a text; put it in quotes"
+        return f"{name}: a key is not a text. Put it in quotes"
     if kind == "missing":
         return f"{name} has no {first['loc'][-1]}"
     if kind == "value_error":
@@ -112,7 +121,10 @@ def _first_error(error: ValidationError, content: Any) -> str:
 
 
 def read_json(path: Path, kind: type[T] | Any, remedy: str = "") -> T:
-    """Returns the content of a JSON file of at most `LIMIT` bytes, as `check_shape` does; errors end with `remedy`."""
+    """Returns the content of a JSON file of at most `LIMIT` bytes; see `check_shape`.
+
+    Error messages end with `remedy`.
+    """
     message = f"; {remedy}" if remedy else ""
     try:
         return check_shape(safe_io.read_json(path, LIMIT), kind)

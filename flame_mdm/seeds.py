@@ -1,9 +1,9 @@
-"""Counter-based random numbers, which depend on their purpose and not on the order of draws.
+"""Counter-based random numbers. They depend on their purpose, not on the order of the draws.
 
-In a sampling run, the noise of a motion is an elementwise function of (seed, replication, id): it
+In a sampling run, the noise of a motion is an elementwise function of (seed, replication, id). It
 does not depend on batch, padding, number of processes or device. A counter is hashed (splitmix64:
-Steele, Lea and Flood 2014, "Fast splittable pseudorandom number generators") and mapped to the
-normal distribution (Box and Muller 1958).
+Steele, Lea and Flood 2014, "Fast splittable pseudorandom number generators"). The hash is mapped
+to the normal distribution (Box and Muller 1958).
 """
 
 import hashlib
@@ -34,8 +34,8 @@ def key(*parts: str | int) -> int:
 def seed_generator(number: int, device: torch.device) -> None:
     """Seeds torch's generators of the processor and of `device`.
 
-    `torch.manual_seed` seeds the generators of all devices, which takes about a millisecond if
-    CUDA is not initialized.
+    `torch.manual_seed` is slower: it seeds the generators of all devices, which takes about a
+    millisecond if CUDA is not initialized.
     """
     torch.default_generator.manual_seed(number)
     if device.type != "cpu":
@@ -60,9 +60,9 @@ def _hash(x: Counters) -> Counters:
 
 
 def integers(keys: np.ndarray) -> Callable[[Any], np.ndarray]:
-    """Returns a function that draws uniform integers (B,) from 0 up to, and not including, its argument.
+    """Returns a function `draw(count)` of uniform integers (B,), 0 <= integer < count.
 
-    The argument is an integer below 2^31, or one for each key (B,) int64. Each call is another
+    `count` is an integer below 2^31 or has one integer per key (B,) int64. Each call is another
     draw.
     """
     state = keys
@@ -76,7 +76,7 @@ def integers(keys: np.ndarray) -> Callable[[Any], np.ndarray]:
 
 
 def uniform(keys: Tensor, shape: Sequence[int]) -> tuple[Tensor, Tensor]:
-    """Returns two independent uniform draws in (0, 1) for each key (B,) and position: (B, *shape), float32."""
+    """Returns two independent uniform draws in (0, 1) for keys (B,): (B, *shape) float32 each."""
     positions = torch.arange(math.prod(shape), device=keys.device).reshape(1, *shape)
     bits = _hash(_hash(keys).reshape(-1, *[1] * len(shape)) + positions * _GOLDEN)
     scale = 2.0**-24
@@ -112,10 +112,10 @@ def seeded_noise(
         features: D.
         seed: seed of the run.
         replication: number of the repetition of the run.
-        like: a tensor of the device and the precision of the noise.
+        like: a tensor; the noise has its device and precision.
 
     Returns:
-        A function from the number of a draw, 0, 1, 2, ..., to noise (B, F, D).
+        A function from the number of a draw (0, 1, 2, ...) to noise (B, F, D).
     """
     keys = torch.tensor([key("noise", seed, replication, name) for name in ids], device=like.device)
     return lambda draw: normal(_hash(keys + draw), frames, features).to(like.dtype)

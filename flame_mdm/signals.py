@@ -1,4 +1,4 @@
-"""Signals: they end a command cleanly, or stop training at the end of a step."""
+"""Signal handlers that end a command cleanly, or stop training at the end of a step."""
 
 import os
 import signal
@@ -16,7 +16,10 @@ _received: BaseException | None = None
 
 @contextmanager
 def stoppable(signums: Sequence[int]) -> Iterator[None]:
-    """Turns signals into exceptions, so that partial files are cleaned up; the exit code is 128 + the signal."""
+    """Turns signals into exceptions, so that partial files are deleted.
+
+    The exit code of the command is 128 + the number of the signal.
+    """
     global _received
 
     def exception(number: int) -> BaseException:
@@ -24,7 +27,7 @@ def stoppable(signums: Sequence[int]) -> Iterator[None]:
 
     def stop(number: int, frame: FrameType | None) -> NoReturn:
         global _received
-        # no message about objects that were being created or deleted
+        # suppresses messages about objects that were being created or deleted
         sys.unraisablehook = lambda _: None
         _received = _received or exception(number)
         raise exception(number)
@@ -36,8 +39,8 @@ def stoppable(signums: Sequence[int]) -> Iterator[None]:
     try:
         yield
     except Exception:
-        # The exception of a signal may come between any two steps of a library, whose cleanup can
-        # then fail.
+        # The exception of a signal may be raised anywhere in a library. The library's cleanup can
+        # then fail with another exception.
         if _received is not None:
             raise _received from None
         raise
@@ -48,16 +51,16 @@ def stoppable(signums: Sequence[int]) -> Iterator[None]:
 
 
 def raise_received() -> None:
-    """Raises the exception of a received signal again; a library may have swallowed the first one."""
+    """Raises the exception of a received signal again, in case a library has swallowed it."""
     if _received is not None:
         raise _received
 
 
 class StopRequest:
-    """Notes a signal, `signum`, that asks training to stop at the end of a step; 0 = none.
+    """Notes a signal that asks training to stop at the end of a step.
 
-    A second SIGINT stops immediately. So does a second SIGTERM more than one second later:
-    `timeout` sends two at once.
+    `signum` is its number; 0 = no signal. A second SIGINT stops immediately. A second SIGTERM
+    also stops immediately, unless it comes within one second: `timeout` sends two at once.
     """
 
     SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
@@ -67,7 +70,7 @@ class StopRequest:
         self.handlers: dict[int, Any] = {}
 
     def install(self) -> None:
-        """Replaces the handlers of the signals by `note`."""
+        """Makes `note` the handler of the signals."""
         self.handlers = {signum: signal.signal(signum, self.note) for signum in self.SIGNALS}
 
     def restore(self) -> None:
@@ -77,8 +80,9 @@ class StopRequest:
         self.handlers = {}
 
     def note(self, signum: int, frame: FrameType | None) -> None:
-        """Notes a signal, so that training stops after the step. A second Ctrl-C ends the process
-        at once.
+        """Notes a signal, so that training stops after the step.
+
+        A second Ctrl-C ends the process at once.
         """
         repeated = self.signum == signum and time.monotonic() > self.time + 1
         if self.signum and (signum == signal.SIGINT or (signum == signal.SIGTERM and repeated)):
@@ -94,7 +98,7 @@ class StopRequest:
 
 
 def kill_children() -> None:
-    """Kills all child processes, including suspended ones, for which Python would wait forever."""
+    """Kills all child processes. Python would wait forever for suspended ones."""
     # torch's handler would raise an error for each worker that ends.
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     for process in active_children():
@@ -102,5 +106,5 @@ def kill_children() -> None:
 
 
 def ignore_interrupts() -> None:
-    """Leaves Ctrl-C to the parent process, in a worker process."""
+    """Ignores Ctrl-C in a worker process; the parent process handles it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -1,5 +1,8 @@
 # pyright: standard
-"""Lightning modules: what trains a model, while the model itself is `flame_mdm.generator.MotionGenerator`."""
+"""Lightning modules that train a model.
+
+The model itself is `flame_mdm.generator.MotionGenerator`.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -27,7 +30,10 @@ from flame_mdm.seeds import key, normal, seed_generator, seeded_noise, uniform
 
 
 class Task(Model, LightningModule):
-    """Base class of all models that `make train` trains; a recipe names the class in `task._target_`."""
+    """Base class of everything that `make train` trains.
+
+    A recipe names its class in `task._target_`.
+    """
 
     def __init__(self, *, optimizer: Config, seed: int):
         super().__init__()
@@ -39,7 +45,7 @@ class Task(Model, LightningModule):
     def build(
         cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()
     ) -> Self:
-        """Builds the task of a recipe, with the sizes that depend on other parts."""
+        """Builds the task of a recipe. Sizes that depend on other parts are set here."""
         raise NotImplementedError
 
     def encoder(self) -> ConditionEncoder:
@@ -48,7 +54,7 @@ class Task(Model, LightningModule):
 
     @property
     def data(self) -> MotionDataModule:
-        """The data that the trainer trains with."""
+        """The data module of the trainer."""
         return self.trainer.datamodule  # type: ignore[attr-defined]
 
     def describe(self) -> str:
@@ -60,13 +66,13 @@ class Task(Model, LightningModule):
         self.encoder().precompute(*self._captions())
 
     def setup(self, stage: str) -> None:
-        """Opens the captions encoded by `prepare_data`, and adds the facts about the data to `facts`."""
+        """Opens the captions encoded by `prepare_data`, and adds facts about the data."""
         data, encoder = self.data, self.encoder()
         size = encoder.load_cache(*self._captions())
         if device := data.choose_device(size):
             encoder.move_cache(device)
-        # Buffers are equal in all processes. If DDP broadcast them in each forward pass,
-        # processes with more validation batches than others would wait forever.
+        # Buffers are equal in all processes. If DDP sent them in each forward pass, a process
+        # with more validation batches than the others would wait forever.
         self._ddp_params_and_buffers_to_ignore = [name for name, _ in self.named_buffers()]
         self.add_facts(
             {
@@ -79,19 +85,22 @@ class Task(Model, LightningModule):
             self.add_facts({"licenses": licenses})
 
     def _captions(self) -> tuple[list[str], Path]:
-        """Returns the captions of the data and the prompts of callbacks, and the folder of their encodings."""
+        """Returns the texts to encode and the folder of their encodings.
+
+        The texts are the captions of the data and the prompts of callbacks.
+        """
         prompts = [text for c in self.trainer.callbacks for text in getattr(c, "texts", ())]  # type: ignore[attr-defined]
         return sorted({*self.data.captions(), *prompts}), self.data.folder.parent / "text"
 
     def make_optimizer(self) -> torch.optim.Optimizer:
-        """Returns the optimizer of the recipe, for all parameters that are trained."""
+        """Returns the recipe's optimizer of all parameters that are trained."""
         return instantiate(self.optimizer, params=[p for p in self.parameters() if p.requires_grad])
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
-        """Returns the optimizer, and the course of its learning rate.
+        """Returns the optimizer and the schedule of its learning rate.
 
-        The rate rises linearly over the first `lr_warmup` steps, and falls linearly to 0 over the
-        last share `lr_decay` of the training.
+        The learning rate rises linearly over the first `lr_warmup` steps. It falls linearly to 0
+        over the last part of the training, whose share is `lr_decay`.
         """
         optimizer = self.make_optimizer()
         share = self.config.get("lr_decay") or 0.0
@@ -99,7 +108,7 @@ class Task(Model, LightningModule):
             raise UserError(f"lr_decay={share}: give the share of the training, from 0 to 1")
         warmup = self.config.get("lr_warmup") or 0
         if warmup < 0:
-            raise UserError(f"lr_warmup={warmup}: give a number of steps from 0 on")
+            raise UserError(f"lr_warmup={warmup}: give a number of steps, 0 or more")
 
         steps = self.trainer.max_steps
         falling = share * steps
@@ -115,7 +124,11 @@ class Task(Model, LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def on_train_start(self) -> None:
-        """Enables clipping for fused optimizers in bfloat16, whose gradients are not scaled; Lightning refuses it."""
+        """Allows clipping with fused optimizers in bfloat16.
+
+        Lightning refuses it because such an optimizer could scale gradients itself. In bfloat16,
+        gradients are not scaled.
+        """
         if self.trainer.precision == "bf16-mixed":
             for optimizer in self.trainer.optimizers:
                 optimizer._step_supports_amp_scaling = False  # type: ignore[attr-defined]
@@ -128,7 +141,7 @@ class Task(Model, LightningModule):
 class GeneratorTask(Task):
     """Trains a `MotionGenerator`: any denoiser with any process.
 
-    Checkpoints hold the weights under the names that they have in the generator.
+    Checkpoints contain the weights under the same names as in the generator.
 
     Args:
         parts: the four parts of the generator.
@@ -137,13 +150,14 @@ class GeneratorTask(Task):
         cond_drop_prob: probability that a training sample gets the null condition.
         guidance_scale, sampler, num_inference_steps: defaults of `generate`; see
             `SamplerOptions`.
-        seed: of all random draws in training, which are functions of (seed, batch number, rank).
-        compile: compile the denoiser with torch.compile, when training begins.
-        targets: options of `TargetConditions`, for a denoiser with a target encoder; None = no
+        seed: seed of all random draws in training. Draws are functions of (seed, batch number,
+            rank).
+        compile: compile the denoiser with torch.compile when training begins.
+        targets: options of `TargetConditions`, for a denoiser with a target encoder. None = no
             targets.
 
     If the denoiser reads `context_frames`, the first frames of a training sample are its clean
-    prefix, and only the frames after them count in the losses.
+    prefix. Only the frames after the prefix count in the losses.
     """
 
     noun = MotionGenerator.noun
@@ -183,7 +197,7 @@ class GeneratorTask(Task):
             else TargetConditions(skeleton.joints, skeleton.facing, **targets)
         )
         if (self.targets is None) != (getattr(parts.denoiser, "target", None) is None):
-            raise UserError("task.targets and denoiser.target_encoder: give both, or none of them")
+            raise UserError("task.targets and denoiser.target_encoder: give both or neither")
         self.cond_drop_prob, self.compiles = cond_drop_prob, compile
         self.val_losses = torch.nn.ModuleDict()
 
@@ -201,7 +215,7 @@ class GeneratorTask(Task):
             seed=config["seed"],
             **section,
         )
-        # The same objects: what training adds to the facts, sampling reads.
+        # One object for both, so that facts added in training are also available in sampling.
         task.config = task.generator.config = config
         task.facts = task.generator.facts = {"actions": list(actions)}
         return task
@@ -219,7 +233,7 @@ class GeneratorTask(Task):
         return self.generator.describe()
 
     def setup(self, stage: str) -> None:
-        """Also stores the vocabulary of the training captions, and tells it to the text encoder."""
+        """Also stores the vocabulary of the training captions, for the text encoder, too."""
         super().setup(stage)
         data = self.data
         context = self.generator.denoiser.context_frames
@@ -240,7 +254,7 @@ class GeneratorTask(Task):
             self.generator.denoiser.compile()
 
     def on_fit_start(self) -> None:
-        """Runs the sampler with a denoiser that returns 0, so that invalid sampling options fail at the start."""
+        """Samples with a denoiser that returns 0, so that invalid sampling options fail early."""
         process = self.generator.process
         like = torch.zeros(1, 2, self.generator.representation.features, device=self.device)
         mask = torch.ones(1, 2, dtype=torch.bool, device=self.device)
@@ -253,17 +267,20 @@ class GeneratorTask(Task):
         )
 
     def on_train_start(self) -> None:
-        """Also trains the text encoder, before the first step of a new run."""
+        """Also trains the text encoder before the first step of a new run."""
         super().on_train_start()
         if self.global_step == 0:
             self.pretrain()
 
     def pretrain(self) -> None:
-        """Trains the text encoder on the captions alone, if the recipe says so, before the first step."""
+        """Trains the text encoder on captions alone before the first step, if the recipe says so."""
         self.encoder().pretrain([clip.captions for clip in self.data.train.clips], self.seed)
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
-        """Returns the loss of one batch. Random draws are functions of (seed, batch number, rank)."""
+        """Returns the loss of one batch.
+
+        Random draws are functions of (seed, batch number, rank).
+        """
         seed_generator(key("step", self.seed, batch_idx, self.global_rank), self.device)
         targeted = None if self.targets is None else torch.rand(2, len(batch), device=self.device)
         batch, cond = _conditioned(
@@ -271,11 +288,11 @@ class GeneratorTask(Task):
         )
         if self.targets is not None and targeted is not None:
             cond = replace(cond, target_mask=targeted[1] >= self.targets.drop_prob)
-        # Even if the probability is 0, since DDP requires a gradient for every parameter
+        # Also with probability 0: DDP requires a gradient for every parameter
         if cond.null is not None:
             cond = cond.drop(self.dropped(batch))
         terms = self.loss_terms(batch, cond)
-        trainer = self._trainer  # None where a step is computed without one
+        trainer = self._trainer  # None if a step is computed without a trainer
         if trainer is None or (trainer.global_step + 1) % trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
             self.log_dict(
                 {f"train/{name}": value.mean() for name, value in terms.items()},
@@ -296,8 +313,11 @@ class GeneratorTask(Task):
     ) -> dict[str, Tensor]:
         """Returns the losses (B,) of the motions of a batch by name; "loss" is their sum.
 
-        Uniform numbers u (B,) in (0, 1), which decide on the times, and noise (B, F, D) are drawn
-        if not given.
+        Args:
+            batch: the motions.
+            cond: their conditions.
+            u: (B,) uniform numbers in (0, 1), which determine the times. Default: drawn.
+            noise: (B, F, D) standard normal noise. Default: drawn.
         """
         process = self.generator.process
         t = None if u is None else process.training_times(u)
@@ -320,7 +340,10 @@ class GeneratorTask(Task):
         )
 
     def losses_of(self, batch: MotionBatch) -> dict[str, Tensor]:
-        """Returns the losses (B,) of clips. Each clip always gets the same time, noise and target."""
+        """Returns the losses (B,) of clips.
+
+        A clip gets the same time, noise and target each time.
+        """
         keys = torch.tensor([key("validation", name) for name in batch.ids], device=self.device)
         u, v = (draw[:, 0] for draw in uniform(keys, (1,)))
         batch, cond = _conditioned(self.generator, self.targets, batch, v)
@@ -328,14 +351,14 @@ class GeneratorTask(Task):
         return self.loss_terms(batch, cond, u, noise)
 
     def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:
-        """Adds the losses of a batch to the means of the validation."""
+        """Adds the losses of a batch to the validation means."""
         for name, value in self.losses_of(batch).items():
             if name not in self.val_losses:
                 self.val_losses[name] = MeanMetric().to(self.device)
             self.val_losses[name].update(value)  # type: ignore[operator]
 
     def on_validation_epoch_end(self) -> None:
-        """Logs each loss as the mean over all clips of all processes; every clip has the same weight."""
+        """Logs the mean of each loss over the clips of all processes, with equal weights."""
         for name, metric in self.val_losses.items():
             assert isinstance(metric, MeanMetric)
             self.log(f"val/{name}", metric.compute(), prog_bar=name == "loss")
@@ -350,7 +373,7 @@ def _conditioned(
 ) -> tuple[MotionBatch, Condition]:
     """Returns the motions to predict, without the frames of the prefix, and their conditions.
 
-    Uniform numbers u (B,) in (0, 1) decide on what a target requests, if there are targets.
+    `u` (B,) are uniform numbers in (0, 1). They determine which targets are requested.
     """
     prefix, batch = generator.split_prefix(batch)
     cond = replace(generator.condition(batch), prefix=prefix)
@@ -361,13 +384,13 @@ def _conditioned(
 
 
 def _name_as_generator(task: GeneratorTask, state: dict[str, Any], prefix: str, *_: object) -> None:
-    """Removes "generator." from the names of the weights that are written."""
+    """Removes "generator." from the names of the weights in a saved state."""
     for name in [name for name in state if name.startswith(f"{prefix}generator.")]:
         state[prefix + name.removeprefix(f"{prefix}generator.")] = state.pop(name)
 
 
 def _name_as_task(task: GeneratorTask, state: dict[str, Any], prefix: str, *_: object) -> None:
-    """Adds "generator." to the names of the weights that are read."""
+    """Adds "generator." to the names of the weights in a state to load."""
     for name in [name for name in state if name.startswith(prefix)]:
         state[f"{prefix}generator.{name.removeprefix(prefix)}"] = state.pop(name)
 

@@ -1,4 +1,4 @@
-"""Condition encoders: text, action labels, or unconditional."""
+"""Condition encoders for text, action labels, or no condition."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Sequence
@@ -12,7 +12,9 @@ from flame_mdm.batch import Condition, MotionBatch
 
 
 class ConditionEncoder(nn.Module, ABC):
-    """Encodes the text or action of a batch as a `Condition`, including the null condition: base class of encoders.
+    """Base class of encoders of text or actions.
+
+    An encoder returns a `Condition` for a batch, which includes the null condition.
 
     Example:
         >>> class WordCount(ConditionEncoder):  # an encoder that counts the words of a caption
@@ -29,11 +31,11 @@ class ConditionEncoder(nn.Module, ABC):
 
     #: C, the width of the condition; 0 = unconditioned.
     features: int
-    #: What it encodes: captions ("text") or class labels ("action").
+    #: What the encoder reads: captions ("text") or class labels ("action").
     reads: Literal["text", "action"] = "text"
     #: Maximum number of words per caption; None if the encoder does not count words.
     max_words: int | None = None
-    #: Words of the training captions; None until they are known.
+    #: Words of the training captions; None before they are known.
     seen: Collection[str] | None = None
 
     @abstractmethod
@@ -44,30 +46,35 @@ class ConditionEncoder(nn.Module, ABC):
             batch: captions in `batch.text`, or labels in `batch.action`.
 
         Returns:
-            The condition on the device of `batch.x`, with its null.
+            The condition, with its null condition, on the device of `batch.x`.
 
         Raises:
             UserError: If the batch has no captions or labels.
         """
 
     def pretrain(self, groups: Sequence[Sequence[str]], seed: int) -> None:
-        """Trains the encoder on captions alone, before the first training step. By default, does nothing.
+        """Trains the encoder on captions alone, before the first training step.
+
+        By default, it does nothing.
 
         Args:
-            groups: captions of each clip.
+            groups: one list of captions per clip.
             seed: seed of all random draws.
         """
 
     def precompute(self, captions: Sequence[str], folder: Path) -> None:
-        """Fills the encoder's cache on disk for these captions. By default, does nothing.
+        """Fills the encoder's cache on disk for these captions. By default, it does nothing.
 
-        Called in one process only.
+        It is called in only one process.
         """
 
     def load_cache(self, captions: Sequence[str], folder: Path) -> int:
-        """Opens the cache of `precompute` in every process, and returns its bytes; 0 without a cache.
+        """Opens the cache of `precompute` in every process and returns its size in bytes.
 
-        Raises `UserError` if the cache is damaged.
+        Without a cache, it returns 0.
+
+        Raises:
+            UserError: If the cache is damaged.
         """
         return 0
 
@@ -76,7 +83,7 @@ class ConditionEncoder(nn.Module, ABC):
 
 
 class Unconditional(ConditionEncoder):
-    """No condition: vectors and tokens of width 0, which are also the null.
+    """No condition: vectors and tokens of width 0. They are also the null condition.
 
     Example:
         >>> x = torch.zeros(2, 5, 3)

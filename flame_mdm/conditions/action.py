@@ -9,10 +9,10 @@ from flame_mdm.errors import UserError
 
 
 class ActionLabels(ConditionEncoder):
-    """One learned vector per class, initialized from N(0, 1); the null is the zero vector.
+    """One learned vector per class, initialized from N(0, 1). The null is the zero vector.
 
-    As in Tevet et al. 2023 (MDM), section 3. The only token repeats the pooled vector, for
-    denoisers that read tokens.
+    Source: Tevet et al. 2023 (MDM), section 3. There is one token, equal to the pooled vector,
+    for denoisers that read tokens.
 
     Args:
         features: C, the width of the vectors.
@@ -36,13 +36,17 @@ class ActionLabels(ConditionEncoder):
         super().__init__()
         if num_actions < 1:
             raise UserError(
-                "condition=action needs a data set with action labels; this one has none"
+                "condition=action needs a data set with action labels. This one has none"
             )
         self.features = features
         self.table = nn.Parameter(torch.randn(num_actions, features))
 
     def forward(self, batch: MotionBatch) -> Condition:
-        """Returns the vectors of the labels `batch.action` (B,); raises `UserError` if there are none."""
+        """Returns the vectors of the labels `batch.action` (B,).
+
+        Raises:
+            UserError: If the batch has no labels.
+        """
         if batch.action is None:
             raise UserError(
                 "condition=action needs action labels, and this batch has none: choose data with labels"

@@ -1,10 +1,11 @@
-"""Target conditions: where joints should be at the end of a motion (Tevet et al. 2025, "CLoSD", section 3.1).
+"""Target conditions: where joints should be at the end of a motion.
 
-A target (B, 8, 4) has a slot for each name in `SLOTS`: x, y, z, and 1 = requested or 0 = free;
-free slots are 0. Positions are in meters, in the frame of reference of the predicted frames: the
-root of the first one is at x = z = 0 and faces +z; y is the height above the floor. "traj" is the
-pelvis on the floor, y = 0. The x of "heading" is the direction that hips and shoulders face, in
-radians: 0 = +z, positive to +x.
+Source: Tevet et al. 2025, "CLoSD", section 3.1. A target (B, 8, 4) has a slot for each name in
+`SLOTS`. A slot contains x, y, z, and 1 = requested or 0 = free. Free slots are 0.
+
+Positions are in meters relative to the first predicted frame: its root is at x = z = 0 and faces
++z. y is the height above the floor. "traj" is the pelvis projected on the floor, y = 0. The x of
+"heading" is the direction that hips and shoulders face, in radians: 0 = +z, positive to +x.
 """
 
 import math
@@ -19,25 +20,25 @@ JOINTS = ("pelvis", "left_foot", "right_foot", "left_wrist", "right_wrist", "hea
 SLOTS = (*JOINTS, "traj", "heading")
 HEADING = SLOTS.index("heading")
 COORDINATES = torch.tensor([[1.0, 1.0, 1.0]] * len(JOINTS) + [[1.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
-"""Coordinates (8, 3) of the slots that are lengths; x of the heading is an angle."""
+"""Coordinates (8, 3) of the slots that are lengths. The x of the heading is an angle."""
 
-# Added to the numbers of requested values, as in the authors' code, so that none of them costs
-# nothing
+# Added to the number of requested values, as in the authors' code, so that the error of a target
+# that requests nothing is 0
 EPSILON = 1e-8
 
 
 class TargetConditions:
-    """Targets of motions in training, and the error of predicted motions.
+    """Draws targets for training motions and computes the error of predicted motions.
 
     Args:
         joints: names of the joints of the skeleton, in the order of its positions.
-        facing: numbers of right hip, left hip, right shoulder and left shoulder.
-        choices: sets of slots; each training motion draws one of them, with equal probability. An empty set is a
-        target that requests nothing, which differs from having no target.
+        facing: joint indices of right hip, left hip, right shoulder and left shoulder.
+        choices: sets of slots. Each training motion draws one set; all have equal probability. An
+            empty set gives a target that requests nothing. This differs from having no target.
         drop_prob: probability that a training motion has no target.
         weight: weight of the error in the loss.
-        heading_modulo_pi: the error of the heading is taken modulo pi, as in MDM's code, so that
-            facing backwards costs nothing.
+        heading_modulo_pi: compute the error of the heading modulo pi, as in MDM's code. Facing
+            backwards then costs nothing.
 
     Raises:
         UserError: If the skeleton lacks a joint, a choice is unknown, or the probability is not
@@ -82,7 +83,12 @@ class TargetConditions:
         self.drop_prob, self.weight, self.heading_modulo_pi = drop_prob, weight, heading_modulo_pi
 
     def locations(self, joints: Tensor, lengths: Tensor | None = None) -> Tensor:
-        """Returns the values (B, 8, 3) of all slots at the last of `lengths` (B,) frames of motions (B, F, J, 3)."""
+        """Returns the values (B, 8, 3) of all slots at the end of motions.
+
+        Args:
+            joints: (B, F, J, 3), positions in meters.
+            lengths: (B,) int64, number of real frames per motion. Default: F.
+        """
         last = (
             joints[:, -1]
             if lengths is None
@@ -94,15 +100,21 @@ class TargetConditions:
         return torch.cat([last[:, self.columns], pelvis, turned[:, None]], 1)
 
     def draw(self, joints: Tensor, u: Tensor, lengths: Tensor | None = None) -> Tensor:
-        """Returns targets (B, 8, 4) of real motions (B, F, J, 3); uniform numbers u (B,) in [0, 1) decide which."""
+        """Returns targets (B, 8, 4) from the ends of real motions.
+
+        Args:
+            joints: (B, F, J, 3), positions in meters.
+            u: (B,) uniform numbers in [0, 1), which select one of the choices.
+            lengths: (B,) int64, number of real frames per motion. Default: F.
+        """
         drawn = (u * len(self.choices)).long()
         return requested(self.locations(joints, lengths), self.choices.to(joints.device)[drawn])
 
     def error(self, joints: Tensor, target: Tensor, lengths: Tensor | None = None) -> Tensor:
-        """Returns the weighted error (B,) of predicted motions (B, F, J, 3); 0 for targets that request nothing.
+        """Returns the weighted error (B,) of predicted motions (B, F, J, 3).
 
         The error is the mean squared error of the requested coordinates in square meters, plus
-        the squared error of the heading in square radians.
+        the squared error of the heading in square radians. It is 0 if a target requests nothing.
         """
         predicted, values, valid = self.locations(joints, lengths), target[..., :3], target[..., 3:]
         counted = valid * COORDINATES.to(target)
@@ -119,7 +131,10 @@ class TargetConditions:
 
 
 def heading(joints: Tensor) -> Tensor:
-    """Returns the direction (B,) that right hip, left hip, right shoulder and left shoulder (B, 4, 3) face."""
+    """Returns the direction (B,) that a body faces, in radians.
+
+    `joints` (B, 4, 3) are the right hip, the left hip, the right shoulder and the left shoulder.
+    """
     right_hip, left_hip, right_shoulder, left_shoulder = joints.unbind(1)
     right = right_hip - left_hip + right_shoulder - left_shoulder
     # forward = y cross right
@@ -127,6 +142,6 @@ def heading(joints: Tensor) -> Tensor:
 
 
 def requested(locations: Tensor, slots: Tensor) -> Tensor:
-    """Returns the target (B, 8, 4) that requests `slots` (B, 8) bool of values (B, 8, 3)."""
+    """Returns the target (B, 8, 4) that requests `slots` (B, 8) bool at `locations` (B, 8, 3)."""
     valid = slots[..., None].to(locations)
     return torch.cat([locations * valid, valid], -1)

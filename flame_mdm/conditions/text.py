@@ -1,4 +1,4 @@
-"""Pretrained language models as text encoders, with their outputs cached on disk."""
+"""Pretrained language models as text encoders. Their outputs are cached on disk."""
 
 import hashlib
 import importlib.util
@@ -29,37 +29,37 @@ CAPTIONS_AT_ONCE = 64
 class PretrainedText(ConditionEncoder):
     """CLIP, RoBERTa, sentence-BERT, DistilBERT or T5 from the transformers library.
 
-    A frozen language model is not part of the state dict or the parameters, and is loaded only
-    for a caption that is not in the cache. Its tokens are always rounded to float16, with and
-    without the cache.
+    A frozen language model is not part of the state dict or the parameters. It is loaded only if
+    a caption is not in the cache. Its tokens are always rounded to float16, even without a cache.
 
     Args:
         model: name on the Hugging Face hub, or a folder.
         features: C, width of the model's outputs.
-        max_tokens: maximum number of word pieces per caption, including special ones; the rest is
-            truncated.
-        pooling: "projection" is CLIP's projected text embedding, not normalized; "mean" is over
-            the real tokens, including special ones (Reimers & Gurevych 2019); "pooler" is tanh of
-            a linear map of the first token, as in BERT. RoBERTa is published without such a map,
-            so transformers draws a new one each time; FLAME was trained with one such draw. Here
-            it is drawn with a fixed seed, and a released checkpoint can replace it.
+        max_tokens: maximum number of word pieces per caption, including special ones. Longer
+            captions are truncated.
+        pooling: how a caption becomes one vector. "projection" is CLIP's projected text
+            embedding, not normalized. "mean" is the mean of the real tokens, including special
+            ones (Reimers & Gurevych 2019). "pooler" is tanh of a linear map of the first token,
+            as in BERT. RoBERTa is published without this map, and transformers initializes it
+            with new random numbers each time. FLAME was trained with one such map. Here, the map
+            is drawn with a fixed seed, and a released checkpoint can replace it.
         revision: commit on the hub, 40 hex digits; required for models from the hub.
-        package: installed Python package whose folder `model` contains the files, instead of the
-            hub.
+        package: installed Python package that contains the files, instead of the hub. `model` is
+            then the folder in the package.
         sha256: hash of the package's model.safetensors, checked before loading; required with
             `package`.
         normalize: scale the pooled vector to length 1.
-        tokens: return the last hidden states as tokens; otherwise there are 0 tokens.
+        tokens: return the last hidden states as tokens. Otherwise, there are 0 tokens.
         attend_padding: pad every caption to `max_tokens` and treat the padding as real, as FLAME
             and MFM do.
-        encode_null: the null is the encoded "" (FLAME); otherwise zeros with the sample's token
-            mask (MDM).
-        freeze: False fine-tunes the language model together with the motion model.
+        encode_null: the null condition is the encoded "" (FLAME). Otherwise, it is zeros with
+            the sample's token mask (MDM).
+        freeze: False = fine-tune the language model together with the motion model.
 
     Raises:
-        UserError: When a caption is encoded, if the model is not pinned, its file is not the
+        UserError: When a caption is encoded: if the model is not pinned, its file is not the
             published one, or its width is not `features`.
-        FileNotFoundError: When a caption is encoded, if the model is neither in the cache nor can
+        FileNotFoundError: When a caption is encoded: if the model is not in the cache and cannot
             be downloaded.
 
     Example:
@@ -102,7 +102,7 @@ class PretrainedText(ConditionEncoder):
         self._pretrained = Pretrained(model, revision, package, sha256)
         self._cache: EncodedCaptions | None = None
         if not freeze:
-            with torch.device("cpu"):  # also in a model that is built on the meta device
+            with torch.device("cpu"):  # also if the whole model is built on the meta device
                 self.network = self._pretrained.load_network().train()
         if pooling == "pooler":
             weight = torch.empty(features, features)
@@ -117,7 +117,11 @@ class PretrainedText(ConditionEncoder):
                     self.register_parameter(f"pooler_{name}", nn.Parameter(value))
 
     def forward(self, batch: MotionBatch) -> Condition:
-        """Returns the encoded captions; raises `UserError` if the batch has none."""
+        """Returns the encoded captions.
+
+        Raises:
+            UserError: If the batch has no captions.
+        """
         if batch.text is None:
             name = self._pretrained.model
             raise UserError(
@@ -136,7 +140,10 @@ class PretrainedText(ConditionEncoder):
         return Condition(pooled, tokens, token_mask, null)
 
     def precompute(self, captions: Sequence[str], folder: Path) -> None:
-        """Encodes the captions with a frozen model and writes them to a file in `folder`, unless it is there."""
+        """Encodes the captions with a frozen model and writes them to a file in `folder`.
+
+        If the file exists already, nothing is encoded.
+        """
         if not self.freeze:
             return
         if (path := self._cache_path(captions, folder)).exists():
@@ -155,7 +162,8 @@ class PretrainedText(ConditionEncoder):
     def load_cache(self, captions: Sequence[str], folder: Path) -> int:
         """Opens the file that `precompute` wrote and returns its size in bytes.
 
-        Raises `UserError` if the file is missing or damaged.
+        Raises:
+            UserError: If the file is missing or damaged.
         """
         if not self.freeze:
             return 0
@@ -171,7 +179,10 @@ class PretrainedText(ConditionEncoder):
             )
 
     def _distinct(self, captions: Sequence[str]) -> list[str]:
-        """Returns each caption once, and "" for the null; longest first, so that batches have similar lengths."""
+        """Returns each caption once, and "" for the null condition.
+
+        The longest captions are first, so that the captions of a batch have similar lengths.
+        """
         return sorted({*captions, ""}, key=lambda caption: (-len(caption), caption))
 
     def _cache_path(self, captions: Sequence[str], folder: Path) -> Path:
@@ -182,7 +193,7 @@ class PretrainedText(ConditionEncoder):
         return Path(folder) / f"{Path(source.model).name}-{key[:16]}.safetensors"
 
     def _pool(self, first: Tensor) -> Tensor:
-        """Applies the steps of pooling that are not cached: (N, C) -> (N, C)."""
+        """Applies the part of the pooling that is not cached: (N, C) -> (N, C)."""
         if self.pooling == "pooler":
             first = torch.tanh(nn.functional.linear(first, self.pooler_weight, self.pooler_bias))
         return nn.functional.normalize(first, dim=-1) if self.normalize else first
@@ -190,7 +201,10 @@ class PretrainedText(ConditionEncoder):
     def _encode(
         self, captions: Sequence[str], network: nn.Module, device: torch.device
     ) -> tuple[Tensor, ...]:
-        """Runs the language model; returns input of `_pool` (N, C), tokens (N, S, C), token mask (N, S)."""
+        """Runs the language model.
+
+        Returns the input of `_pool` (N, C), the tokens (N, S, C) and the token mask (N, S).
+        """
         inputs = self._pretrained.tokenizer(
             list(captions),
             padding="max_length" if self.attend_padding else "longest",
@@ -236,7 +250,7 @@ class PretrainedText(ConditionEncoder):
     def _look_up(
         self, captions: Sequence[str], device: torch.device
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Like `_encode`, but reads the captions from the cache if it has all of them."""
+        """Like `_encode`, but reads the captions from the cache if it contains all of them."""
         encoded, distinct = self._cache, set(captions)
         if encoded is None or not encoded.rows.keys() >= distinct:
             encoded = self._encode_frozen(sorted(distinct, key=len), device)
@@ -244,7 +258,7 @@ class PretrainedText(ConditionEncoder):
 
 
 class Pretrained:
-    """Source of a language model, which is loaded on first use."""
+    """A language model that is loaded when it is first used."""
 
     def __init__(self, model: str, revision: str | None, package: str | None, sha256: str | None):
         self.model, self.revision, self.package, self.sha256 = model, revision, package, sha256
@@ -262,7 +276,12 @@ class Pretrained:
         return self.load_network().eval().requires_grad_(False)
 
     def load_network(self) -> nn.Module:
-        """Loads a new copy of the network, float32; raises `FileNotFoundError` or `UserError` if it is not as named."""
+        """Loads a new copy of the network, float32.
+
+        Raises:
+            FileNotFoundError: If it cannot be found or downloaded.
+            UserError: If it differs from the published model.
+        """
         from transformers import (
             AutoConfig,
             AutoModel,
@@ -282,10 +301,10 @@ class Pretrained:
             "t5": T5EncoderModel
         }
         loader = text_halves.get(kind, AutoModel)
-        # The published pooler of BERT is not used, and RoBERTa has none: see PretrainedText.
+        # BERT's published pooler is not used, and RoBERTa has no pooler: see PretrainedText.
         options = {"add_pooling_layer": False} if kind in ("bert", "roberta") else {}
         verbosity = logging.get_verbosity()
-        # Otherwise it lists the weights of the other half of CLIP or T5 as not loaded
+        # Otherwise, transformers lists the weights of the unused half of CLIP or T5 as not loaded
         logging.set_verbosity_error()
         try:
             network, info = self._load(
@@ -300,7 +319,7 @@ class Pretrained:
         return network
 
     def _load(self, loader: Any, **options: Any) -> Any:
-        # never execute code of a model; without this, transformers asks
+        # Never executes code of a model. Without this option, transformers asks the user.
         options["trust_remote_code"] = False
         if self.package or Path(self.model).is_dir():
             return loader.from_pretrained(self._folder(), local_files_only=True, **options)
@@ -335,10 +354,11 @@ class Pretrained:
 
 
 class EncodedCaptions:
-    """Outputs of a language model: vectors (N, C) float32 and tokens (T, C) float16 of N captions.
+    """Outputs of a language model for N captions.
 
-    Caption n has the tokens `offsets[n]` to `offsets[n + 1]` (exclusive). Arrays read from a file
-    are memory-mapped.
+    They are vectors (N, C) float32 and tokens (T, C) float16. Caption n has the tokens from
+    `offsets[n]` up to, but not including, `offsets[n + 1]`. Arrays read from a file are
+    memory-mapped.
     """
 
     def __init__(self, captions: Sequence[str], pooled: Tensor, tokens: Tensor, offsets: Tensor):
@@ -349,7 +369,7 @@ class EncodedCaptions:
 
     @classmethod
     def open(cls, path: Path) -> "EncodedCaptions":
-        """Returns the content of a file; raises `UserError` if it is missing or damaged."""
+        """Opens a file of encoded captions. Raises `UserError` if it is missing or damaged."""
         try:
             regular_file(path)
             with safe_open(path, "pt") as file:
@@ -372,7 +392,10 @@ class EncodedCaptions:
     def gather(
         self, captions: Sequence[str], device: torch.device
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Returns vectors (N, C), tokens (N, S, C) and their mask (N, S) of captions, float32, on a device."""
+        """Returns the outputs for some captions, float32, on a device.
+
+        They are vectors (N, C), tokens (N, S, C) and the mask of the tokens (N, S).
+        """
         rows = np.array([self.rows[caption] for caption in captions])
         begin, lengths = self.offsets[rows], self.offsets[rows + 1] - self.offsets[rows]
         where = torch.from_numpy(np.stack([rows, begin, lengths]))

@@ -1,4 +1,4 @@
-"""Small text encoder that is trained with the model and needs no download."""
+"""A small text encoder that is trained with the model and needs no download."""
 
 from collections.abc import Sequence
 
@@ -13,28 +13,33 @@ from flame_mdm.errors import UserError
 from flame_mdm.progress import ProgressBar
 from flame_mdm.seeds import key, seed_generator
 
-# Clips per step of the contrastive loss, and the temperature of its softmax
+# Number of clips per step of the contrastive loss, and the temperature of its softmax
 PAIRS, TEMPERATURE = 64, 0.1
 
 START = "<start>"
-"""Inserted before every caption, so that the empty caption also has a token; no caption contains this word."""
+"""Inserted before every caption, so that the empty caption also has a token.
+
+No caption has it.
+"""
 
 
 class LearnedTokens(ConditionEncoder):
-    """Hashed words, learned positions and one transformer layer; the null is one learned vector.
+    """Hashed words, learned positions and one transformer layer. The null is one learned vector.
 
-    A word is the sum of two rows of the table, selected by its hash, see `vocabulary.hashed`.
-    Words that the training captions do not contain are replaced by a form that they do contain
-    (walked, walks), or dropped: their vectors are random. Samples with the same caption share its
-    dropout, since it is encoded once. Linear layers skip the padding.
+    A word is the sum of two rows of the table, selected by its hash; see `vocabulary.hashed`. The
+    vector of a word that the training captions do not contain would be random. Such a word is
+    replaced by another form of it in the captions (walked, walks), or dropped.
 
-    The pooled vector is the mean of the tokens, and the null token is the null vector, so that
-    all parameters receive gradients whether a denoiser reads the pooled vector or the tokens.
+    Samples with the same caption share its dropout, because a caption is encoded once. Linear
+    layers skip the padding.
+
+    The pooled vector is the mean of the tokens, and the null token is the null vector. Therefore
+    all parameters receive gradients, whether a denoiser reads the pooled vector or the tokens.
 
     Args:
         features: C, the width of the tokens and of the pooled vector.
         buckets: rows of the word table.
-        max_words: maximum number of words per caption; the rest is dropped.
+        max_words: maximum number of words per caption. Further words are dropped.
         heads: number of attention heads; divides `features`.
         dropout: probability of dropout in the transformer layer.
         pretrain_steps: number of steps of `pretrain`.
@@ -84,7 +89,7 @@ class LearnedTokens(ConditionEncoder):
         )
         self.norm = nn.LayerNorm(features)
         self.null = nn.Parameter(nn.init.normal_(torch.empty(features), std=0.02))
-        self._rows: dict[str, Tensor] = {}  # rows (T, 2) of the captions met so far
+        self._rows: dict[str, Tensor] = {}  # rows (T, 2) of the captions encoded so far
 
     def rows(self, caption: str) -> list[tuple[int, int]]:
         """Returns the two rows of the table for the start token and each word of a caption."""
@@ -94,11 +99,12 @@ class LearnedTokens(ConditionEncoder):
         return [vocabulary.hashed(word, self.buckets) for word in [START, *words[: self.max_words]]]
 
     def pretrain(self, groups: Sequence[Sequence[str]], seed: int) -> None:
-        """Draws the pooled vectors of captions of the same clip together, and the vectors of different clips apart.
+        """Trains with a contrastive loss (Gao et al. 2021, "SimCSE", equation 1).
 
-        Each step compares two captions each of `PAIRS` clips (Gao et al. 2021, "SimCSE", equation
-        1). The loss of the motions alone teaches a small model many words slowly. Clips with a
-        single caption are not used.
+        Pooled vectors of captions of the same clip are pulled together, and vectors of different
+        clips are pushed apart. Each step compares two captions from each of `PAIRS` clips.
+        Without this training, a small model learns many words slowly, because only the loss of
+        the motions teaches them. Clips with a single caption are not used.
         """
         groups, device = (
             [captions for captions in groups if len(set(captions)) > 1],
@@ -127,7 +133,11 @@ class LearnedTokens(ConditionEncoder):
             optimizer.step()
 
     def forward(self, batch: MotionBatch) -> Condition:
-        """Returns the encoded captions; raises `UserError` if the batch has none."""
+        """Returns the encoded captions.
+
+        Raises:
+            UserError: If the batch has no captions.
+        """
         if batch.text is None:
             raise UserError(
                 "condition=learned: this batch has no captions. Add some, or choose another condition"
@@ -146,17 +156,22 @@ class LearnedTokens(ConditionEncoder):
         return Condition(pooled[of_sample], tokens[of_sample], token_mask[of_sample], self._null())
 
     def encode(self, words: Tensor, counts: Tensor) -> Condition:
-        """Encodes `rows` (B, S, 2) of captions of lengths (B,) as `forward` does, without branches, for a graph."""
+        """Encodes `rows` (B, S, 2) of captions of lengths (B,) like `forward`.
+
+        It has no branches, so that it can be exported as a graph.
+        """
         token_mask = length_mask(counts, words.shape[1])
         index = torch.arange(token_mask.numel(), device=words.device)
         tokens = self._encode(words.flatten(0, 1), index, token_mask) * token_mask[..., None]
         return Condition(tokens.sum(1) / counts[:, None], tokens, token_mask, self._null())
 
     def _encode(self, rows: Tensor, index: Tensor, token_mask: Tensor) -> Tensor:
-        """Encodes captions as (N, S, C), 0 past their ends; padding takes part only in attention.
+        """Encodes captions as (N, S, C), 0 past their ends. Only attention processes padding.
 
-        `rows` (T, 2) of the table are of all real tokens, and `index` (T,) has their places in
-        `token_mask` (N, S).
+        Args:
+            rows: (T, 2), rows of the table for all real tokens.
+            index: (T,), positions of the tokens in the flattened `token_mask`.
+            token_mask: (N, S) bool, True = real token.
         """
 
         def pad(y: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Vocabulary of the training captions: unknown words, suggestions, and sentences of several actions."""
+"""Vocabulary of the training captions: unknown words, suggestions, and parts of sentences."""
 
 import difflib
 import re
@@ -21,7 +21,7 @@ FUNCTION_WORDS = frozenset(
         "boy girl guy lady someone somebody will"
     )
 )
-"""Words that do not tell what happens. A text of only these words says nothing; unknown ones cause no warning."""
+"""Words that do not say what happens. A text needs other words, too; these cause no warning."""
 NUMBERS = frozenset(
     [
         "zero",
@@ -57,14 +57,13 @@ def words(text: str) -> list[str]:
 
 
 def hashed(word: str, buckets: int) -> tuple[int, int]:
-    """Returns the two rows of a table of `buckets` word vectors whose sum is the vector of a word.
+    """Returns two rows of a table of `buckets` word vectors. A word's vector is their sum.
 
-    The rows are two parts of the word's hash (Svenstrup et al. 2017, "Hash embeddings"), so that
-    two words are confused only if both parts collide. The hash (CRC-32) is the same on every
-    machine.
+    The rows are two parts of the word's hash (Svenstrup et al. 2017, "Hash embeddings"). Two words
+    are confused only if both parts are equal. The hash (CRC-32) is the same on every machine.
     """
-    # Not two hashes of the word with different prefixes: CRC is linear, so both would collide
-    # together.
+    # Two hashes of the word with different prefixes would not do: CRC is linear, so both would
+    # collide together.
     number = zlib.crc32(word.encode())
     return number % buckets, number // buckets % buckets
 
@@ -72,15 +71,16 @@ def hashed(word: str, buckets: int) -> tuple[int, int]:
 def vocabulary(
     captions: Iterable[str], shared: Iterable[str] | None = None
 ) -> dict[str, list[str]]:
-    """Returns what a checkpoint keeps of the training captions.
+    """Returns the words and captions of the training data that a checkpoint keeps.
 
     Args:
         captions: all captions of the training clips.
-        shared: those captions that a checkpoint may contain by the license of their data; None = no captions may be.
+        shared: the captions that a checkpoint may contain under the license of their data. None =
+            no captions.
 
     Returns:
-        "vocabulary", all words of the captions, sorted, and, unless `shared` is None, "captions": up to
-        `MAX_CAPTIONS` of `shared`, evenly spaced in their sorted list.
+        "vocabulary" contains all words of the captions, sorted. Unless `shared` is None,
+        "captions" contains up to `MAX_CAPTIONS` of `shared`, evenly spaced in their sorted list.
     """
     facts = {"vocabulary": sorted({word for caption in set(captions) for word in words(caption)})}
     if shared is not None:
@@ -91,13 +91,16 @@ def vocabulary(
 
 
 def known_form(word: str, seen: Collection[str]) -> str | None:
-    """Returns the word, or the same word with another ending (walked, walks), if it is known; otherwise None."""
+    """Returns a known word: `word` itself, or a form with another ending (walked, walks).
+
+    Returns None if no form is known.
+    """
     if word in seen:
         return word
     if word in NUMBERS:  # "four" is not a form of "fours"
         return None
     stems = [word.removesuffix(suffix) for suffix in SUFFIXES if word.endswith(suffix)]
-    # The stem of "waving" is "wave", of "hopping" "hop".
+    # The stem of "waving" is "wave"; the stem of "hopping" is "hop".
     stems += [stem[:-1] for stem in stems if len(stem) > 3 and stem[-1] in f"e{stem[-2]}"]
     forms = (
         stem + ending
@@ -109,12 +112,12 @@ def known_form(word: str, seen: Collection[str]) -> str | None:
 
 
 def advice(text: str, facts: Mapping[str, Any], max_words: int | None = None) -> list[str]:
-    """Returns lines about words of a prompt that a model has never seen in training or does not read.
+    """Returns warnings about words that a model does not read or has never seen in training.
 
     Args:
         text: the prompt.
-        facts: facts of the model. Imported models have no vocabulary, so words are not checked
-            for them.
+        facts: facts of the model. Imported models have no vocabulary, so their words are not
+            checked.
         max_words: maximum number of words that the model reads; None = no limit.
     """
     lines = []
@@ -126,7 +129,11 @@ def advice(text: str, facts: Mapping[str, Any], max_words: int | None = None) ->
 
 
 def check_known(text: str, facts: Mapping[str, Any]) -> None:
-    """Raises `UserError` if a model knows no word of a text that says what happens."""
+    """Checks that a model knows a word of a text that says what happens.
+
+    Raises:
+        UserError: If it knows no such word.
+    """
     if facts.get("vocabulary") and unknown_words(text, facts) == _content(text):
         instead = _suggested(text, facts) or " Use words of its training captions"
         raise UserError(
@@ -144,7 +151,7 @@ def unread_words(text: str, max_words: int | None) -> list[str]:
 
 
 def unknown_words(text: str, facts: Mapping[str, Any]) -> list[str]:
-    """Returns the content words of a text that a model with these facts does not know in any form."""
+    """Returns the content words of a text of which the model knows no form."""
     seen = facts.get("vocabulary")
     return (
         [] if seen is None else [word for word in _content(text) if known_form(word, seen) is None]
@@ -154,11 +161,11 @@ def unknown_words(text: str, facts: Mapping[str, Any]) -> list[str]:
 def _suggested(text: str, facts: Mapping[str, Any]) -> str:
     """Returns the question " Did you mean '...'?" for a text with unknown words.
 
-    It quotes the text with known words in place of the unknown ones, or the nearest training caption.
+    The question quotes the text with known words in place of the unknown words. Without such
+    words, it quotes the nearest training caption that contains a content word of the text.
 
-    Words that are not English are replaced by known words with a similar spelling, English words
-    only by known words with a similar meaning (never "shelf" by "she"). A caption is near if it
-    has a content word of the text.
+    A word that is not English is replaced by a known word with a similar spelling. An English
+    word is replaced only by a known word with a similar meaning ("shelf" never becomes "she").
     """
     fixed = text.lower()
     for word in (unknown := unknown_words(text, facts)):
@@ -174,7 +181,10 @@ def _suggested(text: str, facts: Mapping[str, Any]) -> str:
 
 
 def _meant(word: str, vocabulary: Collection[str]) -> str | None:
-    """Returns the known word that an unknown word is a typo of, or that has a similar meaning; otherwise None."""
+    """Returns the known word that an unknown word probably stands for; None if there is none.
+
+    The unknown word is a typo of it or has a similar meaning.
+    """
     if not is_known(word):
         similar = [other for other in vocabulary if other[:1] == word[0]]
         return next(iter(difflib.get_close_matches(word, similar, 1, 0.75)), None)
@@ -183,12 +193,13 @@ def _meant(word: str, vocabulary: Collection[str]) -> str | None:
 
 
 def in_parts(text: str, verbs: Collection[str]) -> list[str]:
-    """Splits a sentence with several actions: "walks, turns left and waves. Then she sits" has four parts.
+    """Splits a sentence with several actions.
 
-    A text is split at ends of sentences and at "then". With `verbs`, it is also split at commas
-    followed by a verb and, in such an enumeration, at "and" followed by a verb; "raises both
-    hands and waves" is one action. Parts without a verb belong to their neighbor. "In limp style"
-    at the end, which adapters teach, belongs to all parts.
+    For example, "walks, turns left and waves. Then she sits" has four parts.
+    A text is split at ends of sentences and at "then". With `verbs`, it is also split at each
+    comma that a verb follows. After such a comma, "and" before a verb splits, too; otherwise it does not:
+    "raises both hands and waves" is one action. A part without a verb is joined with its neighbor.
+    "In limp style" at the end, which adapters teach, is added to all parts.
 
     Args:
         text: the sentence.
@@ -223,7 +234,7 @@ def in_parts(text: str, verbs: Collection[str]) -> list[str]:
 
 @cache
 def _before_verb(verbs: tuple[str, ...]) -> tuple[re.Pattern[str], re.Pattern[str]]:
-    """Returns the patterns of a comma and of an "and" that a verb follows."""
+    """Returns the patterns of a comma and of an "and" that are followed by a verb."""
     finite = (
         "|".join(re.escape(verb) for verb in sorted(verbs) if not verb.endswith("ing")) or "(?!)"
     )
@@ -234,14 +245,20 @@ def _before_verb(verbs: tuple[str, ...]) -> tuple[re.Pattern[str], re.Pattern[st
 
 
 def plainest(captions: Iterable[str]) -> list[str]:
-    """Returns captions sorted from plain to elaborate: captions about "a person" first, shorter before longer ones."""
+    """Returns captions sorted from plain to elaborate.
+
+    Captions about "a person" are first, and shorter captions come before longer ones.
+    """
     return sorted(
         captions, key=lambda caption: (not caption.startswith("a person "), len(caption), caption)
     )
 
 
 def nearest(text: str, captions: Sequence[str], count: int = 3) -> list[str]:
-    """Returns the captions that share the largest part of their words with a text, best first; none if none does."""
+    """Returns the captions that share the largest part of their words with a text, best first.
+
+    The list is empty if no caption shares a word.
+    """
     prompt = set(words(text))
     content = prompt - FUNCTION_WORDS or prompt
 

@@ -1,1 +1,1 @@
-"""Understanding of English prompts: actions, attributes and their order, the same for every model."""
+"""Understanding of English prompts, independent of a model: actions, attributes, order."""

@@ -17,7 +17,7 @@ CHOICES: dict[str, tuple[Value, ...]] = {
     "count": (1, 2, 3, 4, 5),
     "side": ("left", "right", "both"),
 }
-"""Values of attributes to choose from."""
+"""Values of each attribute that a user can choose."""
 WORDS_OF_VALUES: dict[Value, tuple[str, ...]] = {
     1: ("once", "one", "single", "a ", "1"),
     2: ("twice", "two", "2"),
@@ -30,11 +30,14 @@ WORDS_OF_VALUES: dict[Value, tuple[str, ...]] = {
     "backward": ("back", "reverse"),
     "circle": ("circle",),
 }
-"""Parts of words by value of an attribute. A caption that states the value contains one of them."""
+"""Parts of words by value of an attribute.
+
+A caption that states the value contains one of them.
+"""
 
 
 class Abilities:
-    """Actions and attributes that a model knows, if each of its captions names one action of a list.
+    """Actions and attributes that a model knows. Each of its captions names one action of a list.
 
     Args:
         facts: facts of the model: "actions", "vocabulary" and, if it has them, "captions".
@@ -61,7 +64,7 @@ class Abilities:
 
     @cached_property
     def is_simultaneous(self) -> bool:
-        """Whether some caption of the model has two actions at the same time."""
+        """Whether a caption of the model has two actions at the same time."""
         marked = [
             text for text in self.captions if " while " in text or " at the same time" in text
         ]
@@ -72,9 +75,10 @@ class Abilities:
         return all(word in self.vocabulary for word in text.replace("-", " ").split())
 
     def supports(self, action: str, name: str, value: Value) -> bool:
-        """Returns whether the model knows a value of an attribute of an action: a caption states both.
+        """Returns whether the model knows an action with this value of an attribute.
 
-        Without captions, all its words must be in the vocabulary.
+        A caption must state both the action and the value. If the model has no captions, all
+        words for them must be in its vocabulary.
         """
         key = (action, name, value)
         if key not in self._supported:
@@ -88,7 +92,7 @@ class Abilities:
         if not self.captions or name == "amount":
             return True
         if name == "count" and "steps" in actions()[action].takes:
-            return False  # "takes two steps" of captions is as good as "takes a few steps"
+            return False  # in captions, "takes two steps" means the same as "takes a few steps"
 
         verbs = {
             form for phrase in actions()[action].phrases for form in inflections(phrase.words[0])
@@ -119,7 +123,10 @@ class Abilities:
         return sorted(self.actions, key=lambda other: -similarity(action, other))
 
     def nearest(self, understood: Understanding) -> list[str]:
-        """Returns captions of three known actions: the actions nearest in meaning to a sentence, or the first ones."""
+        """Returns captions of three known actions that are nearest in meaning to a sentence.
+
+        Without a nearest action, these are the first ones.
+        """
         names = [action for action in understood.nearest if action in self.actions]
         ranked = nearest_to([word for word in understood.text.lower().split() if word.isalpha()])
         names += [action for action, _ in ranked if action in self.actions and action not in names]

@@ -1,4 +1,4 @@
-"""Attributes of an action in the words around it: side, count, direction, speed, and amount of a turn."""
+"""Attributes that the words around an action state: side, count, direction, speed, and turn."""
 
 from collections.abc import Collection, Sequence
 
@@ -30,8 +30,8 @@ class Reader:
     Args:
         entry: the action.
         tokens: tokens of the sentence.
-        own: numbers of the tokens that belong to the action.
-        verb: numbers of the tokens of the phrase that names the action.
+        numbers: indices of the tokens that belong to the action.
+        verb: indices of the tokens of the phrase that names the action.
     """
 
     def __init__(
@@ -47,10 +47,10 @@ class Reader:
         self.attributes: dict[str, Value] = {}
 
     def read(self) -> dict[str, Value]:
-        """Returns the attributes that the clause states and the action takes.
+        """Returns the attributes that the clause states and that the action can have.
 
-        Afterward, `used` has the tokens that state such attributes. `dropped` has the tokens that
-        state attributes which the action does not take.
+        Afterward, `used` contains the tokens that state such attributes. `dropped` contains the
+        tokens that state attributes which the action cannot have.
         """
         for position, number in enumerate(self.numbers):
             word = self.tokens[number].word
@@ -64,7 +64,7 @@ class Reader:
         return {name: value for name, value in self.attributes.items() if name in self.entry.takes}
 
     def _word(self, position: int) -> str:
-        """Returns the word at a position in the clause; "" outside of it."""
+        """Returns the word at a position in the clause; "" outside of the clause."""
         return self.tokens[self.numbers[position]].word if 0 <= position < len(self.numbers) else ""
 
     def _state(self, name: str, value: Value, *numbers: int) -> None:
@@ -127,7 +127,7 @@ class Reader:
         self._state("direction", self._around(value), number)
 
     def _around(self, value: str) -> str:
-        """Returns the direction, with a side of a circle as the direction of turning."""
+        """Returns a direction. In a circle, left and right become the direction of turning."""
         earlier = str(self.attributes.get("direction", ""))
         turns = {"left": "counterclockwise", "right": "clockwise"}
         if earlier == "circle":
@@ -175,12 +175,12 @@ class Reader:
             self._state("count", count, number)
 
     def _is_connector(self, position: int) -> bool:
-        """Returns whether "once" begins a clause: "once they have looked around"."""
+        """Returns whether "once" begins a clause, as in "once they have looked around"."""
         subjects = words_of("people") | words_of("determiners")
         return self._word(position) == "once" and self._word(position + 1) in subjects
 
     def _names_action(self, position: int) -> bool:
-        """Returns whether the verb of the clause is a noun that follows a number: "five quick push-ups"."""
+        """Returns whether the action is a noun after a number, as in "five quick push-ups"."""
         ahead = [
             self.numbers[position + step]
             for step in (1, 2, 3)

@@ -1,4 +1,4 @@
-"""Clauses of a sentence, and how they follow each other in time."""
+"""Clauses of a sentence, and their order in time."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -37,11 +37,11 @@ AT_THE_END = {
     (word,)
     for word in ("simultaneously", "meanwhile", "at", "in", "afterwards", "afterward", "later")
 }
-"""First words of connectors that may also stand at the end of the clause to which they belong."""
+"""First words of connectors that may also be at the end of their clause."""
 NEED_SUBJECT = ("once", "as")
-"""Connectors only if a subject follows: "once they have", not "jumps once"."""
+"""Connectors only before a subject: "once they have", but not "jumps once"."""
 NEED_CLAUSE = ("next", "later")
-"""Connectors only at the beginning of a clause: not "next to the table"."""
+"""Connectors only at the beginning of a clause, so not in "next to the table"."""
 
 
 @dataclass
@@ -49,11 +49,12 @@ class Clause:
     """Consecutive words of a sentence.
 
     Attributes:
-        numbers: its tokens.
-        link: how it follows the clause before in time; "" if the sentence does not say so.
+        numbers: indices of its tokens.
+        link: when the clause happens, compared with the clause before; "" if the sentence does
+            not say so.
         is_first: whether it is the first clause of its sentence.
-        after_comma: whether it follows a comma.
-        matches: phrases for actions in it.
+        after_comma: whether a comma precedes it.
+        matches: phrases in it that name actions.
     """
 
     numbers: list[int]
@@ -64,7 +65,10 @@ class Clause:
 
 
 def split(tokens: Sequence[Token], matches: Sequence[Match]) -> list[Clause]:
-    """Returns the clauses of a sentence: they end at punctuation, at "and" and at connectors, but not in a phrase."""
+    """Returns the clauses of a sentence.
+
+    They end at punctuation, at "and" and at connectors, but never inside a phrase.
+    """
     clauses = list(_clauses(tokens, matches))
     for clause in clauses:
         numbers = set(clause.numbers)
@@ -103,7 +107,7 @@ def _clauses(tokens: Sequence[Token], matches: Sequence[Match]) -> Iterator[Clau
 
 
 def _connector(tokens: Sequence[Token], number: int) -> tuple[str, ...]:
-    """Returns the words of the connector at a token; () if there is none."""
+    """Returns the words of the connector at a token; () if the token begins no connector."""
     for words in CONNECTORS:
         if tuple(token.word for token in tokens[number : number + len(words)]) != words:
             continue
@@ -117,9 +121,10 @@ def _connector(tokens: Sequence[Token], number: int) -> tuple[str, ...]:
 
 
 def joined(clauses: Sequence[Clause]) -> list[Clause]:
-    """Merges clauses so that each has an action: words without one join the clause before, the first ones the next.
+    """Merges clauses so that each has an action.
 
-    A clause such as "then faster" stays, because it repeats the action before.
+    A clause without an action is joined to the clause before, or to the next clause if it is the
+    first one. A clause such as "then faster" is not merged, because it repeats the action before.
     """
     merged: list[Clause] = []
     waiting: list[int] = []

@@ -1,4 +1,4 @@
-"""Phrases for actions in the words of a sentence."""
+"""Phrases that name actions in a sentence."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ from flame_mdm.conditions.language.morphology import base_forms
 from flame_mdm.conditions.language.tables import GAP, Phrase, phrases_by_first_word, words_of
 from flame_mdm.conditions.language.tokens import Token
 
-# Maximum number of words for a gap in a phrase
+# Maximum number of words in the gap of a phrase
 LONGEST_GAP = 4
 WEAK_PHRASES = (("stand", "still"), ("take", "step"), ("stand", "around"), ("stand", "there"))
 """Phrases of several words that count as actions only if the sentence has no other action."""
@@ -15,12 +15,13 @@ WEAK_PHRASES = (("stand", "still"), ("take", "step"), ("stand", "around"), ("sta
 
 @dataclass(frozen=True)
 class Match:
-    """A phrase for an action, found in a sentence.
+    """A phrase in a sentence that names an action.
 
     Attributes:
         phrase: the phrase.
-        used: numbers of its tokens in the sentence, increasing.
-        is_weak: whether it counts as an action only if the sentence has no other one, such as "go".
+        used: indices of its tokens in the sentence, increasing.
+        is_weak: whether it counts as an action only if the sentence has no other action, such as
+            "go".
     """
 
     phrase: Phrase
@@ -29,17 +30,20 @@ class Match:
 
     @property
     def first(self) -> int:
-        """Number of the first token."""
+        """Index of the first token."""
         return self.used[0]
 
     @property
     def last(self) -> int:
-        """Number of the last token."""
+        """Index of the last token."""
         return self.used[-1]
 
 
 def find_phrases(tokens: Sequence[Token]) -> list[Match]:
-    """Returns the phrases for actions in a sentence, the longest one at each word; phrases do not overlap."""
+    """Returns the phrases for actions in a sentence.
+
+    At each word, the longest phrase is taken. Phrases do not overlap.
+    """
     matches: list[Match] = []
     number = 0
     while number < len(tokens):
@@ -68,7 +72,7 @@ def _longest_at(tokens: Sequence[Token], start: int) -> tuple[tuple[int, ...], P
 
 
 def _match(tokens: Sequence[Token], start: int, words: Sequence[str]) -> tuple[int, ...] | None:
-    """Returns the positions of the words of a phrase from a token on; None if they are not there."""
+    """Returns the indices of the tokens that match a phrase at `start`; None without a match."""
     if not words:
         return ()
     if words[0] == GAP:
@@ -98,7 +102,10 @@ def _is_negated(tokens: Sequence[Token], number: int) -> bool:
 
 
 def _is_weak(tokens: Sequence[Token], used: Sequence[int], phrase: Phrase) -> bool:
-    """Returns whether a phrase is a general verb, such as "go", or a noun after an article, such as "the guard"."""
+    """Returns whether a match is weak.
+
+    This is a general verb, such as "go", or a noun after an article, such as "the guard".
+    """
     if phrase.size > 1:
         return phrase.words in WEAK_PHRASES
     before = tokens[used[0] - 1].word if used[0] else ""

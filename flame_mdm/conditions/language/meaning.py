@@ -1,4 +1,4 @@
-"""Meanings of words that no table lists: the nearest actions, and things that are not actions."""
+"""Meanings of words that are in no table: the nearest actions, and words for things."""
 
 from collections.abc import Sequence
 from functools import cache
@@ -9,18 +9,24 @@ from flame_mdm.conditions.language.tables import actions, words_of
 from flame_mdm.conditions.language.vectors import word_table
 
 SIMILAR = 0.65
-"""Minimum similarity at which a word stands for the nearest action; docs/language.md has precision and recall."""
-NEIGHBORS = 5  # number of nearest listed words that decide whether a word is a thing
+"""Minimum similarity with which a word is read as the nearest action.
+
+docs/language.md reports precision and recall.
+"""
+NEIGHBORS = 5  # number of nearest listed words that decide whether a word names a thing
 
 
 def nearest_actions(word: str) -> list[tuple[str, float]]:
-    """Returns the actions and their similarities to a word, the nearest first; () if the table lacks the word."""
+    """Returns the actions and their similarities to a word, the nearest first.
+
+    The result is empty if the table of vectors lacks the word.
+    """
     vector = word_table().vector(word)
     return [] if vector is None else _ranked(vector)
 
 
 def nearest_to(words: list[str]) -> list[tuple[str, float]]:
-    """Returns the actions and their similarities to the mean of several words, the nearest first."""
+    """Returns the actions and their similarities to the mean of some words, the nearest first."""
     vector = word_table().mean(words)
     return [] if vector is None else _ranked(vector)
 
@@ -34,7 +40,10 @@ def similarity(action: str, other: str) -> float:
 
 
 def similar_word(word: str, words: Sequence[str]) -> str | None:
-    """Returns the word with the nearest meaning, if it is similar enough to stand for a word; otherwise None."""
+    """Returns the word of `words` that is most similar in meaning to `word`.
+
+    Returns None if no word is similar enough.
+    """
     vector = word_table().vector(word)
     pairs = [(other, row) for other in words if (row := word_table().vector(other)) is not None]
     if vector is None or not pairs:
@@ -45,7 +54,7 @@ def similar_word(word: str, words: Sequence[str]) -> str | None:
 
 
 def is_thing(word: str) -> bool:
-    """Returns whether most of the listed words with the nearest meanings are things, not actions."""
+    """Returns whether most of the nearest listed words name things rather than actions."""
     vector = word_table().vector(word)
     if vector is None:
         return False
@@ -57,7 +66,10 @@ def is_thing(word: str) -> bool:
 
 
 def _ranked(vector: np.ndarray) -> list[tuple[str, float]]:
-    """Returns the actions by their scores: the mean of the similarities to their nearest word and to their center."""
+    """Returns the actions by score.
+
+    The score is the mean of the similarities to the action's nearest word and to its center.
+    """
     names, rows, vectors = _action_vectors()
     words = vectors @ vector
     nearest = np.full(len(names), -1.0)
@@ -69,7 +81,10 @@ def _ranked(vector: np.ndarray) -> list[tuple[str, float]]:
 
 @cache
 def _action_vectors() -> tuple[list[str], np.ndarray, np.ndarray]:
-    """Returns the names of the actions, and of each single word for an action its row in the names and its vector."""
+    """Returns the names of the actions, and the single words that name actions.
+
+    For each word, there is the index of its action in the names, and the word's vector.
+    """
     table, weak = word_table(), words_of("weak")
     names = list(actions())
     rows, vectors = [], []
@@ -89,7 +104,7 @@ def _action_vectors() -> tuple[list[str], np.ndarray, np.ndarray]:
 
 @cache
 def _centers() -> np.ndarray:
-    """Returns the mean vector (N, D) of the words of each action, of length 1."""
+    """Returns, for each action, the mean vector of its words (N, D), scaled to length 1."""
     names, rows, vectors = _action_vectors()
     centers = np.array([vectors[rows == row].sum(0) for row in range(len(names))])
     return centers / np.maximum(np.linalg.norm(centers, axis=1, keepdims=True), 1e-9)

@@ -1,4 +1,4 @@
-"""Base forms of English words, by rule and from a list of irregular forms."""
+"""Base forms of English words, from rules and a list of irregular forms."""
 
 from collections.abc import Iterator
 from functools import cache
@@ -10,15 +10,16 @@ VOWELS = "aeiou"
 
 @cache
 def base_forms(word: str) -> tuple[str, ...]:
-    """Returns the forms that a word may be an inflection of, the word itself first: waving -> waving, wav, wave.
+    """Returns the possible base forms of a word, the word itself first.
 
-    Not all of them are words; a caller looks for those that it knows.
+    For "waving", these are waving, wav and wave. Not all of them are words. The caller looks for
+    forms that it knows.
     """
     return tuple(dict.fromkeys([word, *_irregular().get(word, ()), *_stems(word)]))
 
 
 def _stems(word: str) -> Iterator[str]:
-    """Yields what remains without a regular ending."""
+    """Yields the word without a regular ending, in each possible spelling."""
     if word.endswith(("ies", "ied")) and len(word) > 4:
         yield f"{word[:-3]}y"
     for ending in ("ing", "ed", "es", "s", "in"):
@@ -53,7 +54,7 @@ def inflections(verb: str) -> tuple[str, ...]:
 
 
 def _doubles(verb: str) -> bool:
-    """Returns whether the last consonant of a verb may be doubled: hop, hopping."""
+    """Returns whether the last consonant of a verb may be doubled, as in hop, hopping."""
     return (
         len(verb) > 2
         and verb[-1] not in f"{VOWELS}wxy"

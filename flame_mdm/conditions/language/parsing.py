@@ -1,4 +1,4 @@
-"""Sentences: which actions they ask for, in which order, with which attributes."""
+"""Parsing of sentences: the requested actions, their order and their attributes."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -19,13 +19,13 @@ from flame_mdm.conditions.language.tokens import (
 )
 from flame_mdm.conditions.language.understanding import Mention, Step, Understanding
 
-# Number of actions to choose from if none is understood
+# Number of actions to suggest if no action is understood
 NEAREST = 3
 
 
 @lru_cache(4096)
 def understand(text: str) -> Understanding:
-    """Returns what a sentence asks for, as far as it is understood."""
+    """Returns the actions that a sentence asks for, and the words that are not understood."""
     typed = tokenize(text)
     if is_foreign(typed):
         return Understanding(text, is_foreign=True)
@@ -65,7 +65,10 @@ def is_explained(word: str) -> bool:
 
 
 def _nearest(tokens: Sequence[Token]) -> tuple[str, ...]:
-    """Returns the actions nearest in meaning to the words of a sentence that no table has, or else to all words."""
+    """Returns the actions nearest in meaning to the words of a sentence that are in no table.
+
+    If all words are in tables, all of them count.
+    """
     words = [token.word for token in tokens if token.is_word]
     free = [word for word in words if not is_explained(word)] or words
     return tuple(action for action, _ in nearest_to(free)[:NEAREST])
@@ -88,8 +91,8 @@ class _Sentence:
     def steps(self) -> list[Step]:
         """Returns the actions in their order."""
         steps: list[Step] = []
-        during: list[Step] = []  # "While walking," before the clause that it belongs to
-        later: list[Step] = []  # "Before sitting down,"
+        during: list[Step] = []  # "While walking," comes before the clause that it belongs to
+        later: list[Step] = []  # "Before sitting down," comes before what happens first
         for clause in self.clauses:
             added = self._actions(clause, steps)
             if not added:
@@ -116,7 +119,7 @@ class _Sentence:
         return [_without_idle(step) for step in steps + during + later]
 
     def rest(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Returns the words for things, and the words that are not understood, both as typed."""
+        """Returns the words for things and the words that are not understood, both as typed."""
         objects, unknown = [], []
         for number, token in enumerate(self.tokens):
             if not token.is_word or number in self.verbs:
@@ -133,7 +136,10 @@ class _Sentence:
         return tuple(dict.fromkeys(objects)), tuple(dict.fromkeys(unknown))
 
     def _choose(self, clause: Clause) -> None:
-        """Keeps the phrases of a clause that are its actions; without one, a word with the meaning of an action."""
+        """Keeps the phrases of a clause that name its actions.
+
+        If there is none, a word with the meaning of an action counts.
+        """
         strong = [match for match in clause.matches if not match.is_weak]
         if strong:
             clause.matches = strong
@@ -165,7 +171,7 @@ class _Sentence:
         return before in words_of("determiners") | words_of("prepositions")
 
     def _actions(self, clause: Clause, steps: Sequence[Step]) -> list[Step]:
-        """Returns the actions of a clause, and takes note of the words that state them."""
+        """Returns the actions of a clause, and records the words that state them."""
         if not clause.matches:
             return self._again(clause, steps)
         added: list[Step] = []
@@ -200,7 +206,7 @@ class _Sentence:
         )
 
     def _again(self, clause: Clause, steps: Sequence[Step]) -> list[Step]:
-        """Returns the previous action with the attributes of a clause that names no action: "then faster"."""
+        """Returns the previous action with the attributes of a clause such as "then faster"."""
         if not steps or len(steps[-1]) > 1:
             return []
         before = steps[-1][0]
@@ -220,7 +226,7 @@ class _Sentence:
         ]
 
     def _is_manner(self, clause: Clause, steps: Sequence[Step]) -> bool:
-        """Returns whether a clause says what happens during the one before: "stands still, waving"."""
+        """Returns whether a clause happens during the clause before: "stands still, waving"."""
         if clause.link or not clause.after_comma or not clause.matches:
             return False
         before = steps[-1][0]
@@ -245,7 +251,7 @@ class _Sentence:
 
 
 def _is_same(step: Step, other: Step) -> bool:
-    """Returns whether two steps are one action that the sentence names twice, with attributes that agree."""
+    """Returns whether two steps are the same action, named twice with attributes that agree."""
     if len(step) > 1 or len(other) > 1 or step[0].action != other[0].action:
         return False
     first, second = step[0].attributes, other[0].attributes
@@ -253,6 +259,6 @@ def _is_same(step: Step, other: Step) -> bool:
 
 
 def _without_idle(step: Step) -> Step:
-    """Returns a step without "stands still", if another action happens at the same time, and without repetitions."""
+    """Returns a step without repetitions, and without "stands still" beside another action."""
     moving = [mention for mention in step if mention.action != "idle"] or step[:1]
     return tuple({mention.action: mention for mention in moving}.values())

@@ -1,4 +1,4 @@
-"""What a model makes of a sentence: the captions that it reads, and what it does not know."""
+"""How a model reads a sentence: captions for the model, and words that it does not know."""
 
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
@@ -22,11 +22,11 @@ class Reading:
 
     Attributes:
         understanding: what the sentence asks for.
-        steps: what the model does instead: actions that it knows, in their order.
-        captions: caption of each step, which the model reads.
-        texts: words of the sentence for each step.
-        changes: lines about what is sampled differently from what the sentence says.
-        ignored: words and attributes that change nothing, as typed or in words.
+        steps: actions that the model samples instead, in their order; it knows all of them.
+        captions: one caption per step, for the model.
+        texts: the words of the sentence for each step.
+        changes: differences between the sentence and what is sampled, one line each.
+        ignored: words and attributes without effect, as typed or in words.
     """
 
     understanding: Understanding
@@ -37,7 +37,7 @@ class Reading:
     ignored: tuple[str, ...] = ()
 
     def summary(self) -> str:
-        """Returns what was understood in one line: "walks forward, then waves twice"."""
+        """Returns in one line what was understood, such as "walks forward, then waves twice"."""
         if not self.steps:
             return self.texts[0]
         return ", then ".join(
@@ -45,7 +45,7 @@ class Reading:
         )
 
     def warnings(self) -> list[str]:
-        """Returns lines about what is sampled differently from what the sentence says."""
+        """Returns lines about differences between the sentence and what is sampled."""
         ignored = [f"not understood: {', '.join(self.ignored)}"] if self.ignored else []
         return [*self.changes, *ignored]
 
@@ -72,9 +72,9 @@ class Reader:
     def read(self, text: str) -> Reading:
         """Returns a sentence as the model reads it.
 
-        Two kinds of sentences are not changed: training captions of the model that name an action
-        which the model does not list, and sentences whose words are in no table but are all known
-        to the model.
+        Two kinds of sentences are not changed. The first are training captions whose action the
+        model does not list. The second are sentences whose words are in no table, but are all
+        known to the model.
 
         Raises:
             UserError: If the sentence is not English, or names an action that the model does not
@@ -102,7 +102,11 @@ class Reader:
             return as_typed
 
     def _read_steps(self, understood: Understanding, text: str, style: str) -> Reading:
-        """Returns the actions of a sentence as captions; raises `NotUnderstood` if the model lacks one."""
+        """Returns the actions of a sentence as captions.
+
+        Raises:
+            NotUnderstood: If the model does not know one of the actions.
+        """
         notes = _Notes(
             [f"'{typed}' is read as '{word}'" for typed, word in understood.corrected.items()]
         )
@@ -133,7 +137,7 @@ class Reader:
         return Reading(understood, tuple(steps), tuple(captions), tuple(texts), changes, ignored)
 
     def _mention(self, mention: Mention, text: str, notes: "_Notes") -> Mention:
-        """Returns a mention of an action that the model knows, with the attributes that it knows."""
+        """Returns a mention reduced to an action and attributes that the model knows."""
         action, attributes = self._known_action(mention)
         if action is None:
             nearest = [
@@ -167,7 +171,11 @@ class Reader:
         return replace(mention, action=action, attributes=stated)
 
     def _known_action(self, mention: Mention) -> tuple[str | None, dict[str, Value]]:
-        """Returns the action, or one that shows nearly the same, with its attributes; None if the model has none."""
+        """Returns a known action and the attributes that it needs.
+
+        If the model does not know the action itself, it is one that shows nearly the same.
+        Returns None if there is no such action.
+        """
         if mention.action in self.abilities.actions:
             return mention.action, {}
         for like in actions()[mention.action].like:
@@ -176,7 +184,10 @@ class Reader:
         return None, {}
 
     def _possible(self, step: Step, notes: "_Notes") -> list[Step]:
-        """Returns the step, or its actions one after the other if the model knows no actions at the same time."""
+        """Returns the steps that the model can do instead of a step.
+
+        If the model knows no simultaneous actions, they follow each other.
+        """
         distinct = tuple({mention.action: mention for mention in step}.values())
         if len(distinct) == 1 or self.abilities.is_simultaneous:
             return [distinct]
@@ -187,7 +198,10 @@ class Reader:
         return [(mention,) for mention in distinct]
 
     def _repeated(self, step: Step, notes: "_Notes") -> list[Step]:
-        """Returns a step as often as its count needs: "kicks four times" is "kicks twice", two times."""
+        """Returns the steps that add up to the step's count.
+
+        For example, "kicks four times" becomes two steps of "kicks twice".
+        """
         mention, *others = step
         count = mention.attributes.get("count")
         if count is None or others or self.abilities.supports(mention.action, "count", count):
@@ -207,7 +221,10 @@ class Reader:
 
 
 class NotUnderstood(UserError):
-    """A sentence without an action that the model knows; `nearest` are captions with similar meanings."""
+    """The error for a sentence without an action that the model knows.
+
+    `nearest` are captions with similar meanings.
+    """
 
     def __init__(self, message: str, nearest: Sequence[str]):
         suggested = " or ".join(f"'{text}'" for text in nearest)
@@ -222,14 +239,17 @@ class NotUnderstood(UserError):
 
 @dataclass
 class _Notes:
-    """Lines about changes, and words that change nothing, collected while a sentence is read."""
+    """Lines about changes, and words without effect, collected while a sentence is read."""
 
     changes: list[str]
     ignored: list[str] = field(default_factory=list)
 
 
 def _joined(steps: Sequence[Step], names: Sequence[str]) -> list[Step]:
-    """Returns the steps with pairs that the model knows as one action: "stretches both arms and leans to the left"."""
+    """Returns the steps, with two of them merged if the model knows the pair as one action.
+
+    An example is "stretches both arms and leans to the left".
+    """
     pairs = {
         entry.joins: entry.name
         for entry in actions().values()
@@ -258,12 +278,15 @@ def _shown(text: str) -> str:
 
 
 def _caption(step: Step, words: str, special: Set[str]) -> str:
-    """Returns the caption of a step: the words of the sentence if the model knows one that no table explains."""
+    """Returns the caption of a step.
+
+    It is the sentence's own words if the model knows one of them that no table explains.
+    """
     return words if special & set(words.lower().split()) else caption(step)
 
 
 def _without_style(text: str) -> tuple[str, str]:
-    """Returns a sentence without "in limp style" at its end, which adapters teach, and that ending."""
+    """Splits "in limp style", which adapters teach, off the end of a sentence."""
     before, separator, style = text.rstrip(" .").rpartition(" in ")
     if separator and style.endswith(" style") and style.count(" ") == 1:
         return before, f" in {style}"

@@ -1,11 +1,11 @@
-"""Typos: corrections of one or two letters to a word for motion, its attributes or its subject."""
+"""Corrections of typos by one or two letters to words for motions, attributes and subjects."""
 
 from functools import cache
 
 from flame_mdm.conditions.language.morphology import inflections
 from flame_mdm.conditions.language.tables import GAP, actions, phrases, words_of
 
-# Maximum length of words that are too short to be recognized as another word
+# Maximum length of words that are never corrected: too many words are similar to them
 NEVER_CORRECTED = 2
 FREQUENT = (
     "a",
@@ -25,16 +25,17 @@ FREQUENT = (
 
 
 def distance(first: str, second: str, most: int) -> int:
-    """Returns the number of letters inserted, removed, replaced or swapped with a neighbor; above `most`, most + 1.
+    """Returns the number of edits between two words; `most` + 1 if there are more than `most`.
 
-    Optimal string alignment distance (Damerau 1964; Levenshtein 1966).
+    An edit inserts, removes or replaces a letter, or swaps two neighbors. This is the optimal
+    string alignment distance (Damerau 1964; Levenshtein 1966).
 
     Example:
         >>> distance("wlak", "walk", most=2), distance("dance", "walk", most=2)
         (1, 3)
     """
-    # Dynamic programming over prefixes: `row` has the distances of first[:i] from all prefixes of
-    # the second word. Only the last two rows are needed, since a swap looks back by two letters.
+    # Dynamic programming over prefixes: `row` contains the distances of first[:i] to all prefixes
+    # of the second word. Two earlier rows are enough, because a swap looks back by two letters.
     if abs(len(first) - len(second)) > most:
         return most + 1
     before: list[int] = []
@@ -53,10 +54,10 @@ def distance(first: str, second: str, most: int) -> int:
 
 @cache
 def corrections(word: str) -> tuple[str, ...]:
-    """Returns the words of the tables that a misspelled word may mean, all equally near; () if none is near.
+    """Returns the words of the tables that a misspelled word may mean; () if none is near.
 
-    A word of up to four letters may have one wrong letter, a longer word two. Numbers are not
-    corrected.
+    All of them have the same number of edits. A word of up to four letters may have one wrong
+    letter; a longer word may have two. Numbers are not corrected.
     """
     if len(word) <= NEVER_CORRECTED or any(char.isdecimal() for char in word):
         return ()
@@ -64,8 +65,8 @@ def corrections(word: str) -> tuple[str, ...]:
     near: dict[int, list[str]] = {}
     for other in _correct_words():
         if len(other) > NEVER_CORRECTED and (far := distance(word, other, most)) <= most:
-            # wrong first letters and replaced letters are rarer than missing, added and swapped
-            # ones
+            # A wrong first letter and a replaced letter are rarer than a missing, an added or a
+            # swapped letter.
             begins_otherwise = sorted(other[:2]) != sorted(word[:2]) and other[0] != word[0]
             has_replaced = len(other) == len(word) and sorted(other) != sorted(word)
             near.setdefault(2 * far + begins_otherwise + has_replaced, []).append(other)
@@ -74,7 +75,7 @@ def corrections(word: str) -> tuple[str, ...]:
 
 @cache
 def action_words() -> frozenset[str]:
-    """Returns the forms of all words in the phrases for actions."""
+    """Returns all forms of the words in phrases that name actions."""
     bases = {
         word for entry in actions().values() for phrase in entry.phrases for word in phrase.words
     }
@@ -83,7 +84,10 @@ def action_words() -> frozenset[str]:
 
 @cache
 def _correct_words() -> tuple[str, ...]:
-    """Returns the words that a typo may mean: frequent words, then words for actions, then all others."""
+    """Returns the words that a typo may mean.
+
+    Frequent words are first, then words for actions, then all others.
+    """
     tables = phrases()
     listed = words_of("body") | words_of("people") | words_of("function") | words_of("objects")
     for key in ("numbers", "times"):

@@ -1,4 +1,4 @@
-"""Tables of the language: `actions.yaml`, which has the words for actions, and `phrases.yaml`, which has all others."""
+"""Tables of words: `actions.yaml` for actions and `phrases.yaml` for all other words."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -14,10 +14,10 @@ GAP = "..."
 
 @dataclass(frozen=True)
 class Phrase:
-    """Words for an action.
+    """Words that name an action.
 
     Attributes:
-        words: base forms; `GAP` stands for up to four words.
+        words: base forms; `GAP` represents up to four words.
         action: name of the action.
         attributes: attributes that the phrase states.
     """
@@ -34,7 +34,10 @@ class Phrase:
 
 @dataclass(frozen=True)
 class ActionEntry:
-    """An action: the attributes that it takes, and how a caption says it; `actions.yaml` describes the fields."""
+    """An action: the attributes that it can have and its words in captions.
+
+    `actions.yaml` describes the fields.
+    """
 
     name: str
     phrases: tuple[Phrase, ...]
@@ -57,7 +60,10 @@ def phrases() -> dict[str, Any]:
 
 @cache
 def words_of(*keys: str) -> frozenset[str]:
-    """Returns the words of a list in `phrases.yaml`; `words_of("speed", "slow")` is a list inside another."""
+    """Returns the words of a list in `phrases.yaml`.
+
+    Several keys lead to a nested list: `words_of("speed", "slow")`.
+    """
     entry: Any = phrases()
     for key in keys:
         entry = entry[key]
@@ -66,7 +72,10 @@ def words_of(*keys: str) -> frozenset[str]:
 
 @cache
 def word_values(key: str) -> dict[str, str]:
-    """Returns the value that each word of a table states: `word_values("speed")["slowly"]` is "slow"."""
+    """Returns the value that each word of a table states.
+
+    For example, `word_values("speed")["slowly"]` is "slow".
+    """
     return {word: value for value, listed in phrases()[key].items() for word in listed.split()}
 
 
@@ -79,7 +88,7 @@ def actions() -> dict[str, ActionEntry]:
 
 @cache
 def phrases_by_first_word() -> dict[str, list[Phrase]]:
-    """Returns the phrases for actions by their first words, the longest phrases first."""
+    """Returns the phrases that name actions, by first word. The longest phrases are first."""
     listed_at: dict[str, list[Phrase]] = {}
     for entry in actions().values():
         for phrase in entry.phrases:
@@ -113,7 +122,7 @@ def _phrase(text: str, action: str) -> Phrase:
 
 
 def _like(text: str) -> Phrase:
-    """Returns another action, and attributes that it must have: "walk speed=slow"."""
+    """Parses another action and the attributes that it must have, such as "walk speed=slow"."""
     parts = text.split()
     name = " ".join(part for part in parts if "=" not in part)
     return Phrase((name,), name, dict(part.split("=") for part in parts if "=" in part))

@@ -1,4 +1,4 @@
-"""Words of a sentence, with typos corrected, and whether the sentence is English."""
+"""Words of a sentence, correction of typos, and a test whether the sentence is English."""
 
 import re
 import unicodedata
@@ -14,8 +14,8 @@ from flame_mdm.conditions.language.vectors import word_table
 
 TOKEN = re.compile(r"(?:anti|counter)[- ]?clockwise|\d+|[^\W\d_]+|[.,;:!?|\n]", re.IGNORECASE)
 HYPHEN = re.compile("[- ]")
-# Rank in frequency from which a real word may be a typo of an action, in a sentence without an
-# action
+# In a sentence without an action, a real word may be a typo of an action if its rank in frequency
+# is at least this number.
 RARE = 12_000
 
 
@@ -24,8 +24,8 @@ class Token:
     """A word or a punctuation mark.
 
     Attributes:
-        typed: as typed.
-        word: as read: in lower case, corrected.
+        typed: the word as typed.
+        word: the word as read: in lower case and corrected.
         start, end: position in the sentence.
     """
 
@@ -54,19 +54,20 @@ def tokenize(text: str) -> list[Token]:
 
 
 def is_known(word: str) -> bool:
-    """Returns whether a word is English: in the tables or among the frequent words, in any form."""
+    """Returns whether a word is English: any form is in the tables or a frequent word."""
     if word.isdecimal() or word in _listed():
         return True
-    # not a form of a short word, most of which are names: "tims"
+    # Forms of short words do not count, because most are names: "tims"
     return any(form == word or len(form) > 3 for form in base_forms(word) if word_table().has(form))
 
 
 def is_foreign(tokens: Sequence[Token]) -> bool:
     """Returns whether a sentence is in another language than English.
 
-    A sentence is foreign if most of its letters are not Latin. It is also foreign if fewer than
-    half of its words are English, and one of them has an accent or is a word of a language in
-    `phrases.yaml` without being English.
+    A sentence is foreign if most of its letters are not Latin. It is also foreign if two things
+    are true: fewer than half of its words are English, and one of its words has an accent or is
+    typical of another language. `phrases.yaml` lists typical words. English words among them do
+    not count.
     """
     words = [token.word for token in tokens if token.is_word]
     letters = [char for word in words for char in word if char.isalpha()]
@@ -90,7 +91,7 @@ def is_foreign(tokens: Sequence[Token]) -> bool:
 
 
 def is_english(word: str) -> bool:
-    """Returns whether a word is in the tables, in any form, frequent, or a typo of a word in the tables."""
+    """Returns whether a word is frequent, or is in the tables in any form or with a typo."""
     rank = word_table().rank(word)
     is_frequent = rank is not None and rank < RARE
     return (
@@ -101,7 +102,10 @@ def is_english(word: str) -> bool:
 
 
 def corrected(tokens: Sequence[Token]) -> list[Token]:
-    """Returns the tokens with typos corrected. Typos are unknown words with only a few similar known words."""
+    """Returns the tokens with typos corrected.
+
+    A typo is an unknown word with only a few similar known words.
+    """
     return [
         _corrected(token) if token.is_word and not is_known(token.word) else token
         for token in tokens
@@ -111,11 +115,11 @@ def corrected(tokens: Sequence[Token]) -> list[Token]:
 def corrected_to_action(tokens: Sequence[Token], free: Collection[int]) -> list[Token]:
     """Returns the tokens with one rare word replaced by an action that differs in one letter.
 
-    This is for sentences in which no action is understood: "doge to the left".
+    This is for sentences in which no action is understood, such as "doge to the left".
 
     Args:
         tokens: tokens of the sentence.
-        free: numbers of the words that may be replaced.
+        free: indices of the words that may be replaced.
     """
     for number in free:
         token = tokens[number]

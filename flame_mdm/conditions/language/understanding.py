@@ -1,4 +1,4 @@
-"""What a sentence asks for: actions in their order, with their attributes."""
+"""What a sentence asks for: actions in order, with their attributes."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -8,14 +8,16 @@ from flame_mdm.conditions.language.tables import Value
 
 @dataclass(frozen=True)
 class Mention:
-    """An action that a sentence asks for.
+    """An action in a sentence.
 
     Attributes:
         action: its name in `actions.yaml`.
-        attributes: side, count, direction, speed and amount, as far as the sentence states them.
-        text: the words of the sentence about it.
+        attributes: the attributes that the sentence states, of side, count, direction, speed and
+            amount.
+        text: the words of the sentence for the action.
         start, end: position of its verb in the sentence.
-        typed: the word that was read as this action because of its meaning; "" if the sentence names the action.
+        typed: the word that was read as this action because of its meaning; "" if the sentence
+            names the action.
     """
 
     action: str
@@ -36,16 +38,16 @@ Step = Sequence[Mention]
 
 @dataclass(frozen=True)
 class Understanding:
-    """A sentence, as far as it is understood.
+    """The understood content of a sentence.
 
     Attributes:
         text: the sentence as typed.
-        steps: actions in their order.
-        objects: words for things, which change nothing.
-        unknown: words that are not understood; spelled as typed.
-        corrected: words that were read as other ones: as typed -> as read.
+        steps: actions in order.
+        objects: words for things; they have no effect.
+        unknown: words that are not understood, as typed.
+        corrected: words that were read as other words: typed word -> corrected word.
         is_foreign: whether the sentence is in another language than English.
-        nearest: if no action is understood, the three actions with the nearest meanings.
+        nearest: the three actions with the nearest meanings if no action is understood.
     """
 
     text: str
@@ -58,5 +60,5 @@ class Understanding:
 
     @property
     def mentions(self) -> list[Mention]:
-        """All actions, in their order."""
+        """All actions in order."""
         return [mention for step in self.steps for mention in step]

@@ -1,7 +1,7 @@
-"""Words by meaning: a table of vectors for frequent English words and words for motion.
+"""Meanings of words: a table of vectors for frequent English words and words for motion.
 
-`tools/word_vectors.py` distills it from MiniLM (all-MiniLM-L6-v2, Apache License 2.0); `word_vectors.md` has its source
-and its license.
+`tools/word_vectors.py` distills the table from MiniLM (all-MiniLM-L6-v2, Apache License 2.0).
+`word_vectors.md` documents source and license.
 """
 
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from flame_mdm.conditions.language.morphology import base_forms
 from flame_mdm.safe_io import read_npz
 
 FILE = Path(__file__).with_name("word_vectors.npz")
-SMOOTHING = 1e-4  # words above this frequency count less in a mean
+SMOOTHING = 1e-4  # words with a higher frequency have less weight in a mean
 
 
 class WordTable:
@@ -30,18 +30,19 @@ class WordTable:
         return word in self._rows
 
     def rank(self, word: str) -> int | None:
-        """Returns the rank in frequency of a word, or of its base form; None if the table has neither."""
+        """Returns the rank in frequency of a word or its base form; None if both are missing."""
         return next((self._rows[form] for form in base_forms(word) if form in self._rows), None)
 
     def vector(self, word: str) -> np.ndarray | None:
-        """Returns the vector (D,) of a word, or of a word that it is a form of; None if it is not in the table."""
+        """Returns the vector (D,) of a word or of its base form; None if both are missing."""
         row = self.rank(word)
         return None if row is None else self.vectors[row]
 
     def mean(self, words: Sequence[str]) -> np.ndarray | None:
-        """Returns the mean vector (D,) of words, of length 1; None if the table has none of them.
+        """Returns the mean vector (D,) of words, scaled to length 1; None if all are missing.
 
-        Frequent words count less: smooth inverse frequency (Arora et al. 2017), with frequencies by Zipf's law.
+        Frequent words have less weight: smooth inverse frequency (Arora et al. 2017), with
+        frequencies from Zipf's law.
         """
         rows = [row for word in words if (row := self.rank(word)) is not None]
         if not rows:
@@ -54,9 +55,9 @@ class WordTable:
 
 @cache
 def word_table() -> WordTable:
-    """Returns the table in the package."""
+    """Returns the table that is part of the package."""
     arrays = read_npz(FILE)
     words = arrays["words"].tobytes().decode().split("\n")
-    # 8 bits per number; the scale of each word is lost, because vectors have length 1
+    # 8 bits per number. The scale of each word is lost, but vectors have length 1 anyway.
     vectors = arrays["vectors"].astype(np.float32)
     return WordTable(words, vectors / np.linalg.norm(vectors, axis=1, keepdims=True))

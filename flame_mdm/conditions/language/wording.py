@@ -1,4 +1,4 @@
-"""Captions: the words for actions and their attributes in which a model reads them."""
+"""Words of captions for actions and their attributes, in the form that a model reads."""
 
 from collections.abc import Mapping, Sequence
 
@@ -45,18 +45,18 @@ def predicate(mention: Mention) -> str:
 
 
 def times(count: int) -> str:
-    """Returns the words for a number of repetitions."""
+    """Returns the words for a number of repetitions, such as "twice"."""
     return TIMES.get(count, f"{count} times")
 
 
 def caption(step: Sequence[Mention]) -> str:
-    """Returns the caption of actions at the same time: "a person walks forward while waving"."""
+    """Returns the caption of simultaneous actions: "a person walks forward while waving"."""
     first, *others = (predicate(mention) for mention in step)
     return " while ".join([f"{WHO} {first}", *(_participle(other) for other in others)])
 
 
 def attribute_words(name: str, value: Value) -> str:
-    """Returns the words for an attribute: "right", "twice", "to the left", "quickly", "around"."""
+    """Returns the words for an attribute, such as "right", "twice" or "to the left"."""
     if name == "count":
         return times(int(value))
     if name == "amount":

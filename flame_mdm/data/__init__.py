@@ -1,4 +1,4 @@
-"""Data sets: reading published releases, packing them into stores, and serving training batches."""
+"""Data sets: reading published releases, packing them into stores, and serving batches."""
 
 import hashlib
 import math
@@ -25,68 +25,84 @@ Value = TypeVar("Value")
 
 @dataclass
 class Clip:
-    """One motion that a data set yields to be written into a store."""
+    """One motion of a data set, to be written into a store."""
 
-    id: str  # unique name; a mirrored copy is named `M` + the name of its original
+    id: str  # unique name; a mirrored copy has the name `M` + the name of its original
     # Input of the representation, at its frame rate. Representations of joints take positions
     # (F, J, 3) in meters, y up, in the joint order of the skeleton.
     motion: np.ndarray
     # Descriptions of the motion, each complete; empty for data sets with action labels only
     captions: list[str]
-    split: Split  # mirrored copies and cuts of a take belong to the split of that take
-    source: str  # the take the clip comes from; clips of one source are never in two splits
+    split: Split  # mirrored copies and cuts of a take are in the split of the take
+    source: str  # the take that the clip comes from; clips of one source are never in two splits
     action: int | None = None  # index into the data set's `actions`, or None
-    # Exact facts about the motion, such as side, count and direction, or tagged words, as JSON values.
+    # Exact facts about the motion, such as side, count and direction, or tagged words, as JSON
+    # values.
     attributes: Mapping[str, Any] = field(default_factory=dict)
     # Name of a representation if the release contains its features: `motion` (F, D) is then
     # stored unchanged. Empty if `motion` is raw.
     encoded: str = ""
-    # (first, length): the clip is this cut of its motion. Consecutive clips that hold the same
-    # array object share its frames in the store. Only for representations with one row per frame.
+    # (first, length): the clip is this cut of its motion. Consecutive clips with the same array
+    # object share its frames in the store. Only for representations with one row per frame.
     window: tuple[int, int] | None = None
     # Joints (F', J, 3) in meters at the frame rate of the recording, for protocols that compare
     # motions at that rate.
     reference: np.ndarray | None = None
-    # License of this motion, an identifier such as "MIT". Empty if the data set has one license
+    # Identifier of the license of this motion, such as "MIT". Empty if the data set has one
+    # license for all motions.
     # for all motions.
     license: str = ""
 
 
 class MotionSource(ABC):
-    """A data set in the form in which it is published."""
+    """A data set in its published form."""
 
     name: str
-    # Whether the data set takes its name from `data.name` of the recipe: the files are the
-    # user's.
+    # Whether `data.name` in the recipe names the data set, because the files are the user's.
     named_by_recipe: bool = False
     options: Mapping[str, Any] = {}
-    """Arguments of the constructor that define the data, as JSON values. Paths and numbers of workers are
-    not among them. They are saved in the store, and commands compare them with those in the recipe."""
+    """Arguments of the constructor that define the data, as JSON values.
+
+    Paths and numbers of workers do not belong to them. The arguments are saved in the store, and
+    commands compare them with the recipe.
+    """
     actions: tuple[str, ...] = ()  # names of the action labels, in the order of their numbers
-    # All forms of the verbs in the captions. Sentences are split into actions at these verbs;
-    # empty if they are not split.
+    # All forms of the verbs in the captions. Sentences are split into actions at these verbs.
+    # Empty = sentences are not split.
     verbs: tuple[str, ...] = ()
     license: str = ""
-    """License of all motions, a key of `licenses.yaml` such as "MIT"; empty if unknown, or if clips have their own."""
+    """License of all motions, a key of `licenses.yaml` such as "MIT".
+
+    It is empty if the license is unknown, or if clips have their own licenses.
+    """
     # Whether the license allows checkpoints to contain captions.
     captions_may_be_shared: bool = False
     published_split: bool = False
-    """Whether the papers' split is used, although it tests on training clips or has no validation clips.
+    """Whether the papers' split is used despite its faults.
 
-    Saved in the store and in every result.
+    It tests on training clips or has no validation clips. The value is saved in the store and in
+    every result.
     """
     version: int = 1
-    """Version of the code that reads the motions. It is part of the fingerprint, and stores of another version
-    are not used."""
+    """Version of the code that reads the motions.
+
+    It is part of the fingerprint. Stores of another version are not used.
+    """
     failures: Sequence[str] = ()
-    """Lines about motions that could not be read and are left out, complete once `clips` is exhausted. Commands
-    then end with exit code 1, since the user should correct the files."""
-    workers: int = 0  # processes that read and encode; 0 = one per core, 1 = this process only
+    """One line per motion that could not be read and is left out.
+
+    It is complete after `clips` has ended. Commands then exit with code 1, because the user
+    should correct the files.
+    """
+    workers: int = 0  # processes that read and encode; 0 = one per core, 1 = only this process
     exclude: Collection[str] = ()  # names to leave out
 
     @cached_property
     def excluded(self) -> Counter[str]:
-        """Number of clips or labels left out, by reason; complete once `clips` is exhausted. Saved in the store."""
+        """Number of clips or labels left out, by reason; saved in the store.
+
+        It is complete after `clips` has ended.
+        """
         return Counter()
 
     def leave_out(self, reason: str, count: int = 1) -> None:
@@ -97,7 +113,8 @@ class MotionSource(ABC):
     def not_excluded(self, named: Mapping[str, Value], path: Path) -> dict[str, Value]:
         """Removes the names in `exclude` from a mapping and counts them.
 
-        Raises `UserError` if `exclude` has a name that the mapping lacks.
+        Raises:
+            UserError: If `exclude` has a name that the mapping lacks.
         """
         if unknown := set(self.exclude) - named.keys():
             raise UserError(f"data.source.exclude: {path} has no {some(unknown)}")
@@ -105,33 +122,42 @@ class MotionSource(ABC):
         return {name: value for name, value in named.items() if name not in self.exclude}
 
     def counts(self) -> Mapping[str, float]:
-        """Returns figures of the raw data under the names of `published.yaml`; saved once `clips`
-        is exhausted.
+        """Returns figures of the raw data under the names of `published.yaml`.
+
+        They are saved after `clips` has ended.
         """
         return {}
 
     def findings(self) -> list[str]:
-        """Returns lines to print about the motions, complete once `clips` is exhausted."""
+        """Returns lines to print about the motions; complete after `clips` has ended."""
         return []
 
     def changed(self, store: Path) -> list[str]:
-        """Returns a line if files were added or changed since the file `store` was prepared from them."""
+        """Returns a line if files were added or changed after the store was prepared from them.
+
+        Args:
+            store: a file of the store.
+        """
         return []
 
     def may_share_captions(self, license: str) -> bool:
-        """Returns whether a checkpoint may contain the captions of a clip with this license; "" = the data set's."""
+        """Returns whether a checkpoint may contain the captions of a clip with this license.
+
+        "" = the license of the data set.
+        """
         return self.captions_may_be_shared
 
     def licenses(self) -> set[str]:
-        """Returns the licenses of all motions, without reading motions; "" stands for an unknown license."""
+        """Returns the licenses of all motions, without reading motions; "" = unknown license."""
         return {self.license}
 
     @abstractmethod
     def count(self) -> int:
         """Returns the number of clips that `clips` yields, without reading motions.
 
-        Raises `FileNotFoundError`, which says how to get the raw data, if it is missing, and
-        `UserError` if a file is damaged or an option does not fit the data.
+        Raises:
+            FileNotFoundError: If the raw data is missing; the message says how to get it.
+            UserError: If a file is damaged or an option does not fit the data.
         """
 
     def failure_lines(self) -> list[str]:
@@ -139,27 +165,39 @@ class MotionSource(ABC):
         return [f"error: {failure}" for failure in self.failures]
 
     def check(self, fps: float) -> list[str]:
-        """Returns lines to print about the files that are present or missing, at `fps` frames per
-        second.
+        """Returns lines to print about present and missing files. Prepares nothing.
 
-        Prepares nothing.
+        Args:
+            fps: frames per second.
         """
         return [f"{self.name}: {self.count()} clips can be prepared"]
 
     def suit(self, representation: "Representation") -> None:  # noqa: B027 (most sources yield one kind of motion)
-        """Makes `clips` yield raw motions of a representation; raises `UserError` if the options do not fit it."""
+        """Makes `clips` yield raw motions of a representation.
+
+        Raises:
+            UserError: If the options do not fit the representation.
+        """
 
     def statistics(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Returns mean and std (D,) published with encoded features; None = computed from the training clips."""
+        """Returns mean and std (D,) that are published with encoded features.
+
+        None = they are computed from the training clips.
+        """
         return None
 
     @abstractmethod
     def clips(self, fps: float) -> Iterator[Clip]:
-        """Yields all clips at `fps` frames per second, always in the same order; raises the errors of `count`."""
+        """Yields all clips at `fps` frames per second, always in the same order.
+
+        It raises the same errors as `count`.
+        """
 
     def check_fps(self, fps: float, published: float) -> None:
-        """Raises `UserError` if `fps` is not the `published` frame rate of a data set that is
-        never resampled.
+        """Checks the frame rate of a data set that is never resampled.
+
+        Raises:
+            UserError: If `fps` is not the `published` frame rate.
         """
         if fps != published:
             raise UserError(
@@ -168,32 +206,34 @@ class MotionSource(ABC):
 
 
 def required(path: Path, get_it: str) -> Path:
-    """Returns `path`; raises `FileNotFoundError` with the advice `get_it` if nothing is there."""
+    """Returns `path`.
+
+    Raises:
+        FileNotFoundError: If it does not exist; the message ends with the advice `get_it`.
+    """
     if not path.exists():
         raise FileNotFoundError(f"{path}: not found; {get_it}")
     return path
 
 
 def some(names: Iterable[str]) -> str:
-    """Returns the first five of the sorted names, and how many others there are."""
+    """Returns the first five of the sorted names, and the number of the others."""
     first = sorted(names)
     return ", ".join(first[:5]) + (f" and {len(first) - 5} more" if len(first) > 5 else "")
 
 
 def name_hash(name: str) -> int:
-    """Returns 160 bits that depend on the name alone, so that draws by name are equal on any
-    machine.
-    """
+    """Returns 160 bits that depend only on the name, so that draws are equal on every machine."""
     return int(hashlib.sha1(name.encode()).hexdigest(), 16)
 
 
 def hashed_split(name: str, val: int, test: int) -> Split:
-    """Returns a split that depends on the name alone, so new names do not move other names.
+    """Returns a split that depends only on the name, so that new names do not move other names.
 
     Args:
         name: name of a motion or of its source.
-        val: percent of all names that are held out for validation.
-        test: percent of all names that are held out for testing.
+        val: percentage of all names that are held out for validation.
+        test: percentage of all names that are held out for testing.
     """
     share = (name_hash(name) >> 128) % 100
     return "train" if share < 100 - val - test else "val" if share < 100 - test else "test"
@@ -202,8 +242,8 @@ def hashed_split(name: str, val: int, test: int) -> Split:
 def split_blocks(name: str, clips: int, size: int, *, val: float, test: float) -> dict[int, Split]:
     """Returns the split of each block of `size` consecutive clips, drawn by a hash of `name`.
 
-    Neighboring clips may look alike, so that a block is never divided between splits. `val` and
-    `test` are shares of the blocks; each gets at least one block.
+    Neighboring clips may look alike, so a block is never divided between splits. `val` and `test`
+    are fractions of the blocks; each split gets at least one block.
     """
     count = math.ceil(clips / size)
     blocks = sorted(range(count), key=lambda block: name_hash(f"{name}_{block}"))
@@ -215,7 +255,7 @@ def split_blocks(name: str, clips: int, size: int, *, val: float, test: float) -
 
 
 def swap_sides(text: str) -> str:
-    """Swaps left and right, clockwise and counterclockwise in a text."""
+    """Swaps left with right, and clockwise with counterclockwise, in a text."""
     pairs = {"left": "right", "right": "left", "clockwise": "counterclockwise"}
     pairs |= {"counterclockwise": "clockwise", "anticlockwise": "clockwise"}
 

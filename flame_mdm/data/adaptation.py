@@ -1,5 +1,6 @@
-"""Data of an adaptation: each batch holds clips of the user and clips of what the model knows,
-half and half.
+"""Data for adaptation: one half of each batch are the user's clips.
+
+The other half are clips of motions that the model knows already.
 """
 
 from collections.abc import Iterator
@@ -25,25 +26,23 @@ DRIFT = 0.05
 """Maximum rise of the floor, in meters, from the first to the last second of a clip."""
 FLOAT = 0.1
 """Maximum median height of the body above the floor, in meters."""
-# Maximum number of clips per split that keep what the model knows. They are evenly spaced in its
-# data.
+# Maximum number of known clips per split. They are evenly spaced in the model's data.
 PRIOR = {
     "train": 2000,
     "val": 64,
 }
-KEPT = "prior/"  # beginning of the names of these clips
+KEPT = "prior/"  # prefix of the names of the known clips
 
 
 class Lesson(MotionSource):
-    """Clips of the user's folder, with mirrored copies, and clips of a store of what the model
-    knows.
+    """Clips of the user's folder, with mirrored copies, and clips of what the model knows.
 
     All clips of the folder are for training unless its table says otherwise. They are normalized
     with the statistics of the store. A caption in the folder becomes "CAPTION in NAME style".
 
     Args:
         path: the user's folder of motions.
-        prior: folder of the store of what the model knows.
+        prior: folder of the store with the known clips.
         motion: "joints" for representations of joint positions, "smpl" for representations of
             rotations.
     """
@@ -56,11 +55,11 @@ class Lesson(MotionSource):
 
     @cached_property
     def store(self) -> Store:
-        """The store of what the model knows."""
+        """The store with the known clips."""
         return Store(self.prior)
 
     def kept(self) -> list[Entry]:
-        """Returns the clips that keep what the model knows, at most `PRIOR` per split."""
+        """Returns the known clips, at most `PRIOR` per split."""
         kept: list[Entry] = []
         for split, most in PRIOR.items():
             clips = [clip for clip in self.store.clips if clip.split == split]
@@ -69,8 +68,9 @@ class Lesson(MotionSource):
         return kept
 
     def count(self) -> int:
-        """Returns the number of clips; puts the user's clips into training unless their table
-        names a split.
+        """Returns the number of clips.
+
+        Puts the user's clips into the training split unless their table names a split.
         """
         self.folder.splits = {
             name: note.split or "train" for name, note in self.folder.notes.items()
@@ -78,18 +78,22 @@ class Lesson(MotionSource):
         return self.folder.count() + len(self.kept())
 
     def suit(self, representation: Representation) -> None:
-        """Fits the user's clips to a representation; the clips of the store are features already."""
+        """Fits the user's clips to a representation.
+
+        The clips of the store are features already.
+        """
         self.folder.suit(representation)
 
     def statistics(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns mean and std (D,) of the store, which the model was trained with."""
+        """Returns the mean and std (D,) of the store. The model was trained with them."""
         return self.store.mean, self.store.std
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        """Yields the user's clips with their style in the captions, then the clips of the store.
+        """Yields the user's clips, with their style in the captions, then the clips of the store.
 
-        Raises `UserError` if any motion of the user cannot be read: of a few clips, none is left
-        out.
+        Raises:
+            UserError: If one of the user's motions cannot be read. There are only a few, so none
+                is left out.
         """
         for clip in self.folder.clips(fps):
             yield replace(clip, captions=[styled(caption, self.name) for caption in clip.captions])
@@ -101,15 +105,17 @@ class Lesson(MotionSource):
 
 
 def styled(caption: str, name: str) -> str:
-    """Returns the caption that a clip of the style `name` has in training."""
+    """Returns the caption of a clip of the style `name` in training."""
     return f"{caption.rstrip(' .')} in {name} style"
 
 
 def check_clips(path: str | Path, fps: float) -> None:
-    """Raises `UserError` if a motion in a folder cannot be read, its floor rises, or its body
-    floats.
+    """Checks the motions in a folder before training.
 
     Prints the skeletons of the motions, and what was left out of them.
+
+    Raises:
+        UserError: If a motion cannot be read, its floor rises, or its body floats.
     """
     folder = Folder(str(path))
     faults = [
@@ -124,15 +130,16 @@ def check_clips(path: str | Path, fps: float) -> None:
 
 
 def fault_of(joints: np.ndarray, fps: float) -> str:
-    """Returns how far the floor of a clip rises or its body floats; "" within `DRIFT` and
-    `FLOAT`.
+    """Returns how far the floor of a clip rises or its body floats.
+
+    The result is "" within the limits `DRIFT` and `FLOAT`.
 
     Args:
         joints: (F, J, 3) in meters, y up.
         fps: frames per second.
     """
-    # The floor at a time is the lowest joint within a second around it. A jump is shorter than
-    # that, so that it does not lift the floor. Height 0 is the lowest joint of the whole clip.
+    # The floor at a time is the lowest joint within a window of one second. A jump is shorter, so
+    # it does not lift the floor. Height 0 is the lowest joint of the whole clip.
     floor = minimum_filter1d(joints[..., 1].min(1), round(fps), mode="nearest")
     rise, height = floor[-1] - floor[0], np.median(floor) - floor.min()
     if rise > DRIFT:
@@ -147,7 +154,7 @@ class LessonBatches(Sampler[list[Draw]]):
 
     Args:
         rows: for each stream, the indices of its clips in the data set.
-        streams: batches of indices into these rows.
+        streams: batches of indices into `rows`.
     """
 
     def __init__(self, rows: list[np.ndarray], streams: list[TrainingBatches]):
@@ -163,12 +170,10 @@ class LessonBatches(Sampler[list[Draw]]):
 
 
 class LessonData(MotionDataModule):
-    """Serves a `Lesson`: one half of each batch shows the user's clips, the other half what the
-    model knows.
-    """
+    """Serves a `Lesson`: half of each batch are the user's clips, half are known clips."""
 
     def halves(self) -> list[np.ndarray]:
-        """Returns the indices of the user's training clips, and the indices of the others."""
+        """Returns the indices of the user's training clips, and the indices of the known ones."""
         is_kept = np.array([clip.id.startswith(KEPT) for clip in self.train.clips])
         if is_kept.all():
             raise UserError(

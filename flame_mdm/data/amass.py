@@ -1,7 +1,7 @@
-"""Reader of AMASS (SMPL+H G release), from the downloaded archives or from unpacked folders.
+"""Reader of AMASS (SMPL+H G release), from downloaded archives or unpacked folders.
 
-Mahmood et al., "AMASS: Archive of Motion Capture as Surface Shapes", ICCV 2019; license at
-amass.is.tue.mpg.de.
+Source: Mahmood et al., "AMASS: Archive of Motion Capture as Surface Shapes", ICCV 2019. The
+license is at amass.is.tue.mpg.de.
 """
 
 from __future__ import annotations
@@ -61,8 +61,10 @@ class Recording(NamedTuple):
     def every(self, fps: float) -> Recording:
         """Returns every int(self.fps / fps)-th frame, as HumanML3D and FLAME do.
 
-        Recordings at 59.94 or 250 Hz then have about `fps` frames per second. Raises `UserError`
-        if the recording is slower than `fps`.
+        Recordings at 59.94 or 250 Hz then have about `fps` frames per second.
+
+        Raises:
+            UserError: If the recording is slower than `fps`.
         """
         step = int(self.fps / fps)
         if step < 1:
@@ -72,23 +74,23 @@ class Recording(NamedTuple):
         return self.cut(slice(None, None, step))
 
     def cut(self, frames: slice) -> Recording:
-        """Returns the frames of a slice, with the same body."""
+        """Returns a slice of the frames, with the same body."""
         return self._replace(poses=self.poses[frames], translation=self.translation[frames])
 
     def parameters(self) -> np.ndarray:
-        """Returns (F, 75) float32: translation, and axis-angle vectors of the 24 joints that
-        FLAME uses.
+        """Returns the parameters of FLAME, (F, 75) float32.
+
+        They are the translation and the axis-angle vectors of 24 joints.
         """
         return np.concatenate([self.translation, self.poses[:, :72]], 1).astype(np.float32)
 
 
 def key_of(path: str) -> str | None:
-    """Returns the key of a recording, such as `BioMotionLab_NTroje/rub001/0000_x_poses`; None
-    outside a subset.
+    """Returns the key of a recording, such as `BioMotionLab_NTroje/rub001/0000_x_poses`.
 
-    All names of a subset give the same key, in index files, archives and folders, nested or not.
-    Case is ignored, and spaces are underscores, as in later releases. A file of the SMPL-X
-    release has the key of the SMPL+H file.
+    Returns None if the path is in no subset. All names of a subset give the same key, in index
+    files, archives and folders, nested or not. Case is ignored, and spaces become underscores, as
+    in later releases. A file of the SMPL-X release has the key of the SMPL+H file.
     """
     whole = PurePosixPath(path).with_suffix("")
     for folder in whole.parents:
@@ -106,7 +108,7 @@ def read(file: Path | bytes, name: str) -> Recording:
         name: name of the file in error messages.
 
     Raises:
-        UserError: if the file is not a motion of the SMPL+H G release, or a number is not finite.
+        UserError: If the file is not a motion of the SMPL+H G release, or a number is not finite.
     """
     names = ("poses", "trans", "betas", "gender", "mocap_framerate")
     with naming(name, ValueError), naming(name, KeyError, prefix=f"{RELEASE}: it lacks "):
@@ -140,13 +142,13 @@ class Amass:
 
     @cached_property
     def files(self) -> dict[str, Path]:
-        """Key of each unpacked recording -> its file."""
+        """The file of each unpacked recording, by key."""
         paths = required(self.root, GET_IT).rglob("*.npz")
         return {key: path for path in paths if (key := key_of(str(path.relative_to(self.root))))}
 
     @cached_property
     def archives(self) -> dict[str, Path]:
-        """Subset -> its archive, recognized by the file name."""
+        """The archive of each subset, recognized by its file name."""
         paths = ((path, ARCHIVE.fullmatch(path.name)) for path in sorted(self.root.rglob("*.tar*")))
         return {
             subset: path
@@ -155,8 +157,9 @@ class Amass:
         }
 
     def missing(self, keys: Collection[str]) -> list[str]:
-        """Returns one line per subset with missing recordings. Archives are not opened, so that
-        their contents are not checked.
+        """Returns one line per subset with missing recordings.
+
+        Archives are not opened, so their contents are not checked.
         """
         lines = []
         for subset, of_subset in groupby(sorted(keys), _subset_of):
@@ -179,18 +182,19 @@ class Amass:
         function: Callable[[Argument, Recording], Result],
         workers: int = 0,
     ) -> Iterator[tuple[str, Result]]:
-        """Applies a function to recordings in worker processes and yields (key, result), sorted
-        by key.
+        """Applies a function to recordings in worker processes.
+
+        Yields (key, result), sorted by key.
 
         Args:
-            arguments: key of each recording -> argument of the function. Keys and arguments must
-                be picklable.
-            function: called as `function(argument, recording)`; must be picklable.
+            arguments: argument of the function by the key of the recording. Keys and arguments
+                must be picklable.
+            function: called as `function(argument, recording)`. It must be picklable.
             workers: number of processes; 0 = one per core.
         """
         self.check(arguments)
-        # A task is a single recording or, for subsets that are not unpacked, a whole archive,
-        # which can only be read from its beginning.
+        # A task is a single recording. If a subset is not unpacked, a task is its whole archive,
+        # which can only be read from the beginning.
         tasks: list[tuple[Path, dict[str, Argument]]] = []
         for subset, keys in groupby(sorted(arguments), _subset_of):
             of_subset = {key: arguments[key] for key in keys}
@@ -198,7 +202,7 @@ class Amass:
                 tasks += [(self.files[key], {key: argument}) for key, argument in of_subset.items()]
             else:
                 tasks.append((self.archives[subset], of_subset))
-        # An archive takes minutes, so that this process must not work on one before the others
+        # An archive takes minutes. Therefore this process does not work on one before the workers
         # start.
         for results in in_order(
             partial(_run, function), tasks, min(workers or cores(), len(tasks))
@@ -228,7 +232,7 @@ def _run(
 
 
 def _members(archive: Path, keys: Collection[str]) -> Iterator[tuple[str, str, bytes]]:
-    """Yields key, name and content of recordings in an archive."""
+    """Yields the key, name and content of recordings in an archive."""
     left = set(keys)
     for name, content in archives.members(
         archive, lambda name: name.endswith(".npz") and key_of(name) in left

@@ -1,4 +1,7 @@
-"""Reader of zip and tar archives of motion data: regular files only, with size limits."""
+"""Reader of zip and tar archives of motion data.
+
+It reads only regular files, with size limits.
+"""
 
 import bz2
 import gzip
@@ -25,7 +28,7 @@ from flame_mdm.safe_io import (
 )
 
 MEMBER_LIMIT = 512 * MEBIBYTE
-"""Maximum size of one unpacked member in bytes. Motions, captions and arrays are far smaller."""
+"""Maximum size of an unpacked member in bytes. Motions, captions and arrays are far smaller."""
 HEADER_LIMIT = MEBIBYTE // 16
 """Maximum size in bytes of a tar header that describes the next member."""
 _UNPACKERS = {b"\x1f\x8b": gzip.open, b"BZ": bz2.open, b"\xfd7zXZ": lzma.open}
@@ -38,9 +41,8 @@ def members(path: Path, is_wanted: Callable[[str], bool]) -> Iterator[tuple[str,
     """Yields names and contents of the wanted files in a zip or tar archive.
 
     Raises:
-        UserError: if the archive is damaged, expands disproportionately or has too many members,
-            or if a
-            wanted file is a link, sparse or encrypted.
+        UserError: If the archive is damaged, expands disproportionately or has too many members.
+            Also if a wanted file is a link, sparse or encrypted.
     """
     size = regular_file(path)
     with path.open("rb") as file:
@@ -58,11 +60,13 @@ def members(path: Path, is_wanted: Callable[[str], bool]) -> Iterator[tuple[str,
 
 
 def as_folder(path: Path, owner: object, is_wanted: Callable[[str], bool]) -> Path:
-    """Returns a folder for a path: the folder itself, or a temporary one with the `members` of an
-    archive.
+    """Returns a path that is a folder, or a temporary folder with the `members` of an archive.
 
-    The temporary folder is removed together with `owner`. Returns the deepest folder that
-    contains all members. Also raises `UserError` if the name of a member leads out of the folder.
+    The temporary folder is removed together with `owner`. Its deepest folder that contains all
+    members is returned.
+
+    Raises:
+        UserError: As `members`, and if the name of a member leads out of the folder.
     """
     if not path.is_file():
         return path
@@ -91,7 +95,7 @@ def _zip_members(
             name = info.filename
             if not name:  # `zipfile` cuts names at a null character
                 raise UserError("a file without a name")
-            # macOS adds a folder __MACOSX with attributes of the files.
+            # macOS adds a folder __MACOSX with attributes of the files
             if not info.is_dir() and "__MACOSX" not in name and is_wanted(name):
                 check_member(info)
                 _check_size(name, info.file_size)
@@ -119,8 +123,8 @@ def _tar_members(
                     )
                 _check_size(member.name, member.size)
                 yield member.name, archive.extractfile(member).read()
-            archive.members = []  # a million empty members take a gigabyte
-            archive.pax_headers = {}  # values for all members, which each of them would copy
+            archive.members = []  # otherwise, a million empty members would take a gigabyte
+            archive.pax_headers = {}  # otherwise, each member would copy these shared values
 
 
 def _check_size(name: str, size: int) -> None:
@@ -129,7 +133,7 @@ def _check_size(name: str, size: int) -> None:
 
 
 class _Member(tarfile.TarInfo):
-    """A tar member that refuses large headers and sparse files before their content is read."""
+    """A tar member. It refuses large headers and sparse files before their content is read."""
 
     def _proc_member(self, archive: tarfile.TarFile) -> Any:
         if self.type == tarfile.GNUTYPE_SPARSE:
@@ -143,19 +147,20 @@ class _Member(tarfile.TarInfo):
 
 
 class _Bounded:
-    """Reader of the unpacked content of a compressed file of `packed` bytes; refuses implausibly
-    much content.
+    """Reader of the content of a compressed file of `packed` bytes.
+
+    It refuses implausibly much.
     """
 
     def __init__(self, file: IO[bytes], packed: int):
         self.file, self.packed, self.total, self.ended = file, packed, 0, 0
 
     def read(self, size: int) -> bytes:
-        """Returns up to `size` bytes; raises `EOFError` if a reader goes on past the end."""
+        """Returns up to `size` bytes. Raises `EOFError` if a reader continues past the end."""
         data = self.file.read(size)
         self.total += len(data)
         self.ended += not data
-        # Without this, tarfile reads on until the end of a member, whose header may declare any
+        # Otherwise, tarfile would read until the end of a member, and a header may declare any
         # size.
         if self.ended > 2:
             raise EOFError("it ends too early")

@@ -1,7 +1,7 @@
-"""BABEL: time-stamped action labels on the motions of AMASS, cut into clips as FLAME does.
+"""BABEL: action labels with times on AMASS's motions, cut into clips as in FLAME's code.
 
-Punnakkal et al., "BABEL: Bodies, Action and Behavior with English Labels", CVPR 2021; Kim et al.
-(FLAME), AAAI 2023, appendix "BABEL". `docs/babel.md` describes the set.
+Sources: Punnakkal et al., "BABEL: Bodies, Action and Behavior with English Labels", CVPR 2021; Kim
+et al. (FLAME), AAAI 2023, appendix "BABEL". `docs/babel.md` describes the data set.
 """
 
 import math
@@ -20,11 +20,11 @@ from flame_mdm.progress import ProgressBar
 from flame_mdm.safe_io import naming, read_json
 
 FPS = 20.0
-LENGTH, STRIDE = 128, 10  # frames of a clip, and between the windows of a label
+LENGTH, STRIDE = 128, 10  # number of frames of a clip, and between windows of the same label
 Segment = tuple[str, list[str] | None, float | None, float | None]  # words, categories, start, end
 GET_IT = "BABEL v1.0 is published at https://babel.is.tue.mpg.de: unpack it, then run `make prepare SOURCE=/path/to/it`"
 
-# Files of each part. In the files called extra, only the labels of the first annotator are used.
+# Files of each part. In files called extra, only the labels of the first annotator are used.
 PARTS = {
     "train": ("train", "extra_train"),
     "val": ("val", "extra_val"),
@@ -32,17 +32,17 @@ PARTS = {
 
 
 class Label(NamedTuple):
-    """One text for one segment of a motion."""
+    """A text for a segment of a motion."""
 
     motion: str  # key of the AMASS recording, as returned by `amass.key_of`
     text: str
-    start: float | None  # seconds, like `end`; None if BABEL gives no times
+    start: float | None  # in seconds, like `end`; None if BABEL states no times
     end: float | None
-    kind: Literal["words", "category"]  # the annotator's words or the category of the action
+    kind: Literal["words", "category"]  # the annotator's words, or the category of the action
 
 
 class Window(NamedTuple):
-    """A clip: frames of a motion, beginning at `start`; `id` contains FLAME's number in the part."""
+    """A clip: consecutive frames of a motion. `id` contains FLAME's number in the part."""
 
     id: str
     split: Split
@@ -51,16 +51,16 @@ class Window(NamedTuple):
 
 
 class Babel(MotionSource):
-    """Clips of `LENGTH` frames, as raw motions of the SMPL representations, in AMASS's
-    coordinates.
+    """Clips of `LENGTH` frames, as raw motions of the SMPL representations.
 
-    A label covers frames floor(20 start) to floor(20 end) - 1, as in FLAME's code. A label longer
-    than a clip gives one window every `STRIDE` frames. A shorter label is extended past its end;
-    it is left out if the motion ends before.
+    They are in AMASS's coordinates. As in FLAME's code, a label covers the frames floor(20 start)
+    to floor(20 end) - 1. If a label is longer than a clip, it gives one window every `STRIDE`
+    frames. If it is shorter, the clip continues past its end. The label is left out if the motion
+    ends before the clip.
 
     Both splits train on BABEL's entire train part and test on 20 % of its val part. Our split
-    draws 20 % of the motions, so that no motion is in two splits. FLAME's split takes every fifth
-    clip, so that overlapping windows are in both val and test.
+    draws 20 % of the motions, so no motion is in two splits. FLAME's split takes every fifth
+    clip, so overlapping windows are in both val and test.
 
     Args:
         path: folder of BABEL v1.0.
@@ -88,7 +88,7 @@ class Babel(MotionSource):
         return len(self.windows)
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        """Yields the clips, motion by motion, with the attributes `motion`, `start` and `label`."""
+        """Yields the clips of each motion, with the attributes `motion`, `start` and `label`."""
         self.check_fps(fps, FPS)
         windows: defaultdict[str, list[Window]] = defaultdict(list)
         for window in self.windows:
@@ -109,7 +109,7 @@ class Babel(MotionSource):
 
     @cached_property
     def windows(self) -> list[Window]:
-        """All clips in FLAME's order; reads the labels and the lengths of the motions."""
+        """All clips in FLAME's order. Reads the labels and the lengths of the motions."""
         labels = {part: self.labels(part) for part in PARTS}
         keys = dict.fromkeys(label.motion for part in PARTS for label in labels[part])
         measured = self.amass.map(keys, _measure, self.workers)
@@ -136,14 +136,14 @@ class Babel(MotionSource):
     def labels(self, part: str) -> list[Label]:
         """Returns the labels of a part ("train" or "val") in FLAME's order.
 
-        For each file, the words of the annotators come first, then the categories. Empty and
-        repeated labels (same text, motion, start and end) are dropped.
+        For each file, the annotators' words come first, then the categories. Empty and repeated
+        labels (same text, motion, start and end) are dropped.
         """
         labels = []
         for name in PARTS[part]:
             words, categories = [], []
             for motion, (text, kinds, start, end) in self._annotations(self.path / f"{name}.json"):
-                # FLAME's code drops the words of a label whose list of categories is empty.
+                # FLAME's code drops the words of a label with an empty list of categories.
                 if kinds is None or kinds:
                     words.append(Label(motion, text, start, end, "words"))
                 categories += [Label(motion, kind, start, end, "category") for kind in kinds or ()]
@@ -178,9 +178,7 @@ class Babel(MotionSource):
 
 
 def _segment(label: dict[str, Any]) -> Segment:
-    """Returns the fields of a label that are used; raises `TypeError` if a field has another
-    type.
-    """
+    """Returns the used fields of a label. Raises `TypeError` if a field has another type."""
     text, kinds, times = label["proc_label"], label["act_cat"], (label["start_t"], label["end_t"])
     are_texts = all(isinstance(value, str | None) for value in (text, *(kinds or ())))
     if not are_texts or not all(time is None or -1e6 < time < 1e6 for time in times):
@@ -189,8 +187,9 @@ def _segment(label: dict[str, Any]) -> Segment:
 
 
 def _starts(label: Label, frames: int) -> tuple[range, str]:
-    """Returns the first frame of each clip of a label in a motion of `frames` frames, or why
-    there is none.
+    """Returns the first frame of each clip of a label, or why the label gives no clip.
+
+    `frames` is the number of frames of the motion.
     """
     none = range(0)
     if label.text == "transition":

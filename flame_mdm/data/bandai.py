@@ -1,7 +1,7 @@
-"""The Bandai-Namco-Research-Motiondataset 1 and 2: 3,077 takes of three actors, 25 contents in 19 styles.
+"""The Bandai-Namco-Research-Motiondataset 1 and 2: 3,077 takes of three actors.
 
-Kobayashi et al., arXiv 2306.08861, 2023; CC BY-NC 4.0. `docs/bandai.md` describes the set and how
-it is prepared.
+The actors perform 25 contents in 19 styles. Source: Kobayashi et al., arXiv 2306.08861, 2023;
+CC BY-NC 4.0. `docs/bandai.md` describes the data set and its preparation.
 """
 
 import re
@@ -38,15 +38,17 @@ JOINTS = {
     name: joint if isinstance(joint := _MAP[name], str) else next(iter(joint))
     for name in SMPL22.joints
 }
-"""The joint of the files for each joint of SMPL, in the order of SMPL; spine1 lies between Hips and Spine."""
+"""The joint of the files for each joint of SMPL, in order. spine1 is between Hips and Spine."""
 
 _LEFT, _UP, _FORWARD = np.eye(3)
-_TOES = np.array([np.sin(0.153), 0.0, np.cos(0.153)])  # where SMPL's left foot points
+_TOES = np.array([np.sin(0.153), 0.0, np.cos(0.153)])  # direction of SMPL's left foot
 
 
 def _axes(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Returns orthonormal columns: the direction of x, the part of y that is perpendicular to x,
-    and their cross product.
+    """Returns orthonormal columns.
+
+    They are the direction of x, the part of y that is perpendicular to x, and their cross
+    product.
     """
     first = x / np.linalg.norm(x)
     third = np.cross(first, y) / np.linalg.norm(np.cross(first, y))
@@ -54,7 +56,10 @@ def _axes(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def _limb(name: str, bone: Sequence[float] | np.ndarray, y: np.ndarray) -> dict[str, np.ndarray]:
-    """Returns the axes of a joint of the left limb, and, mirrored, of the right limb, whose bone lies on -x."""
+    """Returns the axes of a joint of the left limb and, mirrored, of the right limb.
+
+    In the right limb, the bone points along -x.
+    """
     left = _axes(np.asarray(bone), y)
     return {f"{name}_L": left, f"{name}_R": np.diag([1.0, -1.0, -1.0]) @ left}
 
@@ -65,7 +70,7 @@ def _sloping(degrees: float) -> np.ndarray:
 
 # Directions of each joint's local axes (columns) when the body is in SMPL's rest pose: standing
 # straight, feet flat, arms out, palms down. In this pose, all rotations of SMPL are the identity.
-# The bones of arms and legs lie on x and have the directions of SMPL's rest pose; knees and
+# The bones of arms and legs lie on x and have the directions of SMPL's rest pose. Knees and
 # elbows bend about y. `docs/bandai.md` explains how the axes were measured.
 REST = {
     "Hips": _axes(_UP, -_LEFT),
@@ -79,16 +84,18 @@ REST = {
     **_limb("Foot", _sloping(39.8), np.cross(_UP, _TOES)),
     **_limb("Toes", _sloping(23.0), np.cross(_UP, _TOES)),
 }
-# Swaps y up and AMASS's z up: (-x, z, y). The SMPL representation swaps them again when it
-# decodes.
+# Converts between y up and AMASS's z up: (-x, z, y). The SMPL representation converts back when
+# it decodes.
 AXES = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
 
 WORDS = read_yaml(Path(__file__).with_suffix(".yaml"))  # contents, styles and captions
 CONTENTS_1, STYLES_1 = tuple(WORDS["dataset_1"]["contents"]), tuple(WORDS["dataset_1"]["styles"])
 STYLES_2 = tuple(WORDS["dataset_2"]["styles"])
 TAKES_2: dict[str, list[int]] = WORDS["dataset_2"]["takes"]
-"""Numbers of published takes of data set 2 by content, in the order of `STYLES_2`. Splits are drawn from these
-numbers, so that they do not depend on which files are present."""
+"""Numbers of published takes of data set 2, by content in the order of `STYLES_2`.
+
+Splits are drawn from these numbers, so they do not depend on which files are present.
+"""
 
 WRONG_SIDE, SIDES = WORDS["wrong_side"], WORDS["sides"]
 HELD_OUT = frozenset(
@@ -108,8 +115,8 @@ FILE = re.compile(r"dataset-([12])_([^_]+)_([^_]+)_(\d+)\.bvh")
 class Take(NamedTuple):
     """One BVH file.
 
-    `content` is the action that the actor performs. It differs from the file name for the takes
-    in `WRONG_SIDE`.
+    `content` is the action that the actor performs. In the takes in `WRONG_SIDE`, it differs from
+    the file name.
     """
 
     file: Path
@@ -120,20 +127,19 @@ class Take(NamedTuple):
 
 
 class Bandai(MotionSource):
-    """Both data sets on SMPL's skeleton, with captions generated from content and style.
+    """Both data sets on SMPL's skeleton. Captions are generated from content and style.
 
     Args:
-        path: a clone of the original repository, any folder above the BVH files, or an archive of
-            one.
+        path: a clone of the original repository, a folder that contains the BVH files at any
+            depth, or an archive of such a folder.
         motion: "joints" for representations of joint positions, "smpl" for representations of
             rotations.
         mirror: whether a mirrored copy follows each clip of the training split.
         workers: number of processes; 0 = one per core.
-        exclude: file names, without extension, of takes to leave out.
+        exclude: file names of takes to leave out, without extension.
         split: "takes" holds out takes of combinations of content and style that training sees.
-            "compositional" holds out the combinations `HELD_OUT`: training sees their contents
-                and styles
-            only in other combinations.
+            "compositional" holds out the combinations `HELD_OUT`: in training, their contents and
+            styles occur only in other combinations.
     """
 
     name = "bandai"
@@ -164,12 +170,12 @@ class Bandai(MotionSource):
         return sum(1 + (self.mirror and take.split == "train") for take in self.takes)
 
     def counts(self) -> dict[str, int]:
-        """Returns the numbers of takes, together and per data set."""
+        """Returns the numbers of takes, in total and per data set."""
         one, two = ([take.dataset for take in self.takes].count(number) for number in (1, 2))
         return {"takes": one + two, "takes of data set 1": one, "takes of data set 2": two}
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        """Yields each take, in training followed by its mirrored copy.
+        """Yields each take. In the training split, its mirrored copy follows.
 
         The attributes are content, style, dataset and, if a side moves, side.
         """
@@ -218,7 +224,7 @@ def convert(file: Path, fps: float, kind: str = "joints") -> np.ndarray:
         kind: "joints", or "smpl" for the motion (F, 75) of `smpl_motion`.
 
     Raises:
-        UserError: if the file has another skeleton, or a joint jumps.
+        UserError: If the file has another skeleton, or a joint jumps.
     """
     recording = read_recording(file, fps, standard=_standard)
     if recording.doubts.jump:
@@ -239,7 +245,7 @@ def _standard(tree: bvh.Bvh) -> tuple[bvh.Bvh, dict[str, Any]]:
 def smpl_motion(skeleton: bvh.Bvh, rotations: np.ndarray, translations: np.ndarray) -> np.ndarray:
     """Converts a take to an SMPL motion (F, 75) float32 in AMASS's axes, z up.
 
-    A frame holds the position of the pelvis in meters and the axis-angle vectors of 24 joints.
+    A frame contains the position of the pelvis in meters and the axis-angle vectors of 24 joints.
     The hands (22 and 23) do not rotate.
 
     Args:
@@ -247,9 +253,9 @@ def smpl_motion(skeleton: bvh.Bvh, rotations: np.ndarray, translations: np.ndarr
         rotations: (F, J, 3, 3), each in the frame of the parent joint.
         translations: (F, J, 3) in centimeters, each in the frame of the parent joint.
     """
-    # A joint of SMPL has the same parent as in the file, except spine1: it lies between two
-    # joints of the file and rotates with the pelvis. So a rotation R of the file only needs the
-    # axes B of the rest pose to become a rotation of SMPL: B_parent R B_joint^-1.
+    # A joint of SMPL has the same parent as in the file. The exception is spine1: it is between
+    # two joints of the file and rotates with the pelvis. Therefore a rotation R of the file
+    # becomes a rotation of SMPL with the axes B of the rest pose: B_parent R B_joint^-1.
     positions, turned = bvh.forward_kinematics(skeleton.parents, rotations, translations)
     local = np.tile(np.eye(3), (len(rotations), 24, 1, 1))
     hips = skeleton.joints.index("Hips")
@@ -275,15 +281,16 @@ def mirror(motion: np.ndarray) -> np.ndarray:
 
 
 def side_of(content: str) -> str:
-    """Returns the side that moves or that the body moves to: left, right or both; "" if a content
-    has none.
+    """Returns the side that moves or that the body moves to: left, right or both.
+
+    The result is "" if a content has no side.
     """
     named = re.search("left|right|both", content)
     return named[0] if named else SIDES.get(content, "")
 
 
 def captions(content: str, style: str, side: str) -> list[str]:
-    """Returns four captions of a take, worded like the captions of HumanML3D."""
+    """Returns four captions of a take, phrased like the captions of HumanML3D."""
     contents, styles = WORDS["contents"], WORDS["styles"]
     phrases = zip(contents[re.sub("left|right", "{side}", content)], styles[style], strict=True)
     filled = (
@@ -293,14 +300,14 @@ def captions(content: str, style: str, side: str) -> list[str]:
 
 
 def split_of(dataset: int, content: str, style: str, number: int, rule: str = "takes") -> Split:
-    """Returns the split of a take, which depends on its name alone.
+    """Returns the split of a take. It depends only on the take's name.
 
-    Neighboring takes look alike, so that blocks of five stay in one split. Data set 1 has a
-    single take of most combinations, so that a whole combination goes to one split. The normal
-    takes of walk-turn-left and -right overlap in time across names and are all used for training.
+    Neighboring takes look alike, so blocks of five stay in one split. Data set 1 has only one
+    take of most combinations, so a whole combination goes to one split. The normal takes of
+    walk-turn-left and -right overlap in time across names. All of them are used for training.
 
-    With the rule "compositional", the combinations `HELD_OUT` are the test split, and takes that
-    the rule "takes" tests on are used for training.
+    With the rule "compositional", the combinations `HELD_OUT` are the test split. Other takes
+    that the rule "takes" would test on are used for training.
     """
     if rule == "compositional":
         if (content, style) in HELD_OUT:
@@ -332,7 +339,8 @@ def _take(file: Path, rule: str) -> Take:
 
 
 def prompts() -> list[str]:
-    """Returns fixed prompts worded like the captions. The recipes of this data set show samples
-    for them.
+    """Returns fixed prompts, phrased like the captions.
+
+    The recipes of this data set show samples for these prompts.
     """
     return WORDS["prompts"]

@@ -1,4 +1,4 @@
-"""Rest poses of SMPL and SMPL+H from their licensed model files, which users download."""
+"""Rest poses of SMPL and SMPL+H. They are read from licensed model files that users download."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,9 +22,8 @@ def load_offsets(path: Path) -> tuple[tuple[float, float, float], ...]:
     The body is the mean shape in the rest pose.
 
     Args:
-        path: SMPL's .pkl from https://smpl.is.tue.mpg.de, of which no code is run, or an .npz
-            file with the
-            same arrays.
+        path: SMPL's .pkl from https://smpl.is.tue.mpg.de, or an .npz file with the same arrays.
+            No code in the .pkl is run.
     """
     with naming(
         path, KeyError, TypeError, IndexError, ValueError, prefix="not a SMPL model of 24 joints: "
@@ -47,8 +46,10 @@ def load_offsets(path: Path) -> tuple[tuple[float, float, float], ...]:
 def _rest_joints(
     regressor: Any, vertices: Any, tree: Any, joints: int, parents: tuple[int, ...]
 ) -> np.ndarray:
-    """Returns the rest joints (J, 3) of a model; raises `ValueError` if its first joints do not
-    have `parents`.
+    """Returns the rest joints (J, 3) of a model.
+
+    Raises:
+        ValueError: If its first joints do not have `parents`.
     """
     regressor, vertices = np.asarray(regressor, np.float64), np.asarray(vertices, np.float64)
     numbers = np.asarray(tree)[0, 1 : len(parents)].tolist()
@@ -67,19 +68,20 @@ def _rest_joints(
 
 
 class Body(NamedTuple):
-    """The first 22 rest joints of SMPL+H as a function of the shape, in meters.
+    """The first 22 rest joints of SMPL+H as a function of the body's shape, in meters.
 
     Args:
         rest: (22, 3), joints of the mean shape.
-        shape: (22, 3, 10), displacement of the joints per beta.
+        shape: (22, 3, 10), displacement of the joints per unit of each beta.
     """
 
     rest: torch.Tensor
     shape: torch.Tensor
 
     def joints(self, recording: Recording) -> np.ndarray:
-        """Returns joints (F, 22, 3) float64 of a recording in meters, y up as in HumanML3D:
-        AMASS's (-x, z, y).
+        """Returns the joints (F, 22, 3) float64 of a recording in meters.
+
+        As in HumanML3D, y is up: AMASS's (-x, z, y).
         """
         betas = torch.from_numpy(recording.betas[:10].astype(np.float64))
         rest = self.rest + self.shape[..., : len(betas)] @ betas
@@ -93,8 +95,8 @@ class Body(NamedTuple):
 def load_body(folder: Path, gender: str) -> Body:
     """Loads the extended SMPL+H model of a gender.
 
-    The file is `male/model.npz` or `SMPLH_MALE.npz` (for "male"), in the folder or in its folder
-    `smplh`.
+    For "male", the file is `male/model.npz` or `SMPLH_MALE.npz`. It is in the folder or in the
+    subfolder `smplh`.
     """
     names = (f"{gender}/model.npz", f"SMPLH_{gender.upper()}.npz")
     candidates = [folder / inner / name for inner in ("", "smplh") for name in names]

@@ -1,4 +1,4 @@
-"""Tables of captions that users write: `captions.csv`, one line per caption."""
+"""Tables of captions that users write: `captions.csv`, with one line per caption."""
 
 import csv
 import io
@@ -12,16 +12,19 @@ from flame_mdm.safe_io import naming, read_text
 
 TABLE = "captions.csv"
 COLUMNS = ("id", "text", "action", "split", "source", "license")
-SPLITTABLE = 10  # with this number of motions, each split has at least one
+SPLITTABLE = 10  # from this number of motions on, each split has at least one motion
 
 
 def table_rows(
     path: Path, columns: Collection[str] = COLUMNS
 ) -> Iterator[tuple[str, dict[str, str]]]:
-    """Yields the rows of a table of captions: file and line, for errors, and the cells by column.
+    """Yields the rows of a table of captions.
 
-    Raises `UserError` if the table is damaged, has no column `id`, or has a column that is not in
-    `columns`.
+    A row is its file and line, for error messages, and its cells by column.
+
+    Raises:
+        UserError: If the table is damaged, has no column `id`, or has a column that is not in
+            `columns`.
     """
     rows = csv.DictReader(
         io.StringIO(read_text(path).removeprefix("\ufeff"), newline=""), strict=True
@@ -36,13 +39,13 @@ def table_rows(
             where = f"{path}, line {rows.line_num}"
             if None in row or None in row.values():
                 raise UserError(
-                    f"{where}: not one cell per column; put texts that contain a comma in quotes"
+                    f"{where}: not one cell per column. Put texts that contain a comma in quotes"
                 )
             yield where, {name: cell.strip() for name, cell in row.items()}
 
 
 def known_split(split: str) -> Split:
-    """Returns `split` if it is the name of a split; raises `UserError` otherwise."""
+    """Returns `split` if it is the name of a split. Raises `UserError` otherwise."""
     for name in SPLITS:
         if split == name:
             return name
@@ -52,16 +55,16 @@ def known_split(split: str) -> Split:
 def drawn_splits(
     sources: Mapping[str, str], stated: Mapping[str, Split | None]
 ) -> dict[str, Split]:
-    """Returns the split of each motion: the split in the table, else one drawn by a hash of the
-    source.
+    """Returns the split of each motion: the split in the table or, without one, a drawn split.
 
-    All motions of a source stay in one split. If no motion is drawn for training, the source with
-    the highest hash moves there from the split with the most sources. With `SPLITTABLE` or more
-    motions, val and test are filled in the same manner.
+    Splits are drawn by a hash of the source, so all motions of a source are in one split. If no
+    motion is drawn for training, the split with the most sources gives its source with the
+    highest hash to training. With `SPLITTABLE` or more motions, val and test are filled in the
+    same way.
 
     Args:
-        sources: name of each motion -> its source.
-        stated: name of each motion -> its split in the table, or None.
+        sources: source of each motion, by name.
+        stated: split of each motion in the table, by name; None = not stated.
     """
     of_sources: dict[str, Split] = {sources[name]: split for name, split in stated.items() if split}
     free = sorted(set(sources.values()) - set(of_sources))

@@ -1,8 +1,8 @@
-"""The CMU motion capture database with the sentences of HumanML3D and KIT-ML, or with the user's captions.
+"""The CMU motion capture database with captions of HumanML3D and KIT-ML, or of the user.
 
-Motions: http://mocap.cs.cmu.edu, free for all uses, as ASF/AMC or converted to BVH. Captions: Guo
-et al., CVPR 2022 (HumanML3D), and Plappert et al., Big Data 2016 (KIT-ML). `docs/cmu.md` says
-what to download and what differs.
+The motions are from http://mocap.cs.cmu.edu, free for all uses, as ASF/AMC or converted to BVH.
+Captions: Guo et al., CVPR 2022 (HumanML3D), and Plappert et al., Big Data 2016 (KIT-ML).
+`docs/cmu.md` says what to download, and how the data differs from these data sets.
 """
 
 import re
@@ -34,7 +34,7 @@ from flame_mdm.safe_io import naming, read_json, read_yaml
 
 FACTS: dict[str, Any] = read_yaml(Path(__file__).with_suffix(".yaml"))
 FILE = re.compile(r"(\d{2,3}_\d{2,3})\.(amc|bvh)", re.IGNORECASE)
-# Endings of the files that are unpacked from an archive.
+# Endings of the files that are unpacked from an archive
 SUFFIXES = (
     ".amc",
     ".asf",
@@ -46,10 +46,10 @@ SUFFIXES = (
     ".zip",
 )
 RATES = (120.0, 60.0)  # frame rates of the recordings, the usual one first
-SLACK = 0.05  # durations may differ by this many seconds, one frame at 20 fps
-SHORTEST = 40  # rows of features of a clip, as in HumanML3D
-BLENDED = 3  # frames after the T-pose of a Daz-friendly file that are blended with it
-# Columns of a table of the user's captions.
+SLACK = 0.05  # tolerance of durations in seconds: one frame at 20 fps
+SHORTEST = 40  # minimum number of feature rows of a clip, as in HumanML3D
+BLENDED = 3  # number of frames after the T-pose of a Daz-friendly file that are blended with it
+# Columns of a table of the user's captions
 COLUMNS = (
     "id",
     "begin",
@@ -59,9 +59,9 @@ COLUMNS = (
     "split",
     "source",
 )
-# Assumed frames of a recording whose length is not known before it is read: more than `SHORTEST`.
+# Number of frames assumed for a recording of unknown length; any number above `SHORTEST` works
 UNKNOWN = 1000
-# The arguments `seconds`, `last` and `is_sixty` of `decide_rate`.
+# The arguments `seconds`, `last` and `is_sixty` of `decide_rate`
 Evidence = tuple[float | None, int | None, bool]
 MAP = {**LAYOUTS["CMU ASF"].map, "pelvis": "pelvis", "neck": "upperneck", "head": "face"}
 _HIP, _KNEE, _ANKLE, _HEAD = (
@@ -76,10 +76,10 @@ GET_IT = (
 
 
 class Item(NamedTuple):
-    """Captions of a part of a recording, frames `start` to `end` at 20 fps, or of an entire recording.
+    """Captions of an entire recording, or of its part from frame `start` to `end` at 20 fps.
 
-    `action` is the label of a part in `captions.csv`, which `is_own` tells from HumanML3D's and
-    KIT-ML's.
+    `action` is the label of a part in `captions.csv`. `is_own` is true for such parts, and false
+    for captions of HumanML3D and KIT-ML.
     """
 
     id: str
@@ -93,32 +93,33 @@ class Item(NamedTuple):
     is_own: bool = False
 
     def cuts(self, frames: int) -> list[Cut]:
-        """Returns what becomes a clip of the part, which has `frames` rows of features."""
+        """Returns the clips to cut from this part, which has `frames` rows of features."""
         if not self.is_own:
             return cuts(self.id, frames, self.descriptions, SHORTEST)
         return [Cut(self.id, 0, frames, self.descriptions)] if frames >= SHORTEST else []
 
 
 class CMU(MotionSource):
-    """Clips of HumanML3D, and recordings with captions of KIT-ML, on the 22 joints of SMPL; or captions of one's own.
+    """Recordings of the CMU database with captions, on the 22 joints of SMPL.
 
-    HumanML3D's clips keep their names, splits and mirrored copies. Other recordings are in the
-    test (val) split if one of its test (val) clips is cut from them, and are split by subject if
-    HumanML3D has no clip of them. If there is a table `captions.csv`, its rows are the only
-    captions. Each part of a recording in it becomes a clip.
+    These are clips of HumanML3D, recordings with captions of KIT-ML, or motions with the user's
+    captions. HumanML3D's clips keep their names, splits and mirrored copies. Another recording is
+    in the test (val) split if a test (val) clip of HumanML3D is cut from it. If HumanML3D has no
+    clip of it, the subject determines its split. If there is a table `captions.csv`, its rows are
+    the only captions. Each of its parts of a recording becomes a clip.
 
     Args:
         path: folder with recordings such as 02_01.bvh, or 02_01.amc and 02.asf, in any
-            subfolders; or an archive of it.
+            subfolders; or an archive of such a folder.
         captions: clone of HumanML3D's repository, a folder with texts, splits and index, or a
-            folder with `captions.csv`; default: `path`. KIT-ML's captions of AMASS, kitml*.json,
-            are used if they are in one of the two folders.
-        motion: "joints", or "smpl" for SMPL's rotations, computed from the joints.
+            folder with `captions.csv`. Default: `path`. KIT-ML's captions of AMASS, kitml*.json,
+            are used if they are in either folder.
+        motion: "joints", or "smpl" for SMPL's rotations, which are computed from the joints.
     """
 
     name = "cmu"
     license = "CMU"
-    version = 2  # 1: the bone from neck to head changed its length while the head nodded
+    version = 2  # in version 1, the bone from neck to head changed its length with a nod
 
     def __init__(
         self,
@@ -135,7 +136,7 @@ class CMU(MotionSource):
 
     @cached_property
     def path(self) -> Path:
-        """Folder of the recordings; an archive is unpacked into a temporary one."""
+        """Folder of the recordings. An archive is unpacked into a temporary folder."""
         return archives.as_folder(self.archive, self, lambda name: name.lower().endswith(SUFFIXES))
 
     @property
@@ -145,7 +146,10 @@ class CMU(MotionSource):
 
     @cached_property
     def files(self) -> dict[str, list[Path]]:
-        """Recording -> its files, the best first; without recordings that are known to be bad."""
+        """Files of each recording, the best first.
+
+        Recordings that are known to be bad are absent.
+        """
         files: defaultdict[str, list[Path]] = defaultdict(list)
         for path in sorted(self.path.rglob("*")):
             if match := FILE.fullmatch(path.name):
@@ -163,7 +167,7 @@ class CMU(MotionSource):
 
     @cached_property
     def table(self) -> Path | None:
-        """The table of captions of one's own, None if there is none."""
+        """The table of the user's captions; None if there is no table."""
         required(self.captions, f"it is the folder of the captions: {GET_IT}")
         path = self.captions / TABLE
         return path if path.exists() else None
@@ -172,7 +176,10 @@ class CMU(MotionSource):
     def humanml3d(
         self,
     ) -> tuple[list[IndexedClip], dict[str, list[Description]], Mapping[str, Split]]:
-        """HumanML3D's clips of CMU recordings, captions by name, and splits; empty with captions of one's own."""
+        """HumanML3D's clips of CMU recordings, captions by name, and splits.
+
+        They are empty if the user gives captions.
+        """
         if self.table:
             return [], {}, {}
         required(self.captions, f"it is the folder of the captions: {GET_IT}")
@@ -193,7 +200,10 @@ class CMU(MotionSource):
 
     @cached_property
     def kit(self) -> list[tuple[str, str, str, float]]:
-        """Id, recording, text and seconds of KIT-ML's captions of CMU recordings; empty if there is no file of them."""
+        """KIT-ML's captions of CMU recordings: id, recording, text and seconds.
+
+        The list is empty if there is no file of them.
+        """
         if self.table:
             return []
         files = [
@@ -225,7 +235,7 @@ class CMU(MotionSource):
 
     @cached_property
     def items(self) -> dict[str, list[Item]]:
-        """Recording -> what is cut from it, for all recordings that are present and have captions."""
+        """Parts to cut from each recording that is present and has captions."""
         files, (rows, texts, splits) = self.files, self.humanml3d
         items: defaultdict[str, list[Item]] = defaultdict(list)
         cut_from: defaultdict[str, set[Split]] = defaultdict(set)
@@ -267,8 +277,9 @@ class CMU(MotionSource):
         return captioned
 
     def count(self) -> int:
-        """Returns the number of clips. Recordings are not read: their lengths follow from the
-        captions.
+        """Returns the number of clips.
+
+        Recordings are not read: the captions determine the lengths of the clips.
         """
         items = [item for items in self.items.values() for item in items]
         ends = {id_: round(seconds * FPS) for id_, _, _, seconds in self.kit}
@@ -315,13 +326,13 @@ class CMU(MotionSource):
         return self._counts
 
     def findings(self) -> list[str]:
-        """Returns a line per recording that cannot be read."""
+        """Returns one line per recording that cannot be read."""
         return [f"left out: {error}" for error in self._errors]
 
 
 @dataclass
 class _Part:
-    """A part of a recording in a table of captions, frames `start` to `end` at 20 fps."""
+    """A part of a recording in a table of captions: frames `start` to `end` at 20 fps."""
 
     name: str
     trial: str
@@ -334,7 +345,10 @@ class _Part:
 
 
 def _parts(table: Path) -> dict[str, _Part]:
-    """Returns the parts of recordings in a table by name; rows of the same part are captions of one clip."""
+    """Returns the parts of recordings in a table, by name.
+
+    Rows of the same part are captions of one clip.
+    """
     parts: dict[str, _Part] = {}
     for where, cells in table_rows(table, COLUMNS):
         with naming(where):
@@ -354,7 +368,10 @@ def _parts(table: Path) -> dict[str, _Part]:
 
 
 def _own_items(parts: Mapping[str, _Part]) -> dict[str, list[Item]]:
-    """Returns recording -> its parts. Their splits are stated, or drawn by their source or else by their subject."""
+    """Returns the parts of each recording.
+
+    The table states their splits, or they are drawn by the source or, without one, the subject.
+    """
     sources = {
         name: part.source or f"CMU subject {part.trial.partition('_')[0]}"
         for name, part in parts.items()
@@ -380,7 +397,7 @@ def _own_items(parts: Mapping[str, _Part]) -> dict[str, list[Item]]:
 
 
 def _part_in_table(cells: Mapping[str, str]) -> _Part:
-    """Returns the part of a recording, without captions, that the cells of a row name."""
+    """Returns the part of a recording that the cells of a row name, without captions."""
     trial, begin, end = cells["id"], cells.get("begin", ""), cells.get("end", "")
     if not re.fullmatch(r"\d{2,3}_\d{2,3}", trial):
         raise UserError(f"id {trial!r} is not the name of a recording, such as 02_01")
@@ -408,7 +425,10 @@ def _is_in(fact: str, trial: str) -> bool:
 
 
 def _rank(path: Path) -> int:
-    """Returns the rank of a file: 0 = original, 1 = converted, 2 = Daz-friendly conversion, whose legs often jump."""
+    """Returns the rank of a file: 0 = original, 1 = converted, 2 = Daz-friendly conversion.
+
+    The legs of Daz-friendly conversions often jump.
+    """
     if path.suffix.lower() == ".amc":
         return 0
     return 2 if "daz" in str(path).lower() else 1
@@ -419,7 +439,10 @@ def _recording(key: str) -> str:
 
 
 def _test_captions(path: Path) -> dict[str, list[Description]]:
-    """Returns captions by name of a JSON list of test captions; `segment` is the part described, in seconds."""
+    """Returns the captions in a JSON list of test captions, by name.
+
+    `segment` is the described part, in seconds.
+    """
     texts: defaultdict[str, list[Description]] = defaultdict(list)
     with naming(
         path, KeyError, TypeError, ValueError, prefix="not a list of captions of HumanML3D: "
@@ -438,8 +461,9 @@ def decide_rate(
 ) -> float:
     """Returns the frame rate of a recording of `frames` frames.
 
-    Durations are trusted first, KIT-ML's `seconds` and HumanML3D's `last` frame at 20 fps; then
-    CMU's list; then the `header` of the file: conversions say 120 for nearly all recordings.
+    Durations have priority: KIT-ML's `seconds`, then HumanML3D's `last` frame at 20 fps. CMU's
+    list comes next. The `header` of the file is last, because conversions state 120 for nearly
+    all recordings.
     """
     rates = RATES if header in (None, *RATES) else (*RATES, header)
     if fitting := [rate for rate in rates if seconds and abs(frames / rate - seconds) < SLACK]:
@@ -454,15 +478,15 @@ def decide_rate(
 
 
 def standardize(tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
-    """Returns a recording with the bones of CMU's own files, and the fields of `Layout` for them.
+    """Returns a recording with the bones of CMU's own files, and the fields of its `Layout`.
 
     Both conversions begin with a T-pose, which is removed. Joints `pelvis` and `face` are added
-    where SMPL has pelvis and head, and `upperneck` to the Daz figure. Other skeletons are
-    returned unchanged, with no fields.
+    at the positions of SMPL's pelvis and head, and `upperneck` is added to the Daz figure. Other
+    skeletons are returned unchanged, without fields.
     """
     is_original, unit, blended = "lfemur" in tree.joints, LAYOUTS["CMU ASF"].unit, 0
-    # The MotionBuilder-friendly conversion lost a bone of the trunk and of each hand. Each lost
-    # bone gets its share of the neighboring bone that it was merged into.
+    # The MotionBuilder-friendly conversion lacks a bone of the trunk and of each hand. Each of
+    # them is restored: it gets its share of the neighboring bone that contains it.
     if "LHipJoint" in tree.joints:
         offsets, at = tree.offsets.copy(), tree.joints.index
         for child, (share, bone) in FACTS["lost"].items():
@@ -473,7 +497,7 @@ def standardize(tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
             offsets=offsets,
             joints=tuple(FACTS["motionbuilder"].get(n, n) for n in tree.joints),
         )
-    # The Daz-friendly conversion moves another figure. Rotations are kept, and its bones are
+    # The Daz-friendly conversion moves another figure. Its rotations are kept, and its bones are
     # replaced by bones of a person.
     elif "lButtock" in tree.joints:
         tree, unit, blended = _added(tree, upperback=("abdomen", [0, 0, 0])), 0.01, BLENDED
@@ -489,29 +513,29 @@ def standardize(tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
     if "lfemur" not in tree.joints:
         return tree, {}
     # A first frame without rotation is the T-pose. In Daz-friendly files, the next few frames
-    # blend it with the motion, and get the pose of the first frame after them.
+    # blend it with the motion. They get the pose of the first frame after them.
     if not (is_original or tree.frames[0, 3:6].any()) and len(tree.frames) > 1 + blended:
         frames = tree.frames[1:].copy()
         frames[:blended, 6:] = frames[blended, 6:]
         tree = replace(tree, frames=frames)
 
-    # SMPL's pelvis is above the middle of the hips, by a distance that is scaled with the legs.
+    # SMPL's pelvis is above the middle of the hips. The distance is scaled with the legs.
     bone = dict(zip(tree.joints, tree.offsets, strict=True))
     scale = float(np.linalg.norm(bone["ltibia"]) + np.linalg.norm(bone["lfoot"])) / ADULT_LEG
     pelvis = (bone["lfemur"] + bone["rfemur"]) / 2 - [0, scale * _HIP[1], 0]
-    # As in SMPL, the head joint follows the neck and not the turns of the head, so that its bone
+    # As in SMPL, the head joint follows the neck and not the rotations of the head, so its bone
     # keeps its length.
     above = tree.parents[tree.joints.index("head")]
     face = bone["head"] + [0, 0, scale * _HEAD[2]]
     tree = _added(tree, pelvis=("root", pelvis), face=(tree.joints[above], face))
-    # The Daz figure has one bone from the lower neck to the head, which is divided in the middle.
+    # The Daz figure has one bone from the lower neck to the head. It is divided in the middle.
     if "upperneck" not in tree.joints:
         tree = _added(tree, upperneck=(tree.joints[above], bone["head"] / 2))
     return tree, {"map": MAP, "unit": unit}
 
 
 def _added(tree: Bvh, **joints: tuple[str, Any]) -> Bvh:
-    """Returns a tree with more joints: name -> parent and offset (3,)."""
+    """Returns a tree with additional joints, given as name -> parent and offset (3,)."""
     return replace(
         tree,
         joints=(*tree.joints, *joints),
@@ -522,7 +546,7 @@ def _added(tree: Bvh, **joints: tuple[str, Any]) -> Bvh:
 
 
 def _read(kind: str, task: tuple[list[Path], Evidence, list[Item]]) -> list[np.ndarray] | str:
-    """Returns the items of a recording from the first of its files that can be read, or the first error."""
+    """Returns the items of a recording from its first readable file, or the first error."""
     files, evidence, items = task
     errors = []
     for file in files:
@@ -543,14 +567,18 @@ def _read(kind: str, task: tuple[list[Path], Evidence, list[Item]]) -> list[np.n
 
 
 def _standardized(is_original: bool, evidence: Evidence, tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
-    """Returns a recording as `standardize` does, at its frame rate."""
+    """Returns a recording like `standardize`, at its frame rate."""
     tree, fields = standardize(tree)
     rate = decide_rate(len(tree.frames), None if is_original else tree.fps, *evidence)
     return replace(tree, fps=rate), fields
 
 
 def _part(joints: np.ndarray, mirrored: bool, kind: str) -> np.ndarray:
-    """Returns joints, or (F, 75) translation and SMPL's rotations of the adult body, in AMASS's coordinates."""
+    """Returns a part as joints, or as SMPL motion.
+
+    An SMPL motion (F, 75) is the translation and SMPL's rotations of the adult body, in AMASS's
+    coordinates.
+    """
     part = SMPL22.mirror(torch.from_numpy(joints)) if mirrored else torch.from_numpy(joints)
     if kind == "joints" or len(joints) <= SHORTEST:
         return part.numpy()

@@ -1,4 +1,7 @@
-"""Crop rules: which frames of a clip a training sample contains, as in the authors' code; cropped clips of a split."""
+"""Rules that crop clips to training samples, and data sets of cropped clips.
+
+The rules are the rules of the authors' code.
+"""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -17,11 +20,11 @@ from flame_mdm.errors import UserError
 from flame_mdm.representations import Representation
 from flame_mdm.seeds import integers, key
 
-# Index of a clip, and the number of the batch that it is drawn for, which is -1 in evaluation.
+# Index of a clip, and the number of the batch it is drawn for; -1 in evaluation
 Draw = tuple[int, int]
-# Id, features x (F, D), caption and action of a clip: the input of `collate`.
+# Id, features x (F, D), caption and action of a clip: the input of `collate`
 Sample = tuple[str, Tensor, str | None, int | None]
-# Draws integers from 0 up to, and not including, its argument: a number, or (B,) numbers.
+# Draws uniform integers, 0 <= integer < argument. The argument is a number or numbers (B,).
 Below = Callable[[Any], Any]
 
 
@@ -37,23 +40,34 @@ class Crop(ABC):
 
     @abstractmethod
     def draw(self, frames: Any, below: Below | None) -> tuple[Any, Any]:
-        """Returns first frame and number of frames (B,) of samples of clips with `frames` (B,) frames, or of one clip.
+        """Draws the frames of samples, or of one sample.
 
-        They are fixed without `below`. Past the end of a clip, its last frame is repeated.
+        Without `below`, the result is fixed. Past the end of a clip, its last frame is repeated.
+
+        Args:
+            frames: (B,) number of frames of each clip.
+            below: draws random integers.
+
+        Returns:
+            First frame (B,) and number of frames (B,) of each sample.
         """
 
     def __call__(self, frames: int, generator: np.random.Generator | None) -> np.ndarray:
-        """Returns the indices of the frames selected from a clip of `frames` frames; fixed without a generator."""
+        """Returns the indices of the frames selected from a clip of `frames` frames.
+
+        Without a generator, they are fixed.
+        """
         first, length = self.draw(frames, generator.integers if generator else None)
         return np.minimum(np.arange(length) + first, frames - 1)
 
 
 @dataclass(frozen=True)
 class Units(Crop):
-    """HumanML3D and KIT (Guo et al. 2022): a multiple of `unit` frames, one unit shorter in one of three draws.
+    """HumanML3D and KIT (Guo et al. 2022): a multiple of `unit` frames.
 
-    A clip longer than `max_frames` gives a window of that length at a random position. Without a
-    generator: the longest window, beginning at the first frame.
+    In one of three draws, the sample is one unit shorter. A clip longer than `max_frames` gives a
+    window of that length at a random position. Without a generator, it gives the longest window
+    from the first frame on.
     """
 
     min_frames: int = 40
@@ -77,30 +91,30 @@ class Units(Crop):
 
 @dataclass(frozen=True)
 class Whole(Crop):
-    """FLAME: the whole clip, cut after `max_frames`."""
+    """FLAME: the whole clip, truncated after `max_frames`."""
 
     min_frames: int = 1
     max_frames: int = 471
 
     def draw(self, frames: Any, below: Below | None) -> tuple[Any, Any]:
-        """Returns frame 0, and the length of the clip up to `max_frames`."""
+        """Returns frame 0, and the length of the clip, at most `max_frames`."""
         length = np.minimum(frames, self.max_frames)
         return np.zeros_like(length), length
 
 
 @dataclass(frozen=True)
 class Fixed(Crop):
-    """ACTOR's action data sets: always `frames` frames; short clips repeat their last frame, long ones give a window.
+    """ACTOR's action data sets: always `frames` frames.
 
-    As in ACTOR's code, the window never starts at the last possible frame. Without a generator:
-    the first window.
+    Short clips repeat their last frame; long clips give a window. As in ACTOR's code, the window
+    never starts at the last possible frame. Without a generator, it is the first window.
     """
 
     frames: int = 60
     min_frames: int = 1
 
     def longest(self) -> int:
-        """Returns the number of frames, which all samples have."""
+        """Returns the number of frames of all samples."""
         return self.frames
 
     def draw(self, frames: Any, below: Below | None) -> tuple[Any, Any]:
@@ -111,7 +125,10 @@ class Fixed(Crop):
 
 
 class Clips(Dataset[Sample]):
-    """The clips of a split that are long enough for the crop rule, cropped at every draw, then normalized."""
+    """The clips of a split that are long enough for the crop rule.
+
+    They are cropped at every draw, then normalized.
+    """
 
     def __init__(
         self, store: Store, split: Split, *, representation: Representation, crop: Crop, seed: int
@@ -132,7 +149,7 @@ class Clips(Dataset[Sample]):
         return self.__getitems__([draw])[0]
 
     def __getitems__(self, draws: Sequence[Draw]) -> list[Sample]:
-        """Returns the samples of a batch; the data loader calls this."""
+        """Returns the samples of a batch. The data loader calls this."""
         samples: list[Sample] = []
         indices = [index for index, _ in draws]
         for index, first, length, caption in zip(
@@ -150,10 +167,9 @@ class Clips(Dataset[Sample]):
     def draw(
         self, indices: Sequence[int] | np.ndarray, batch: int
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns first frame, number of frames and number of the caption (B,) of clips in a batch.
+        """Returns first frame, number of frames and caption index (B,) of clips in a batch.
 
-        They are functions of (seed, batch, index); in evaluation (batch -1), they are always the
-        same.
+        They are functions of (seed, batch, index). In evaluation (batch -1), they never change.
         """
         rows = np.asarray(indices)
         if batch < 0:
@@ -163,7 +179,7 @@ class Clips(Dataset[Sample]):
 
     @cached_property
     def evaluated(self) -> np.ndarray:
-        """Number (clips,) of the caption of each clip in evaluation, chosen by the id of the clip."""
+        """Index (clips,) of each clip's caption in evaluation, chosen by the id of the clip."""
         draws = (
             key("caption", self.seed, -1, clip.id) % max(1, len(clip.captions))
             for clip in self.clips

@@ -1,7 +1,7 @@
 """Training and evaluation batches from a packed store.
 
-Every batch is a function of (seed, step, rank). No generator state needs to be saved, and a
-resumed run sees the same batches as an uninterrupted one.
+Every batch is a function of (seed, step, rank). Therefore no generator state is saved, and a
+resumed run gets the same batches as an uninterrupted run.
 """
 
 import re
@@ -26,19 +26,20 @@ from flame_mdm.data.store import Store, write_store
 from flame_mdm.errors import UserError, say
 from flame_mdm.representations import Representation
 
-# Maximum number of frames of a sample; one hour at 20 frames per second has 72,000
+# Maximum number of frames of a sample. One hour at 20 frames per second has 72,000.
 MAX_FRAMES = 100_000
-# Permitted name of a data set. It begins the name of a folder, which must neither leave `root`
-# nor be hidden.
+# Permitted name of a data set. The name of its folder starts with it, and this folder must
+# neither be outside of `root` nor hidden.
 NAME = r"\w[\w .-]*"
 Loader = DataLoader[Sample] | ResidentLoader
 
 
 class TrainingBatches(Sampler[list[Draw]]):
-    """An endless stream of batches. Batch n is a function of (seed, n); its clips have similar lengths.
+    """An endless stream of batches of clips with similar lengths.
 
-    Each pass over the data is shuffled and cut into groups of `BUCKETS` batches. Each group is
-    sorted by length to reduce padding. Process `rank` of `world` takes every `world`-th batch.
+    Batch n is a function of (seed, n). Each pass over the data is shuffled and divided into
+    groups of `BUCKETS` batches. Each group is sorted by length to reduce padding. Process `rank`
+    of `world` takes every `world`-th batch.
     """
 
     BUCKETS = 16
@@ -75,7 +76,7 @@ class TrainingBatches(Sampler[list[Draw]]):
 def evaluation_batches(
     lengths: np.ndarray, batch_size: int, *, rank: int, world: int
 ) -> list[list[Draw]]:
-    """Returns batches with every clip once across all processes, longest first, without repeats."""
+    """Returns batches with every clip exactly once across all processes, longest first."""
     mine = np.argsort(-lengths, kind="stable")[rank::world]
     return [
         [(int(i), -1) for i in mine[b : b + batch_size]] for b in range(0, len(mine), batch_size)
@@ -83,19 +84,20 @@ def evaluation_batches(
 
 
 class MotionDataModule(LightningDataModule):
-    """Prepares a data set if it is not prepared yet, and serves its batches.
+    """Prepares a data set, unless it is prepared already, and serves its batches.
 
     Args:
-        representation: encodes the clips; receives the statistics of the store.
+        representation: encodes the clips; it gets the statistics of the store.
         root: folder of all prepared data sets.
-        name: name of the data set, which begins the name of its folder in `root`.
+        name: name of the data set. The name of its folder in `root` starts with it.
         batch_size: clips per process and step.
         num_workers: number of loading processes; 0 loads in the training process.
         crop: rule for the frames of a sample and the minimum length of a clip.
-        resident: whether the data set is kept on the training device, where the same batches are
-            gathered without workers. "auto": if it takes at most a quarter of the free memory.
-        pad_multiple: batches are padded to multiples of this number of frames, so that compiled
-            networks see few shapes, at most to the longest sample of the crop rule.
+        resident: whether the data set is kept on the training device. The same batches are then
+            gathered there without workers. "auto": only if it takes at most a quarter of the free
+            memory.
+        pad_multiple: batches are padded to a multiple of this number of frames, so that compiled
+            networks see few shapes. Padding never exceeds the longest sample of the crop rule.
     """
 
     def __init__(
@@ -153,10 +155,10 @@ class MotionDataModule(LightningDataModule):
         self.crop, self.resident, self.pad_multiple = crop, resident, pad_multiple
         self.device: torch.device | None = None
         self.features: Tensor | None = None
-        self.prepare_data_per_node = False  # machines share the folder
+        self.prepare_data_per_node = False  # all machines share the folder
 
     def prepare_data(self) -> None:
-        """Writes the store if there is none; Lightning calls this in one process only."""
+        """Writes the store if it does not exist. Lightning calls this in one process only."""
         if (self.folder / "store.json").exists():
             say(*self.source.changed(self.folder / "store.json"))
         else:
@@ -165,15 +167,19 @@ class MotionDataModule(LightningDataModule):
 
     @property
     def actions(self) -> Sequence[str]:
-        """Names of the action labels; from the store if it exists, so that training does not need the raw data."""
+        """Names of the action labels.
+
+        They come from the store if it exists, so that training does not need the raw data.
+        """
         prepared = (self.folder / "store.json").exists()
         return self.open().info["actions"] if prepared else self.source.actions
 
     def open(self) -> Store:
         """Returns the prepared store and copies its statistics to the representation.
 
-        Raises `FileNotFoundError` if the data set is not prepared, and `UserError` if the store
-        is damaged or was prepared with other options.
+        Raises:
+            FileNotFoundError: If the data set is not prepared.
+            UserError: If the store is damaged or was prepared with other options.
         """
         store = Store(self.folder)
         recipe = {
@@ -199,7 +205,7 @@ class MotionDataModule(LightningDataModule):
         return store
 
     def counts(self, store: Store) -> list[str]:
-        """Returns lines about the number of clips of each split that are long enough for the crop rule."""
+        """Returns lines about the clips of each split that are long enough for the crop rule."""
         shortest = self.crop.min_frames
         used = Counter(clip.split for clip in store.clips if clip.length >= shortest)
         short = {split: total - used[split] for split, total in store.info["clips"].items()}
@@ -236,7 +242,10 @@ class MotionDataModule(LightningDataModule):
         self.choose_device()
 
     def choose_device(self, more: int = 0) -> torch.device | None:
-        """Returns the device on which the data set is kept, with `more` bytes of the text encoder; None = on none."""
+        """Returns the device that keeps the data set; None = no device.
+
+        `more` are the bytes of the text encoder's cache.
+        """
         device = self.trainer.strategy.root_device if self.trainer else torch.device("cpu")
         free, size = free_memory(device), 4 * self.store.features.size + more
         if self.trainer and device.type == "cpu":
@@ -269,7 +278,10 @@ class MotionDataModule(LightningDataModule):
         )
 
     def train_dataloader(self) -> Loader:
-        """Returns an endless loader that starts at the trainer's current step, so that a resumed run is unchanged."""
+        """Returns an endless loader.
+
+        It starts at the trainer's current step, for resumed runs.
+        """
         trainer = self.trainer
         first = trainer.global_step * trainer.accumulate_grad_batches if trainer else 0
         rank, world = (trainer.global_rank, trainer.world_size) if trainer else (0, 1)
@@ -282,10 +294,10 @@ class MotionDataModule(LightningDataModule):
         return TrainingBatches(self.train.lengths, self.batch_size, **of_process)
 
     def val_dataloader(self) -> Loader:
-        """Returns each validation clip once across all processes.
+        """Returns a loader of each validation clip, exactly once across all processes.
 
-        With fewer clips than processes, every process gets all clips: a process without a batch
-        would skip validation while the others wait for it.
+        If there are fewer clips than processes, every process gets all clips. A process without a
+        batch would skip the validation, and the others would wait for it.
         """
         trainer = self.trainer
         shared = trainer is not None and len(self.val) >= trainer.world_size

@@ -1,4 +1,7 @@
-"""Own data: a folder of motions (BVH, AMASS or joint files) with captions, described in `docs/own-data.md`."""
+"""The user's own data: a folder of motions (BVH, AMASS or joint files) with captions.
+
+`docs/own-data.md` describes the folder.
+"""
 
 import contextlib
 import math
@@ -31,12 +34,12 @@ from flame_mdm.representations.smpl import SMPL
 from flame_mdm.safe_io import naming, read_text
 
 SHORTEST = 3  # minimum number of frames that representations need
-# Maximum number of copies of a clip in a balanced set; more would only be learned by heart
+# Maximum number of copies of a clip in a balanced set. A model would memorize a clip with more.
 MOST_COPIES = 16
 
 
 class MotionFile(NamedTuple):
-    """A file, and which of its animations is meant; None = the only one."""
+    """A file, and the name of one of its animations; None = the only animation."""
 
     path: Path
     animation: str | None = None
@@ -54,26 +57,29 @@ class Note:
 
 
 class Folder(MotionSource):
-    """Motions and captions in a folder, as SMPL's 22 joints or as raw motions of the SMPL representation.
+    """Motions and captions in a folder, as joints or as SMPL motions.
 
-    If the table gives no split, 85 % of the sources are used for training, 5 % for validation and 10 % for testing,
-    selected by a hash of their names.
+    Joints are SMPL's 22 joints. SMPL motions are raw motions of the SMPL representation. If the
+    table states no split, 85 % of the sources are used for training, 5 % for validation and 10 %
+    for testing, selected by a hash of their names.
 
     Args:
-        path: the folder; motions may be in subfolders.
-        motion: "joints" for representations of joint positions; "smpl" for representations of SMPL's
-            rotations, which AMASS files contain and the bones of BVH files show. They are fitted to the
-            joints of other files.
+        path: the folder. Motions may be in subfolders.
+        motion: "joints" for representations of joint positions; "smpl" for representations of
+            SMPL's rotations. AMASS files contain rotations, and the bones of BVH files determine
+            them. For other files, they are fitted to the joints.
         mirror: yield a mirrored copy after each clip of the training split; joints only.
         exclude: motions to leave out, by their path in the folder without extension.
-        balance: training clips of an action that has fewer than this many, mirrored copies included, are repeated
-            until there are about as many, each at most 16 times; 0 repeats none.
-        license: of the motions whose row in the table has none, a key of `licenses.yaml`; empty = unknown.
+        balance: minimum number of training clips per action, mirrored copies included. If an
+            action has fewer clips, each clip is repeated until there are about as many, at most
+            16 times. 0 = no repetition.
+        license: license of the motions for which the table states none, a key of `licenses.yaml`.
+            Empty = unknown.
     """
 
     name = "folder"
     named_by_recipe = True
-    version = 2  # 1: joints of arrays were interpolated linearly
+    version = 2  # in version 1, joints of arrays were interpolated linearly
 
     def __init__(
         self,
@@ -103,15 +109,17 @@ class Folder(MotionSource):
             self.options["balance"] = balance
         if license:
             self.options["license"] = license
-        # How upright the bodies of the motions read so far are, by layout.
+        # By layout, how upright the body is in each motion read so far
         self._uprights: defaultdict[str, list[float]] = defaultdict(list)
         self._notes: Counter[str] = Counter()  # lines about the motions read so far
-        # the representation whose raw motions are yielded; see `suit`
+        # The representation of the raw motions to yield; see `suit`
         self._representation: Representation | None = None
 
     def suit(self, representation: Representation) -> None:
-        """Makes `clips` yield raw motions of a representation; raises `UserError` if `motion`
-        does not fit it.
+        """Makes `clips` yield raw motions of a representation.
+
+        Raises:
+            UserError: If `motion` does not fit the representation.
         """
         name = representation.name
         if needs_rotations(representation) and self.motion == "joints":
@@ -130,12 +138,15 @@ class Folder(MotionSource):
         return sum(self.copies.values()) + images
 
     def licenses(self) -> set[str]:
-        """Returns the licenses in the table, and `license` if the table leaves one out."""
+        """Returns the licenses in the table, and `license` if a row states none."""
         return {note.license or self.license for note in self.notes.values()}
 
     @cached_property
     def copies(self) -> dict[str, int]:
-        """Number of times that each motion occurs in the set (see `balance`); a mirrored copy occurs equally often."""
+        """Number of times that each motion occurs in the set; see `balance`.
+
+        A mirrored copy occurs equally often.
+        """
         sizes = Counter(
             note.action for name, note in self.notes.items() if self.splits[name] == "train"
         )
@@ -176,7 +187,7 @@ class Folder(MotionSource):
         _check_upright(self.path, self._uprights)
 
     def _motions(self, fps: float) -> Iterator[tuple[str, np.ndarray]]:
-        """Yields name and motion of each file that can be read, and keeps what was learned of all."""
+        """Yields the name and the motion of each readable file, and records findings."""
         self.failures = failures = list[str]()
         self._uprights, self._notes = defaultdict(list), Counter()
         attempts = in_order(
@@ -193,14 +204,14 @@ class Folder(MotionSource):
             yield name, attempt.motion
 
     def findings(self) -> list[str]:
-        """Returns the skeletons of the motions read so far, and what was left out of them."""
+        """Returns the skeletons of the motions read so far, and the parts that were left out."""
         skeletons = [
             f"{layout}: {len(motions)} motions" for layout, motions in self._uprights.items()
         ]
         return skeletons + [f"{count} motions: {note}" for note, count in self._notes.items()]
 
     def check(self, fps: float) -> list[str]:
-        """Reads all captions and motions; returns lines on skeletons and failures."""
+        """Reads all captions and motions. Returns lines about skeletons and failures."""
         splits = Counter(self.splits[name] for name, _ in self._motions(fps))
         if self.failures:
             return [*self.findings(), *self.failure_lines()]
@@ -212,7 +223,7 @@ class Folder(MotionSource):
         ]
 
     def failure_lines(self) -> list[str]:
-        """Returns a line per motion that cannot be prepared, and their number."""
+        """Returns one line per motion that cannot be prepared, and a line with their number."""
         if not self.failures:
             return []
         summary = f"error: {len(self.failures)} of {len(self.files)} motions of {self.path} cannot be prepared"
@@ -226,7 +237,10 @@ class Folder(MotionSource):
 
     @cached_property
     def files(self) -> dict[str, MotionFile]:
-        """Path in the folder without extension -> file, sorted; with several animations, each has `PATH/ANIMATION`."""
+        """Files by their path in the folder without extension, sorted.
+
+        If a file has several animations, each animation is `PATH/ANIMATION`.
+        """
         files: dict[str, MotionFile] = {}
         for path in motions_in(self.path):
             name = path.relative_to(self.path).with_suffix("").as_posix()
@@ -263,7 +277,10 @@ class Folder(MotionSource):
 
     @cached_property
     def notes(self) -> dict[str, Note]:
-        """Captions and labels of each motion, from the table and text files; all motions have a caption, or none."""
+        """Captions and labels of each motion, from the table and text files.
+
+        Either all motions have captions, or no motion has one.
+        """
         notes = {name: Note() for name in self.files}
         if os.path.lexists(self.path / TABLE):
             _read_table(self.path / TABLE, notes, self.exclude)
@@ -285,15 +302,17 @@ class Folder(MotionSource):
 
     @cached_property
     def splits(self) -> dict[str, Split]:
-        """Split of each motion: from the table, else drawn as in `drawn_splits`."""
+        """Split of each motion, from the table or else drawn as in `drawn_splits`."""
         sources = {name: note.source or name for name, note in self.notes.items()}
         return drawn_splits(sources, {name: note.split for name, note in self.notes.items()})
 
 
 def _check_upright(folder: Path, uprights: Mapping[str, Sequence[float]]) -> None:
-    """Raises `UserError` if the body lies in most motions of a layout.
+    """Raises `UserError` if the body is lying in most motions of a layout.
 
-    `uprights`: layout -> `upright` of each motion, see `Doubts`.
+    Args:
+        folder: the folder, for the message.
+        uprights: `upright` of each motion (see `Doubts`), by layout.
     """
     for layout, values in uprights.items():
         if np.median(values) < LYING:
@@ -303,17 +322,20 @@ def _check_upright(folder: Path, uprights: Mapping[str, Sequence[float]]) -> Non
 
 
 def _repeated(clip: Clip, copies: int) -> Iterator[Clip]:
-    """Yields a clip and its further copies, which share its frames in the store."""
+    """Yields a clip and its repetitions, which share its frames in the store."""
     yield clip
     for number in range(2, copies + 1):
         yield replace(clip, id=f"{clip.id}~{number}")
 
 
 def _animations(name: str, path: Path) -> Iterator[tuple[str, MotionFile]]:
-    """Yields the motions of a file and their names; several animations of one file get their own names."""
+    """Yields the names of the motions of a file, and the motions.
+
+    If there are several animations, each gets its own name.
+    """
     animations: list[str] = []
     if path.suffix.lower() in SCENES:
-        with contextlib.suppress(UserError):  # the reader names what is wrong with this file later
+        with contextlib.suppress(UserError):  # the reader reports faults of this file later
             animations = scenes.animations(path)
     if len(animations) <= 1:
         yield name, MotionFile(path)
@@ -349,7 +371,7 @@ def _add(notes: dict[str, Note], cells: dict[str, str]) -> None:
 
 @dataclass
 class _Attempt:
-    """A motion that was read for a data set, or the line that says why it cannot be used."""
+    """A motion that was read for a data set, or a line that says why it cannot be used."""
 
     error: str = ""
     motion: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
@@ -361,10 +383,11 @@ class _Attempt:
 def _read(
     kind: str, representation: Representation | None, fps: float, file: MotionFile
 ) -> _Attempt:
-    """Reads joints or, if `kind` is "smpl", a raw motion of SMPL's rotations, at `fps` frames per second.
+    """Reads joints or, if `kind` is "smpl", a raw motion of SMPL's rotations.
 
-    Without a `representation`, joints are SMPL's 22 and rotations are in AMASS's axes. KIT-ML's representations get
-    its 21 joints, and representations in the camera's axes get rotations in these.
+    The motion has `fps` frames per second. Without a `representation`, joints are SMPL's 22, and
+    rotations are in AMASS's axes. KIT-ML's representations get its 21 joints. Representations in
+    the camera's axes get rotations in these axes.
     """
     path = file.path
     try:

@@ -1,6 +1,6 @@
 """HumanML3D: motions of AMASS and HumanAct12 with descriptions, as features and as SMPL parameters.
 
-Guo et al., "Generating Diverse and Natural 3D Human Motions From Text", CVPR 2022. See
+Source: Guo et al., "Generating Diverse and Natural 3D Human Motions From Text", CVPR 2022. See
 `docs/humanml3d.md`.
 """
 
@@ -31,7 +31,7 @@ FPS = 20
 class IndexedClip(NamedTuple):
     """A clip in `index.csv`: frames `start` to `end` of a recording at 20 fps.
 
-    `key` names the recording as `amass.key_of` does, or the file of a clip of HumanAct12.
+    `key` is the key of the recording (see `amass.key_of`), or the file of a clip of HumanAct12.
     """
 
     name: str
@@ -41,11 +41,11 @@ class IndexedClip(NamedTuple):
 
     @property
     def humanact12(self) -> bool:
-        """Whether the clip is a file of HumanAct12, named by `key` and used whole."""
+        """Whether the clip is a whole file of HumanAct12, named by `key`."""
         return "/" not in self.key
 
     def frames(self, count: int) -> slice:
-        """Returns the clip's frames in a recording of `count` frames."""
+        """Returns the frames of the clip in a recording of `count` frames."""
         if self.humanact12:
             return slice(0, count)
         trimmed = FACTS["trimmed"].get(self.key.partition("/")[0], 0)
@@ -54,8 +54,10 @@ class IndexedClip(NamedTuple):
 
 
 def read_index(path: Path) -> list[IndexedClip]:
-    """Reads `index.csv`; raises `UserError` if the file has another layout or names an unknown
-    recording.
+    """Reads `index.csv`.
+
+    Raises:
+        UserError: If the file has another layout or names an unknown recording.
     """
     required(path, "it is index.csv of https://github.com/EricGuo5513/HumanML3D")
     rows = []
@@ -72,7 +74,7 @@ def read_index(path: Path) -> list[IndexedClip]:
 
 
 def by_recording(rows: Iterable[IndexedClip]) -> dict[str, list[IndexedClip]]:
-    """Returns recording of AMASS -> its clips."""
+    """Returns the clips of each recording of AMASS."""
     recordings = defaultdict(list)
     for row in rows:
         if not row.humanact12:
@@ -85,15 +87,13 @@ class HumanML3D(T2MFolder):
 
     Args:
         path: the folder, which must contain texts and splits.
-        exclude: names of motions to leave out; a mirrored copy has its own name.
-        amass: folder of AMASS's SMPL+H G archives, packed or unpacked, from which missing motions
-            are
-            created. This also takes `index.csv` and HumanAct12's joints,
-                `pose_data/humanact12.zip`, in the
-            folder or next to it.
+        exclude: names of motions to leave out. A mirrored copy has its own name.
+        amass: folder of AMASS's SMPL+H G release, as archives or unpacked, to create missing
+            motions. This also needs `index.csv` and HumanAct12's joints,
+            `pose_data/humanact12.zip`, in the folder or next to it.
         body_models: folder of the extended SMPL+H model.
-        bone_lengths: 22 bone lengths, in meters, of the skeleton that all motions are retargeted
-            to.
+        bone_lengths: 22 bone lengths, in meters, of the skeleton to which all motions are
+            retargeted.
         workers: number of processes; 0 = one per core.
     """
 
@@ -123,15 +123,16 @@ class HumanML3D(T2MFolder):
         self.options = {**self.options, "bone_lengths": bone_lengths and list(bone_lengths)}
 
     def count(self) -> int:
-        """Returns the number of clips; creates missing motions from AMASS first, if `amass` is
-        set.
+        """Returns the number of clips.
+
+        If `amass` is set, first creates missing motions from AMASS.
         """
         if self.amass:
             self._make(self.amass)
         return super().count()
 
     def check(self, fps: float) -> list[str]:
-        """Returns how many motions are created, and a line per missing input of the others."""
+        """Returns a line with the number of created motions, and a line per missing input."""
         if not self.amass:
             return super().check(fps)
         todo = self._todo()
@@ -147,13 +148,16 @@ class HumanML3D(T2MFolder):
 
     @cached_property
     def humanact12_files(self) -> dict[str, Path]:
-        """Files of joints of HumanAct12 by name; empty if they are missing."""
+        """Files of HumanAct12's joints by name; empty if they are missing."""
         path = self._beside("humanact12", "pose_data/humanact12", "pose_data/humanact12.zip")
         folder = archives.as_folder(path, self, lambda name: name.endswith(".npy"))
         return {file.stem: file for file in folder.rglob("*.npy")}
 
     def _beside(self, *names: str) -> Path:
-        """Returns the first of these names that exists in the folder or next to it, else the first in the folder."""
+        """Returns the first of these names that exists in the folder or next to it.
+
+        If none exists, it returns the first name in the folder.
+        """
         candidates = [folder / name for name in names for folder in (self.path, self.path.parent)]
         return next((candidate for candidate in candidates if candidate.exists()), candidates[0])
 
@@ -179,9 +183,9 @@ class HumanML3D(T2MFolder):
         return missing
 
     def _make(self, amass: Amass) -> None:
-        """Creates the motions that do not exist yet; an interrupted run thus continues where it stopped."""
+        """Creates the motions that do not exist yet. An interrupted run thus continues."""
         if todo := self._todo():
-            _ = self.names, self.texts  # which may be missing
+            _ = self.names, self.texts  # raises an error if they are missing
             if missing := self._missing(amass, todo):
                 raise FileNotFoundError(
                     f"{self.name} cannot be created. Missing: {'; '.join(missing)}"
@@ -210,7 +214,7 @@ class HumanML3D(T2MFolder):
             remove_abandoned(folder)  # temporary files of workers that were stopped
 
     def _write_statistics(self) -> None:
-        """Writes mean and std over all motions of any length and split, including mirrored ones."""
+        """Writes mean and std of all motions of any length and split, mirrored ones included."""
         representation = HumanML("smpl22", "legacy")
         shapes = {name: self._load(name, mmap=True).shape for name in sorted(self._motions())}
         if wrong := [
@@ -229,7 +233,7 @@ class HumanML3D(T2MFolder):
 def _from_amass(
     write: partial[None], bodies: dict[str, Body], rows: Sequence[IndexedClip], recording: Recording
 ) -> int:
-    """Writes the clips of a recording; any gender but "male" uses the female body, as published."""
+    """Writes the clips of a recording. As published, only "male" bodies are not female."""
     recording = recording.every(FPS)
     body = bodies["male" if recording.gender == "male" else "female"]
     for row in rows:
@@ -240,7 +244,7 @@ def _from_amass(
 def _write_features(
     folder: Path, representation: HumanML, row: IndexedClip, joints: np.ndarray
 ) -> None:
-    """Writes the features of a clip and of its mirror image, each under a temporary name first."""
+    """Writes the features of a clip and its mirror image, first under temporary names."""
     motion = torch.from_numpy(joints).double()
     with naming(f"clip {row.name} (data.source.exclude=[{row.name}] leaves it out)", ValueError):
         features = representation.encode_many([motion, representation.skeleton.mirror(motion)])
@@ -268,22 +272,20 @@ def _read_joints(path: Path) -> np.ndarray:
 
 
 class HumanML3DSMPL(MotionSource):
-    """FLAME's form of the data set (Kim et al., AAAI 2023): SMPL parameters, whole clips, one
-    clip per caption.
+    """FLAME's form of the data set (Kim et al., AAAI 2023): SMPL parameters of whole clips.
 
-    As in FLAME's code, there are no mirrored copies, no limits of length and no cuts: a caption
-    of a part is used for the whole motion. Clips are named NAME#0, NAME#1 ... Unlike in FLAME's
-    code, the frames that were trimmed from the start of five subsets are taken into account, so
-    that motion and caption match.
+    There is one clip per caption, named NAME#0, NAME#1 ... As in FLAME's code, there are no
+    mirrored copies, no limits of length and no cuts: a caption of a part is used for the whole
+    motion. In five subsets, frames were trimmed from the start. Unlike FLAME's code, this class
+    takes them into account, so that motion and caption match.
 
     Args:
         path: folder of HumanML3D with texts, splits and `index.csv`; no motions are needed.
-        amass: folder of AMASS's SMPL+H G archives, packed or unpacked.
-        humanact12: FLAME's `humanact12_processed.pkl`; without it, the clips of HumanAct12 are
+        amass: folder of AMASS's SMPL+H G release, as archives or unpacked.
+        humanact12: FLAME's `humanact12_processed.pkl`. Without it, the clips of HumanAct12 are
             left out.
-        published_split: train on the validation clips as well (FLAME's "final"); none are left
-            for
-            validation.
+        published_split: train on the validation clips as well (FLAME's "final"). No clips are
+            then left for validation.
     """
 
     name = "humanml3d-smpl"
@@ -322,8 +324,10 @@ class HumanML3DSMPL(MotionSource):
         return used
 
     def count(self) -> int:
-        """Returns the number of clips, one per caption; raises `FileNotFoundError` if recordings
-        are missing.
+        """Returns the number of clips, one per caption.
+
+        Raises:
+            FileNotFoundError: If recordings are missing.
         """
         self.amass.check(by_recording(self.rows))
         return sum(len(self.folder.texts[row.name]) for row in self.rows)
@@ -339,7 +343,10 @@ class HumanML3DSMPL(MotionSource):
             yield from self._from_humanact12(self.humanact12)
 
     def _from_humanact12(self, path: Path) -> Iterator[Clip]:
-        """Yields SMPL poses of HumanAct12; the root position is used as SMPL's translation, as in FLAME's code."""
+        """Yields SMPL poses of HumanAct12.
+
+        As in FLAME's code, the root position is used as SMPL's translation.
+        """
         data = restricted_pickle.read(path)
         for row in sorted((row for row in self.rows if row.humanact12), key=lambda row: row.key):
             entry = (

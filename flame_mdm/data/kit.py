@@ -1,7 +1,7 @@
-"""KIT Motion-Language: a processed folder with 251 features, and joint positions as TEMOS reads them.
+"""KIT Motion-Language: a processed folder with 251 features, and joint positions as in TEMOS.
 
-Plappert, Mandery, Asfour, "The KIT Motion-Language Dataset", Big Data 2016. `docs/kit.md` says
-what to download.
+Source: Plappert, Mandery, Asfour, "The KIT Motion-Language Dataset", Big Data 2016. `docs/kit.md`
+says what to download.
 """
 
 from collections.abc import Iterator, Sequence
@@ -32,13 +32,15 @@ class KIT(T2MFolder):
 
 
 class KITTemos(MotionSource):
-    """Joints of the MMM model, every eighth of 100 frames per second, with TEMOS's splits and limits.
+    """Joints of the MMM model at 12.5 frames per second, with TEMOS's splits and limits.
 
-    Petrovich, Black, Varol, "TEMOS", ECCV 2022, whose rules FLAME follows. Training and
-    validation leave out motions of fewer than 10 or more than 500 frames. The test split keeps
-    all motions, but only their first caption; Ghosh et al.'s test clips have the attribute
-    `ghosh_test`. `path` contains `NUMBER_fke.csv`, `NUMBER_annotations.json` and
-    `NUMBER_meta.json`, `splits` TEMOS's lists of these numbers.
+    Every eighth of 100 frames per second is used. Source: Petrovich, Black, Varol, "TEMOS", ECCV
+    2022; FLAME follows its rules. Training and validation leave out motions of fewer than 10 or
+    more than 500 frames. The test split keeps all motions, but only their first caption. Ghosh et
+    al.'s test clips have the attribute `ghosh_test`.
+
+    `path` contains `NUMBER_fke.csv`, `NUMBER_annotations.json` and `NUMBER_meta.json`. `splits`
+    contains TEMOS's lists of these numbers.
     """
 
     name = "kit-temos"
@@ -53,18 +55,18 @@ class KITTemos(MotionSource):
 
     @cached_property
     def names(self) -> dict[str, Split]:
-        """Name of each motion in a split -> its split."""
+        """Split of each motion, by name."""
         return self.not_excluded(read_splits(self.splits, "", self.get_it), self.splits)
 
     @cached_property
     def ghosh_test(self) -> set[str]:
-        """Names in Ghosh et al.'s test split, if there is a list of them."""
+        """Names in Ghosh et al.'s test split; empty if there is no list of them."""
         file = self.splits / "ghosh-test"
         return set(read_text(file).split()) if file.is_file() else set()
 
     @cached_property
     def texts(self) -> dict[str, list[str]]:
-        """Captions of each motion in the splits, except motions without captions."""
+        """Captions of each motion in the splits. Motions without captions are absent."""
         names, texts = self.names, {}
         required(self.path, self.get_motions)
         for name in names:
@@ -100,7 +102,10 @@ class KITTemos(MotionSource):
         return sum(self._fits(name) for name in self.frames)
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        """Yields one clip per motion; a test clip has all frames of its recording as `reference`."""
+        """Yields one clip per motion.
+
+        A test clip has all frames of its recording as `reference`.
+        """
         self.check_fps(fps, 12.5)
         for name, split in self.names.items():
             if name not in self.texts:
@@ -143,7 +148,10 @@ def _recording(task: tuple[Path, int]) -> np.ndarray:
 
 
 def read_joints(path: Path, step: int = 8) -> np.ndarray:
-    """Reads joints (F, 21, 3) float32 in meters, y up, of every `step`-th frame; KIT's unit is about 1/640 m."""
+    """Reads joints (F, 21, 3) float32 in meters, y up, of every `step`-th frame.
+
+    KIT's unit is about 1/640 m.
+    """
     lines = read_text(path).splitlines()[1::step]
     with naming(path, ValueError, prefix="damaged, exclude it by its number: "):
         rows = np.loadtxt(lines, delimiter=",", ndmin=2)

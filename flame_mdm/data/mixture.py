@@ -1,4 +1,4 @@
-"""Several data sets as one: every clip keeps the license of the data set that it comes from."""
+"""Several data sets as one. Every clip keeps the license of its data set."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -16,7 +16,7 @@ Use = Literal["any", "research"]
 
 @cache
 def known_licenses() -> dict[str, dict[str, str]]:
-    """Returns the content of `licenses.yaml`: by the name of a license, the `use` that it allows and its `terms`."""
+    """Returns the content of `licenses.yaml`: the permitted `use` and the `terms` per license."""
     return read_yaml(Path(__file__).with_name("licenses.yaml"))
 
 
@@ -25,13 +25,14 @@ class Mixture(MotionSource):
 
     Args:
         parts: the data sets, by a name of your choice.
-        use: what the trained model is for. "any" refuses data sets with motions whose license is unknown or allows
-            research only; "research" takes all.
+        use: purpose of the trained model. "any" refuses data sets with motions whose license is
+            unknown or allows only research. "research" accepts all data sets.
     """
 
     name = "mixture"
     named_by_recipe = True
-    # Increase it with the version of any data set, since its motions are then read differently here, too.
+    # Increase it with the version of any data set: its motions are then read differently here,
+    # too.
     version = 1
 
     def __init__(self, parts: Mapping[str, MotionSource], use: Use = "any"):
@@ -47,8 +48,10 @@ class Mixture(MotionSource):
         }
 
     def count(self) -> int:
-        """Returns the number of clips of all parts; raises `UserError` if a license forbids the
-        use.
+        """Returns the number of clips of all parts.
+
+        Raises:
+            UserError: If a license forbids the use.
         """
         self.check_licenses()
         return sum(part.count() for part in self.parts.values())
@@ -58,7 +61,7 @@ class Mixture(MotionSource):
         return {license for part in self.parts.values() for license in part.licenses()}
 
     def may_share_captions(self, license: str) -> bool:
-        """Returns whether the license allows any use of the clip, and so of its captions."""
+        """Returns whether the license allows any use of the clip, which includes its captions."""
         return known_licenses().get(license, {}).get("use") == "any"
 
     def check_licenses(self) -> None:
@@ -76,14 +79,14 @@ class Mixture(MotionSource):
                 )
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        """Yields the clips of each part; equal names of actions get one number in all parts."""
+        """Yields the clips of each part. Actions with equal names get one number in all parts."""
         self.check_licenses()
         names: dict[str, int] = {}
         for part in self.parts.values():
             for clip in part.clips(fps):
                 action = None
                 if clip.action is not None:
-                    # A folder knows its actions only when it yields the first clip.
+                    # A folder knows its actions only when it has yielded the first clip.
                     action = names.setdefault(part.actions[clip.action], len(names))
                 yield replace(clip, action=action, license=clip.license or part.license)
             self.excluded.update(part.excluded)
@@ -99,7 +102,7 @@ class Mixture(MotionSource):
         return [line for part in self.parts.values() for line in part.failure_lines()]
 
     def changed(self, store: Path) -> list[str]:
-        """Returns a line per part whose files changed since."""
+        """Returns a line for each part with changed files."""
         return [line for part in self.parts.values() for line in part.changed(store)]
 
     def suit(self, representation: Representation) -> None:

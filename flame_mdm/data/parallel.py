@@ -19,8 +19,8 @@ from flame_mdm.signals import ignore_interrupts
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
-# Seconds of work before processes are started, if their number is not given. Starting them takes
-# about as long.
+# Seconds of work after which processes are started, if their number is not given. Starting them
+# takes about as long.
 PATIENCE = 2.0
 
 
@@ -32,20 +32,19 @@ def cores() -> int:
 def in_order(
     function: Callable[[Task], Result], tasks: Iterable[Task], workers: int = 0
 ) -> Generator[Result]:
-    """Yields `function(task)` for each task, in the order of the tasks; reads only a few tasks
-    ahead.
+    """Yields `function(task)` for each task, in the order of the tasks.
 
-    If `tasks` comes from another `in_order`, both share one pool.
+    It reads only a few tasks ahead. If `tasks` comes from another `in_order`, both share one
+    pool.
 
     Args:
         function: must be picklable, like tasks and results.
         tasks: any number of tasks.
         workers: number of processes. 1 works in this process. 0 starts one process per core once
-            the work has
-            taken `PATIENCE` seconds.
+            the work has taken `PATIENCE` seconds.
 
     Raises:
-        UserError: if a worker died, for instance because the system ran out of memory.
+        UserError: If a worker died, for example because the system ran out of memory.
     """
     workers = 1 if not workers and cores() == 1 else workers
     start, remaining = time.monotonic(), iter(tasks)
@@ -83,8 +82,8 @@ _pool: _Pool | None = None  # the pool in use, if any
 @contextmanager
 def _shared_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
     global _pool
-    # Spawned, not forked: a fork would copy locks held by threads of this process, which may have
-    # used torch.
+    # Processes are spawned, not forked: a fork would copy locks of this process's threads, which
+    # may have used torch.
     pool = _pool = _pool or _Pool(
         ProcessPoolExecutor(workers, get_context("spawn"), _start_worker), active_children()
     )
@@ -114,7 +113,10 @@ def _shared_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
 
 
 def _first(pending: deque[Future[Result]]) -> Result:
-    """Returns the result of the first task, or raises the error of any task: the first may take long or never end."""
+    """Returns the result of the first task, or raises the first error of any task.
+
+    Errors of later tasks are raised at once, because the first task may take long or never end.
+    """
     while True:
         for future in pending:
             if future.done() and future.exception() is not None:
@@ -125,8 +127,12 @@ def _first(pending: deque[Future[Result]]) -> Result:
 
 
 def _start_worker() -> None:
-    """Sets up a worker: it uses one thread, ignores Ctrl-C (the parent handles it) and exits when the parent dies."""
-    # read when a task imports torch; importing it for tasks that do not takes long
+    """Sets up a worker process.
+
+    It uses one thread and ignores Ctrl-C, which the parent handles. It exits when the parent
+    dies.
+    """
+    # Read when a task imports torch. Importing it here would slow down tasks that do not need it.
     os.environ["OMP_NUM_THREADS"] = "1"
 
     def follow() -> None:

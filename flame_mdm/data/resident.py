@@ -1,4 +1,7 @@
-"""Data sets that are kept on the training device, where batches are gathered without workers and copies."""
+"""Data sets kept on the training device.
+
+Batches are gathered there, without workers and copies.
+"""
 
 import os
 from collections.abc import Iterable, Iterator
@@ -15,13 +18,16 @@ from flame_mdm.data.store import Store
 from flame_mdm.representations import Representation
 
 # With data.resident=auto, a data set is kept on the device if it takes at most 1 / SHARE of the
-# memory that is free there: the rest is for the model and its activations.
+# free memory. The rest is for the model and its activations.
 SHARE = 4
-CHUNK = 1 << 16  # frames that are copied at once, so that the copy takes little memory
+CHUNK = 1 << 16  # number of frames that are copied at once, so that copying takes little memory
 
 
 def free_memory(device: torch.device) -> int:
-    """Returns the free memory of a GPU in bytes; for other devices, what the system or the container can provide."""
+    """Returns the free memory of a device in bytes.
+
+    For other devices than GPUs, this is what the system or the container can provide.
+    """
     if device.type == "cuda":
         return torch.cuda.mem_get_info(device)[0]
     try:
@@ -36,14 +42,15 @@ def free_memory(device: torch.device) -> int:
             Path(f"/sys/fs/cgroup/memory.{name}").read_text() for name in ("max", "current")
         )
         return min(free, int(limit) - int(used))
-    except (OSError, ValueError):  # no container, or one without a limit
+    except (OSError, ValueError):  # not in a container, or in a container without a limit
         return free
 
 
 def resident_features(store: Store, representation: Representation, device: torch.device) -> Tensor:
-    """Returns the frames of a store on a device, (N + 1, D); the last row is zeros, for padding.
+    """Returns the frames of a store on a device, (N + 1, D). The last row is zeros, for padding.
 
-    Frames are normalized here unless the representation adapts cuts, which are normalized later.
+    Frames are normalized here. If the representation adapts cuts, they are normalized later
+    instead.
     """
     features = torch.empty(len(store.features) + 1, store.features.shape[1], device=device)
     mean, std = store.mean.astype(np.float32), store.std.astype(np.float32)
@@ -56,14 +63,14 @@ def resident_features(store: Store, representation: Representation, device: torc
 
 
 def adapts_cuts(representation: Representation) -> bool:
-    """Returns whether a representation changes the features of a cut of a motion (see `rebase`)."""
+    """Returns whether a representation changes the features of a cut (see `rebase`)."""
     return type(representation).rebase is not Representation.rebase
 
 
 class ResidentLoader:
     """Loads the batches of a split by gathering features on the device.
 
-    The batches are equal, bit for bit, to the batches of the data loader.
+    The batches are bit-identical to the batches of the data loader.
 
     Args:
         clips: clips of the split.
@@ -86,7 +93,7 @@ class ResidentLoader:
         )
 
     def __len__(self) -> int:
-        # Batches of training are endless and have no length.
+        # Training batches are endless and have no length.
         return len(self.batches)  # type: ignore[arg-type]
 
     def __iter__(self) -> Iterator[MotionBatch]:

@@ -1,13 +1,14 @@
-"""Restricted reader of pickles: arrays, numbers, text, lists, tuples and dictionaries with text
-keys.
+"""Restricted reader of pickles.
 
-A pickle can name any function and have it called. This reader calls none: each object is kept as
-its arguments and its state, and arrays are made from the bytes among them. NumPy's own functions
-are not used for that, because a wrong byte in a dtype crashes them.
+It reads arrays, numbers, text, lists, tuples and dictionaries with text keys.
+
+A pickle can name any function and have it called. This reader calls no function. It keeps the
+arguments and the state of each object, and creates arrays from the bytes among them. NumPy's own
+functions are not used for this, because a wrong byte in a dtype crashes them.
 
 Python's C unpickler allocates as much memory as a file of ten bytes requests. Therefore this
 reader is based on the unpickler in Python. No read may request more bytes than are left in the
-file, and content that a pickle repeats is counted at each repetition.
+file. Content that a pickle repeats is counted at each repetition.
 """
 
 import pickle
@@ -23,13 +24,13 @@ from flame_mdm.errors import UserError, first_line
 from flame_mdm.safe_io import check_expansion, regular_file
 
 DTYPE = re.compile(r"[biufcSU]\d{1,9}|O8?")
-# Bytes that each value counts as: a file of a few bytes could otherwise repeat a list without
-# end.
+# Number of bytes that each value counts as. Otherwise, a file of a few bytes could repeat a list
+# without end.
 VALUE = 512
 
 
 class _Object:
-    """An object of a pickle. Nothing is loaded or called to make it."""
+    """An object of a pickle. Nothing is loaded or called to create it."""
 
     state: Any = None
 
@@ -44,19 +45,20 @@ ARRAY, SCALAR, BUFFER, BYTES = ALLOWED = (
     "_codecs.encode",
 )
 KINDS = {name: type(name, (_Object,), {}) for name in (*ALLOWED, "numpy.ndarray", "numpy.dtype")}
-"""All globals that a pickle may name -> the class of their objects."""
+"""All globals that a pickle may name, and the class of their objects."""
 BASES = (
     "copy_reg._reconstructor",
     "copyreg._reconstructor",
     "__builtin__.object",
     "builtins.object",
 )
-"""Globals that old protocols name to make an object of a class."""
+"""Globals with which old protocols create an object of a class."""
 
 
 class _Dictionary(dict[str, Any]):
-    """A dictionary with text keys. Keys of other types could be chosen so that all have the same
-    hash.
+    """A dictionary with text keys.
+
+    Keys of other types could be chosen so that all of them have the same hash.
     """
 
     def __setitem__(self, key: Any, value: Any) -> None:
@@ -68,7 +70,7 @@ class _Dictionary(dict[str, Any]):
 class _Unpickler(pickle._Unpickler):
     """Reads the pickle in a file of `size` bytes.
 
-    Objects of globals whose names begin with one of `opaque` become their state.
+    `opaque` contains beginnings of names. Objects of such globals become their state.
     """
 
     stack: list[Any]
@@ -76,22 +78,26 @@ class _Unpickler(pickle._Unpickler):
     read: Callable[[int], bytes]
 
     def __init__(self, file: IO[bytes], size: int, opaque: tuple[str, ...]):
-        # the encoding in which Python 2 wrote the bytes of arrays
+        # Python 2 wrote the bytes of arrays in this encoding.
         super().__init__(file, encoding="latin1")
         self._file_read = self.read_file
         self.file, self.size, self.opaque, self.expanded = file, size, opaque, 0
 
     def read_file(self, size: int) -> bytes:
-        """Returns `size` bytes; raises `EOFError` before any memory is taken if the file has
-        fewer.
+        """Returns `size` bytes.
+
+        Raises:
+            EOFError: If the file has fewer; no memory is taken in this case.
         """
         if size > self.size - self.file.tell():
             raise EOFError("it ends too early")
         return self.file.read(size)
 
     def find_class(self, module_name: str, global_name: str, /) -> type[_Object]:
-        """Returns the class of objects for a permitted global; raises `UnpicklingError` for
-        others.
+        """Returns the class of objects of a permitted global.
+
+        Raises:
+            UnpicklingError: For other globals.
         """
         name = f"{module_name}.{global_name}".replace("numpy._core.", "numpy.core.")
         if name in KINDS:
@@ -104,7 +110,7 @@ class _Unpickler(pickle._Unpickler):
         )
 
     def plain(self, value: Any) -> Any:
-        """Returns a value with arrays, numbers and text in place of the objects of the pickle."""
+        """Returns a value in which objects of the pickle are arrays, numbers and text."""
         self.expanded += VALUE + (len(value) if isinstance(value, str | bytes | bytearray) else 0)
         check_expansion(self.expanded, self.size)
         match value:
@@ -113,12 +119,15 @@ class _Unpickler(pickle._Unpickler):
             case list() | tuple():
                 return type(value)(self.plain(item) for item in value)
             case _Object():
-                # The object only has the name of its class, and nothing was called to make it.
+                # The object only has the name of its class. Nothing was called to create it.
                 return self.plain_object(type(value).__name__, value)
         return value
 
     def plain_object(self, name: str, value: _Object) -> Any:
-        """Returns the array, number or text that an object describes; for opaque objects, their state."""
+        """Returns the array, number or text that an object describes.
+
+        For opaque objects, it returns their state.
+        """
         if name == ARRAY:
             _, shape, dtype, is_fortran, data = value.state
             return self.array(data, dtype, shape, "F" if is_fortran else "C")
@@ -144,7 +153,7 @@ class _Unpickler(pickle._Unpickler):
         data = data.encode("latin1") if isinstance(data, str) else data
         return np.frombuffer(data, kind).reshape(shape, order=order)
 
-    # BUILD would call `__setstate__` or set attributes. Here, it keeps the state.
+    # BUILD would call `__setstate__` or set attributes. Here, it only stores the state.
     def _load_build(self) -> None:
         state = self.stack.pop()
         if not isinstance(self.stack[-1], _Object):
@@ -174,16 +183,18 @@ class _Unpickler(pickle._Unpickler):
 
 
 def read(path: Path, opaque: tuple[str, ...] = ()) -> Any:
-    """Returns the content of a pickle, protocols 0 to 5; raises `UserError` if it is damaged or names other globals.
+    """Returns the content of a pickle of protocol 0 to 5.
 
-    Objects whose names begin with one of `opaque` may be there, too, and are replaced by their
-    state.
+    Objects whose names begin with one of `opaque` are permitted, too. Their state replaces them.
+
+    Raises:
+        UserError: If the file is damaged or names other globals.
     """
     size = regular_file(path)
     with path.open("rb") as file:
         try:
             unpickler = _Unpickler(file, size, opaque)
             return unpickler.plain(unpickler.load())
-        except Exception as error:  # a damaged pickle can fail in any way
+        except Exception as error:  # a damaged pickle can cause any error
             reason = "nested too deeply" if isinstance(error, RecursionError) else first_line(error)
             raise UserError(f"{path}: not read as a pickle: {reason}") from error

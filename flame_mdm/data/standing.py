@@ -1,4 +1,4 @@
-"""A person who stands still: the frames that a stream continues at its start."""
+"""A person who stands still, which a stream continues at its start."""
 
 import numpy as np
 from torch import Tensor
@@ -11,11 +11,11 @@ from flame_mdm.representations.skeleton import SMPL22
 
 
 def standing(representation: Representation, frames: int) -> Motion:
-    """Returns a person who stands still, with the features of a representation.
+    """Returns a motion of a person who stands still, with the features of a representation.
 
-    The person is the one of the synthetic motions, so that no data is needed.
+    The person is taken from the synthetic motions, so no data is needed.
     """
-    # Some representations have one row per step between frames, and none for the last frame.
+    # Some representations have one row per pair of neighboring frames, so one frame is added.
     body = Body(np.random.default_rng(0), np.zeros(frames + 1))
     still = Motion(body.joints(), representation.fps, SMPL22, "a person stands still", "standing")
     features: Tensor = representation.encode(raw_motion(still, representation).values)[:frames]

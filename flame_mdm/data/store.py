@@ -1,12 +1,14 @@
-"""Stores of prepared data: all clips packed in one memory-mapped array, with an index, statistics and hashes.
+"""Stores of prepared data: packed clips with an index, statistics and hashes.
 
-A store is a folder that is written once and never changed:
+All clips are in one memory-mapped array. A store is a folder that is written once and never
+changed:
 
     features.npy     (N, D) float32, the concatenated frames of all clips, not normalized
-    clips.jsonl      one clip per line: id, start, length, split, source, captions, action, attributes
-    statistics.npz   mean and std (D,) of the training frames, used by the representation for normalization
-    references.npz   joints (F', J, 3) float32 by clip id, at the frame rate of the recording, if the data set has them
-    store.json       representation, frame rate, options of the source, counts, hashes of the other files, fingerprint
+    clips.jsonl      one clip per line: id, start, length, split, source, captions, action,
+    attributes statistics.npz   mean and std (D,) of the training frames, used by the
+    representation for normalization references.npz   joints (F', J, 3) float32 by clip id, at the
+    frame rate of the recording, if the data set has them store.json       representation, frame
+    rate, options of the source, counts, hashes of the other files, fingerprint
 
 Verification adds a report to the folder, `verify.json`.
 """
@@ -48,14 +50,20 @@ from flame_mdm.safe_io.paths import check_within, remove_abandoned
 from flame_mdm.schemas import Int, Schema, check_shape
 
 FILES = ("features.npy", "clips.jsonl", "statistics.npz", "references.npz")
-"""Files that `store.json` lists with their hashes. Others in the folder of a store are never removed."""
-BLOCK = 8192  # frames that are read together for the statistics
+"""Files that `store.json` lists with their hashes.
+
+Other files in the folder are never removed.
+"""
+BLOCK = 8192  # number of frames that are read together for the statistics
 Count = Annotated[int, Field(ge=0, lt=2**63)]
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One clip of a store: frames `start` to `start + length` of the packed array; other fields as in `Clip`."""
+    """One clip of a store: frames `start` to `start + length` of the packed array.
+
+    `Clip` describes the other fields.
+    """
 
     id: Annotated[str, Field(min_length=1)]
     start: Count
@@ -90,8 +98,9 @@ class Contents(Schema):
 class Store:
     """A prepared data set, opened for reading.
 
-    Raises `FileNotFoundError` if `folder` contains no store, and `UserError` if its files are
-    damaged.
+    Raises:
+        FileNotFoundError: If `folder` contains no store.
+        UserError: If its files are damaged.
     """
 
     def __init__(self, folder: Path):
@@ -102,8 +111,8 @@ class Store:
         with _intact(contents):
             self.info: dict[str, Any] = read_json(contents)
             check_shape(self.info, Contents)
-        # The fingerprint is part of results. It is equal for equal clips and options on any
-        # machine.
+        # The fingerprint is part of results. Equal clips and options have the same fingerprint on
+        # every machine.
         self.fingerprint: str = self.info["fingerprint"]
         self._check("clips.jsonl", "statistics.npz")
         frames, width = self.info["shape"]
@@ -130,11 +139,17 @@ class Store:
                 raise ValueError("its fingerprint does not match the clips")
 
     def motion(self, clip: Entry) -> np.ndarray:
-        """Returns the features (F, D) float32 of a clip, not normalized: a view of the memory-mapped array."""
+        """Returns the features (F, D) float32 of a clip, not normalized.
+
+        They are a view of the memory-mapped array.
+        """
         return self.features[clip.start : clip.start + clip.length]
 
     def references(self, ids: Sequence[str]) -> list[np.ndarray] | None:
-        """Returns the joints of clips at the frame rate of their recording; None if a clip has none."""
+        """Returns the joints of clips at the frame rate of their recordings.
+
+        Returns None if a clip has none.
+        """
         if "references.npz" not in self.info["sha256"]:
             return None
         self._check("references.npz")
@@ -142,9 +157,9 @@ class Store:
         return [joints[name] for name in ids] if joints.keys() == set(ids) else None
 
     def licenses(self) -> list[dict[str, Any]]:
-        """Returns license, clips, minutes and actions of the motions under each license, if the data set states them.
+        """Returns license, clips, minutes and actions of the motions under each license.
 
-        Copies of a clip count once.
+        It is empty if the data set states no licenses. Copies of a clip count once.
         """
         frames: dict[str, dict[int, int]] = {}
         actions: dict[str, set[str]] = {}
@@ -165,7 +180,10 @@ class Store:
         ]
 
     def verify(self) -> None:
-        """Checks the hashes of the features and references; opening the store checks the other files only."""
+        """Checks the hashes of features and references.
+
+        Opening the store checks the other files.
+        """
         self._check("features.npy", *{"references.npz"} & self.info["sha256"].keys())
 
     def _check(self, *names: str) -> None:
@@ -177,19 +195,21 @@ class Store:
 
 
 def write_store(folder: Path, source: MotionSource, representation: Representation) -> Store:
-    """Encodes every clip of a data set and writes the store, under a temporary name until it is complete.
+    """Encodes every clip of a data set and writes the store.
 
-    If another process is writing it, waits and opens the result. If data cannot be read, leaves
-    no files behind. Raises `UserError` if `folder` holds anything but an intact store, which is
-    replaced if it existed before the call.
+    The store has a temporary name until it is complete. If another process is writing it, this
+    function waits and opens the result. If data cannot be read, no files are left behind. An
+    intact store that existed before the call is replaced.
+
+    Raises:
+        UserError: If `folder` contains anything but an intact store.
     """
     source.suit(representation)
     total, before = source.count(), (folder / "store.json").exists()
     lock = folder.with_name(folder.name + ".lock")
     waiting = f"{folder}: another process is preparing it; waiting"
     with locked(lock, lambda _: say(waiting), "prepare in one process at a time"):
-        # This process holds the lock, so that files of a process that is just ending are removed,
-        # too.
+        # This process holds the lock, so files of a process that is just ending are removed, too.
         remove_abandoned(folder.parent, folder, is_locked=True)
         remove_abandoned(folder.parent)
         if before or not (folder / "store.json").exists():
@@ -202,10 +222,13 @@ def write_store(folder: Path, source: MotionSource, representation: Representati
 
 
 def _replaceable(folder: Path) -> list[Path]:
-    """Returns the files of the store in a folder, `store.json` first; none if the folder does not exist or is empty.
+    """Returns the files of the store in a folder, `store.json` first.
 
-    Raises `UserError` if the folder is a link or holds other files but no store, or if the store
-    is damaged.
+    The list is empty if the folder does not exist or is empty.
+
+    Raises:
+        UserError: If the folder is a link, contains other files but no store, or contains a
+            damaged store.
     """
     check_within(folder, folder.parent)
     if not folder.is_dir() or not any(folder.iterdir()):
@@ -261,7 +284,7 @@ def _write(folder: Path, source: MotionSource, representation: Representation, t
 
 
 def _line(entry: Entry) -> str:
-    """Returns the line of a clip. A clip without a license lacks the key, as in stores of earlier versions."""
+    """Returns the line of a clip. Without a license, the key is left out, as in older stores."""
     values = asdict(entry)
     if not entry.license:
         del values["license"]
@@ -271,10 +294,14 @@ def _line(entry: Entry) -> str:
 def _pack(
     folder: Path, name: str, encoded: Iterable[tuple[Clip, np.ndarray]], features: int
 ) -> tuple[list[Entry], int]:
-    """Writes the features and references of the data set `name` clip by clip; returns its clips and number of frames.
+    """Writes the features and references of the data set `name` clip by clip.
 
-    Consecutive clips with the same motion share its frames. Raises `UserError` if a clip exceeds
-    its motion, has the id of another clip, or is in another split than a clip of its source.
+    Returns its clips and number of frames. Consecutive clips with the same motion share its
+    frames.
+
+    Raises:
+        UserError: If a clip exceeds its motion, has the id of another clip, or is in another
+            split than a clip of the same source.
     """
     entries: dict[str, Entry] = {}
     split_of: dict[str, Split] = {}  # split of each source
@@ -286,7 +313,7 @@ def _pack(
             if clip.motion is not motion:
                 motion, begin = clip.motion, frames
                 frames += len(values)
-                # Written through the file: through a memory map, a full disk would kill the
+                # Written with file operations: with a memory map, a full disk would kill the
                 # process (SIGBUS).
                 packed.write(values.tobytes())
             first, length = clip.window or (0, len(values))
@@ -333,8 +360,11 @@ def _write_header(file: IO[bytes], frames: int, features: int) -> None:
 def training_statistics(
     folder: Path, clips: Iterable[Entry], frames: int, representation: Representation
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns mean and std (D,) of the training frames of a store, which are read from its file in blocks."""
-    training = np.zeros(frames, bool)  # cuts may overlap; each frame counts once
+    """Returns the mean and std (D,) of the training frames of a store.
+
+    The frames are read from its file in blocks.
+    """
+    training = np.zeros(frames, bool)  # cuts may overlap, but each frame counts only once
     for clip in clips:
         training[clip.start : clip.start + clip.length] |= clip.split == "train"
 
@@ -352,7 +382,10 @@ def training_statistics(
 def _encoded(
     clips: Iterable[Clip], representation: Representation, workers: int
 ) -> Generator[tuple[Clip, np.ndarray]]:
-    """Yields each clip with the features of its entire motion, encoded in worker processes, each shared motion once."""
+    """Yields each clip with the features of its entire motion, encoded in worker processes.
+
+    A motion of several clips is encoded only once.
+    """
     groups: deque[list[Clip]] = deque()
 
     def motions() -> Iterator[tuple[str, str, np.ndarray]]:
@@ -366,7 +399,10 @@ def _encoded(
 
 
 def _encode(encoder: Representation, named: tuple[str, str, np.ndarray]) -> np.ndarray:
-    """Returns the features of a motion with its name and its representation, if it is published as features."""
+    """Returns the features of a motion, given with its name and published representation.
+
+    The representation is "" if the motion is not published as features.
+    """
     name, encoded, motion = named
     if encoded and encoded not in (encoder.name, encoder.part_of):
         raise UserError(
@@ -394,18 +430,18 @@ def _fingerprint(
     folder: Path, representation: str, fps: float, mean: np.ndarray, std: np.ndarray, version: int
 ) -> str:
     digest = hashlib.sha256((folder / "clips.jsonl").read_bytes())
-    # Features differ in their last bits between processors and thread counts, so the fingerprint
-    # depends on them only through statistics rounded to a fixed number of decimals. Adding 0.0
-    # makes -0.0 and 0.0 equal.
+    # Features differ in their last bits between processors and thread counts. Therefore the
+    # fingerprint contains only their statistics, rounded to a fixed number of decimals. Adding
+    # 0.0 makes -0.0 and 0.0 equal.
     rounded = [round(float(value), 4) + 0.0 for value in np.concatenate([mean, std])]
-    versions = [version] if version > 1 else []  # fingerprints of version 1 do not contain it
+    versions = [version] if version > 1 else []  # fingerprints of version 1 lack the version
     digest.update(json.dumps([representation, fps, rounded, *versions]).encode())
     return digest.hexdigest()[:16]
 
 
 @contextmanager
 def _intact(path: Path) -> Iterator[Path]:
-    """Yields a path of a store; errors that its content causes become one `UserError`."""
+    """Yields a path of a store. Errors caused by its content become one `UserError`."""
     try:
         yield path
     except (OSError, ValueError, KeyError) as error:
@@ -416,7 +452,8 @@ def _intact(path: Path) -> Iterator[Path]:
 
 def _entries(path: Path, frames: int, actions: int) -> list[Entry]:
     clips: list[Entry] = []
-    # Lines are read from the file. `splitlines` would also split at separators within captions.
+    # Lines are read from the file, because `splitlines` would also split at separators in
+    # captions.
     with (
         _intact(path),
         path.open(encoding="utf-8") as lines,

@@ -1,8 +1,8 @@
-"""The synthetic data set: procedural motions with captions and exact attributes; needs no download.
+"""The synthetic data set: procedural motions with captions and exact attributes.
 
-`docs/synthetic.md` describes the grammar of the captions and the limits of the data set. To add
-an action, write its motion in `synthetic_motions`, a line in `MORE` of `synthetic_actions`, and
-its captions in `synthetic_more.yaml`.
+It needs no download. `docs/synthetic.md` describes the grammar of the captions and the limits of
+the data set. To add an action, write its motion in `synthetic_motions`, a line in `MORE` of
+`synthetic_actions`, and its captions in `synthetic_more.yaml`.
 """
 
 import re
@@ -31,14 +31,14 @@ from flame_mdm.safe_io import read_yaml
 
 MIN_SECONDS, MAX_SECONDS = 2.0, 3.0  # durations of clips
 CAPTIONS = 8  # captions per clip
-SIMULTANEOUS = 0.08  # share of the clips that show two actions at once, with actions="all"
-CYCLIC = 0.04  # share of the clips that show a part of a cycle, such as two steps of a walk
-MARGIN = 1.0  # seconds before and after a part of a cycle, in which the body starts and stops
-# Share of the training clips whose captions leave out attributes. Captions of val and test state
-# all of them, so that every attribute can be measured.
+SIMULTANEOUS = 0.08  # fraction of clips that show two simultaneous actions, with actions="all"
+CYCLIC = 0.04  # fraction of clips that show a part of a cycle, such as two steps of a walk
+MARGIN = 1.0  # seconds of motion before and after such a part, in which the body starts and stops
+# Fraction of the training clips with captions that leave out attributes. Captions of val and test
+# state all of them, so that every attribute can be measured.
 PARTIAL = 0.25
 ALWAYS = ("action", "while")  # attributes that each caption states
-UNSAID = {"speed": "normal", "amount": "quarter"}  # values that a caption need not state
+UNSAID = {"speed": "normal", "amount": "quarter"}  # values that a caption may leave out
 CHOICE = re.compile(r"\[([^\[\]]*)\]")
 SLOT = re.compile(r"\{(\w+)(?:\.(\w+))?\}")
 VERB = re.compile(r"((?:\w+ly )?)<([^>]*)>")  # with an adverb before it: "is slowly walking"
@@ -46,10 +46,10 @@ VERB = re.compile(r"((?:\w+ly )?)<([^>]*)>")  # with an adverb before it: "is sl
 
 @cache
 def content() -> dict[str, Any]:
-    """Returns the grammars of the two groups of actions as one.
+    """Returns the grammars of both groups of actions as one grammar.
 
-    Captions are by single keys, the forms of verbs by their infinitive; `core_verbs` are the
-    infinitives of the core.
+    Captions have single keys, and the forms of verbs have their infinitives as keys. `core_verbs`
+    are the infinitives of the core actions.
     """
     grammar = read_yaml(Path(__file__).with_name("synthetic.yaml"))
     more = read_yaml(Path(__file__).with_name("synthetic_more.yaml"))
@@ -75,10 +75,9 @@ def content() -> dict[str, Any]:
 def draw_captions(
     rng: np.random.Generator, attributes: Attributes, count: int, incomplete: bool = False
 ) -> tuple[list[str], Attributes]:
-    """Draws `count` different captions of a clip with these attributes, and returns them with those that they state.
+    """Draws `count` different captions of a clip. Also returns the attributes that they state.
 
-    If `incomplete`, they leave out some attributes, all of them the same ones, if the grammar has
-    such captions.
+    If `incomplete` and the grammar has such captions, all of them leave out the same attributes.
     """
     everything = {
         name
@@ -87,8 +86,8 @@ def draw_captions(
     }
     captions: list[str] = []
     stated = everything
-    # The first caption that leaves out attributes decides which ones all captions of the clip
-    # leave out.
+    # The first caption that leaves out attributes determines which attributes all captions of the
+    # clip leave out.
     for _ in range(30 if incomplete else 0):
         caption, said = _sentence(rng, attributes)
         if said != everything:
@@ -136,7 +135,10 @@ def _sentence(rng: np.random.Generator, attributes: Attributes) -> tuple[str, se
 
 
 def _template(rng: np.random.Generator, attributes: Attributes) -> str:
-    """Returns a template of the captions; for two actions at once, with the templates of both inserted."""
+    """Returns a template of the captions.
+
+    For simultaneous actions, the templates of both are inserted into it.
+    """
     grammar = content()
     if "while" not in attributes:
         return _one(rng, entry(grammar["captions"], attributes))
@@ -165,7 +167,10 @@ def _conjugated(rng: np.random.Generator, text: str, tenses: Sequence[tuple[str,
 
 
 def entry(table: Mapping[str, Any], attributes: Attributes) -> Any:
-    """Returns the entry for the action and one of its attributes, such as "walk left", or for the action, or None."""
+    """Returns the entry for the action and one of its attributes, such as "walk left".
+
+    Without such an entry, returns the entry for the action, or None.
+    """
     action = str(attributes["action"])
     keys = [f"{action} {value}" for value in attributes.values()] + [action]
     return next((table[key] for key in keys if key in table), None)
@@ -192,16 +197,17 @@ def _joints(rng: np.random.Generator, t: np.ndarray, attributes: Attributes) -> 
 
 
 class Synthetic(MotionSource):
-    """Clips of the 22 SMPL joints, y up, that start at the origin facing +z; each shows one action.
+    """Clips of the 22 SMPL joints, y up. Each clip shows one action.
 
-    Clip number n is a function of the seed, n, and the group of actions.
+    A clip starts at the origin and faces +z. Clip number n is a function of the seed, n, and the
+    group of actions.
 
     Args:
         clips: number of clips.
-        seed: seed of the clips; from 0 on.
-        workers: processes that generate clips; 0 = one per core.
-        actions: "core", 22 actions, or "all", which adds 54 actions, clips of two actions at
-            once, and parts of cycles.
+        seed: seed of the clips; 0 or more.
+        workers: number of processes that generate clips; 0 = one per core.
+        actions: "core", 22 actions, or "all", which adds 54 actions, clips of two simultaneous
+            actions, and parts of cycles.
     """
 
     name = "synthetic"
@@ -221,7 +227,7 @@ class Synthetic(MotionSource):
     ):
         if clips < 1 or seed < 0:
             raise UserError(
-                f"synthetic: clips={clips}, seed={seed}: give at least one clip and a seed from 0 on"
+                f"synthetic: clips={clips}, seed={seed}: give at least one clip and a seed of 0 or more"
             )
         if actions not in ("core", "all"):
             raise UserError(f'synthetic: actions={actions!r}: choose "core" or "all"')
@@ -259,7 +265,10 @@ class Synthetic(MotionSource):
     def described(
         self, name: str, motion: np.ndarray, attributes: Attributes, words: np.random.Generator
     ) -> Clip:
-        """Returns the clip of a motion (F, 22, 3), with captions drawn by `words` and its split, drawn by its name."""
+        """Returns the clip of a motion (F, 22, 3).
+
+        Its captions are drawn by `words`, and its split by its name.
+        """
         split = hashed_split(name, val=5, test=10)
         incomplete = split == "train" and words.random() < PARTIAL
         texts, stated = draw_captions(words, attributes, CAPTIONS, incomplete)
@@ -291,10 +300,12 @@ class Synthetic(MotionSource):
 
 
 def prompts(count: int | None = None) -> list[tuple[str, Attributes]]:
-    """Returns fixed prompts with their attributes, for dashboard samples and `evaluators.metrics.attributes`.
+    """Returns fixed prompts and their attributes.
+
+    They are for samples on dashboards and for `evaluators.metrics.attributes`.
 
     Args:
-        count: Number of prompts, the first ones. Default: all.
+        count: number of prompts, counted from the first. Default: all.
     """
     return [
         (row["text"], {name: row[name] for name in row if name != "text"})
@@ -303,7 +314,10 @@ def prompts(count: int | None = None) -> list[tuple[str, Attributes]]:
 
 
 def example(attributes: Attributes, fps: float = 20.0) -> np.ndarray:
-    """Returns the joints (F, 22, 3) of a motion of three seconds with at least these attributes, such as a prompt's."""
+    """Returns the joints (F, 22, 3) of a motion of three seconds with at least these attributes.
+
+    The attributes can be the attributes of a prompt.
+    """
     name = str(attributes["action"])
     drawn = attributes
     if not attributes.keys() & {"while", "ends"}:

@@ -1,8 +1,8 @@
-"""The actions of the synthetic data set: their motions, their shares and the attributes of their clips.
+"""The actions of the synthetic data set: motions, frequencies and attributes.
 
-`CORE` has the actions of the data set `synthetic`. `MORE` has those that
-`Synthetic(actions="all")` adds, `CYCLES` and `BASES` with `GESTURES` its clips that begin and end
-in mid-action and those that show two actions at once.
+`CORE` contains the actions of the data set `synthetic`. `MORE` contains the actions that
+`Synthetic(actions="all")` adds. `CYCLES` are its clips that begin and end in the middle of an
+action. `BASES` and `GESTURES` are combined in its clips of two simultaneous actions.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -22,13 +22,13 @@ from flame_mdm.data.synthetic_motions.body import Attributes, Body
 
 
 class Action(NamedTuple):
-    """An action and the attributes that its clips have besides its name."""
+    """An action, and the attributes of its clips besides its name."""
 
-    # moves a body at times (F,) in seconds, for the attributes
+    # Moves a body at times (F,) in seconds, as the attributes say
     motion: Callable[[Body, np.random.Generator, np.ndarray, Attributes], None]
-    share: float = 1  # how often the action occurs, relative to the others
-    # attribute -> values, equally often, or with their probabilities; drawn in this order,
-    # `speed` for forward only
+    share: float = 1  # frequency of the action, relative to the other actions
+    # Values of each attribute: equally frequent, or with their probabilities. Attributes are
+    # drawn in this order; `speed` is drawn only for the direction forward.
     values: Mapping[str, Sequence[str | int] | Mapping[str, float]] = {}
     seconds: float = 0.0  # minimum duration
     reverse: bool = False  # whether the motion is played backward
@@ -171,13 +171,13 @@ GESTURES = {
 
 
 def drawn_from(rng: np.random.Generator, actions: Mapping[str, Action]) -> str:
-    """Draws the name of an action by the shares."""
+    """Draws the name of an action. `share` determines the frequencies."""
     shares = np.array([action.share for action in actions.values()], float)
     return str(rng.choice(list(actions), p=shares / shares.sum()))
 
 
 def move(body: Body, rng: np.random.Generator, t: np.ndarray, attributes: Attributes) -> None:
-    """Moves a body through the action, or the two actions at once, of the attributes."""
+    """Moves a body through the action, or the two simultaneous actions, of the attributes."""
     name, cyclic = str(attributes["action"]), attributes.get("ends") == "cycle"
     action = CYCLES[name] if cyclic else ACTIONS[name]
     action.motion(body, rng, t, attributes)

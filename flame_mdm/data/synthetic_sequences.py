@@ -1,4 +1,4 @@
-"""Synthetic clips for models that continue frames: the end of a motion, and the one of the captions after it."""
+"""Synthetic clips for models that continue frames: one motion after the end of another."""
 
 import numpy as np
 
@@ -8,23 +8,23 @@ from flame_mdm.data.synthetic_actions import ACTIONS, move
 from flame_mdm.data.synthetic_motions.body import Attributes, Body
 from flame_mdm.data.synthetic_motions.joining import frames_of, join
 
-SECONDS = 2.0, 3.0  # durations of the motion of the captions
-EARLIER_SECONDS = 1.4, 2.0  # durations of what is left of the motion before it
-AGAIN = 0.25  # share of the clips in which a motion is followed by the same one
-RESTING = 0.25  # share of the clips in which the person only stands before
-FROM_THE_FLOOR = 0.15  # share of the clips that stand up before a motion that begins standing
-OVERLAP = 0.45  # seconds, at most, in which both motions are seen
-# Motions without an end of their own. Clips show up to 6 seconds of them and leave the end out,
-# so that a stream keeps moving until its text changes.
+SECONDS = 2.0, 3.0  # duration of the motion that the captions describe
+EARLIER_SECONDS = 1.4, 2.0  # duration of the visible end of the earlier motion
+AGAIN = 0.25  # fraction of clips in which the earlier motion shows the same action
+RESTING = 0.25  # fraction of clips in which the person stands before the motion
+FROM_THE_FLOOR = 0.15  # fraction of clips that stand up before a motion that begins standing
+OVERLAP = 0.45  # maximum duration, in seconds, of the overlap of both motions
+# Motions that have no natural end. Clips show up to 6 seconds of them and leave out their end, so
+# that a stream keeps moving until its text changes.
 ENDLESS = (
     *("walk", "run", "sneak", "crouch walk", "limp", "march", "march in place", "run in place"),
     *("carry", "push", "pull", "strafe", "skip", "dance", "waltz", "crawl", "idle", "stand"),
     *("look around", "talk", "laugh", "cry", "guitar", "phone", "seated", "type"),
     "fighting stance",
 )
-LONGEST = 6.0  # seconds of a motion without an end
-STOPPING = 0.9  # seconds at its end that are left out
-# Posture at the beginning or the end of the actions that do not stand there
+LONGEST = 6.0  # maximum duration of an endless motion, in seconds
+STOPPING = 0.9  # duration of its end that is left out, in seconds
+# Posture at the beginning or at the end of actions that do not stand there
 STARTS = {
     **dict.fromkeys(("rise", "seated", "type"), "seated"),
     **{"get up": "lying", "crawl": "on all fours", "push-ups": "a plank"},
@@ -34,23 +34,22 @@ ENDS = {
     **dict.fromkeys(("lie", "fall"), "lying"),
     **{"kneel": "kneeling", "crawl": "on all fours", "push-ups": "a plank"},
 }
-# How a person who stands gets into these postures; backward, how a person stands up again
+# Action with which a standing person takes each posture; played backward, the person stands up
 WAYS_DOWN = {"seated": "sit", "lying": "lie", "kneeling": "kneel"}
-HIGHER = ("climb stairs", "climb ladder")  # end above the floor, so that nothing follows
+HIGHER = ("climb stairs", "climb ladder")  # they end above the floor, so no motion follows
 
 
 class SyntheticSequences(Synthetic):
-    """Clips that begin in an earlier motion, which goes over into the motion of the captions.
+    """Clips that begin with the end of an earlier motion, followed by the motion of the captions.
 
-    The earlier motion is any other action, the same action once more, or standing. Its end
-    precedes the motion of the captions, which begins before the body is back at rest. Sitting,
-    lying and kneeling people stand up first. Motions such as walking go on to the end of the
-    clip.
+    The earlier motion is any other action, the same action once more, or standing. The motion of
+    the captions begins before the body is back at rest. Sitting, lying and kneeling people stand
+    up first. Motions such as walking continue until the end of the clip.
 
     Args:
         clips: number of clips.
-        seed: seed of the clips; from 0 on.
-        workers: processes that generate clips; 0 = one per core.
+        seed: seed of the clips; 0 or more.
+        workers: number of processes that generate clips; 0 = one per core.
     """
 
     name = "synthetic_sequences"
@@ -72,7 +71,10 @@ class SyntheticSequences(Synthetic):
 
 
 def _joined(rng: np.random.Generator, attributes: Attributes, fps: float) -> Body:
-    """Returns the body of a clip: the end of an earlier motion, a way to the posture needed, and the motion."""
+    """Returns the body of a clip.
+
+    It shows the end of an earlier motion, a transition to the required posture, and the motion.
+    """
     action = str(attributes["action"])
     start = STARTS.get(action, "standing")
     again = rng.random() < AGAIN and action not in HIGHER
@@ -83,7 +85,7 @@ def _joined(rng: np.random.Generator, attributes: Attributes, fps: float) -> Bod
     tail = frames[-round(rng.uniform(*EARLIER_SECONDS) * fps) :]
 
     if posture != start and posture == ENDS.get(action):
-        # A person who already sits stays seated.
+        # A person who sits already stays seated.
         hold = round(rng.uniform(*SECONDS) * fps)
         return frames_of(before, np.concatenate([tail, np.repeat(tail[-1], hold)]))
     before = frames_of(before, tail)
@@ -99,7 +101,7 @@ def _joined(rng: np.random.Generator, attributes: Attributes, fps: float) -> Bod
 
 
 def _earlier(rng: np.random.Generator, start: str) -> Attributes:
-    """Draws the attributes of the motion before one that begins in the posture `start`."""
+    """Draws the attributes of the motion before a motion that begins in the posture `start`."""
     if start == "standing":
         if rng.random() < RESTING:
             return {"action": "stand"}
@@ -117,7 +119,7 @@ def _earlier(rng: np.random.Generator, start: str) -> Attributes:
 
 
 def _way(rng: np.random.Generator, posture: str, fps: float, up: bool = False) -> Body:
-    """Returns a body that gets from standing into a posture, or `up` again."""
+    """Returns a body that changes from standing into a posture, or `up` again."""
     name = WAYS_DOWN[posture]
     body = _moved(rng, ACTIONS[name].draw(rng, name), fps)
     frames = np.arange(len(body.t))
@@ -127,11 +129,14 @@ def _way(rng: np.random.Generator, posture: str, fps: float, up: bool = False) -
 def _moved(
     rng: np.random.Generator, attributes: Attributes, fps: float, whole: bool = True
 ) -> Body:
-    """Returns a body that has moved through the action; not to its end if it is endless and not `whole`."""
+    """Returns a body that has moved through the action.
+
+    If the action is endless and not `whole`, its end is left out.
+    """
     action = ACTIONS[str(attributes["action"])]
     shortest = max(SECONDS[0], 0.35 + 0.8 * int(attributes.get("count", 0)), action.seconds)
     seconds = rng.uniform(shortest, SECONDS[1])
-    # A circle would become wider with more time, as it has a given angle.
+    # A circle has a fixed angle, so it would become wider with more time.
     circle = attributes.get("direction") in ("clockwise", "counterclockwise")
     endless = attributes["action"] in ENDLESS and not whole and not circle
     if endless:

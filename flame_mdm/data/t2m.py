@@ -20,15 +20,18 @@ from flame_mdm.data import SPLITS, Clip, MotionSource, Split, archives, required
 from flame_mdm.errors import UserError
 from flame_mdm.safe_io import naming, read_npy, read_text
 
-# Frames per second of the tags `from` and `to`. The published code uses 20 for KIT-ML, too, whose
-# motions have 12.5.
+# Frames per second of the tags `from` and `to`. The published code uses 20 for KIT-ML, too,
+# although its motions have 12.5.
 TAG_FPS = 20
-MAX_LENGTH = 200  # motions and cuts of this many frames or more are left out
+MAX_LENGTH = 200  # motions and cuts with this number of frames or more are left out
 MAX_TOKENS = 20
 
 
 class Description(NamedTuple):
-    """One line of a text file: seconds `begin` to `end` of the motion, both 0 for the entire motion."""
+    """One line of a text file.
+
+    It describes seconds `begin` to `end`; both are 0 for the entire motion.
+    """
 
     caption: str
     tokens: list[str]
@@ -37,7 +40,10 @@ class Description(NamedTuple):
 
 
 class Cut(NamedTuple):
-    """One item of the data set: frames `start` to `start + length` of a motion and their descriptions."""
+    """One item of the data set: a part of a motion with its descriptions.
+
+    The part is frames `start` to `start + length`.
+    """
 
     id: str
     start: int
@@ -47,7 +53,10 @@ class Cut(NamedTuple):
     def clip(
         self, motion: np.ndarray, split: Split, source: str, encoded: str = "", **facts: str
     ) -> Clip:
-        """Returns the clip of a motion; `facts` are attributes beside the tokens, which are left out if empty."""
+        """Returns the clip of a motion.
+
+        `facts` are attributes besides the tokens. Empty facts are left out.
+        """
         captions, tokens, *_ = map(list, zip(*self.descriptions, strict=True))
         attributes = facts | ({"tokens": tokens} if all(tokens) else {})
         window = (self.start, self.length)
@@ -55,7 +64,10 @@ class Cut(NamedTuple):
 
 
 def parse(text: str, where: str) -> list[Description]:
-    """Parses the descriptions in a text file, which `where` names in errors; a NaN tag means 0, as published."""
+    """Parses the descriptions in a text file. As published, a NaN tag means 0.
+
+    `where` names the file in error messages.
+    """
     descriptions = []
     for number, line in enumerate(map(str.strip, text.splitlines()), 1):
         if line:
@@ -73,9 +85,9 @@ def parse(text: str, where: str) -> list[Description]:
 def cuts(name: str, frames: int, descriptions: Sequence[Description], shortest: int) -> list[Cut]:
     """Returns the items of a motion of `frames` frames, in the published order.
 
-    A description of a part gives a separate item, NAME@from-to, and the second of the same part
-    NAME@from-to#2. As published, a motion that is too short or too long gives none, even if parts
-    of it would fit.
+    The description of a part gives a separate item, NAME@from-to. A second description of the
+    same part gives NAME@from-to#2. As published, a motion that is too short or too long gives no
+    items, even if parts of it would fit.
     """
     if not shortest <= frames < MAX_LENGTH:
         return []
@@ -102,13 +114,20 @@ def words_of(caption: str) -> list[str]:
 
 
 def frame_tokens(tokens: Sequence[str]) -> tuple[list[str], int]:
-    """Returns the first 20 tokens between sos and eos, padded to 22 with unk, and the number without padding."""
+    """Returns up to 20 tokens between sos and eos, padded to 22 with unk.
+
+    Also returns the number of tokens without padding.
+    """
     framed = ["sos/OTHER", *tokens[:MAX_TOKENS], "eos/OTHER"]
     return framed + ["unk/OTHER"] * (MAX_TOKENS + 2 - len(framed)), len(framed)
 
 
 def read_splits(folder: Path, ending: str, get_it: str) -> dict[str, Split]:
-    """Returns name -> split, in the order of the lists; raises `UserError` if a name is in two splits."""
+    """Returns the split of each name, in the order of the lists.
+
+    Raises:
+        UserError: If a name is in two splits.
+    """
     splits: dict[str, Split] = {}
     for split in SPLITS:
         file = required(folder, get_it) / f"{split}{ending}"
@@ -119,10 +138,10 @@ def read_splits(folder: Path, ending: str, get_it: str) -> dict[str, Split]:
 
 
 class T2MFolder(MotionSource):
-    """A processed folder. Cuts and mirrored copies have the split of their motion, which is also their source.
+    """A processed folder. Cuts and mirrored copies have the split of their motion, their source.
 
     The attribute `tokens` contains the words with their parts of speech, one list per caption. A
-    mirrored copy has a name of its own to exclude.
+    mirrored copy has its own name, by which it can be excluded.
     """
 
     representation: str  # name of the representation of the features in the folder
@@ -136,7 +155,7 @@ class T2MFolder(MotionSource):
 
     @cached_property
     def names(self) -> dict[str, Split]:
-        """Name of each motion that is not excluded -> its split."""
+        """Split of each motion that is not excluded, by name."""
         return self.not_excluded(read_splits(self.path, ".txt", self.get_it), self.path)
 
     @cached_property
@@ -165,7 +184,7 @@ class T2MFolder(MotionSource):
         return {name: len(self._load(name, mmap=True)) for name in names}
 
     def count(self) -> int:
-        """Returns the number of items; raises `UserError` if Mean.npy or Std.npy is damaged."""
+        """Returns the number of items. Raises `UserError` if Mean.npy or Std.npy is damaged."""
         total = sum(
             len(cuts(name, length, self.texts[name], self.shortest))
             for name, length in self.frames.items()
@@ -188,7 +207,7 @@ class T2MFolder(MotionSource):
                 )
 
     def statistics(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the published mean and std, which are over all motions of all splits."""
+        """Returns the published mean and std of all motions of all splits."""
         mean, std = (self._array(f"{name}.npy", 1).astype(np.float32) for name in ("Mean", "Std"))
         if mean.shape != std.shape or not np.isfinite(mean).all() or not (std > 0).all():
             raise UserError(
@@ -197,7 +216,7 @@ class T2MFolder(MotionSource):
         return mean, std
 
     def counts(self) -> dict[str, float]:
-        """Returns the figures of `published.yaml`, in which motions and texts do not include mirrored copies."""
+        """Returns the figures of `published.yaml`. They do not count mirrored copies."""
         texts = [
             text for name, texts in self.texts.items() if not name.startswith("M") for text in texts
         ]
@@ -219,7 +238,7 @@ class T2MFolder(MotionSource):
 
     def _motions(self) -> set[str]:
         files = (self.path / "new_joint_vecs").glob("*.npy")
-        # A name that begins with a dot is an unfinished file of a killed process.
+        # A file whose name begins with a dot was left unfinished by a killed process.
         return {path.stem for path in files if not path.name.startswith(".")}
 
     def _load(self, name: str, mmap: bool = False) -> np.ndarray:

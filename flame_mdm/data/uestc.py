@@ -1,7 +1,7 @@
-"""UESTC: 25,600 videos of 40 exercises by 118 subjects, as the SMPL poses that ACTOR's authors estimated with VIBE.
+"""UESTC: 25,600 videos of 40 exercises by 118 subjects, as SMPL poses.
 
-Ji et al., ACM MM 2018; poses by Petrovich et al. (ACTOR), ICCV 2021. `docs/actions.md` describes
-the set.
+Sources: Ji et al., ACM MM 2018; poses by Petrovich et al. (ACTOR), ICCV 2021, who estimated them
+with VIBE. `docs/actions.md` describes the data set.
 """
 
 import math
@@ -26,18 +26,18 @@ TRAIN_SUBJECTS = (
     107, 108, 112, 113,
 )
 # fmt: on
-"""Training subjects of the cross-subject protocol: 51 of 118; the other 67 are for testing."""
+"""Training subjects of the cross-subject protocol: 51 of 118. The other 67 are for testing."""
 VAL_SUBJECTS = 5  # number of training subjects that our split uses for validation
 MIN_FRAMES = 45  # minimum length of a training clip: three quarters of 60
-ROOT = 8  # index of the middle of the hips among VIBE's 49 joints, which ACTOR uses as the root
-# Focal length and image size in pixels that ACTOR assumes, since VIBE estimates only a scale.
+ROOT = 8  # index of the middle of the hips in VIBE's 49 joints; ACTOR uses it as the root
+# Focal length and image size in pixels that ACTOR assumes, because VIBE estimates only a scale.
 FOCAL_LENGTH = 500.0
 IMAGE_SIZE = 540.0
 NAME = re.compile(r"(a(\d+)_d(\d+)_p(\d+)_c(\d+))(_.*)?")
 
 
 class Video(NamedTuple):
-    """Fields of a video's file name; `index` is its position in the lists."""
+    """Fields of a video's file name. `index` is its position in the lists."""
 
     index: int
     id: str
@@ -48,10 +48,11 @@ class Video(NamedTuple):
 
 
 class UESTC(MotionSource):
-    """The clips of `vibe_cache_refined.pkl`, rotated to the front view, as raw motions of the SMPL representations.
+    """The clips of `vibe_cache_refined.pkl` in front view, as raw SMPL motions.
 
-    As published, training clips of fewer than 45 frames are left out and all test clips are kept.
-    The published split trains on all 51 training subjects; ours uses 5 of them for validation.
+    As published, training clips of fewer than 45 frames are left out, and all test clips are
+    kept. The published split trains on all 51 training subjects. Our split uses 5 of them for
+    validation.
     """
 
     name = "uestc"
@@ -62,12 +63,16 @@ class UESTC(MotionSource):
 
     @cached_property
     def actions(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Names of the actions, read from the data set: models need their number before training."""
+        """Names of the actions.
+
+        They are read from the data, as models need their number early.
+        """
         return tuple(self._lines("action_classes.txt"))
 
     def count(self) -> int:
-        """Returns the number of videos, including the few that turn out to be too short when they
-        are read.
+        """Returns the number of videos.
+
+        It includes the few videos that turn out to be too short when they are read.
         """
         return len(self.used)  # including the few that are left out when their poses are read
 
@@ -82,8 +87,10 @@ class UESTC(MotionSource):
 
     @cached_property
     def videos(self) -> list[Video]:
-        """All videos, in the order of the file of poses; raises `UserError` if a name cannot be
-        read.
+        """All videos, in the order of the file of poses.
+
+        Raises:
+            UserError: If a name cannot be parsed.
         """
         videos = []
         for index, name in enumerate(self._lines("names.txt")):
@@ -98,7 +105,7 @@ class UESTC(MotionSource):
 
     @cached_property
     def used(self) -> list[Video]:
-        """The videos that are used: of side 2, only views 0 to 7."""
+        """The videos that are used. Of side 2, these are only views 0 to 7."""
         return [video for video in self.videos if video.side == 1 or video.view < 8]
 
     def _lines(self, name: str) -> list[str]:
@@ -152,13 +159,21 @@ class UESTC(MotionSource):
 
 
 def front_view(pose: np.ndarray, root: np.ndarray, camera: np.ndarray, video: Video) -> np.ndarray:
-    """Converts VIBE's estimates to a raw motion; videos of side 2 are rotated about the vertical by their view.
+    """Converts VIBE's estimates to a raw motion (F, 75) float32.
 
     VIBE's camera is weak-perspective: a scale s and a shift. ACTOR's code places the body at x, y
-    = the shift and at the depth z at which a camera of focal length f shows it in that size: z =
-    f / (s w / 2) in an image w pixels wide. `pose` (F, 72) is axis-angle, `root` (F, 3) relative
-    to the body; `camera` (F, 4) has scales sx (used) and sy, then the shift. Returns (F, 75)
-    float32: translation relative to the first frame and pose, in camera axes.
+    = the shift. The depth z is the distance at which a camera of focal length f shows the body in
+    that size: z = f / (s w / 2) in an image w pixels wide. Videos of side 2 are rotated about the
+    vertical axis by their view.
+
+    Args:
+        pose: (F, 72), axis-angle vectors.
+        root: (F, 3), root position relative to the body.
+        camera: (F, 4), scales sx (used) and sy, then the shift.
+        video: the video.
+
+    Returns:
+        Translation relative to the first frame, and pose, in camera axes.
     """
     depth = FOCAL_LENGTH / (np.abs(camera[:, 0]) * IMAGE_SIZE / 2)
     shift = np.concatenate([camera[:, 2:], depth[:, None]], 1)

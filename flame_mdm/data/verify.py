@@ -1,4 +1,4 @@
-"""Verification report of a prepared data set: contents, comparison with published figures, anomalies."""
+"""Verification report of a prepared data set: contents, published figures and anomalies."""
 
 import json
 from collections import Counter, defaultdict
@@ -20,23 +20,23 @@ from flame_mdm.representations import Representation
 from flame_mdm.safe_io import read_yaml, write_text
 
 PUBLISHED = Path(__file__).with_name("published.yaml")
-# A clip counts as still if no joint moves farther, in meters, from its first position.
+# Distance in meters. A clip counts as still if no joint moves farther from its first position.
 STILL_DISTANCE = 0.01
 
 
 def report(data: MotionDataModule) -> dict[str, Any]:
-    """Hashes and scans the store of a data set; writes the report into its folder as
-    `verify.json`.
+    """Hashes and scans the store of a data set, and writes a report as `verify.json`.
+
+    The report is written into the folder of the store.
 
     Returns:
         The report: data set, hashes of the `files`, `figures` next to published ones, numbers of
-            captions and
-        actions, lengths, `still` clips, `duplicates`, differences of the statistics, and
-            `excluded` clips.
+            captions and actions, lengths, `still` clips, `duplicates`, differences of the
+            statistics, and `excluded` clips.
 
     Raises:
-        FileNotFoundError: if the data set is not prepared.
-        UserError: if the store has wrong hashes or numbers that are not finite.
+        FileNotFoundError: If the data set is not prepared.
+        UserError: If the store has wrong hashes or numbers that are not finite.
     """
     store = data.open()
     store.verify()
@@ -83,8 +83,8 @@ def report(data: MotionDataModule) -> dict[str, Any]:
         "duplicates_across_splits": sum(
             len({clip.split for clip in group}) > 1 for group in duplicates
         ),
-        # Mean and std of the store may have been published with the data set. They are compared
-        # with values computed from its training clips.
+        # Mean and std of the store may be published values. They are compared with values
+        # computed from the training clips.
         "statistics": {
             "largest difference of a mean, in std": float((np.abs(store.mean - mean) / std).max()),
             "largest relative difference of a std": float(np.abs(store.std / std - 1).max()),
@@ -98,7 +98,7 @@ def report(data: MotionDataModule) -> dict[str, Any]:
 
 
 def lines(content: dict[str, Any]) -> list[str]:
-    """Returns the lines of a report as YAML, with the first of many still clips and duplicates."""
+    """Returns the lines of a report as YAML. Long lists of clips are shortened."""
     groups = [" = ".join(group) for group in content["duplicates"]]
     shown = content | {
         "still": some(content["still"]) or "none",
@@ -110,7 +110,7 @@ def lines(content: dict[str, Any]) -> list[str]:
 
 
 def deviations(content: dict[str, Any]) -> list[str]:
-    """Returns the figures of a report that differ from the published ones, with the differences."""
+    """Returns the figures of a report that differ from published ones, with differences."""
     differing = [
         (name, f["found"], f["published"])
         for name, f in content["figures"].items()
@@ -123,9 +123,9 @@ def deviations(content: dict[str, Any]) -> list[str]:
 
 
 def _figures(store: Store) -> dict[str, dict[str, Any]]:
-    """Returns figures of the store and of the raw data that it was prepared from.
+    """Returns figures of the store and of its raw data.
 
-    A figure that both have is of the raw data.
+    If both have a figure, the figure of the raw data is returned.
     """
     labeled = [clip for clip in store.clips if clip.action is not None]
     counted: dict[str, float] = {"clips": len(store.clips), **store.info["clips"]}
@@ -157,10 +157,12 @@ def _figures(store: Store) -> dict[str, dict[str, Any]]:
 def _anomalies(
     store: Store, representation: Representation
 ) -> tuple[list[Entry], list[list[Entry]]]:
-    """Returns the clips without movement, and groups of clips of bit-identical motions.
+    """Returns the clips without movement, and groups of clips with bit-identical motions.
 
-    Clips that share all their frames are one motion: they differ only in caption. Raises
-    `UserError` if a frame is not finite.
+    Clips that share all their frames are one motion: they differ only in their captions.
+
+    Raises:
+        UserError: If a frame is not finite.
     """
     sharing: defaultdict[tuple[int, int], list[Entry]] = defaultdict(list)
     for clip in store.clips:

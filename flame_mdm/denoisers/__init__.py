@@ -8,10 +8,11 @@ from flame_mdm.batch import Condition
 
 
 class Denoiser(nn.Module, ABC):
-    """A network that predicts the target of a process from a noisy motion: base class of all denoisers.
+    """Base class of all denoisers.
 
-    Subclasses take the following arguments, as far as they use them. `Parts.build` passes the
-    first three, which depend on other parts; the others come from the configuration.
+    A denoiser predicts the target of a process from a noisy motion. Subclasses take some of the
+    following arguments. `Parts.build` passes the first three, which depend on other parts. The
+    others come from the configuration.
 
     Args:
         in_features: D, the number of features of a frame.
@@ -21,9 +22,9 @@ class Denoiser(nn.Module, ABC):
         ff_size: hidden width of the feed-forward layers.
         num_layers: number of layers.
         num_heads: number of attention heads; divides `latent_dim`.
-        dropout: probability in [0, 1) of dropout after the positions and inside the layers.
+        dropout: probability of dropout after the positions and inside the layers, in [0, 1).
         project_condition: False adds the condition to the time without projection, as MDM does
-            with action embeddings; C must then be `latent_dim`.
+            with action embeddings. C must then be `latent_dim`.
 
     Example:
         >>> import torch
@@ -35,8 +36,8 @@ class Denoiser(nn.Module, ABC):
         torch.Size([2, 5, 3])
     """
 
-    #: Whether padding has no influence on real frames. A network that attends to padding (False)
-    #: is sampled at the padded length of its training.
+    #: Whether padding has no influence on real frames. If False, the network attends to padding
+    #: and is sampled with the padded length of its training.
     mask_padding: bool = True
 
     #: Number of clean frames before the motion that the network reads in `Condition.prefix`.
@@ -44,15 +45,17 @@ class Denoiser(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
-        """Returns the prediction (B, F, out_features). A pure function, except for dropout in training.
+        """Returns the prediction (B, F, out_features).
+
+        It is a pure function, except for dropout in training.
 
         Args:
             x_t: (B, F, D) noisy motion.
             t: (B,) float in [0, 1000), the time as a row of the sinusoidal table.
             mask: (B, F) bool, True = real frame. See also `mask_padding`.
-            cond: the condition, in which dropped samples are already replaced by nulls.
+            cond: the condition. Dropped samples have the null condition already.
 
         Raises:
             UserError: If a motion is too long for the network, condition tokens are missing or
-                too many, or the prefix is not `context_frames` long.
+                too many, or the prefix does not have `context_frames` frames.
         """

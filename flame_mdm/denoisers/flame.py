@@ -12,11 +12,11 @@ from flame_mdm.errors import UserError
 
 
 class FLAME(Denoiser):
-    """Transformer decoder over the frames with cross-attention to the text; the network of FLAME.
+    """The network of FLAME: a transformer decoder over frames, with cross-attention to the text.
 
-    Its input is [ML, TS, CLS, frame 1, frame 2, ...], its memory [ML, TS, CLS, text tokens]. ML
-    embeds the length of the motion, TS is the sinusoid of the time, CLS the projected pooled
-    condition. The output of frames past the end of a motion is 0.
+    Its input is [ML, TS, CLS, frame 1, frame 2, ...]. Its memory is [ML, TS, CLS, text tokens].
+    ML embeds the length of the motion, TS is the sinusoid of the time, and CLS is the projected
+    pooled condition. The output past the end of a motion is 0.
 
     Args:
         in_features: D.
@@ -31,10 +31,10 @@ class FLAME(Denoiser):
         length_token: False omits ML (table 4, first row).
         cross_attention: False gives a transformer encoder over ML, TS, CLS and frames (table 4,
             first two rows).
-        condition_frames: also add TS and CLS to every frame: a small network follows the text
-            after fewer steps.
-        length_unit: ML embeds the length rounded down to a multiple of this, the unit of the
-            windows in training.
+        condition_frames: also add TS and CLS to every frame. A small network then learns to
+            follow the text in fewer steps.
+        length_unit: unit of the windows in training, in frames. ML embeds the length rounded down
+            to a multiple of it.
 
     Example:
         >>> denoiser = FLAME(
@@ -70,7 +70,7 @@ class FLAME(Denoiser):
             condition_frames,
             length_unit,
         )
-        # A table of max_frames rows is enough for the lengths 1 to max_frames: row 0, which the
+        # A table of max_frames rows is enough for the lengths 1 to max_frames. Row 0, which the
         # authors' code never reads, is used for the longest motion.
         self.length_embedding = nn.Embedding(max_frames, latent_dim) if length_token else None
         self.input = nn.Linear(in_features, latent_dim)
@@ -121,7 +121,10 @@ class FLAME(Denoiser):
 
 
 def cosine_first_sinusoid(position: Tensor, features: int) -> Tensor:
-    """Embeds positions or times (N,) as (N, features) float32: cosines in the first half, sines in the second."""
+    """Embeds positions or times (N,) as (N, features) float32.
+
+    The first half are cosines, the second half sines.
+    """
     half = features // 2
     frequency = torch.exp(
         -math.log(10000.0) * torch.arange(half, device=position.device, dtype=torch.float32) / half

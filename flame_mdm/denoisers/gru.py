@@ -1,4 +1,4 @@
-"""The recurrent network of the Human Motion Diffusion Model (Tevet et al. 2023, "MDM", section 4.1, appendix C)."""
+"""The recurrent network of MDM (Tevet et al. 2023, section 4.1, appendix C)."""
 
 import torch
 from torch import Tensor, nn
@@ -9,9 +9,9 @@ from flame_mdm.denoisers.layers import TimeAndCondition, sinusoid
 
 
 class MDMGRU(Denoiser):
-    """GRU over the frames, with time + condition concatenated to each frame.
+    """GRU over the frames. Time + condition is concatenated to each frame.
 
-    It runs forward in time, so that padding at the end does not affect real frames.
+    It runs forward in time, so padding at the end does not affect real frames.
 
     Args:
         in_features: D.
@@ -21,9 +21,9 @@ class MDMGRU(Denoiser):
         num_layers: number of layers of the GRU.
         dropout: probability of dropout after the positions.
         project_condition: False adds the condition to the time without projection.
-        recur_over_batch: recurs from sample to sample instead of from frame to frame, as MDM's
-            released code does because of swapped axes. Only for reproduction: results then depend
-            on the order of the batch.
+        recur_over_batch: recur from sample to sample instead of from frame to frame, as MDM's
+            released code does because of swapped axes. This is only for reproduction: results
+            then depend on the order of the batch.
 
     Example:
         >>> denoiser = MDMGRU(6, 6, 4, latent_dim=8, num_layers=1, dropout=0.0)

@@ -1,4 +1,4 @@
-"""Layers shared by the denoisers: sinusoids, post-norm transformer, embedding of time and condition."""
+"""Layers shared by the denoisers: sinusoids, transformer, embedded time and condition."""
 
 import math
 from collections.abc import Callable
@@ -11,10 +11,10 @@ from flame_mdm.errors import UserError
 
 
 def sinusoid(position: Tensor, features: int) -> Tensor:
-    """Returns sines in even and cosines in odd of the (N, features) channels (Vaswani et al. 2017, section 3.5).
+    """Returns the sinusoids (N, features) of positions (Vaswani et al. 2017, section 3.5).
 
-    Computed in float32 for any precision of the network, as in the training of the released
-    weights.
+    Even channels are sines, odd channels are cosines. They are computed in float32 for any
+    precision of the network, as in the training of the released weights.
     """
     channel = torch.arange(0, features, 2, device=position.device, dtype=torch.float32)
     angle = position.float()[:, None] * torch.exp(channel * (-math.log(10000.0) / features))
@@ -22,15 +22,15 @@ def sinusoid(position: Tensor, features: int) -> Tensor:
 
 
 def with_prefix(mask: Tensor, prefix: int) -> Tensor:
-    """Extends a mask (B, N) to (B, prefix + N); the prefix is always real."""
+    """Extends a mask (B, N) to (B, prefix + N). The prefix is always real."""
     return torch.cat([mask.new_ones(mask.shape[0], prefix), mask], 1)
 
 
 class Attention(nn.Module):
     """Multi-head attention of x to itself or to a memory (Vaswani et al. 2017, section 3.2.2).
 
-    Query, key and value share one matrix (3C, C), as in released weights, so that self-attention
-    projects once.
+    Query, key and value share one matrix (3C, C), as in released weights. Self-attention then
+    needs only one projection.
     """
 
     def __init__(self, features: int, num_heads: int, dropout: float):
@@ -46,7 +46,13 @@ class Attention(nn.Module):
         nn.init.zeros_(self.out.bias)
 
     def forward(self, x: Tensor, mask: Tensor | None, memory: Tensor | None = None) -> Tensor:
-        """Attends from x (B, N, C) to the real entries (mask (B, S), None = all) of memory (B, S, C), or of x."""
+        """Attends from x (B, N, C) to a memory, or to x if there is no memory.
+
+        Args:
+            x: (B, N, C), the queries.
+            mask: (B, S) bool, True = real entry; None = all are real.
+            memory: (B, S, C).
+        """
 
         def heads(y: Tensor, parts: int) -> Tensor:
             return y.unflatten(-1, (parts, self.num_heads, -1)).permute(2, 0, 3, 1, 4)
@@ -68,7 +74,10 @@ class Attention(nn.Module):
 
 
 class TransformerLayer(nn.Module):
-    """Self-attention, optional cross-attention and feed-forward, with a norm after each residual sum."""
+    """Self-attention, optional cross-attention and feed-forward, each followed by a norm.
+
+    The norm is after the residual sum.
+    """
 
     def __init__(
         self,
@@ -96,7 +105,14 @@ class TransformerLayer(nn.Module):
     def forward(
         self, x: Tensor, mask: Tensor | None, memory: Tensor | None, memory_mask: Tensor | None
     ) -> Tensor:
-        """Transforms x (B, N, C), with memory (B, S, C) for cross-attention; masks (B, N), (B, S), None = all real."""
+        """Transforms a sequence.
+
+        Args:
+            x: (B, N, C), the sequence.
+            mask: (B, N) bool, True = real; None = all are real.
+            memory: (B, S, C), for cross-attention.
+            memory_mask: (B, S) bool, True = real; None = all are real.
+        """
         x = self.self_norm(x + self.dropout(self.self_attention(x, mask)))
         if self.cross_attention is not None and self.cross_norm is not None:
             x = self.cross_norm(x + self.dropout(self.cross_attention(x, memory_mask, memory)))
@@ -104,7 +120,10 @@ class TransformerLayer(nn.Module):
 
 
 class Transformer(nn.Module):
-    """A stack of post-norm layers, with cross-attention (a decoder) or without (an encoder); no causal mask."""
+    """A stack of post-norm layers without causal mask.
+
+    With cross-attention, it is a decoder, otherwise an encoder.
+    """
 
     def __init__(
         self,
@@ -127,18 +146,24 @@ class Transformer(nn.Module):
         memory: Tensor | None = None,
         memory_mask: Tensor | None = None,
     ) -> Tensor:
-        """Transforms x (B, N, C), with memory (B, S, C) for a decoder; masks (B, N) and (B, S), None = all real."""
+        """Transforms a sequence.
+
+        Args:
+            x: (B, N, C), the sequence.
+            mask: (B, N) bool, True = real; None = all are real.
+            memory: (B, S, C), for a decoder.
+            memory_mask: (B, S) bool, True = real; None = all are real.
+        """
         for layer in self.layers:
             x = layer(x, mask, memory, memory_mask)
         return x
 
 
 class TimeAndCondition(nn.Module):
-    """z_tk of MDM (Tevet et al. 2023, section 3): the sinusoid of the time after two linear
-    layers, plus the condition.
+    """z_tk of MDM (Tevet et al. 2023, section 3).
 
-    The null condition is a zero vector *before* the projection, so that only the projection's
-    bias remains.
+    It is the sinusoid of the time after two linear layers, plus the projected condition. The null
+    condition is a zero vector *before* the projection, so only the projection's bias remains.
     """
 
     def __init__(self, features: int, cond_features: int, project_condition: bool):
@@ -162,7 +187,10 @@ class TimeAndCondition(nn.Module):
         return self.time_embedding(sinusoid(t, self.features).to(next(self.parameters()).dtype))
 
     def forward(self, t: Tensor, condition: Tensor) -> Tensor:
-        """Embeds times (B,) and condition (B, C) or (B, S, C) as (B, features) or (B, S, features)."""
+        """Embeds times (B,) and a condition (B, C) as (B, features).
+
+        A condition (B, S, C) gives (B, S, features).
+        """
         return self.add(self.time(t), condition)
 
     def add(self, time: Tensor, condition: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""The transformers of the Human Motion Diffusion Model (Tevet et al. 2023, "MDM", section 3 and appendix C)."""
+"""The transformers of MDM (Tevet et al. 2023, section 3 and appendix C)."""
 
 from typing import Literal
 
@@ -13,7 +13,7 @@ from flame_mdm.errors import UserError
 
 
 class MDMEncoder(Denoiser):
-    """Transformer encoder over [time + condition, frame 1, frame 2, ...]; the network of MDM and MFM.
+    """Transformer encoder over [time + condition, frame 1, frame 2, ...]; used by MDM and MFM.
 
     Args:
         in_features: D.
@@ -25,13 +25,13 @@ class MDMEncoder(Denoiser):
         num_heads: number of attention heads; divides `latent_dim`.
         dropout: probability of dropout after the positions and inside the layers.
         project_condition: False adds the condition to the time without projection.
-        max_tokens: 0 = the pooled condition is added to the time. Otherwise the maximum number of
-            condition tokens between the time and the frames (MFM with T5: 30); frames keep their
-            positions if there are fewer.
-        mask_padding: False lets frames attend to the padding, as the released models of MDM and
-            MFM do: they are sampled at the padded length of their training and cropped.
-        condition_frames: also add time + condition (with `max_tokens`, the time) to every frame:
-            a small network follows the text after fewer steps.
+        max_tokens: 0 = the pooled condition is added to the time. Otherwise, it is the maximum
+            number of condition tokens between the time and the frames (MFM with T5: 30). The
+            positions of the frames do not depend on the number of tokens.
+        mask_padding: False lets frames attend to padding, as in the released models of MDM and
+            MFM. Motions are then sampled with the padded length of training, and cropped.
+        condition_frames: also add time + condition (with `max_tokens`, only the time) to every
+            frame. A small network then learns to follow the text in fewer steps.
 
     Example:
         >>> denoiser = MDMEncoder(6, 6, 4, latent_dim=8, ff_size=8, num_layers=1, num_heads=2, dropout=0.0)
@@ -69,7 +69,11 @@ class MDMEncoder(Denoiser):
         self.output = nn.Linear(latent_dim, out_features)
 
     def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
-        """See `Denoiser.forward`. Raises `UserError` if there are no tokens for `max_tokens`, or more than that."""
+        """See `Denoiser.forward`.
+
+        Raises:
+            UserError: If `max_tokens` is above 0 and there are no tokens, or too many.
+        """
         token_mask = mask[:, :0]
         if self.max_tokens:
             tokens, token_mask = condition_tokens(cond)
@@ -95,12 +99,11 @@ class MDMEncoder(Denoiser):
 
 
 class MDMDecoder(Denoiser):
-    """Transformer decoder over the frames, with time + condition as cross-attention memory; the
-    network of MDM and DiP.
+    """Transformer decoder over the frames; used by MDM and DiP.
 
-    With `context_frames`, clean frames precede the noisy ones, as in DiP (Tevet et al. 2025,
-    "CLoSD", section 3.1). Nothing but their positions marks them as clean, and their outputs are
-    dropped.
+    The memory of its cross-attention is time + condition. With `context_frames`, clean frames
+    precede the noisy ones, as in DiP (Tevet et al. 2025, "CLoSD", section 3.1). Only their
+    positions mark them as clean, and their outputs are dropped.
 
     Args:
         in_features: D.
@@ -112,18 +115,18 @@ class MDMDecoder(Denoiser):
         num_heads: number of attention heads; divides `latent_dim`.
         dropout: probability of dropout after the positions and inside the layers.
         project_condition: False adds the condition to the time without projection.
-        input_token: token before the frames: "condition" is time + condition, as in the paper's
-            "+ input token" and the released model; "time" is the time alone, as in MDM's code
+        input_token: token before the frames. "condition" is time + condition, as in the paper's
+            "+ input token" and in the released model. "time" is the time alone, as in MDM's code
             since February 2025.
-        token_memory: memory of all condition tokens, with the time added to each, as in MDM with
-            DistilBERT.
-        memory: how the time enters the memory of all tokens: "add" to each of them, or "concat"
-            as a token before them.
-        mask_padding: False lets frames attend to the padding, as the released models without
-            `mask_frames` do.
+        token_memory: use all condition tokens as memory and add the time to each of them, as MDM
+            does with DistilBERT.
+        memory: how the time enters the memory of all tokens. "add": it is added to each token;
+            "concat": it is a token before them.
+        mask_padding: False lets frames attend to padding, as in the released models without
+            `mask_frames`.
         context_frames: number of clean frames before the motion, in `Condition.prefix`.
-        target_encoder: network that embeds `Condition.target`, which is added to the time; "none"
-            ignores targets.
+        target_encoder: network that embeds `Condition.target`. The result is added to the time.
+            "none" ignores targets.
         target_layers: number of hidden layers of the target encoders "single" and "split".
         condition_frames: also add time + condition to every noisy frame: a small network follows
             the text after fewer steps, and noisy frames differ from clean ones.
@@ -189,7 +192,11 @@ class MDMDecoder(Denoiser):
         self.output = nn.Linear(latent_dim, out_features)
 
     def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
-        """See `Denoiser.forward`. Raises `UserError` if the prefix or the tokens are missing or of the wrong size."""
+        """See `Denoiser.forward`.
+
+        Raises:
+            UserError: If the prefix or the tokens are missing or have the wrong size.
+        """
         time = self.condition.time(t)
         if self.target is not None:
             time = time + self.target(cond).to(time)
@@ -214,7 +221,7 @@ class MDMDecoder(Denoiser):
         return self.output(x[:, before:])
 
     def _with_context(self, x_t: Tensor, cond: Condition) -> Tensor:
-        """Returns the clean frames of the prefix and the noisy frames after them."""
+        """Returns the clean frames of the prefix, followed by the noisy frames."""
         if not self.context_frames:
             return x_t
         frames = 0 if cond.prefix is None else cond.prefix.shape[1]
@@ -225,7 +232,12 @@ class MDMDecoder(Denoiser):
         return torch.cat([cond.prefix.to(x_t), x_t], 1)
 
     def _memory(self, time: Tensor, cond: Condition) -> tuple[Tensor, Tensor | None]:
-        """Returns the memory (B, S, C) of embedded times (B, C) and the condition, and its mask (B, S), None = all."""
+        """Returns the memory (B, S, C) and its mask (B, S); None = all are real.
+
+        Args:
+            time: (B, C), embedded times.
+            cond: the condition.
+        """
         if not self.token_memory:
             return self.condition.add(time, cond.pooled)[:, None], None
         tokens, mask = condition_tokens(cond)
@@ -237,7 +249,7 @@ class MDMDecoder(Denoiser):
 
 
 def condition_tokens(cond: Condition) -> tuple[Tensor, Tensor]:
-    """Returns the tokens (B, S, C) and their mask (B, S); raises `UserError` if there are none."""
+    """Returns the tokens (B, S, C) and their mask (B, S). Raises `UserError` without tokens."""
     if cond.token_mask is None or not cond.tokens.shape[1]:
         raise UserError(
             "this denoiser needs condition tokens, but the condition encoder has none: choose another one"

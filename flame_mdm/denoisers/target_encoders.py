@@ -1,6 +1,7 @@
-"""Encoders of target conditions: where joints should be at the end of a motion (Tevet et al. 2025, "CLoSD").
+"""Encoders of target conditions: where joints should be at the end of a motion.
 
-A target (B, 8, 4) has a slot per joint; each slot is x, y, z and 1 = requested or 0 = free.
+Source: Tevet et al. 2025, "CLoSD". A target (B, 8, 4) has a slot per joint. Each slot is x, y, z,
+and 1 = requested or 0 = free.
 """
 
 from abc import ABC, abstractmethod
@@ -11,16 +12,16 @@ from torch import Tensor, nn
 from flame_mdm.batch import Condition
 from flame_mdm.errors import UserError
 
-# Slots of a target: six joints, the place on the floor and the heading, see
+# Number of slots of a target: six joints, the place on the floor and the heading; see
 # `flame_mdm.conditions.target`
 SLOTS = 8
 
 
 class TargetEncoder(nn.Module, ABC):
-    """Embeds the target of a condition as (B, features); without a target, the embedding is 0.
+    """Embeds the target of a condition as (B, features). Without a target, the embedding is 0.
 
-    A target that requests no joint is not the same as no target: its embedding has the biases of
-    the network.
+    A target that requests no joint differs from no target: the biases of the network are in its
+    embedding.
 
     Example:
         >>> encoder = SingleTarget(features=16, layers=1)
@@ -33,7 +34,7 @@ class TargetEncoder(nn.Module, ABC):
         """Embeds targets (B, 8, 4) as (B, features)."""
 
     def forward(self, cond: Condition) -> Tensor:
-        """Embeds the target of a condition; samples whose target is left out get 0."""
+        """Embeds the target of a condition. Samples without target get 0."""
         if cond.target is None:
             return cond.pooled.new_zeros(len(cond.pooled), 1)
         embedding = self.embed(cond.target)
@@ -75,8 +76,8 @@ class SplitTarget(TargetEncoder):
 class MultiTarget(TargetEncoder):
     """One network per slot; the outputs of requested slots are summed with learned weights.
 
-    The weights are divided by their sum over all slots, as in the authors' code, where the sum
-    may be near 0. `layers` has no effect.
+    As in the authors' code, the weights are divided by their sum over all slots, which may be
+    near 0. `layers` has no effect.
     """
 
     def __init__(self, features: int, layers: int):
@@ -98,7 +99,7 @@ TARGET_ENCODERS: dict[str, type[TargetEncoder]] = {
     "split": SplitTarget,
     "multi": MultiTarget,
 }
-"""Target encoders, by the names that the authors give them."""
+"""Target encoders, by the names that the authors use."""
 
 
 def perceptron(in_features: int, features: int, layers: int) -> nn.Sequential:

@@ -1,8 +1,8 @@
-"""The U-Net of the Human Motion Diffusion Model (Tevet et al. 2023, "MDM", section 4.1), whose code is not public.
+"""The U-Net of MDM (Tevet et al. 2023, section 4.1). Its code is not public.
 
-The paper specifies convolutions over time, joints as channels, 23.47 M parameters. The rest
-follows the network of DDPM (Ho et al. 2020, appendix B) with the scale-and-shift injection of
-Dhariwal and Nichol 2021.
+The paper specifies convolutions over time, joints as channels, and 23.47 M parameters. All other
+details are as in the network of DDPM (Ho et al. 2020, appendix B), with the scale-and-shift
+injection of Dhariwal and Nichol 2021.
 """
 
 from collections.abc import Sequence
@@ -19,18 +19,18 @@ from flame_mdm.errors import UserError
 
 
 class MDMUNet(Denoiser):
-    """U-Net over time with the features of a frame as channels, for motions of any length.
+    """U-Net over time, for motions of any length. The features of a frame are channels.
 
-    Padding does not affect real frames: padded frames are zeroed before every convolution, as if
-    the motion ended there, and excluded from the statistics of the norms. A frame of a coarser
-    level is real if the first of its two finer frames is real.
+    Padding does not affect real frames. Padded frames are set to 0 before every convolution, as
+    if the motion ended there, and are excluded from the statistics of the norms. A frame of a
+    coarser level is real if the first of its two finer frames is real.
 
     Args:
         in_features: D.
         out_features: D, or 2D with a learned variance.
         cond_features: C; 0 = unconditioned.
         latent_dim: width of the embedded time and condition.
-        channels: width of each level; each level has half the frame rate of the previous one.
+        channels: width of each level. Each level has half the frame rate of the previous one.
         num_groups: number of groups of the group norms; divides all widths.
         dropout: probability of dropout inside the blocks.
         project_condition: False adds the condition to the time without projection.
@@ -92,7 +92,7 @@ class MDMUNet(Denoiser):
 
 
 class ResidualBlock(nn.Module):
-    """Norm, SiLU and convolution, twice; time and condition scale and shift the second norm."""
+    """Norm, SiLU and convolution, twice. Time and condition scale and shift the second norm."""
 
     def __init__(
         self, in_channels: int, out_channels: int, features: int, num_groups: int, dropout: float
@@ -111,7 +111,13 @@ class ResidualBlock(nn.Module):
         )
 
     def forward(self, x: Tensor, token: Tensor, mask: Tensor) -> Tensor:
-        """Maps x (B, in_channels, F), token (B, features), mask (B, 1, F) of 0 and 1 -> (B, out_channels, F)."""
+        """Returns (B, out_channels, F).
+
+        Args:
+            x: (B, in_channels, F), the input.
+            token: (B, features), embedded time and condition.
+            mask: (B, 1, F), 1 = real frame, 0 = padding.
+        """
         y = self.conv1(functional.silu(self.norm1(x, mask)) * mask)
         scale, shift = self.scale_shift(token)[..., None].chunk(2, 1)
         y = functional.silu(self.norm2(y, mask) * (1 + scale) + shift)
@@ -119,7 +125,7 @@ class ResidualBlock(nn.Module):
 
 
 class MaskedGroupNorm(nn.Module):
-    """Group norm (Wu and He 2018) with statistics over real frames only."""
+    """Group norm (Wu and He 2018) with statistics of real frames only."""
 
     def __init__(self, channels: int, num_groups: int):
         super().__init__()
@@ -132,7 +138,7 @@ class MaskedGroupNorm(nn.Module):
         self.bias = nn.Parameter(torch.zeros(channels))
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Normalizes x (B, C, F) with mask (B, 1, F) of 0 and 1 -> (B, C, F)."""
+        """Normalizes x (B, C, F). The mask (B, 1, F) is 1 for real frames and 0 for padding."""
         groups = x.unflatten(1, (self.num_groups, -1))
         mask = mask[:, None]
         count = groups.shape[2] * mask.sum(-1, keepdim=True).clamp(min=1)

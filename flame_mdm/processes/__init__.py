@@ -1,4 +1,4 @@
-"""Generative processes: corruption of motion, prediction target of the denoiser, training loss and sampling."""
+"""Generative processes: corruption of motions, targets of denoisers, losses and sampling."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -13,15 +13,19 @@ from flame_mdm.processes.samplers import Sampler
 from flame_mdm.sampler_options import SamplerOptions
 
 Auxiliary = Callable[[Tensor, Tensor, Tensor], dict[str, Tensor]]
-"""(x0_hat (B, F, D), x (B, F, D), mask (B, F)) -> weighted per-sample losses (B,) of the clean estimate, by name."""
+"""The function (x0_hat (B, F, D), x (B, F, D), mask (B, F)) -> losses by name.
+
+Losses (B,) are weighted, per sample, of the clean estimate x0_hat.
+"""
 
 
 class Process(nn.Module, ABC):
-    """A path between noise and data: base class of Gaussian diffusion and flow matching.
+    """Base class of generative processes: paths between noise and data.
 
-    A process corrupts motions in training, says what the denoiser predicts, and samples motions
-    from noise. Only the process interprets the time t; the denoiser just embeds it. B is the
-    batch size, F the number of frames, D the number of features.
+    Subclasses are Gaussian diffusion and flow matching. A process corrupts motions in training,
+    defines what the denoiser predicts, and samples motions from noise. Only the process
+    interprets the time t; the denoiser just embeds it. B is the batch size, F the number of
+    frames, D the number of features.
 
     Example:
         >>> import torch
@@ -38,7 +42,7 @@ class Process(nn.Module, ABC):
     #: What the denoiser returns: "x0" (the clean motion), "epsilon" (the noise) or "velocity".
     prediction: str
 
-    #: Modes of `Edit` that sampling supports; the first is the authors'.
+    #: Modes of `Edit` that sampling supports. The first is the mode of the authors.
     edit_modes: Sequence[str] = ()
 
     #: Samplers by name.
@@ -49,15 +53,21 @@ class Process(nn.Module, ABC):
 
     @abstractmethod
     def out_features(self, features: int) -> int:
-        """Returns the number of output channels of the denoiser for D = `features`: D, or 2D with learned variance."""
+        """Returns the number of output channels of the denoiser for `features` D.
+
+        It is D, or 2D with a learned variance.
+        """
 
     @abstractmethod
     def training_times(self, u: Tensor) -> Tensor:
-        """Returns times t (B,) of training samples for uniform numbers (B,) in (0, 1)."""
+        """Returns times t (B,) of training samples, from uniform numbers (B,) in (0, 1)."""
 
     @abstractmethod
     def corrupt(self, x: Tensor, noise: Tensor, t: Tensor) -> Tensor:
-        """Returns noisy motion x_t (B, F, D) at times t (B,) from clean `x` and `noise` (B, F, D)."""
+        """Returns the noisy motion x_t (B, F, D) at times t (B,).
+
+        It is computed from the clean motion `x` and `noise` (B, F, D).
+        """
 
     @abstractmethod
     def target(self, x: Tensor, noise: Tensor, t: Tensor) -> Tensor:
@@ -65,7 +75,10 @@ class Process(nn.Module, ABC):
 
     @abstractmethod
     def to_x0(self, output: Tensor, x_t: Tensor, t: Tensor) -> Tensor:
-        """Returns the clean estimate (B, F, D); for target(x, noise, t) and corrupt(x, noise, t), it is x."""
+        """Returns the clean estimate (B, F, D).
+
+        For the output target(x, noise, t) and the noisy motion corrupt(x, noise, t), it is x.
+        """
 
     def table_time(self, t: Tensor) -> Tensor:
         """Converts times (B,) of this process to times for the denoiser in [0, 1000)."""
@@ -79,7 +92,10 @@ class Process(nn.Module, ABC):
 
     @abstractmethod
     def grid(self, count: int) -> list[float]:
-        """Returns `count` evenly spaced times, at most all, from pure noise to one interval before the data."""
+        """Returns `count` evenly spaced times from pure noise to one interval before the data.
+
+        There are at most as many as the process has times.
+        """
 
     def loss(
         self,
@@ -125,8 +141,9 @@ class Process(nn.Module, ABC):
     def terms(
         self, output: Tensor, x: Tensor, noise: Tensor, x_t: Tensor, t: Tensor, mask: Tensor
     ) -> dict[str, Tensor]:
-        """Returns the losses (B,) of the denoiser's output over the frames of the mask: "mse",
-        the error of the target.
+        """Returns the losses (B,) of the denoiser's output over the real frames.
+
+        The loss "mse" is the squared error of the target.
         """
         return {"mse": masked_mse(output, self.target(x, noise, t), mask)}
 
@@ -145,24 +162,29 @@ class Process(nn.Module, ABC):
         """Samples normalized motion from noise.
 
         Args:
-            denoise: the denoiser, guided or not; `options.guidance_scale` is ignored.
-            noise: returns draw 0, 1, 2, ... of the noise, (B, F, D); sampling starts from draw 0.
+            denoise: the denoiser, with or without guidance; `options.guidance_scale` is ignored.
+            noise: returns draw 0, 1, 2, ... of the noise, (B, F, D). Sampling starts from draw 0.
             mask: (B, F) bool, True = real frame.
             cond: conditions of the batch.
             options: the sampler, its number of steps and its options.
             edit: part of a motion to keep.
-            trajectory: list that gets the clean estimate (B, F, D) of each call of the denoiser.
+            trajectory: list to which the clean estimate (B, F, D) of each call of the denoiser is
+                added.
 
         Returns:
             Normalized motion (B, F, D); frames past the end of a motion are 0.
 
         Raises:
             UserError: If the process does not support the sampler, the number of steps or the
-                edit, or the sampler does not have one of the options.
+                edit, or if the sampler lacks one of the options.
         """
 
     def find_sampler(self, options: SamplerOptions) -> Sampler:
-        """Returns the requested sampler; raises `UserError` if there is none, or it lacks one of the options."""
+        """Returns the requested sampler.
+
+        Raises:
+            UserError: If there is no such sampler, or it lacks one of the options.
+        """
         name = options.sampler
         if name is None or name not in self.samplers:
             raise UserError(
@@ -178,8 +200,9 @@ class Process(nn.Module, ABC):
         return self.samplers[name]
 
     def check_edit(self, edit: Edit, mask: Tensor, options: SamplerOptions) -> None:
-        """Raises `UserError` if process or sampler cannot make an edit, or its shape differs from
-        the motions' shape.
+        """Raises `UserError` if this process or sampler does not support an edit.
+
+        The edit must also have the shape of the motions.
         """
         if edit.mode not in self.edit_modes:
             modes = ", ".join(self.edit_modes)

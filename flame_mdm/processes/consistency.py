@@ -1,8 +1,8 @@
-"""Consistency distillation: a student learns to reach in one call what its teacher reaches in many small steps.
+"""Consistency distillation: a student learns to do many small steps of its teacher in one call.
 
 f(x_t, t) is the clean estimate of a network at time t. Along a path of the teacher, f should be
 the same at all times (Song et al. 2023, "Consistency Models"). The teacher's steps are guided, so
-that the student needs no guidance (Luo et al. 2023, "Latent Consistency Models"; Dai et al. 2024,
+the student needs no guidance (Luo et al. 2023, "Latent Consistency Models"; Dai et al. 2024,
 "MotionLCM").
 """
 
@@ -28,22 +28,23 @@ def consistency_terms(
     noise: Tensor,
     auxiliary: Auxiliary,
 ) -> dict[str, Tensor]:
-    """Computes the losses of the student's estimate at x_t against the estimate after one step of the teacher.
+    """Computes the losses of a student.
 
-    The step is DDIM's with eta = 0, or Euler's for a flow. After the last time of the grid, the
+    The student's estimate at x_t is compared with an estimate after one step of the teacher. The
+    step is DDIM's with eta = 0, or Euler's for a flow. After the last time of the grid, the
     target is the teacher's own estimate of the data.
 
     Args:
         process: process of student and teacher; it predicts the clean motion or the velocity.
         student: the network to train.
-        follower: computes the target, the estimate after the step, without gradient: the student
-            or an average of its weights.
+        follower: computes the target, the estimate after the step, without gradient. It is the
+            student or an average of its weights.
         teacher: the guided teacher.
         x: (B, F, D) normalized clean motion.
         mask: (B, F) bool, True = real frame.
         cond: conditions of the batch.
-        times: (N,) times from pure noise on; see `Process.grid`.
-        index: (B,) int64, the number of the time of each motion, 0 ... N - 1.
+        times: (N,) times, starting from pure noise; see `Process.grid`.
+        index: (B,) int64, the index in `times` of the time of each motion, 0 ... N - 1.
         noise: (B, F, D).
         auxiliary: geometric losses of the estimate against the target.
 
@@ -51,8 +52,8 @@ def consistency_terms(
         Losses (B,) per sample by name: "consistency", the auxiliary losses, and "loss", their
         sum.
     """
-    # From the teacher's clean estimate and the noise that it implies, follow the teacher's path
-    # to the next time.
+    # The step follows the teacher's path to the next time, from the teacher's clean estimate and
+    # the noise that this estimate implies.
     is_last = index == len(times) - 1
     t, end = times[index], times[(index + 1).clamp(max=len(times) - 1)]
     x_t = process.corrupt(x, noise, t)

@@ -19,39 +19,39 @@ from flame_mdm.sampler_options import SamplerOptions
 class GaussianDiffusion(Process):
     """Gaussian diffusion over T steps, the process of MDM and FLAME (Ho et al. 2020).
 
-    The time t is the step 0 ... T - 1 as a float, which the denoiser gets unchanged. x_t =
-    sqrt(ab) x + sqrt(1 - ab) noise, where ab, "alpha bar", comes from the schedule.
+    The time t is the step 0 ... T - 1 as a float. The denoiser gets it unchanged. x_t =
+    sqrt(ab) x + sqrt(1 - ab) noise, where ab ("alpha bar") comes from the schedule.
 
     Args:
         num_train_timesteps: T.
         schedule: name of the noise schedule, "cosine" or "linear".
-        prediction: first D channels of the denoiser's output: the clean motion, the noise, or the
-            velocity sqrt(ab) noise - sqrt(1 - ab) x (Salimans and Ho 2022).
-        variance: variance of the reverse process. "fixed_small": the variance of the posterior;
-            "fixed_large": beta; "learned_range": learned between the two, from a second set of D
+        prediction: what the first D channels of the denoiser's output are: the clean motion, the
+            noise, or the velocity sqrt(ab) noise - sqrt(1 - ab) x (Salimans and Ho 2022).
+        variance: variance of the reverse process. "fixed_small" is the variance of the posterior.
+            "fixed_large" is beta. "learned_range" is between the two and learned, from D more
             channels (Nichol and Dhariwal 2021, eq. 15).
         vlb_weight: lambda in L_simple + lambda L_vlb (FLAME, eq. 4 and 15), if the variance is
-            learned. L_vlb, a sum over T steps, is T times the term of one step: 0.001 at T = 1000
-            (Nichol and Dhariwal) is 1 in FLAME's code.
+            learned. L_vlb is a sum over T steps, so it is T times the term of one step. The value
+            0.001 at T = 1000 (Nichol and Dhariwal) is 1 in FLAME's code.
         average_padding: average losses over the padded length with noise 0 in the padding, as in
-            FLAME's code, so that short motions have less weight. The denoiser must return 0
-            there.
+            FLAME's code. Short motions then have less weight. The denoiser must return 0 in the
+            padding.
         clip_x0: clamp the clean estimate to [-1, 1] in sampling, as in FLAME's code.
         timestep_sampling: how training steps are drawn (FLAME, tables 6 and 7).
         skip: only with prediction epsilon: the noise is sqrt(1 - ab) x_t + sqrt(ab) times the
             output (Karras et al. 2022, eq. 7, for data of variance 1). The output is then a
-            velocity, trained with the error of the noise: the network need not carry its input,
-            and the clean estimate divides nothing by the signal.
-        min_snr: weights each step's squared error as if the clean motion was predicted with
-            weight min(SNR, min_snr) (Hang et al. 2023, eq. 4; they use 5). None = weight 1,
-            whatever is predicted.
+            velocity, trained with the error of the noise. The network need not pass its input
+            through, and computing the clean estimate needs no division by the signal.
+        min_snr: weight the squared error of each step as if the clean motion was predicted with
+            weight min(SNR, min_snr) (Hang et al. 2023, eq. 4; they use 5). None = weight 1 for
+            every prediction.
         noise_scale: factor of the ratio of noise to signal at each step. With 263 features that
-            depend on each other, the text matters only where there is much noise; a factor above
-            1 gives more steps to it (Hoogeboom et al. 2023, section 2.2).
+            depend on each other, the text matters only at high noise. A factor above 1 gives more
+            steps to high noise (Hoogeboom et al. 2023, section 2.2).
 
     Raises:
-        UserError: If T or `noise_scale` is out of range, `skip` is combined with another prediction, or `min_snr`
-            is not above 0.
+        UserError: If T or `noise_scale` is out of range, `skip` is combined with another
+            prediction, or `min_snr` is not above 0.
 
     Example:
         >>> import torch
@@ -100,7 +100,7 @@ class GaussianDiffusion(Process):
         return 2 * features if self.variance == "learned_range" else features
 
     def training_times(self, u: Tensor) -> Tensor:
-        """Returns uniform steps (B,) from 0 to T - 1 for uniform numbers (B,) in (0, 1)."""
+        """Returns uniform steps (B,) from 0 to T - 1, from uniform numbers (B,) in (0, 1)."""
         return (u * len(self.schedule)).floor().clamp(max=len(self.schedule) - 1)
 
     def corrupt(self, x: Tensor, noise: Tensor, t: Tensor) -> Tensor:
@@ -108,7 +108,7 @@ class GaussianDiffusion(Process):
         return self.schedule.corrupt(x, noise, t)
 
     def target(self, x: Tensor, noise: Tensor, t: Tensor) -> Tensor:
-        """Returns what the denoiser should predict (B, F, D): the clean motion, the noise or the velocity."""
+        """Returns the target (B, F, D): the clean motion, the noise or the velocity."""
         if self.prediction == "x0":
             return x
         if self.prediction == "epsilon" and not self.skip:
@@ -116,7 +116,10 @@ class GaussianDiffusion(Process):
         return self.schedule.at("signal", t, x) * noise - self.schedule.at("noise", t, x) * x
 
     def to_x0(self, output: Tensor, x_t: Tensor, t: Tensor | int) -> Tensor:
-        """See `Process.to_x0`; `output` may contain the channels of a learned variance, and t be one step for all."""
+        """See `Process.to_x0`.
+
+        `output` may contain the channels of a learned variance. t may be one step for the batch.
+        """
         output = output[..., : x_t.shape[-1]]
         if self.prediction == "x0":
             return output
@@ -134,8 +137,11 @@ class GaussianDiffusion(Process):
     def log_variance(
         self, output: Tensor, x_t: Tensor, i: Tensor | int, schedule: Schedule
     ) -> Tensor | float:
-        """Returns the log-variance of x_{t-1} at step i of `schedule`: a number, (B, 1, 1), or (B, F, D) if learned."""
-        # A learned variance is interpolated between its two bounds, in the logarithm.
+        """Returns the log-variance of x_{t-1} at step i of `schedule`.
+
+        It is a number, (B, 1, 1), or (B, F, D) if it is learned.
+        """
+        # The logarithm of a learned variance is interpolated between its two bounds.
         small = schedule.factor("posterior_log_variance", i, x_t)
         if self.variance == "fixed_small":
             return small
@@ -148,7 +154,7 @@ class GaussianDiffusion(Process):
         self, output: Tensor, x: Tensor, noise: Tensor, x_t: Tensor, t: Tensor, mask: Tensor
     ) -> dict[str, Tensor]:
         """Returns the losses "mse" (FLAME, eq. 3) and, if the variance is learned, "vlb"."""
-        # With the skip, an error in the output is the error in the noise divided by the signal.
+        # With `skip`, an error in the output is the error in the noise divided by the signal.
         scale = self.schedule.at("signal", t, x) if self.skip else 1.0
         error = masked_mse(
             scale * output[..., : x.shape[-1]], scale * self.target(x, noise, t), mask
@@ -169,18 +175,19 @@ class GaussianDiffusion(Process):
         snr = (
             (self.schedule.at("signal", t, t) / self.schedule.at("noise", t, t)).square().flatten()
         )
-        # A squared error of 1 in the clean motion is one of SNR in the noise, and of SNR + 1 in
-        # the velocity.
+        # A squared error of 1 in the clean motion corresponds to an error of SNR in the noise,
+        # and of SNR + 1 in the velocity.
         return (
             snr.clamp(max=self.min_snr)
             / {"x0": 1.0, "epsilon": snr, "velocity": snr + 1}[self.prediction]
         )
 
     def vlb(self, output: Tensor, x: Tensor, x_t: Tensor, t: Tensor) -> Tensor:
-        """Returns terms of the variational bound (B, F, D) at steps t (B,), in nats (Ho et al. 2020, eq. 5).
+        """Returns terms (B, F, D) of the variational bound at steps t (B,), in nats.
 
-        Only the variance receives a gradient (Nichol and Dhariwal 2021, section 3.1). The term of
-        step 0 is the divergence with the clipped posterior variance, as in FLAME's code.
+        Source: Ho et al. 2020, eq. 5. Only the variance receives a gradient (Nichol and Dhariwal
+        2021, section 3.1). As in FLAME's code, the term of step 0 is the divergence with the
+        clipped posterior variance.
         """
         real = self.schedule.posterior_mean(x, x_t, t)
         mean = self.schedule.posterior_mean(self.to_x0(output, x_t, t).detach(), x_t, t)
@@ -202,11 +209,12 @@ class GaussianDiffusion(Process):
         edit: Edit | None = None,
         trajectory: list[Tensor] | None = None,
     ) -> Tensor:
-        """See `Process.sample`. The denoiser is called once per step; draws of noise are numbered in order of use.
+        """See `Process.sample`. The denoiser is called once per step.
 
-        `options.num_inference_steps` is a number from 2 to T, of steps placed by
-        `options.spacing`, or the steps themselves in increasing order. The sampler "consistency"
-        takes 1 to T steps of `grid`. An edit of mode "x0" reproduces the kept part exactly.
+        Draws of noise are numbered in the order of their use. `options.num_inference_steps` is a
+        number of steps from 2 to T, which `options.spacing` places, or a list of steps in
+        increasing order. The sampler "consistency" takes 1 to T steps of `grid`. An edit of mode
+        "x0" reproduces the kept part exactly.
         """
         sampler, steps = self.find_sampler(options), self._steps(options)
         if edit is not None:

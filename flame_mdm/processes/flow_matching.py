@@ -13,24 +13,24 @@ from flame_mdm.sampler_options import SamplerOptions
 
 
 class FlowMatching(Process):
-    """Straight path from noise at t = 0 to motion at t = 1, the process of MFM (Lipman et al. 2023; Hu et al. 2023).
+    """Straight path from noise at t = 0 to motion at t = 1, the process of MFM.
 
-    The denoiser predicts the velocity of the path, or the clean motion. It gets the time 1000 t.
-    With s = `sigma_min`, x_t = t x + (1 - (1 - s) t) noise, and the velocity is x - (1 - s)
-    noise.
+    Sources: Lipman et al. 2023; Hu et al. 2023. The denoiser predicts the velocity of the path or
+    the clean motion. It gets the time 1000 t. With s = `sigma_min`, x_t = t x + (1 - (1 - s) t)
+    noise, and the velocity is x - (1 - s) noise.
 
     Args:
         sigma_min: standard deviation of the noise left at t = 1 (Lipman et al. 2023, eq. 20-23).
-        prediction: output of the denoiser: the velocity of the path (MFM), or the clean motion,
-            from which the velocity is computed. A network narrower than the motion cannot
-            represent the noise in the velocity.
+        prediction: output of the denoiser: the velocity of the path (MFM) or the clean motion.
+            The velocity is computed from the clean motion. A network narrower than the motion
+            cannot represent the noise in the velocity.
         time_distribution: distribution of training times: uniform on [0, 1), or the logistic of a
-            normal variable, which favors the middle (Esser et al. 2024, eq. 19).
+            normal variable. The latter favors the middle (Esser et al. 2024, eq. 19).
         quantize_time: pass floor(1000 t), a row of the time table, to the denoiser, as in MFM's
             code.
         odeint_grid: use float32 multiples of 1 / N as times, like torchdiffeq's Euler steps in
-            MFM's code. For some N, a time is one row of the table lower than with N equal steps
-            (never for 10, 20 or 30).
+            MFM's code. For some N, a time then has another row of the table, one row lower than
+            with N equal steps. This never happens for N = 10, 20 or 30.
 
     Raises:
         UserError: If `sigma_min` is not in [0, 1).
@@ -76,7 +76,7 @@ class FlowMatching(Process):
         return features
 
     def training_times(self, u: Tensor) -> Tensor:
-        """Returns times (B,) in (0, 1) of `time_distribution` for uniform numbers (B,) in (0, 1)."""
+        """Returns times (B,) in (0, 1) with `time_distribution`, from uniform numbers (B,)."""
         return u if self.time_distribution == "uniform" else torch.special.ndtri(u).sigmoid()
 
     def corrupt(self, x: Tensor, noise: Tensor, t: Tensor) -> Tensor:
@@ -89,14 +89,20 @@ class FlowMatching(Process):
         return x if self.prediction == "x0" else x - (1 - self.sigma_min) * noise
 
     def to_x0(self, output: Tensor, x_t: Tensor, t: Tensor) -> Tensor:
-        """See `Process.to_x0`. Exact, unlike x_t + (1 - t) u in MFM's code, which leaves sigma_min times the noise."""
+        """See `Process.to_x0`. The result is exact.
+
+        MFM's code computes x_t + (1 - t) u instead, which leaves sigma_min times the noise.
+        """
         if self.prediction == "x0":
             return output
         return (1 - (1 - self.sigma_min) * t[:, None, None]) * output + (1 - self.sigma_min) * x_t
 
     def table_time(self, t: Tensor) -> Tensor:
-        """Converts flow times to times for the denoiser in [0, 1000]; above 1000 only if a solver evaluates t > 1."""
-        # Always in float32: models were trained with this rounding.
+        """Converts flow times to times for the denoiser in [0, 1000].
+
+        Times are above 1000 only if a solver evaluates t > 1.
+        """
+        # Always in float32, because models were trained with this rounding
         return (t.to(torch.float32) * 1000).floor() if self.quantize_time else t * 1000
 
     def times(self, count: int) -> list[float]:
@@ -120,12 +126,12 @@ class FlowMatching(Process):
         edit: Edit | None = None,
         trajectory: list[Tensor] | None = None,
     ) -> Tensor:
-        """See `Process.sample`. Takes N >= 1 equal steps; "dopri5" chooses its own. Only "consistency" adds noise.
+        """See `Process.sample`. It takes N >= 1 equal steps; "dopri5" chooses its own steps.
 
-        An edit of mode "trajectory" replaces the kept part before each step at a time <= `until`
-        by the straight path from its noise to the known motion (MFM, algorithm 1); after that,
-        the model moves it freely. Mode "x0" overwrites the clean estimate of every call, which
-        reproduces the kept part exactly.
+        Only "consistency" adds noise. An edit of mode "trajectory" acts before each step at a
+        time <= `until`. The straight path from the noise of the kept part to the known motion
+        then replaces the kept part (MFM, algorithm 1). Afterward, the model moves it freely. Mode
+        "x0" overwrites the clean estimate of every call, which reproduces the kept part exactly.
         """
         sampler, count = self.find_sampler(options), options.num_inference_steps
         if not isinstance(count, int):
@@ -136,7 +142,7 @@ class FlowMatching(Process):
         guide = None if imposed is None else imposed.guide
 
         def velocity(x: Tensor, t: float | Tensor) -> Tensor:
-            # Filling a tensor on the device with a number needs no copy and no synchronization.
+            # Filling a tensor on the device needs no copy and no synchronization.
             precision = torch.promote_types(x.dtype, torch.float32)
             time = (
                 t.expand(len(x))

@@ -1,4 +1,4 @@
-"""Guidance by a condition, a wrapper with the same interface as the denoiser, and by positions in the world."""
+"""Guidance by a condition, and guidance by positions in the world."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,30 +10,38 @@ from torch import Tensor
 from flame_mdm.batch import Condition, Denoise
 from flame_mdm.losses import bone_lengths
 
-# Gradient steps before each step of the sampler
+# Number of gradient steps before each step of the sampler
 STEERING_STEPS = 2
 STEERING_LIMIT = 0.02
-"""Maximum length of a gradient step, as RMS over normalized features. After longer steps, x_t is
-unlike the noisy motions of the training wherever the denoiser depends on x_t only weakly: in one
-trial, arms grew by a third."""
+"""Maximum length of a gradient step, as RMS over normalized features.
+
+If the denoiser depends only weakly on x_t, longer steps make x_t unlike the noisy motions of the
+training. In one trial, arms became longer by a third.
+"""
 CLOSE, MOST_STEPS = 0.005, 8
-"""Largest error in meters that ends the search for a motion that reaches positions, and its maximum number of steps."""
+"""The search for a motion that reaches positions ends below this error, in meters.
+
+The second number is the maximum number of steps of the search.
+"""
 RELAXATION = 1e-3
-"""Variance of an error that may remain, relative to the variance of the position itself; it limits the changes."""
+"""Variance of the error that may remain, relative to the variance of the position.
+
+It limits the changes.
+"""
 
 
 def classifier_free_guidance(denoise: Denoise, scale: float | Tensor, features: int) -> Denoise:
-    """Returns a denoiser guided by its unconditional prediction: null + scale * (cond - null), with batch size 2B.
+    """Returns a denoiser guided by its unconditional prediction: null + scale * (cond - null).
 
-    Ho and Salimans 2021, with w = scale - 1, in the form of MDM and FLAME (eq. 5), where 1 means
-    no guidance.
+    The batch size is 2B. Source: Ho and Salimans 2021, with w = scale - 1. In this form, which
+    MDM and FLAME (eq. 5) use, scale 1 means no guidance.
 
     Args:
         denoise: the denoiser; its condition must have a null.
         scale: guidance scale, one number or one per sample (B,). For the number 1, `denoise`
             itself is returned.
-        features: D. Channels from D on, a learned variance, are not guided; they come from the
-            conditional half.
+        features: D. Channels from D on contain a learned variance. They are not guided, but come
+            from the conditional half.
 
     Returns:
         A function with the arguments and the result of `denoise`.
@@ -50,8 +58,8 @@ def classifier_free_guidance(denoise: Denoise, scale: float | Tensor, features: 
     if not isinstance(scale, Tensor) and scale == 1:
         return denoise
     strength = scale[:, None, None] if isinstance(scale, Tensor) else scale
-    # One doubled mask and condition per sampling run, so that a denoiser can cache what it
-    # computes from them.
+    # The doubled mask and condition are computed once per sampling run, so that a denoiser can
+    # cache what it computes from them.
     seen: tuple[Tensor, Condition] | None = None
     doubled: tuple[Tensor, Condition]
 
@@ -71,11 +79,11 @@ def classifier_free_guidance(denoise: Denoise, scale: float | Tensor, features: 
 
 @dataclass
 class Positions:
-    """M coordinates of joints in the world, which a motion should reach.
+    """M coordinates of joints in the world that a motion should reach.
 
     Attributes:
-        frames: (M,) int64, numbers of the frames.
-        joints: (M,) int64, numbers of the joints.
+        frames: (M,) int64, indices of the frames.
+        joints: (M,) int64, indices of the joints.
         axes: (M,) int64, 0 = x, 1 = y, 2 = z.
         values: (M,) the coordinates in meters.
     """
@@ -96,10 +104,11 @@ def steer(
     to_joints: Callable[[Tensor], Tensor],
     positions: Positions,
 ) -> Tensor:
-    """Leads noisy motions toward positions in the world; the entire body adapts, since the denoiser decides how.
+    """Leads noisy motions toward positions in the world.
 
-    Steps along the gradient through the denoiser (Chung et al. 2023, "Diffusion posterior
-    sampling"), of Polyak's length up to `STEERING_LIMIT`.
+    Each step follows the gradient through the denoiser (Chung et al. 2023, "Diffusion posterior
+    sampling"), so the entire body adapts in the way that the denoiser prefers. The step has
+    Polyak's length, but at most `STEERING_LIMIT`.
 
     Args:
         clean: returns the clean estimate (B, F, D) of a noisy motion.
@@ -108,9 +117,9 @@ def steer(
         positions: the positions.
 
     Returns:
-        Noisy motions (B, F, D) whose clean estimates are nearer to the positions.
+        Noisy motions (B, F, D) with clean estimates that are nearer to the positions.
     """
-    # Polyak's step: along the gradient, a linear loss would be 0 after the distance loss / slope.
+    # Polyak's step: if the loss was linear, it would be 0 after the distance loss / slope.
     for _ in range(STEERING_STEPS):
         with torch.enable_grad():
             x = x_t.detach().requires_grad_()
@@ -130,30 +139,30 @@ def reach(
     free: Tensor,
     smoothness: float,
 ) -> Tensor:
-    """Returns the motions nearest to `x` whose joints reach positions in the world.
+    """Returns the motions nearest to `x` that have joints at given positions in the world.
 
     Each Gauss-Newton step takes the smallest change of the normalized features that reaches the
-    positions, under a Gaussian-process prior that keeps the change smooth in time. In the frames
-    of the positions, bone lengths are constraints, too: their medians over the motion.
-    Neighboring frames receive only part of the change, which would shorten turning bones; their
-    lengths are restored afterward.
+    positions. A Gaussian-process prior keeps the change smooth in time. In the frames of the
+    positions, bone lengths are also constraints: they must equal their medians over the motion.
+    Neighboring frames receive only part of the change, which would shorten turning bones. Their
+    bone lengths are restored afterward.
 
     Args:
         x: (B, F, D) normalized motions.
         to_joints: converts normalized features (F, D) to joints (F, J, 3) in meters.
         positions: the positions.
-        bones: (3, N) int64: frame, parent and child of bones that the change could stretch; all
-            bones of a frame.
+        bones: (3, N) int64: frame, parent and child of bones that the change could stretch. Each
+            frame has all bones.
         free: (B, F, D) bool, True = this feature may change.
-        smoothness: standard deviation in frames of the Gaussian process.
+        smoothness: standard deviation of the Gaussian process, in frames.
 
     Returns:
-        Normalized motions (B, F, D). Positions are reached up to `CLOSE` meters, if `MOST_STEPS`
-        steps suffice.
+        Normalized motions (B, F, D). Their error is at most `CLOSE` meters, unless `MOST_STEPS`
+        steps are not enough.
     """
     # The prior's covariance K between frames is a Gaussian kernel. With the Jacobian A of the
-    # constraints and their error e, the smallest change is K A^T (A K A^T)^-1 e: `smooth` is A K,
-    # `gram` is A K A^T.
+    # constraints and their error e, the smallest change is K A^T (A K A^T)^-1 e. Below, `smooth`
+    # is A K, and `gram` is A K A^T.
     offset = torch.arange(-int(3 * smoothness), int(3 * smoothness) + 1, device=x.device)
     kernel = torch.exp(-0.5 * (offset / smoothness) ** 2)
     frames, edges = bones[0], bones[1:].T
@@ -200,8 +209,11 @@ def _with_bones(
     lengths: Tensor,
     free: Tensor,
 ) -> Tensor:
-    """Returns the nearest motion (F, D) whose bones `edges` (N, 2) have `lengths` (F, N) in each frame."""
-    # Gauss-Newton steps as in `reach`, for each frame on its own: A^T (A A^T)^-1 e.
+    """Returns the nearest motion (F, D) with given bone lengths in each frame.
+
+    Bones `edges` (N, 2) have `lengths` (F, N).
+    """
+    # Gauss-Newton steps as in `reach`, but for each frame separately: A^T (A A^T)^-1 e
 
     def lengths_of(frame: Tensor) -> Tensor:
         return bone_lengths(to_joints(frame[None])[0], edges)

@@ -1,8 +1,8 @@
-"""Samplers: one plain function each, which takes one step from noise towards motion, and what each of them supports.
+"""Samplers: functions that take one step from noise toward motion, with their capabilities.
 
-Diffusion samplers descend numbers i of steps of a `Schedule`; they get the clean motion and the
-log-variance at step i from `estimate`. ODE solvers follow a velocity field. Coefficients and
-times are Python numbers, so that no step waits for the device.
+Diffusion samplers descend the numbers i of steps of a `Schedule`. At step i, they get the clean
+motion and the log-variance from `estimate`. ODE solvers follow a velocity field. Coefficients and
+times are Python numbers, so no step waits for the device.
 """
 
 import math
@@ -17,14 +17,17 @@ from flame_mdm.processes.schedules import Schedule
 from flame_mdm.sampler_options import SamplerOptions
 
 Estimate = Callable[[Tensor, int], tuple[Tensor, Tensor | float]]
-"""(x_t (B, F, D), step i) -> clean estimate (B, F, D) and log-variance of x_{t-1}, a number or (B, F, D)."""
+"""The function (x_t (B, F, D), step i) -> clean estimate (B, F, D), log-variance of x_{t-1}.
+
+The log-variance is a number or (B, F, D).
+"""
 
 Velocity = Callable[[Tensor, float | Tensor], Tensor]  # (x (B, F, D), time t) -> dx/dt (B, F, D)
 
 
 @dataclass(frozen=True)
 class Sampler:
-    """A sampler: the function that takes one step, and what the sampler can do.
+    """A sampler: the function that takes one step, and the capabilities of the sampler.
 
     Example:
         >>> DIFFUSION_SAMPLERS["ddim"].options
@@ -34,12 +37,12 @@ class Sampler:
     #: Takes one step. In a diffusion: (x_t, `Descent`, step i) -> x_{t-1}. In a flow: (x, `Flow`,
     #: time, next time) -> x at the next time.
     step: Callable[..., Tensor]
-    #: Fields of `SamplerOptions` that it has besides guidance_scale, sampler and
+    #: Fields of `SamplerOptions` that it uses, besides guidance_scale, sampler and
     #: num_inference_steps.
     options: tuple[str, ...] = ()
-    #: Edits that it cannot make: modes of `Edit`, or "resample".
+    #: Edits that it does not support: modes of `Edit`, or "resample".
     unsupported: tuple[str, ...] = ()
-    #: Whether it chooses its own steps, so that one call goes from noise to motion.
+    #: Whether it chooses its own steps. One call then goes from noise to motion.
     adaptive: bool = False
 
 
@@ -55,7 +58,7 @@ class Descent:
     draws: Iterator[Tensor]
     #: Options of the sampler.
     options: SamplerOptions
-    #: Clean estimate of the step before, for samplers that use it.
+    #: Clean estimate of the previous step, for samplers that use it.
     last: Tensor | None = None
 
 
@@ -67,18 +70,18 @@ class Flow:
     velocity: Velocity
     #: Noise (B, F, D), in order of use.
     draws: Iterator[Tensor]
-    #: Standard deviation of the noise left at the end.
+    #: Standard deviation of the noise that is left at the end.
     sigma_min: float
 
 
 def ancestral(x: Tensor, run: Descent, i: int) -> Tensor:
-    """Draws x_{t-1} from the learned reverse process; the last step returns its mean.
+    """Draws x_{t-1} from the learned reverse process. The last step returns its mean.
 
-    Ho et al. 2020, algorithm 2.
+    Source: Ho et al. 2020, algorithm 2.
 
     Args:
         x: (B, F, D) noisy motion at step i.
-        run: the run, whose clean estimate and variance define the step.
+        run: the run; its clean estimate and variance define the step.
         i: the step, N - 1 ... 0.
 
     Returns:
@@ -102,13 +105,14 @@ def ancestral(x: Tensor, run: Descent, i: int) -> Tensor:
 
 
 def ddim(x: Tensor, run: Descent, i: int) -> Tensor:
-    """Takes a step of DDIM, deterministic at eta = 0 (the default) and as random as `ancestral` at eta = 1.
+    """Takes a step of DDIM.
 
-    Non-Markovian sampling of Song et al. 2021, eq. 12 and 16.
+    It is deterministic with eta = 0 (the default) and as random as `ancestral` with eta = 1.
+    Source: Song et al. 2021, eq. 12 and 16 (non-Markovian sampling).
 
     Args:
         x: (B, F, D) noisy motion at step i.
-        run: the run; its options give eta, 0 to 1.
+        run: the run; its options contain eta, 0 to 1.
         i: the step, N - 1 ... 0.
 
     Returns:
@@ -121,7 +125,7 @@ def ddim(x: Tensor, run: Descent, i: int) -> Tensor:
         >>> ddim(torch.zeros(1, 1, 2), run, 0).tolist()  # the last step ends in the clean estimate
         [[[1.0, 1.0]]]
     """
-    # The clean estimate implies the noise in x; the step keeps the part of this noise that the
+    # The clean estimate implies the noise in x. The step keeps the part of this noise that the
     # next level needs, and replaces the rest by new noise of the given variance.
     schedule, eta = run.schedule, run.options.eta or 0.0
     x0_hat, _ = run.estimate(x, i)
@@ -134,14 +138,14 @@ def ddim(x: Tensor, run: Descent, i: int) -> Tensor:
 
 
 def dpm_solver_pp_2m(x: Tensor, run: Descent, i: int) -> Tensor:
-    """Takes a step of DPM-Solver++ (2M), a deterministic multistep solver of order 2 with one call per step.
+    """Takes a step of DPM-Solver++ (2M), a deterministic multistep solver of order 2.
 
-    Lu et al. 2022b, algorithm 2. The first step is of first order, since there is no history; the
-    last step returns the clean estimate.
+    It calls the denoiser once per step. The first step has order 1, since there is no history.
+    The last step returns the clean estimate. Source: Lu et al. 2022b, algorithm 2.
 
     Args:
         x: (B, F, D) noisy motion at step i.
-        run: the run, which remembers the clean estimate for the next step.
+        run: the run; it stores the clean estimate for the next step.
         i: the step, N - 1 ... 0.
 
     Returns:
@@ -157,9 +161,9 @@ def dpm_solver_pp_2m(x: Tensor, run: Descent, i: int) -> Tensor:
         >>> x.tolist()
         [[[1.0, 1.0]]]
     """
-    # In the half logarithm of the signal-to-noise ratio as time, the linear part of the equation
-    # is solved exactly. The clean estimate, which remains under the integral, is extrapolated
-    # from this step and the step before.
+    # The time is half the logarithm of the signal-to-noise ratio. With this time, the linear part
+    # of the equation is solved exactly. The clean estimate remains under the integral. It is
+    # extrapolated from this step and the previous step.
     schedule, last = run.schedule, run.last
     x0_hat, _ = run.estimate(x, i)
     run.last = x0_hat
@@ -176,9 +180,9 @@ def dpm_solver_pp_2m(x: Tensor, run: Descent, i: int) -> Tensor:
 
 
 def consistency(x: Tensor, run: Descent, i: int) -> Tensor:
-    """Estimates the clean motion and adds new noise for the next step, as distilled models are sampled.
+    """Estimates the clean motion and adds new noise for the next step.
 
-    Song et al. 2023, "Consistency Models", algorithm 1.
+    This is how distilled models are sampled (Song et al. 2023, "Consistency Models", algorithm 1).
 
     Args:
         x: (B, F, D) noisy motion at step i.
@@ -202,20 +206,20 @@ def consistency(x: Tensor, run: Descent, i: int) -> Tensor:
 def blended(
     sampler: Sampler, x: Tensor, run: Descent, steps: Sequence[int], edit: Edit, start: Tensor
 ) -> Tensor:
-    """Samples with an edit of mode "x_t": the known motion, as noisy as the rest, replaces the
-    kept part at each step.
+    """Samples with an edit of mode "x_t".
 
-    With the blend "after", the kept part of the first x_t has the noise of the start, as if a
-    step had been blended before. RePaint (Lugmayr et al. 2022, algorithm 1) repeats each step
-    after adding its noise again.
+    At each step, the known motion with the current amount of noise replaces the kept part. With
+    the blend "after", the kept part of the first x_t has the noise of the start, as if a step had
+    been blended before. RePaint (Lugmayr et al. 2022, algorithm 1) repeats each step after adding
+    its noise again.
 
     Args:
         sampler: a sampler of diffusion.
         x: (B, F, D) noisy motion at the first step.
         run: the run.
         steps: the steps to take, from noisy to clean.
-        edit: the part to keep, how to blend it, and how often to repeat each step.
-        start: (B, F, D) noise that sampling started from.
+        edit: the part to keep, how to blend it, and how many times to repeat each step.
+        start: (B, F, D) noise with which sampling started.
 
     Returns:
         Normalized motion (B, F, D).
@@ -246,7 +250,7 @@ DIFFUSION_SAMPLERS = {
 
 
 def euler(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
-    """Takes a step of Euler's method: order 1, one call of the denoiser per step.
+    """Takes a step of Euler's method: order 1, one call of the denoiser.
 
     Args:
         x: (B, F, D) motion at time t.
@@ -266,7 +270,7 @@ def euler(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
 
 
 def midpoint(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
-    """Takes a step of the midpoint method: order 2, two calls of the denoiser per step.
+    """Takes a step of the midpoint method: order 2, two calls of the denoiser.
 
     Args:
         x: (B, F, D) motion at time t.
@@ -287,7 +291,9 @@ def midpoint(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
 
 
 def heun(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
-    """Takes a step of Heun's method, the trapezoid with an Euler predictor: order 2, two calls per step.
+    """Takes a step of Heun's method, the trapezoidal rule with an Euler predictor.
+
+    It has order 2 and calls the denoiser twice.
 
     Args:
         x: (B, F, D) motion at time t.
@@ -309,7 +315,9 @@ def heun(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
 
 
 def rk4(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
-    """Takes a step of Kutta's 3/8 rule, also called rk4 in torchdiffeq: order 4, four calls per step.
+    """Takes a step of Kutta's 3/8 rule, which torchdiffeq also calls rk4.
+
+    It has order 4 and calls the denoiser four times.
 
     Args:
         x: (B, F, D) motion at time t.
@@ -334,11 +342,11 @@ def rk4(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
 
 
 def dopri5(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
-    """Integrates with adaptive steps of order 5 (Dormand and Prince 1980), rtol = atol = 1e-5, as in MFM.
+    """Integrates with adaptive steps of order 5 (Dormand and Prince 1980).
 
-    The error is measured over the entire batch, so a motion depends on the rest of its batch, up
-    to the tolerance. The last step may go beyond the last time; the solver then interpolates
-    back.
+    As in MFM, rtol = atol = 1e-5. The error is measured over the entire batch, so a motion
+    depends on the rest of its batch, up to the tolerance. The last step may go beyond the last
+    time; the solver then interpolates back.
 
     Args:
         x: (B, F, D) motion at time t.
@@ -355,7 +363,7 @@ def dopri5(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
         [1.0, 1.0]
     """
     ends = torch.tensor([t, end], dtype=x.dtype, device=x.device)
-    from torchdiffeq import odeint  # here, because it imports much of scipy
+    from torchdiffeq import odeint  # imported here because it imports much of scipy
 
     path = odeint(lambda t, y: run.velocity(y, t), x, ends, rtol=1e-5, atol=1e-5, method="dopri5")
     assert isinstance(path, Tensor)
@@ -363,7 +371,7 @@ def dopri5(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
 
 
 def consistency_flow(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
-    """Goes straight to the data and adds new noise for the next time: `consistency` for flows.
+    """Goes straight to the data and adds new noise for the next time; see `consistency`.
 
     Args:
         x: (B, F, D) motion at time t.

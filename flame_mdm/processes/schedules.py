@@ -1,4 +1,4 @@
-"""Noise schedules of Gaussian diffusion: coefficients, and selection of sampling steps."""
+"""Noise schedules of Gaussian diffusion: coefficients and selection of sampling steps."""
 
 import math
 
@@ -10,8 +10,9 @@ from flame_mdm.sampler_options import MAX_STEPS
 
 
 def cosine_betas(num_train_timesteps: int) -> Tensor:
-    """Returns noise variances (T,) float64 of the cosine schedule, clipped at 0.999 (Nichol and
-    Dhariwal 2021, eq. 17).
+    """Returns the noise variances (T,) float64 of the cosine schedule, clipped at 0.999.
+
+    Source: Nichol and Dhariwal 2021, eq. 17.
 
     Example:
         >>> betas = cosine_betas(1000)
@@ -32,10 +33,10 @@ def cosine_betas(num_train_timesteps: int) -> Tensor:
 
 
 def linear_betas(num_train_timesteps: int) -> Tensor:
-    """Returns noise variances (T,) float64 of Ho et al. 2020, section 4: 1e-4 to 0.02 at T = 1000.
+    """Returns the noise variances (T,) float64 of Ho et al. 2020, section 4.
 
-    For other T, they are scaled by 1000 / T to end at the same noise, as in guided-diffusion, and
-    clipped at 0.999.
+    They are 1e-4 to 0.02 at T = 1000. For other T, they are scaled by 1000 / T, so that the final
+    noise is the same, as in guided-diffusion. They are clipped at 0.999.
 
     Example:
         >>> [round(beta, 5) for beta in linear_betas(1000)[[0, -1]].tolist()]
@@ -69,7 +70,7 @@ def with_more_noise(betas: Tensor, noise_scale: float) -> Tensor:
 class Schedule:
     """Coefficients of a Gaussian diffusion, by step i = 0 (least noise) to N - 1.
 
-    Tables are float64 on the CPU and rounded once, when used. They are not buffers, because
+    Tables are float64 on the CPU and rounded once, when they are used. They are not buffers:
     casting or moving a model (bfloat16, MPS) must not round them. Formulas: Ho et al. 2020, eq. 4
     and 7.
 
@@ -87,8 +88,8 @@ class Schedule:
         alphas_cumprod = (1 - betas).cumprod(0)
         previous = torch.cat([betas.new_ones(1), alphas_cumprod[:-1]])
         posterior_variance = betas * (1 - previous) / (1 - alphas_cumprod)
-        # The posterior of step 0 has variance 0; the logarithm of step 1 replaces its infinite
-        # logarithm (Nichol and Dhariwal 2021).
+        # The posterior of step 0 has variance 0 and therefore an infinite logarithm. The
+        # logarithm of step 1 replaces it (Nichol and Dhariwal 2021).
         clipped = torch.cat([posterior_variance[:2][-1:], posterior_variance[1:]])
         self.tables = {
             "betas": betas,
@@ -112,22 +113,28 @@ class Schedule:
         return len(self.tables["betas"])
 
     def number(self, name: str, i: int) -> float:
-        """Returns a coefficient at step i of the whole batch."""
+        """Returns a coefficient at step i, for the whole batch."""
         return self.numbers[name][i]
 
     def at(self, name: str, i: Tensor, x: Tensor) -> Tensor:
-        """Returns a coefficient (B, 1, 1) at steps i (B,), on the device of x, in its precision or float32."""
+        """Returns a coefficient (B, 1, 1) at steps i (B,), on the device of x.
+
+        It has the precision of x, but at least float32.
+        """
         key = (name, x.device, torch.promote_types(x.dtype, torch.float32))
         if key not in self._moved:
             self._moved[key] = self.tables[name].to(*key[1:])
         return self._moved[key][i.long()][:, None, None]
 
     def factor(self, name: str, i: int | Tensor, x: Tensor) -> float | Tensor:
-        """Returns `number` or `at`, for formulas that hold for one step of the whole batch and for steps (B,)."""
+        """Returns `number` for one step of the whole batch, or `at` for steps (B,)."""
         return self.number(name, i) if isinstance(i, int) else self.at(name, i, x)
 
     def respace(self, steps: list[int]) -> "Schedule":
-        """Returns the schedule that visits only these increasing steps (Nichol and Dhariwal 2021, section 4)."""
+        """Returns the schedule of only these steps, which must increase.
+
+        Source: Nichol and Dhariwal 2021, section 4.
+        """
         alphas_cumprod = self.tables["alphas_cumprod"][steps]
         previous = torch.cat([alphas_cumprod.new_ones(1), alphas_cumprod[:-1]])
         return Schedule(1 - alphas_cumprod / previous)
@@ -180,10 +187,10 @@ def timesteps(
     Args:
         num_train_timesteps: T.
         num_inference_steps: N, 1 to T.
-        spacing: "linspace" includes both ends and rounds half to even ("N" in the code of MDM and
-            FLAME, after Nichol and Dhariwal 2021). "stride" counts from 0 with the smallest
-            integer stride that gives N steps, so that the noisiest step may be well below T - 1
-            ("ddimN" in their code, after Song et al. 2021).
+        spacing: "linspace" includes both ends and rounds half to even. It is "N" in the code of
+            MDM and FLAME, after Nichol and Dhariwal 2021. "stride" counts from 0 with the
+            smallest integer stride that gives N steps, so the noisiest step may be well below T -
+            1. It is "ddimN" in their code, after Song et al. 2021.
 
     Returns:
         N increasing steps from 0 ... T - 1.
@@ -208,8 +215,8 @@ def timesteps(
             f"no stride gives {count} of {total} steps: choose another number or spacing=linspace"
         )
     stride = (total - 1) / (count - 1) if count > 1 else 1.0
-    # A running sum, not i * stride: its rounding decides ties, and the released models were
-    # sampled at those steps.
+    # This is a running sum, not i * stride, because its rounding decides ties. The released
+    # models were sampled at these steps.
     steps, position = [], 0.0
     for _ in range(count):
         steps.append(round(position))

@@ -1,9 +1,9 @@
 """Long motions from overlapping windows: a wrapper with the same interface as the denoiser.
 
-At each sampling step, the denoiser sees all windows of a motion in one batch, each with its own
-condition, and their outputs are averaged where windows overlap (Bar-Tal et al. 2023,
-"MultiDiffusion"; Zhang et al. 2023, "DiffCollage"). Outputs are affine in the clean estimate for
-equal x_t and t, so this blends the clean estimates.
+At each sampling step, the denoiser processes all windows of a motion in one batch, each with its
+own condition. Their outputs are averaged where windows overlap (Bar-Tal et al. 2023,
+"MultiDiffusion"; Zhang et al. 2023, "DiffCollage"). For equal x_t and t, outputs are affine in the
+clean estimate, so this blends the clean estimates.
 """
 
 from collections.abc import Sequence
@@ -19,18 +19,18 @@ from flame_mdm.batch import Condition, Denoise, MotionBatch, length_mask
 class Windows:
     """W windows of at most L frames that cover B motions."""
 
-    #: Conditions and masks (W, L) of the windows; its `x` has no features.
+    #: Conditions and masks (W, L) of the windows. Its `x` has no features.
     batch: MotionBatch
-    #: (W,) int64, the motion of each window.
+    #: (W,) int64, the index of each window's motion.
     rows: Tensor
-    #: (W, L) int64, the number of the motion's frame at each frame of a window.
+    #: (W, L) int64, the index in the motion of each frame of a window.
     frames: Tensor
-    #: (W, L), 0 past the end of a window; they sum to 1 at each frame of a motion.
+    #: (W, L), 0 past the end of a window. The weights of each frame of a motion sum to 1.
     weights: Tensor
 
 
 def blended(denoise: Denoise, windows: Windows) -> Denoise:
-    """Returns a denoiser of entire motions, which are longer than the motions in training.
+    """Returns a denoiser of entire motions, which may be longer than the motions in training.
 
     Args:
         denoise: denoiser of the windows.
@@ -58,14 +58,14 @@ def spans(
 ) -> list[tuple[int, int, int]]:
     """Covers the consecutive parts of a motion with windows.
 
-    The windows of a part reach half the overlap into its neighbors. A part that does not fit into
-    one window gets several.
+    The windows of a part extend by half the overlap into the neighboring parts. A part that does
+    not fit into one window gets several windows.
 
     Args:
         lengths: number of frames of each part.
         longest: maximum number of frames of a window.
         overlap: number of frames that neighboring windows share, an even number.
-        loop: whether the first part follows the last one; windows may then begin before frame 0.
+        loop: whether the first part follows the last one. Windows may then begin before frame 0.
 
     Returns:
         Part, first frame and number of frames of each window.
@@ -98,8 +98,8 @@ def cover(
     """Returns the frames and weights of windows, without conditions.
 
     The weight of a window rises over the overlap at its start and falls over the overlap at its
-    end. Past its end, a window holds the frames that follow in the motion; after the last frame
-    of a motion comes the first.
+    end. Past its end, a window contains the next frames of the motion. The last frame of a motion
+    is followed by its first frame.
 
     Args:
         windows: motion, first frame and number of frames of each of the W windows.

@@ -1,4 +1,4 @@
-"""Motion representations: encoding of motions as features and decoding to joint positions."""
+"""Motion representations: encoding of motions as features, and decoding to joint positions."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -17,9 +17,9 @@ Features = TypeVar("Features", np.ndarray, Tensor)
 
 @dataclass(frozen=True)
 class Frames:
-    """The frames (N, D) of a data set, read in parts, as often as needed."""
+    """The frames (N, D) of a data set. They can be read in parts, any number of times."""
 
-    # Returns arrays (F, D) of any length, each time in the same order
+    # Returns arrays (F, D) of any length, in the same order each time
     arrays: Callable[[], Iterable[np.ndarray]]
     count: int
 
@@ -27,7 +27,10 @@ class Frames:
         return self.count
 
     def split(self, size: int) -> Iterator[Tensor]:
-        """Yields consecutive parts (size, D), the last one shorter, like `Tensor.split`."""
+        """Yields consecutive parts (size, D), like `Tensor.split`.
+
+        The last one may be shorter.
+        """
         pending: list[np.ndarray] = []
         for array in self.arrays():
             pending.append(array)
@@ -40,12 +43,12 @@ class Frames:
 
 
 class Representation(nn.Module, ABC):
-    """Conversion of motions to features and back: base class of all representations.
+    """Base class of all representations: conversions of motions to features and back.
 
-    Mean and std are buffers, so that sampling needs no data set.
+    Mean and std are buffers, so sampling needs no data set.
 
     Args:
-        name: saved in stores and checkpoints; features with different names are never mixed.
+        name: name in stores and checkpoints. Features with different names are never mixed.
         features: D, the number of features of a frame.
         fps: frames per second, 1 to 1000.
         skeleton: the skeleton of the decoded joints.
@@ -72,9 +75,9 @@ class Representation(nn.Module, ABC):
     mean: Tensor
     #: (D,) standard deviation of the features.
     std: Tensor
-    #: Name of a representation whose first features these are, so that its features can be cut.
+    #: Name of a representation that begins with these features, so that its features can be cut.
     part_of: str = ""
-    #: Whether the root moves by steps between frames, so that any window of frames is a motion.
+    #: Whether the root moves by steps between frames. Any window of frames is then a motion.
     relative: bool = True
     #: Columns of the features by name.
     slices: Mapping[str, slice] = {}
@@ -94,40 +97,58 @@ class Representation(nn.Module, ABC):
         """Encodes a raw motion as features (F', D) float32 in the data's units, not normalized."""
 
     def encode_many(self, motions: Sequence[Tensor]) -> list[Tensor]:
-        """Encodes several motions; subclasses may do so in one pass."""
+        """Encodes several motions. Subclasses may do so in one pass."""
         return [self.encode(motion) for motion in motions]
 
     @abstractmethod
     def decode(self, features: Tensor) -> Tensor:
-        """Decodes features (..., F, D) in the data's units to joints (..., F, J, 3), meters, y up. Differentiable."""
+        """Decodes features (..., F, D) in the data's units to joints (..., F, J, 3).
+
+        Joints are in meters, y up. The decoding is differentiable.
+        """
 
     def rotations6d(self, features: Tensor) -> Tensor:
-        """Returns the rotations (..., F, N, 6) in features (..., F, D) in the data's units; by default N = 0."""
+        """Returns the rotations (..., F, N, 6) in features (..., F, D) in the data's units.
+
+        By default, N = 0.
+        """
         return features.new_zeros(*features.shape[:-1], 0, 6)
 
     def statistics(self, features: Tensor | Frames) -> tuple[Tensor, Tensor]:
-        """Returns mean and std (D,) for normalization, from all training frames (N, D); 0 and 1 without `slices`."""
+        """Returns mean and std (D,) for normalization, computed from all training frames (N, D).
+
+        Without `slices`, they are 0 and 1.
+        """
         if self.slices:
             return grouped_statistics(features, self.slices.values())
         return torch.zeros(self.features), torch.ones(self.features)
 
     @abstractmethod
     def joint_features(self, joints: Iterable[int]) -> Tensor:
-        """Returns (D,) bool, True for features of these joints; features of the root trajectory belong to joint 0."""
+        """Returns (D,) bool, True = feature of these joints.
+
+        Features of the root trajectory belong to joint 0.
+        """
 
     def joint_mask(self, joints: Iterable[int]) -> Tensor:
-        """Returns (J,) bool, True for these joints."""
+        """Returns (J,) bool, True = one of these joints."""
         mask = torch.zeros(len(self.skeleton), dtype=torch.bool)
         mask[list(joints)] = True
         return mask
 
     def contacts(self, features: Features) -> Features | None:
-        """Returns columns (..., F, N), about 0 to 1, of contacts of `skeleton.feet` with the floor, or None."""
+        """Returns columns (..., F, N) for contacts of `skeleton.feet` with the floor.
+
+        Values are about 0 to 1. Returns None if the features contain no contacts.
+        """
         columns = self.slices.get("contacts")
         return None if columns is None else features[..., columns]
 
     def rebase(self, features: Features) -> Features:
-        """Adapts features (..., F, D) of cuts to start like complete motions; by default, returns them unchanged."""
+        """Adapts features (..., F, D) of cuts, so that they start like complete motions.
+
+        By default, returns them unchanged.
+        """
         return features
 
     def normalize(self, features: Tensor) -> Tensor:
@@ -139,25 +160,30 @@ class Representation(nn.Module, ABC):
         return x * self.std + self.mean
 
     def to_joints(self, x: Tensor) -> Tensor:
-        """Decodes normalized features (..., F, D) to joints (..., F, J, 3), meters, y up. Differentiable."""
+        """Decodes normalized features (..., F, D) to joints (..., F, J, 3).
+
+        Joints are in meters, y up. The decoding is differentiable.
+        """
         return self.decode(self.denormalize(x))
 
 
 def check_finite(motion: Tensor, name: str = "motion") -> None:
-    """Raises `UserError` if a raw motion (F, ...) has a number that is not finite."""
+    """Raises `UserError` if a raw motion (F, ...) contains a number that is not finite."""
     if not motion.isfinite().all():
         frame = int((~motion.isfinite()).flatten(1).any(1).nonzero()[0, 0])
         raise UserError(f"{name}: numbers in frame {frame} are not finite; leave the motion out")
 
 
-# Smallest standard deviation of a group of features that is not constant; positions in KIT's units round to 3e-5
+# Smallest standard deviation of a group of features that is not constant. Positions in KIT's
+# units have rounding errors of 3e-5.
 SMALLEST_STD = 1e-4
 
 
 def grouped_statistics(features: Tensor | Frames, groups: Iterable[slice]) -> tuple[Tensor, Tensor]:
-    """Returns the mean (D,) of each feature of frames (N, D), and the std averaged over each group of features.
+    """Returns the mean (D,) of each feature, and the std averaged over each group of features.
 
-    A constant group (`SMALLEST_STD`) gets std 1, so that rounding errors are not amplified.
+    `features` are frames (N, D). A group is constant if its std is below `SMALLEST_STD`. It gets
+    std 1, so that rounding errors are not amplified.
     """
     mean, squares = moments(features)
     std = (squares / len(features)).sqrt()
@@ -168,8 +194,8 @@ def grouped_statistics(features: Tensor | Frames, groups: Iterable[slice]) -> tu
 
 
 def moments(features: Tensor | Frames) -> tuple[Tensor, Tensor]:
-    """Returns the mean (D,) of frames (N, D) and the sum (D,) of squared deviations from it, float64."""
-    size, zero = 1 << 16, torch.zeros(())  # the frames of a data set would not fit in memory
+    """Returns the mean (D,) of frames (N, D), and the sum (D,) of squared deviations, float64."""
+    size, zero = 1 << 16, torch.zeros(())  # all frames of a data set would not fit in memory
     mean = sum((chunk.double().sum(0) for chunk in features.split(size)), zero) / len(features)
     return mean, sum(
         (chunk.double().sub_(mean).square_().sum(0) for chunk in features.split(size)), zero

@@ -1,12 +1,13 @@
-"""MARDM's essential features: the part of HumanML3D's that positions are decoded from."""
+"""MARDM's essential features: the part of HumanML3D's features that determines the positions."""
 
 from flame_mdm.representations.humanml import HumanML
 
 
 class Essential(HumanML):
-    """The first 67 of HumanML3D's 263 features (Meng et al. 2025, MARDM), 64 of KIT's 251, 3 J + 1 for J joints.
+    """The first 67 of HumanML3D's 263 features (Meng et al. 2025, MARDM).
 
-    `HumanML` describes the arguments and the columns.
+    For KIT, these are 64 of 251 features; for J joints, 3 J + 1. `HumanML` describes the
+    arguments and the columns.
 
     Example:
         >>> Essential().features, Essential(skeleton="kit21").features

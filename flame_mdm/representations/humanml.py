@@ -14,13 +14,17 @@ from flame_mdm.representations import Representation, check_finite, rotation
 from flame_mdm.representations.skeleton import SKELETONS
 
 LEGACY_SMOOTHING_FRAMES, SMOOTHING_SECONDS = 20, 1.0
-"""Standard deviation of the Gaussian that removes arm swing from the heading: 20 frames at 20 fps, as published."""
+"""Standard deviation of the Gaussian that removes arm swing from the heading.
+
+It is 20 frames at 20 fps, as published.
+"""
 
 
 class HumanML(Representation):
-    """Features of Guo et al. 2022 (HumanML3D): 263 for 22 joints, 251 for KIT's 21, 12 J - 1 for J joints.
+    """Features of Guo et al. 2022 (HumanML3D).
 
-    A motion of T frames gives T - 1 rows. Columns by name, in `slices`:
+    There are 263 for 22 joints, 251 for KIT's 21, and 12 J - 1 for J joints. A motion of T frames
+    gives T - 1 rows. Columns by name, in `slices`:
 
     | name | width | content |
     |---|---|---|
@@ -32,34 +36,36 @@ class HumanML(Representation):
     | velocities | 3 J | each joint's displacement to the next frame, in body coordinates |
     | contacts | 4 | 1 if a foot joint (`skeleton.feet`) hardly moves to the next frame |
 
-    The heading is 0 when the body faces +z and increases as it turns left, towards +x. Motions
-    are first made canonical: lowest joint at y = 0, root of the first frame at x = z = 0, facing
-    +z there.
+    The heading is 0 when the body faces +z, and increases as the body turns left, toward +x.
+    Motions are first made canonical: the lowest joint is at y = 0, and in the first frame, the
+    root is at x = z = 0 and the body faces +z.
 
-    Variant "legacy" equals the published data with all its peculiarities. Its heading subtracts
-    the hips from the shoulders instead of adding them, and is 0 in the first frame although the
-    smoothed heading is not. `turn` is half the turn to the right and changes sign where the
-    heading crosses 180 degrees. The root velocity is in the body coordinates of the next frame.
-    Rotations are rotations of bones in the world relative to the inverse heading, also at the
-    shoulders. `decode` is the published one. If a bone is exactly opposite to its rest direction,
-    the published code gives NaN; here it is a half turn.
+    The variant "legacy" equals the published data with all its peculiarities. Its heading
+    subtracts the hips from the shoulders instead of adding them. In the first frame, it is 0,
+    although the smoothed heading is not. `turn` is half the turn to the right, and changes sign
+    where the heading crosses 180 degrees. The root velocity is in the body coordinates of the
+    next frame. Rotations are rotations of bones in the world relative to the inverse heading,
+    also at the shoulders. `decode` is the published decoding. If a bone is exactly opposite to
+    its rest direction, the published code gives NaN; here, the rotation is a half turn.
 
-    Variant "clean" has none of these. Headings are unwrapped before smoothing and padded
-    point-symmetrically at both ends, which preserves the first and the last heading and steady
-    turns. Rotations are taken of the body facing +z, each relative to its parent in the skeleton.
+    The variant "clean" has none of these. Headings are unwrapped before smoothing. They are
+    padded point-symmetrically at both ends, which preserves the first and the last heading and
+    steady turns. Rotations are computed after the body is turned to +z, and are relative to the
+    parent in the skeleton.
 
-    Input and output joints are in meters; features are in units of 1 / `units_per_metre` meters
+    Input and output joints are in meters. Features are in units of 1 / `units_per_metre` meters
     (KIT: 1/640).
 
     Args:
         skeleton: key in `SKELETONS`.
         variant: "clean" for the intended features, "legacy" for the published ones.
         fps: frames per second.
-        bone_lengths: J lengths in the features' unit, of the bone that ends in each joint, that
-            all motions are retargeted to; None keeps the lengths of each motion.
+        bone_lengths: J lengths in the features' unit. Each is the length of the bone that ends in
+            a joint. All motions are retargeted to these lengths. None keeps the lengths of each
+            motion.
         units_per_metre: units of the features per meter.
-        contact_threshold: squared displacement of a foot per frame, in the features' unit, below
-            which the foot is in contact: 0.002 for HumanML3D, 0.05 for KIT.
+        contact_threshold: squared displacement of a foot per frame, in the features' unit. Below
+            it, the foot is in contact. HumanML3D uses 0.002, KIT 0.05.
 
     Raises:
         UserError: If the skeleton is unknown, or `bone_lengths` do not fit it.
@@ -109,7 +115,7 @@ class HumanML(Representation):
         return self.encode_many([motion])[0]
 
     def encode_many(self, motions: Sequence[Tensor]) -> list[Tensor]:
-        """Encodes several motions in one pass over all their frames, which is faster."""
+        """Encodes several motions in one pass over all their frames, for speed."""
         joints, lengths = self._canonical(motions)
         heading = torch.cat([self._heading(clip) for clip in joints.split(lengths)])
         last = torch.tensor(lengths).cumsum(0) - 1
@@ -135,7 +141,10 @@ class HumanML(Representation):
         return list(rows.split([length - 1 for length in lengths]))
 
     def decode(self, features: Tensor) -> Tensor:
-        """Decodes turn, root and positions of features (..., F, D) to joints (..., F, J, 3), meters. Differentiable."""
+        """Decodes turn, root and positions of features (..., F, D) to joints (..., F, J, 3).
+
+        Joints are in meters. The decoding is differentiable.
+        """
         heading, root = self._root(features)
         local = features[..., self.slices["positions"]].unflatten(-1, (-1, 3))
         turned = rotation.rotate_y(local, heading[..., None])
@@ -155,7 +164,10 @@ class HumanML(Representation):
         ]
 
     def _canonical(self, motions: Sequence[Tensor]) -> tuple[Tensor, list[int]]:
-        """Returns all frames (N, J, 3) of the canonical motions, float64 in the features' unit, and their lengths."""
+        """Returns all frames (N, J, 3) of the canonical motions, and the lengths of the motions.
+
+        Frames are float64 in the features' unit.
+        """
         for number, motion in enumerate(motions):
             name = f"motion {number}" if len(motions) > 1 else "motion"
             if motion.ndim != 3 or motion.shape[1:] != (joints := len(self.skeleton), 3):
@@ -182,7 +194,10 @@ class HumanML(Representation):
         ), lengths
 
     def _retarget(self, joints: Tensor, first: Tensor, clip: Tensor) -> Tensor:
-        """Sets the bone lengths and scales the root trajectory by the ratio of leg lengths in the first frame."""
+        """Sets the bone lengths and scales the root trajectory.
+
+        The scale is the ratio of leg lengths in the first frame.
+        """
         target = torch.tensor(self.bone_lengths, dtype=joints.dtype)
         bones = self.skeleton.bones(joints)
         leg = list(self.skeleton.leg)
@@ -192,10 +207,10 @@ class HumanML(Representation):
         )
 
     def _facing(self, joints: Tensor, hips: float = 1.0) -> Tensor:
-        """Returns x and z (N, 2) of the direction hips and shoulders face; shorter if the body lies on its side.
+        """Returns x and z (N, 2) of the direction that hips and shoulders face.
 
-        It is the cross product of the vertical and the direction to the right; `hips` is the
-        weight of the hips.
+        It is the cross product of the vertical and the direction to the right. It is shorter if
+        the body lies on its side. `hips` is the weight of the hips.
         """
         right_hip, left_hip, right_shoulder, left_shoulder = joints[
             :, list(self.skeleton.facing)
@@ -221,7 +236,10 @@ class HumanML(Representation):
         return torch.from_numpy(smooth - smooth[0])
 
     def _rotations(self, joints: Tensor, heading: Tensor) -> Tensor:
-        """Returns 6D columns (N, J - 1, 6) of the shortest arcs from rest to the bones, relative to the parent arc."""
+        """Returns the shortest arcs from rest to the bones, as 6D columns (N, J - 1, 6).
+
+        Arcs are relative to the arc of the parent.
+        """
         rest = joints.new_tensor(self.skeleton.raw_offsets)
         arcs = rotation.between(rest, self.skeleton.bones(joints))
         if self.legacy:

@@ -1,4 +1,4 @@
-"""MotionStreamer's features: root velocity and turn, local joints and their velocities, SMPL's rotations."""
+"""MotionStreamer's features: root trajectory, local joints, velocities, SMPL's rotations."""
 
 from collections.abc import Iterable, Sequence
 from copy import deepcopy
@@ -13,7 +13,9 @@ from flame_mdm.representations.smpl import ADULT, read_pose
 
 
 class Motion272(Representation):
-    """272 features of Xiao et al. 2025 (MotionStreamer), one row per frame. Columns by name, in `slices`:
+    """272 features of Xiao et al. 2025 (MotionStreamer), one row per frame.
+
+    Columns by name, in `slices`:
 
     | name | width | content |
     |---|---|---|
@@ -23,15 +25,15 @@ class Motion272(Representation):
     | velocities | 66 | differences of `positions` from the last frame: without the body's own motion and turn |
     | rotations | 132 | SMPL's rotations as 6D rows, of the root in body coordinates |
 
-    In the first row, `turn` is the identity and velocities are 0. The heading is the heading of
+    In the first row, `turn` is the identity, and velocities are 0. The heading is the heading of
     the root's rotation, so it jumps when a body lies down. Motions begin at x = z = 0, facing +z.
-    `smpl.read_pose` describes raw motions, whose z axis is up. Bones have the lengths of
-    `offsets`, whereas the authors keep the bone lengths of each subject.
+    Raw motions have z up; `smpl.read_pose` describes them. Bones have the lengths of `offsets`.
+    The authors keep the bone lengths of each subject instead.
 
     Args:
         fps: frames per second.
-        offsets: (24, 3) offsets of the body in meters, like `ADULT`; the first is from
-            translation to pelvis.
+        offsets: (24, 3) offsets of the body in meters, like `ADULT`. The first offset leads from
+            the translation to the pelvis.
 
     Example:
         >>> representation = Motion272()
@@ -62,7 +64,10 @@ class Motion272(Representation):
         return self.features_of(joints, rotations)
 
     def features_of(self, joints: Tensor, rotations: Tensor) -> Tensor:
-        """Returns features (F, 272) float32 of joints (F, 22, 3) and rotations (F, 22, 3, 3), y up, facing +z."""
+        """Returns features (F, 272) float32 of joints (F, 22, 3) and rotations (F, 22, 3, 3).
+
+        Both have y up and face +z.
+        """
         joints = joints.double() - torch.stack(
             [joints[0, 0, 0], joints[..., 1].min(), joints[0, 0, 2]]
         )
@@ -90,13 +95,19 @@ class Motion272(Representation):
         return torch.cat([turn, features[..., self.slices["rotations"]].unflatten(-1, (22, 6))], -2)
 
     def decode(self, features: Tensor) -> Tensor:
-        """Decodes velocity, turn and positions of features (..., F, 272) to joints (..., F, 22, 3). Differentiable."""
+        """Decodes velocity, turn and positions of features to joints (..., F, 22, 3).
+
+        Features are (..., F, 272). The decoding is differentiable.
+        """
         inverse, ground = self._root(features)
         local = features[..., self.slices["positions"]].unflatten(-1, (22, 3))
         return local @ inverse + ground[..., None, :]
 
     def poses(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Decodes features (..., F, 272) to the pelvis (..., F, 3) and SMPL's rotations (..., F, 22, 3, 3), y up."""
+        """Decodes features (..., F, 272) to SMPL poses, y up.
+
+        These are the pelvis (..., F, 3) and SMPL's rotations (..., F, 22, 3, 3).
+        """
         inverse, ground = self._root(features)
         turned = rotation.rot6d_to_matrix(self.rotations6d(features)[..., 1:, :], "rows")
         height = features[..., self.slices["positions"]][..., 1:2] * features.new_tensor(
@@ -106,10 +117,13 @@ class Motion272(Representation):
         return ground + height, torch.cat([root, turned[..., 1:, :, :]], -3)
 
     def _root(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns rotations to body coordinates (..., F, 3, 3), and the root's x and z as vectors (..., F, 3)."""
+        """Returns rotations to body coordinates (..., F, 3, 3) and positions (..., F, 3).
+
+        Positions are the root's x and z, with y = 0.
+        """
         inverse = rotation.rot6d_to_matrix(self.rotations6d(features)[..., 0, :], "rows")
         step = 1
-        while step < features.shape[-2]:  # products of all turns so far, in log2(F) steps
+        while step < features.shape[-2]:  # computes all products of turns in log2(F) steps
             inverse = torch.cat(
                 [inverse[..., :step, :, :], inverse[..., step:, :, :] @ inverse[..., :-step, :, :]],
                 -3,
@@ -118,11 +132,14 @@ class Motion272(Representation):
         x, z = features[..., self.slices["root_velocity"]].unbind(-1)
         velocity = torch.stack([x, torch.zeros_like(x), z], -1)
         world = (velocity[..., 1:, None, :] @ inverse[..., :-1, :, :])[..., 0, :]
-        level = world * world.new_tensor([1.0, 0.0, 1.0])  # a generated turn need not be about y
+        level = world * world.new_tensor([1.0, 0.0, 1.0])  # generated turns may not be about y
         return inverse, torch.cat([velocity[..., :1, :], level], -2).cumsum(-2)
 
     def rebase(self, features: Features) -> Features:
-        """Sets velocities and turn in the first frame of cuts (..., F, D), as in the first frame of a motion."""
+        """Sets velocities and turn in the first frame of cuts (..., F, D).
+
+        They get the values of a motion's first frame.
+        """
         cut = deepcopy(features)
         for name in ("root_velocity", "turn", "velocities"):
             cut[..., 0, self.slices[name]] = 0.0
@@ -130,13 +147,19 @@ class Motion272(Representation):
         return cut
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
-        """Returns (272,) bool, True for features of these joints; the root trajectory belongs to joint 0."""
+        """Returns (272,) bool, True = feature of these joints.
+
+        The root trajectory belongs to joint 0.
+        """
         part = self.joint_mask(joints)
         return torch.cat([part[:1].expand(8), *(part.repeat_interleave(n) for n in (3, 3, 6))])
 
 
 def face_forward(translation: Tensor, rotations: Tensor) -> tuple[Tensor, Tensor]:
-    """Turns translation (F, 3) and rotations (F, J, 3, 3) about y, so that the root faces +z in the first frame."""
+    """Turns a motion about y, so that the root faces +z in the first frame.
+
+    The motion is the translation (F, 3) and rotations (F, J, 3, 3).
+    """
     turn = _to_body(rotations[:1])
     return translation @ turn[0].T, torch.cat(
         [(turn @ rotations[:, 0])[:, None], rotations[:, 1:]], 1
@@ -144,6 +167,9 @@ def face_forward(translation: Tensor, rotations: Tensor) -> tuple[Tensor, Tensor
 
 
 def _to_body(rotations: Tensor) -> Tensor:
-    """Returns rotations (F, 3, 3) about y that turn the z axis of the root, in rotations (F, J, 3, 3), to +z."""
+    """Returns rotations (F, 3, 3) about y that turn the z axis of the root to +z.
+
+    The root is joint 0 of the rotations (F, J, 3, 3).
+    """
     heading = torch.atan2(rotations[:, 0, 0, 2], rotations[:, 0, 2, 2])
     return rotation.axis_angle_to_matrix(-heading[:, None] * heading.new_tensor([0.0, 1.0, 0.0]))

@@ -13,11 +13,16 @@ from flame_mdm.representations.skeleton import KIT21
 KNEES_AND_ELBOWS = [
     KIT21.joints.index(f"{side}_{part}") for part in ("knee", "elbow") for side in ("left", "right")
 ]
-"""Used as hips and shoulders by the published code, which applies their indices after removing the root."""
+"""Joints that the published code uses as hips and shoulders.
+
+It applies their indices after removing the root.
+"""
 
 
 class Rifke(Representation):
-    """64 features of Petrovich et al. 2022 (TEMOS) for KIT's 21 joints, also used by FLAME; T rows for T frames.
+    """64 features of Petrovich et al. 2022 (TEMOS) for KIT's 21 joints, also used by FLAME.
+
+    A motion of T frames gives T rows.
 
     | columns | content |
     |---|---|
@@ -26,13 +31,13 @@ class Rifke(Representation):
     | 61 | heading change since the previous frame, radians, 0 in the first frame |
     | 62:64 | x and z of the root's displacement since the previous frame, in body coordinates |
 
-    Kept as published: the floor is a soft minimum, which depends on the unit of length; heading
-    changes are not unwrapped; and the heading is computed from knees and elbows instead of the
-    intended hips and shoulders.
+    Three peculiarities of the published code are kept. The floor is a soft minimum, which depends
+    on the unit of length. Heading changes are not unwrapped. The heading is computed from knees
+    and elbows instead of the intended hips and shoulders.
 
     Args:
         fps: frames per second.
-        units_per_metre: units of the features per meter; KIT's unit is 1/640 meters. Joints are
+        units_per_metre: units of the features per meter. KIT's unit is 1/640 meters. Joints are
             in meters.
 
     Example:
@@ -64,7 +69,10 @@ class Rifke(Representation):
         return torch.cat([root[:, 1:2], local.flatten(1), turn[:, None], step[:, ::2]], 1).float()
 
     def decode(self, features: Tensor) -> Tensor:
-        """Decodes (..., T, 64) to joints (..., T, 21, 3) in meters, the first root at 0, facing +z. Differentiable."""
+        """Decodes features (..., T, 64) to joints (..., T, 21, 3) in meters.
+
+        The first root is at 0, facing +z. The decoding is differentiable.
+        """
         turned, step = features[..., 61].cumsum(-1), features[..., 62:]
         heading = turned - turned[..., :1]
         step = torch.stack([step[..., 0], torch.zeros_like(heading), step[..., 1]], -1)
@@ -77,31 +85,46 @@ class Rifke(Representation):
         )
 
     def floor(self, joints: Tensor) -> Tensor:
-        """Returns the floor height of joints (T, 21, 3) in KIT's unit: a soft minimum over time of the lowest foot."""
+        """Returns the floor height of joints (T, 21, 3) in KIT's unit.
+
+        It is a soft minimum over time of the height of the lowest foot.
+        """
         lowest = joints[:, list(KIT21.feet), 1].amin(1)
         least, most = lowest.min(), lowest.max()
         return least - torch.log(0.5 + torch.exp(least - most))
 
     def heading(self, joints: Tensor) -> Tensor:
-        """Returns the heading (T,) of joints (T, 21, 3) in radians, 0 = +z, positive towards +x, in (-pi, pi]."""
+        """Returns the heading (T,) of joints (T, 21, 3) in radians, in (-pi, pi].
+
+        0 = +z; the heading is positive toward +x.
+        """
         left_knee, right_knee, left_elbow, right_elbow = joints[:, KNEES_AND_ELBOWS].unbind(1)
         across = right_knee - left_knee + right_elbow - left_elbow
         return torch.atan2(-across[:, 2], across[:, 0])
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
-        """Returns (64,) bool, True for features of these joints; the root trajectory belongs to joint 0."""
+        """Returns (64,) bool, True = feature of these joints.
+
+        The root trajectory belongs to joint 0.
+        """
         part = self.joint_mask(joints)
         return torch.cat([part[:1], part[1:].repeat_interleave(3), part[:1].expand(3)])
 
     def statistics(self, features: Tensor | Frames) -> tuple[Tensor, Tensor]:
-        """Returns mean and unbiased std of each feature; std 1 if it is constant."""
+        """Returns the mean and unbiased std of each feature.
+
+        The std of a constant feature is 1.
+        """
         mean, squares = moments(features)
         std = (squares / (len(features) - 1)).sqrt()
         return mean.float(), torch.where(std > 0, std, 1.0).float()
 
 
 def upsample(joints: Tensor, factor: int = 8) -> Tensor:
-    """Interpolates (T, ...) linearly to ((T - 1) * factor + 1, ...): TEMOS evaluates at 100 frames per second."""
+    """Interpolates (T, ...) linearly to ((T - 1) * factor + 1, ...).
+
+    TEMOS evaluates at 100 frames per second.
+    """
     steps = torch.arange((len(joints) - 1) * factor + 1)
     begin = (steps // factor).clamp(max=max(len(joints) - 2, 0))
     weight = ((steps - begin * factor) / factor).to(joints).reshape(-1, *[1] * (joints.ndim - 1))

@@ -13,11 +13,11 @@ from flame_mdm.representations.smpl import ADULT, read_pose
 
 
 class Rot6D(Representation):
-    """25 x 6 features of Petrovich et al. 2021 (ACTOR): 24 rotations as 6D rows, then (x, y, z, 0, 0, 0).
+    """25 x 6 features of Petrovich et al. 2021 (ACTOR), not normalized.
 
-    (x, y, z) is the root's translation relative to the first frame, in camera coordinates:
-    meters, y down, z away from the camera. Not normalized. `smpl.read_pose` describes raw
-    motions.
+    They are 24 rotations as 6D rows, then (x, y, z, 0, 0, 0). (x, y, z) is the root's translation
+    relative to the first frame, in camera coordinates: meters, y down, z away from the camera.
+    `smpl.read_pose` describes raw motions.
 
     Args:
         fps: frames per second.
@@ -54,7 +54,10 @@ class Rot6D(Representation):
         return features[..., :144].unflatten(-1, (24, 6))
 
     def decode(self, features: Tensor) -> Tensor:
-        """Decodes features (..., F, 150) to joints (..., F, 24, 3), meters, y up (rotated 180 degrees about x)."""
+        """Decodes features (..., F, 150) to joints (..., F, 24, 3) in meters.
+
+        y is up: the camera coordinates are rotated 180 degrees about x.
+        """
         rotations = rotation.rot6d_to_matrix(self.rotations6d(features), "rows")
         translation = features[..., 144:147]
         joints = forward_kinematics(
@@ -63,6 +66,9 @@ class Rot6D(Representation):
         return joints * joints.new_tensor([1.0, -1.0, -1.0])
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
-        """Returns (150,) bool, True for features of these joints; the translation belongs to joint 0."""
+        """Returns (150,) bool, True = feature of these joints.
+
+        The translation belongs to joint 0.
+        """
         part = self.joint_mask(joints)
         return torch.cat([part, part[:1]]).repeat_interleave(6)

@@ -1,7 +1,8 @@
-"""Conversions between rotations: axis-angle, quaternions, matrices, the two 6D conventions and Euler angles.
+"""Conversions between rotations.
 
+Rotations are axis-angle vectors, quaternions, matrices, two kinds of 6D vectors, or Euler angles.
 Every function accepts any leading batch shape, preserves the dtype and is differentiable.
-Quaternions are (w, x, y, z) of unit length; matrices act on column vectors; angles are in
+Quaternions are (w, x, y, z) and have unit length. Matrices act on column vectors. Angles are in
 radians.
 """
 
@@ -14,9 +15,12 @@ from torch import Tensor
 from flame_mdm.errors import UserError
 
 SixD = Literal["rows", "columns"]
-"""Which vectors of the matrix are kept: the first two rows (pytorch3d, FLAME, ACTOR, TEMOS, MDM's
-action data) or the first two columns (HumanML3D). rows(R) = columns(R^T): decoding one as the
-other gives the inverse rotation."""
+"""Which vectors of the matrix are kept.
+
+These are the first two rows (pytorch3d, FLAME, ACTOR, TEMOS, MDM's action data) or the first two
+columns (HumanML3D). rows(R) = columns(R^T), so decoding with the wrong convention gives the
+inverse rotation.
+"""
 
 
 def axis_angle_to_quaternion(axis_angle: Tensor) -> Tensor:
@@ -29,7 +33,7 @@ def axis_angle_to_quaternion(axis_angle: Tensor) -> Tensor:
 
 
 def quaternion_to_axis_angle(quaternion: Tensor) -> Tensor:
-    """(..., 4) -> (..., 3) axis times angle, the angle in [0, pi]."""
+    """(..., 4) -> (..., 3) axis times angle. The angle is in [0, pi]."""
     quaternion = standardize(quaternion)
     w, xyz = quaternion[..., :1], quaternion[..., 1:]
     sine = torch.linalg.vector_norm(xyz, dim=-1, keepdim=True)
@@ -53,7 +57,7 @@ def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
 def matrix_to_quaternion(matrix: Tensor) -> Tensor:
     """(..., 3, 3) -> (..., 4) with w >= 0."""
     (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in matrix.unbind(-2))
-    # Rows of 4 q q^T; the row of the largest component is well-conditioned for every rotation.
+    # These are rows of 4 q q^T. The row of the largest component is well-conditioned.
     outer = [
         *(1 + a + e + i, h - f, c - g, d - b),
         *(h - f, 1 + a - e - i, b + d, c + g),
@@ -72,12 +76,12 @@ def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
 
 
 def matrix_to_axis_angle(matrix: Tensor) -> Tensor:
-    """(..., 3, 3) -> (..., 3), the angle in [0, pi]."""
+    """(..., 3, 3) -> (..., 3). The angle is in [0, pi]."""
     return quaternion_to_axis_angle(matrix_to_quaternion(matrix))
 
 
 def matrix_to_rot6d(matrix: Tensor, convention: SixD) -> Tensor:
-    """(..., 3, 3) -> (..., 6), the first two rows or the first two columns, one after the other."""
+    """(..., 3, 3) -> (..., 6): the first two rows or columns, one after the other."""
     vectors = matrix if convention == "rows" else matrix.mT
     return vectors[..., :2, :].flatten(-2)
 
@@ -85,12 +89,12 @@ def matrix_to_rot6d(matrix: Tensor, convention: SixD) -> Tensor:
 def rot6d_to_matrix(rot6d: Tensor, convention: SixD) -> Tensor:
     """(..., 6), orthonormal or not -> (..., 3, 3) by Gram-Schmidt (Zhou et al. 2019, eq. 15).
 
-    Every finite pair of vectors gives a rotation. If one has no direction, it is replaced by the
-    basis vector that is least along the other one; so is the second vector if both are parallel.
-    Two zeros give the identity.
+    Every finite pair of vectors gives a rotation. If one vector has no direction, a basis vector
+    replaces it: the one that is least parallel to the other vector. If both vectors are parallel,
+    such a basis vector replaces the second one. Two zeros give the identity.
     """
     degenerate = _degenerate(rot6d, *_orthogonal(rot6d))
-    # not a branch: neither exported graphs nor torch.func.vmap, which guidance uses, can have one
+    # No branch, because exported graphs and torch.func.vmap, used in guidance, cannot contain one
     first, across = _orthogonal(torch.where(degenerate, _completed(rot6d), rot6d))
     second = F.normalize(across, dim=-1)
     rows = torch.stack([first, second, torch.linalg.cross(first, second)], -2)
@@ -98,24 +102,27 @@ def rot6d_to_matrix(rot6d: Tensor, convention: SixD) -> Tensor:
 
 
 def is_degenerate(rot6d: Tensor) -> Tensor:
-    """Returns (...,) bool: whether pairs of vectors (..., 6) define no rotation, so that `rot6d_to_matrix` adds one.
+    """Returns (...,) bool, True = a pair of vectors (..., 6) defines no rotation.
 
-    A vector of such a pair is 0, or both vectors are parallel.
+    One vector is 0, or both are parallel. `rot6d_to_matrix` completes such pairs.
     """
     return _degenerate(rot6d, *_orthogonal(rot6d)).squeeze(-1)
 
 
 def _orthogonal(rot6d: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns the first of two vectors (..., 6), normalized, and the part of the second one across it."""
+    """Returns two orthogonal vectors from (..., 6).
+
+    They are the first vector, normalized, and the part of the second one perpendicular to it.
+    """
     first, second = F.normalize(rot6d[..., :3], dim=-1), rot6d[..., 3:]
     return first, second - (first * second).sum(-1, keepdim=True) * first
 
 
 def _degenerate(rot6d: Tensor, first: Tensor, across: Tensor) -> Tensor:
-    """Returns (..., 1) bool: whether two vectors (..., 6), of which `_orthogonal` is known, define no rotation.
+    """Returns (..., 1) bool, True = two vectors (..., 6) define no rotation.
 
-    Of parallel vectors, rounding alone determines `across`. NaN is not degenerate, so it stays
-    NaN.
+    `first` and `across` are the results of `_orthogonal`. If the vectors are parallel, `across`
+    consists of rounding errors. NaN is not degenerate, so it stays NaN.
     """
     length = torch.linalg.vector_norm(rot6d[..., 3:], dim=-1, keepdim=True)
     parallel = (
@@ -126,7 +133,10 @@ def _degenerate(rot6d: Tensor, first: Tensor, across: Tensor) -> Tensor:
 
 
 def _shorter(normalized: Tensor) -> Tensor:
-    """Returns (..., 1) bool: whether normalized vectors (..., 3) are shorter than 1, because they were about 0."""
+    """Returns (..., 1) bool, True = a normalized vector (..., 3) is shorter than 1.
+
+    The original vector was about 0.
+    """
     return (
         torch.linalg.vector_norm(normalized, dim=-1, keepdim=True)
         < 1 - torch.finfo(normalized.dtype).eps ** 0.5
@@ -134,7 +144,7 @@ def _shorter(normalized: Tensor) -> Tensor:
 
 
 def _completed(rot6d: Tensor) -> Tensor:
-    """Returns pairs of vectors (..., 6) in which one vector of each pair, or both, is replaced by a basis vector."""
+    """Returns pairs of vectors (..., 6) in which basis vectors replace one or both vectors."""
     first, second = F.normalize(rot6d[..., :3], dim=-1), F.normalize(rot6d[..., 3:], dim=-1)
     basis = torch.eye(3, dtype=rot6d.dtype, device=rot6d.device)
     replaced = _shorter(first)
@@ -145,10 +155,12 @@ def _completed(rot6d: Tensor) -> Tensor:
 
 
 def matrix_to_euler(matrix: Tensor, order: str) -> Tensor:
-    """Returns Euler angles (..., 3) of matrices (..., 3, 3), the middle one in [-pi/2, pi/2].
+    """Returns Euler angles (..., 3) of matrices (..., 3, 3). The middle one is in [-pi/2, pi/2].
 
-    In gimbal lock, the third angle is 0. Raises `UserError` if `order` is not one of XYZ, XZY,
-    YXZ, YZX, ZXY, ZYX.
+    In gimbal lock, the third angle is 0.
+
+    Raises:
+        UserError: If `order` is not XYZ, XZY, YXZ, YZX, ZXY or ZYX.
     """
     if sorted(order) != ["X", "Y", "Z"]:
         raise UserError(
@@ -168,7 +180,7 @@ def matrix_to_euler(matrix: Tensor, order: str) -> Tensor:
 
 
 def standardize(quaternion: Tensor) -> Tensor:
-    """Returns q or -q (..., 4), which are the same rotation, with w >= 0.
+    """Returns q or -q (..., 4), whichever has w >= 0. Both are the same rotation.
 
     Example:
         >>> standardize(torch.tensor([-1.0, 0.0, 0.0, 0.5])).tolist()
@@ -178,7 +190,7 @@ def standardize(quaternion: Tensor) -> Tensor:
 
 
 def multiply(a: Tensor, b: Tensor) -> Tensor:
-    """Hamilton product (..., 4): first b, then a."""
+    """Returns the Hamilton product (..., 4): first b, then a."""
     aw, ax, ay, az = a.unbind(-1)
     bw, bx, by, bz = b.unbind(-1)
     product = [
@@ -191,36 +203,38 @@ def multiply(a: Tensor, b: Tensor) -> Tensor:
 
 
 def inverse(quaternion: Tensor) -> Tensor:
-    """(..., 4) of unit length -> (..., 4)."""
+    """(..., 4) with unit length -> (..., 4)."""
     return torch.cat([quaternion[..., :1], -quaternion[..., 1:]], -1)
 
 
 def rotate(quaternion: Tensor, vector: Tensor) -> Tensor:
-    """Rotates vectors (..., 3) by unit quaternions (..., 4); the leading shapes broadcast."""
+    """Rotates vectors (..., 3) by unit quaternions (..., 4). The leading shapes broadcast."""
     xyz, vector = torch.broadcast_tensors(quaternion[..., 1:], vector)
     twice = 2 * torch.linalg.cross(xyz, vector)
     return vector + quaternion[..., :1] * twice + torch.linalg.cross(xyz, twice)
 
 
 def _scaled(vectors: Tensor) -> Tensor:
-    """Returns vectors scaled to largest entry 1, so that squares of tiny ones do not underflow; 0 stays 0."""
+    """Returns vectors scaled so that their largest entry is 1; 0 stays 0.
+
+    Squares of tiny vectors then do not underflow.
+    """
     largest = vectors.abs().amax(-1, keepdim=True)
     return vectors / torch.where(largest > 0, largest, 1.0)
 
 
 def between(a: Tensor, b: Tensor) -> Tensor:
-    """Returns the shortest rotation that turns vectors `a` (..., 3) to the directions of `b` (..., 3).
+    """Returns the shortest rotation from the directions of `a` (..., 3) to those of `b` (..., 3).
 
     The quaternions (..., 4) have w >= 0. For opposite directions, the result is a half turn about
-    a perpendicular axis; if a vector is 0, the identity.
+    a perpendicular axis. If a vector is 0, the result is the identity.
 
     Example:
         >>> quarter = between(torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 2.0, 0.0]))
         >>> [round(value, 4) for value in quarter.tolist()]  # 90 degrees about z
         [0.7071, 0.0, 0.0, 0.7071]
     """
-    # (|a| |b| + a . b, a x b) is the quaternion of half the angle between a and b, up to its
-    # length.
+    # (|a| |b| + a . b, a x b) is the quaternion of the rotation from a to b, up to its length.
     a, b = torch.broadcast_tensors(_scaled(a), _scaled(b))
     lengths = torch.linalg.vector_norm(a, dim=-1, keepdim=True) * torch.linalg.vector_norm(
         b, dim=-1, keepdim=True
@@ -241,7 +255,10 @@ def between(a: Tensor, b: Tensor) -> Tensor:
 
 
 def slerp(a: Tensor, b: Tensor, t: Tensor | float) -> Tensor:
-    """Returns the rotation at `t` in [0, 1] (number or shape (..., 1)) on the shorter arc from `a` to `b` (..., 4)."""
+    """Returns a rotation on the shorter arc from `a` to `b` (..., 4).
+
+    `t` in [0, 1] is a number or has the shape (..., 1); 0 gives `a`, and 1 gives `b`.
+    """
     dot = (a * b).sum(-1, keepdim=True)
     b = torch.where(dot < 0, -b, b)
     dot = dot.abs()
@@ -254,14 +271,20 @@ def slerp(a: Tensor, b: Tensor, t: Tensor | float) -> Tensor:
 
 
 def continuous(quaternion: Tensor, dim: int) -> Tensor:
-    """Flips signs along the time axis `dim`, so that neighbors are in one hemisphere; the first one is unchanged."""
+    """Flips signs along the time axis `dim`, so that neighbors are in one hemisphere.
+
+    The first quaternion is unchanged.
+    """
     q = quaternion.movedim(dim, 0)
     flips = torch.where((q[1:] * q[:-1]).sum(-1, keepdim=True) < 0, -1.0, 1.0).to(q.dtype)
     return torch.cat([q[:1], q[1:] * flips.cumprod(0)]).movedim(0, dim)
 
 
 def rotate_y(vector: Tensor, angle: Tensor) -> Tensor:
-    """Rotates vectors (..., 3) about the vertical by `angle` (...); positive angles turn +z towards +x, to the left."""
+    """Rotates vectors (..., 3) about the vertical by `angle` (...).
+
+    Positive angles turn +z toward +x, to the left.
+    """
     x, y, z = vector.unbind(-1)
     cosine, sine = torch.cos(angle), torch.sin(angle)
     return torch.stack([cosine * x + sine * z, y.expand_as(cosine * x), cosine * z - sine * x], -1)

@@ -20,20 +20,21 @@ LEG, ARM = (
 
 @dataclass(frozen=True)
 class Skeleton:
-    """A tree of joints; parents precede their children, joint 0 is the root."""
+    """A tree of joints. Parents precede their children, and joint 0 is the root."""
 
     name: str  # key in `SKELETONS`
-    # Names in the order of the data; the prefixes `left_` and `right_` mark the sides
+    # Names in the order of the data. The prefixes `left_` and `right_` mark the sides.
     joints: tuple[str, ...]
     parents: tuple[int, ...]  # parent of each joint, -1 for the root
-    chains: tuple[tuple[int, ...], ...]  # paths followed by HumanML3D's inverse kinematics
-    # (J, 3) unit direction at rest of the bone that ends in a joint, 0 for the root; from HumanML3D's `paramUtil.py`
+    chains: tuple[tuple[int, ...], ...]  # paths of HumanML3D's inverse kinematics
+    # (J, 3), rest direction of the bone that ends in each joint, of unit length; 0 for the root.
+    # From HumanML3D's `paramUtil.py`.
     raw_offsets: tuple[tuple[int, int, int], ...]
-    # Right hip, left hip, right shoulder, left shoulder, which define the heading
+    # Right hip, left hip, right shoulder, left shoulder. They define the heading.
     facing: tuple[int, int, int, int]
     # Joints that touch the ground, in the order of HumanML3D's contact features
     feet: tuple[int, ...]
-    leg: tuple[int, int]  # (knee, ankle), whose bones measure the size of a body
+    leg: tuple[int, int]  # (knee, ankle); the lengths of their bones measure the size of a body
 
     def __len__(self) -> int:
         return len(self.joints)
@@ -45,7 +46,10 @@ class Skeleton:
 
     @cached_property
     def chain_parents(self) -> tuple[int, ...]:
-        """Joint that each of HumanML3D's rotations is relative to: the parent, or the root for the start of a chain."""
+        """For each joint, the joint to which HumanML3D's rotation is relative.
+
+        It is the parent or, at the start of a chain, the root.
+        """
         starts = {chain[1] for chain in self.chains}
         return tuple(0 if joint in starts else parent for joint, parent in enumerate(self.parents))
 
@@ -59,11 +63,14 @@ class Skeleton:
         )
 
     def mirror(self, joints: Tensor) -> Tensor:
-        """Returns the mirror image of joints (..., J, 3): x changes sign, left and right joints are swapped."""
+        """Returns the mirror image of joints (..., J, 3).
+
+        x changes sign, and left and right joints are swapped.
+        """
         return joints[..., list(self.mirrored), :] * joints.new_tensor([-1.0, 1.0, 1.0])
 
     def bones(self, joints: Tensor) -> Tensor:
-        """Returns vectors (..., J, 3) from the parent to each joint; 0 for the root."""
+        """Returns the vectors (..., J, 3) from the parents to the joints; 0 for the root."""
         return joints - joints[..., [max(parent, 0) for parent in self.parents], :]
 
     def assemble(self, bones: Tensor, root: Tensor) -> Tensor:
@@ -77,10 +84,15 @@ class Skeleton:
 def forward_kinematics(
     skeleton: Skeleton, rotations: Tensor, offsets: Tensor, root: Tensor
 ) -> Tensor:
-    """Computes joint positions (..., J, 3) from rotations and root (..., 3), in the unit of `offsets`. Differentiable.
+    """Computes joint positions (..., J, 3) in the unit of `offsets`. Differentiable.
 
-    `rotations` (..., J, 3, 3) are relative to the parents and apply to bones that leave a joint, as in SMPL and BVH;
-    `offsets` (J, 3) are positions relative to the parents in the rest pose, of which the root's is not used.
+    Args:
+        skeleton: the tree of joints.
+        rotations: (..., J, 3, 3), relative to the parents. They apply to the bones that leave a
+            joint, as in SMPL and BVH.
+        offsets: (J, 3), positions relative to the parents in the rest pose. The offset of the
+            root is not used.
+        root: (..., 3), position of the root.
     """
     turned = global_rotations(rotations, skeleton.parents)
     bones = (
@@ -90,7 +102,10 @@ def forward_kinematics(
 
 
 def global_rotations(rotations: Tensor, parents: Sequence[int]) -> Tensor:
-    """Converts rotations (..., J, 3, 3) from parent to world frames, with one matrix product per level of the tree."""
+    """Converts rotations (..., J, 3, 3) from the frames of the parents to the world.
+
+    Each level of the tree takes one matrix product.
+    """
     import torch
 
     level = [0]
@@ -185,9 +200,10 @@ SMPL24 = Skeleton(
     leg=SMPL22.leg,
 )
 
-# In the order of MMM's root, BP, BT, BLN, BUN, LS, LE, LW, RS, RE, RW, LH, LK, LA, LMrot, LF, RH, RK, RA, RMrot, RF.
-# KIT's coordinates are mirrored: the left side of a body that faces +z is at -x. So the published code calls the leg
-# named L in MMM the right one; `facing` and `feet` keep its order, whereas the names here are MMM's.
+# The order is MMM's: root, BP, BT, BLN, BUN, LS, LE, LW, RS, RE, RW, LH, LK, LA, LMrot, LF, RH,
+# RK, RA, RMrot, RF. KIT's coordinates are mirrored: the left side of a body that faces +z is at
+# -x. Therefore the published code calls MMM's leg L the right leg. `facing` and `feet` keep the
+# order of the published code, whereas the names here are MMM's.
 KIT21 = Skeleton(
     name="kit21",
     joints=(
@@ -234,7 +250,10 @@ SKELETONS: dict[str, Skeleton] = {skeleton.name: skeleton for skeleton in (SMPL2
 
 
 def part_names(skeleton: Skeleton) -> dict[str, list[int]]:
-    """Returns the joints of body parts: lower_body is the root and the legs, as in MDM, upper_body everything else."""
+    """Returns the joints of body parts.
+
+    As in MDM, lower_body is the root and the legs, and upper_body is everything else.
+    """
     parts: dict[str, list[int]] = {}
     for side in ("left", "right"):
         for limb, words in (("arm", ARM), ("leg", LEG)):
@@ -252,7 +271,11 @@ def part_names(skeleton: Skeleton) -> dict[str, list[int]]:
 
 
 def find_joints(skeleton: Skeleton, names: str | Sequence[str]) -> list[int]:
-    """Returns the indices of joints given by names of joints or body parts; a `UserError` suggests similar names."""
+    """Returns the indices of joints, given by names of joints or body parts.
+
+    Raises:
+        UserError: If a name is unknown; the message suggests similar names.
+    """
     indices = part_names(skeleton) | {name: [index] for index, name in enumerate(skeleton.joints)}
     chosen: list[Any] = list(names) if isinstance(names, list | tuple) else [names]
     for name in chosen:

@@ -18,22 +18,30 @@ ADULT = (
     *((0.12, 0.045, -0.02), (-0.12, 0.045, -0.02), (0.26, -0.015, -0.025), (-0.26, -0.015, -0.025)),
     *((0.267, 0.01, 0.0), (-0.267, 0.01, 0.0), (0.085, -0.01, -0.015), (-0.085, -0.01, -0.015)),
 )
-"""Position of each of SMPL's 24 joints relative to its parent in the rest pose (arms out, facing
-+z, y up), meters. It replaces the licensed model files: bone lengths of HumanML3D's reference
-clip, rounded and symmetric."""
+"""Position of each of SMPL's 24 joints relative to its parent in the rest pose, in meters.
+
+In the rest pose, the arms are out, and the body faces +z, y up. The positions replace the
+licensed model files. They are bone lengths of HumanML3D's reference clip, rounded and symmetric.
+"""
 
 
 AXIS_ANGLES = {66: 22, 72: 24, 156: 52, 165: 55}
-"""Numbers per frame of axis-angle vectors -> joints: the body alone, SMPL, SMPL+H and SMPL-X."""
+"""Number of joints by numbers per frame of their axis-angle vectors.
+
+The kinds are the body alone, SMPL, SMPL+H and SMPL-X.
+"""
 
 
 def read_pose(motion: Tensor) -> tuple[Tensor, Tensor]:
-    """Splits a raw SMPL motion (F, 3 + 3 K) into translation (F, 3) and matrices (F, 24, 3, 3), float64.
+    """Splits a raw SMPL motion (F, 3 + 3 K) into a translation and rotation matrices, float64.
 
-    It is a translation in meters, then axis-angle vectors of K = 24, 52 or 55 joints. Of SMPL+H's
-    52, the first 24 are used, as in FLAME's code, so that the hands are its left_index1 and
-    left_index2. Raises `UserError` if the shape is another one, such as 24 rotation matrices, or
-    a number is not finite.
+    The motion is a translation in meters, then axis-angle vectors of K = 24, 52 or 55 joints. The
+    results are (F, 3) and (F, 24, 3, 3). As in FLAME's code, the first 24 of SMPL+H's 52 joints
+    are used, so the hands are its left_index1 and left_index2.
+
+    Raises:
+        UserError: If the shape is another one, such as 24 rotation matrices, or a number is not
+            finite.
     """
     widths = [3 + numbers for numbers, joints in AXIS_ANGLES.items() if joints >= 24]
     if motion.ndim != 2 or not len(motion) or motion.shape[1] not in widths:
@@ -46,15 +54,15 @@ def read_pose(motion: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class SMPL(Representation):
-    """147 features of Kim et al. 2023 (FLAME): translation (3), then 24 rotations as 6D rows. Not normalized.
+    """147 features of Kim et al. 2023 (FLAME), not normalized.
 
-    World coordinates as in AMASS: meters, z up, neither centered nor rotated. `read_pose`
-    describes raw motions.
+    They are the translation (3), then 24 rotations as 6D rows, in world coordinates as in AMASS:
+    meters, z up, neither centered nor rotated. `read_pose` describes raw motions.
 
     Args:
         fps: frames per second.
-        offsets: (24, 3) offsets of the body used for decoding, in meters, like `ADULT`; the first
-            is from translation to pelvis.
+        offsets: (24, 3) offsets of the body used for decoding, in meters, like `ADULT`. The first
+            offset leads from the translation to the pelvis.
 
     Example:
         >>> representation = SMPL()
@@ -81,7 +89,10 @@ class SMPL(Representation):
         return features[..., 3:].unflatten(-1, (24, 6))
 
     def decode(self, features: Tensor) -> Tensor:
-        """Decodes features (..., F, 147) to joints (..., F, 24, 3), meters, y up as in HumanML3D: (-x, z, y)."""
+        """Decodes features (..., F, 147) to joints (..., F, 24, 3) in meters.
+
+        y is up as in HumanML3D: (-x, z, y).
+        """
         rotations = rotation.rot6d_to_matrix(self.rotations6d(features), "rows")
         offsets = features.new_tensor(self.offsets)
         joints = forward_kinematics(
@@ -90,6 +101,9 @@ class SMPL(Representation):
         return joints[..., [0, 2, 1]] * joints.new_tensor([-1.0, 1.0, 1.0])
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
-        """Returns (147,) bool, True for features of these joints; the translation belongs to joint 0."""
+        """Returns (147,) bool, True = feature of these joints.
+
+        The translation belongs to joint 0.
+        """
         part = self.joint_mask(joints)
         return torch.cat([part[:1].expand(3), part.repeat_interleave(6)])

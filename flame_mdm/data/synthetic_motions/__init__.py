@@ -1,1 +1,1 @@
-"""Procedural motions of the synthetic data set: one function per action, which returns the body's curves."""
+"""Procedural motions of the synthetic data set. One function per action moves the body."""

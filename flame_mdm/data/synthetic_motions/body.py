@@ -1,17 +1,17 @@
 """The body of the synthetic motions: curves that an action sets, and its kinematics.
 
 Joint angles move the upper body by forward kinematics. The legs follow planned footprints by
-two-bone inverse kinematics, so that a foot on the ground does not move at all; hands do the same
-if they reach for something. Bone lengths are close to HumanML3D's reference skeleton (Guo et al.
-2022).
+two-bone inverse kinematics, so a foot on the ground does not move at all. Hands that reach for
+something use inverse kinematics, too. Bone lengths are close to HumanML3D's reference skeleton
+(Guo et al. 2022).
 """
 
 from collections.abc import Sequence
 
 import numpy as np
 
-# Offsets from the parent in meters, standing with hanging arms, facing +z; x for the left side,
-# mirrored on the right.
+# Offsets from the parent in meters, standing with hanging arms, facing +z. x is for the left
+# side; the right side is mirrored.
 HIP = (0.075, -0.075, 0.0)
 SPINE1 = (0.0, 0.131, -0.015)
 SPINE2 = (0.0, 0.142, 0.0)
@@ -21,10 +21,10 @@ HEAD = (0.0, 0.085, 0.058)
 COLLAR = (0.072, 0.119, -0.01)
 SHOULDER = (0.125, -0.02, -0.01)
 THIGH, SHIN, UPPER_ARM, FOREARM = 0.393, 0.429, 0.260, 0.268
-# A flat foot: the ankle at 6 cm, the toe joint on the floor
+# Height of the ankle of a flat foot, whose toe joint is on the floor
 ANKLE_HEIGHT = 0.06
 FOOT = (0.0, -0.06, 0.134)
-STAND = 0.97  # target height of the pelvis in meters, which standing legs just do not reach
+STAND = 0.97  # target height of the pelvis in meters, just out of reach of standing legs
 
 LEFT, RIGHT = 0, 1
 SIDES = {"left": (LEFT,), "right": (RIGHT,), "both": (LEFT, RIGHT)}
@@ -34,13 +34,19 @@ Attributes = dict[str, str | int | float]
 
 
 def ease(t: np.ndarray, start: float, end: float) -> np.ndarray:
-    """Returns 0 before `start`, 1 after `end`, and a minimum-jerk transition between (Flash & Hogan 1985)."""
+    """Returns a minimum-jerk transition from 0 before `start` to 1 after `end`.
+
+    Source: Flash & Hogan 1985.
+    """
     s = np.clip((t - start) / (end - start), 0, 1)
     return s * s * s * (10 + s * (6 * s - 15))
 
 
 def pulse(t: np.ndarray, start: float, top: float, leave: float, end: float) -> np.ndarray:
-    """Returns a curve that rises from 0 to 1 between `start` and `top` and falls back between `leave` and `end`."""
+    """Returns a curve that rises from 0 to 1 and falls back to 0.
+
+    It rises between `start` and `top`, and falls between `leave` and `end`.
+    """
     return ease(t, start, top) - ease(t, leave, end)
 
 
@@ -56,7 +62,7 @@ def rotation(axis: int, angle: np.ndarray) -> np.ndarray:
 
 
 class Body:
-    """Curves over the frames that an action controls, initialized to a person who stands and breathes.
+    """Curves over the frames, which an action controls. Initially, a person stands and breathes.
 
     Angles are in radians. The first axis of feet and arms is the side: 0 = left, 1 = right.
     """
@@ -64,7 +70,10 @@ class Body:
     def __init__(
         self, rng: np.random.Generator, t: np.ndarray, width: float | Sequence[float] | None = None
     ):
-        """`width` is half the distance between the feet in meters, or its range; None = as in a relaxed stance."""
+        """`width` is half the distance between the feet in meters, or its range.
+
+        None = the width of a relaxed stance.
+        """
         self.t = t
         half = rng.uniform(width[0], width[1]) if isinstance(width, Sequence) else width
         self.position = np.zeros((len(t), 3))
@@ -79,8 +88,8 @@ class Body:
         self.arms += np.array(
             [rng.normal(0.03, 0.05), rng.uniform(0.14, 0.24), -0.4, rng.uniform(0.2, 0.4)]
         )[:, None]
-        self.shoulders = np.zeros((2, len(t)))  # the girdle raised, beyond its rise with the arm
-        # Whether a foot that is too far from its hip is drawn toward it, instead of a longer shin
+        self.shoulders = np.zeros((2, len(t)))  # additional rise of the shoulders, beyond the arm's
+        # Whether a foot that is too far away is pulled toward its hip, instead of a longer shin
         self.keeps_legs = False
         self.reaches: list[tuple[int, np.ndarray, np.ndarray, str]] = []
 
@@ -89,7 +98,7 @@ class Body:
         self.ankles[..., 1] = ANKLE_HEIGHT
         self.ankles[..., 2] = -0.03 + rng.normal(0, 0.012, (2, 1))
         self.foot_yaw = np.repeat((rng.uniform(0.05, 0.2, 2) * SIGN)[:, None], len(t), 1)
-        self.foot_pitch = np.zeros((2, len(t)))  # heel up
+        self.foot_pitch = np.zeros((2, len(t)))  # positive: the heel is up
 
         self.position[:, 1] = STAND - rng.uniform(0, 0.015)
         self.position[:, [0, 2]] += self._drift(rng, 0.018, 2).T
@@ -102,7 +111,10 @@ class Body:
         return (weight * np.sin(2 * np.pi * (frequency * self.t + phase))).sum(0)
 
     def move_arm(self, side: int, weight: np.ndarray, pose: Sequence[float | np.ndarray]) -> None:
-        """Blends one arm by `weight` (F,) into a pose: forward, sideways, turned outward, elbow."""
+        """Blends an arm by `weight` (F,) into a pose.
+
+        The pose is four angles: forward, sideways, turned outward, elbow.
+        """
         for angle, target in enumerate(pose):
             self.arms[side, angle] += weight * (target - self.arms[side, angle])
 
@@ -113,32 +125,33 @@ class Body:
         target: Sequence[float | np.ndarray] | np.ndarray,
         frame: str = "world",
     ) -> None:
-        """Draws a wrist by `weight` (F,) from where the arm's angles put it to a point (3,) or (F, 3) in meters.
+        """Moves a wrist by `weight` (F,) from its position to a point (3,) or (F, 3) in meters.
 
-        `frame` is world, or chest or head: then the point is relative to this joint, with x to
+        Without weight, the angles of the arm determine the position of the wrist. `frame` is
+        world, chest or head. For chest and head, the point is relative to this joint, with x to
         the left and z ahead.
         """
         self.reaches.append((side, weight[:, None], np.asarray(target, float), frame))
 
     def joints(self) -> np.ndarray:
         """Returns joint positions (F, 22, 3) in meters, y up."""
-        # Footprints are fixed first, so that feet never slide. The pelvis is placed above them,
-        # the legs reach from the hips to the feet by inverse kinematics, and spine, head and arms
+        # Footprints are fixed first, so that feet never slide. The pelvis is placed above them.
+        # The legs reach from the hips to the feet by inverse kinematics. Spine, head and arms
         # follow from angles.
         out = np.empty((len(self.t), 22, 3))
         yaw, (pitch, twist, roll) = self.heading, self.pelvis
         pelvis = rotation(1, yaw) @ rotation(1, twist) @ rotation(0, pitch) @ rotation(2, -roll)
         hips = np.stack([pelvis @ np.array([SIGN[side] * HIP[0], *HIP[1:]]) for side in (0, 1)])
 
-        # A raised heel rotates about the toes, and raised toes about the ankle, so that the part
-        # on the floor does not move.
+        # A raised heel rotates about the toes, and raised toes rotate about the ankle, so the
+        # part on the floor does not move.
         foot = rotation(1, self.foot_yaw) @ rotation(0, self.foot_pitch)
         toe_offset = foot @ np.array(FOOT)
         heel_up = (self.foot_pitch > 0)[..., None]
         ankles = self.ankles + heel_up * (rotation(1, self.foot_yaw) @ np.array(FOOT) - toe_offset)
 
-        # The pelvis sinks if a leg would not reach its footprint. This produces the bobbing of a
-        # walk.
+        # The pelvis sinks if a leg would not reach its footprint. This makes the pelvis of a walk
+        # bob.
         reach = 0.998 * (THIGH + SHIN)
         out[:, 0] = self.position
         apart = np.sum((ankles - hips - self.position)[..., [0, 2]] ** 2, -1)
@@ -175,7 +188,7 @@ class Body:
         for side, sign in enumerate(SIGN):
             forward, sideways, outward, elbow = self.arms[side]
             arm = rotation(2, sign * sideways) @ rotation(0, -forward) @ rotation(1, sign * outward)
-            # The shoulder girdle rises with the arm, as in people.
+            # The shoulder girdle rises with the arm, as in people
             lift = 0.2 * (1 + (arm @ down)[:, 1]) + self.shoulders[side]
             collar = bone @ rotation(2, sign * lift)
             out[:, 13 + side] = out[:, 9] + bone @ np.array([sign * COLLAR[0], *COLLAR[1:]])
@@ -190,7 +203,7 @@ class Body:
             shoulder, elbow, wrist = (out[:, joint + side] for joint in (16, 18, 20))
             origin, axes = frames[frame]
             goal = wrist + weight * (origin + (axes @ target[..., None])[..., 0] - wrist)
-            # Elbows point outward. Those of an upright body point backward rather than forward.
+            # Elbows point outward. The elbows of an upright body point backward, not forward.
             toward = (
                 elbow
                 - shoulder
@@ -204,9 +217,12 @@ class Body:
 def bent(
     start: np.ndarray, end: np.ndarray, upper: float, lower: float, toward: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the middle and the end (F, 3) of a limb of two bones that bends `toward` (F, 3) and reaches for `end`."""
-    # Both bones are sides of a triangle over the line from start to end. A limb is never quite
-    # straight nor folded, so that its direction of bending is defined.
+    """Returns the middle and the end (F, 3) of a limb of two bones that reaches for `end`.
+
+    The limb bends toward the direction `toward` (F, 3).
+    """
+    # The bones and the line from start to end form a triangle. A limb is never completely
+    # straight or folded, so the direction in which it bends is always defined.
     line = end - start
     length = np.linalg.norm(line, axis=-1, keepdims=True)
     line /= length
@@ -218,7 +234,7 @@ def bent(
 
 
 def beat(t: np.ndarray, frequency: float, phase: float = 0.0) -> np.ndarray:
-    """Returns a sine wave of a frequency in hertz; `phase` in turns."""
+    """Returns a sine wave of a frequency in hertz. `phase` is in turns."""
     return np.sin(2 * np.pi * (frequency * t + phase))
 
 
@@ -231,9 +247,10 @@ def step(
     lift: float = 0.09,
     heel: float = 0.3,
 ) -> None:
-    """Moves a foot by (x, y, z) in meters between two times; the heel, at the angle `heel`, leaves the floor first.
+    """Moves a foot by (x, y, z) in meters between two times.
 
-    A foot that lands higher than it stood rises before it moves ahead.
+    The heel leaves the floor first, at the angle `heel`. A foot that lands higher than it stood
+    rises before it moves ahead.
     """
     s = np.clip((body.t - start) / (end - start), 0, 1)
     across, up = ease(s, 0.25 if by[1] else 0.08, 0.96), ease(s, 0.02, 0.7)
@@ -253,8 +270,9 @@ def follow_feet(body: Body) -> None:
 
 
 def flight(t: np.ndarray, start: float, seconds: float) -> np.ndarray:
-    """Returns the height (F,) in meters of a body in free fall that lands `seconds` after
-    `start`.
+    """Returns the height (F,) in meters of a body in free fall.
+
+    It lands `seconds` after `start`.
     """
     s = np.clip((t - start) / seconds, 0, 1)
     return 9.81 / 8 * seconds**2 * 4 * s * (1 - s)
@@ -263,9 +281,7 @@ def flight(t: np.ndarray, start: float, seconds: float) -> np.ndarray:
 def events(
     rng: np.random.Generator, t: np.ndarray, count: int, slowest: float
 ) -> list[tuple[float, float]]:
-    """Returns (start, seconds) of `count` equally long repetitions, at a random time inside the
-    clip.
-    """
+    """Returns (start, seconds) of `count` equally long repetitions, at a random time."""
     seconds = min(rng.uniform(0.85, 1.0) * slowest, (t[-1] - 0.3) / count)
     start = rng.uniform(0.1, max(0.15, min(0.4, t[-1] - 0.15 - seconds * count)))
     return [(start + n * seconds, seconds) for n in range(count)]

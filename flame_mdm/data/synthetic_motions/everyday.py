@@ -1,4 +1,4 @@
-"""Everyday gestures of a person who stands: idling, talking, holding something, feelings, and what hands do."""
+"""Everyday gestures of a standing person, such as idling, talking, crying or drinking."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from flame_mdm.data.synthetic_motions.gestures import seat
 
 
 def hold(rng: np.random.Generator, t: np.ndarray, seconds: float = 0.5) -> np.ndarray:
-    """Returns the weight (F,) of a pose that is taken early and left at the end of the clip."""
+    """Returns the weight (F,) of a pose that begins early and lasts until the clip's end."""
     start = rng.uniform(0.05, 0.2)
     return pulse(t, start, start + rng.uniform(0.9, 1.15) * seconds, t[-1] - seconds, t[-1])
 
@@ -50,7 +50,7 @@ def point(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attrib
     start = rng.uniform(0.1, 0.3)
     out = pulse(t, start, start + rng.uniform(0.45, 0.6), t[-1] - 0.55, t[-1])
     aside = rng.uniform(-0.1, 0.35)
-    # The lean of the trunk is taken off the arm, so that it points ahead and not at the floor.
+    # The lean of the trunk is subtracted from the arm, so that it points ahead and not down.
     bent = body.pelvis[0] + body.spine[0]
     body.move_arm(side, out, (rng.uniform(1.4, 1.6) + bent, aside, -0.4, 0.06))
     body.spine[1] -= 0.2 * SIGN[side] * out
@@ -129,7 +129,7 @@ def laugh(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attrib
 
 
 def drink(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Leads a hand to the mouth and tips the head back."""
+    """Moves a hand to the mouth and tips the head back."""
     (side,) = SIDES[str(requested["side"])]
     start = rng.uniform(0.05, 0.2)
     up = pulse(t, start, start + rng.uniform(0.65, 0.8), t[-1] - 0.75, t[-1] - 0.05)
@@ -245,7 +245,7 @@ def touch_head(body: Body, rng: np.random.Generator, t: np.ndarray, requested: A
 
 
 def touch_face(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Leads a hand to the cheek and holds it there."""
+    """Moves a hand to the cheek and holds it there."""
     (side,) = SIDES[str(requested["side"])]
     sign, on = SIGN[side], hold(rng, t, 0.65)
     body.move_arm(side, on, (0.8, 0.25, -0.4, 2.2))

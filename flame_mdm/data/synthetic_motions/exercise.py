@@ -1,4 +1,4 @@
-"""Exercises and floor work: stretching, leaning, jumping jacks, push-ups, hops on one leg, and kneeling."""
+"""Exercises: stretching, leaning, jumping jacks, push-ups, hops on one leg, and kneeling."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from flame_mdm.data.synthetic_motions.body import (
     pulse,
 )
 
-LYING_HEEL = 1.35  # angle of a foot that stands on its toes behind the body, in radians
+LYING_HEEL = 1.35  # angle of a foot on its toes behind the lying body, in radians
 
 
 def stretch(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
@@ -77,7 +77,10 @@ def jumping_jacks(
 
 
 def push_ups(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Lowers the straight body between the hands and pushes it up again; begins and ends in a plank."""
+    """Lowers the straight body between the hands and pushes it up again.
+
+    The motion begins and ends in a plank.
+    """
     down = sum(
         pulse(t, s, s + 0.42 * d, s + 0.5 * d, s + d)
         for s, d in events(rng, t, int(requested["count"]), 1.2)
@@ -90,7 +93,7 @@ def push_ups(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Att
     toes_ahead, toes_below = _toes(LYING_HEEL)
     back = -0.8
     body.ankles[..., 2] = back + toes_ahead - FOOT[2]
-    legs = 0.888  # from the ankles to the pelvis
+    legs = 0.888  # distance from the ankles to the pelvis
     body.position[:, 2] = back + legs * np.cos(slope)
     body.position[:, 1] = toes_below + legs * np.sin(slope)
     body.position[:, 0] *= 0.3
@@ -106,13 +109,16 @@ def push_ups(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Att
 
 
 def _toes(heel: float) -> tuple[float, float]:
-    """Returns how far the toes of a foot with a raised heel are ahead of and below the ankle, in meters."""
+    """Returns the position of the toes of a foot with a raised heel, in meters.
+
+    The two numbers are the distances ahead of and below the ankle.
+    """
     _, low, ahead = FOOT
     return ahead * np.cos(heel) + low * np.sin(heel), ahead * np.sin(heel) - low * np.cos(heel)
 
 
 def hop(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Hops on one leg; the other foot is held up behind."""
+    """Hops on one leg and holds up the other foot behind."""
     (side,) = SIDES[str(requested["side"])]
     sign, hops = SIGN[side], events(rng, t, int(requested["count"]), 0.75)
     first, last = hops[0][0], hops[-1][0] + hops[-1][1]

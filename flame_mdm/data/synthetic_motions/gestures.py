@@ -1,4 +1,4 @@
-"""Motions about one spot: gestures of arms and head, jumps, kicks, bends, sitting and lying."""
+"""Motions on the spot: gestures of arms and head, jumps, kicks, bends, sitting and lying."""
 
 import numpy as np
 
@@ -36,7 +36,7 @@ def wave(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
 
 
 def raise_arms(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Raises one arm or both over the head, along the front or along the side."""
+    """Raises one arm or both over the head, in front of the body or at its side."""
     start = rng.uniform(0.15, 0.5)
     weight = ease(t, start, start + rng.uniform(0.7, 1.0))
     over_front, high = rng.random() < 0.5, rng.uniform(2.7, 3.0)
@@ -47,7 +47,7 @@ def raise_arms(body: Body, rng: np.random.Generator, t: np.ndarray, requested: A
 
 
 def punch(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Punches ahead from a guard, as often as `count`."""
+    """Punches ahead from a guard, `count` times."""
     (side,) = SIDES[str(requested["side"])]
     body.ankles[..., 2] += rng.uniform(0.04, 0.1) * rng.choice([-1, 1]) * SIGN[:, None]
     body.position[:, 1] -= 0.03
@@ -90,7 +90,7 @@ def throw(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attrib
 
 
 def clap(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Claps in front of the chest, as often as `count`."""
+    """Claps in front of the chest, `count` times."""
     claps = events(rng, t, int(requested["count"]), 0.85)
     first, last = claps[0][0], claps[-1][0] + claps[-1][1]
     ready = pulse(t, first - 0.1, first + 0.3, last - 0.2, last + 0.35)
@@ -118,7 +118,7 @@ def salute(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attri
 
 
 def nod(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Lowers and lifts the head, as often as `count`."""
+    """Lowers and lifts the head, `count` times."""
     deep = rng.uniform(0.8, 0.95)
     for start, seconds in events(rng, t, int(requested["count"]), 0.9):
         down = pulse(t, start, start + 0.4 * seconds, start + 0.5 * seconds, start + 0.9 * seconds)
@@ -127,11 +127,11 @@ def nod(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribut
 
 
 def stand(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Leaves the body as it is: it stands and breathes."""
+    """Leaves the body unchanged: it stands and breathes."""
 
 
 def jump(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Crouches, jumps and lands, as often as `count`."""
+    """Crouches, jumps and lands, `count` times."""
     depth, reach = rng.uniform(0.16, 0.24), rng.uniform(0.8, 1.6)
     for start, seconds in events(rng, t, int(requested["count"]), 1.05):
         up = start + 0.4 * seconds
@@ -174,7 +174,7 @@ def leap(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
 
 
 def kick(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Kicks ahead with one leg, as often as `count`, on the other."""
+    """Kicks ahead with one leg while standing on the other, `count` times."""
     (side,) = SIDES[str(requested["side"])]
     high = rng.uniform(1.15, 1.45)
     kicks = events(rng, t, int(requested["count"]), 1.25)
@@ -211,7 +211,7 @@ def kick(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
 
 
 def squat(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Squats with the arms ahead, as often as `count`."""
+    """Squats with the arms ahead, `count` times."""
     depth, reach = rng.uniform(0.34, 0.44), rng.uniform(1.0, 1.9)
     for start, seconds in events(rng, t, int(requested["count"]), 1.9):
         down = pulse(t, start, start + 0.45 * seconds, start + 0.5 * seconds, start + seconds)
@@ -254,7 +254,13 @@ def pick(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
 
 
 def seat(body: Body, seated: np.ndarray, bent: np.ndarray) -> None:
-    """Seats a body by the share `seated` (F,) on a chair behind its feet; `bent` (F,) is how far the trunk leans."""
+    """Moves a body to a seat on a chair behind its feet.
+
+    Args:
+        body: the body.
+        seated: (F,) progress from standing, 0, to sitting, 1.
+        bent: (F,) lean of the trunk.
+    """
     body.position[:, 1] += seated * (CHAIR - body.position[:, 1])
     body.position[:, 2] -= 0.36 * seated
     body.pelvis[0] += 0.45 * bent - 0.08 * seated

@@ -1,4 +1,4 @@
-"""Motions one after another in one body: the second begins where, and as, the first ends."""
+"""Joins two motions: the second begins at the place and in the pose of the first's end."""
 
 import copy
 
@@ -6,33 +6,34 @@ import numpy as np
 
 from flame_mdm.data.synthetic_motions.body import Body, ease, rotation
 
-# Curves of a body that return to their value of the next motion, and the axis of their frames
+# Curves of a body that end with the values of the second motion, and the axis of their frames
 ANGLES = {"pelvis": -1, "spine": -1, "head": -1, "arms": -1, "shoulders": -1, "foot_pitch": -1}
-# Curves that keep their place in the world
+# Curves that continue at their place in the world
 PLACES = {"position": 0, "heading": -1, "ankles": 1, "foot_yaw": -1}
 FRAMES = ANGLES | PLACES
-PLANTED = 0.05  # meters; a foot that has to go farther than this takes a step
+PLANTED = 0.05  # distance in meters; a foot that has to move farther takes a step
 STEP_SECONDS, STEP_HEIGHT = 0.35, 0.07
 
 
 def join(first: Body, second: Body, overlap: float = 0.0, blend: float = 0.4) -> Body:
-    """Returns a body that moves as `first`, and then as `second` from where `first` ends.
+    """Returns a body that moves like `first` and then, from the end of `first`, like `second`.
 
-    What the second motion changes is added to the end of the first motion. The difference between
-    the end of the first and the beginning of the second motion fades, except for the place in the
-    world. Feet that stand elsewhere at the beginning of the second motion take a step there.
+    The changes during the second motion are added to the end of the first motion. The difference
+    between the end of the first and the beginning of the second motion fades, except for the
+    place in the world. A foot that is elsewhere at the beginning of the second motion takes a
+    step to this place.
 
     Args:
         first: a body at evenly spaced times.
         second: a body at times with the same spacing.
-        overlap: seconds before the end of the first motion in which the second one begins.
+        overlap: how many seconds before the end of the first motion the second one begins.
         blend: seconds after the end of the first motion until the difference has faded.
     """
     spacing = second.t[1] - second.t[0]
     start = len(first.t) - min(round(overlap / spacing), len(first.t) - 1) - 1
     frames = start + len(second.t)
     joined = copy.copy(first)
-    # Between a plank and a standing body, a leg may be too short for its foot's way.
+    # Between a plank and a standing body, a leg may be too short for the path of its foot.
     joined.keeps_legs = True
     joined.t = np.arange(frames) * spacing
     end = (len(first.t) - 1) * spacing
@@ -57,7 +58,7 @@ def join(first: Body, second: Body, overlap: float = 0.0, blend: float = 0.4) ->
         getattr(joined, name)[..., 1] = after[name][..., 1] + height
 
     def world(points: np.ndarray) -> np.ndarray:
-        """Returns points of the second motion where they are in the joined one."""
+        """Returns points of the second motion at their place in the joined motion."""
         return first.position[-1] * ground + (points - second.position[0] * ground) @ turn.T
 
     ground = np.array([1.0, 0.0, 1.0])
@@ -86,7 +87,7 @@ def join(first: Body, second: Body, overlap: float = 0.0, blend: float = 0.4) ->
 
 
 def frames_of(body: Body, frames: np.ndarray) -> Body:
-    """Returns a body that shows frames (N,) of another one, in this order, at the same frame rate."""
+    """Returns a body that shows frames (N,) of another body, at the same frame rate."""
     part = copy.copy(body)
     part.t = np.arange(len(frames)) * (body.t[1] - body.t[0])
     for name, axis in FRAMES.items():
@@ -99,6 +100,9 @@ def frames_of(body: Body, frames: np.ndarray) -> Body:
 
 
 def _padded(values: np.ndarray, axis: int, start: int, frames: int) -> np.ndarray:
-    """Returns values whose first frame is repeated up to `start`, and whose last one is repeated up to `frames`."""
+    """Returns values with `frames` frames along `axis`; the given values begin at frame `start`.
+
+    The first given value is repeated before `start`, and the last one after its frame.
+    """
     length = values.shape[axis]
     return np.take(values, np.clip(np.arange(frames) - start, 0, length - 1), axis)

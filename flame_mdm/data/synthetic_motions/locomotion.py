@@ -1,4 +1,4 @@
-"""Walking, running, turning, dancing and crawling: footprints along a path, and a pelvis that follows it."""
+"""Walking, running, turning, dancing and crawling: the pelvis follows a path of footprints."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -17,7 +17,7 @@ from flame_mdm.data.synthetic_motions.body import (
 )
 
 Path = Callable[[np.ndarray, float], tuple[np.ndarray, np.ndarray, np.ndarray]]
-"""Share (N,) of a path, and its length in meters -> x (N,), z (N,) and heading (N,) there."""
+"""Fraction (N,) of a path, and its length in meters -> x (N,), z (N,) and heading (N,) there."""
 
 
 @dataclass(frozen=True)
@@ -28,29 +28,29 @@ class Gait:
     # Time of a foot in the air, in steps. Above 1, both feet are in the air between two steps, as
     # in a run.
     swing: float
-    lift: float  # height of the foot in mid-swing
+    lift: float  # height of the foot in the middle of its swing
     heel_off: float  # angle of the heel when the foot leaves the floor
-    toe_up: float  # angle of the toes when the foot comes down; negative: the toes come down first
+    toe_up: float  # angle of the toes when the foot lands; negative: the toes land first
     width: float  # half the distance between the tracks of the feet
-    sink: float = 0.03  # lowering of the pelvis while moving
-    bounce: float = 0.0  # amplitude of the pelvis, highest with both feet in the air
-    behind: float = 0.0  # how much farther back the feet come down than they stand
+    sink: float = 0.03  # how much the pelvis is lowered while moving
+    bounce: float = 0.0  # amplitude of the pelvis; it is highest when both feet are in the air
+    behind: float = 0.0  # distance by which the feet land farther back than they stand
 
 
 def walk_along(
     body: Body, rng: np.random.Generator, gait: Gait, speed: float, path: Path, first: int
 ) -> np.ndarray:
-    """Moves the pelvis at `speed`, in m/s, along a path, and places the feet on either side of it, `first` first.
+    """Moves the pelvis at `speed`, in m/s, along a path, with footprints on both sides of it.
 
-    Returns (F,) how far the right foot is in front of the left one, in meters, relative to the
-    heading of the pelvis.
+    The foot `first` takes the first step. Returns how far the right foot is in front of the left
+    foot (F,), in meters, relative to the heading of the pelvis.
     """
-    # The pelvis accelerates, keeps its speed and stops. Each footprint is where the pelvis will
-    # be in the middle of the foot's next stance, aside by the width of the gait: feet are under
-    # the body on average.
+    # The pelvis accelerates, keeps its speed and stops. A footprint is where the pelvis will be
+    # in the middle of the foot's next stance, shifted sideways by the width of the gait. The feet
+    # are therefore under the body on average.
     t, start = body.t, rng.uniform(0.08, 0.18)
     seconds = t[-1] - rng.uniform(0.06, 0.16) - start  # time until the last foot is down
-    # A run ends with the steps of a walk, whose feet never leave the ground together.
+    # A run ends with steps of a walk, in which the feet never leave the ground together.
     landing = min(gait.swing, 0.82)
     count = max(1, round(seconds / gait.step - landing))
     gait = replace(gait, step=seconds / (count + landing))
@@ -88,7 +88,7 @@ def walk_along(
             [px + across * cos + along * sin, pz - across * sin + along * cos, yaw + yaw0[side]]
         )
         # In the air, the foot eases from print to print. Its highest point is early in the swing,
-        # when it has just been pulled up, and smaller steps are lower.
+        # because it has just been lifted. Smaller steps are lower.
         s = np.clip((t - lift_off) / swing, 0, 1)
         share = ease(s, 0.08, 0.96)
         distance = np.hypot(*(goal - prints[side])[:2])
@@ -113,7 +113,7 @@ def walk_along(
 
 
 def straight(x: float, z: float) -> Path:
-    """Returns a path in the direction (x, z); its length is the distance."""
+    """Returns a path in the direction (x, z). Its length is the length of (x, z)."""
     return lambda share, length: (x * share * length, z * share * length, 0 * share)
 
 
@@ -216,7 +216,7 @@ def dance(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attrib
     body.head += np.stack([0.15 * bounce, 0.2 * swing, 0.05 * swing])
     high = rng.uniform(0.2, 0.7)
     for side, sign in enumerate(SIGN):
-        light = np.maximum(-sign * swing, 0) ** 1.5  # the foot that carries nothing
+        light = np.maximum(-sign * swing, 0) ** 1.5  # the foot that carries no weight
         body.ankles[side, :, 1] += 0.1 * light
         body.ankles[side, :, 2] += 0.08 * light
         body.foot_pitch[side] += 0.35 * light

@@ -1,4 +1,4 @@
-"""Other ways to get around: sneaking, limping, marching, climbing, carrying, pushing, stumbling, spinning."""
+"""Other ways to move, such as sneaking, limping, marching, climbing or carrying."""
 
 import numpy as np
 
@@ -19,14 +19,17 @@ from flame_mdm.data.synthetic_motions.body import (
 )
 from flame_mdm.data.synthetic_motions.locomotion import Gait, straight, swing_arms, walk_along
 
-# Distance between rungs, and distance of the ladder from the pelvis, in meters
+# Distance between rungs, and distance from the pelvis to the ladder, in meters
 RUNG = 0.3
 LADDER = 0.36
 RISE, TREAD = 0.17, 0.29  # height and depth of a stair in meters
 
 
 def sneak(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Walks bent and slowly, lifting the feet high and coming down on the toes, with the hands in front."""
+    """Walks bent and slowly, with the hands in front.
+
+    Feet are lifted high and land on the toes.
+    """
     gait = Gait(rng.uniform(0.66, 0.78), 0.8, rng.uniform(0.15, 0.19), 0.35, -0.3, 0.09, 0.0)
     body.position[:, 1] -= rng.uniform(0.1, 0.15)
     walk_along(body, rng, gait, rng.uniform(0.4, 0.55), straight(0, 1), RIGHT)
@@ -53,7 +56,7 @@ def crouch_walk(body: Body, rng: np.random.Generator, t: np.ndarray, requested: 
 
 
 def limp(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Walks with one stiff, sore leg: the trunk drops and leans over it, and its foot is hardly lifted."""
+    """Walks with a stiff, sore leg: the trunk leans over it, and its foot is hardly lifted."""
     (side,) = SIDES[str(requested["side"])]
     sign = SIGN[side]
     gait = Gait(rng.uniform(0.52, 0.6), 0.82, 0.12, 0.35, 0.1, 0.09)
@@ -130,10 +133,11 @@ def run_in_place(
 def _tread(
     body: Body, frequency: float, lift: float, ahead: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Lifts the feet in turn on the spot, the left one first, by `lift` meters, and moves them `ahead` in the air.
+    """Lifts the feet in turn on the spot, the left foot first.
 
-    Returns (F,) a wave that is 1 with the left and -1 with the right foot up, and whether the
-    body is moving.
+    A foot is lifted by `lift` meters and moves `ahead` meters in the air. Returns two curves
+    (F,): a wave that is 1 when the left foot is up and -1 when the right foot is up, and whether
+    the body is moving.
     """
     t = body.t
     phases = max(2, round((t[-1] - 0.2) * 2 * frequency))
@@ -204,7 +208,7 @@ def pull(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
 def climb_ladder(
     body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes
 ) -> None:
-    """Climbs a ladder in front of the body: each hand moves with the opposite foot, by two rungs."""
+    """Climbs a ladder: each hand moves with the opposite foot, by two rungs."""
     seconds, start = rng.uniform(0.5, 0.6), rng.uniform(0.05, 0.15)
     steps = int((t[-1] - 0.1 - start) / seconds)
     seconds = (t[-1] - 0.1 - start) / steps
@@ -235,7 +239,7 @@ def climb_ladder(
 def climb_stairs(
     body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes
 ) -> None:
-    """Goes up stairs, one foot on each; the last step brings the feet side by side."""
+    """Climbs stairs with one foot on each stair. The last step brings the feet side by side."""
     start, seconds = rng.uniform(0.05, 0.15), rng.uniform(0.5, 0.6)
     steps = int((t[-1] - 0.1 - start) / seconds)
     seconds = (t[-1] - 0.1 - start) / steps
@@ -254,7 +258,7 @@ def climb_stairs(
 
 
 def _smooth(count: np.ndarray) -> np.ndarray:
-    """Returns a count (F,) that grows evenly, with some of its speed lost between two steps."""
+    """Returns a count (F,) that grows evenly, but more slowly between two steps."""
     return count - 0.05 * np.sin(2 * np.pi * count)
 
 
@@ -279,7 +283,7 @@ def stumble(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attr
 
 
 def skip(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Skips along happily: springy steps with a raised knee and large swings of the arms."""
+    """Skips along happily, with springy steps, raised knees and large swings of the arms."""
     gait = Gait(rng.uniform(0.42, 0.48), 1.12, rng.uniform(0.3, 0.36), 0.7, -0.2, 0.08, 0.03, 0.055)
     apart = walk_along(body, rng, gait, rng.uniform(1.3, 1.6), straight(0, 1), RIGHT)
     swing_arms(body, apart, rng.uniform(1.0, 1.2))

@@ -1,18 +1,21 @@
-"""Motion files for exchange with other programs. `docs/formats.md` lists units, axes and joints of each format."""
+"""Motion files for exchange with other programs.
+
+`docs/formats.md` lists the units, axes and joints of each format.
+"""
 
 import re
 from pathlib import Path
 
 from flame_mdm.errors import UserError
 
-SCENES = (".fbx", ".glb", ".vrm", ".vrma")  # files with a scene of nodes, and animations of them
-# Endings of motion files that are read
+SCENES = (".fbx", ".glb", ".vrm", ".vrma")  # files with a scene of nodes and its animations
+# Endings of motion files that can be read
 ENDINGS = (".npz", ".bvh", *SCENES, ".amc", ".json", ".npy")
-TREES = (".bvh", ".amc")  # Endings of files with a tree of joints and their rotations
+TREES = (".bvh", ".amc")  # endings of files with a tree of joints and their rotations
 USD = (".usda", ".usdc", ".usdz")  # Universal Scene Description
 # Endings of files that can have the skeleton of another program
 RIGGED = (".bvh", ".glb", ".fbx", *USD)
-# Endings of the files that `Motion.save` writes.
+# Endings of the files that `Motion.save` writes
 WRITTEN = (
     *RIGGED,
     ".vrma",
@@ -32,7 +35,7 @@ ADVICE = {
     ".pt": "Save its arrays with numpy.savez as joints and fps, or as poses, trans and mocap_framerate",
     ".csv": "Save joints (frames, joints, 3) with numpy.savez as joints and fps",
 }
-"""Ending of motion files that are not read -> what to do."""
+"""Advice by ending, for motion files that cannot be read."""
 
 NO_MOTIONS = ("shape.npz", "_stagei.npz")
 """Suffixes of AMASS files that contain a body shape and no motion."""
@@ -49,16 +52,16 @@ def unread(path: Path) -> UserError:
 
 
 def motions_in(folder: Path) -> list[Path]:
-    """Returns the motion files in a folder and the folders below it, sorted.
+    """Returns the motion files in a folder and its subfolders, sorted.
 
-    Hidden files, as macOS and editors leave them, folders and files of AMASS without motion are
-    left out. Of JSON files, only those with an array of joints are motions.
+    Hidden files, which macOS and editors create, folders, and files of AMASS without motion are
+    left out. A JSON file is a motion only if it has an array of joints.
     """
     return sorted(file for file in folder.rglob("*") if _is_motion(file, folder))
 
 
 def motion_files(folder: Path) -> list[Path]:
-    """Returns the files of `motions_in`; raises `UserError` if there are none."""
+    """Returns the files of `motions_in`. Raises `UserError` if there are none."""
     files = motions_in(folder)
     if not files:
         raise UserError(f"{folder}: no motion files ({', '.join(ENDINGS)})")
@@ -80,7 +83,10 @@ def _is_motion(file: Path, folder: Path) -> bool:
 
 
 def _has_joints(file: Path) -> bool:
-    """Returns whether a JSON file has an array of joints; a file that cannot be read is left to its reader."""
+    """Returns whether a JSON file has an array of joints.
+
+    It is also true for a file that cannot be read: its reader reports the fault.
+    """
     tail = b""
     try:
         with file.open("rb") as content:

@@ -1,7 +1,7 @@
-"""Node hierarchies in motion, as FBX and GLB files contain them: the positions of all nodes in each frame.
+"""Animated node hierarchies of FBX and GLB files: the positions of all nodes in each frame.
 
-Only positions are used. Rotations of the motion are solved for afterward, so that a rest pose
-that is not a T-pose, and local axes that differ between programs, do not matter.
+Only positions are used, and the rotations of the motion are computed from them. Therefore the
+rest pose need not be a T-pose, and the local axes, which differ between programs, do not matter.
 """
 
 from collections.abc import Sequence
@@ -12,14 +12,14 @@ import numpy as np
 
 from flame_mdm.errors import UserError, did_you_mean
 
-LARGEST = 1e9  # largest coordinate, in the unit of the file, that is read
+LARGEST = 1e9  # maximum coordinate that is read, in the unit of the file
 
 Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, eq=False)
 class AnimatedNodes:
-    """The nodes of a file in one of its animations.
+    """The nodes of a file during one of its animations.
 
     Attributes:
         names: names of the N nodes.
@@ -28,8 +28,8 @@ class AnimatedNodes:
         positions: (F, N, 3) in the world, in meters, y up.
         fps: frames per second.
         animation: the name of the animation.
-        humanoid: joint of SMPL -> index of a node, if the file says which nodes are a human body;
-            else empty.
+        humanoid: index of a node by the joint of SMPL, if the file says which nodes are a human
+            body; otherwise empty.
         unit: meters per unit of length, as the file declares it.
     """
 
@@ -47,9 +47,10 @@ def choose(animations: Sequence[tuple[str, Item]], requested: str | int | None) 
 
     Args:
         animations: names and contents.
-        requested: the name of an animation, or its number, counted from 1; None = the first one.
+        requested: the name of an animation, or its number, counted from 1. None = the first one.
 
-    Raises `UserError` if there is no such animation.
+    Raises:
+        UserError: If there is no such animation.
     """
     if not animations:
         raise UserError("contains no animation. Export the file with its animation")
@@ -73,8 +74,11 @@ def choose(animations: Sequence[tuple[str, Item]], requested: str | int | None) 
 def parents_first(parents: Sequence[int]) -> list[int]:
     """Returns an order of nodes in which parents precede their children.
 
-    Raises `ValueError` if a node is its own ancestor. `parents` holds the index of each node's
-    parent, -1 for a root.
+    Args:
+        parents: index of each node's parent; -1 for a root.
+
+    Raises:
+        ValueError: If a node is its own ancestor.
     """
     children: list[list[int]] = [[] for _ in parents]
     order = []
@@ -91,7 +95,10 @@ def parents_first(parents: Sequence[int]) -> list[int]:
 
 
 def world_matrices(parents: Sequence[int], local: np.ndarray) -> np.ndarray:
-    """Returns matrices (F, N, 4, 4) to the world from matrices to the parent; parents precede their children."""
+    """Converts matrices to the parents to matrices to the world, (F, N, 4, 4) each.
+
+    Parents precede their children.
+    """
     worlds = local.copy()
     for node, parent in enumerate(parents):
         if parent >= 0:

@@ -1,4 +1,4 @@
-"""Motion files of arrays: `.npz`, `.npy` and `.json`, with joints, or rotations of SMPL as in AMASS."""
+"""Motion files of arrays (`.npz`, `.npy`, `.json`), with joints or SMPL's rotations."""
 
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from flame_mdm.representations import rotation
 from flame_mdm.representations.smpl import AXIS_ANGLES, read_pose
 from flame_mdm.safe_io import MEBIBYTE, read_json, read_npy, read_npz
 
-# Maximum size of a `.json` motion; parsed, it takes many times its size
+# Maximum size of a `.json` motion in bytes. Parsed, it takes many times as much memory.
 JSON_LIMIT = 128 * MEBIBYTE
 RATES = (
     "fps",
@@ -32,7 +32,10 @@ NEEDED = {
     "features",
     "representation",
 }
-"""Arrays of an .npz file that are read. Others, which may hold pickled objects, are never opened."""
+"""Arrays of an .npz file that are read.
+
+Other arrays may contain pickled objects; they are never opened.
+"""
 LENGTHS = {
     "m": 1.0,
     "meter": 1.0,
@@ -50,8 +53,8 @@ def read_arrays(path: Path) -> dict[str, Any]:
     """Reads the arrays of an .npz, .json or .npy motion.
 
     Returns joints, or poses (F, 72) and trans (F, 3) as in AMASS. Also returns fps, text,
-    features and representation if the file has them, and of `.json` files up, unit and names.
-    `ours` is whether this project wrote the file.
+    features and representation if the file has them, and up, unit and names of `.json` files.
+    `ours` says whether this project wrote the file.
     """
     suffix = path.suffix.lower()
     if suffix == ".npz":
@@ -90,7 +93,10 @@ def is_real(values: np.ndarray) -> bool:
 
 
 def smpl_motion(data: dict[str, Any], fps: float | None = None) -> tuple[Tensor, Tensor]:
-    """Returns translation (F, 3) and quaternions (F, 24, 4), float64, of AMASS arrays, resampled to `fps` if given."""
+    """Returns the motion of AMASS arrays, resampled to `fps` if given.
+
+    It is the translation (F, 3) and quaternions (F, 24, 4), float64.
+    """
     poses = data["poses"]
     frames = None if fps is None else frame_pairs(len(poses), data["fps"], fps, poses.shape[1] // 3)
     translation, rotations = read_pose(torch.from_numpy(np.concatenate([data["trans"], poses], 1)))
@@ -110,7 +116,10 @@ def _joined(parts: list[np.ndarray]) -> np.ndarray:
 
 
 def _axis_angles(poses: np.ndarray) -> np.ndarray:
-    """Returns axis-angle vectors (F, 72) of SMPL's joints; without hands, theirs are 0."""
+    """Returns axis-angle vectors (F, 72) of SMPL's joints.
+
+    If there are no hands, theirs are 0.
+    """
     count = int(np.prod(poses.shape[1:]))
     if poses.ndim > 3 or (poses.ndim == 3 and poses.shape[2] != 3) or count not in AXIS_ANGLES:
         advice = ""
@@ -126,7 +135,12 @@ def _axis_angles(poses: np.ndarray) -> np.ndarray:
 
 
 def check_numbers(name: str, values: np.ndarray) -> None:
-    """Raises `UserError` unless an array (F, ...) contains real numbers below a million, in few enough frames."""
+    """Checks the numbers of an array (F, ...).
+
+    Raises:
+        UserError: If there are too many frames or none, or if a number is not real or not below a
+            million.
+    """
     if not is_real(values):
         raise UserError(f"{name} are not an array of real numbers")
     if not values.ndim or not len(values):

@@ -1,9 +1,10 @@
-"""ASF/AMC motion capture files, as recorded by Acclaim and the CMU database: a skeleton and its motion in two files.
+"""ASF/AMC motion capture files of Acclaim and the CMU database: one file per skeleton and motion.
 
-An ASF file lists the bones of a subject: direction and length in the world while standing in the
-rest pose, the axes C in which the bone turns, and its degrees of freedom. An AMC file has their
-angles per frame. With the angles' rotation M, a bone turns by C M C^-1 relative to its parent.
-Orders such as XYZ mean that x is applied first: C = Rz Ry Rx.
+An ASF file lists the bones of a subject. Each bone has a direction and length in the world in the
+rest pose (standing), the axes C in which it turns, and its degrees of freedom. An AMC file
+contains the angles of these degrees of freedom per frame. If M is the rotation of the angles, the
+bone turns by C M C^-1 relative to its parent. Orders such as XYZ mean that x is applied first: C
+= Rz Ry Rx.
 """
 
 from __future__ import annotations
@@ -27,7 +28,11 @@ _POSITIONS, _ROTATIONS = CHANNELS[:3], CHANNELS[:2:-1]
 
 
 class Bone(NamedTuple):
-    """A bone: vector (3,) from its start to its end, axes C as a rotation, and degrees of freedom in file order."""
+    """A bone.
+
+    It is the vector (3,) from its start to its end, the axes C as a rotation, and the degrees of
+    freedom in the order of the file.
+    """
 
     vector: np.ndarray
     axes: Rotation
@@ -36,9 +41,10 @@ class Bone(NamedTuple):
 
 
 def read(path: Path, fps: float | None) -> Bvh:
-    """Reads an AMC file and its skeleton as a tree of joints; each bone gives a joint of its name at its start.
+    """Reads an AMC file and its skeleton as a tree of joints.
 
-    AMC files do not contain `fps`: it is 120 for most of CMU's recordings.
+    Each bone gives a joint of the same name at its start. AMC files do not contain `fps`: it is
+    120 for most of CMU's recordings.
     """
     lines = read_lines(path)
     bones, parents = read_skeleton(skeleton_of(path))
@@ -61,7 +67,7 @@ def read(path: Path, fps: float | None) -> Bvh:
                 order, np.stack([values[turn] for turn in turns], 1), degrees=True
             )
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # in gimbal lock, any third angle is as good
+                warnings.simplefilter("ignore")  # in gimbal lock, any third angle is equally good
                 columns.append((bone.axes * turned * bone.axes.inv()).as_euler("ZYX", degrees=True))
         positions = _POSITIONS if name == "root" else ()
         channels.append(positions + (_ROTATIONS if turns else ()))
@@ -79,8 +85,10 @@ def read(path: Path, fps: float | None) -> Bvh:
 def skeleton_of(path: Path) -> Path:
     """Returns the ASF file of an AMC file, in the same folder.
 
-    It has the name of the file, the name of its subject (02.asf), or is the only ASF file. Raises
-    `UserError` if there is none.
+    It has the name of the AMC file or of its subject (02.asf), or is the only ASF file.
+
+    Raises:
+        UserError: If there is no such file.
     """
     candidates = (path.with_suffix(".asf"), path.with_name(path.stem.partition("_")[0] + ".asf"))
     files = sorted(path.parent.glob("*.asf"))
@@ -95,7 +103,10 @@ def skeleton_of(path: Path) -> Path:
 
 
 def read_skeleton(path: Path) -> tuple[dict[str, Bone], dict[str, str]]:
-    """Returns the bones of an ASF file, parents before their children, and the parent of each bone but the root."""
+    """Returns the bones of an ASF file and the parent of each bone except the root.
+
+    Parents precede their children.
+    """
     lines = read_lines(path)
     root = Bone(np.zeros(3), Rotation.identity(), "XYZ", (*MOVES, *TURNS))
     read: dict[str, Bone] = {"root": root}
@@ -166,7 +177,8 @@ def _order(lines: Lines, words: list[str]) -> str:
 def _angles(lines: Lines, bones: dict[str, Bone], joints: int) -> dict[str, np.ndarray]:
     """Returns the values (F, N) of the N degrees of freedom of each bone; angles in degrees.
 
-    Raises `UserError` for too many frames of this number of `joints`.
+    Raises:
+        UserError: If there are too many frames for this number of `joints`.
     """
     rows: dict[str, list[list[float]]] = {name: [] for name, bone in bones.items() if bone.freedoms}
     frames = 0

@@ -1,4 +1,4 @@
-"""Bodies in motion: rotations of their joints, and meshes fitted to their bone lengths."""
+"""Moving bodies: rotations of their joints, and meshes fitted to their bone lengths."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from flame_mdm.representations.skeleton import JOINT, SMPL22
 from flame_mdm.visualize.body import ANCHORS, HELPERS, Figure, FittedBody, Mesh, mannequin
 
 TRUNK = {"pelvis": 0.0, "spine1": 0.35, "spine2": 0.75, "spine3": 1.0}
-"""Joints of the trunk -> how much their width follows the shoulders rather than the hips."""
-# Limits of the factor of hips and shoulders, relative to the factor of the limbs: joints at unusual
-# places must not make the trunk too thin or too wide.
+"""By joint of the trunk, how much its width follows the shoulders; the rest follows the hips."""
+# Limits of the scale of hips and shoulders, relative to the scale of the limbs. Joints at unusual
+# positions must not make the trunk too thin or too wide.
 WIDER = (0.8, 1.25)
-LONGER = (0.4, 2.5)  # limits of the length of a limb relative to the mesh's
-# Limits of the factor of the other parts' lengths, relative to the factor of the limbs.
+LONGER = (0.4, 2.5)  # limits of a limb's length, relative to the mesh's length
+# Limits of the scale of the other parts' lengths, relative to the scale of the limbs
 TALLER = (0.6, 1.6)
-ORTHONORMAL = 0.1  # largest error of the products of two rows of a rotation matrix
+ORTHONORMAL = 0.1  # maximum error of the products of two rows of a rotation matrix
 LIMBS = tuple(
     JOINT[f"{side}_{name}"]
     for side in ("left", "right")
@@ -32,7 +32,7 @@ LIMBS = tuple(
 
 @dataclass(eq=False, repr=False)
 class PosedFigure(Figure):
-    """Joints in motion with rotations, so that bodies and characters can follow them.
+    """Moving joints with rotations that bodies and characters can follow.
 
     Attributes:
         poses: rotations of SMPL's joints, if they are known.
@@ -41,7 +41,10 @@ class PosedFigure(Figure):
     poses: Poses | None = None
 
     def posed(self) -> Poses:
-        """Returns the rotations; if they are not known, computes them from joint positions of SMPL's skeleton."""
+        """Returns the rotations.
+
+        If they are not known, they are computed from the joint positions of SMPL's skeleton.
+        """
         if self.poses is not None:
             return self.poses
         joints = torch.from_numpy(self.joints)
@@ -50,7 +53,10 @@ class PosedFigure(Figure):
         return solve(joints, self.fps)
 
     def try_fit(self, body: Mesh | None = None) -> tuple[FittedBody | None, str]:
-        """Returns the body of `fit_body` and "", or None and the reason why this motion is drawn as a skeleton."""
+        """Returns the body of `fit_body` and "".
+
+        If no body fits, returns None and the reason why this motion is drawn as a skeleton.
+        """
         try:
             return fit_body(self, body), ""
         except UserError as error:
@@ -63,13 +69,12 @@ def fit_body(motion: PosedFigure, body: Mesh | None = None) -> FittedBody:
     The joints of the body are the joints of the motion, raised by the thickness of the sole.
 
     Args:
-        motion: the clip. Rotations that it lacks are solved for and completed.
+        motion: the clip. If its rotations are missing, they are computed and completed.
         body: the mesh; None = the mannequin.
 
     Raises:
-        UserError: if the skeleton is not SMPL's, a limb is much longer or shorter than people's,
-            or a matrix is
-            not a rotation.
+        UserError: If the skeleton is not SMPL's, a limb is much longer or shorter than a
+            person's, or a matrix is not a rotation.
     """
     poses, body = motion.posed(), body or mannequin()
     joints = motion.joints[:, : len(SMPL22)].astype(float)
@@ -80,8 +85,7 @@ def fit_body(motion: PosedFigure, body: Mesh | None = None) -> FittedBody:
     if motion.poses is None:
         neutral, world, offsets = complete(joints, offsets, world)
     _check_rotations(world)
-    # Feet are stretched such that the sole is below the ankle by the height that the clip has
-    # there.
+    # Feet are stretched so that the sole is as far below the ankle as the floor in the clip.
     lift = wide * body.sole
     for toe in (JOINT["left_foot"], JOINT["right_foot"]):
         _, high, long = body.rest[toe]
@@ -102,7 +106,10 @@ def fit_body(motion: PosedFigure, body: Mesh | None = None) -> FittedBody:
 
 
 def local_rotations(body: FittedBody) -> np.ndarray:
-    """Returns the rotations (F, 22, 3, 3) of a body's joints relative to their parents, with the bend of toes."""
+    """Returns the rotations (F, 22, 3, 3) of a body's joints relative to their parents.
+
+    Toes are bent.
+    """
     count = len(SMPL22)
     world = body.turns[:, :count] @ body.mesh.turns[:count] @ body.neutral.mT
     local = world.copy()
@@ -112,9 +119,12 @@ def local_rotations(body: FittedBody) -> np.ndarray:
 
 
 def proportions(body: Mesh, offsets: np.ndarray) -> tuple[np.ndarray, float]:
-    """Returns the linear map (22, 3, 3) of each part to a clip's `offsets` (22, 3) at rest, and the map of widths."""
-    # The limbs decide how large the body is. Hips and shoulders follow the clip's own widths, the
-    # trunk blends both from bottom to top, and limbs are stretched along their bones only.
+    """Returns the linear map (22, 3, 3) of each part of a body, and the scale of its widths.
+
+    The maps lead to a clip's `offsets` (22, 3) at rest.
+    """
+    # The limbs determine the size of the body. Hips and shoulders follow the clip's own widths.
+    # The trunk blends both widths from bottom to top. Limbs are stretched only along their bones.
     lengths, usual = np.linalg.norm(offsets, axis=1), np.linalg.norm(body.rest, axis=1)
     ratio = np.divide(lengths, usual, out=np.ones_like(lengths), where=usual > 0)
     for joint in LIMBS:
@@ -146,7 +156,7 @@ def proportions(body: Mesh, offsets: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def _check_rotations(world: np.ndarray) -> None:
-    """Raises `UserError` if one of the matrices (F, 22, 3, 3) is not finite, or far from a rotation."""
+    """Raises `UserError` if a matrix of (F, 22, 3, 3) is not finite or not nearly a rotation."""
     products = world @ world.mT
     near = (np.abs(products - np.eye(3)) < ORTHONORMAL).all((2, 3))
     mirrored = (np.cross(world[..., 0, :], world[..., 1, :]) * world[..., 2, :]).sum(-1) < 0
@@ -160,7 +170,7 @@ def _check_rotations(world: np.ndarray) -> None:
 
 def _with_helpers(world: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     """Appends the rotations of the helper bones to the rotations of the joints (F, 22, 3, 3)."""
-    # Skin that follows a twisting bone wrings at the joint. A helper bone takes a share of the
+    # Skin that follows a twisting bone collapses at the joint. A helper bone takes a part of the
     # twist about the limb, so that the twist is spread along the limb as under real skin.
     helpers = []
     for joint, share in HELPERS:

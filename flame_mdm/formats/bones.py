@@ -1,9 +1,10 @@
-"""Rotations of SMPL's joints from the bones of a file with a tree of joints, BVH or AMC.
+"""Rotations of SMPL's joints from the bones of a BVH or AMC file.
 
-Joint positions do not show how a forearm or a head turns about its own axis; the bones of a file do. A joint of SMPL
-turns as its bone has turned since the rest pose. Three rest poses are known, in this order: the pose of the file
-without rotations, a rest pose in front of the motion, and the axes of a known skeleton in a T-pose. Arms and legs of a
-rest pose that is not a T-pose are raised, by the smallest rotation, to the directions of SMPL's.
+Joint positions do not show how a forearm or a head turns about its own axis, but the bones of a
+file do. A joint of SMPL turns as its bone has turned since the rest pose. Three rest poses are
+tried, in this order: the pose of the file without rotations, a rest pose in front of the motion,
+and the axes of a known skeleton in a T-pose. If a rest pose is not a T-pose, its arms and legs
+are turned to SMPL's directions by the smallest rotation.
 """
 
 from collections.abc import Sequence
@@ -22,11 +23,14 @@ from flame_mdm.formats.rig import LIMBS, SIDES, rest_pose
 from flame_mdm.representations.skeleton import JOINT, SMPL22
 from flame_mdm.representations.smpl import ADULT
 
-APART = 0.03  # maximum mean distance in meters of joints whose rotations and positions agree
-# Largest angle between a limb of a known skeleton in its T-pose and SMPL's, as a cosine
+APART = 0.03  # maximum mean distance in meters of joints if rotations and positions agree
+# Maximum angle between a limb of a known skeleton in its T-pose and SMPL's limb, as a cosine
 ALIKE = np.cos(np.radians(30))
 VERTICALS = ((0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
-"""Directions in which the trunk of a rest pose may point: some programs export it with another axis up."""
+"""Possible directions of the trunk in a rest pose.
+
+Some programs export it with another axis up.
+"""
 
 
 def bone_poses(
@@ -38,15 +42,16 @@ def bone_poses(
 ) -> BoneRotations:
     """Returns the rotations of SMPL's joints in a file.
 
+    They cannot be used if the rest pose is not known. They can also not be used if they do not
+    move the joints to their positions, as in files that move each joint by position channels.
+
     Args:
         tree: the file.
         layout: its skeleton.
         joints: (F, 22, 3) of SMPL in meters, y up.
         worlds: (F, J, 3, 3), rotations of the J joints of the file in the world of the file.
-        in_front: (J, 3, 3), rotations relative to parents of a rest pose in front of the motion, if there is one.
-
-    They cannot be used if the rest pose is not known, or if they do not move the joints as the positions do, as in
-    files that move each joint by position channels.
+        in_front: (J, 3, 3), rotations relative to the parents in a rest pose in front of the
+            motion; None if there is no such pose.
     """
     if layout.mirrored:
         return BoneRotations(reason="the motion of the file is mirrored")
@@ -77,7 +82,10 @@ def _rest(
     steps: np.ndarray,
     in_front: np.ndarray | None,
 ) -> np.ndarray | None:
-    """Returns rotations (22, 3, 3) of bones in the rest pose, y up and facing +z, or None if no rest pose is known."""
+    """Returns the rotations (22, 3, 3) of bones in the rest pose, y up and facing +z.
+
+    Returns None if no rest pose is known.
+    """
     still = np.tile(np.eye(3), (len(tree.joints), 1, 1))
     for local in (still, in_front):
         if local is not None:
@@ -98,7 +106,10 @@ def _rest(
 
 
 def _upright(pose: np.ndarray, turned: np.ndarray) -> np.ndarray | None:
-    """Returns rotations (22, 3, 3) of bones in a pose (22, 3) turned to y up and +z ahead, or None if it leans."""
+    """Returns the rotations (22, 3, 3) of bones in a pose, turned to y up and +z ahead.
+
+    Returns None if the pose (22, 3) leans.
+    """
     shoulders = pose[[JOINT["left_shoulder"], JOINT["right_shoulder"]]].mean(0)
     trunk = shoulders - pose[[JOINT["left_hip"], JOINT["right_hip"]]].mean(0)
     vertical = max(VERTICALS, key=lambda axis: float(trunk @ np.array(axis)))
@@ -111,7 +122,7 @@ def _upright(pose: np.ndarray, turned: np.ndarray) -> np.ndarray | None:
 
 
 def _limbs() -> list[tuple[int, int]]:
-    """Returns the first joint of each bone of arms and legs, and the joint at its end."""
+    """Returns the first and the last joint of each bone of arms and legs."""
     return [
         (JOINT[f"{side}_{start}"], JOINT[f"{side}_{end}"])
         for side in SIDES
@@ -132,7 +143,7 @@ def _aligned(rest: np.ndarray, turned: np.ndarray, steps: np.ndarray) -> np.ndar
 
 
 def _local(turned: np.ndarray, steps: np.ndarray, start: int, end: int) -> np.ndarray:
-    """Returns the mean position (3,) of the end of a bone in the frame of the bone."""
+    """Returns the mean position (3,) of the end of a bone in the bone's frame of reference."""
     return np.einsum("fji,fj->fi", turned[:, start], steps[:, end]).mean(0)
 
 
@@ -142,7 +153,10 @@ def _unit(vector: ArrayLike) -> np.ndarray:
 
 
 def _assembled(turned: np.ndarray, root: np.ndarray, steps: np.ndarray) -> Poses:
-    """Returns the poses of joints with rotations (F, 22, 3, 3) in the world, on a body with bones as in the file."""
+    """Returns the poses of joints with rotations (F, 22, 3, 3) in the world.
+
+    The body has the bones of the file.
+    """
     offsets = np.zeros((len(SMPL22), 3))
     local = turned.copy()
     for parent, joint in SMPL22.edges:

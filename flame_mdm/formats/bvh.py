@@ -2,8 +2,8 @@
 
 A BVH file is a tree of joints with offsets, and a table of numbers with one row per frame and one
 column per channel. The rotation channels of a joint are intrinsic Euler angles in degrees, in the
-order in which they are listed: `Zrotation Xrotation Yrotation` means R = Rz Rx Ry on column
-vectors. Position channels replace the joint's offset.
+listed order: `Zrotation Xrotation Yrotation` means R = Rz Rx Ry on column vectors. Position
+channels replace the joint's offset.
 """
 
 from __future__ import annotations
@@ -26,12 +26,15 @@ from flame_mdm.safe_io import TEXT_LIMIT, naming, regular_file, write_text
 
 CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "XYZ")
 MAX_JOINTS = 4096  # maximum number of joints and end sites of a file
-LARGEST = 1e9  # largest number that is read, and largest sum of the numbers in a line
+LARGEST = 1e9  # maximum number that is read, and maximum sum of the numbers in a line
 
 
 @dataclass(frozen=True, eq=False)
 class Bvh:
-    """A skeleton and its motion. J joints, F frames, C channels; lengths in the file's unit."""
+    """A skeleton and its motion, with J joints, F frames and C channels.
+
+    Lengths have the file's unit.
+    """
 
     # J names. The end site of a joint is a joint without channels, called `NAME.end`.
     joints: tuple[str, ...]
@@ -62,7 +65,10 @@ class Bvh:
         return rotations
 
     def translations(self) -> np.ndarray:
-        """Returns the position (F, J, 3) of each joint in its parent's frame, from position channels or the offset."""
+        """Returns the position (F, J, 3) of each joint in its parent's frame.
+
+        It comes from the position channels or the offset.
+        """
         translations = np.tile(self.offsets, (len(self.frames), 1, 1))
         for joint, (names, column) in enumerate(zip(self.channels, self.columns(), strict=True)):
             for k, name in enumerate(names):
@@ -75,10 +81,11 @@ class Bvh:
         return forward_kinematics(self.parents, self.rotations(), self.translations())[0]
 
     def resample(self, fps: float, cubic: bool = False) -> tuple[np.ndarray, np.ndarray]:
-        """Returns rotations (F', J, 3, 3) and translations (F', J, 3) at times 0, 1/fps, ... up to the last frame.
+        """Resamples to times 0, 1/fps, ... up to the last frame.
 
-        Rotations are interpolated on the sphere (slerp), so that bones keep their length.
-        Translations are interpolated linearly, or with `cubic` splines.
+        Returns rotations (F', J, 3, 3) and translations (F', J, 3). Rotations are interpolated on
+        the sphere (slerp), so bones keep their length. Translations are interpolated linearly, or
+        with `cubic` splines.
         """
         before, after, share = frame_pairs(
             len(self.frames), self.fps, fps, len(self.joints), slack=0
@@ -101,10 +108,14 @@ class Bvh:
 def forward_kinematics(
     parents: Sequence[int], rotations: np.ndarray, translations: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns positions (F, J, 3) and rotations in the world: G_j = G_p R_j and p_j = p_p + G_p t_j, p the parent of j.
+    """Returns positions (F, J, 3) and rotations (F, J, 3, 3) in the world.
 
-    Parents precede their children, -1 for a root; rotations (F, J, 3, 3) and translations are in
-    a parent's frame.
+    G_j = G_p R_j and p_j = p_p + G_p t_j, where p is the parent of j.
+
+    Args:
+        parents: index of each joint's parent; -1 for a root. Parents precede their children.
+        rotations: (F, J, 3, 3), relative to the parents.
+        translations: (F, J, 3), in the parents' frames.
     """
     positions, turned = translations.copy(), rotations.copy()
     for joint, parent in enumerate(parents):
@@ -116,13 +127,16 @@ def forward_kinematics(
 
 
 def read_lines(path: str | Path) -> Lines:
-    """Reads a text file; raises `UserError` if it is not UTF-8 or too large."""
+    """Reads a text file. Raises `UserError` if it is not UTF-8 or too large."""
     regular_file(path, TEXT_LIMIT)
     return Lines(Path(path).read_bytes(), str(path))
 
 
 def read(path: str | Path) -> Bvh:
-    """Reads a BVH file; raises `UserError`, with file and line, if it is not complete and valid."""
+    """Reads a BVH file.
+
+    Raises `UserError`, with file and line, if it is incomplete or invalid.
+    """
     source = read_lines(path)
     if [word.upper() for word in next(iter(source), [])] != ["HIERARCHY"]:
         source.fail("not a BVH file (it must begin with HIERARCHY)")
@@ -167,14 +181,14 @@ def read(path: str | Path) -> Bvh:
         source.fail("MOTION before the end of the hierarchy, or before the end of its line")
 
     count = int(source.labeled(r"Frames:\s*(\d{1,18})", "Frames: and a number"))
-    # few digits, because Python needs quadratic time for many
+    # Few digits are allowed, because Python needs quadratic time for long numbers.
     pattern = r"Frame Time:\s*((?:\d{1,9}(?:\.\d{1,30})?|\.\d{1,30})(?:E[-+]?\d{1,3})?)"
     seconds = source.labeled(pattern, "Frame Time: and a number of seconds")
     time = float(seconds)
     if not 1 / RATES[1] <= time <= 1 / RATES[0]:
         source.fail(f"the frame time must be between {1 / RATES[1]:g} and {1 / RATES[0]:g} seconds")
-    # a rounded time (0.0333333 for 1/30) means the integer, or resampling could move the last
-    # frame past the end
+    # A rounded time (0.0333333 for 1/30) means an integer rate. Otherwise, resampling could move
+    # the last frame past the end.
     whole, last_digit = max(round(1 / time), 1), 10.0 ** int(Decimal(seconds).as_tuple().exponent)
     fps = float(whole) if abs(1 / whole - time) < min(last_digit, 0.01 * time) else 1 / time
     width = sum(len(node.channels) for node in nodes)
@@ -199,7 +213,7 @@ _IN_JOINT, _IN_END = ("OFFSET", "CHANNELS", "JOINT", "END", "}"), ("OFFSET", "}"
 
 @dataclass
 class _Node:
-    """A joint of a hierarchy or an end site, and the keywords that may be in its braces."""
+    """A joint or end site of a hierarchy, and the keywords that may be in its braces."""
 
     name: str
     parent: int
@@ -209,9 +223,9 @@ class _Node:
 
 
 class Lines:
-    """Splits the lines of a text file into words; skips blank lines and comments (#).
+    """Splits the lines of a text file into words. Skips blank lines and comments (#).
 
-    Tracks the line number for error messages.
+    Counts lines for error messages.
     """
 
     def __init__(self, data: bytes, name: str):
@@ -226,7 +240,7 @@ class Lines:
             for number, line in enumerate(lines, 1)
             if not line.startswith("#")
         )
-        # Words of the current line that are not read yet, the last one first
+        # Words of the current line that are not read yet, in reverse order
         self.pending: list[str] = []
 
     def __iter__(self) -> Iterator[list[str]]:
@@ -240,7 +254,10 @@ class Lines:
         raise UserError(f"{self.name}, line {self.line}: {fault}")
 
     def word(self, expected: str = "") -> str:
-        """Returns the next word of the hierarchy; it must be `expected` (case-insensitive) if that is not empty."""
+        """Returns the next word of the hierarchy.
+
+        If `expected` is not empty, the word must be equal to it, ignoring case.
+        """
         if not self.pending:
             self.pending = next(iter(self), [])[::-1]
         if not self.pending:
@@ -251,7 +268,7 @@ class Lines:
         return word
 
     def name_of_joint(self) -> str:
-        """Returns the rest of the line up to a brace: names may contain spaces."""
+        """Returns the rest of the line up to a brace, because names may contain spaces."""
         words = [self.word()]
         while self.pending and self.pending[-1] != "{":
             words.append(self.pending.pop())
@@ -276,7 +293,10 @@ class Lines:
 
 
 def write(bvh: Bvh, path: str | Path) -> None:
-    """Writes a BVH file that `read` converts back to the same numbers; joints are in depth-first order."""
+    """Writes a BVH file. `read` converts it back to the same numbers.
+
+    Joints are written in depth-first order.
+    """
     children: list[list[int]] = [[] for _ in bvh.joints]
     for joint, parent in enumerate(bvh.parents):
         if parent >= 0:

@@ -1,4 +1,4 @@
-"""The meshes of a character in a .glb file, so that writers of other formats can bind them to its skeleton."""
+"""Meshes of a character in a .glb file, for writers of other formats."""
 
 import io
 from collections.abc import Sequence
@@ -13,15 +13,16 @@ from flame_mdm.formats.body import PosedFigure
 from flame_mdm.formats.characters import Character, moved
 from flame_mdm.formats.rigged import Material, RiggedClip, Skin
 
-TRIANGLES = 4  # mode of a primitive whose corners form triangles
+TRIANGLES = 4  # mode of a primitive with triangles
 MAX_VERTICES = 2_000_000  # maximum number of vertices of a character
 MAX_IMAGE = 64 * 2**20  # maximum size of an image file in bytes
 
 
 def character_clip(character: Character, motion: PosedFigure, name: str) -> RiggedClip:
-    """Returns a character in motion with its meshes; `name` is the name of the animation.
+    """Returns a moving character with its meshes; `name` is the name of the animation.
 
-    Raises `UserError` if a mesh is stored in a form that cannot be converted.
+    Raises:
+        UserError: If a mesh is stored in a form that cannot be converted.
     """
     file = character.file
     world, positions, rig = moved(character, motion)
@@ -50,7 +51,7 @@ def character_clip(character: Character, motion: PosedFigure, name: str) -> Rigg
 
 
 def _distinct(names: Sequence[str]) -> tuple[str, ...]:
-    """Returns names in which a repeated one gets a number."""
+    """Returns the names. A number is appended to a repeated name."""
     counts: dict[str, int] = {}
     distinct = []
     for name in names:
@@ -60,9 +61,12 @@ def _distinct(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def meshes(file: glb.Glb) -> list[Skin]:
-    """Returns one skinned mesh per part of a mesh in a file. Parts without a skin follow their node.
+    """Returns one skinned mesh per part of a mesh in a file.
 
-    Raises `ValueError` if a part is compressed, has no triangles, or is damaged.
+    Parts without a skin follow their node.
+
+    Raises:
+        ValueError: If a part is compressed, has no triangles, or is damaged.
     """
     rank = {index: number for number, index in enumerate(file.nodes)}
     palette = [_material(file, number) for number in range(len(file.document.get("materials", [])))]
@@ -104,7 +108,7 @@ def _part(
     uvs = np.zeros((0, 2))
     if "TEXCOORD_0" in attributes:
         uvs = glb.numbers(file, attributes["TEXCOORD_0"], "VEC2")
-        # glTF counts v from the upper edge of the image.
+        # glTF counts v from the upper edge of the image
         uvs = np.stack([uvs[:, 0], 1 - uvs[:, 1]], 1)
 
     if bound is None or "JOINTS_0" not in attributes:
@@ -142,7 +146,10 @@ def _part(
 def _normals(
     file: glb.Glb, attributes: dict[str, Any], points: np.ndarray, triangles: np.ndarray
 ) -> np.ndarray:
-    """Returns the normals (V, 3) of a mesh; without stored ones, the mean normals of the adjacent triangles."""
+    """Returns the normals (V, 3) of a mesh.
+
+    If no normals are stored, these are the mean normals of the adjacent triangles.
+    """
     if "NORMAL" in attributes:
         return glb.numbers(file, attributes["NORMAL"], "VEC3")
     first, second, third = points[triangles].transpose(1, 0, 2)
@@ -167,7 +174,10 @@ def _material(file: glb.Glb, number: int) -> Material:
 
 
 def _image(file: glb.Glb, number: int | None) -> bytes:
-    """Returns the content of an image in the file as PNG or JPEG; b"" if it is elsewhere, or of another kind."""
+    """Returns an image in the file as PNG or JPEG.
+
+    Returns b"" if the image is outside of the file, or of another kind.
+    """
     if number is None:
         return b""
     image = file.document["images"][number]

@@ -1,12 +1,12 @@
-"""Motions on a user's character: the skeleton of the skin of a .glb file, or of a .bvh file.
+"""Motions on a user's character: a skinned .glb file, or the skeleton of a .bvh file.
 
-A character may have other proportions, units, axes and names than SMPL's body, and another rest
-pose. The rest pose must be upright with flat feet.
+The proportions, units, axes, names and rest pose of a character may differ from SMPL's body. The
+rest pose must be upright with flat feet.
 
 Arms and legs take the directions of the motion's bones. Trunk, head, hands and feet are turned as
 in the motion, starting from the rest pose. The path of the hips is scaled by the leg length. Then
-the legs are bent so that the toes reach the motion's toe positions, scaled in the same manner, at
-the character's own toe height.
+the legs are bent so that the toes reach the motion's toe positions, which are scaled in the same
+way. The toes are at the character's own height.
 """
 
 import copy
@@ -46,17 +46,25 @@ class BvhCharacter(RestPose):
 
 
 def read(path: str | Path) -> Character | BvhCharacter:
-    """Reads a character. Its joints have the names of a known skeleton, or of a `.yaml` file with the same name.
+    """Reads a character.
 
-    Raises `UserError` if the file is damaged, or has no skin (.glb), no known joints
-    (`UnknownJoints`) or no usable rest pose.
+    Its joints must have the names of a known skeleton, or the names in a `.yaml` file with the
+    same name as the character's file.
+
+    Raises:
+        UserError: If the file is damaged, a .glb file has no skin, or there is no usable rest
+            pose.
+        UnknownJoints: If joints are not known.
     """
     path = Path(path)
     return _read_bvh(path) if path.suffix.lower() == ".bvh" else read_skinned(path)
 
 
 def _read_bvh(path: Path) -> BvhCharacter:
-    """Reads the skeleton of a BVH file; its rest pose is the one without rotations, or else the first frame."""
+    """Reads the skeleton of a BVH file.
+
+    Its rest pose is the pose without rotations or, if that is not usable, the first frame.
+    """
     file = bvh.read(path)
     joints = identify(
         path, {number: file.joints[number] for number, names in enumerate(file.channels) if names}
@@ -83,7 +91,7 @@ def _read_bvh(path: Path) -> BvhCharacter:
                 path, file.joints, file.parents, positions, turned, joints, positions, up
             )
             return BvhCharacter(pose.rig, pose.map, pose.floor, file)
-        except UserError as error:  # many files are upright in their first frame alone
+        except UserError as error:  # many files are upright only in their first frame
             problem = problem or error
     raise problem or AssertionError
 
@@ -98,7 +106,7 @@ def _moves(channels: Sequence[str]) -> bool:
 
 
 def _above(file: bvh.Bvh, joint: int) -> dict[int, Sequence[str]]:
-    """Returns the channels of a joint and of the joints above it, by number, from the joint to the root."""
+    """Returns the channels of a joint and of all joints above it, from the joint to the root."""
     channels: dict[int, Sequence[str]] = {}
     while joint >= 0:
         channels[joint] = file.channels[joint]
@@ -115,7 +123,7 @@ def _vertical(positions: np.ndarray, joints: Mapping[str, int]) -> tuple[int, in
 
 
 def read_skinned(path: Path) -> Character:
-    """Reads a character in a .glb file; raises the errors of `read`."""
+    """Reads a character in a .glb file. Raises the same errors as `read`."""
     file = glb.read(path)
     skeletons: list[set[int]] = []
     for skin in file.skins:
@@ -149,14 +157,14 @@ def read_skinned(path: Path) -> Character:
 
 
 def _rest(file: glb.Glb, pelvis: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns matrices (N, 4, 4) of nodes in the pose in which the skin was bound, and corners around its meshes.
+    """Returns the pose in which the skin was bound, and corners around its meshes.
 
-    If they are stored in another pose, the pelvis, which is nearly upright, shows how the skin's
-    frame is turned.
+    The pose is matrices (N, 4, 4) of nodes. If the nodes are stored in another pose, the pelvis,
+    which is nearly upright, shows how the frame of the skin is turned.
     """
-    # Joint matrix times inverse bind matrix is the same for all joints if the file is stored in
-    # the bind pose. If it is not, this product of the pelvis is taken as the frame of the skin,
-    # its rotation rounded to quarter turns, and the bind matrices give the pose of all joints.
+    # If the file is stored in the bind pose, joint matrix times inverse bind matrix is the same
+    # for all joints. Otherwise, this product of the pelvis, with its rotation rounded to quarter
+    # turns, is used as the frame of the skin. The bind matrices then give the pose of all joints.
     worlds, corners = file.worlds.copy(), []
     rest: dict[int, np.ndarray] = {}
     for skin in sorted(file.skins, key=lambda skin: (pelvis in skin.joints, len(skin.joints))):
@@ -181,7 +189,7 @@ def _rest(file: glb.Glb, pelvis: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def moved(character: RestPose, motion: PosedFigure) -> tuple[np.ndarray, np.ndarray, Rig]:
-    """Moves a character as in a motion; see `follow`."""
+    """Moves a character like a motion; see `follow`."""
     body = fit_body(motion)
     joints = motion.joints[:, : len(SMPL22)]
     world = world_rotations(local_rotations(body)) @ body.neutral
@@ -189,7 +197,10 @@ def moved(character: RestPose, motion: PosedFigure) -> tuple[np.ndarray, np.ndar
 
 
 class UnknownJoints(UserError):
-    """Some joints could not be identified; `template` has the lines of a file of names, to be completed by the user."""
+    """The error for joints that could not be identified.
+
+    `template` contains the lines of a file of names that the user can complete.
+    """
 
     def __init__(self, message: str, template: list[str]):
         super().__init__(message)
@@ -197,7 +208,13 @@ class UnknownJoints(UserError):
 
 
 def identify(path: Path, names: Mapping[int, str]) -> dict[str, int]:
-    """Returns SMPL's joints -> numbers, among numbers -> names of a character; raises `UnknownJoints` if some lack."""
+    """Returns the number of the character's joint for each joint of SMPL.
+
+    `names` are the names of the character's joints by number.
+
+    Raises:
+        UnknownJoints: If joints are missing.
+    """
     listed = path.with_suffix(".yaml")
     chosen = read_yaml(listed) if listed.exists() else None
     candidates = (
@@ -246,7 +263,7 @@ def _listed(
 
 @cache
 def known_skeletons() -> list[dict[str, str]]:
-    """Returns the bones of known skeletons: spellings of names -> joint of SMPL."""
+    """Returns, per known skeleton, the joint of SMPL for each spelling of a bone's name."""
     skeletons = []
     for layout in LAYOUTS.values():
         joints = {name: joint for joint, name in layout.bones.items()}
@@ -256,7 +273,10 @@ def known_skeletons() -> list[dict[str, str]]:
 
 
 def write(path: Path, character: Character, motion: PosedFigure, name: str) -> str:
-    """Writes the character's file with a further animation, the first one, and returns a line that describes it."""
+    """Writes the character's file with an additional animation. Returns a line that describes it.
+
+    The new animation is the first one.
+    """
     if path.suffix.lower() != ".glb":
         raise UserError(
             f"{path}: this character is a .glb file, so name a .glb, .fbx, .usda, .usdc or .usdz file for the result"
@@ -270,8 +290,8 @@ def write(path: Path, character: Character, motion: PosedFigure, name: str) -> s
     for joint, source in enumerate(rig.sources):
         if source >= 0 or joint in skinned:
             turns = glb.quaternions(np.concatenate([rest[None, joint], local[:, joint]]))
-            # Animations need a node with translation, rotation and scale instead of a matrix. It
-            # gets the rest pose, also if the file was stored in another pose.
+            # Animations need a node with translation, rotation and scale instead of a matrix. The
+            # node gets the rest pose, even if the file was stored in another pose.
             size = float(
                 rig.scales[joint]
                 / (rig.scales[rig.parents[joint]] if rig.parents[joint] >= 0 else 1)
@@ -298,14 +318,14 @@ def write(path: Path, character: Character, motion: PosedFigure, name: str) -> s
 
 
 def write_bvh(path: Path, character: BvhCharacter, motion: PosedFigure) -> str:
-    """Writes the character's file with a motion in place of its own, and returns a line that describes it."""
+    """Writes the character's file with this motion. Returns a line that describes the file."""
     if path.suffix.lower() != ".bvh":
         raise UserError(
             f"{path}: this character is a .bvh file without meshes, so name a .bvh file for the result"
         )
     file, (world, positions, rig) = character.file, moved(character, motion)
     local, offsets, hips = rig.local(world), rig.offsets(), rig.hips
-    # The joint that carries the body is the hips, or a root above them.
+    # The joint that moves the body is the hips, or a root above them.
     mover = next(joint for joint, names in _above(file, hips).items() if _moves(names))
     carried = rig.within(rig.positions[mover] + positions[:, hips] - rig.positions[hips], mover)
 
@@ -327,6 +347,6 @@ def write_bvh(path: Path, character: BvhCharacter, motion: PosedFigure) -> str:
 
 
 def _following(rig: Rig, joints: int) -> str:
-    """Describes how many of the `joints` of a character follow the motion."""
+    """Returns how many of the `joints` of a character follow the motion."""
     follow = sum(source >= 0 for source in rig.sources)
     return f"{follow} of {joints} joints follow the motion, {joints - follow} keep their angle"

@@ -1,45 +1,49 @@
-"""Checks of motions on SMPL's joints: their size, their feet, where up is, legs that flip, and a rest pose in front."""
+"""Checks of motions on SMPL's joints: size, feet, the axis up, flipped legs, and rest poses."""
 
 import numpy as np
 
 from flame_mdm.formats.layouts import UP, Layout, check_feet, check_size
 from flame_mdm.representations.skeleton import SMPL22
 
-# a body lies if the direction of its trunk has a smaller vertical component on average
+# A body lies if the vertical component of its trunk's direction is smaller on average.
 LYING = 0.3
-STANDING = 0.7  # with another axis up, the body would stand if the component is larger than this
+STANDING = 0.7  # with another axis up, a body stands if the component is larger than this
 FASTEST = 15.0  # maximum speed of the pelvis in m/s; faster files are damaged, sprinters reach 12
 AVERAGED = 0.05  # seconds over which the speed of the pelvis is averaged
 # Speed of an ankle relative to the pelvis, in m/s, above which a leg has flipped between frames.
 # The fastest kicks reach 20.
 KICK = 30.0
-UNDER = 0.02  # a body this many meters below the floor is called smaller than an adult
+UNDER = 0.02  # depth in meters below the floor from which on a body is reported as too small
 
-# Seconds from a rest pose in front of a motion to the motion: some conversions blend a few
+# Seconds between a rest pose in front of a motion and the motion. Some conversions blend these
+# frames.
 # frames.
 BLEND = 0.04
-CALM = 8  # number of the following frames with which the first steps are compared
-# Length in meters of the step from a rest pose to the motion, and its ratio to the steps that
-# follow.
+CALM = 8  # number of subsequent frames with which the first steps are compared
+# Minimum length in meters of the step from a rest pose to the motion, and minimum ratio to the
+# following steps
 JUMP = (
     0.15,
     3.0,
 )
-STRAIGHT = np.cos(np.radians(25))  # cosine of the largest bend of arms and legs in a rest pose
+STRAIGHT = np.cos(np.radians(25))  # cosine of the maximum bend of arms and legs in a rest pose
 # Arms in a rest pose are raised from the trunk by at least 25 degrees
 HANGING = np.cos(np.radians(25))
-SYMMETRIC = 0.2  # largest difference of the cosines of left and right arm
+SYMMETRIC = 0.2  # maximum difference between the cosines of the left and the right arm
 
 _NUMBER = {joint: number for number, joint in enumerate(SMPL22.joints)}
 _LIMBS = (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle"))
 
 
 def check_body(joints: np.ndarray, layout: Layout) -> None:
-    """Raises `UserError` if joints (F, 22, 3) are not a person: wrong size, or feet without length or backwards.
+    """Checks that joints (F, 22, 3) are a person.
 
-    The `layout` of the file has its unit, its axis that points up, and whether the body may be a
-    child's. The advice on the size also names the axis if the body lies, so that one correction
-    of the file is enough.
+    The `layout` of the file contains its unit, its axis that points up, and whether the body may
+    be a child's. If the size is wrong and the body lies, the message names both the unit and the
+    axis, so that one correction of the file is enough.
+
+    Raises:
+        UserError: If the size is wrong, a foot has no length, or the feet point backwards.
     """
     doubt = lying(joints, layout.up, np.array(UP[layout.up], float))
     check_size(joints, layout.unit, layout.children, doubt)
@@ -47,15 +51,18 @@ def check_body(joints: np.ndarray, layout: Layout) -> None:
 
 
 def uprightness(joints: np.ndarray) -> float:
-    """Returns the mean vertical component of the direction of the trunk, -1 to 1, of joints (F, 22, 3), y up."""
+    """Returns the mean vertical component of the direction of the trunk, -1 to 1.
+
+    `joints` (F, 22, 3) are y up.
+    """
     return float(_trunk(joints)[:, 1].mean())
 
 
 def lying(joints: np.ndarray, up: str, axes: np.ndarray) -> str:
-    """Returns a line if the body lies in most frames, with the axis that would make it stand, or "".
+    """Returns a line if the body lies in most frames, with the axis that would make it stand.
 
-    Joints (F, 22, 3) are y up, turned by `axes` (3, 3) from the axes of the file, in which `up`
-    was up.
+    Returns "" otherwise. `joints` (F, 22, 3) are y up. `axes` (3, 3) have turned them from the
+    axes of the file, in which `up` was the axis that points up.
     """
     if uprightness(joints) >= LYING:
         return ""
@@ -70,9 +77,12 @@ def lying(joints: np.ndarray, up: str, axes: np.ndarray) -> str:
 
 
 def jump(joints: np.ndarray, fps: float) -> str:
-    """Returns a line if the pelvis or a leg of joints (F, 22, 3) moves faster than people do, or ""."""
+    """Returns a line if the pelvis or a leg moves faster than people do; otherwise "".
+
+    `joints` are (F, 22, 3).
+    """
     ankles = joints[:, [_NUMBER["left_ankle"], _NUMBER["right_ankle"]]] - joints[:, :1]
-    # a body that shakes for a frame is not a jump, but a leg that flips does so within a frame
+    # A body that shakes for a frame does not jump, but a leg can flip within a frame.
     apart = max(1, round(fps * AVERAGED))
     for verb, points, frames, fastest in (
         ("the body jumps", joints[:, :1], apart, FASTEST),
@@ -90,7 +100,10 @@ def jump(joints: np.ndarray, fps: float) -> str:
 
 
 def below_floor(joints: np.ndarray) -> str:
-    """Returns a line if a body with the bones of an adult stands below the floor, because the file's is smaller."""
+    """Returns a line if a body with the bones of an adult is below the floor; otherwise "".
+
+    This happens if the body in the file is smaller.
+    """
     lowest = float(np.median(joints[..., 1].min(1)))
     if lowest > -UNDER:
         return ""
@@ -99,10 +112,10 @@ def below_floor(joints: np.ndarray) -> str:
 
 
 def rest_frames(joints: np.ndarray, fps: float) -> int:
-    """Returns the number of frames in front of a motion that show a rest pose, or lead from it to the motion.
+    """Returns the number of frames in front of a motion that show a rest pose or lead from it.
 
-    Several programs write a T- or A-pose as the first frame. In motion that was recorded from a
-    rest pose on, the first step is no longer than the following ones.
+    Several programs write a T-pose or A-pose as the first frame. If a recorded motion begins with
+    a rest pose instead, its first step is not longer than the following steps.
     """
     if len(joints) < 3 or not _is_rest_pose(joints[0].astype(float)):
         return 0
@@ -126,7 +139,7 @@ def _is_rest_pose(pose: np.ndarray) -> bool:
             if upper @ lower < STRAIGHT:
                 return False
             raised.append(-upper @ trunk)
-    # cosine of the angle to the direction down the trunk
+    # cosines of the angles to the direction down the trunk
     left_arm, left_leg, right_arm, right_leg = raised
     legs_hang = min(left_leg, right_leg) > STRAIGHT
     return bool(
@@ -135,7 +148,7 @@ def _is_rest_pose(pose: np.ndarray) -> bool:
 
 
 def _trunk(joints: np.ndarray) -> np.ndarray:
-    """Returns the directions (F, 3) from pelvis to neck."""
+    """Returns the directions (F, 3) from the pelvis to the neck."""
     return _unit(joints[:, _NUMBER["neck"]].astype(float) - joints[:, 0])
 
 

@@ -1,4 +1,8 @@
-"""Cleanup of generated motion: smooth joints, constant bone lengths, feet that stay in place, hands out of the body."""
+"""Cleanup of generated motion.
+
+It smooths joints, makes bone lengths constant, keeps feet in place, and moves hands out of the
+body.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,32 +18,39 @@ from flame_mdm.formats.poses import BoneRotations
 from flame_mdm.representations.skeleton import Skeleton
 
 # Weight of the squared third differences of a joint's path, relative to its squared change. Third
-# differences are changes of acceleration, so that steady accelerations of fast motions are kept.
+# differences are changes of acceleration, so steady accelerations of fast motions are kept.
 SMOOTHNESS = 0.034
 OUTLIER = 0.03  # distance in meters from the smooth path at which a position has half its weight
-LOW = 0.07  # height in meters above the floor at which a toe counts as in the air
-# Horizontal speed in m/s at which a low toe counts as off the ground while the body stands still
+LOW = 0.07  # height in meters above which a toe counts as off the floor
+# Horizontal speed in m/s above which a low toe counts as off the floor, while the body stands
+# still
 SLOW = 0.5
 SHARE, SHARE_PINNED = 0.5, 0.4
-"""Fraction of the body's speed added to `SLOW`, before and after the body follows its feet. In generated motion, a foot
-on the floor may slide along with the body; a swinging foot is faster than the body."""
+"""Fraction of the body's speed added to `SLOW`, before and after the body follows its feet.
+
+In generated motion, a foot on the floor may slide along with the body. A swinging foot is faster
+than the body.
+"""
 DRIFT = 0.2
-"""Speed in m/s up to which the body may slide over its feet, for which the legs compensate. Above 1.5 times this speed,
-the body follows its feet entirely."""
-CLEAR = 0.15  # seconds in which a hand that would be inside the body starts to avoid it
-# Maximum distance from hip to ankle relative to the straight leg, unless it was longer before
+"""Maximum speed in m/s with which the body may slide over its feet; the legs compensate for it.
+
+Above 1.5 times this speed, the body follows its feet entirely.
+"""
+CLEAR = 0.15  # seconds before a hand would be inside the body, in which it starts to avoid it
+# Maximum distance from hip to ankle, relative to the straight leg, unless it was longer before
 REACH = 0.999
 
 
 def cleaned(motion: Motion, contacts: np.ndarray | None = None) -> Motion:
     """Returns a motion with smooth joints, constant bone lengths and feet that do not slide.
 
-    `cleanup` says how the joints are changed. The result has no features, rotations and contacts,
-    since they would no longer fit.
+    `cleanup` describes the changes of the joints. The result has no features, rotations and
+    contacts, because they would no longer match the joints.
 
     Args:
         motion: the motion.
-        contacts: (F, N) probabilities that each of `skeleton.feet` stands on the floor; None = estimated.
+        contacts: (F, N) probabilities that each of `skeleton.feet` stands on the floor. None =
+            they are estimated.
 
     Example:
         >>> motion = Motion(joints=np.zeros((3, 22, 3)), fps=20)
@@ -70,18 +81,16 @@ def cleanup(
         fps: frames per second.
         skeleton: skeleton of the joints.
         contacts: (F, N), probabilities that each of `skeleton.feet` stands on the floor until the
-            next frame,
-            as models predict them for some representations. None = estimated from height and
-                speed of the
-            toes.
+            next frame. Models predict them for some representations. None = they are estimated
+            from height and speed of the toes.
 
     Returns:
         Joints (F, J, 3) float32.
     """
-    # Joints get smooth paths and bones their median lengths. Then the body moves over the ground
-    # so that its feet in contact stand still on average. What still slides is corrected by
-    # two-bone inverse kinematics: legs keep each toe in place during its contacts, and arms leave
-    # trunk and thighs.
+    # Joints get smooth paths, and bones get their median lengths. Then the body moves over the
+    # ground so that its feet in contact stand still on average. The rest of the sliding is
+    # corrected by two-bone inverse kinematics: legs keep each toe in place during its contacts,
+    # and arms leave trunk and thighs.
     if len(joints) < 4:
         return np.array(joints, np.float32)
     smooth = _smooth(np.asarray(joints, float))
@@ -94,7 +103,7 @@ def cleanup(
     else:
         contact = np.clip(2 * contacts[:-1, [skeleton.feet.index(toe) for toe in toes]] - 0.5, 0, 1)
     for chain, weight in zip(skeleton.chains[:2], contact.T, strict=True):
-        # Over the ground, the shift of a foot fades out between its contacts.
+        # Between contacts, the horizontal shift of a foot fades from one to the next.
         toe = motion[:, chain[-1]]
         shift = np.zeros((len(motion), 3))
         still = -np.diff(toe[:, [0, 2]], axis=0)
@@ -110,13 +119,15 @@ def cleanup(
 def _least_squares(
     frames: int, *terms: tuple[int, np.ndarray | float, np.ndarray | float]
 ) -> np.ndarray:
-    """Returns x (frames, N) with the minimum sum of all terms: weight (n-th differences of x - target)^2.
+    """Returns x (frames, N) with the minimum sum of all terms.
 
-    A term is n, weight (frames - n,) or a number, and target (frames - n, N) or a number; one is an array.
+    A term (n, weight, target) is weight (n-th differences of x - target)^2. The weight is
+    (frames - n,) or a number. The target is (frames - n, N) or a number; at least one target is
+    an array.
     """
     # An n-th difference has binomial coefficients with alternating signs. It couples frames that
-    # are at most three apart, so that the normal equations are a banded matrix and take time
-    # linear in the frames.
+    # are at most three apart. The normal equations are therefore a banded matrix, and solving
+    # them takes time linear in the number of frames.
     width = next(target.shape[1] for _, _, target in terms if isinstance(target, np.ndarray))
     matrix, right = np.zeros((4, frames)), np.zeros((frames, width))
     for order, weight, target in terms:
@@ -131,9 +142,12 @@ def _least_squares(
 
 
 def _smooth(motion: np.ndarray) -> np.ndarray:
-    """Returns smooth paths of the joints (Whittaker 1923); positions that jump for a few frames hardly bend them."""
+    """Returns smooth paths of the joints (Whittaker 1923).
+
+    Positions that jump for a few frames hardly influence them.
+    """
     # After each fit, positions far from the path lose weight, as in iteratively reweighted least
-    # squares: a pop of a few frames is cut off instead of being spread over its neighbors. Four
+    # squares. A pop of a few frames is cut off instead of being spread over its neighbors. Four
     # fits are enough.
     smooth = motion.copy()
     for joint in range(motion.shape[1]):
@@ -145,7 +159,7 @@ def _smooth(motion: np.ndarray) -> np.ndarray:
 
 
 def _constant_bones(motion: np.ndarray, skeleton: Skeleton) -> np.ndarray:
-    """Returns the motion with bones in the same directions at their median lengths."""
+    """Returns the motion with bones in the same directions, but with their median lengths."""
     out = motion.copy()
     for parent, joint in skeleton.edges:
         bone = motion[:, joint] - motion[:, parent]
@@ -155,10 +169,10 @@ def _constant_bones(motion: np.ndarray, skeleton: Skeleton) -> np.ndarray:
 
 
 def _keep_heights(motion: np.ndarray, before: np.ndarray, skeleton: Skeleton) -> None:
-    """Bends the limbs whose feet or hands are lower than before bones got their lengths.
+    """Bends limbs whose foot or hand has become lower because bones got their median lengths.
 
-    Where a sequence passes from one pose to a very different one, such as from a crawl to a walk, its poses are means
-    of both, with short bones. At their full lengths, these would reach through the floor.
+    Between two very different poses of a sequence, for example from a crawl to a walk, poses are
+    means of both, with short bones. With full lengths, they would reach through the floor.
     """
     legs = [chain[1:] for chain in skeleton.chains[:2]]
     for limb in (*legs, *(_arm(skeleton, side) for side in ("left", "right"))):
@@ -177,9 +191,12 @@ def _arm(skeleton: Skeleton, side: str) -> list[int]:
 
 
 def _contacts(toes: np.ndarray, root: np.ndarray, fps: float, share: float) -> np.ndarray:
-    """Returns (F - 1, 2) in [0, 1]: the confidence that each toe (F, 2, 3) stands on the floor until the next frame."""
-    # A toe stands if it is both low and slow. The faster the body travels, the faster a toe may
-    # slide: feet of generated motions are carried along with the body.
+    """Returns the confidence (F - 1, 2) in [0, 1] that each toe stays on the floor.
+
+    The confidence of a frame is for the time until the next frame. `toes` are (F, 2, 3).
+    """
+    # A toe is on the floor if it is both low and slow. The faster the body travels, the faster a
+    # toe may slide, because feet of generated motions are carried along with the body.
     speed = np.linalg.norm(np.diff(toes[..., [0, 2]], axis=0), axis=-1) * fps
     travel = np.linalg.norm(np.diff(root[:, [0, 2]], axis=0), axis=-1) * fps
     travel = gaussian_filter1d(travel, 0.15 * fps, mode="nearest")
@@ -191,12 +208,13 @@ def _contacts(toes: np.ndarray, root: np.ndarray, fps: float, share: float) -> n
 
 def _follow_feet(motion: np.ndarray, toes: list[int], fps: float) -> np.ndarray:
     """Moves the body over the ground so that its feet in contact stand still on average."""
-    # The drift of the body is the mean slide of the feet in contact, smooth in time and almost 0
-    # where no foot stands. Subtracting it from the path of the root lets these feet stand still.
+    # The drift of the body is the mean sliding of the feet in contact. It is smooth in time, and
+    # almost 0 while no foot is in contact. These feet stand still after the drift is subtracted
+    # from the path of the root.
     slides = np.diff(motion[:, toes], axis=0)[..., [0, 2]]
     contact = weights = _contacts(motion[:, toes], motion[:, 0], fps, SHARE)
     drift = np.zeros((len(slides), 2))
-    # Feet that move differently from the mean lose weight, until one foot decides.
+    # Feet that move differently from the mean lose weight, until one foot determines the drift.
     for _ in range(10):
         mean = (weights[..., None] * slides).sum(1) / np.maximum(weights.sum(1), 1e-9)[:, None]
         drift = _least_squares(
@@ -213,13 +231,13 @@ def _follow_feet(motion: np.ndarray, toes: list[int], fps: float) -> np.ndarray:
 
 
 def _push_out(motion: np.ndarray, skeleton: Skeleton, side: str, fps: float) -> None:
-    """Moves a wrist away from the axis of trunk or thigh until neither it nor the hand is inside."""
+    """Moves a wrist away from the axis of trunk or thigh until wrist and hand are not inside."""
     arm = _arm(skeleton, side)
     frames = max(1.0, CLEAR * fps)
     other = skeleton.joints.index("right_shoulder" if side == "left" else "left_shoulder")
     aside = unit(motion[:, arm[0]] - motion[:, other])  # a hand near the axis goes to its own side
-    # Each pass moves the wrist out where it is deepest. The shift rises and fades within `CLEAR`
-    # seconds, so that the hand avoids the body and does not jump out of it.
+    # Each pass moves the wrist out of the deepest point. The shift rises and fades within `CLEAR`
+    # seconds, so the hand avoids the body and does not jump out of it.
     for _ in range(4):
         depth, away = (values[:, 1:] for values in depths(motion, skeleton.joints, side))
         deepest = depth.argmax(1)[:, None]
@@ -235,11 +253,14 @@ def _push_out(motion: np.ndarray, skeleton: Skeleton, side: str, fps: float) -> 
 
 
 def bend(motion: np.ndarray, leg: Sequence[int], shift: np.ndarray) -> None:
-    """Moves the foot of a leg (hip, knee, ankle, other joints of the foot) by `shift` (F, 3); hands work alike."""
-    # Two-bone inverse kinematics. The new ankle lies on the line from the hip to the requested
-    # position, as far as the leg reaches. Thigh and shin are two sides of a triangle over this
-    # line, which gives the position of the knee along the line; the knee stays on the side where
-    # it was.
+    """Moves the foot of a leg by `shift` (F, 3). Hands of arms work in the same way.
+
+    `leg` is hip, knee, ankle and other joints of the foot.
+    """
+    # This is two-bone inverse kinematics. The new ankle is on the line from the hip to the
+    # requested position, as far as the leg can reach. Thigh, shin and this line are a triangle,
+    # which determines the position of the knee along the line. The knee stays on the same side of
+    # the line.
     hip, knee, ankle, *foot = (motion[:, joint].copy() for joint in leg)
     thigh, shin = (np.linalg.norm(bone[0]) for bone in (knee - hip, ankle - knee))
     before = np.linalg.norm(ankle - hip, axis=-1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Motions as the raw motions that representations encode: joints, or rotations of SMPL's body."""
+"""Conversion of motions to joints or SMPL's rotations, which representations encode."""
 
 from dataclasses import dataclass
 
@@ -17,10 +17,13 @@ from flame_mdm.representations.skeleton import KIT21, SMPL22
 from flame_mdm.representations.smpl import ADULT, SMPL
 
 CAMERA_AXES = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))
-"""Converts the camera's coordinates of the action data sets, y down, to y up. It is its own inverse."""
+"""Rotation from the camera coordinates of the action data sets, y down, to y up.
+
+It is its own inverse.
+"""
 KIT_SOURCES = {"root": "pelvis", "belly": "spine2", "thorax": "spine3"}
 KIT_SOURCES |= {f"{side}_toes": f"{side}_foot" for side in ("left", "right")}
-"""Joints of KIT-ML -> joints of SMPL at the same point of the body, where names differ."""
+"""Joint of SMPL at the same point of the body, for joints of KIT-ML with other names."""
 LEGS = tuple(
     SMPL22.joints.index(f"{side}_{name}")
     for side in ("left", "right")
@@ -33,10 +36,11 @@ class RawMotion:
     """A motion that `Representation.encode` takes.
 
     Attributes:
-        values: joints (F, J, 3) in meters, y up, or rotations of SMPL (F, 75) as in `representations.smpl.read_pose`.
-        note: a line for the user if a body of other proportions was used, with the error; "" otherwise. It says whether
-            rotations come from the file, or were fitted to joints.
-        error: mean distance in meters of the joints of this body from the joints of the motion.
+        values: joints (F, J, 3) in meters, y up, or rotations of SMPL (F, 75) as in
+            `representations.smpl.read_pose`.
+        note: a line for the user if a body with other proportions was used, with the error; ""
+            otherwise. It says whether the rotations come from the file or were fitted to joints.
+        error: mean distance in meters between the joints of this body and of the motion.
     """
 
     values: Tensor
@@ -50,12 +54,15 @@ def needs_rotations(representation: Representation) -> bool:
 
 
 def raw_motion(motion: Motion, representation: Representation) -> RawMotion:
-    """Returns a motion at the frame rate of a representation, as the representation encodes motions.
+    """Returns a motion in the form and at the frame rate of a representation.
 
-    Joints are resampled with cubic splines, rotations on the sphere. KIT-ML's 21 joints are taken from SMPL's.
-    Rotations of SMPL that are not known are taken from the bones of the file or else solved for; the body then has the
-    bones of an adult, and its path is scaled by the length of the legs. Raises `UserError` if the skeleton of the
-    motion does not fit the representation.
+    Joints are resampled with cubic splines, and rotations on the sphere. KIT-ML's 21 joints are
+    taken from SMPL's joints. If rotations of SMPL are not known, they are taken from the bones of
+    the file or, without bones, fitted to the joints. The body then has the bones of an adult, and
+    its path is scaled by the length of the legs.
+
+    Raises:
+        UserError: If the skeleton of the motion does not fit the representation.
     """
     if needs_rotations(representation):
         axes = CAMERA_AXES if isinstance(representation, Rot6D) else AMASS_AXES
@@ -69,9 +76,10 @@ def raw_motion(motion: Motion, representation: Representation) -> RawMotion:
 
 
 def kit_joints(joints: np.ndarray) -> np.ndarray:
-    """Converts joints (F, 22 or more, 3) of SMPL to the 21 joints (F, 21, 3) of KIT-ML, mirrored as KIT-ML is.
+    """Converts joints (F, 22 or more, 3) of SMPL to the 21 joints (F, 21, 3) of KIT-ML.
 
-    The middle of KIT-ML's feet is taken to be halfway between ankle and toes.
+    The result is mirrored, like KIT-ML. The middle of a foot in KIT-ML is placed halfway between
+    ankle and toes.
     """
     at = {name: joints[:, number] for number, name in enumerate(SMPL22.joints)}
     feet = {
@@ -116,13 +124,14 @@ def _rotations(motion: Motion, fps: float, axes: Tensor) -> RawMotion:
 
 
 def _adult(body: Poses, joints: np.ndarray) -> tuple[Poses, np.ndarray]:
-    """Puts a motion on the body of an adult, whose path is scaled by the length of the legs.
+    """Puts a motion on the body of an adult. The path is scaled by the length of the legs.
 
     Args:
         body: the motion, with its own bones.
         joints: (F, 22, 3), its joints in meters.
 
-    Returns the poses, and the distances (F, 22) in meters of their joints from the scaled `joints`.
+    Returns:
+        The poses, and the distances (F, 22) in meters of their joints from the scaled `joints`.
     """
     adult = body.offsets.new_tensor(ADULT[: len(SMPL22)])
     legs = list(LEGS)

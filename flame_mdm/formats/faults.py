@@ -1,4 +1,4 @@
-"""Physical faults: sliding feet, jumps, changing bones, penetration, arms in the body, floating, bends, freezing."""
+"""Physical faults of motions, such as sliding feet, jumps, penetration, floating or freezing."""
 
 import math
 from collections.abc import Sequence
@@ -9,10 +9,11 @@ from scipy.ndimage import binary_opening
 
 from flame_mdm.formats.motion import Motion
 
-# Height in meters above the floor, y = 0, below which a toe joint touches it. Foot skating uses
-# it, too.
+# Height in meters above the floor, y = 0, below which a toe joint touches it. It is also used for
+# foot skating.
 LOW = 0.05
-# Speed of the root in m/s below which a body does not jump. At the top, a jump is slower for 0.04
+# Speed of the root in m/s up to which a body is not jumping. A jump is slower than this at its
+# top, but only for 0.04 s.
 # s only.
 STANDSTILL = 0.2
 LIMITS = {
@@ -49,9 +50,12 @@ LIMITS = {
     ),
     "frozen": (0.02, "m/s", "no joint moves faster than 2 cm/s for a second or more"),
 }
-"""Fault -> limit, its unit, and what it is. docs/motion-faults.md has the share of real clips that each flags."""
-# Distance from the wrist to the middle of the hand, relative to the forearm. The hand is taken to
-# continue the forearm.
+"""By fault: its limit, the unit of the limit, and a description.
+
+docs/motion-faults.md reports the share of real clips with each fault.
+"""
+# Distance from the wrist to the middle of the hand, relative to the forearm. The hand is assumed
+# to continue the direction of the forearm.
 PALM = 0.3
 TRUNK = 0.18  # radius of the trunk from front to back, relative to its length from pelvis to neck
 WIDTH = 1.4  # width of the trunk relative to its depth
@@ -59,7 +63,10 @@ THIGH = 0.17  # radius of a thigh, relative to its length
 
 
 class Fault(NamedTuple):
-    """A fault of a joint, or of the body, in frames `start` to `end` (exclusive); `worst` in the unit of its limit."""
+    """A fault of a joint or of the body in frames `start` to `end` (exclusive).
+
+    `worst` is in the unit of the limit.
+    """
 
     kind: str
     joint: str
@@ -88,7 +95,8 @@ def find_faults(motion: Motion) -> list[Fault]:
     low = joints[:, toes, 1] < LOW
     travel = np.linalg.norm(np.diff(joints[:, toes][..., [0, 2]], axis=0), axis=-1) * fps
     slides[:-1, toes] = travel * (low[1:] & low[:-1])
-    # An acceleration: the distance of a joint from the middle between its neighbors in time.
+    # This is an acceleration: the distance of a joint from the middle between its neighbors in
+    # time.
     jumps = np.zeros(joints.shape[:2])
     jumps[1:-1] = np.linalg.norm(np.diff(joints, n=2, axis=0), axis=-1) * fps**2
     # Opening a flag in time keeps only runs that are at least as long as the window.
@@ -116,7 +124,11 @@ def _runs(
     flags: np.ndarray | None = None,
     frames: int = 1,
 ) -> list[Fault]:
-    """Returns the runs of at least `frames` frames with flags (F, J), or values (F, J) above the limit."""
+    """Returns the runs of at least `frames` frames.
+
+    A frame belongs to a run if its flag (F, J) is set or, without flags, if its value (F, J) is
+    above the limit.
+    """
     runs, flags = [], values > LIMITS[kind][0] if flags is None else flags
     for joint in np.flatnonzero(flags.any(0)).tolist():
         flag = binary_opening(flags[:, joint], np.ones(frames)) if frames > 1 else flags[:, joint]
@@ -143,7 +155,7 @@ def _stretched(
 
 
 def _inside(joints: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """Returns how deep elbows and wrists are in the body; the hand counts as the wrist."""
+    """Returns how deep elbows and wrists are in the body. The hand counts as the wrist."""
     depth = np.zeros(joints.shape[:2])
     for side in ("left", "right"):
         elbow, wrist, hand = depths(joints, names, side)[0].T
@@ -153,7 +165,10 @@ def _inside(joints: np.ndarray, names: Sequence[str]) -> np.ndarray:
 
 
 def _bends(joints: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Finds knees that bend forward, judged by the direction of the foot, and knees and elbows folded into the limb."""
+    """Finds knees that bend forward, and knees and elbows that are folded too far.
+
+    The direction of the foot determines the front of the knee.
+    """
     limit = LIMITS["limit"][0]
     flags = np.zeros(joints.shape[:2], bool)
     worst = np.zeros(joints.shape[:2])
@@ -166,13 +181,13 @@ def _bends(joints: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.nda
             at = names.index(chain[1])
             flags[:, at], worst[:, at] = 180 - bend < limit, 180 - bend
             if "knee" in chain[1]:
-                # The front of the shin is the direction of the foot, perpendicular to the shin. A
-                # knee bends forward if the thigh tilts to this side.
+                # The front of the shin is the direction of the foot, made perpendicular to the
+                # shin. A knee bends forward if the thigh tilts to this side.
                 toes = unit(joints[:, names.index(f"{side}_foot")] - lower)
                 front = toes - (toes * b).sum(-1, keepdims=True) * b
                 tilt = np.degrees(np.arcsin(np.clip(-(a * unit(front)).sum(-1), -1, 1)))
-                # The front of a foot that points straight down is undefined, so that such frames
-                # do not count.
+                # The front is undefined if the foot points straight down, so such frames do not
+                # count.
                 forward = (tilt > limit) & (np.linalg.norm(front, axis=-1) > 0.5)
                 flags[:, at] |= forward
                 worst[:, at] = np.where(forward, tilt, worst[:, at])
@@ -180,8 +195,9 @@ def _bends(joints: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.nda
 
 
 def depths(joints: np.ndarray, names: Sequence[str], side: str) -> tuple[np.ndarray, np.ndarray]:
-    """Measures the left or right arm against capsules about trunk and thighs, whose sizes follow
-    from the bones.
+    """Measures how deep an arm is in the body, which consists of capsules.
+
+    Trunk and thighs are capsules whose sizes follow from the bones.
 
     Args:
         joints: (F, J, 3) in meters.
@@ -189,9 +205,9 @@ def depths(joints: np.ndarray, names: Sequence[str], side: str) -> tuple[np.ndar
         side: "left" or "right".
 
     Returns:
-        Depth (F, 3) in meters of elbow, wrist and middle of the hand, negative outside, and unit
-            vectors
-        (F, 3, 3) from the axis of the part in which each point is deepest.
+        Depth (F, 3) in meters of elbow, wrist and middle of the hand, negative outside. Also unit
+            vectors (F, 3, 3) to the points, from the axis of the part in which each point is
+            deepest.
     """
     at = {name: joints[:, number] for number, name in enumerate(names)}
     elbow, wrist = at[f"{side}_elbow"], at[f"{side}_wrist"]
@@ -202,7 +218,7 @@ def depths(joints: np.ndarray, names: Sequence[str], side: str) -> tuple[np.ndar
         *((at[f"{leg}_hip"], at[f"{leg}_knee"]) for leg in ("left", "right")),
     ]
     # The trunk is wider than deep. Sideways distances from its axis are shortened, so that the
-    # same capsule works in all directions.
+    # same capsule can be used in all directions.
     away = [_away(points, start, end) for start, end in bones]
     lateral = (away[0] * across[:, None]).sum(-1, keepdims=True) * across[:, None]
     away[0] = away[0] - (1 - 1 / WIDTH) * lateral
@@ -217,7 +233,10 @@ def depths(joints: np.ndarray, names: Sequence[str], side: str) -> tuple[np.ndar
 
 
 def _away(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Returns vectors (F, P, 3) to points (F, P, 3) from the nearest point of a segment with ends (F, 3)."""
+    """Returns vectors (F, P, 3) from a segment to points (F, P, 3).
+
+    They start at the nearest point of the segment, whose ends are (F, 3).
+    """
     axis, points = (end - start)[:, None], points - start[:, None]
     share = (points * axis).sum(-1, keepdims=True) / np.maximum(
         (axis**2).sum(-1, keepdims=True), 1e-9
@@ -226,5 +245,5 @@ def _away(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
-    """Returns vectors (..., 3) of length 1, or 0 for a vector of no length."""
+    """Returns vectors (..., 3) scaled to length 1. A vector without length becomes 0."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)

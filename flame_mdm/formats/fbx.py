@@ -1,4 +1,6 @@
-"""Binary FBX files as trees of records: the container of `fbx_scene`, which reads motions, and `fbx_writer`.
+"""Binary FBX files as trees of records.
+
+`fbx_scene` reads motions from these trees, and `fbx_writer` writes motions as such trees.
 
 Autodesk does not publish the format. The layout of records, arrays and the end of the file
 follows the description of the Blender Foundation
@@ -19,18 +21,18 @@ from flame_mdm.errors import UserError
 from flame_mdm.safe_io import MEBIBYTE, atomic_write, regular_file
 
 MAGIC = b"Kaydara FBX Binary  \x00\x1a\x00"
-# FBX 7.4 of 2014: the newest version whose records have 32-bit offsets, read by all programs
+# FBX 7.4 of 2014 is the newest version with 32-bit offsets. All programs read it.
 VERSION = 7400
 WIDE_VERSION = 7500  # first version whose records have 64-bit offsets
 OLDEST_VERSION = 7000  # earlier files store animations in another structure
 LIMIT = 512 * MEBIBYTE  # maximum size of a file that is read
-# Maximum size of all arrays of a file together, after decompression
+# Maximum total size of all decompressed arrays of a file in bytes
 EXPANDED_LIMIT = 512 * MEBIBYTE
 MAX_DEPTH = 32  # maximum nesting of records; programs write about 8
 MAX_RECORDS = 1_000_000  # maximum number of records of a file
 MAX_NAME = 255  # the length of a name is stored in one byte
 
-# Code of the type of a number -> its format.
+# Format of a number by the code of its type
 SCALARS = {
     "Y": "<h",
     "C": "<?",
@@ -39,7 +41,7 @@ SCALARS = {
     "D": "<d",
     "L": "<q",
 }
-# Code of the type of an array -> type of its items.
+# Type of an array's items by the code of the array's type
 ARRAYS = {
     "f": "<f4",
     "d": "<f8",
@@ -50,7 +52,7 @@ ARRAYS = {
 }
 DEFLATED = 128  # arrays of this many bytes or more are compressed
 
-# Constants at the end of each file, equal in all files without a password.
+# Constants at the end of each file. They are equal in all files without a password.
 FOOTER_ID = bytes.fromhex("fabcab09d0c8d466b176fb831cf7267e")
 FOOTER_END = bytes.fromhex("f85a8c6adef5d97eece90ce3758f290b")
 
@@ -62,11 +64,11 @@ class Record:
     Attributes:
         name: the name, such as "Model".
         properties: bool, int, float, str, bytes or one-dimensional arrays. `write` stores an int
-            as 64-bit integer and a float as double; `Int` and `Short` are written as shorter
+            as a 64-bit integer and a float as a double. `Int` and `Short` are written as shorter
             integers.
         children: nested records.
-        block: whether a terminator follows the children even if there are none. Some readers need
-            it.
+        block: whether a terminator follows the children even if there are none. Some readers
+            need it.
     """
 
     name: str
@@ -107,7 +109,8 @@ class Short(int):
 def read(path: Path) -> Record:
     """Reads a binary FBX file of version 7 and returns the record that contains all others.
 
-    Raises `UserError` if the file is too large, damaged, in ASCII, or of an earlier version.
+    Raises:
+        UserError: If the file is too large, damaged, in ASCII, or of an earlier version.
     """
     regular_file(path, LIMIT)
     content = path.read_bytes()
@@ -132,13 +135,13 @@ def read(path: Path) -> Record:
 
 
 class _Reader:
-    """Parses the records of a file and counts what it has read."""
+    """Parses the records of a file and counts their size."""
 
     def __init__(self, content: bytes, version: int) -> None:
         self.content = content
         self.head = struct.Struct("<QQQB" if version >= WIDE_VERSION else "<IIIB")
         self.records = 0
-        self.expanded = 0  # bytes of all arrays so far
+        self.expanded = 0  # size in bytes of all arrays read so far
 
     def read(self) -> Record:
         root = Record("")
@@ -149,7 +152,7 @@ class _Reader:
         return root
 
     def _record(self, start: int, limit: int, depth: int) -> tuple[Record, int] | None:
-        """Returns the record at `start` and its end, or None for the terminator of a list of records."""
+        """Returns the record at `start` and its end; None at the terminator of a list."""
         end, count, size, length = self.head.unpack_from(self.content, start)
         if end == 0:
             return None
@@ -207,7 +210,7 @@ class _Reader:
             raise ValueError(f"arrays of more than {EXPANDED_LIMIT // MEBIBYTE} MiB")
         if encoding == 1:
             unpacker = zlib.decompressobj()
-            # One byte more than declared is unpacked, to notice arrays that are too long.
+            # One byte more than declared is unpacked, to detect arrays that are too long.
             packed = unpacker.decompress(packed, size + 1)
         elif encoding != 0:
             raise ValueError(f"unknown encoding {encoding} of an array")

@@ -1,10 +1,12 @@
 """Motions in FBX files: the models of a scene, evaluated in each frame of an animation.
 
-The transform of a model is, as the documentation of Autodesk's FBX SDK gives it ("Computing transformation matrices"),
+According to the documentation of Autodesk's FBX SDK ("Computing transformation matrices"), the
+transform of a model is
 
     T  Roff  Rp  Rpre  R  Rpost^-1  Rp^-1  Soff  Sp  S  Sp^-1
 
-with translation T, rotation R and scale S, offsets and pivots of rotation and scale, and pre- and post-rotation.
+with translation T, rotation R, scale S, offsets and pivots of rotation and scale, and pre- and
+post-rotation.
 """
 
 import math
@@ -26,11 +28,11 @@ CENTIMETER = 0.01  # meters per centimeter; `UnitScaleFactor` is the number of c
 MAX_MODELS = 4096  # maximum number of models of a scene
 MAX_CELLS = 4_000_000  # maximum number of frames times models
 
-# Order of Euler angles in `RotationOrder`, as in scipy: "xyz" turns about the fixed axes x, y and
-# z, in this order.
+# Order of Euler angles by `RotationOrder`, as in scipy: "xyz" rotates about the fixed axes x, y
+# and z, in this order.
 ORDERS = ("xyz", "xzy", "yzx", "yxz", "zxy", "zyx", "xyz")
 
-# Frames per second of `TimeMode`; 0 and 14 mean the rate in `CustomFrameRate`.
+# Frames per second by `TimeMode`; 0 and 14 mean the rate in `CustomFrameRate`
 TIME_MODES = {
     1: 120.0,
     2: 100.0,
@@ -51,9 +53,9 @@ TIME_MODES = {
     18: 120000 / 1001,
 }
 
-CONSTANT, CUBIC = 0x2, 0x8  # bits of `KeyAttrFlags`; linear otherwise
+CONSTANT, CUBIC = 0x2, 0x8  # bits of `KeyAttrFlags`; without them, interpolation is linear
 NEXT_VALUE = 0x100  # bit of a constant segment that has the value of the key after it
-UNSTEPPED = 1e-6  # seconds by which a frame may lie before the key whose value it takes
+UNSTEPPED = 1e-6  # seconds by which a frame may be before the key whose value it takes
 
 ZERO, ONE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 
@@ -76,7 +78,10 @@ class Curve:
     slopes: np.ndarray
 
     def at(self, times: np.ndarray) -> np.ndarray:
-        """Returns the values (F,) at times (F,) in seconds; the first and last keys hold before and after."""
+        """Returns the values (F,) at times (F,) in seconds.
+
+        Before the first and after the last key, the value of the key is held.
+        """
         if len(self.times) == 1:
             return np.full(len(times), self.values[0])
         inside = np.clip(times, self.times[0], self.times[-1])
@@ -97,7 +102,7 @@ class Curve:
 
 
 def hermite(begin: Any, end: Any, leaving: Any, arriving: Any, share: Any) -> Any:
-    """Returns the cubic Hermite spline between two keys, at `share` (0 to 1) of the way.
+    """Returns the cubic Hermite spline between two keys at `share`, from 0 to 1.
 
     `leaving` and `arriving` are the slopes at the two keys, per segment.
     """
@@ -157,7 +162,10 @@ class _Model:
 
 
 def euler(order: str, degrees: np.ndarray) -> np.ndarray:
-    """Returns rotations (..., 3, 3) of angles (..., 3) about x, y and z in degrees, applied in `order`."""
+    """Returns rotations (..., 3, 3) from angles (..., 3) about x, y and z in degrees.
+
+    The angles are applied in `order`.
+    """
     angles = degrees[..., ["xyz".index(axis) for axis in order]]
     return Rotation.from_euler(order, angles, degrees=True).as_matrix()
 
@@ -167,11 +175,12 @@ def read(path: Path, animation: str | int | None = None) -> AnimatedNodes:
 
     Args:
         path: the file.
-        animation: name of the take, or its number, counted from 1; None = the first one with
+        animation: name of the take, or its number, counted from 1. None = the first one with
             keys.
 
-    Raises `UserError` if the file is damaged, has no animation, or has several animation layers
-    with keys.
+    Raises:
+        UserError: If the file is damaged, has no animation, or has several animation layers with
+            keys.
     """
     root = fbx.read(path)
     try:
@@ -183,7 +192,7 @@ def read(path: Path, animation: str | int | None = None) -> AnimatedNodes:
 
 
 def animations(path: Path) -> list[str]:
-    """Returns the names of the takes in an FBX file that have keys."""
+    """Returns the names of the takes with keys in an FBX file."""
     root = fbx.read(path)
     try:
         return [name for name, _ in _Scene(root).takes()]
@@ -210,8 +219,8 @@ class _Scene:
         if len(self.models) > MAX_MODELS:
             raise ValueError(f"more than {MAX_MODELS} models")
 
-        # Id of an object -> ids of the objects connected to it, and the property that each is
-        # connected to.
+        # By object id: ids of the objects connected to the object, each with the property it is
+        # connected to
         self.below: dict[int, list[tuple[int, str]]] = defaultdict(list)
         for record in connections.all("C"):
             if len(record.properties) < 3:
@@ -222,7 +231,7 @@ class _Scene:
                 self.models[child].parent = parent
 
     def takes(self) -> list[tuple[str, int]]:
-        """Returns the names of animations that have keys, and the ids of their layers."""
+        """Returns the names of animations with keys, and the ids of their layers."""
         takes = []
         for number, record in self.records.items():
             if record.name != "AnimationStack":
@@ -242,7 +251,7 @@ class _Scene:
         ]
 
     def _keys(self, layer: int) -> list[tuple[int, int, int]]:
-        """Returns curve node, axis and curve of all curves in a layer."""
+        """Returns curve node, axis and curve for each curve in a layer."""
         axes = {"d|X": 0, "d|Y": 1, "d|Z": 2}
         curves = []
         for node in self._below(layer, "AnimationCurveNode"):
@@ -257,7 +266,7 @@ class _Scene:
 
     def motion(self, animation: str | int | None) -> AnimatedNodes:
         name, layer = choose(self.takes(), animation)
-        animated = {  # curve node -> model and property
+        animated = {  # by curve node: model and property
             node: (model, target)
             for model in self.models
             for node, target in self.below[model]
@@ -311,7 +320,7 @@ class _Scene:
         return CENTIMETER * (scale if 0 < scale < LARGEST else 1)
 
     def _axes(self) -> np.ndarray:
-        """Returns the rotation (3, 3) from the axes of the file to x left, y up, z to the front."""
+        """Returns the rotation (3, 3) from the axes of the file to x left, y up, z ahead."""
         axes = np.zeros((3, 3))
         for row, name, usual in ((0, "Coord", 0), (1, "Up", 1), (2, "Front", 2)):
             axis = int(self._setting(f"{name}Axis", usual))
@@ -320,7 +329,7 @@ class _Scene:
                 raise ValueError(f"{name}Axis is {axis}")
             axes[row, axis] = -1 if sign < 0 else 1
         if not np.isclose(np.linalg.det(axes), 1):
-            return np.eye(3)  # such axes are not right-handed; programs ignore them
+            return np.eye(3)  # such axes are not right-handed, and programs ignore them
         return axes
 
 
@@ -329,7 +338,7 @@ def _is_object(record: fbx.Record) -> bool:
 
 
 def _name(record: fbx.Record) -> str:
-    """Returns the name of an object, which is stored with its class."""
+    """Returns the name of an object. It is stored together with the class of the object."""
     name = record.properties[1]
     return str(name).partition("\x00")[0] or record.name
 
@@ -348,7 +357,7 @@ def _properties(record: fbx.Record | None) -> dict[str, tuple[float, ...]]:
 
 
 def _model_defaults(root: fbx.Record) -> dict[str, tuple[float, ...]]:
-    """Returns the properties that models have unless they say otherwise, from the template of the file."""
+    """Returns the default properties of models, from the template of the file."""
     definitions = root.first("Definitions")
     for kind in definitions.all("ObjectType") if definitions else ():
         if kind.properties[:1] == ["Model"]:

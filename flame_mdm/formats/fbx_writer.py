@@ -1,9 +1,9 @@
 """Writes a motion with its skeleton and skin as an FBX file: binary 7.4, centimeters, y up.
 
-The structure of the scene follows files of Autodesk's FBX SDK. Programs differ in what they need;
-the comments name the reader that fails without a detail. The bones are at the top level, since
-Unreal and Unity take a node above them for a bone. Their rest pose is in `PreRotation`, so that
-rotations of 0 are the rest pose in every program.
+The structure of the scene follows files of Autodesk's FBX SDK. Programs need different details;
+comments name the reader that fails without a detail. The bones are at the top level, because
+Unreal and Unity treat a node above them as a bone. The rest pose of the bones is in
+`PreRotation`, so rotations of 0 are the rest pose in every program.
 """
 
 from collections import Counter
@@ -22,21 +22,21 @@ from flame_mdm.formats.rigged import CONTACTS, Material, RiggedClip, Skin
 
 PER_METER = 100  # the files are in centimeters
 CUSTOM_RATE = 14  # `TimeMode` of a rate in `CustomFrameRate`
-# A fixed time, so that equal motions give equal files. Readers check it against `FileId`.
+# A fixed time, so that equal motions give equal files. Readers compare it with `FileId`.
 CREATED = "1970-01-01 10:00:00:000"
 FILE_ID = bytes.fromhex("28b32aebb624ccc2bfc8b02aa92bfcf1")
 EULER = "ZYX"  # R = Rz Ry Rx, the order that FBX calls eEulerXYZ
-# Flags of a key: linear interpolation and its tangents, as Blender and the SDK write them.
+# Flags of a key: linear interpolation and its tangents, as Blender and the SDK write them
 LINEAR_KEY = 0x4 | 0x100 | 0x2000 | 0x4000
-# Meters by which a root is moved back. Blender does not move a pelvis that is exactly at the tail
-# of its root.
+# Distance in meters by which a root is moved back. Blender does not move a pelvis that is exactly
+# at the tail of its root.
 ROOT_BACK = 1e-4
 AXES = ("X", "Y", "Z")
-HELD_KEY = 0x2  # a value that is held until the next key
+HELD_KEY = 0x2  # flag of a key whose value is held until the next key
 
 
 def write(path: Path, clip: RiggedClip) -> None:
-    """Writes a motion, with the skin of its person if it has one."""
+    """Writes a motion, with the skin of its person if there is one."""
     fbx.write(path, _Writer(clip).scene())
 
 
@@ -51,7 +51,7 @@ class _Writer:
         self.offsets, self.moves = self._lifted()
 
     def scene(self) -> Record:
-        """Returns the record that contains all others."""
+        """Returns the record that contains all other records."""
         clip = self.clip
         duration = round((len(clip.turns) - 1) / clip.fps * TICKS)
         bones = self._skeleton()
@@ -60,15 +60,15 @@ class _Writer:
         for skin in clip.skins:
             poses |= self._mesh(skin, bones, materials)
         if poses and clip.root >= 0:
-            # three.js takes the position of the root from the bind pose, so that it moves there,
-            # too.
+            # three.js takes the position of the root from the bind pose. Therefore the root is
+            # also moved there.
             poses[bones[clip.root]][2, 3] -= PER_METER * ROOT_BACK
         if poses:
             self._bind_pose(poses)
         self._animation(bones, duration)
 
-        # The order of a file: header, settings, documents, definitions, objects, connections,
-        # takes. Objects are a flat list; connections by id make it a tree, with id 0 as the
+        # A file has this order: header, settings, documents, definitions, objects, connections,
+        # takes. Objects are a flat list. Connections by id make it a tree, in which id 0 is the
         # scene.
         root = Record("")
         _header(root)
@@ -89,7 +89,7 @@ class _Writer:
         return root
 
     def _new(self) -> int:
-        """Returns the id of a new object; some readers fail on negative or small ones."""
+        """Returns the id of a new object. Some readers fail with negative or small ids."""
         self.last_id += 1
         return self.last_id
 
@@ -106,10 +106,10 @@ class _Writer:
             self.connections.add("C", "OP", child, parent, target)
 
     def _lifted(self) -> tuple[np.ndarray, dict[int, np.ndarray]]:
-        """Returns the offsets (J, 3) and the moves of the clip in centimeters, with the person on its soles.
+        """Returns the offsets (J, 3) and the moves of the clip in centimeters.
 
-        A root on the floor is moved back by `ROOT_BACK`, and the hips forward by the same
-        distance.
+        The person stands on its soles. A root on the floor is moved back by `ROOT_BACK`, and the
+        hips are moved forward by the same distance.
         """
         clip = self.clip
         offsets, moves = clip.on_soles()
@@ -124,9 +124,9 @@ class _Writer:
         return PER_METER * offsets, {joint: PER_METER * moved for joint, moved in moves.items()}
 
     def _skeleton(self) -> list[int]:
-        """Adds the bones in the rest pose; returns their ids."""
-        # Each bone is a Model, which has the transform, and a NodeAttribute, which says that it
-        # is a bone. The rest pose is the PreRotation, so that the animated rotation is 0 at rest.
+        """Adds the bones in the rest pose and returns their ids."""
+        # Each bone is a Model, which has the transform, and a NodeAttribute, which marks it as a
+        # bone. The rest pose is the PreRotation, so that the animated rotation is 0 at rest.
         clip, bones = self.clip, []
         before = _degrees(clip.rest[None])[0]
         for joint, name in enumerate(clip.joints):
@@ -146,14 +146,14 @@ class _Writer:
     def _mesh(
         self, skin: Skin, bones: Sequence[int], materials: dict[Material, int]
     ) -> dict[int, np.ndarray]:
-        """Adds a mesh in the pose in which it is bound, with its materials and its skin.
+        """Adds a mesh in its bind pose, with its materials and its skin.
 
-        `materials` holds the ids of the materials that the file has so far. Returns the matrix
-        (4, 4) of each object, by id, in this pose.
+        `materials` contains the ids of the materials that the file has so far. Returns the matrix
+        (4, 4) of each object in the bind pose, by id.
         """
-        # A Geometry has the vertices and a Model places it. A Skin deforms the geometry with one
-        # Cluster per bone: its vertices, their weights, and the matrices of mesh and bone when
-        # they were bound.
+        # A Geometry has the vertices, and a Model places it. A Skin deforms the geometry with one
+        # Cluster per bone. A cluster contains its vertices, their weights, and the matrices of
+        # mesh and bone in the bind pose.
         geometry, record = self._object("Geometry", skin.name, "Mesh")
         _geometry(record, skin)
         model, record = self._object("Model", skin.name, "Mesh")
@@ -189,7 +189,7 @@ class _Writer:
         return poses
 
     def _material(self, material: Material) -> int:
-        """Adds a material, and its image if it has one; returns the id."""
+        """Adds a material and, if it has one, its image. Returns the id."""
         number, record = self._object("Material", material.name, "")
         record.add("Version", Int(102))
         record.add("ShadingModel", "lambert")
@@ -218,7 +218,7 @@ class _Writer:
         return number
 
     def _bind_pose(self, poses: dict[int, np.ndarray]) -> None:
-        """Adds the matrices (4, 4) of objects, by id, in the pose in which the meshes are bound."""
+        """Adds the matrices (4, 4) of objects in the bind pose of the meshes, by id."""
         _, record = self._object("Pose", "bind pose", "BindPose")
         record.add("Type", "BindPose")
         record.add("Version", Int(100))
@@ -229,7 +229,7 @@ class _Writer:
             node.add("Matrix", _matrix(matrix))
 
     def _animation(self, bones: Sequence[int], duration: int) -> None:
-        """Adds one key per frame for the rotations of all bones, and for the positions of those that move."""
+        """Adds one key per frame for all rotations, and for the positions of moving bones."""
         clip = self.clip
         stack, record = self._object("AnimationStack", clip.name, "", "AnimStack")
         record.block = True  # without a block, assimp finds no animation
@@ -262,9 +262,9 @@ class _Writer:
         axes: Sequence[str] = AXES,
         interpolation: int = LINEAR_KEY,
     ) -> None:
-        """Adds a curve for each axis of a property, values (F, axes)."""
+        """Adds a curve for each axis of a property; `values` are (F, axes)."""
         # An animated property is a CurveNode that is connected to the property of the bone. Each
-        # of its axes has a curve with times, values and flags; one flag counts for all keys.
+        # of its axes has a curve with times, values and flags. One flag applies to all keys.
         node, record = self._object("AnimationCurveNode", label, "", "AnimCurveNode")
         properties = record.add("Properties70")
         self._connect(node, layer)
@@ -283,13 +283,16 @@ class _Writer:
 
 
 def _degrees(turns: np.ndarray) -> np.ndarray:
-    """Converts rotations (F, J, 3, 3) to angles (F, J, 3) about x, y and z in degrees, without jumps."""
+    """Converts rotations (F, J, 3, 3) to angles (F, J, 3) about x, y and z in degrees.
+
+    The angles have no jumps.
+    """
     angles = continuous_euler(torch.from_numpy(turns), [EULER] * turns.shape[1])
     return np.degrees(angles.flip(-1).numpy())
 
 
 def _matrix(matrix: np.ndarray) -> np.ndarray:
-    """Returns the 16 numbers of a matrix; the translation is in the last four."""
+    """Returns the 16 numbers of a matrix. The last four contain the translation."""
     return matrix.T.astype("<f8").ravel()
 
 
@@ -302,7 +305,7 @@ def _vector(
 
 
 def _model(record: Record, offset: np.ndarray, before: np.ndarray, scale: float = 1.0) -> Record:
-    """Adds the transform of a model at rest; returns the record of its properties."""
+    """Adds the transform of a model at rest. Returns the record of its properties."""
     record.add("Version", Int(232))
     properties = record.add("Properties70")
     properties.add("P", "RotationActive", "bool", "", "", Int(1))

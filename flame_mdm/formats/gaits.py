@@ -1,8 +1,8 @@
-"""Clips for game engines, cut from longer motions: loops, starts, stops and turns whose ends fit together.
+"""Clips for game engines, cut from longer motions: loops, starts, stops and turns.
 
-A gait is cut at two frames one cycle apart: the start before them, the loop between them, and the
-stop after them. The ends of the clips are then changed to shared poses: the loop's first pose,
-and the pose in which the person stands.
+The ends of the clips fit together. A gait is cut at two frames that are one cycle apart. The
+start is before them, the loop between them, and the stop after them. Then the ends of the clips
+are changed to shared poses: the first pose of the loop, and the pose in which the person stands.
 """
 
 from collections.abc import Sequence
@@ -24,24 +24,24 @@ from flame_mdm.formats.grounding import (
 )
 
 Kind = Literal["loop", "start", "stop", "turn"]
-CYCLE = (0.5, 1.8)  # shortest and longest cycle of a gait in seconds
-STEADY = 0.85  # a gait is steady above this share of its full speed
+CYCLE = (0.5, 1.8)  # minimum and maximum cycle of a gait in seconds
+STEADY = 0.85  # a gait is steady above this fraction of its full speed
 EVEN = 0.2  # seconds over which the speed is averaged, because side steps stop and go
-SLOWEST = 0.2  # m/s; a slower motion is not a gait
-ASIDE = 35.0  # degrees by which a gait may go in another direction than requested
-VELOCITY = 0.1  # seconds; weight of velocities beside positions when two poses are compared
-SETTLED = 0.12  # m/s; a body stands if no joint is faster, relative to the root
+SLOWEST = 0.2  # minimum speed of a gait in m/s
+ASIDE = 35.0  # maximum angle in degrees between the gait and the requested direction
+VELOCITY = 0.1  # weight, in seconds, of velocities beside positions when poses are compared
+SETTLED = 0.12  # a body stands if no joint is faster than this relative to the root, in m/s
 MARGIN = 0.15  # seconds of standing that are kept before a start and after a stop
 FADE = 0.5  # seconds in which the first or the last pose of a clip changes into the motion
-OVERSHOOT = (0.6, 1.6)  # smallest and largest turn relative to the requested one
-PART = 0.5  # shortest start and stop in seconds
+OVERSHOOT = (0.6, 1.6)  # minimum and maximum turn relative to the requested turn
+PART = 0.5  # minimum length of a start or stop in seconds
 # Meters and degrees from one repetition of a loop to the next. A loop that moves less stays in
 # place.
 STILL = (
     0.1,
     10.0,
 )
-TALL = 0.15  # meters per joint; poses of two cycles that differ more do not make a loop
+TALL = 0.15  # maximum mean distance in meters per joint between the end poses of a cycle
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,10 +49,10 @@ class Clip:
     """A motion for a game engine.
 
     Attributes:
-        name: without the name of the set.
+        name: name, without the name of the set.
         kind: loop (the last pose is the first one), start, stop or turn.
-        motion: the joints, and the path of the root.
-        text: what the model was asked for.
+        motion: the joints and the path of the root.
+        text: text that the model was given.
     """
 
     name: str
@@ -63,7 +63,11 @@ class Clip:
 
 @dataclass(frozen=True)
 class Cycle:
-    """A cycle of a gait in a motion: its first frame, the same pose one cycle later, and how much the poses differ."""
+    """A cycle of a gait in a motion.
+
+    It is its first frame, the frame with the same pose one cycle later, and the difference of
+    both poses.
+    """
 
     first: int
     last: int
@@ -71,12 +75,15 @@ class Cycle:
 
 
 def direction(degrees: float) -> np.ndarray:
-    """Returns x and z (2,) of a direction; 0 degrees is ahead, 90 degrees is to the left."""
+    """Returns x and z (2,) of a direction. 0 degrees is ahead, 90 degrees is to the left."""
     return np.array([np.sin(np.radians(degrees)), np.cos(np.radians(degrees))])
 
 
 def progress(motion: GroundedMotion, degrees: float) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the velocities (F,) of the root along a direction relative to its facing, and to the left of it."""
+    """Returns the velocities (F,) of the root along a direction, and to the left of it.
+
+    The direction is relative to the facing of the root.
+    """
     cosine, sine = np.cos(motion.heading), np.sin(motion.heading)
     dx, dz = (
         np.gradient(motion.path, axis=0).T * motion.fps
@@ -90,13 +97,13 @@ def progress(motion: GroundedMotion, degrees: float) -> tuple[np.ndarray, np.nda
 
 
 def find_cycle(motion: GroundedMotion, degrees: float) -> Cycle | None:
-    """Returns the cycle of a gait in a direction whose ends differ least; None if there is none.
+    """Returns the cycle of a gait in a direction with the smallest difference between its ends.
 
-    Cycles that begin when the left foot lands are preferred, so that the loops of a set begin
-    with the same foot.
+    Returns None if there is no cycle. Cycles that begin when the left foot lands are preferred,
+    so that the loops of a set begin with the same foot.
     """
-    # A cycle lies in the longest part with a steady speed in the requested direction. All pairs
-    # of frames that are a plausible cycle apart are compared, by the distance of joints and of
+    # A cycle is in the longest part with a steady speed in the requested direction. All pairs of
+    # frames at the distance of a plausible cycle are compared, by the distances of joints and
     # velocities.
     along, aside = progress(motion, degrees)
     even = gaussian_filter1d(along, EVEN * motion.fps, mode="nearest")
@@ -140,12 +147,12 @@ def gait(
     Args:
         motion: a person who stands, moves in a direction, and stands again.
         cycle: the cycle that becomes the loop.
-        degrees: the direction, relative to where the person looks.
+        degrees: the direction, relative to the facing of the person.
         stand: (22, 3), the first pose of the start and the last pose of the stop.
     """
-    # All three parts come from one motion, so that they fit nearly. The loop is closed first;
-    # then the ends of start and stop are changed to its first pose and to the standing pose, and
-    # toes are planted again.
+    # All three parts come from one motion, so they nearly fit. The loop is closed first. Then the
+    # ends of start and stop are changed to its first pose and to the standing pose, and toes are
+    # planted again.
     straight = straightened(motion, degrees)
     loop = closed(straight.cut(cycle.first, cycle.last))
     along = direction(degrees)
@@ -174,9 +181,12 @@ def straightened(motion: GroundedMotion, degrees: float) -> GroundedMotion:
 
 
 def closed(motion: GroundedMotion) -> GroundedMotion:
-    """Returns a cycle whose last pose is its first one; the difference is spread evenly over the cycle."""
-    # The first half of the cycle takes up one half of the difference and the second half the other,
-    # so that the pose in the middle does not change.
+    """Returns a cycle with equal first and last poses.
+
+    The difference of these poses is spread evenly over the cycle.
+    """
+    # The first half of the cycle takes one half of the difference, and the second half takes the
+    # other, so the pose in the middle does not change.
     share = np.linspace(-0.5, 0.5, len(motion))[:, None, None]
     change = motion.local[0] - motion.local[-1]
     local = with_lengths(motion.local + share * change, motion.local[0])
@@ -197,11 +207,11 @@ def moving(motion: GroundedMotion) -> tuple[int, int]:
 
 
 def turn(motion: GroundedMotion, degrees: float, stand: np.ndarray) -> GroundedMotion | None:
-    """Returns a turn on the spot by an angle; None if the motion turns much less or more, or to the other side.
+    """Returns a turn on the spot by an angle. `stand` (22, 3) is the first and the last pose.
 
-    `stand` (22, 3) is the first and the last pose.
+    Returns None if the motion turns much less or more, or to the other side.
     """
-    # The model turns by about the requested angle. The root gets exactly this angle; the pose
+    # The model turns by about the requested angle. The root gets exactly this angle, and the pose
     # turns along.
     begin, end = moving(motion)
     part = motion.cut(begin, end)
@@ -218,7 +228,7 @@ def turn(motion: GroundedMotion, degrees: float, stand: np.ndarray) -> GroundedM
 def loop(motion: GroundedMotion) -> GroundedMotion:
     """Returns the middle repetition of a loop that was generated three times in a row.
 
-    The root follows a straight line at a constant speed if the loop travels; otherwise it stays
+    If the loop travels, the root follows a straight line at a constant speed. Otherwise, it stays
     in place.
     """
     count = (len(motion) - 1) // 3
@@ -231,10 +241,10 @@ def loop(motion: GroundedMotion) -> GroundedMotion:
 
 
 def passing(motion: GroundedMotion) -> list[float | None]:
-    """Returns when the left and the right toes, planted, pass the root of a loop, in seconds; None if they never do.
+    """Returns when the planted left and right toes pass the root of a loop, in seconds.
 
-    Two gaits are best blended at these moments, because then both have the foot at the same
-    place.
+    None = the toes never pass the root. Two gaits are best blended at these moments, because then
+    both have the foot at the same place.
     """
     travel = motion.path[-1] - motion.path[0]
     distance = np.linalg.norm(travel)
@@ -253,11 +263,11 @@ def passing(motion: GroundedMotion) -> list[float | None]:
 
 
 def with_neighbors(clips: Sequence[Clip], frames: int) -> tuple[np.ndarray, list[slice]]:
-    """Returns the joints of all clips, seen from the root, in one array, and the frames of each clip in it.
+    """Returns the joints of all clips in one array, and the frames of each clip.
 
-    Each clip has as many `frames` of neighbors before and after it, so that filters over time do
-    not mix the clips: a loop continues with itself, other clips stay in their first and last
-    pose.
+    The joints are relative to the root. Each clip has `frames` neighbors before and after it, so
+    that filters over time do not mix the clips. The neighbors of a loop are the loop again. The
+    neighbors of other clips are their first and last poses.
     """
     parts, slices, position = [], [], 0
     for clip in clips:

@@ -1,6 +1,7 @@
-"""glTF 2.0 binary files (.glb): one validated document for every reader, and the binary part of files that are written.
+"""glTF 2.0 binary files (.glb).
 
-Khronos Group, "glTF 2.0 Specification", https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html
+Readers get a validated document. Writers use `Binary` for the binary part. Source: Khronos Group,
+"glTF 2.0 Specification", https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html
 """
 
 import json
@@ -21,7 +22,7 @@ from flame_mdm.representations import rotation
 from flame_mdm.safe_io import MEBIBYTE, atomic_write, parse_json, regular_file
 
 UNSIGNED_BYTE, UNSIGNED_SHORT, FLOAT = 5121, 5123, 5126
-# Type of integers -> the integer that means 1 if the accessor is normalized.
+# For each type of integers, the integer that means 1 if the accessor is normalized
 WHOLE = {
     5120: 127,
     UNSIGNED_BYTE: 255,
@@ -44,10 +45,10 @@ DOCUMENT_LIMIT = 16 * MEBIBYTE
 MAX_NODES, MAX_ITEMS = 4096, 65_536  # maximum number of nodes, and of all other items of one list
 LARGEST = 1e9  # largest coordinate or matrix entry that is read
 HARMLESS = re.compile(r"KHR_(materials|texture|lights|mesh|draco)_|EXT_texture_|VRM")
-"""Required extensions that change neither nodes, skins nor bounds: a character is read, and written with them."""
+"""Required extensions that change neither nodes, skins nor bounds. Characters may use them."""
 
 Item = TypeVar("Item")
-# Index into another list, or number of bytes. A missing index is -1.
+# Index in another list, or number of bytes. A missing index is -1.
 Index = Annotated[int, Field(ge=0, lt=2**40)]
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
 Items = Annotated[list[Item], Field(max_length=MAX_ITEMS), FailFast()]
@@ -56,7 +57,10 @@ Vector = Annotated[list[Number], Field(min_length=3, max_length=3)]
 
 
 class _Object(BaseModel):
-    """A part of the document that is read. Types are strict; other keys are ignored, and copied unchanged."""
+    """A part of the document that is read.
+
+    Types are strict. Other keys are ignored and copied unchanged.
+    """
 
     model_config = ConfigDict(strict=True)
 
@@ -72,7 +76,7 @@ class _Node(_Object):
     scale: Vector = [1, 1, 1]
 
     def local(self) -> np.ndarray:
-        """Returns the matrix (4, 4) from the node's coordinates to its parent's."""
+        """Returns the matrix (4, 4) from the node's coordinates to its parent's coordinates."""
         if self.matrix is not None:
             return np.array(self.matrix, float).reshape(4, 4).T
         matrix = np.eye(4)
@@ -132,14 +136,18 @@ class _Document(_Object):
 
 
 def _item(items: Sequence[Item], index: int, name: str) -> Item:
-    """Returns an item of a list in the document; raises `ValueError` if there is none."""
+    """Returns an item of a list in the document. Raises `ValueError` if it does not exist."""
     if not 0 <= index < len(items):
         raise ValueError(f"{name}: there is no number {index}, only {len(items)} of them")
     return items[index]
 
 
 def _ordered(nodes: Sequence[_Node]) -> tuple[list[int], dict[int, int]]:
-    """Returns an order of nodes with parents first, and the parents; raises `ValueError` if they form no trees."""
+    """Returns an order of nodes in which parents precede their children, and the parents.
+
+    Raises:
+        ValueError: If the nodes are not trees.
+    """
     above = {child: number for number, node in enumerate(nodes) for child in node.children}
     if len(above) != sum(len(node.children) for node in nodes):
         raise ValueError("a node has two parents")
@@ -153,7 +161,10 @@ def _ordered(nodes: Sequence[_Node]) -> tuple[list[int], dict[int, int]]:
 
 @dataclass(frozen=True, eq=False)
 class Skin:
-    """A skin: numbers of its K joints, inverse bind matrices (K, 4, 4) or (0, 4, 4), corners (C, 3) of its meshes."""
+    """A skin: numbers of its K joints, inverse bind matrices, and corners of its meshes.
+
+    Matrices are (K, 4, 4) or (0, 4, 4). Corners are (C, 3).
+    """
 
     joints: list[int]
     binds: np.ndarray
@@ -162,7 +173,7 @@ class Skin:
 
 @dataclass(frozen=True, eq=False)
 class Glb:
-    """A valid .glb file. N nodes, in an order in which parents precede their children."""
+    """A valid .glb file with N nodes. Parents precede their children."""
 
     # The JSON part, with the lists `buffers`, `bufferViews` and `accessors`
     document: dict[str, Any]
@@ -170,13 +181,17 @@ class Glb:
     nodes: tuple[int, ...]  # index of each node in the document
     names: tuple[str, ...]  # name of each node
     parents: tuple[int, ...]  # number of each node's parent, -1 for a root
-    locals: np.ndarray  # (N, 4, 4), from each node's coordinates to its parent's
-    worlds: np.ndarray  # (N, 4, 4), from each node's coordinates to the world's
+    locals: np.ndarray  # (N, 4, 4), from each node's coordinates to its parent's coordinates
+    worlds: np.ndarray  # (N, 4, 4), from each node's coordinates to the world
     skins: tuple[Skin, ...]  # skins of meshes
 
 
 def read(path: Path) -> Glb:
-    """Reads a .glb file; raises `UserError` if it is too large or damaged, or is not glTF 2.0 in one file."""
+    """Reads a .glb file.
+
+    Raises:
+        UserError: If the file is too large or damaged, or is not glTF 2.0 in one file.
+    """
     regular_file(path, LIMIT)
     content = path.read_bytes()
     if content[:4] != b"glTF":
@@ -232,7 +247,7 @@ def _chunks(content: bytes) -> tuple[Any, bytes]:
 
 
 def _skins(parts: _Document, data: bytes, rank: Sequence[int]) -> tuple[Skin, ...]:
-    """Returns the skins; `rank` converts indices of the document to numbers of nodes."""
+    """Returns the skins. `rank` converts indices of the document to numbers of nodes."""
     corners: list[list[np.ndarray]] = [[np.zeros((0, 3))] for _ in parts.skins]
     for node in (node for node in parts.nodes if min(node.mesh, node.skin) >= 0):
         boxes = _item(corners, node.skin, "skin")
@@ -281,14 +296,17 @@ def _binds(parts: _Document, skin: _Skin, data: bytes) -> np.ndarray:
 
 
 def numbers(file: Glb, accessor: int, kind: str) -> np.ndarray:
-    """Returns the numbers (N, C) of an accessor as float64; normalized integers become numbers up to 1.
+    """Returns the numbers (N, C) of an accessor as float64.
+
+    Normalized integers become numbers up to 1.
 
     Args:
         file: the file.
         accessor: index of the accessor in the document.
         kind: type that the accessor must have, such as "VEC3".
 
-    Raises `ValueError` if the file does not contain such numbers.
+    Raises:
+        ValueError: If the file does not contain such numbers.
     """
     item = _Accessor.model_validate(_item(file.document["accessors"], accessor, "accessor"))
     view = _View.model_validate(_item(file.document["bufferViews"], item.bufferView, "bufferView"))
@@ -310,7 +328,7 @@ def numbers(file: Glb, accessor: int, kind: str) -> np.ndarray:
 
 
 class Binary:
-    """The binary part of the file: concatenated arrays, with buffer views and accessors that describe them."""
+    """The binary part of a file: concatenated arrays with their buffer views and accessors."""
 
     def __init__(
         self, data: bytes = b"", views: Sequence[Any] = (), accessors: Sequence[Any] = ()
@@ -325,7 +343,10 @@ class Binary:
         bounds: bool = False,
         normalized: bool = False,
     ) -> int:
-        """Appends numbers (N,) or (N, K) and returns the index of their accessor; `normalized`: bytes mean 0 to 1."""
+        """Appends numbers (N,) or (N, K) and returns the index of their accessor.
+
+        If `normalized`, bytes mean 0 to 1.
+        """
         rows = array.reshape(len(array), -1)
         component = {"u1": UNSIGNED_BYTE, "u2": UNSIGNED_SHORT, "f4": FLOAT}[rows.dtype.str[1:]]
         view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": rows.nbytes}
@@ -344,7 +365,10 @@ class Binary:
     def animation(
         self, name: str, fps: float, curves: Sequence[tuple[str, int, np.ndarray]]
     ) -> dict[str, Any]:
-        """Appends an animation of properties of nodes and returns it: property, node, values (F, K) in frames."""
+        """Appends an animation of nodes and returns it.
+
+        A curve is property, node, and values (F, K) by frame.
+        """
         times = self.add(
             np.arange(len(curves[0][2]), dtype=np.float32) / np.float32(fps), bounds=True
         )
@@ -356,7 +380,10 @@ class Binary:
         return {"name": name, "samplers": samplers, "channels": channels}
 
     def save(self, path: Path, document: dict[str, Any]) -> None:
-        """Writes a .glb file with this binary part; adds the accessors, the views and the buffer to the document."""
+        """Writes a .glb file with this binary part.
+
+        Adds the accessors, the views and the buffer to the document.
+        """
         binary, *others = document.get("buffers") or [{}]
         document |= {"accessors": self.accessors, "bufferViews": self.views}
         document["buffers"] = [{**binary, "byteLength": len(self.data)}, *others]
@@ -373,6 +400,9 @@ class Binary:
 
 
 def quaternions(matrices: np.ndarray) -> np.ndarray:
-    """Converts rotations (F, ..., 3, 3) to float32 quaternions x, y, z, w without sign changes between frames."""
+    """Converts rotations (F, ..., 3, 3) to float32 quaternions x, y, z, w.
+
+    Signs do not change between frames.
+    """
     turns = rotation.continuous(rotation.matrix_to_quaternion(torch.from_numpy(matrices)), dim=0)
     return turns[..., [1, 2, 3, 0]].float().numpy()

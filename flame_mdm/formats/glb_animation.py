@@ -1,6 +1,6 @@
-"""Motions in animated .glb files, VRM and VRMA files included: positions of all nodes in each frame of an animation.
+"""Motions in animated .glb, .vrm and .vrma files: positions of all nodes in each frame.
 
-Khronos Group, "glTF 2.0 Specification", section 3.11 and appendix C (interpolation). VRM
+Sources: Khronos Group, "glTF 2.0 Specification", section 3.11 and appendix C (interpolation); VRM
 consortium, "VRMC_vrm_animation 1.0", https://github.com/vrm-c/vrm-specification
 """
 
@@ -21,17 +21,17 @@ from flame_mdm.formats.fbx_scene import hermite
 from flame_mdm.formats.resampling import MAX_FRAMES, RATES
 
 MAX_CELLS = 4_000_000  # maximum number of frames times nodes
-# Keys at a lower rate than this were placed by hand: sampled motions have denser keys.
+# Keys at a lower rate than this were placed by hand. Sampled motions have denser keys.
 SPARSE_RATE = 24.0
 USUAL_RATE = 30.0  # rate at which motions with keys placed by hand are sampled
-# Numbers per key of the properties that move nodes
+# Numbers per key, for the properties that move nodes
 WIDTHS = {
     "translation": 3,
     "rotation": 4,
     "scale": 3,
 }
 
-# Bones of VRM's humanoid -> joints of SMPL.
+# Joints of SMPL for the bones of VRM's humanoid
 HUMANOID = {
     "hips": "pelvis",
     "spine": "spine1",
@@ -90,8 +90,8 @@ class Track:
     Attributes:
         times: (K,) in seconds, increasing.
         values: (K, C).
-        interpolation: between the keys.
-        slopes: (2, K, C), change per second before and after each key; only of CUBICSPLINE.
+        interpolation: interpolation between the keys.
+        slopes: (2, K, C), change per second before and after each key; only for CUBICSPLINE.
     """
 
     times: np.ndarray
@@ -100,10 +100,12 @@ class Track:
     slopes: np.ndarray
 
     def at(self, times: np.ndarray) -> np.ndarray:
-        """Returns the values (F, C) at times (F,); rotations are not normalized. The first and last keys hold."""
-        # Each time lies in a segment between two keys; before the first and after the last key,
-        # the value is held. CUBICSPLINE stores slopes per second, which become slopes per
-        # segment.
+        """Returns the values (F, C) at times (F,). Rotations are not normalized.
+
+        Before the first and after the last key, the value of the key is held.
+        """
+        # Each time is in a segment between two keys. CUBICSPLINE stores slopes per second. They
+        # are converted to slopes per segment.
         if len(self.times) == 1:
             return np.tile(self.values[0], (len(times), 1))
         inside = np.clip(times, self.times[0], self.times[-1])
@@ -125,9 +127,12 @@ class Track:
 
 
 def slerp(begin: np.ndarray, end: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Interpolates unit quaternions (F, 4) on the sphere, the shorter way; `share` (F, 1) is from 0 to 1."""
-    # q and -q are the same rotation; the one on the side of `begin` is the shorter way. For nearly
-    # equal rotations, sin(angle) is 0 and linear interpolation is exact enough.
+    """Interpolates unit quaternions (F, 4) on the sphere, along the shorter arc.
+
+    `share` (F, 1) is from 0 to 1.
+    """
+    # q and -q are the same rotation. The one on the side of `begin` is on the shorter arc. For
+    # nearly equal rotations, sin(angle) is 0, and linear interpolation is exact enough.
     cosine = (begin * end).sum(1, keepdims=True)
     end = np.where(cosine < 0, -end, end)
     angle = np.arccos(np.clip(np.abs(cosine), 0, 1))
@@ -143,10 +148,11 @@ def read(path: Path, animation: str | int | None = None) -> AnimatedNodes:
 
     Args:
         path: the file.
-        animation: name of the animation, or its number, counted from 1; None = the first one that
+        animation: name of the animation, or its number, counted from 1. None = the first one that
             moves nodes.
 
-    Raises `UserError` if the file is damaged, or has no such animation.
+    Raises:
+        UserError: If the file is damaged, or has no such animation.
     """
     file = glb.read(path)
     try:
@@ -188,7 +194,10 @@ def _motion(file: glb.Glb, animation: str | int | None) -> AnimatedNodes:
 
 
 def world_matrices_of(path: Path) -> np.ndarray:
-    """Returns the matrices (F, N, 4, 4) from nodes to the world in the first animation of a valid file."""
+    """Returns the matrices from nodes to the world in the first animation of a valid file.
+
+    The matrices are (F, N, 4, 4).
+    """
     file = glb.read(path)
     candidates = _animations(file)
     return _worlds(file, candidates[0][1], candidates)[0]
@@ -197,7 +206,10 @@ def world_matrices_of(path: Path) -> np.ndarray:
 def _worlds(
     file: glb.Glb, chosen: _Animation, candidates: Sequence[tuple[str, _Animation]]
 ) -> tuple[np.ndarray, float]:
-    """Returns the matrices (F, N, 4, 4) from nodes to the world in each frame of an animation, and the frame rate."""
+    """Returns the matrices from nodes to the world in each frame, and the frame rate.
+
+    Matrices are (F, N, 4, 4).
+    """
     tracks = _tracks(file, chosen)
     fps = _rate(file, [item for _, item in candidates])
     last = max(track.times[-1] for properties in tracks.values() for track in properties.values())
@@ -265,10 +277,14 @@ def _track(file: glb.Glb, sampler: _Sampler, width: int) -> Track:
 
 
 def _rate(file: glb.Glb, items: Sequence[_Animation]) -> float:
-    """Returns the frame rate: the one that the writer noted in `asset.extras.fps`, or the smallest distance of keys."""
-    # glTF has keys and no frame rate. The median distance of keys is the frame rate of sampled
-    # animations; it is rounded to a whole number that is nearly equal, since times are in single
-    # precision.
+    """Returns the frame rate.
+
+    It is the rate that the writer stored in `asset.extras.fps`, or follows from the distance of
+    keys.
+    """
+    # glTF has keys, but no frame rate. In a sampled animation, the median distance of keys gives
+    # the frame rate. Times have single precision, so the rate is rounded to a nearly equal whole
+    # number.
     extras = file.document["asset"].get("extras")
     noted = extras.get("fps") if isinstance(extras, dict) else None
     if isinstance(noted, int | float) and RATES[0] <= noted <= RATES[1]:
@@ -286,7 +302,10 @@ def _rate(file: glb.Glb, items: Sequence[_Animation]) -> float:
 
 
 def humanoid(file: glb.Glb) -> dict[str, int]:
-    """Returns SMPL's joints -> nodes of a file that says which nodes are the bones of VRM's humanoid; else {}."""
+    """Returns the node of each joint of SMPL, if the file declares the bones of VRM's humanoid.
+
+    Otherwise, returns {}.
+    """
     extensions = file.document.get("extensions")
     if not isinstance(extensions, dict):
         return {}

@@ -8,14 +8,15 @@ import numpy as np
 from flame_mdm.formats.glb import Binary, quaternions
 from flame_mdm.formats.rigged import RiggedClip, Skin, contact_events
 
-VERTICES, INDICES = 34962, 34963  # uses of a buffer view in glTF
+VERTICES, INDICES = 34962, 34963  # values of a buffer view's target in glTF
 
 
 def write(path: Path, clip: RiggedClip, text: str) -> None:
-    """Writes a clip with one node per joint, and the skin of a person if it has one; `text` is stored in the file.
+    """Writes a clip with one node per joint, and the skin of a person if there is one.
 
-    The person stands on its soles: the node `lifted` above the joints is as high as the soles are thick.
-    In a rig with a root on the floor, the hips are lifted instead, so that the root stays there.
+    `text` is stored in the file. The person stands on its soles: the node `lifted` above the
+    joints is as high as the soles are thick. In a rig with a root on the floor, the hips are
+    lifted instead, so that the root stays on the floor.
     """
     offsets, moves, lift = clip.offsets, clip.moves, clip.lift
     if clip.root >= 0:
@@ -58,8 +59,8 @@ def write(path: Path, clip: RiggedClip, text: str) -> None:
 
 
 def _skin(binary: Binary, skin: Skin) -> dict[str, Any]:
-    """Appends the mesh of a person, and returns the parts of the document that describe it."""
-    light = np.rint(255 * (skin.colors / 255) ** 2.2)  # colors of screens to linear ones
+    """Appends the mesh of a person. Returns the parts of the document that describe it."""
+    light = np.rint(255 * (skin.colors / 255) ** 2.2)  # from colors of screens to linear colors
     light = np.pad(light, ((0, 0), (0, 1)), constant_values=255).astype("u1")
     attributes = {
         "POSITION": binary.add(skin.points.astype("<f4"), VERTICES, bounds=True),

@@ -1,11 +1,11 @@
-"""Motions seen from a root on the floor, and feet that stay where they are planted.
+"""Motions relative to a root on the floor, and feet that stay where they are planted.
 
-Game engines move a character by a root on the floor and play the rest of the motion relative to
+Game engines move a character by a root on the floor, and play the rest of the motion relative to
 this root. Cuts of a motion are changed in this view, so that the last pose of one clip can be the
-first pose of the next. Then the path of the root is put below them again, and inverse kinematics
-keeps each foot in place during its contacts.
+first pose of the next. Then the path of the root is added again, and inverse kinematics keeps
+each foot in place during its contacts.
 
-Arrays hold F frames and the 22 joints of SMPL, in meters, y up. Angles are radians; positive
+Arrays have F frames and the 22 joints of SMPL, in meters, y up. Angles are in radians. Positive
 angles turn to the left.
 """
 
@@ -19,17 +19,18 @@ from flame_mdm.representations.skeleton import JOINT, SMPL22
 
 # Seconds over which the path of the root is smoothed, so that it does not follow single steps
 SMOOTHNESS = 0.15
-LOW = 0.05  # a toe this many meters above its lowest position still touches the floor
-SLOW = 0.25  # a planted toe is slower than this, in m/s over the floor
-SHORT = 0.1  # seconds; shorter contacts, and shorter gaps between contacts, are left out
+LOW = 0.05  # height in meters above its lowest position up to which a toe still touches the floor
+SLOW = 0.25  # maximum speed of a planted toe over the floor in m/s
+SHORT = 0.1  # seconds; shorter contacts, and shorter gaps between contacts, are ignored
 LOWERING = 0.2  # seconds in which the body is lowered for a leg that is too short
-# Repetitions of a loop that are planted together; the middle one has neighbors on both sides
+# Number of repetitions of a loop that are planted together. The middle one has neighbors on both
+# sides.
 COPIES = 3
 FEET = tuple(
     tuple(JOINT[f"{side}_{name}"] for name in ("hip", "knee", "ankle", "foot"))
     for side in ("left", "right")
 )
-"""Joints of the legs, the left one first."""
+"""Joints of the legs. The left leg is first."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,9 +38,9 @@ class GroundedMotion:
     """A motion as a path of a root on the floor, and joints relative to this root.
 
     Attributes:
-        local: (F, 22, 3), joints seen from the root, which faces +z.
+        local: (F, 22, 3), joints relative to the root, which faces +z.
         path: (F, 2), x and z of the root.
-        heading: (F,), direction of the root; 0 faces +z.
+        heading: (F,), direction of the root; 0 = it faces +z.
         contacts: (F, 2), whether the left and the right toes are planted.
         fps: frames per second.
     """
@@ -66,7 +67,10 @@ class GroundedMotion:
         return replace(self, local=turned(local, -self.heading[:, None]))
 
     def cut(self, first: int, last: int) -> "GroundedMotion":
-        """Returns the frames from `first` to `last`, both included; the root begins at the origin and faces +z."""
+        """Returns the frames from `first` to `last`, both included.
+
+        The root begins at the origin and faces +z.
+        """
         frames = slice(first, last + 1)
         start, heading = self.path[first], self.heading[first]
         away = np.zeros((last + 1 - first, 3))
@@ -89,7 +93,7 @@ def turned(points: np.ndarray, angles: np.ndarray | float) -> np.ndarray:
 
 
 def facing(joints: np.ndarray) -> np.ndarray:
-    """Returns the direction (F,) that hips and shoulders face, without jumps of a full turn."""
+    """Returns the direction (F,) that hips and shoulders face, without jumps by a full turn."""
     right_hip, left_hip, right_shoulder, left_shoulder = (
         joints[:, joint] for joint in SMPL22.facing
     )
@@ -98,9 +102,9 @@ def facing(joints: np.ndarray) -> np.ndarray:
 
 
 def grounded(joints: np.ndarray, fps: float) -> GroundedMotion:
-    """Puts a root below joints (F, 22, 3); its path and its direction are smooth."""
-    # The root is where the pelvis is, projected onto the floor. It is smoothed in time: in an
-    # engine, the sway of a walk belongs to the pose and not to the path.
+    """Puts a root below joints (F, 22, 3). Its path and its direction are smooth."""
+    # The root is the pelvis, projected onto the floor. It is smoothed in time: in an engine, the
+    # sway of a walk belongs to the pose and not to the path.
     joints = joints.astype(float)
     frames = SMOOTHNESS * fps
     path = gaussian_filter1d(joints[:, 0][:, [0, 2]], frames, axis=0, mode="nearest")
@@ -110,9 +114,9 @@ def grounded(joints: np.ndarray, fps: float) -> GroundedMotion:
 
 
 def planted_toes(joints: np.ndarray, fps: float) -> np.ndarray:
-    """Returns whether the left and the right toes are planted, (F, 2), by their height and speed."""
-    # A toe is planted if it is low, and slow before or after a frame. Gaps and contacts
-    # shorter than `SHORT` are closed and removed.
+    """Returns whether the left and right toes are planted, (F, 2), by height and speed."""
+    # A toe is planted in a frame if it is low, and slow before or after the frame. Gaps shorter
+    # than `SHORT` are closed, and contacts shorter than `SHORT` are removed.
     toes = joints[:, [leg[-1] for leg in FEET]]
     steps = np.linalg.norm(np.diff(toes[..., [0, 2]], axis=0), axis=-1) * fps
     steps = np.concatenate([steps[:1], steps, steps[-1:]])
@@ -129,12 +133,12 @@ def planted_toes(joints: np.ndarray, fps: float) -> np.ndarray:
 def anchored(
     motion: GroundedMotion, pose: np.ndarray, seconds: float, *, at_end: bool
 ) -> GroundedMotion:
-    """Returns the motion with another first or last pose; the change fades over some seconds.
+    """Returns the motion with another first or last pose. The change fades over some seconds.
 
-    `pose` (22, 3) is seen from the root. Bones keep their lengths.
+    `pose` (22, 3) is relative to the root. Bones keep their lengths.
     """
-    # The difference to the pose is added with a weight that falls from 1 to 0 without a kink: 3
-    # w^2 - 2 w^3.
+    # The difference to the pose is added with a weight that falls smoothly from 1 to 0: 3 w^2 - 2
+    # w^3.
     frames = np.arange(len(motion)) / max(1.0, min(seconds * motion.fps, len(motion) - 1))
     share = np.clip(1 - (frames[::-1] if at_end else frames), 0, 1)
     weight = share**2 * (3 - 2 * share)
@@ -144,7 +148,10 @@ def anchored(
 
 
 def with_lengths(joints: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Returns joints (F, 22, 3) with bones in the same directions, and with the bone lengths of a pose (22, 3)."""
+    """Returns joints (F, 22, 3) with the bone lengths of a pose (22, 3).
+
+    The bones keep their directions.
+    """
     out = joints.copy()
     for parent, joint in SMPL22.edges:
         bone = joints[:, joint] - joints[:, parent]
@@ -164,21 +171,21 @@ def runs(flags: np.ndarray) -> list[tuple[int, int]]:
 def planted(
     motion: GroundedMotion, *, fixed_start: bool = False, fixed_end: bool = False
 ) -> GroundedMotion:
-    """Returns the motion with toes that do not move during their contacts, and are never below the floor.
+    """Returns the motion with toes that do not move during contacts.
 
-    The body is lowered where a leg would be too short. With `fixed_start` and `fixed_end`, the
-    first and the last pose do not change: a foot that is planted there stays where this pose has
-    it.
+    Toes are also never below the floor. If a leg would be too short, the body is lowered. With
+    `fixed_start` and `fixed_end`, the first and the last pose do not change. A foot that is
+    planted in such a pose stays at its position in the pose.
     """
     # Each toe is moved to one footprint per contact. If a leg is too short for its footprint, the
-    # whole body is lowered for a moment, smoothly, before the legs bend to reach the footprints.
+    # whole body is lowered smoothly for a moment. Then the legs bend to reach the footprints.
     world = motion.world()
     near = round(SHORT * motion.fps)
     shifts = [
         _shift(world[:, leg[-1]], flags, fixed_start, fixed_end, near)
         for leg, flags in zip(FEET, motion.contacts.T, strict=True)
     ]
-    # A blend of two poses that stand on the floor may be lower. A fixed pose stays where it is.
+    # A blend of two poses that stand on the floor may be lower. A fixed pose keeps its height.
     fixed = [0] * fixed_start + [-1] * fixed_end
     for leg, shift in zip(FEET, shifts, strict=True):
         height = world[:, leg[-1], 1]
@@ -205,10 +212,10 @@ def planted(
 
 
 def _lack(world: np.ndarray, leg: tuple[int, ...], shift: np.ndarray) -> np.ndarray:
-    """Returns by how much (F,) the hip of a leg is too high for a foot that is moved by `shift` (F, 3)."""
-    # The hip may be anywhere in a sphere around the ankle whose radius is the straight leg, or
-    # the leg in the motion if that is longer. `highest` is the top of the sphere above the floor
-    # point of the hip.
+    """Returns how much (F,) the hip of a leg is too high for a foot moved by `shift` (F, 3)."""
+    # The hip may be anywhere in a sphere around the ankle. Its radius is the straight leg, or the
+    # leg in the motion if it is longer. `highest` is the height of the sphere above the hip's
+    # position on the floor.
     hip, knee, ankle = (world[:, joint] for joint in leg[:3])
     length = np.linalg.norm(knee - hip, axis=1) + np.linalg.norm(ankle - knee, axis=1)
     reach = np.maximum(REACH * length, np.linalg.norm(ankle - hip, axis=1))
@@ -220,11 +227,14 @@ def _lack(world: np.ndarray, leg: tuple[int, ...], shift: np.ndarray) -> np.ndar
 def _shift(
     toe: np.ndarray, flags: np.ndarray, fixed_start: bool, fixed_end: bool, near: int
 ) -> np.ndarray:
-    """Returns how far a toe (F, 3) is moved over the floor, (F, 3): smoothly from each contact to the next."""
+    """Returns the movement (F, 3) of a toe (F, 3) over the floor.
+
+    It changes smoothly from each contact to the next.
+    """
     # Within a contact, the shift brings the toe to its mean position, or to the position in a
-    # fixed pose. Between contacts, the shift of one becomes the shift of the next. A contact that
-    # begins or ends fewer than `near` frames from a fixed pose keeps the toe where it is then:
-    # there is no time to move it.
+    # fixed pose. Between contacts, one shift changes into the next. If a contact begins or ends
+    # fewer than `near` frames from a fixed pose, there is no time to move the toe. It stays where
+    # it is in that frame.
     last = len(toe) - 1
     floor = np.array([1.0, 0.0, 1.0])
     frames, shifts = [], []
@@ -246,7 +256,7 @@ def _shift(
     if not frames:
         return np.zeros_like(toe)
 
-    # between two contacts, the shift changes with zero speed at both ends
+    # Between two contacts, the shift changes with zero speed at both ends.
     fixed = np.array(shifts)
     after = np.clip(np.searchsorted(frames, np.arange(last + 1)), 0, len(frames) - 1)
     before = np.maximum(after - 1, 0)
@@ -258,9 +268,12 @@ def _shift(
 
 
 def repeated(motion: GroundedMotion, copies: int = COPIES) -> GroundedMotion:
-    """Returns a loop several times in a row; its last frame is the first one of the next repetition."""
-    # Each repetition begins where the one before ended and in the direction that it ended in: its
-    # path is turned and moved there.
+    """Returns a loop several times in a row.
+
+    Its last frame is the first frame of the next repetition.
+    """
+    # Each repetition begins at the place and in the direction in which the previous one ended.
+    # Its path is turned and moved there.
     step = turned(np.r_[motion.path[-1] - motion.path[0], 0][[0, 2, 1]], -motion.heading[0])
     turn = motion.heading[-1] - motion.heading[0]
     count = len(motion) - 1
@@ -283,9 +296,9 @@ def repeated(motion: GroundedMotion, copies: int = COPIES) -> GroundedMotion:
 
 
 def planted_loop(motion: GroundedMotion) -> GroundedMotion:
-    """Returns a loop with planted toes, which is still a loop: the last pose is the first one."""
-    # A single cycle has contacts that are cut at its ends. Several cycles are planted in a row,
-    # and the middle one is kept, whose neighbors are cycles, too.
+    """Returns a loop with planted toes. It is still a loop: the last pose is the first one."""
+    # Contacts are cut at the ends of a single cycle. Therefore several cycles in a row are
+    # planted. The middle one is kept, because its neighbors are cycles, too.
     count = len(motion) - 1
     several = planted(repeated(motion))
     middle = several.local[count * (COPIES // 2) : count * (COPIES // 2 + 1) + 1].copy()
@@ -294,7 +307,7 @@ def planted_loop(motion: GroundedMotion) -> GroundedMotion:
 
 
 def slide(motion: GroundedMotion) -> float:
-    """Returns the largest distance in meters that a toe moves over the floor during one contact."""
+    """Returns the maximum distance in meters that a toe slides during one contact."""
     toes = motion.world()[:, [leg[-1] for leg in FEET]][..., [0, 2]]
     distances = [0.0]
     for foot in range(2):
@@ -308,7 +321,10 @@ def slide(motion: GroundedMotion) -> float:
 
 
 def pivot(motion: GroundedMotion) -> float:
-    """Returns the largest angle in degrees by which a foot turns about the vertical during one contact."""
+    """Returns the maximum angle in degrees by which a foot turns during one contact.
+
+    The angle is about the vertical.
+    """
     joints = motion.world()
     angles = [0.0]
     for foot, (_, _, ankle, toe) in enumerate(FEET):
@@ -320,7 +336,7 @@ def pivot(motion: GroundedMotion) -> float:
 
 
 def jolt(motion: GroundedMotion) -> float:
-    """Returns the largest acceleration of an ankle or of toes in m/s²."""
+    """Returns the maximum acceleration of an ankle or of toes in m/s²."""
     feet = motion.world()[:, [joint for leg in FEET for joint in leg[2:]]]
     changes = np.diff(feet, 2, axis=0) * motion.fps**2
     return float(np.linalg.norm(changes, axis=-1).max(initial=0.0))

@@ -1,4 +1,4 @@
-"""Skeletons of motion files, their mapping to SMPL's joints, and checks of units and maps by the size of the body."""
+"""Skeletons of motion files, their maps to SMPL's joints, and checks by the size of the body."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from flame_mdm.formats.retarget import joint_names, presets
 from flame_mdm.representations.skeleton import SKELETONS, SMPL22
 from flame_mdm.safe_io import read_yaml, regular_file
 
-# The axis that points up -> rows of the rotation that maps it to +y
+# By axis that points up: rows of the rotation that maps the axis to +y
 UP = {
     "y": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
     "z": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
     "-y": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
 }
-# Shortest, longest and usual leg of an adult, in meters: hip to knee to ankle
+# Minimum, maximum and usual leg of an adult, in meters: hip to knee to ankle
 LEG, USUAL_LEG = (
     (0.6, 1.2),
     0.83,
 )
-CHILD = 0.25  # shortest leg of a child in meters, at about one year
-FOOT = 0.02  # shortest foot in meters, ankle to toes
+CHILD = 0.25  # minimum leg of a child in meters, at about one year
+FOOT = 0.02  # minimum foot in meters, ankle to toes
 # If left and right limbs differ by more than this ratio, the joints are not in the assumed order.
 UNEQUAL = 1.5
-# If the lengths of limbs vary by more than this share of their mean, the joints are not in the assumed order either.
+# The order is also wrong if the lengths of limbs vary by more than this fraction of their mean.
 CHANGING = 0.25
 LIMBS = (("hip", "knee"), ("knee", "ankle"), ("shoulder", "elbow"), ("elbow", "wrist"))
 SIDES = ("left_", "right_")  # prefixes of SMPL's joints
@@ -49,15 +49,18 @@ UNITS = {  # in meters
     "the unit of CMU's recordings": 0.0564444,
 }
 
-# A joint of the file, or the weights of a mean of several joints.
+# A joint of the file, or weights of several joints for a weighted mean
 Source = str | Annotated[dict[str, FiniteFloat], Field(min_length=1)]
 
 
 class Layout(BaseModel):
-    """Mapping from the joints of files to the 22 joints of SMPL, in meters, y up; the keys of `skeleton.yaml`."""
+    """Map from the joints of files to the 22 joints of SMPL, in meters, y up.
+
+    The fields are the keys of `skeleton.yaml`.
+    """
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
-    # Name of each of SMPL's joints -> name of the joint in the files.
+    # Name of the joint in the files, by the name of each of SMPL's joints
     map: dict[str, Source] = {joint: joint for joint in SMPL22.joints}
     joints: list[str] = []  # names of the joints of arrays, in order; BVH files contain their own
     unit: Annotated[FiniteFloat, Field(gt=0)] = 1.0  # meters per unit of length in the files
@@ -65,14 +68,14 @@ class Layout(BaseModel):
     # frame rate of files that do not contain it
     fps: Annotated[float, Field(ge=RATES[0], le=RATES[1])] | None = None
     mirrored: bool = False  # the files contain mirrored motion; the sign of x is changed
-    children: bool = False  # whether children may be among the bodies
+    children: bool = False  # whether bodies may be children
     _name: str = PrivateAttr("own map")
     _bones: dict[str, str] = PrivateAttr(default_factory=dict)
     _rig: str = PrivateAttr("")
 
     @property
     def used(self) -> set[str]:
-        """The joints of files that the mapping uses."""
+        """The joints of files that the map uses."""
         return {name for source in self.map.values() for name in _shares(source)}
 
     @property
@@ -82,27 +85,36 @@ class Layout(BaseModel):
 
     @property
     def bones(self) -> Mapping[str, str]:
-        """SMPL's joints -> the bones that follow them; a map of positions may use means of several joints instead."""
+        """Bones that the joints of SMPL follow, by joint.
+
+        A map of positions may use means of several joints instead.
+        """
         return self._bones
 
     @property
     def rig(self) -> str:
-        """The name of the skeleton of `rigs.yaml` with the same joints, or ""."""
+        """The name of the skeleton of `rigs.yaml` with the same joints; "" if there is none."""
         return self._rig
 
     def bone(self, joint: str) -> str:
-        """Returns the joint of files that turns as a joint of SMPL: its bone, or the largest share of its position."""
+        """Returns the joint of files that turns like a joint of SMPL.
+
+        It is the bone of the joint, or the joint with the largest weight in its position.
+        """
         shares = _shares(self.map[joint])
         return self.bones.get(joint) or max(shares, key=lambda name: shares[name])
 
     def named(self, name: str, map: Mapping[str, Source]) -> Layout:
-        """Returns the layout with another map, as a known one."""
+        """Returns the layout with another map, as a known layout."""
         layout = self.model_copy(update={"map": dict(map)})
         layout._name = name
         return layout
 
     def ending(self, **ends: str) -> dict[str, Source]:
-        """Returns a map in which joints of SMPL, such as the toes, are the end sites of their parents: joint=parent."""
+        """Returns a map in which some joints of SMPL are the end sites of their parents.
+
+        They are given as joint=parent, for example the toes.
+        """
         return {
             side + joint: f"{self.map[side + parent]}.end"
             for joint, parent in ends.items()
@@ -110,7 +122,10 @@ class Layout(BaseModel):
         }
 
     def pairs(self) -> dict[str, str]:
-        """Returns the joints of files that the mapping uses -> their counterparts on the other side, or themselves."""
+        """Returns the counterparts on the other side, by joint of files that the map uses.
+
+        A joint without counterpart is its own.
+        """
         pairs: dict[str, str] = {}
         for joint, source in self.map.items():
             other = self.map[opposite(joint)]
@@ -121,7 +136,7 @@ class Layout(BaseModel):
         return pairs
 
     def apply(self, positions: np.ndarray, names: Sequence[str]) -> np.ndarray:
-        """Maps joints (F, J, 3) of a file with these names to (F, 22, 3) float32, meters, y up."""
+        """Maps joints (F, J, 3) with these names to (F, 22, 3) float32, meters, y up."""
         weights = np.zeros((len(SMPL22), len(names)))
         for row, joint in zip(weights, SMPL22.joints, strict=True):
             for name, share in _shares(self.map[joint]).items():
@@ -129,7 +144,7 @@ class Layout(BaseModel):
         return self.turn(weights @ positions).astype(np.float32)
 
     def turn(self, positions: np.ndarray) -> np.ndarray:
-        """Returns positions (F, J, 3) of a file in meters, y up, of the same joints."""
+        """Returns positions (F, J, 3) of the same joints in meters, y up."""
         return (
             self.unit
             * positions
@@ -185,7 +200,7 @@ LAYOUTS: dict[str, Layout] = {
 
 @cache
 def _variants() -> dict[str, Layout]:
-    """Returns the known layouts, and these with end sites instead of toes, of hands, or of both, by name."""
+    """Returns the known layouts by name, also with end sites instead of toes, hands, or both."""
     variants = {name: layout.named(name, layout.map) for name, layout in LAYOUTS.items()}
     toes, hands = {"foot": "ankle"}, {"wrist": "elbow"}
     for parts, ends in (("toes", toes), ("hands", hands), ("toes and hands", toes | hands)):
@@ -197,18 +212,21 @@ def _variants() -> dict[str, Layout]:
 
 @cache
 def _spelled() -> dict[str, dict[str, str]]:
-    """Returns for each of `_variants` spellings -> names of the joints that it uses."""
+    """Returns spellings of the names of the joints that each of `_variants` uses.
+
+    For each layout, it is a mapping from spelling to name.
+    """
     return {name: spelled(layout.pairs()) for name, layout in _variants().items()}
 
 
 @lru_cache(64)
 def _nearest(names: tuple[str, ...]) -> Match:
-    """Returns the known layout that fits names best."""
+    """Returns the known layout that fits the names best."""
     return best_match(names, _spelled())
 
 
 def read_tree(path: Path, rate: float | None = None) -> bvh.Bvh:
-    """Reads a BVH or AMC file; `rate` overrides its frame rate."""
+    """Reads a BVH or AMC file. `rate` overrides its frame rate."""
     if path.suffix.lower() == ".amc":
         return asf.read(path, rate)
     file = bvh.read(path)
@@ -216,10 +234,10 @@ def read_tree(path: Path, rate: float | None = None) -> bvh.Bvh:
 
 
 def tree_layout(file: bvh.Bvh, fields: Mapping[str, Any]) -> tuple[Layout, Sequence[str]]:
-    """Returns the layout of a file of `read_tree`, and the names of its joints as the layout has them.
+    """Returns the layout of a file of `read_tree`, and the names of its joints in the layout.
 
-    `fields` of `Layout` override the known ones. Known skeletons whose arrays are in meters are in centimeters in BVH
-    files, as written by `flame_mdm.formats`.
+    `fields` of `Layout` override the known fields. Known skeletons with arrays in meters are in
+    centimeters in BVH files, as written by `flame_mdm.formats`.
     """
     layout = find_layout(file.joints, fields)
     if "map" not in fields and "unit" not in layout.model_fields_set:
@@ -228,7 +246,10 @@ def tree_layout(file: bvh.Bvh, fields: Mapping[str, Any]) -> tuple[Layout, Seque
 
 
 def array_layout(joints: np.ndarray, fields: Mapping[str, Any]) -> tuple[Layout, Sequence[str]]:
-    """Returns layout and joint names of an array (F, J, 3), from `fields` or inferred from their number."""
+    """Returns layout and joint names of an array (F, J, 3).
+
+    They come from `fields`, or from the number of joints.
+    """
     if joints.ndim != 3 or joints.shape[2] != 3 or not len(joints):
         raise UserError(f"joints of shape {joints.shape}, not (frames, joints, 3)")
     count = joints.shape[1]
@@ -257,10 +278,12 @@ def layout_name(layout: Layout) -> str:
 
 
 def find_layout(names: Sequence[str], fields: Mapping[str, Any]) -> Layout:
-    """Returns the known layout for joints with these names, overridden by `fields`; its map uses these names.
+    """Returns the known layout for joints with these names, overridden by `fields`.
 
-    Names are matched as in `flame_mdm.formats.names`. Raises `UserError` if no layout fits, or several joints may be
-    meant by a name.
+    The map of the layout uses these names. Names are matched as in `flame_mdm.formats.names`.
+
+    Raises:
+        UserError: If no layout fits, or a name could mean several joints.
     """
     joints, mapped = ", ".join(names)[:1000], "map" in fields
     advice = f"Map SMPL's joints in skeleton.yaml (docs/own-data.md) to those of the file: {joints}"
@@ -288,8 +311,9 @@ def find_layout(names: Sequence[str], fields: Mapping[str, Any]) -> Layout:
 
 
 def _one(name: str, candidates: Sequence[str]) -> str:
-    """Returns the joint of a file that a name means; if there are several, the joint with exactly
-    this name.
+    """Returns the joint of a file that a name means.
+
+    If there are several, it is the joint with exactly this name.
     """
     if len(set(candidates)) == 1 or name in candidates:
         return name if name in candidates else candidates[0]
@@ -306,7 +330,7 @@ def _renamed(source: Source, names: Mapping[str, str]) -> Source:
 
 
 def skeleton_file(path: Path) -> Path | None:
-    """Returns the nearest `skeleton.yaml`, a regular file, in the folder of a file or above it."""
+    """Returns the nearest `skeleton.yaml`, a regular file, in a file's folder or above it."""
     for folder in path.absolute().parents:
         if os.path.lexists(folder / "skeleton.yaml"):
             regular_file(folder / "skeleton.yaml")
@@ -315,7 +339,10 @@ def skeleton_file(path: Path) -> Path | None:
 
 
 def find_skeleton(path: Path, up: str | None = None) -> dict[str, Any]:
-    """Returns the fields of `Layout` in the `skeleton_file` of a file, overridden by `up` (y, z or -y)."""
+    """Returns the fields of `Layout` in the `skeleton_file` of a file.
+
+    `up` (y, z or -y) overrides the axis that points up.
+    """
     if up is not None and up not in UP:
         raise UserError(f"up={up}: the axis that points up is one of {', '.join(UP)}")
     file = skeleton_file(path)
@@ -323,7 +350,10 @@ def find_skeleton(path: Path, up: str | None = None) -> dict[str, Any]:
 
 
 def read_skeleton(path: Path) -> dict[str, Any]:
-    """Reads some fields of `Layout` from a skeleton file; a `UserError` names the file and the key."""
+    """Reads some fields of `Layout` from a skeleton file.
+
+    A `UserError` names the file and the key.
+    """
     try:
         fields = Layout.model_validate(read_yaml(path)).model_dump(exclude_unset=True)
     except ValidationError as error:
@@ -341,7 +371,10 @@ def read_skeleton(path: Path) -> dict[str, Any]:
 
 
 def leg_length(joints: np.ndarray) -> float:
-    """Returns the mean length in meters of the left leg, hip to knee to ankle, of joints (F, 22, 3) of SMPL."""
+    """Returns the mean length in meters of the left leg, hip to knee to ankle.
+
+    `joints` are (F, 22, 3) of SMPL.
+    """
     return _bone(joints, "left_hip", "left_knee") + _bone(joints, "left_knee", "left_ankle")
 
 
@@ -351,9 +384,16 @@ def head_height(joints: np.ndarray) -> float:
 
 
 def check_size(joints: np.ndarray, unit: float, children: bool = False, doubt: str = "") -> None:
-    """Raises `UserError` if legs are not a person's, and says which unit would fit.
+    """Checks the length of the legs.
 
-    `unit` of the file is in meters. `doubt` is a line about another fault of the motion, for the message.
+    Args:
+        joints: (F, 22, 3) of SMPL, in meters.
+        unit: unit of the file, in meters.
+        children: whether bodies may be children.
+        doubt: a line about another fault of the motion, for the message.
+
+    Raises:
+        UserError: If the legs are not a person's; the message suggests a unit.
     """
     leg, shortest = leg_length(joints), CHILD if children else LEG[0]
     if shortest <= leg <= LEG[1]:
@@ -378,20 +418,24 @@ def check_size(joints: np.ndarray, unit: float, children: bool = False, doubt: s
 
 
 def _usual_unit(leg: float, unit: float) -> str:
-    """Returns advice on the unit of a file whose legs are `leg` meters long with `unit` and have no usual unit."""
+    """Returns advice for a file with legs of `leg` meters if no usual unit fits."""
     usual = unit * USUAL_LEG / leg if leg > 0 else 0.0
     if not 0 < usual < math.inf:
         return "The unit is wrong"
     return f"The file has no usual unit; {usual:.3g} gives the usual legs of {USUAL_LEG:g} m"
 
 
-# Share of the frames in which the toes of both feet point backward. Above it, left and right are
-# exchanged.
+# Fraction of the frames in which the toes of both feet point backward. Above it, left and right
+# are exchanged.
 BACKWARDS = 0.25
 
 
 def check_feet(joints: np.ndarray) -> None:
-    """Raises `UserError` if a foot of SMPL's joints (F, 22, 3) has no length, or the toes point backwards."""
+    """Checks the feet of SMPL's joints (F, 22, 3).
+
+    Raises:
+        UserError: If a foot has no length, or the toes point backwards.
+    """
     at = {name: joints[:, number] for number, name in enumerate(SMPL22.joints)}
     for side in ("left", "right"):
         if _bone(joints, f"{side}_ankle", f"{side}_foot") < FOOT:
@@ -399,9 +443,9 @@ def check_feet(joints: np.ndarray) -> None:
             raise UserError(
                 f"the {side} foot has no length. Map {side}_foot in skeleton.yaml {advice}"
             )
-    # The toes of a foot in the air may point backwards, as in a run, so only the lower foot of
-    # each frame counts. The toes of one foot of a person who kneels point backwards, too, so
-    # both feet must point backwards in a share of the frames.
+    # The toes of a foot in the air may point backwards, for example in a run. Therefore only the
+    # lower foot of each frame counts. The toes of one foot of a kneeling person point backwards,
+    # too. Therefore both feet must point backwards in a fraction of the frames.
     across, trunk = at["left_hip"] - at["right_hip"], at["neck"] - at["pelvis"]
     depths = [
         ((at[f"{side}_hip"] - at[f"{side}_ankle"]) * trunk).sum(1) for side in ("left", "right")
@@ -417,15 +461,18 @@ def check_feet(joints: np.ndarray) -> None:
 
 
 def check_order(joints: np.ndarray, count: int, skeleton: str) -> None:
-    """Raises `UserError` if an array of joints was taken for another skeleton, because of their number alone.
+    """Checks that an array of joints was not taken for another skeleton with as many joints.
+
+    The bones of a person's limbs have the same length on both sides, and keep their length. With
+    another order of joints or another skeleton, the same pairs of joints are not bones.
 
     Args:
         joints: (F, 22, 3) of SMPL, mapped as if the array had the joints of the skeleton.
         count: number of joints of the array.
         skeleton: name of the skeleton.
 
-    The bones of a person's limbs are equally long on both sides and keep their length. In another order of joints, or
-    on another skeleton, the same pairs of joints are not bones.
+    Raises:
+        UserError: If the limbs differ between the sides or change their length.
     """
     lengths = np.stack(
         [_lengths(joints, side + start, side + end) for side in SIDES for start, end in LIMBS], 1

@@ -1,8 +1,9 @@
-"""`Motion`, one motion outside the models, and writers of motion files. `docs/formats.md` describes the files.
+"""`Motion`, one motion outside the models, and writers of motion files.
 
-The 6D rotations among the 263 features of HumanML3D are not SMPL's: they follow different chains and do not define the
-twist of a bone. They are never exported; rotations come from joint positions (`flame_mdm.formats.poses`) or from
-features and files that contain SMPL's.
+`docs/formats.md` describes the files. The 6D rotations among the 263 features of HumanML3D are
+not SMPL's rotations: they follow different chains and do not define the twist of a bone. They are
+never exported. Rotations come from joint positions (`flame_mdm.formats.poses`), or from features
+and files that contain SMPL's rotations.
 """
 
 import json
@@ -45,7 +46,10 @@ from flame_mdm.safe_io import atomic_write, write_text
 from flame_mdm.visualize.body import Mesh
 
 AMASS_AXES = torch.tensor([[-1.0, 0, 0], [0, 0, 1], [0, 1, 0]], dtype=torch.float64)
-"""Converts AMASS's coordinates, z up, to y up as in HumanML3D: (-x, z, y). It is its own inverse."""
+"""Converts AMASS's coordinates, z up, to y up as in HumanML3D: (-x, z, y).
+
+It is its own inverse.
+"""
 END_SITES = {
     "head": (0.0, 0.18, 0.0),
     "left_foot": (0.0, 0.0, 0.06),
@@ -53,7 +57,10 @@ END_SITES = {
     "left_wrist": ADULT[22],
     "right_wrist": ADULT[23],
 }
-"""Tips of head, toes and hands beyond the last joints, in meters; without them programs do not draw these bones."""
+"""Tips of head, toes and hands beyond the last joints, in meters.
+
+Without them, programs do not draw these bones.
+"""
 
 
 @dataclass(eq=False, repr=False)
@@ -61,7 +68,8 @@ class Motion(PosedFigure):
     """One motion outside the models: generated, real or read from a file.
 
     Attributes:
-        joints, fps, skeleton, text, id, contacts: see `flame_mdm.visualize.body.Figure`; joints are float32.
+        joints, fps, skeleton, text, id, contacts: see `flame_mdm.visualize.body.Figure`. Joints
+            are float32.
         poses: rotations of SMPL's joints, if they are known.
         features: (F, D) float32 features in the units of the data; empty if they are not known.
         representation: name of the representation of the features.
@@ -69,11 +77,13 @@ class Motion(PosedFigure):
         degenerate: number of frames in which the features determine no rotation for some joint.
         parts: text, first and last frame (exclusive) of each part of a sequence; () = one part.
         notes: lines for the user about the file that was read, such as frames that were left out.
-        bones: rotations from the bones of the file that was read, for features that contain rotations. They show how a
-            forearm turns about its own axis. Files and pictures are made from `poses` or joint positions.
+        bones: rotations from the bones of the file that was read, for features that contain
+            rotations. They show how a forearm turns about its own axis. Files and pictures are
+            made from `poses` or joint positions instead.
 
     Raises:
-        UserError: If a shape is wrong, a joint is not finite, or the frame rate is not a positive number.
+        UserError: If a shape is wrong, a joint is not finite, or the frame rate is not a positive
+            number.
 
     Example:
         >>> Motion(joints=np.zeros((40, 22, 3)), fps=20, text="a person stands")
@@ -127,19 +137,23 @@ class Motion(PosedFigure):
         """Writes a motion file and returns a line that describes it.
 
         Args:
-            path: the file; its extension selects the format (docs/formats.md).
-            rest_pose: begin a `.bvh` file with a frame of the rest pose, arms out, which some programs expect.
-            rig: the skeleton of a `.bvh`, `.glb`, `.fbx` or USD file, one of `flame_mdm.formats.retarget.presets`;
-                default: SMPL's.
-            character: your own character, or what `characters.read` returned: a `.glb` file with a skin, to be written
-                with this motion as a `.glb`, `.fbx` or USD file, or a `.bvh` file, to be written as a `.bvh` file.
-            body: the body in `.glb`, `.fbx`, USD, `.gif` and `.mp4` files, from `formats.people.load_body`; default:
-                the mannequin.
-            root_motion: the joint on the floor of `rig` follows the hips in a `.glb`, `.fbx` or USD file; otherwise
-                it stays in place. For `rig="unreal"` and `rig="soma"`.
+            path: the file. Its extension selects the format (docs/formats.md).
+            rest_pose: begin a `.bvh` file with a frame of the rest pose, arms out. Some programs
+                expect it.
+            rig: the skeleton of a `.bvh`, `.glb`, `.fbx` or USD file, one of
+                `flame_mdm.formats.retarget.presets`. Default: SMPL's.
+            character: your own character: a file, or the result of `characters.read`. A `.glb`
+                file with a skin can be written with this motion as a `.glb`, `.fbx` or USD file.
+                A `.bvh` file can be written as a `.bvh` file.
+            body: the body in `.glb`, `.fbx`, USD, `.gif` and `.mp4` files, from
+                `formats.people.load_body`. Default: the mannequin.
+            root_motion: the joint on the floor of `rig` follows the hips in a `.glb`, `.fbx` or
+                USD file. Otherwise, it stays in place. For `rig="unreal"` and `rig="soma"`.
             facts: additional entries of an `.npz` file, such as the seed.
 
-        Raises `UserError` if an argument is unknown, or does not fit the file or the motion, or if `.mp4` needs av.
+        Raises:
+            UserError: If an argument is unknown, or does not fit the file or the motion, or if av
+                is missing for `.mp4`.
         """
         path = Path(path)
         ending = path.suffix.lower()
@@ -179,10 +193,11 @@ class Motion(PosedFigure):
         return f"{path}: {len(self.joints)} frames at {self.fps:g} per second, {summary}"
 
     def resampled(self, fps: float) -> "Motion":
-        """Returns this motion at another frame rate, over the same time.
+        """Returns this motion at another frame rate, with the same duration.
 
-        Rotations that are known are interpolated on the sphere, so that bones keep their length; joints alone are
-        interpolated by cubic splines. Features belong to one frame rate and are left out.
+        Known rotations are interpolated on the sphere, so bones keep their length. Without
+        rotations, joints are interpolated by cubic splines. Features belong to one frame rate, so
+        they are left out.
         """
         if math.isclose(self.fps, fps):
             return self
@@ -215,7 +230,11 @@ class Motion(PosedFigure):
         )
 
     def show(self) -> Any:
-        """Returns a player: a display in a Jupyter notebook, otherwise the path of a page to open in any browser."""
+        """Returns a player.
+
+        In a Jupyter notebook, it is a display; otherwise, it is the path of a page for any
+        browser.
+        """
         from flame_mdm.visualize import player_page
 
         page = player_page([self], self.text or self.id or "Motion")
@@ -223,7 +242,7 @@ class Motion(PosedFigure):
         if hasattr(ipython, "kernel"):  # a notebook, not a terminal
             style = "width:100%;height:560px;border:0"
             frame = f'<iframe sandbox="allow-scripts allow-downloads" style="{style}" srcdoc="{escape(page)}"></iframe>'
-            # IPython warns of a bare iframe, so that it is wrapped in a division.
+            # IPython warns of a bare iframe, so it is wrapped in a division.
             return import_module("IPython.display").HTML(f"<div>{frame}</div>")
         path = Path(tempfile.mkdtemp(prefix="flame_mdm_")) / "motion.html"
         write_text(path, page)
@@ -231,7 +250,10 @@ class Motion(PosedFigure):
 
 
 def amass_parameters(poses: Poses) -> tuple[np.ndarray, np.ndarray]:
-    """Returns axis-angle vectors (F, 66) of 22 joints and translation (F, 3) in AMASS's coordinates: meters, z up."""
+    """Returns axis-angle vectors (F, 66) of 22 joints and the translation (F, 3).
+
+    They are in AMASS's coordinates: meters, z up.
+    """
     world = poses.rotations.clone()
     world[:, 0] = AMASS_AXES @ world[:, 0]
     turns = rotation.matrix_to_axis_angle(world).flatten(1).numpy()
@@ -239,7 +261,7 @@ def amass_parameters(poses: Poses) -> tuple[np.ndarray, np.ndarray]:
 
 
 def motion_of_poses(poses: Poses, fps: float, text: str = "", id: str = "") -> Motion:
-    """Returns the motion of a body whose rotations are known."""
+    """Returns the motion of a body with known rotations."""
     return Motion(poses.joints().float().numpy(), fps, SMPL22, text, id, poses)
 
 
@@ -265,7 +287,7 @@ def _write_npz(motion: Motion, path: Path, facts: dict[str, Any]) -> str:
             "trans": translation,
         }
         content |= {"betas": np.zeros(16), "gender": "neutral", "mocap_framerate": motion.fps}
-        # names of AMASS's SMPL-X files, which GMR reads
+        # names in AMASS's SMPL-X files, which GMR reads
         content |= {
             "root_orient": turns[:, :3],
             "pose_body": turns[:, 3:],
@@ -291,12 +313,12 @@ def _write_bvh(motion: Motion, path: Path, rest_pose: bool, rig: str | None) -> 
     channels, columns = [], []
     for joint, order in enumerate(skeleton.orders):
         channels.append(tuple(f"{axis}rotation" for axis in order))
-        if joint <= skeleton.hips:  # also a root, below which the hips move
+        if joint <= skeleton.hips:  # the hips, and a root above them
             channels[joint] = (*bvh.CHANNELS[:3], *channels[joint])
             at_rest = np.tile(offsets[joint], (len(angles), 1))
             columns.append(np.round(root / skeleton.unit, 5) if joint == skeleton.hips else at_rest)
         columns.append(angles[:, joint])
-    # programs disagree on whether the channels replace the offset or add to it
+    # Programs disagree on whether the channels replace the offset or are added to it.
     offsets[skeleton.hips] = 0
     ends = {
         skeleton.sources.index(SMPL22.joints.index(name)): site for name, site in END_SITES.items()
@@ -321,7 +343,7 @@ def _write_bvh(motion: Motion, path: Path, rest_pose: bool, rig: str | None) -> 
 def _write_rigged(
     motion: Motion, path: Path, rig: str | None, body: Mesh | None, root_motion: bool
 ) -> str:
-    """Writes a .glb, .fbx or USD file: the skeleton in motion, with a skinned body, if one fits."""
+    """Writes a .glb, .fbx or USD file: the moving skeleton with a skinned body, if one fits."""
     poses = motion.posed()
     fitted, reason = motion.try_fit(body)
     name = motion.text or motion.id or "motion"
@@ -339,7 +361,11 @@ def _write_rigged(
 
 
 def _write_character(motion: Motion, path: Path, character: Character | BvhCharacter) -> str:
-    """Writes a .glb or .bvh file, which keeps the skeleton of the character's file, or an .fbx or USD file."""
+    """Writes a character's motion.
+
+    A .glb or .bvh file keeps the skeleton of the character's file. It can also be an .fbx or USD
+    file.
+    """
     name = motion.text or motion.id or "motion"
     ending = path.suffix.lower()
     if isinstance(character, BvhCharacter):
@@ -387,7 +413,7 @@ def _write_video(motion: Motion, path: Path, body: Mesh | None) -> str:
     return summary + (reason and f"; without a body: {reason}")
 
 
-# Millimeters; above it, the line about a file names the joint
+# In millimeters. Above this error, the line about a file names the joint.
 LARGE_ERROR = 10
 
 

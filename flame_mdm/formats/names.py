@@ -1,8 +1,10 @@
-"""Names of joints: one way to match them. Blender's extension contains this file, which needs the standard library.
+"""Matching of joint names.
+
+Blender's extension contains this file, so it needs only the standard library.
 
 Programs write the same joint in many ways: `mixamorig:LeftUpLeg`, `Character1_LeftUpLeg`, `Actor
-left up leg`, `L_UpLeg`. Case, separators, a prefix that many joints share and the place and
-length of the mark of the side (left, L) make no difference.
+left up leg`, `L_UpLeg`. Case, separators, and a prefix that many joints share make no difference.
+The mark of the side may be short or long (L, left), at the beginning or the end.
 """
 
 import re
@@ -11,18 +13,18 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 SIDES = (("left", "l"), ("right", "r"))  # marks of the left and of the right side in names
-SHARED = 10  # minimum number of joints with a prefix; a skeleton without hands has about 20 joints
+SHARED = 10  # minimum number of joints with a prefix; without hands, skeletons have about 20
 PREFIXES = 16  # maximum number of prefixes that are tried
-JOINED = re.compile(r"mixamorig\d*")  # a prefix that may lack a separator
+JOINED = re.compile(r"mixamorig\d*")  # a prefix that may have no separator after it
 
 
 class Match(NamedTuple):
-    """The skeleton that fits names best.
+    """The skeleton that fits some names best.
 
     Attributes:
-        skeleton: its key.
-        numbers: name in the skeleton -> indices of the joints that may be meant, more than one if
-            this is ambiguous.
+        skeleton: key of the skeleton.
+        numbers: indices of the joints that each name in the skeleton may mean. Several indices
+            are ambiguous.
         missing: names of the skeleton that no joint has.
     """
 
@@ -37,10 +39,10 @@ def plain(name: str) -> str:
 
 
 def spellings(name: str, opposite: str) -> list[str]:
-    """Returns the `plain` spellings of a name, itself first; `opposite` is its counterpart on the other side.
+    """Returns the `plain` spellings of a name. The name itself is first.
 
-    The mark of the side is spelled in either length, before or after the rest: LeftHip, L_Hip,
-    hip.L.
+    `opposite` is its counterpart on the other side. The mark of the side is spelled short or
+    long, before or after the rest: LeftHip, L_Hip, hip.L.
     """
     name, opposite = plain(name), plain(opposite)
     options = [name]
@@ -56,9 +58,12 @@ def spellings(name: str, opposite: str) -> list[str]:
 
 
 def spelled(pairs: Mapping[str, str]) -> dict[str, str]:
-    """Returns `spellings` of names -> names, from names -> their counterparts on the other side, or themselves.
+    """Returns the name of each of the `spellings` of some names.
 
-    A spelling of two names means the one that is spelled so itself.
+    If two names have the same spelling, it means the name that is spelled exactly like it.
+
+    Args:
+        pairs: for each name, its counterpart on the other side, or the name itself.
     """
     variants = {name: spellings(name, opposite) for name, opposite in pairs.items()}
     names: dict[str, str] = {}
@@ -71,15 +76,15 @@ def spelled(pairs: Mapping[str, str]) -> dict[str, str]:
 
 
 def best_match(names: Sequence[str], skeletons: Mapping[str, Mapping[str, str]]) -> Match:
-    """Returns the skeleton that names of joints fit best.
+    """Returns the skeleton that fits names of joints best.
 
-    Skeletons without missing joints come first, then the skeleton with the most joints; among
-    equals, the first one counts. Prefixes that fit equally well make the match ambiguous.
+    Skeletons without missing joints are preferred. Then the number of joints decides, then the
+    order. If several prefixes fit equally well, the match is ambiguous.
 
     Args:
         names: names of the joints of a file, at least one.
-        skeletons: for each key, spelling of a joint -> name in the skeleton; the first spelling
-            is preferred.
+        skeletons: for each key, the name in the skeleton by spelling of a joint. The first
+            spelling is preferred.
     """
     best: list[Match] = []
     score = (False, -1)
@@ -114,7 +119,10 @@ def _match(key: str, skeleton: Mapping[str, str], by_name: Mapping[str, list[int
 
 
 def _prefixes(names: Sequence[str]) -> list[str]:
-    """Returns "" and the prefixes that at least `SHARED` names have, up to a separator, the most frequent first."""
+    """Returns "" and the prefixes, up to a separator, that at least `SHARED` names have.
+
+    The most frequent prefix is first.
+    """
     counts: Counter[str] = Counter()
     for name in set(names):
         counts.update(

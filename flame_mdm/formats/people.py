@@ -1,9 +1,9 @@
-"""Bodies by name: the mannequin, the body in a file, and people of all shapes made by Anny (`body="anny age=0.9"`).
+"""Bodies by name: the mannequin, the body in a file, and people of all shapes by Anny.
 
-Brégier et al., "Human Mesh Modeling for Anny Body", 2026, https://arxiv.org/abs/2511.03589: (c)
-2025 NAVER Corp., Apache-2.0; its shapes and weights come from MakeHuman and MPFB2, CC0.
-Topologies of SMPL and SMPL-X, which Anny downloads and which are not free for commercial use, are
-never built.
+Anny's shapes are given as numbers (`body="anny age=0.9"`). Source: Brégier et al., "Human Mesh
+Modeling for Anny Body", 2026, https://arxiv.org/abs/2511.03589: (c) 2025 NAVER Corp., Apache-2.0.
+Its shapes and weights come from MakeHuman and MPFB2, CC0. Anny can also download topologies of
+SMPL and SMPL-X, which are not free for commercial use. They are never built here.
 """
 
 import os
@@ -31,8 +31,10 @@ from flame_mdm.visualize.body import (
 )
 
 SHAPE = {"gender": 0.5, "age": 2 / 3, "height": 0.45, "weight": 0.4}
-"""Anny's numbers and their defaults, 0 to 1: male to female, baby to old (2/3: a young adult), small to tall, light to
-heavy."""
+"""Anny's numbers and their defaults, from 0 to 1.
+
+They mean male to female, baby to old (2/3: a young adult), small to tall, light to heavy.
+"""
 PARTS = {
     "spine1": "spine04 spine03",
     "spine2": "spine02",
@@ -48,7 +50,10 @@ PARTS = {
     "ankle": "foot",
     "foot": "toe",
 }
-"""Joint of SMPL -> beginnings of the names of Anny's bones that follow it; all others follow the pelvis."""
+"""By joint of SMPL: prefixes of the names of Anny's bones that follow it.
+
+Others follow the pelvis.
+"""
 HEADS = {
     "hip": "upperleg01",
     "knee": "lowerleg01",
@@ -56,7 +61,7 @@ HEADS = {
     "foot": "toe2-1",
     "shoulder": "upperarm01",
 } | {**{"elbow": "lowerarm01", "wrist": "wrist", "head": "head"}}
-"""Joint of SMPL -> the bone of Anny that begins there."""
+"""By joint of SMPL: the bone of Anny that begins there."""
 CLOTHES = {
     "neck": SKIN,
     "head": SKIN,
@@ -67,10 +72,14 @@ CLOTHES = {
 
 
 def load_body(name: str) -> Mesh:
-    """Returns a body: "mannequin", a file, or "anny" and numbers of its shape, such as "anny gender=1 age=0.9".
+    """Returns a body by its name.
 
-    Anny takes about 90 seconds for the first body; each body is kept in the user's cache. Raises
-    `UserError` if the file is damaged, a number is unknown, or Anny is not installed.
+    A name is "mannequin", a file, or "anny" with numbers of its shape, such as "anny gender=1
+    age=0.9". Anny takes about 90 seconds for the first body. Each body is saved in the user's
+    cache.
+
+    Raises:
+        UserError: If the file is damaged, a number is unknown, or Anny is not installed.
     """
     kind, *words = name.split() or [""]
     if kind != "anny":
@@ -106,7 +115,10 @@ def shape_of(words: list[str]) -> dict[str, float]:
 
 
 def bake(shape: dict[str, float]) -> dict[str, np.ndarray]:
-    """Returns the arrays of the file of a figure of Anny: `packed`. Anny takes about 90 seconds the first time."""
+    """Returns the arrays of a file with a body of Anny; see `packed`.
+
+    Anny takes about 90 seconds the first time.
+    """
     try:
         package = import_module("anny")
     except ImportError:
@@ -176,10 +188,10 @@ def _joints(heads: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def _turns(joints: np.ndarray) -> np.ndarray:
-    """Returns rotations (22, 3, 3) in the world from the rest pose of SMPL to joints (22, 3) in Anny's rest pose.
+    """Returns rotations (22, 3, 3) in the world from SMPL's rest pose to Anny's rest pose.
 
-    Pelvis, chest and head keep their direction, and feet stay level; arms are twisted so that elbows bend like
-    SMPL's.
+    `joints` (22, 3) are in Anny's rest pose. Pelvis, chest and head keep their direction, and
+    feet stay level. Arms are twisted so that elbows bend like SMPL's.
     """
     turns = np.tile(np.eye(3), (len(SMPL22), 1, 1))
     usual = np.array(ADULT)
@@ -201,7 +213,10 @@ def _turns(joints: np.ndarray) -> np.ndarray:
 
 
 def _clothes(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Returns colors (V, 3), 0 to 255, by the joint that a vertex follows, with the mannequin's hair."""
+    """Returns colors (V, 3), 0 to 255, by the joint that a vertex follows.
+
+    The hair is the mannequin's.
+    """
     table = np.array([CLOTHES.get(name.split("_")[-1], SHIRT) for name in SMPL22.joints], float)
     colors = weights @ table
     figure, head = mannequin(), weights[:, JOINT["head"]] > 0.5
@@ -215,7 +230,10 @@ def _clothes(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def hairline(points: np.ndarray) -> np.ndarray:
-    """Returns the distance of points of the head into the hair: above the forehead, and behind the ears."""
+    """Returns how far points of the head are inside the hair.
+
+    Hair is above the forehead and behind the ears.
+    """
     above = (points - [0, 0.757, 0.086]) @ np.array([0, 0.84, -0.54])
     behind = np.minimum(
         (points - [0, 0.70, 0.016]) @ np.array([0, 0.10, -0.99]), points[..., 1] - 0.652
@@ -224,16 +242,17 @@ def hairline(points: np.ndarray) -> np.ndarray:
 
 
 def smooth(low: float, high: float, value: np.ndarray) -> np.ndarray:
-    """Returns 0 below `low`, 1 above `high` and a smooth transition between."""
+    """Returns 0 below `low`, 1 above `high`, and a smooth transition in between."""
     share = np.clip((value - low) / (high - low), 0, 1)
     return share * share * (3 - 2 * share)
 
 
 def with_helpers(points: np.ndarray, weights: np.ndarray, joints: np.ndarray) -> np.ndarray:
-    """Returns weights (V, 28): the upper part of limbs moves to helper bones, which turn less about the limb.
+    """Returns weights (V, 28) with helper bones.
 
-    The forearm is the other way round: its lower half moves to a bone that takes part in the
-    twist of the wrist. `joints` (22, 3) are the joints of the mesh.
+    The upper part of a limb follows a helper bone, which turns less about the limb. In the
+    forearm, it is the lower part: it follows a bone that takes part in the twist of the wrist.
+    `joints` (22, 3) are the joints of the mesh.
     """
     columns = []
     for joint, _ in HELPERS:
@@ -256,7 +275,8 @@ def packed(
 ) -> dict[str, np.ndarray]:
     """Returns the arrays of the file of a body, which `Mesh` reads.
 
-    Points are stored in 1/20 mm, with the pelvis at 0, and normals in 1/127.
+    Points are stored in units of 1/20 mm, with the pelvis at 0. Normals are stored in units of
+    1/127.
     """
     bones, shares = largest_weights(weights)
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Joint rotations from joint positions, by analytic inverse kinematics of SMPL's first 22 joints."""
+"""Joint rotations from joint positions: analytic inverse kinematics of 22 joints of SMPL."""
 
 import math
 from collections.abc import Sequence
@@ -20,32 +20,38 @@ CHILDREN = tuple(
 )
 PELVIS, SPINE3 = 0, 9
 ALIKE = ((0,), (1, 2), (3,), (4, 5), (6,), (7, 8), (9,), (12,), (13, 14), (16, 17), (18, 19))
-"""Joints with children, from the root outward, left and right joints together."""
-# Joints between pelvis and chest -> fraction of the rotation from pelvis to chest
+"""Joints with children, from the root outward. Left and right joints are together."""
+# For each joint between pelvis and chest, its fraction of the rotation from pelvis to chest
 SPINE = {
     3: 1 / 3,
     6: 2 / 3,
 }
 BENDS = {1: -1.0, 2: -1.0, 16: 1.0, 17: 1.0}
-"""Hips and shoulders -> z of the direction in which the knee or elbow bends the limb in the rest pose."""
+"""By hip and shoulder: z of the direction to which the knee or elbow bends in the rest pose."""
 STRAIGHT = 0.15
-"""Sine of the bend of a knee or elbow at which bend and parent's rotation have the same weight for the limb's twist.
-Weights are squared, so that a clear bend dominates."""
-# Weight of the foot relative to the shin in the twist of a thigh. The shin tells nothing of the
-# twist while the leg is straight.
+"""Sine of the bend of a knee or elbow at which two cues of the limb's twist have the same weight.
+
+The cues are the bend and the rotation of the parent. Weights are squared, so that a clear bend
+dominates.
+"""
+# Weight of the foot relative to the shin, for the twist of a thigh. The shin says nothing about
+# the twist while the leg is straight.
 FOOT = 0.3
 # Seconds over which bends are averaged, so that an arm does not spin while it is nearly straight
 SMOOTH = 0.1
-SQUARINGS = 12  # squarings that isolate an eigenvector; others shrink by the power 4,096
+SQUARINGS = 12  # squarings that isolate an eigenvector: others shrink with the power 4,096
 
 
 @dataclass(eq=False)
 class Poses:
-    """A body in motion, in meters, y up; the rest pose is SMPL's: arms out to the sides, facing +z, left at +x."""
+    """A moving body, in meters, y up.
+
+    The rest pose is SMPL's: arms to the sides, facing +z, left at +x.
+    """
 
     # (22, 3) float64, position of each joint of `SMPL22` relative to its parent in the rest pose
     offsets: Tensor
-    # (F, 22, 3, 3) float64, relative to parents; they apply to the bones that leave a joint
+    # (F, 22, 3, 3) float64, relative to the parents. They apply to the bones that leave a joint.
     rotations: Tensor
     root: Tensor  # (F, 3) float64, position of the pelvis
 
@@ -59,9 +65,9 @@ class Poses:
         return joints - joints.new_tensor([0, 1, 0]) * joints[:, 1].min()
 
     def resampled(self, rate: float, fps: float) -> "Poses":
-        """Returns the motion at `fps` instead of `rate` frames per second, with rotations interpolated on the sphere.
+        """Returns the motion at `fps` instead of `rate` frames per second.
 
-        The path of the pelvis is interpolated by cubic splines.
+        Rotations are interpolated on the sphere, and the path of the pelvis with cubic splines.
         """
         if math.isclose(rate, fps):
             return self
@@ -78,8 +84,10 @@ class BoneRotations:
     """Rotations of SMPL's joints that a file contains, taken from its bones.
 
     Attributes:
-        poses: the rotations, on a body with the bones of the file; None if there are none that can be used.
-        reason: why the rotations of the file cannot be used; "" if it has none, or if they can.
+        poses: the rotations, on a body with the bones of the file. None: the file has no usable
+            rotations.
+        reason: why the rotations of the file cannot be used. "": the file has no rotations, or
+            they can be used.
     """
 
     poses: Poses | None = None
@@ -89,13 +97,20 @@ class BoneRotations:
 def solve(joints: Tensor, fps: float) -> Poses:
     """Computes a body and rotations that reproduce its joint positions in every frame.
 
-    Bones get their mean length over the clip. Pelvis and chest, which have three bones each, are rotated for the best
-    fit of all three (Kabsch 1976); every other joint aims its bone at the next joint. Positions do not determine the
-    twist of a bone about its own axis: thighs and upper arms are twisted so that knees and elbows bend like hinges, the
-    spine twists evenly from pelvis to chest, and all other joints, also head, hands and toes, follow their parent.
+    Bones get their mean length over the clip. Pelvis and chest have three bones each. They are
+    rotated for the best fit of all three bones (Kabsch 1976). Every other joint aims its bone at
+    the next joint.
 
-    `joints` (F, 22, 3) have the order of `SMPL22`, in meters, y up. Raises `UserError` if they have another
-    shape, or if a bone has no length.
+    Positions do not determine the twist of a bone about its own axis. Thighs and upper arms are
+    twisted so that knees and elbows bend like hinges. The spine twists evenly from pelvis to
+    chest. All other joints, including head, hands and toes, follow their parent.
+
+    Args:
+        joints: (F, 22, 3) in the order of `SMPL22`, in meters, y up.
+        fps: frames per second.
+
+    Raises:
+        UserError: If the joints have another shape, or a bone has no length.
     """
     if joints.ndim != 3 or not len(joints) or joints.shape[1:] != (len(SMPL22), 3):
         raise UserError(
@@ -114,9 +129,10 @@ def solve(joints: Tensor, fps: float) -> Poses:
 
 
 def solve_checked(joints: Tensor, fps: float) -> tuple[Tensor, Tensor]:
-    """Returns offsets (22, 3) and quaternions (F, 22, 4) of `solve` in the joints' precision, without checks.
+    """Returns offsets (22, 3) and quaternions (F, 22, 4) of `solve`, without checks.
 
-    Has no data-dependent branches and solves similar joints in one batch, so that its ONNX graph is small.
+    They have the precision of the joints. The function has no data-dependent branches and solves
+    similar joints in one batch, so that its ONNX graph is small.
     """
     bones = SMPL22.bones(joints)
     lengths = torch.linalg.vector_norm(bones, dim=-1).mean(0)
@@ -170,15 +186,15 @@ def solve_checked(joints: Tensor, fps: float) -> tuple[Tensor, Tensor]:
 
 
 def _fit(offsets: Tensor, bones: Tensor) -> Tensor:
-    """Returns quaternions (F, 4) that best align K offsets (K, 3) with K bones (F, K, 3), by repeated squaring.
+    """Returns quaternions (F, 4) that best align K offsets (K, 3) with K bones (F, K, 3).
 
-    They are dominant eigenvectors (Horn 1987, "Closed-form solution of absolute orientation using unit quaternions").
-    Bones without length give the identity.
+    They are dominant eigenvectors (Horn 1987, "Closed-form solution of absolute orientation using
+    unit quaternions"), computed by repeated squaring. Bones without length give the identity.
     """
     (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in (offsets.mT @ bones).unbind(-2))
-    # The rotation is the eigenvector of the largest eigenvalue of this symmetric matrix. ONNX
-    # has no operator for eigenvectors. The columns of high powers of a matrix approach this
-    # eigenvector, and repeated squaring takes few operations.
+    # The rotation is the eigenvector of the largest eigenvalue of this symmetric matrix. ONNX has
+    # no operator for eigenvectors. The columns of high powers of a matrix approach this
+    # eigenvector, and repeated squaring needs few operations.
     rows = (
         torch.stack((a + e + i, f - h, g - c, b - d), -1),
         torch.stack((f - h, a - e - i, b + d, g + c), -1),
@@ -198,9 +214,14 @@ def _fit(offsets: Tensor, bones: Tensor) -> Tensor:
 def _twist(
     group: Sequence[int], swung: Tensor, offsets: Tensor, bones: Tensor, fps: float
 ) -> Tensor:
-    """Returns quaternions (F, G, 4) that rotate limbs, which begin at G joints, about their axes until hinges match.
+    """Returns quaternions (F, G, 4) that rotate limbs about their axes until hinges match.
 
-    `swung` (F, G, 4) are the limbs before, with `offsets` (G, 3); `bones` (F, 22, 3) are all of them.
+    Args:
+        group: the G joints at which the limbs begin.
+        swung: (F, G, 4), rotations of the limbs before the twist.
+        offsets: (G, 3), offsets of the limbs.
+        bones: (F, 22, 3), all bones.
+        fps: frames per second.
     """
     middle = [CHILDREN[joint][0] for joint in group]
     end = [CHILDREN[joint][0] for joint in middle]
@@ -225,7 +246,7 @@ def _twist(
 
 
 def _smooth(x: Tensor, frames: float) -> Tensor:
-    """Smooths (F, N) over time with a Gaussian whose standard deviation is `frames`."""
+    """Smooths (F, N) over time with a Gaussian. Its standard deviation is `frames`."""
     reach = int(4 * frames + 0.5)
     weights = torch.exp(-0.5 * (torch.arange(-reach, reach + 1) / frames) ** 2).to(x)
     padded = torch.cat([x[:1].expand(reach, -1), x, x[-1:].expand(reach, -1)])

@@ -1,21 +1,29 @@
-"""Rotations of a body in the world. Blender's extension contains this file: it needs numpy alone."""
+"""Rotations of a body in the world.
+
+Blender's extension contains this file, so it needs only numpy.
+"""
 
 import numpy as np
 
 from flame_mdm.representations.skeleton import JOINT, SMPL22
 
-# Cosine of the largest tilt of the chest at which the head is level on average
+# Cosine of the maximum tilt of the chest at which the head is level on average
 UPRIGHT = np.cos(np.radians(30))
-STANDING = 0.02  # largest height in meters of a flat foot above its lowest position
+STANDING = 0.02  # maximum height in meters of a flat foot above its lowest position
 TOES = (0.02, 0.09, np.radians(60))
-"""Heights of the toe joint below which toes stay flat, and above which they follow the foot; and the largest bend."""
+"""Limits for the bend of toes.
+
+They are the height of the toe joint below which toes stay flat, the height above which they
+follow the foot, and the maximum bend.
+"""
 
 
 def complete(
     joints: np.ndarray, offsets: np.ndarray, world: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Completes rotations that were solved from positions, which show neither the head's pitch
-    nor the toes.
+    """Completes rotations that were computed from positions.
+
+    Positions show neither the pitch of the head nor the bend of the toes.
 
     Args:
         joints: (F, 22, 3) in meters.
@@ -24,11 +32,11 @@ def complete(
 
     Returns:
         The rotation (22, 3, 3) of each part of the body in the rest pose, the rotations (F, 22,
-            3, 3) of these
-        parts in the world, and the offsets (22, 3) of a body that stands on flat feet.
+            3, 3) of these parts in the world, and the offsets (22, 3) of a body that stands on
+            flat feet.
     """
-    # A person who stands upright looks straight ahead: the median direction from neck to head,
-    # seen from an upright chest, is where the head is level. Toes stay flat on the floor while
+    # A person who stands upright looks straight ahead. The head is therefore level in the median
+    # direction from neck to head, relative to an upright chest. Toes stay flat on the floor while
     # the heel rises.
     neutral, offsets = np.tile(np.eye(3), (len(SMPL22), 1, 1)), offsets.copy()
     for side in ("left", "right"):
@@ -50,7 +58,7 @@ def complete(
 
 
 def world_rotations(rotations: np.ndarray) -> np.ndarray:
-    """Returns rotations (..., 22, 3, 3) in the world; `rotations` are relative to the parents."""
+    """Converts rotations (..., 22, 3, 3) relative to the parents to rotations in the world."""
     world = rotations.copy()
     for parent, joint in SMPL22.edges:
         world[..., joint, :, :] = world[..., parent, :, :] @ rotations[..., joint, :, :]
@@ -58,7 +66,10 @@ def world_rotations(rotations: np.ndarray) -> np.ndarray:
 
 
 def orthonormal(direction: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Returns axes as rows (3, 3): the direction, then `u` made orthogonal to it, then the third one."""
+    """Returns axes as rows (3, 3).
+
+    They are the direction, then `u` made orthogonal to it, then the third axis.
+    """
     along = direction / np.linalg.norm(direction)
     across = u - (u @ along) * along
     across /= np.linalg.norm(across)
@@ -77,7 +88,7 @@ def shortest_turns(start: np.ndarray, end: np.ndarray) -> np.ndarray:
 
 def rotations_about(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
     """Returns rotations (..., 3, 3) about unit vectors (..., 3) by angles (...)."""
-    # Rodrigues' formula, with the matrix of the cross product.
+    # Rodrigues' formula, with the matrix of the cross product
     x, y, z = np.moveaxis(axis, -1, 0)
     cross = np.stack([0 * x, -z, y, z, 0 * x, -x, -y, x, 0 * x], -1).reshape(*axis.shape, 3)
     sine, cosine = np.sin(angle)[..., None, None], np.cos(angle)[..., None, None]
@@ -85,7 +96,7 @@ def rotations_about(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
 
 
 def _flat_foot(ankle: np.ndarray, toe: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """Returns the position of the toes relative to the ankle while the foot stands flat, in the rest pose."""
+    """Returns the position of the toes of a flat foot relative to the ankle, at rest."""
     # The foot is flat in the frames in which ankle and toes together are lowest.
     height = ankle[:, 1] + toe[:, 1]
     flat = height <= height.min() + STANDING
@@ -96,7 +107,10 @@ def _flat_foot(ankle: np.ndarray, toe: np.ndarray, offset: np.ndarray) -> np.nda
 
 
 def _toes(foot: np.ndarray, height: np.ndarray) -> np.ndarray:
-    """Returns the rotations (F, 3, 3) of the toes relative to a foot, whose world rotations are `foot` (F, 3, 3)."""
+    """Returns the rotations (F, 3, 3) of the toes relative to a foot.
+
+    `foot` (F, 3, 3) are the world rotations of the foot.
+    """
     low, high, most = TOES
     down = np.clip(np.arcsin(np.clip(-foot[:, 1, 2], -1, 1)), 0, most)
     near = np.clip((high - height) / (high - low), 0, 1)

@@ -1,6 +1,7 @@
-"""The reader of motion files; writers are in `flame_mdm.formats.motion`. `docs/formats.md` describes the files.
+"""The reader of motion files. Writers are in `flame_mdm.formats.motion`.
 
-Commands, data sets and Python read motions here, so that each file gets the same skeleton, frame rate and checks.
+`docs/formats.md` describes the files. Commands, data sets and Python read motions here, so a file
+gets the same skeleton, frame rate and checks everywhere.
 """
 
 import math
@@ -41,31 +42,39 @@ from flame_mdm.representations.skeleton import SKELETONS, SMPL22, Skeleton
 from flame_mdm.representations.smpl import ADULT
 from flame_mdm.safe_io import naming, regular_file
 
-# Rotation from the camera's axes of the action data sets, y down, to y up.
+# Rotation from the camera's axes of the action data sets, y down, to y up
 CAMERA_AXES = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))
-# Representations with SMPL's rotations -> number of features.
+# Number of features of the representations with SMPL's rotations
 ROTATED = {
     "smpl147": 147,
     "rot6d-25": 150,
     "motion272": 272,
 }
 BODY_AXES = {"z": AMASS_AXES, "y": torch.eye(3, dtype=torch.float64), "-y": CAMERA_AXES}
-"""Axis that points up in a file of SMPL's rotations -> the rotation to y up; as in AMASS, it is z by default."""
+"""By axis that points up in a file of SMPL's rotations: the rotation to y up.
+
+As in AMASS, the default is z.
+"""
 PELVIS = (0.0, -0.223, 0.028)
-"""Pelvis of SMPL's template in meters: a body is there at translation 0, in the axes of the file, however it turns."""
+"""Position of the pelvis of SMPL's template in meters, in the axes of the file.
+
+A body is there at translation 0, for any rotation.
+"""
 
 Standard = Callable[[Bvh], tuple[Bvh, Mapping[str, Any]]]
-"""A change of the tree of a published data set. Returns the tree and fields of `Layout`; without fields, the
-layout follows from the file."""
+"""A change of the tree of a published data set. It returns the tree and fields of `Layout`.
+
+Without fields, the file determines the layout.
+"""
 
 
 @dataclass(frozen=True)
 class Doubts:
-    """What looks wrong in a motion and may yet be meant.
+    """Findings that look wrong in a motion, but may be intended.
 
     Attributes:
-        upright: mean vertical component of the direction of the trunk, -1 to 1; NaN if it was not measured, in files of
-            this project and with KIT-ML's skeleton.
+        upright: mean vertical component of the direction of the trunk, -1 to 1. NaN = not
+            measured, in files of this project and with KIT-ML's skeleton.
         lying: a line if the body lies, "" otherwise.
         jump: a line if the body jumps or a leg flips, "" otherwise.
     """
@@ -82,14 +91,16 @@ class Doubts:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A motion that was read from a file, and what the reader learned.
+    """A motion that was read from a file, with findings of the reader.
 
     Attributes:
-        motion: the motion; its notes are lines for the user.
+        motion: the motion. Its notes are lines for the user.
         layout: skeleton, unit and frame rate of the file, as `prepare` lists them.
-        doubts: what looks wrong; its lines are among the notes of the motion.
-        smpl: translation (F, 3) and quaternions (F, 24, 4) of SMPL's joints in AMASS's axes, if the file has them.
-        tree: the tree of joints, without rest pose, at the frame rate of the file, if the file has one.
+        doubts: findings that look wrong. Their lines are among the notes of the motion.
+        smpl: translation (F, 3) and quaternions (F, 24, 4) of SMPL's joints in AMASS's axes; None
+            if the file has none.
+        tree: the tree of joints without rest pose, at the frame rate of the file; None if the
+            file has none.
     """
 
     motion: Motion
@@ -109,26 +120,29 @@ def read(
 ) -> Motion:
     """Reads a motion file.
 
-    Files are `.npz` of this project, of AMASS or with joints and fps, `.bvh`, animations in `.fbx`, `.glb`, `.vrm` and
-    `.vrma`, `.amc`, `.json`, or `.npy`.
+    It can be an `.npz` file of this project, of AMASS or with joints and fps, a `.bvh` file, an
+    animation in an `.fbx`, `.glb`, `.vrm` or `.vrma` file, or an `.amc`, `.json` or `.npy` file.
 
     Args:
-        path: the file. The nearest `skeleton.yaml` in its folder or above describes it, except files written by this
-            project; `fps`, `unit` and `up` override it.
-        fps: frames per second, overrides the rate in the file; .npy and .amc files have none.
-        unit: meters per unit of length in the file, not for files with SMPL's rotations, such as AMASS.
+        path: the file. The nearest `skeleton.yaml` in its folder or above describes it, except
+            for files written by this project. `fps`, `unit` and `up` override it.
+        fps: frames per second; overrides the rate in the file. .npy and .amc files contain no
+            rate.
+        unit: meters per unit of length in the file. Not for files with SMPL's rotations, such as
+            AMASS's files.
         up: the axis of the file that points up: y, z or -y.
-        resample_to: target frame rate; None = the rate of the file. Rotations are interpolated on the
-            sphere, joints and translations with cubic splines.
-        animation: name or number, from 1, of an animation in an FBX or GLB file; None = the first one.
+        resample_to: target frame rate; None = the rate of the file. Rotations are interpolated on
+            the sphere, joints and translations with cubic splines.
+        animation: name or number, from 1, of an animation in an FBX or GLB file; None = the first
+            one.
 
     Returns:
         The motion; its `notes` say what was left out or looks wrong.
 
     Raises:
         FileNotFoundError: If there is no such file.
-        UserError: If the file is damaged, of another kind, without rate, not of a person's size,
-            or if an argument has no effect on it.
+        UserError: If the file is damaged or of another kind, has no rate, or is not of a person's
+            size. Also if an argument has no effect on it.
 
     Example:
         >>> walk = read("walk.bvh", resample_to=20)
@@ -152,8 +166,9 @@ def read_recording(
 ) -> Recording:
     """Reads and checks a motion; see `read` for arguments and errors.
 
-    `as_smpl` maps all arrays to SMPL's 22 joints, otherwise KIT-ML's 21 joints and SMPL's hands are kept. `standard`
-    changes the tree of a published data set, whose root is then resampled linearly, as published.
+    `as_smpl` maps all arrays to SMPL's 22 joints. Otherwise, KIT-ML's 21 joints and SMPL's hands
+    are kept. `standard` changes the tree of a published data set. As published, its root is then
+    resampled linearly.
     """
     path = Path(path)
     if path.suffix.lower() not in ENDINGS:
@@ -180,7 +195,10 @@ def read_recording(
 
 
 def from_array(joints: Any, fps: float | None) -> Motion:
-    """Returns a motion of joints (F, J, 3) in meters, y up, of the built-in skeleton with this number of joints."""
+    """Returns a motion of joints (F, J, 3) in meters, y up.
+
+    The built-in skeleton is chosen by the number of joints.
+    """
     values = joints.detach().cpu().numpy() if isinstance(joints, Tensor) else np.asarray(joints)
     if not is_real(values):
         name = type(joints).__name__
@@ -250,7 +268,10 @@ def _of_scene(
     resample_to: float | None,
     fields: Mapping[str, Any],
 ) -> Recording:
-    """Returns the recording of an animation of nodes, whose positions are in meters, y up, unless `fields` differ."""
+    """Returns the recording of an animation of nodes.
+
+    Its positions are in meters, y up, unless `fields` differ.
+    """
     _refuse(fields, ["joints"], "FBX and GLB files contain the names of their joints")
     scene = scenes.read(path, animation)
     rate = scene.fps if rate is None else rate
@@ -279,12 +300,15 @@ def _of_joints(
     said: dict[str, Any],
     as_smpl: bool,
 ) -> Recording:
-    """Returns the recording of an array of joints; `said` has the keys of the command, which override the file's."""
+    """Returns the recording of an array of joints.
+
+    `said` has the keys of the command, which override the keys of the file.
+    """
     rate, joints = _rate(data, rate, fields), data["joints"]
     stated = {key: data[key] for key in ("up", "unit") if key in data}
     fields = _checked(fields | stated | said)
     names = tuple(data.get("names", ()))
-    # Without names, the skeleton follows from the number of joints.
+    # Without names, the number of joints determines the skeleton.
     is_counted = not names and not {"joints", "map"} & fields.keys()
     if (
         names
@@ -365,7 +389,10 @@ def _of_ours(
     said: dict[str, Any],
     as_smpl: bool,
 ) -> Recording:
-    """Returns the recording of a file that this project wrote: in meters, y up, with rotations and features."""
+    """Returns the recording of a file that this project wrote.
+
+    It is in meters, y up, with rotations and features.
+    """
     for key, value in said.items():
         raise UserError(
             f"{key}={value} has no effect: this project wrote the file, in meters, y up. Drop {key}="
@@ -392,7 +419,10 @@ def _of_ours(
 
 
 def _rate(data: Mapping[str, Any], rate: float | None, fields: Mapping[str, Any]) -> float:
-    """Returns the frame rate of arrays, from the command, from the file, or from skeleton.yaml, in this order."""
+    """Returns the frame rate of arrays.
+
+    It comes from the command, the file, or skeleton.yaml, in this order.
+    """
     rate = data.get("fps", fields.get("fps")) if rate is None else rate
     if rate is None:
         raise UserError(
@@ -402,7 +432,7 @@ def _rate(data: Mapping[str, Any], rate: float | None, fields: Mapping[str, Any]
 
 
 def _checked(fields: dict[str, Any]) -> dict[str, Any]:
-    """Returns fields of `Layout`, some of which a JSON file states, if they are valid."""
+    """Checks fields of `Layout`, some of which may be from a JSON file, and returns them."""
     try:
         Layout(**{key: value for key, value in fields.items() if key in ("up", "unit")})
     except ValueError as error:
@@ -444,7 +474,10 @@ def _label(path: Path, layout: Layout, rate: float) -> str:
 
 
 def _resampled(motion: Motion, fps: float | None) -> Motion:
-    """Returns a motion at another frame rate, with joints alone, or unchanged if it has this rate."""
+    """Returns a motion at another frame rate, with only its joints.
+
+    If it has this rate already, it is returned unchanged.
+    """
     if fps is None or math.isclose(motion.fps, fps):
         return motion
     joints = resample(motion.joints.astype(float), motion.fps, fps, cubic=True)
@@ -452,7 +485,10 @@ def _resampled(motion: Motion, fps: float | None) -> Motion:
 
 
 def _matrices(smpl: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-    """Returns the position of the pelvis (F, 3) and rotations (F, 24, 3, 3) of a translation and quaternions."""
+    """Returns the position of the pelvis (F, 3) and rotation matrices (F, 24, 3, 3).
+
+    The arguments are a translation and quaternions.
+    """
     translation, turns = smpl
     return translation + torch.tensor(PELVIS, dtype=torch.float64), rotation.quaternion_to_matrix(
         turns
@@ -460,7 +496,10 @@ def _matrices(smpl: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
 
 
 def _in_amass_axes(translation: Tensor, turns: Tensor, axes: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns a translation (F, 3) and quaternions (F, 24, 4) in AMASS's axes; `axes` turns the file's to y up."""
+    """Returns a translation (F, 3) and quaternions (F, 24, 4) in AMASS's axes.
+
+    `axes` turns the axes of the file to y up.
+    """
     if torch.equal(axes, AMASS_AXES):
         return translation, turns
     turn, pelvis = AMASS_AXES @ axes, torch.tensor(PELVIS, dtype=torch.float64)
@@ -478,13 +517,16 @@ def _smpl_poses(pelvis: Tensor, rotations: Tensor, axes: Tensor) -> Poses:
 
 
 def _poses(data: dict[str, Any]) -> Poses | None:
-    """Returns the rotations stored with joints, from AMASS arrays or SMPL features; HumanML3D features contain none."""
+    """Returns the rotations stored with joints, from AMASS arrays or SMPL features.
+
+    HumanML3D features contain no such rotations.
+    """
     if "poses" in data:
         if len(data["poses"]) != len(data["joints"]):
             raise UserError(
                 f"{len(data['poses'])} frames of poses, but {len(data['joints'])} of joints"
             )
-        translation, turns = smpl_motion(data)  # written without the template's pelvis
+        translation, turns = smpl_motion(data)  # it does not contain the template's pelvis
         return _smpl_poses(translation, rotation.quaternion_to_matrix(turns), AMASS_AXES)
     representation = str(data.get("representation", ""))
     if "features" not in data or representation not in ROTATED:

@@ -1,4 +1,4 @@
-"""Facts about published recordings that their files do not contain or state wrongly."""
+"""Facts about published recordings that are missing or wrong in their files."""
 
 import re
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 from flame_mdm.safe_io import read_yaml
 
 AT_60: frozenset[str] = frozenset(read_yaml(Path(__file__).with_suffix(".yaml"))["cmu_at_60"])
-"""Subjects, and single recordings, of CMU at 60 frames per second."""
+"""Subjects and single recordings of CMU at 60 frames per second."""
 # Skeletons of CMU's recordings and their conversions
 CMU_SKELETONS = (
     "CMU",
@@ -24,9 +24,9 @@ def is_at_60(trial: str) -> bool:
 
 
 def known_rate(name: str, skeleton: str, fps: float) -> float | None:
-    """Returns the frame rate of a recording if the name of its file and its skeleton show that `fps` is wrong.
+    """Returns the frame rate of a recording if its name and skeleton show that `fps` is wrong.
 
-    Conversions of CMU's recordings to BVH say 120 frames per second for nearly all of them.
+    Conversions of CMU's recordings to BVH state 120 frames per second for nearly all of them.
     """
     trial = TRIAL.search(name)
     if (

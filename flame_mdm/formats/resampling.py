@@ -1,4 +1,7 @@
-"""Frame rates, lengths and resampling of motions; limited, because a file of a few bytes can declare any value."""
+"""Frame rates, lengths and resampling of motions.
+
+They are limited, because a file of a few bytes can declare any value.
+"""
 
 import math
 from typing import Any
@@ -9,21 +12,27 @@ from flame_mdm.errors import UserError
 
 RATES = (0.1, 1000.0)  # lowest and highest frame rate of a motion file, in frames per second
 MAX_FRAMES = 500_000  # maximum number of frames of a motion: 70 minutes at 120 frames per second
-# Maximum frames times joints of a tree: an hour of 57 joints at 120 frames per second
+# Maximum number of frames times joints of a tree: an hour of 57 joints at 120 frames per second
 MAX_POSITIONS = 25_000_000
-# Frames times joints that a file of any size may have: 300 MB while it is read
+# Number of frames times joints that a file of any size may have; reading it takes 300 MB
 FEW_POSITIONS = 1_000_000
 BYTES_PER_POSITION = 4
-"""Smallest number of bytes of a larger file per frame and joint. A joint with three numbers of one digit takes 6 bytes
-in each frame, but end sites take none."""
+"""Minimum number of bytes per frame and joint, for files with more positions.
+
+A joint with three numbers of one digit takes 6 bytes in each frame, but end sites take no bytes.
+"""
 # Maximum number of joint positions after upsampling: 38 minutes of 22 joints at 20 fps
 MAX_RESAMPLED = 1_000_000
 
 
 def frame_rate(value: Any, name: str = "fps") -> float:
-    """Returns a frame rate, `name` in its file, as a float; raises `UserError` unless it is a number in `RATES`."""
+    """Returns a frame rate as a float; `name` is its name in the file.
+
+    Raises:
+        UserError: If the value is not a number in `RATES`.
+    """
     number = np.asarray(value)
-    # Some programs write an array of one number
+    # Some programs write an array with one number
     number = number.reshape(()) if number.size == 1 else number
     if number.shape or number.dtype.kind not in "fiu" or not RATES[0] <= float(number) <= RATES[1]:
         limits = f"from {RATES[0]:g} to {RATES[1]:g}"
@@ -40,7 +49,7 @@ def check_frames(frames: int) -> None:
 def check_tree(frames: int, joints: int, size: int) -> None:
     """Raises `UserError` if a file of `size` bytes has too many frames for its number of joints.
 
-    Each joint takes memory in each frame, even if the file has no numbers for it.
+    Each joint takes memory in each frame, even if the file contains no numbers for it.
     """
     check_frames(frames)
     most = min(MAX_POSITIONS, max(FEW_POSITIONS, size // BYTES_PER_POSITION))
@@ -56,9 +65,12 @@ def frame_pairs(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns the frames before and after each new frame, and its position between them, 0 to 1.
 
-    New frames are at times 0, 1/fps, 2/fps, ... up to the last frame, or past it by `slack` of a
-    frame. Raises `UserError` if there are more than `MAX_FRAMES` frames before, or more than
-    `MAX_RESAMPLED` positions after.
+    New frames are at times 0, 1/fps, 2/fps, ... up to the last frame. The last new frame may be
+    past it by `slack` of a frame.
+
+    Raises:
+        UserError: If there are more than `MAX_FRAMES` frames before, or more than `MAX_RESAMPLED`
+            positions after resampling.
     """
     check_frames(frames)
     count = math.floor((frames - 1) * fps / rate + slack) + 1
@@ -67,8 +79,8 @@ def frame_pairs(
             f"{frames:,} frames at {rate:g} frames per second would become {count:,} at {fps:g}, with {joints} joints: "
             "too many; check the frame rate, or cut the motion"
         )
-    # Frames are counted from the first one, so that rounding errors do not accumulate. The last
-    # new frame may lie a hair past the last old one and takes its value.
+    # Frames are counted from the first one, so that rounding errors do not accumulate. If the
+    # last new frame is slightly past the last old frame, it takes the value of the latter.
     times = np.arange(count) * rate / fps
     before = np.minimum(times.astype(int), frames - 1)
     return before, np.minimum(before + 1, frames - 1), times - before
@@ -78,7 +90,7 @@ def resample(values: np.ndarray, rate: float, fps: float, cubic: bool = False) -
     """Resamples positions (F, ...) from `rate` to `fps` frames per second.
 
     Returns F' = floor((F - 1) fps / rate) + 1 frames. With `cubic`, values between frames are on
-    a cubic spline, and bones keep their length to 0.1 %; otherwise they are interpolated
+    a cubic spline, and bones keep their length to 0.1 %. Otherwise, they are interpolated
     linearly.
     """
     before, after, share = frame_pairs(len(values), rate, fps, math.prod(values.shape[1:-1]))
@@ -89,10 +101,11 @@ def resample(values: np.ndarray, rate: float, fps: float, cubic: bool = False) -
 
 
 def interpolate(values: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Returns the cubic spline through values (F, ...) in frames 0, 1, ... at `times` (N,), in
-    frames.
+    """Returns the cubic spline through values (F, ...) at `times` (N,).
+
+    The values are at times 0, 1, ...; times are in frames.
     """
-    from scipy.interpolate import CubicSpline  # here, because few motions need it
+    from scipy.interpolate import CubicSpline  # imported here, because few motions need it
 
     if len(values) < 2:
         return values[np.zeros(len(times), int)]

@@ -1,4 +1,7 @@
-"""Motions on the skeletons of other programs and data sets; `rigs.yaml` contains their names, rest poses and axes."""
+"""Motions on the skeletons of other programs and data sets.
+
+`rigs.yaml` contains the names, rest poses and axes of these skeletons.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
@@ -20,7 +23,10 @@ from flame_mdm.safe_io import read_yaml
 
 DIRECTIONS = {"up": (0, 1, 0), "down": (0, -1, 0), "forward": (0, 0, 1), "back": (0, 0, -1)}
 SMPL_ORDERS = tuple("YXZ" if name.endswith("shoulder") else "YZX" for name in SMPL22.joints)
-"""Euler orders that keep gimbal lock away from common poses: bent limbs, a hanging arm, a body that turns or bows."""
+"""Euler orders for which common poses are far from gimbal lock.
+
+Such poses are bent limbs, a hanging arm, and a body that turns or bows.
+"""
 
 
 @cache
@@ -30,7 +36,7 @@ def presets() -> dict[str, dict[str, Any]]:
 
 
 def joint_names(skeleton: Mapping[str, Any]) -> dict[str, str]:
-    """Returns SMPL's joints -> names of the joints of a skeleton in `rigs.yaml`, without prefix."""
+    """Returns the joint names of a skeleton in `rigs.yaml`, without prefix, by SMPL's joint."""
     names = {}
     for part, side, mark in _parts(skeleton):
         bones = {joint: name for name, joint in skeleton[part].items() if isinstance(joint, str)}
@@ -39,14 +45,17 @@ def joint_names(skeleton: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _parts(skeleton: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
-    """Yields the parts of a skeleton in `rigs.yaml`: key, prefix of SMPL's joints, mark of the side in names."""
+    """Yields the parts of a skeleton in `rigs.yaml`.
+
+    A part is its key, the prefix of SMPL's joints, and the mark of the side in names.
+    """
     yield "trunk", "", ""
     for side, mark in zip(("left_", "right_"), skeleton["sides"], strict=True):
         yield from (("leg", side, mark), ("arm", side, mark))
 
 
 def preset(name: str | None, poses: Poses) -> Rig:
-    """Returns a skeleton of `rigs.yaml` with the bone lengths of a body; None = SMPL's own skeleton."""
+    """Returns a skeleton of `rigs.yaml` with a body's bone lengths; None = SMPL's skeleton."""
     if name is None:
         same, sources = np.tile(np.eye(3), (len(SMPL22), 1, 1)), tuple(range(len(SMPL22)))
         return Rig(
@@ -86,8 +95,8 @@ def preset(name: str | None, poses: Poses) -> Rig:
                     _RigJoint(label, parent, joint, rest[joint], posed[joint] @ local, local)
                 )
             else:
-                # A joint that SMPL lacks is at a share of the way from its parent to the next
-                # joint of SMPL. It does not rotate.
+                # A joint that SMPL lacks is between its parent and the next joint of SMPL, at a
+                # fraction of the distance. It does not rotate.
                 above = joints[parent]
                 following = next(ours for _, ours in names[number:] if isinstance(ours, str))
                 distance = rest[JOINT[side + following]] - above.position
@@ -108,7 +117,10 @@ def preset(name: str | None, poses: Poses) -> Rig:
 
 
 class _RigJoint(NamedTuple):
-    """A joint of a rig: name, parent, joint of SMPL, position, world rotation and neutral rotation in the rest pose."""
+    """A joint of a rig in the rest pose.
+
+    It has a name, a parent, a joint of SMPL, a position, a world rotation and a neutral rotation.
+    """
 
     name: str
     parent: int
@@ -119,14 +131,14 @@ class _RigJoint(NamedTuple):
 
 
 def _axes(axes: dict[str, Any], part: str, joint: str, bone: np.ndarray, right: bool) -> np.ndarray:
-    """Returns the local axes (3, 3) in a T-pose of a joint whose bone has the direction `bone`."""
-    # Gram-Schmidt: the first direction is kept, the second one loses its part along the first,
-    # and the third axis is their cross product. The right side is the mirror image of the left
-    # side; skeletons that are "opposed" then have all three axes reversed, which keeps them
+    """Returns the local axes (3, 3) of a joint in a T-pose; `bone` is the bone's direction."""
+    # Gram-Schmidt: the first direction is kept. The second direction loses its part along the
+    # first. The third axis is their cross product. The right side is the mirror image of the left
+    # side. In skeletons that are "opposed", all three axes are then reversed, which keeps them
     # right-handed.
     flip = np.array([-1, 1, 1]) if right else np.ones(3)
     matrix, columns = np.eye(3), []
-    # Axes are listed for two directions, and for the left side only.
+    # The file lists axes for two directions, and only for the left side.
     for axis, direction in axes.get(joint, axes.get(part, {})).items():
         toward = np.array(DIRECTIONS[direction], float) if direction in DIRECTIONS else bone * flip
         for column in columns:
@@ -153,8 +165,9 @@ def retarget(poses: Poses, rig: Rig) -> tuple[np.ndarray, np.ndarray]:
 
 
 def continuous_euler(matrices: Tensor, orders: Sequence[str] = SMPL_ORDERS) -> Tensor:
-    """Converts rotations to Euler angles in radians, without jumps, so that programs can
-    interpolate them.
+    """Converts rotations to Euler angles in radians, without jumps.
+
+    Programs can then interpolate the angles.
 
     Args:
         matrices: (F, J, 3, 3).
@@ -163,9 +176,9 @@ def continuous_euler(matrices: Tensor, orders: Sequence[str] = SMPL_ORDERS) -> T
     Returns:
         Angles (F, J, 3).
     """
-    # Two triples of Euler angles describe each rotation, (a, b, c) and (a + pi, pi - b, c + pi),
-    # up to full turns of each angle. In each frame, the triple nearest to the frame before is
-    # used.
+    # Two triples of Euler angles describe each rotation, (a, b, c) and (a + pi, pi - b, c + pi).
+    # Full turns may be added to each angle. In each frame, the triple nearest to the previous
+    # frame is used.
     turn = 2 * torch.pi
     first = torch.stack(
         [rotation.matrix_to_euler(matrices[:, j], order) for j, order in enumerate(orders)], 1

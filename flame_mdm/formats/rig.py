@@ -1,4 +1,7 @@
-"""Skeletons of other programs and characters in motion. Blender's extension contains it, so it needs numpy alone."""
+"""Skeletons of other programs, and moving characters.
+
+Blender's extension contains this file, so it needs only numpy.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,16 +17,17 @@ CENTIMETER = 0.01
 SIDES = ("left", "right")
 LEGS = (("hip", "knee"), ("knee", "ankle"))
 LIMBS = {"hip": "knee", "knee": "ankle", "shoulder": "elbow", "elbow": "wrist"}
-"""Joints whose bone takes the direction of the motion's bone -> the joint at the end of this bone."""
+"""Joints whose bone takes the direction of the motion's bone, with the joint at its end."""
 SPINE = ("spine1", "spine2", "spine3")
 TILT = 45  # maximum angle in degrees between the trunk of a rest pose and the vertical
-SNAP = 8  # a facing direction within this angle of an axis, in degrees, is taken for the axis
+SNAP = 8  # a facing direction within this angle of an axis, in degrees, is replaced by the axis
 # Minimum sine of the bend of an elbow or knee in the rest pose. The twist of a straighter limb
-# cannot be read: the limbs of people also bend sideways, by 7 degrees at the knees and 5 degrees at
-# the elbows of SMPL's body, so that a small bend is far from the axis of the joint.
+# cannot be determined. The limbs of people also bend sideways, in SMPL's body by 7 degrees at the
+# knees and by 5 degrees at the elbows. A small bend is therefore far from the axis of the joint.
 BEND = 0.25
 GROUND = 0.1  # maximum height in meters of the lowest joint of a clip that stands on the floor
-# Distance of the knee from the line of the leg, in lengths of the thigh, at which bend and thigh weigh the same
+# Distance of the knee from the line of the leg, in lengths of the thigh, at which the bend and
+# the front of the thigh have the same weight
 STRAIGHT = 0.05
 REACH = 0.999  # maximum distance from hip to ankle relative to the length of the straight leg
 
@@ -34,7 +38,7 @@ class Rig:
 
     joints: tuple[str, ...]  # names; parents precede their children
     parents: tuple[int, ...]  # index of each joint's parent, -1 for a root
-    positions: np.ndarray  # (J, 3) of the joints
+    positions: np.ndarray  # (J, 3), positions of the joints
     turns: np.ndarray  # (J, 3, 3), rotations of the joints in the world
     # For each joint, the index of the joint of SMPL whose rotation it takes, or -1
     sources: tuple[int, ...]
@@ -44,22 +48,25 @@ class Rig:
     unit: float = CENTIMETER  # meters per unit of length in BVH files
     # (3, 3), rotation from the world of the file
     frame: np.ndarray = field(default_factory=lambda: np.eye(3))
-    # (J,), world units per unit of a joint; none = 1
+    # (J,), world units per unit of a joint; an empty array means 1
     scales: np.ndarray = field(default_factory=lambda: np.ones(0))
 
     @property
     def hips(self) -> int:
-        """The joint of the pelvis."""
+        """Index of the pelvis."""
         return self.sources.index(0)
 
     def offsets(self) -> np.ndarray:
-        """Returns the position (J, 3) of each joint in the frame of its parent, or in the world of the file."""
+        """Returns the position (J, 3) of each joint relative to its parent.
+
+        The position of a root is in the world of the file.
+        """
         return np.stack(
             [self.within(self.positions[joint], joint) for joint in range(len(self.joints))]
         )
 
     def within(self, positions: np.ndarray, joint: int) -> np.ndarray:
-        """Converts positions (..., 3) in the world to the frame of a joint's parent in the rest pose."""
+        """Converts positions (..., 3) from the world to the frame of a joint's parent at rest."""
         parent = self.parents[joint]
         if parent < 0:
             return positions @ self.frame
@@ -67,11 +74,17 @@ class Rig:
         return (positions - self.positions[parent]) @ self.turns[parent] / scale
 
     def rest(self) -> np.ndarray:
-        """Returns the rotation (J, 3, 3) of each joint relative to its parent, or to the world of the file."""
+        """Returns the rotation (J, 3, 3) of each joint relative to its parent.
+
+        The rotation of a root is relative to the world of the file.
+        """
         return self.local(self.turns)
 
     def local(self, turned: np.ndarray) -> np.ndarray:
-        """Converts rotations (..., J, 3, 3) in the world to those relative to parents, or to the world of the file."""
+        """Converts rotations (..., J, 3, 3) in the world to rotations relative to the parents.
+
+        The rotation of a root becomes relative to the world of the file.
+        """
         local = turned.copy()
         for joint, parent in enumerate(self.parents):
             above = turned[..., parent, :, :] if parent >= 0 else self.frame
@@ -79,7 +92,10 @@ class Rig:
         return local
 
     def turned(self, body: np.ndarray) -> np.ndarray:
-        """Returns rotations (F, J, 3, 3) in the world that follow SMPL's, `body` (F, 22, 3, 3), or the parent's."""
+        """Returns rotations (F, J, 3, 3) in the world that follow SMPL's, `body` (F, 22, 3, 3).
+
+        Joints without counterpart in SMPL follow their parent.
+        """
         rest, turned = self.rest(), np.tile(self.turns, (len(body), 1, 1, 1))
         for joint, (parent, source) in enumerate(zip(self.parents, self.sources, strict=True)):
             if source >= 0:
@@ -89,7 +105,10 @@ class Rig:
         return turned
 
     def assembled(self, world: np.ndarray, pelvis: np.ndarray) -> np.ndarray:
-        """Returns positions (F, J, 3) of joints with world rotations (F, J, 3, 3), with the pelvis at (F, 3)."""
+        """Returns positions (F, J, 3) of joints with world rotations (F, J, 3, 3).
+
+        The pelvis is at `pelvis` (F, 3).
+        """
         positions, hips = np.tile(self.positions, (len(world), 1, 1)), self.hips
         for joint, parent in enumerate(self.parents):
             if joint == hips:
@@ -103,10 +122,14 @@ class Rig:
 def recognized(
     names: Mapping[int, str], skeletons: Sequence[Mapping[str, str]]
 ) -> dict[str, list[int]]:
-    """Returns the numbers of the joints that the most similar skeleton names: joint of SMPL -> numbers.
+    """Returns the numbers of the joints for each joint of SMPL.
 
-    `skeletons` are spellings of joints -> joints of SMPL, as in
-    `flame_mdm.formats.names.best_match`.
+    The most similar skeleton determines them.
+
+    Args:
+        names: names of the joints by number.
+        skeletons: joint of SMPL by spelling of a joint, as in
+            `flame_mdm.formats.names.best_match`.
     """
     numbers = list(names)
     match = best_match(
@@ -120,7 +143,10 @@ def recognized(
 def matched(
     source: object, names: Mapping[int, str], candidates: Mapping[str, Sequence[int]]
 ) -> tuple[dict[str, int], list[str]]:
-    """Returns numbers of a character's joints by SMPL's, each at most once, and the required ones that it lacks."""
+    """Returns the number of a character's joint for each joint of SMPL, and missing joints.
+
+    Only required joints are reported as missing. Each joint of SMPL has at most one number.
+    """
     if double := next((joint for joint, numbers in candidates.items() if len(numbers) > 1), None):
         same = ", ".join(names[number] for number in candidates[double])
         raise UserError(
@@ -138,8 +164,8 @@ def matched(
 class RestPose:
     """A character's skeleton in its rest pose, y up, facing +z, in its own unit."""
 
-    rig: Rig  # the skeleton; `fitted` replaces its neutral rotations by ones that depend on the motion
-    map: Mapping[str, int]  # SMPL's joint -> index of the character's
+    rig: Rig  # the skeleton; `fitted` replaces its neutral rotations for a motion
+    map: Mapping[str, int]  # index of the character's joint by joint of SMPL
     floor: float  # height of the lowest point in the rest pose
 
     def position(self, joint: str) -> np.ndarray:
@@ -157,19 +183,25 @@ def rest_pose(
     lowest: np.ndarray,
     vertical: Sequence[int],
 ) -> RestPose:
-    """Returns a rest pose, turned to y up and +z ahead; `source` names the character in messages.
+    """Returns a rest pose, turned to y up and +z ahead.
 
-    Positions (J, 3), rotations `turned` (J, 3, 3) and points that include the `lowest` one are in
-    a world of any unit and direction, in which `vertical` (3,) is up. `joints` maps SMPL's joints
-    to indices of the character's.
+    Args:
+        source: name of the character in messages.
+        names: names of the J joints.
+        parents: index of each joint's parent.
+        positions: (J, 3), in a world of any unit and direction.
+        turned: (J, 3, 3), rotations in this world.
+        joints: index of the character's joint by joint of SMPL.
+        lowest: points in this world that include the lowest one.
+        vertical: (3,), the direction in this world that is up.
     """
     at = {joint: positions[number] for joint, number in joints.items()}
 
     def middle(name: str) -> np.ndarray:
         return (at[f"left_{name}"] + at[f"right_{name}"]) / 2
 
-    # First, the pose must be one that rotations can start from: limbs with a length, an upright
-    # trunk and upright legs, left and right apart.
+    # First, the pose must be a pose from which rotations can start: limbs with a length, an
+    # upright trunk and upright legs, left and right apart.
     trunk, legs = middle("shoulder") - middle("hip"), middle("hip") - middle("ankle")
     up = np.array(vertical)
     shortest = max(1e-4 * float(np.linalg.norm(legs)), 1e-9)
@@ -188,9 +220,9 @@ def rest_pose(
             f"{source}: the rest pose is not upright, it leans by {tilt:.0f} degrees. Use a T- or an A-pose"
         )
 
-    # The frame is: x to the left, from hips and shoulders, y up, z ahead. A direction that is
-    # nearly an axis of the file becomes this axis, so that small asymmetries of a mesh do not
-    # turn the character.
+    # The axes of the new frame are: x to the left, from hips and shoulders, y up, z ahead. A
+    # direction that is nearly an axis of the file becomes this axis. Small asymmetries of a mesh
+    # then do not turn the character.
     left = at["left_hip"] + at["left_shoulder"] - at["right_hip"] - at["right_shoulder"]
     left = left - up * (up @ left)
     if np.linalg.norm(left) <= shortest:
@@ -223,15 +255,14 @@ def rest_pose(
 
 
 def fitted(character: RestPose, offsets: np.ndarray) -> Rig:
-    """Returns the skeleton with neutral rotations in which its limbs point like the limbs of
-    SMPL's rest pose.
+    """Returns the skeleton with neutral rotations, in which its limbs point like SMPL's at rest.
 
     `offsets` (22, 3) are the offsets of SMPL's joints from their parents at rest.
     """
-    # Each limb bone is turned from the character's rest pose to SMPL's: its direction first, then
-    # the twist, such that knees and elbows bend about the same axis. A limb that is clearly bent
-    # at rest shows this axis. For a straight limb, knees are taken to bend backward and elbows
-    # forward.
+    # Each bone of a limb is turned from the character's rest pose to SMPL's. Its direction comes
+    # first, then its twist, so that knees and elbows bend about the same axis. A limb that is
+    # clearly bent at rest shows this axis. If a limb is straight, knees are assumed to bend
+    # backward, and elbows forward.
     rig, turns = character.rig, np.tile(np.eye(3), (len(SMPL22), 1, 1))
     for side in SIDES:
         for (start, middle, end), bend in (
@@ -267,16 +298,22 @@ def follow(
     neutral: np.ndarray,
     world: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, Rig]:
-    """Moves a character as a body moves; returns rotations (F, J, 3, 3), positions (F, J, 3) and the skeleton for it.
+    """Moves a character like a body.
 
-    The body has joints (F, 22, 3) in meters, with `offsets` (22, 3) from their parents in the
-    rest pose; its parts have rotations `neutral` (22, 3, 3) in the rest pose and `world`
-    (F, 22, 3, 3) in the world.
+    Args:
+        character: the character.
+        joints: (F, 22, 3), joints of the body in meters.
+        offsets: (22, 3), offsets of the joints from their parents in the rest pose.
+        neutral: (22, 3, 3), rotations of the body's parts in the rest pose.
+        world: (F, 22, 3, 3), rotations of the body's parts in the world.
+
+    Returns:
+        Rotations (F, J, 3, 3) and positions (F, J, 3) of the character, and its skeleton.
     """
     # All joints get the rotations of the body, relative to the rest poses. The hips follow the
-    # scaled path. Legs of other proportions would then hover or sink, so that each leg is bent
-    # until its toes or its ankle are at the scaled position, at the character's own height above
-    # the floor.
+    # scaled path. Legs with other proportions would then hover or sink. Therefore each leg is
+    # bent until its toes or its ankle are at the scaled position, at the character's own height
+    # above the floor.
     rig, neutral = fitted(character, offsets), neutral.copy()
     turned = world @ np.swapaxes(neutral, 1, 2)
     neutral[JOINT["neck"]] = neutral[JOINT["head"]]
@@ -327,9 +364,11 @@ def follow(
 def _bent(
     hip: np.ndarray, knee: np.ndarray, ankle: np.ndarray, target: np.ndarray, forward: np.ndarray
 ) -> np.ndarray:
-    """Returns where a knee (F, 3) is if the ankle is at `target`, or as near as the leg reaches; it bends as before."""
-    # Thigh and shin are two sides of a triangle over the line to the target, as in
-    # `cleanup.bend`.
+    """Returns the position (F, 3) of a knee if the ankle is at `target`, or as near as possible.
+
+    The knee bends to the same side as before.
+    """
+    # Thigh, shin and the line to the target are a triangle, as in `cleanup.bend`.
     thigh, shin = np.linalg.norm(knee - hip, axis=1), np.linalg.norm(ankle - knee, axis=1)
     line = target - hip
     length = np.maximum(np.linalg.norm(line, axis=1), 1e-9)
@@ -340,7 +379,7 @@ def _bent(
     out = (knee - hip) - before * ((knee - hip) * before).sum(1, keepdims=True) / (before**2).sum(
         1, keepdims=True
     )
-    # A straight leg does not show where its knee points, so that a little of the thigh's front is
+    # A straight leg does not show where its knee points, so a small part of the thigh's front is
     # added.
     out = out + STRAIGHT * thigh[:, None] * forward
     out = out - line * (out * line).sum(1, keepdims=True)

@@ -1,7 +1,7 @@
-"""A motion on a skeleton of another program, with the skin of a person, for the writers of .glb, .fbx and .usd files.
+"""Moving skeletons of other programs, with a person's skin, for .glb, .fbx and USD files.
 
-Lengths are in meters, y up; the rest pose faces +z. Frames, joints and vertices are counted by F,
-J and V.
+Lengths are in meters, y up. The rest pose faces +z. F, J and V are the numbers of frames, joints
+and vertices.
 """
 
 from dataclasses import dataclass, field, replace
@@ -27,8 +27,8 @@ class Material:
 
     Attributes:
         name: its name.
-        color: red, green and blue from 0 to 1, as screens show them.
-        image: content of a PNG or JPEG file that is multiplied with the color; empty without one.
+        color: red, green and blue from 0 to 1, as on screens.
+        image: content of a PNG or JPEG file that is multiplied with the color; empty = no image.
     """
 
     name: str
@@ -42,7 +42,7 @@ PALETTE = tuple(
 )
 """Materials of the package's person."""
 CONTACTS = ("LeftFootContact", "RightFootContact")
-"""Names of the properties that say whether the left and the right foot are planted, in .fbx and USD files."""
+"""Properties in .fbx and USD files that say whether the left or right foot is planted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,19 +51,18 @@ class Skin:
 
     Attributes:
         name: the name of the mesh.
-        points: (V, 3) in the coordinates of the mesh; `normals` (V, 3) of length 1.
-        triangles: (T, 3), counterclockwise seen from outside.
+        points: (V, 3) in the coordinates of the mesh. `normals` (V, 3) have length 1.
+        triangles: (T, 3), counterclockwise if seen from outside.
         palette: the materials.
-        materials: (T,), index into `palette` of each triangle.
-        ordered: indices of joints of the skeleton. For a person, joints that follow SMPL's come
-            first, in its order.
-        bones: (V, K), the joints that move a vertex, as indices into `ordered`.
-        weights: (V, K), the share of each of these joints; a row adds up to 1.
+        materials: (T,), index in `palette` of each triangle's material.
+        ordered: indices of joints of the skeleton. For a person, joints that follow SMPL's joints
+            come first, in SMPL's order.
+        bones: (V, K), the joints that move a vertex, as indices in `ordered`.
+        weights: (V, K), weights of these joints; the sum of a row is 1.
         binds: (len(ordered), 4, 4), matrices from the coordinates of the mesh to the coordinates
             of each joint.
-        colors: (V, 3) from 0 to 255, as screens show them; (0, 3) if the materials alone have
-            colors.
-        uvs: (V, 2), places in the images, from the lower left corner; (0, 2) without images.
+        colors: (V, 3) from 0 to 255, as on screens; (0, 3) if only the materials have colors.
+        uvs: (V, 2), positions in the images, from the lower left corner; (0, 2) without images.
     """
 
     name: str
@@ -82,7 +81,7 @@ class Skin:
 
 @dataclass(frozen=True, eq=False)
 class RiggedClip:
-    """A skeleton in motion.
+    """A moving skeleton.
 
     Attributes:
         name: the name of the animation.
@@ -93,14 +92,12 @@ class RiggedClip:
         offsets: (J, 3), position of each joint relative to its parent in the rest pose.
         rest: (J, 3, 3), rotation of each joint relative to its parent in the rest pose.
         turns: (F, J, 3, 3), rotations relative to parents.
-        moves: joints that move relative to their parents -> positions (F, 3) relative to their
-            parents.
-        lift: height by which a person is above these positions: the thickness of the soles.
+        moves: positions (F, 3) relative to their parents, for the joints that move there.
+        lift: height of a person above these positions: the thickness of the soles.
         skins: the meshes; () if the motion does not fit a person.
         scales: (J,), units of the parent per unit of each joint.
-        root: index of the joint on the floor above the hips; -1 if there is none.
-        contacts: (F, 2), whether the left and the right toes are planted; (0, 2) if it is not
-            known.
+        root: index of the joint on the floor above the hips; -1 = no such joint.
+        contacts: (F, 2), whether the left and the right toes are planted; (0, 2) = not known.
     """
 
     name: str
@@ -118,9 +115,9 @@ class RiggedClip:
     contacts: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), bool))
 
     def world(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns positions (F, J, 3) and rotations (F, J, 3, 3) of the joints in the world, not lifted.
+        """Returns positions (F, J, 3) and rotations (F, J, 3, 3) of the joints in the world.
 
-        For skeletons whose joints all have the scale 1.
+        They are not lifted. All joints of the skeleton must have the scale 1.
         """
         positions = np.tile(self.offsets, (len(self.turns), 1, 1))
         for joint, moved in self.moves.items():
@@ -139,9 +136,9 @@ class RiggedClip:
         return replace(self, name=name, turns=self.turns[frames], moves=moves, contacts=contacts)
 
     def contact_changes(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """Returns for each of `CONTACTS` the frames (K,) at which it changes, and its values (K,) from there on.
+        """Returns the changes of each of `CONTACTS`: frames (K,) and new values (K,).
 
-        The first frame is always among them. Empty if the contacts are not known.
+        The first frame is always among them. The result is empty if the contacts are not known.
         """
         if not len(self.contacts):
             return {}
@@ -154,7 +151,7 @@ class RiggedClip:
     def on_path(self, path: np.ndarray, heading: np.ndarray) -> "RiggedClip":
         """Returns a clip whose body stays in place, moved along a path.
 
-        The root moves, or the hips if there is no root on the floor.
+        The root moves. If there is no root on the floor, the hips move.
 
         Args:
             path: (F, 2), x and z.
@@ -176,7 +173,10 @@ class RiggedClip:
         return replace(self, turns=turns, moves=moves)
 
     def on_soles(self) -> tuple[np.ndarray, dict[int, np.ndarray]]:
-        """Returns `offsets` and `moves` with the person on its soles: hips are lifted, a root stays on the floor."""
+        """Returns `offsets` and `moves` with the person on its soles.
+
+        The hips are lifted, and a root stays on the floor.
+        """
         offsets = self.offsets.copy()
         moves = {joint: moved.copy() for joint, moved in self.moves.items()}
         hips = max(moves)
@@ -191,7 +191,7 @@ class RiggedClip:
 
 
 class ContactEvent(NamedTuple):
-    """A moment in which a foot begins or ends to stand on the floor."""
+    """A moment at which a foot is planted on the floor or lifted."""
 
     time: float  # seconds
     frame: int
@@ -200,7 +200,10 @@ class ContactEvent(NamedTuple):
 
 
 def contact_events(contacts: np.ndarray, fps: float) -> list[ContactEvent]:
-    """Returns when the left and the right foot land and leave the floor, by time, from contacts (F, 2)."""
+    """Returns when the left and the right foot land and leave the floor, sorted by time.
+
+    `contacts` are (F, 2).
+    """
     events = []
     for foot, flags in zip(("left", "right"), contacts.T, strict=True):
         for frame in np.flatnonzero(np.diff(flags.astype(int))).tolist():
@@ -217,18 +220,19 @@ def rigged(
     fitted: FittedBody | None = None,
     root_motion: bool = False,
 ) -> RiggedClip:
-    """Returns a body in motion as a clip of a skeleton.
+    """Returns a moving body as a clip of a skeleton.
 
     Args:
         poses: the body.
         name: name of the animation.
         fps: frames per second.
         skeleton: the skeleton, with the bone lengths of the body.
-        fitted: the body of the person, whose toes bend as in pictures; None = no skin.
-        root_motion: the root on the floor follows the hips and their direction; otherwise it
+        fitted: the body of the person. Its toes bend as in pictures. None = no skin.
+        root_motion: the root on the floor follows the hips and their direction. Otherwise, it
             stays in place.
 
-    Raises `UserError` for `root_motion` of a skeleton without a root on the floor.
+    Raises:
+        UserError: If `root_motion` is set for a skeleton without a root on the floor.
     """
     moved = (
         poses
@@ -262,10 +266,10 @@ def rigged(
 def _with_root_motion(
     turns: np.ndarray, hips: np.ndarray, skeleton: Rig
 ) -> tuple[np.ndarray, dict[int, np.ndarray]]:
-    """Moves the path of the hips on the floor, and their direction, to the root, the joint above the hips.
+    """Moves the path and the direction of the hips on the floor to the root above the hips.
 
-    The direction is the heading of the hips relative to the first frame's axes, a turn about the
-    vertical.
+    The direction is the heading of the hips relative to the first frame's axes, a rotation about
+    the vertical.
     """
     root, joint = skeleton.parents[skeleton.hips], skeleton.hips
     above = skeleton.turns[root]
@@ -288,7 +292,7 @@ def _with_root_motion(
 
 
 def _skin(body: FittedBody, rig: Rig) -> Skin:
-    """Returns the mesh of a body in its stored pose, with the hips where they are in the rest pose of the skeleton."""
+    """Returns the mesh of a body in its stored pose, with the hips at the rig's rest position."""
     mesh = body.mesh
     moved = rig.positions[rig.hips] + [0, body.lift, 0] - body.joints[0]
     weights = mesh.weights[:, : len(SMPL22)].copy()  # helper bones join their joints
@@ -303,8 +307,8 @@ def _skin(body: FittedBody, rig: Rig) -> Skin:
     count = len(skinned)
     binds[:count, :3] = rig.neutral[skinned].mT @ np.concatenate([stored, moves], -1)
 
-    # Joints without vertices keep their place in their parents: three.js reads it from the pose
-    # of the mesh.
+    # Joints without vertices keep their position in their parents, because three.js reads it from
+    # the pose of the mesh.
     worlds = np.tile(np.eye(4), (len(rig.joints), 1, 1))
     worlds[skinned] = np.linalg.inv(binds[:count])
     local = np.tile(np.eye(4), (len(rig.joints), 1, 1))

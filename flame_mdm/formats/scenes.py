@@ -1,4 +1,4 @@
-"""Animations in files with a scene of nodes, FBX and GLB, and the names of the nodes as joints of a skeleton."""
+"""Animations in FBX and GLB files, and the names of their nodes as joints of a skeleton."""
 
 import re
 from pathlib import Path
@@ -7,11 +7,15 @@ from flame_mdm.formats import fbx_scene, glb_animation
 from flame_mdm.formats.animated import AnimatedNodes
 
 TIP = re.compile(r"[_. ]?(end|nub|tip)(site)?$", re.IGNORECASE)
-"""How programs name the node at the tip of the last bone, which BVH files call an end site."""
+"""Names of programs for the node at the tip of the last bone. BVH files call it an end site."""
 
 
 def read(path: Path, animation: str | None = None) -> AnimatedNodes:
-    """Reads an animation by its name or number, from 1; None = the first one. Raises `UserError`, see the readers."""
+    """Reads an animation by its name or number, from 1; None = the first one.
+
+    Raises:
+        UserError: As the readers of both formats.
+    """
     reader = fbx_scene if path.suffix.lower() == ".fbx" else glb_animation
     return reader.read(path, animation)
 
@@ -23,11 +27,11 @@ def animations(path: Path) -> list[str]:
 
 
 def joint_names(scene: AnimatedNodes) -> tuple[str, ...]:
-    """Returns a name per node, as the layouts of skeletons expect them.
+    """Returns a name per node, as in the layouts of skeletons.
 
-    Bones of a humanoid that the file identifies get SMPL's names. A node at the tip of a bone is
-    named as the end site of the bone in a BVH file, `NAME.end`, also if the tip has the name of
-    the bone with another ending.
+    If the file declares the bones of a humanoid, they get SMPL's names. A node at the tip of a
+    bone is called `NAME.end`, like the end site of a bone in a BVH file. This also applies if the
+    tip has the name of the bone with another ending.
     """
     if scene.humanoid:
         humanoid = {node: joint for joint, node in scene.humanoid.items()}

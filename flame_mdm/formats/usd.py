@@ -1,9 +1,10 @@
 # pyright: reportAttributeAccessIssue=false
 # The modules of usd-core come from C++ and have no types.
-"""Writes a motion with its skeleton and skin as Universal Scene Description: .usda, .usdc or .usdz, with UsdSkel.
+"""Writes a motion with its skeleton and skin as Universal Scene Description, with UsdSkel.
 
-Pixar, "UsdSkel", https://openusd.org/release/api/usd_skel_page_front.html. Needs the package
-usd-core, extra `usd`.
+Files are .usda, .usdc or .usdz. Source: Pixar, "UsdSkel",
+https://openusd.org/release/api/usd_skel_page_front.html. Writing needs the package usd-core
+(extra `usd`).
 """
 
 import re
@@ -20,7 +21,7 @@ from flame_mdm.safe_io import atomic_write
 
 
 def write(path: Path, clip: RiggedClip) -> None:
-    """Writes a clip in meters, y up; raises `UserError` if usd-core is not installed."""
+    """Writes a clip in meters, y up. Raises `UserError` if usd-core is not installed."""
     try:
         from pxr import Sdf, Usd, UsdGeom, UsdSkel, UsdUtils
     except ImportError as error:
@@ -55,7 +56,7 @@ def write(path: Path, clip: RiggedClip) -> None:
 
 
 def _paths(clip: RiggedClip) -> list[str]:
-    """Returns the joints as paths from the root, in which names have letters, digits and underscores only."""
+    """Returns the joints as paths from the root. See `_name` for the names in a path."""
     paths: list[str] = []
     for name, parent in zip(clip.joints, clip.parents, strict=True):
         paths.append(f"{paths[parent]}/{_name(name)}" if parent >= 0 else _name(name))
@@ -63,13 +64,13 @@ def _paths(clip: RiggedClip) -> list[str]:
 
 
 def _name(name: str) -> str:
-    """Returns a name with letters, digits and underscores only, which does not begin with a digit."""
+    """Returns a name of only letters, digits and underscores, which begins with no digit."""
     plain = re.sub(r"[^A-Za-z0-9_]", "_", name) or "_"
     return f"_{plain}" if plain[0].isdigit() else plain
 
 
 def _matrices(values: np.ndarray) -> Any:
-    """Returns matrices (N, 4, 4) as USD stores them, with the translation in the last row."""
+    """Returns matrices (N, 4, 4) as USD stores them: the translation is in the last row."""
     from pxr import Gf, Vt
 
     return Vt.Matrix4dArray([Gf.Matrix4d(matrix.T.tolist()) for matrix in values])
@@ -108,7 +109,7 @@ def _skeleton(stage: Any, clip: RiggedClip) -> None:
         values = [Gf.Quatf(float(w), float(x), float(y), float(z)) for x, y, z, w in turns[frame]]
         rotations.Set(Vt.QuatfArray(values), frame)
         translations.Set(Vt.Vec3fArray.FromNumpy(moved[frame].astype("f4")), frame)
-    # Booleans are held until the next sample, so the frames in which they change are enough.
+    # Booleans are held until the next sample, so only frames in which they change are written.
     for name, (frames, planted) in clip.contact_changes().items():
         contact = animation.GetPrim().CreateAttribute(name, Sdf.ValueTypeNames.Bool, custom=True)
         for frame, value in zip(frames.tolist(), planted.tolist(), strict=True):
@@ -159,12 +160,13 @@ def _mesh(stage: Any, skin: Skin) -> None:
 
 
 def _extent(stage: Any, root: Any, clip: RiggedClip) -> None:
-    """Declares the box around the person in each frame, from the joints."""
+    """Declares the box around the person in each frame. The joints determine the box."""
     from pxr import UsdGeom, Vt
 
     positions, _ = clip.world()  # scales are ignored: the box only has to be large enough
     positions[..., 1] += clip.lift
-    # meters from joints to the farthest point of the surface, the tips of hands and head
+    # distance in meters from joints to the farthest point of the surface, the tips of hands and
+    # head
     margin = 0.25
     boxes = UsdGeom.Boundable(root.GetPrim()).CreateExtentAttr()
     for frame, points in enumerate(positions):

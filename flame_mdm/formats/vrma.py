@@ -1,8 +1,8 @@
-"""Writes a motion as a VRM animation (.vrma), which moves any VRM avatar.
+"""Writes a motion as a VRM animation (.vrma), which can move any VRM avatar.
 
-VRM consortium, "VRMC_vrm_animation 1.0", https://github.com/vrm-c/vrm-specification. A .vrma file
-is a .glb file without a mesh. It says which nodes are the bones of a humanoid, and its rest pose
-is the T-pose of VRM: limbs along the axes, feet straight ahead, soles on the floor. Programs
+Source: VRM consortium, "VRMC_vrm_animation 1.0", https://github.com/vrm-c/vrm-specification. A
+.vrma file is a .glb file without a mesh. It declares which nodes are the bones of a humanoid. Its
+rest pose is VRM's T-pose: limbs along the axes, feet straight ahead, soles on the floor. Programs
 apply the rotations relative to this pose, and scale the path of the hips by the ratio of the
 heights of the hips.
 """
@@ -22,12 +22,13 @@ from flame_mdm.representations.skeleton import JOINT, SMPL22
 
 EXTENSION = "VRMC_vrm_animation"
 LIMBS = {"shoulder": (1, 0, 0), "elbow": (1, 0, 0), "hip": (0, -1, 0), "knee": (0, -1, 0)}
-"""Joints of the left side -> direction of the bone that begins there in VRM's T-pose."""
+"""For joints of the left side: direction of the bone that begins there in VRM's T-pose."""
 
 
 def rest_rig(poses: Poses) -> Rig:
-    """Returns VRM's humanoid in its T-pose, with the bone lengths of a body; its axes are the
-    axes of the world.
+    """Returns VRM's humanoid in its T-pose, with the bone lengths of a body.
+
+    Its axes are the axes of the world.
     """
     names = {joint: bone for bone, joint in HUMANOID.items()}
     offsets = poses.offsets.numpy().copy()
@@ -39,7 +40,7 @@ def rest_rig(poses: Poses) -> Rig:
             toward = np.array(direction, float) * [sign, 1, 1]
             neutral[joint] = shortest_turns(toward[None], offsets[child][None])[0]
             offsets[child] = toward * np.linalg.norm(offsets[child])
-        # The foot turns about the vertical, so that its sole stays flat.
+        # The foot turns about the vertical, so its sole stays flat.
         ankle, toes = JOINT[f"{side}_ankle"], JOINT[f"{side}_foot"]
         sideways, down, ahead = offsets[toes]
         angle = np.arctan2(sideways, ahead)

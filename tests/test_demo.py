@@ -65,7 +65,7 @@ def test_a_link_reproduces_its_request_and_names_every_option_that_is_not_left_t
     assert [key for key, _ in parse_qsl(EDITED.query())] == keys
 
 
-def test_way_points_are_reached_at_a_constant_speed_just_before_the_end():
+def test_waypoints_are_reached_at_a_constant_speed_just_before_the_end():
     request = DemoRequest(
         text="a person walks @4 | a person waves", seconds=1.2, path=((0.0, 3.0), (1.0, 3.0))
     )
@@ -93,7 +93,7 @@ BAD = {
     "text=walks+%E2%80%AEkcab": "string should match", "file=/etc/passwd": "unknown option file",
     "path=0,nan": "path.0.1=nan: input should be a finite number",
     "path=0,1+20.5,0": "path.1.0=20.5: input should be less than or equal to 20",
-    "path=0,1+2": "path=0,1 2: give way points as x,z in meters", "path=0,x": "path=0,x: give way points as x,z",
+    "path=0,1+2": "path=0,1 2: give waypoints as x,z in meters", "path=0,x": "path=0,x: give waypoints as x,z",
     "path=0,19": "root[0]: 19.0 m from the start in 0.8 seconds is impossible",
     "path=" + "+".join(["0,1"] * 17): "should have at most 16 items",
     "edit=<script>alert(1)</script>": "edit=<script>", "edit=" + "[" * 5000: "edit=",

@@ -104,7 +104,7 @@ def test_notes_on_the_motion_to_continue_are_warnings(model, tmp_path):
 
 
 def test_a_path_is_as_long_as_the_motion_whose_sentence_becomes_a_sequence(model):
-    """The last way point is reached 0.2 seconds before the end of all parts."""
+    """The last waypoint is reached 0.2 seconds before the end of all parts."""
     sentence = "a man walks forward, then turns left"
     request = SamplingRequest(texts=sentence, seconds=2, path=[(0, 1), (0.5, 2)])
     targets = resolve(request, model).targets

@@ -189,7 +189,7 @@ def test_a_linear_decoder_is_solved_exactly_and_changes_least():
     assert moved[4, :2].tolist() == pytest.approx([2.0, 0.0], abs=1e-2)
 
 
-def test_way_points_joints_and_poses_are_reached(model, tmp_path):
+def test_waypoints_joints_and_poses_are_reached(model, tmp_path):
     bow = flame_mdm.generate(model, "a person bows", seconds=2, num_inference_steps=10)[0]
     bow.save(tmp_path / "bow.npz")
     content = {
@@ -270,7 +270,7 @@ def test_the_command_prints_the_distance_and_bad_words_are_one_line(
     for options, message in (
         ([], "say what to sample: text="),
         (["text=walks", "unconditioned=true"], "text and unconditioned exclude each other"),
-        (["text=walks", "path=0,1 2"], "path=0,1 2: give way points as x,z in meters"),
+        (["text=walks", "path=0,1 2"], "path=0,1 2: give waypoints as x,z in meters"),
         (["text=walks", "path=0,1", "targets=t.json"], "targets cannot be given with a path"),
     ):
         with subtests.test(options=options, message=message):

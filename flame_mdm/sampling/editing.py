@@ -1,5 +1,5 @@
 # pyright: standard
-"""Motion editing without additional training: part of a motion is kept, the rest is resampled."""
+"""Motion editing without additional training: a part of a motion is kept, and the rest is resampled."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -27,15 +27,18 @@ from flame_mdm.sampling.reading import part_of, read_motion, with_features
 from flame_mdm.sampling.resolution import ResolvedRequest, resolve
 
 MFM_STEPS = 25
-"""Sampling steps of MFM's edits: with `until` = 0.2, "the first 6 time steps" are up to "0.2 time" (i / 25 <= 0.2)."""
+"""Number of sampling steps of MFM's edits.
+
+With `until` = 0.2, "the first 6 time steps" are the steps up to "0.2 time" (i / 25 <= 0.2).
+"""
 
 
 @dataclass(eq=False, repr=False, kw_only=True)
 class Edited(Motion):
-    """An edited motion, with its original and how well the kept part was kept.
+    """An edited motion with its original, and the errors of the kept part.
 
-    The joint error can be large although features are kept: they are relative to the root, so a kept part continues
-    from where a resampled part ends.
+    The joint error can be large although features are kept. Features are relative to the root, so
+    a kept part continues from the end of a resampled part.
 
     Example:
         >>> import flame_mdm
@@ -46,20 +49,20 @@ class Edited(Motion):
 
     #: The motion before editing.
     original: Motion
-    #: (F, D) bool, True = this feature of this frame was to be kept.
+    #: (F, D) bool, True = this feature of this frame should be kept.
     keep: np.ndarray
-    #: Maximum change of the kept values, in normalized features; 0 if the method is exact.
+    #: Maximum change of the kept values, in normalized features. It is 0 if the method is exact.
     feature_error: float
-    #: Maximum distance in meters between the world positions of a kept joint before and after.
+    #: Maximum distance in meters of kept joints in the world, before and after the edit.
     joint_error: float
 
 
 @dataclass(frozen=True)
 class ResolvedEdit:
-    """An edit for one model, whose motion has been read.
+    """An edit for one model, with the motion that was read.
 
     Attributes:
-        resolved: the request, with the part that is kept.
+        resolved: the request, with the kept part.
         original: the motion, with the features of the model.
         keep: (F, D) bool, features to keep.
         kept_joints: (F, J) bool, joints to keep.
@@ -83,32 +86,35 @@ def edit(
 ) -> list[Edited]:
     """Resamples part of a motion and keeps the rest, without additional training.
 
-    The `joints` in the frames of `region` are resampled; either is by default all of them. With `strength`, the result
-    is a variation of the motion instead of a new one.
+    The `joints` in the frames of `region` are resampled. The default is all joints and all
+    frames. With `strength`, the result is a variation of the motion instead of a new motion.
 
     Args:
         model: the model, from `flame_mdm.load`.
-        motion: a file or clip that `read_motion` reads; a motion, generated or read; or joints (F, J, 3) in meters, y
-            up, in the order of a known skeleton.
-        texts: what the person does in the new part; one text or several. Default: unconditioned, unless `actions` are
-            given.
-        fps: frames per second of an array or an .npy file; for other files, it overrides the rate in the file.
+        motion: a file or clip that `read_motion` reads; a motion, generated or read; or joints
+            (F, J, 3) in meters, y up, in the order of a known skeleton.
+        texts: what the person does in the new part; one text or several. Default: unconditioned,
+            unless `actions` are given.
+        fps: frames per second of an array or an .npy file. For other files, it overrides the rate
+            in the file.
         cut: [begin, end] in seconds of the part of the motion to use. Default: all of it.
-        stages: list that gets the clean estimates along the sampling of the first motion, at equal intervals, and that
-            motion itself.
-        keywords: `region` or `region_seconds`, `joints` and `strength` say what is resampled; `method`, `until` and
-            `resample` say how (`flame_mdm.sampling.motion_request.EditRequest` describes these seven). The keywords of
-            `flame_mdm.generate` also apply, such as `samples` (1), `seed` (0) and `guidance_scale`. `cleanup` also
+        stages: list to which clean estimates of the first motion are added, at equal intervals of
+            the sampling, followed by the motion.
+        keywords: `region` or `region_seconds`, `joints` and `strength` say what is resampled.
+            `method`, `until` and `resample` say how. All of them are described in
+            `flame_mdm.sampling.motion_request.EditRequest`. The keywords of `flame_mdm.generate`
+            also apply, such as `samples` (1), `seed` (0) and `guidance_scale`. `cleanup` also
+            changes the kept part, usually by millimeters; `Edited.joint_error` says by how much.
             changes the kept part, by millimeters as a rule; `Edited.joint_error` says by how much.
 
     Returns:
-        One edited motion per sample, `samples` for each text: all samples of the first text in the order of their
-        numbers, then all samples of the second text, and so on. The original is not in the list; it is the attribute
-        `original` of each edited motion.
+        One edited motion per sample, `samples` for each text: all samples of the first text in
+        the order of their numbers, then all samples of the second text, and so on. The original
+        is not in the list; it is the attribute `original` of each edited motion.
 
     Raises:
-        UserError: If the request is invalid, the process does not support the method, or the motion cannot be read or
-            is longer than the motions in training.
+        UserError: If the request is invalid, the process does not support the method, or the
+            motion cannot be read or is longer than the motions in training.
 
     Example:
         >>> import flame_mdm
@@ -132,9 +138,9 @@ def resolve_edit(
     fps: float | None = None,
     cut: Sequence[float] | None = None,
 ) -> ResolvedEdit:
-    """Reads the motion and finds out which of its features `request.editing` keeps.
+    """Reads the motion and determines which of its features `request.editing` keeps.
 
-    `motion`, `fps` and `cut` are arguments of `edit`, which also lists the errors.
+    `edit` describes the arguments `motion`, `fps` and `cut`, and the errors.
     """
     representation, editing = model.representation, request.editing or EditRequest()
     if model.denoiser.context_frames:
@@ -155,7 +161,7 @@ def resolve_edit(
 
     edit_options, options = method_options(model.process, editing, request.options)
     frames = [_part_length(parts, length, original.fps) for parts in request.parts]
-    # A sentence stays one action, since the edit keeps a single motion.
+    # A sentence stays one action, because the edit keeps a single motion.
     fitted = replace(request, frames=frames, options=options, editing=None, split=False)
     features = torch.from_numpy(original.features).to(model.device)
     normalized = representation.normalize(features)[None]
@@ -167,14 +173,14 @@ def resolve_edit(
 def sample_edit(
     model: MotionGenerator, edit: ResolvedEdit, *, stages: list[Motion] | None = None
 ) -> list[Edited]:
-    """Samples the motions of a resolved edit, and measures how well each one kept the part to keep."""
+    """Samples the motions of a resolved edit, and measures the errors of the kept part."""
     representation, original, request = model.representation, edit.original, edit.resolved.request
     keep, kept_joints = edit.keep.numpy(), edit.kept_joints.numpy()
     # Normalization rounds, so kept values are compared with the input of the sampler.
     assert edit.resolved.edit is not None
     exact = representation.denormalize(edit.resolved.edit.known[0]).cpu().numpy()
     std = representation.std.cpu().numpy()
-    # The features are compared before cleanup, after which a motion has none.
+    # The features are compared before cleanup, because a cleaned motion has no features.
     uncleaned = replace(edit.resolved, request=replace(request, cleanup=False))
     edits = []
     for motion in sample(model, uncleaned, stages=stages):
@@ -202,7 +208,7 @@ def _original(
     fps: float | None,
     cut: Sequence[float] | None,
 ) -> Motion:
-    """Returns the motion to edit, or the part `cut` of it, with the features of a representation."""
+    """Returns the motion to edit, or its part `cut`, with the features of a representation."""
     if isinstance(motion, str | Path):
         return read_motion(representation, motion, fps=fps, cut=cut)
     if not isinstance(motion, Motion):
@@ -214,7 +220,10 @@ def _original(
 
 
 def _part_length(parts: Sequence[Part], length: int, fps: float) -> int:
-    """Returns the frames of each part that gives no seconds, so that all parts are as long as the motion."""
+    """Returns the number of frames of each part without seconds.
+
+    All parts together are as long as the motion.
+    """
     timed = [round(seconds * fps) for _, seconds in parts if seconds is not None]
     rest, others = length - sum(timed), len(parts) - len(timed)
     fits = rest == 0 if others == 0 else rest >= others and rest % others == 0
@@ -229,7 +238,10 @@ def _part_length(parts: Sequence[Part], length: int, fps: float) -> int:
 def kept_parts(
     representation: Representation, length: int, editing: EditRequest
 ) -> tuple[Tensor, Tensor]:
-    """Returns which features (F, D) and joints (F, J) of each frame an edit of a motion with `length` frames keeps."""
+    """Returns which features (F, D) and joints (F, J) an edit keeps in each frame.
+
+    The motion has `length` = F frames.
+    """
     new_frames = _new_frames(length, representation.fps, editing)[:, None]
     if editing.joints is None:
         return ~new_frames.expand(-1, representation.features), ~new_frames.expand(
@@ -269,7 +281,10 @@ def _new_frames(length: int, fps: float, editing: EditRequest) -> Tensor:
 def method_options(
     process: Process, editing: EditRequest, options: SamplerOptions
 ) -> tuple[dict[str, Any], SamplerOptions]:
-    """Returns the options of `Edit` and of the sampler, for the requested method or for the method of the process."""
+    """Returns the options of `Edit` and of the sampler.
+
+    They belong to the requested method or, by default, to the method of the process.
+    """
     possible = [
         name for name, method_edit in METHODS.items() if method_edit["mode"] in process.edit_modes
     ]

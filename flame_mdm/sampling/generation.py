@@ -1,5 +1,5 @@
 # pyright: standard
-"""Motion sampling, with text, action or no condition."""
+"""Motion sampling with text, action, or no condition."""
 
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -24,9 +24,9 @@ from flame_mdm.sampling.sequences import overlap, windows
 from flame_mdm.sampling.streams import Schedule, Streams, starting_point
 
 BATCH = 32
-STAGES = 10  # number of clean estimates shown of one sampling run, as in figure 5 of MFM
+STAGES = 10  # number of shown clean estimates of a sampling run, as in figure 5 of MFM
 Score = Callable[[Sequence[Motion]], Sequence[float]]
-"""Scores motions, such as the candidates for a text; higher is better."""
+"""A function that scores motions, such as the candidates for a text. Higher is better."""
 
 
 def generate(
@@ -38,34 +38,38 @@ def generate(
     stages: list[Motion] | None = None,
     **keywords: Unpack[SamplingKeywords],
 ) -> list[Motion]:
-    """Generates motions for texts or actions; unconditioned motions if neither is given.
+    """Generates motions for texts or actions, or unconditioned motions if neither is given.
 
-    A motion depends only on its text, its length, the sample number and the seed, not on other texts. If a text is
-    given several times, sample numbers continue, so that its samples differ. "A man walks, then sits down" becomes the
-    sequence "A man walks | sits down", unless `split=False`.
+    A motion depends only on its text, its length, the sample number and the seed, not on other
+    texts. If a text is given several times, sample numbers continue, so its samples differ. "A
+    man walks, then sits down" becomes the sequence "A man walks | sits down", unless
+    `split=False`.
 
     Args:
         model: the model, from `flame_mdm.load`.
         texts: what the person does; one text or several.
-        score: function that scores the `candidates` without faults; the highest score is kept. Default: the candidate
-            with the fewest faulty frames is kept.
-        edit: part of a motion of the same length to keep in every sample, with `known` and `keep` (1, F, D).
-        stages: list that gets the clean estimates along the sampling of the first motion, at equal intervals, and that
-            motion itself (MFM, figure 5).
-        keywords: how many motions, of which length, and how they are sampled: `actions` (instead of texts), `seconds`
-            or `frames` (default: 3 seconds), `samples` (1) per text, `candidates` (1) per sample, `seed` (0), `after`,
-            `split` (True), `loop` (False), `targets` or `path`, `shared_noise` (False), `cleanup` (False), and
-            `guidance_scale`, `sampler`, `num_inference_steps`, `eta` and `spacing` (default: the model's).
-            `flame_mdm.sampling.motion_request.SamplingRequest` and `flame_mdm.sampler_options.SamplerOptions`
+        score: function that scores the `candidates` without faults. The highest score is kept.
+            Default: the candidate with the fewest faulty frames is kept.
+        edit: part of a motion of the same length to keep in every sample, with `known` and `keep`
+            (1, F, D).
+        stages: list to which clean estimates of the first motion are added, at equal intervals of
+            the sampling, followed by the motion (MFM, figure 5).
+        keywords: number and length of the motions, and how they are sampled: `actions` (instead
+            of texts), `seconds` or `frames` (default: 3 seconds), `samples` (1) per text,
+            `candidates` (1) per sample, `seed` (0), `after`, `split` (True), `loop` (False),
+            `targets` or `path`, `shared_noise` (False), `cleanup` (False), and `guidance_scale`,
+            `sampler`, `num_inference_steps`, `eta` and `spacing` (default: the model's).
+            `flame_mdm.sampling.motion_request.SamplingRequest` and
+            `flame_mdm.sampler_options.SamplerOptions` describe them.
             describe them.
 
     Returns:
-        One motion per sample, `samples` for each text: all samples of the first text in the order of their numbers,
-        then all samples of the second text, and so on.
+        One motion per sample, `samples` for each text: all samples of the first text in the order
+        of their numbers, then all samples of the second text, and so on.
 
     Raises:
-        UserError: If the request is invalid, the model cannot do what is requested, or knows no word of a text that
-            says what happens.
+        UserError: If the request is invalid, the model cannot do what is requested, or the model
+            knows no word of a text that says what happens.
 
     Example:
         >>> import flame_mdm
@@ -92,7 +96,7 @@ def sample(
     score: Score | None = None,
     stages: list[Motion] | None = None,
 ) -> list[Motion]:
-    """Samples the motions of a resolved request in batches; see `generate` for the arguments and the result."""
+    """Samples the motions of a resolved request in batches; see `generate`."""
     request = resolved.request
     if model.denoiser.context_frames and (stages is not None or resolved.edit is not None):
         keyword = "edit" if stages is None else "trajectory"
@@ -124,7 +128,8 @@ def sample(
 def best(candidates: Sequence[Motion], score: Score | None = None) -> Motion:
     """Returns the candidate without faults that has the highest score.
 
-    All candidates are scored if each has faults. Without `score`, returns the one with the fewest faulty frames.
+    If all candidates have faults, all of them are scored. Without `score`, returns the candidate
+    with the fewest faulty frames.
     """
     faulty = [_faulty_frames(motion) for motion in candidates]
     if score is None:
@@ -149,7 +154,7 @@ class _Row:
 
 
 def _rows(resolved: ResolvedRequest) -> list[_Row]:
-    """Returns the motions to sample, beginning with the motions of the first prompt."""
+    """Returns the motions to sample. The motions of the first prompt come first."""
     copies = resolved.request.samples * resolved.request.candidates
     counts: Counter[str] = Counter()
     rows = []
@@ -199,7 +204,10 @@ def _sample(
 def _sample_streams(
     model: MotionGenerator, resolved: ResolvedRequest, rows: Sequence[_Row]
 ) -> list[Motion]:
-    """Samples motions as the beginnings of streams; with targets one by one, since their guidance is of one motion."""
+    """Samples motions as the beginnings of streams.
+
+    Motions with targets are sampled one by one, because their guidance is for a single motion.
+    """
     if resolved.targets is not None and len(rows) > 1:
         return [motion for row in rows for motion in _sample_streams(model, resolved, [row])]
     request, before = resolved.request, resolved.before
@@ -208,7 +216,7 @@ def _sample_streams(
         features = before[-model.denoiser.context_frames :].to(model.device)
         prefix = model.representation.normalize(features)[None]
 
-    # The noise depends on the first part alone, so that later parts change nothing before them.
+    # The noise depends only on the first part, so later parts change nothing before them.
     numbers = [row.id.rpartition("#")[2] for row in rows]
     first = [row.prompt.conditions[0] for row in rows]
     ids = [f"{condition}#{number}" for condition, number in zip(first, numbers, strict=True)]
@@ -231,7 +239,7 @@ def _sample_streams(
 
 
 def _edit(model: MotionGenerator, resolved: ResolvedRequest, x: Tensor) -> Edit | None:
-    """Returns what a batch x (B, F, D) of motions keeps and reaches, padded to its frames."""
+    """Returns the edit of a batch x (B, F, D): its kept parts and targets, padded to F frames."""
     edit, frames = resolved.edit, x.shape[1]
     if resolved.targets is not None:
         goal = resolved.targets.edit(model.representation, frames, model.device)
@@ -263,14 +271,17 @@ def _decoded(model: MotionGenerator, resolved: ResolvedRequest, row: _Row, x: Te
 
 
 class _First(list[Tensor]):
-    """Keeps the first motion (1, F, D) of each batch that is appended, on the CPU."""
+    """A list that keeps only the first motion (1, F, D) of each appended batch, on the CPU."""
 
     def append(self, x: Tensor) -> None:
         super().append(x[:1].cpu())
 
 
 def _stages(model: MotionGenerator, trajectory: Sequence[Tensor], result: Motion) -> list[Motion]:
-    """Returns up to `STAGES` of the first motion's clean estimates at equal intervals of the calls, and the motion."""
+    """Returns up to `STAGES` clean estimates of the first motion, followed by the motion.
+
+    The estimates are at equal intervals of the denoiser's calls.
+    """
     count, stages = len(trajectory), []
     for call in sorted({index * count // STAGES for index in range(STAGES)}):
         x = trajectory[call][0, : len(result.features)].float()

@@ -1,7 +1,8 @@
 # pyright: standard
 """Keywords of `flame_mdm.generate` and `flame_mdm.edit`, with their types.
 
-They are the fields of `SamplingRequest`, `EditRequest` and `SamplerOptions`, where defaults and help texts are.
+They are the fields of `SamplingRequest`, `EditRequest` and `SamplerOptions`, which contain the
+defaults and help texts.
 """
 
 from collections.abc import Mapping, Sequence
@@ -9,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypedDict
 
 from flame_mdm.formats.motion import Motion
-from flame_mdm.sampling.motion_request import Ranges, WayPoints
+from flame_mdm.sampling.motion_request import Ranges, Waypoints
 
 
 class SamplerKeywords(TypedDict, total=False):
@@ -23,7 +24,7 @@ class SamplerKeywords(TypedDict, total=False):
 
 
 class SamplingKeywords(SamplerKeywords, total=False):
-    """Fields of `flame_mdm.sampling.motion_request.SamplingRequest` besides the texts, and of `SamplerOptions`."""
+    """Fields of `SamplingRequest`, except the texts, and of `SamplerOptions`."""
 
     actions: str | Sequence[str] | None
     seconds: float | Sequence[float] | None
@@ -35,13 +36,13 @@ class SamplingKeywords(SamplerKeywords, total=False):
     split: bool
     loop: bool
     targets: str | Path | Mapping[str, Any] | None
-    path: str | WayPoints | None
+    path: str | Waypoints | None
     shared_noise: bool
     cleanup: bool
 
 
 class EditKeywords(SamplingKeywords, total=False):
-    """Fields of `flame_mdm.sampling.motion_request.EditRequest`, besides `SamplingKeywords`."""
+    """Fields of `EditRequest`, and `SamplingKeywords`."""
 
     region: str | Ranges | None
     region_seconds: Ranges | None

@@ -1,5 +1,8 @@
 # pyright: standard
-"""Requests for motions and edits. Their checks do not import torch, so that wrong input is refused at once."""
+"""Requests for motions and edits.
+
+They are checked without torch, so wrong input fails quickly.
+"""
 
 from __future__ import annotations
 
@@ -19,9 +22,9 @@ from flame_mdm.sampler_options import SamplerOptions
 if TYPE_CHECKING:
     from flame_mdm.formats.motion import Motion
 
-# Maximum number of samples per request; they are kept in memory until all are complete
+# Maximum number of samples per request. They are kept in memory until all are complete.
 MAX_SAMPLES = 10_000
-# Maximum number of characters of a text; captions of the data sets are far shorter
+# Maximum number of characters of a text. Captions of the data sets are far shorter.
 MAX_TEXT_LENGTH = 2000
 TRAINED_ON = {
     "text": ("was trained on captions", 'text="a person walks"'),
@@ -35,7 +38,7 @@ METHODS: dict[str, dict[str, Any]] = {
     "mfm": {"mode": "trajectory", "until": 0.2},
 }
 """Editing methods of the papers, as options of `flame_mdm.batch.Edit`."""
-# Tasks that name the frames to resample
+# Names for the frames to resample
 REGIONS = (
     "in_between",
     "prediction",
@@ -44,16 +47,16 @@ REGIONS = (
     "interpolate",
 )
 
-# Text of a part of a sequence, and its seconds if the text gives them
+# Text of a part of a sequence, and its seconds if the text states them
 Part = tuple[str, float | None]
-WayPoints = Sequence[tuple[float, float]]  # x and z in meters
+Waypoints = Sequence[tuple[float, float]]  # x and z in meters
 Ranges = Sequence[float] | Sequence[Sequence[float]]
-ARRIVAL = 0.2  # seconds before the end of a motion at which the last way point of a path is reached
+ARRIVAL = 0.2  # seconds between the last waypoint of a path and the end of the motion
 
 
 @dataclass(frozen=True, kw_only=True)
 class EditRequest:
-    """Which part of a motion to resample, and how: keywords of `flame_mdm.edit`.
+    """The part of a motion to resample, and the method: keywords of `flame_mdm.edit`.
 
     Raises:
         UserError: If a value is invalid for every motion.
@@ -90,8 +93,8 @@ class EditRequest:
     )
     strength: float | None = option(
         None,
-        "starts from the motion with noise added, and takes this fraction of the sampling steps, above 0 and up to 1: "
-        "the smaller, the closer to the motion",
+        "starts from the motion with noise added, and takes this fraction of the sampling steps, above 0 and up to 1. "
+        "With a smaller fraction, the result is closer to the motion",
     )
 
     def __post_init__(self) -> None:
@@ -117,7 +120,7 @@ class EditRequest:
 
     @property
     def ranges(self) -> list[tuple[float, float]] | None:
-        """The ranges of `region`, or of `region_seconds`; None if they have none."""
+        """The ranges of `region` or `region_seconds`; None if there are no ranges."""
         name = "region" if self.region_seconds is None else "region_seconds"
         value: Any = getattr(self, name)
         if value is None or (name == "region" and isinstance(value, str)):
@@ -132,7 +135,8 @@ class EditRequest:
     def method_options(self, method: str) -> dict[str, Any]:
         """Returns the options of `flame_mdm.batch.Edit` for a method.
 
-        Raises `UserError` if this request has options that the method lacks.
+        Raises:
+            UserError: If this request has options that the method lacks.
         """
         options = METHODS[method] | {"resample": self.resample, "strength": self.strength}
         if self.resample != 1 and options["mode"] != "x_t":
@@ -148,14 +152,14 @@ class EditRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class SamplingRequest:
-    """Motions to sample, for texts or actions: keywords of `flame_mdm.generate`; unconditioned without both.
+    """Motions to sample for texts or actions, or unconditioned motions: keywords of `flame_mdm.generate`.
 
-    A text or action may have several parts, "walks forward @3 | turns left | sits down @2", with
-    their seconds. They are generated together as one motion, in windows that overlap; see
-    docs/sequences.md. So is a single part with seconds, "walks forward @10", which may be longer
-    than the motions in training.
+    A text or action may have several parts with their seconds, "walks forward @3 | turns left |
+    sits down @2". They are generated together as one motion, in overlapping windows; see
+    docs/sequences.md. A single part with seconds, "walks forward @10", is also generated in
+    windows. It may be longer than the motions in training.
 
-    `flame_mdm.sampling.resolution.resolve` adds what depends on a model.
+    `flame_mdm.sampling.resolution.resolve` adds the values that depend on a model.
 
     Raises:
         UserError: If a value is invalid for every model, or two values contradict each other.
@@ -172,8 +176,8 @@ class SamplingRequest:
     actions: str | Sequence[str] | None = option(None, "a label, for models trained on labels")
     seconds: float | Sequence[float] | None = option(
         None,
-        "length of the motion, or a list with one length per text; in a sequence, length of each part that has no "
-        "seconds in the text. Default: 3, or the longest motion in training if that is shorter",
+        "length of the motion, or a list with one length per text. In a sequence, it is the length of each part "
+        "without seconds in the text. Default: 3, or the longest motion in training if that is shorter",
     )
     frames: int | Sequence[int] | None = option(
         None, "length in frames, or a list of lengths, instead of seconds"
@@ -181,7 +185,7 @@ class SamplingRequest:
     samples: int = option(1, "motions per text or action")
     candidates: int = option(
         1,
-        "motions generated for each kept motion: the best one without faults is kept, or the best if all have faults",
+        "motions generated for each kept motion. The best one without faults is kept. If all have faults, the best is",
     )
     seed: int = option(0, "seed of the noise")
     after: str | Path | Motion | None = option(
@@ -194,13 +198,13 @@ class SamplingRequest:
         False, "true = the last frame leads to the first one, for motions that are repeated"
     )
     targets: str | Path | Mapping[str, Any] | None = option(
-        None, "a JSON file of way points, joint positions and poses to reach: docs/targets.md"
+        None, "a JSON file of waypoints, joint positions and poses to reach: docs/targets.md"
     )
-    path: str | WayPoints | None = option(
-        None, 'way points on the floor, x,z in meters, instead of targets: "0,1 0.5,2"'
+    path: str | Waypoints | None = option(
+        None, 'waypoints on the floor, x,z in meters, instead of targets: "0,1 0.5,2"'
     )
     shared_noise: bool = option(
-        False, "the same noise for all motions: they differ by texts and lengths alone"
+        False, "the same noise for all motions, which then differ only by text and length"
     )
     cleanup: bool = option(False, "smooth motions, constant bone lengths, feet that do not slide")
     options: SamplerOptions = field(default_factory=SamplerOptions)
@@ -212,8 +216,9 @@ class SamplingRequest:
     ) -> SamplingRequest:
         """Returns the request of the keywords of a function, `generate` or `edit`.
 
-        Raises `UserError` if a keyword is not a field of this class, of `SamplerOptions` or, with
-        `editing`, of `EditRequest`.
+        Raises:
+            UserError: If a keyword is not a field of this class, of `SamplerOptions` or, with
+                `editing`, of `EditRequest`.
         """
         request_names = _names(cls) - {"options", "editing"}
         option_names = _names(SamplerOptions)
@@ -234,7 +239,7 @@ class SamplingRequest:
     def __post_init__(self) -> None:
         for name in ("texts", "actions", "seconds", "frames"):
             value = getattr(self, name)
-            # Arrays and numbers of numpy become lists and numbers.
+            # NumPy's arrays and numbers become lists and numbers
             value = value.tolist() if hasattr(value, "tolist") else value
             if isinstance(value, str) and name in ("texts", "actions"):
                 value = (value,)
@@ -315,7 +320,11 @@ class SamplingRequest:
                 raise UserError(f"{shown} is not a valid length")
 
     def check_edit(self, varies: bool) -> None:
-        """Raises `UserError` if a request to edit a motion, or to vary all of it, asks for more than that."""
+        """Checks a request to edit a motion, or to vary all of it.
+
+        Raises:
+            UserError: If the request asks for more than that.
+        """
         if self.after is not None or (not varies and (self.is_sequence or self.has_targets)):
             advice = (
                 "Variations of an entire motion (strength=0.5) may have parts, loop and targets"
@@ -326,14 +335,14 @@ class SamplingRequest:
 
     @property
     def kind(self) -> Literal["text", "action", "none"]:
-        """The condition of the motions."""
+        """The kind of condition of the motions."""
         return (
             "text" if self.texts is not None else "action" if self.actions is not None else "none"
         )
 
     @property
     def has_targets(self) -> bool:
-        """Whether motions have places to reach."""
+        """Whether the motions have targets."""
         return self.targets is not None or self.path is not None
 
     @property
@@ -351,11 +360,14 @@ class SamplingRequest:
 
     @property
     def is_sequence(self) -> bool:
-        """Whether motions are generated in windows: prompts have parts or seconds, or they loop or continue one."""
+        """Whether motions are generated in windows.
+
+        This is the case if prompts have parts or seconds, or motions loop or continue a motion.
+        """
         return self.loop or self.after is not None or any(is_timed(parts) for parts in self.parts)
 
     def lengths(self, fps: float) -> list[float | None]:
-        """Returns the length of each prompt in frames, not rounded; None where the request gives none."""
+        """Returns the length of each prompt in frames, not rounded; None = not stated."""
         value: Any = self.frames if self.seconds is None else self.seconds
         lengths = value if isinstance(value, tuple) else [value] * len(self.prompts)
         return [
@@ -381,12 +393,16 @@ def check_length(text: str) -> None:
 
 
 def is_timed(parts: Sequence[Part]) -> bool:
-    """Returns whether a prompt has several parts, or seconds."""
+    """Returns whether a prompt has several parts, or states seconds."""
     return len(parts) > 1 or parts[0][1] is not None
 
 
 def read_parts(text: str) -> list[Part]:
-    """Splits "walks @3 | sits down" into parts, [("walks", 3.0), ("sits down", None)], or raises `UserError`."""
+    """Splits "walks @3 | sits down" into parts, [("walks", 3.0), ("sits down", None)].
+
+    Raises:
+        UserError: If a part is empty, or its seconds are not a number above 0.
+    """
     parts: list[Part] = []
     for part in text.split("|"):
         words, at, number = part.rpartition("@") if "@" in part else (part, "", "")
@@ -412,8 +428,12 @@ def is_range(value: Any) -> bool:
     return pair and all(isinstance(v, int | float) and math.isfinite(v) for v in value)
 
 
-def read_path(path: str | WayPoints) -> tuple[tuple[float, float], ...]:
-    """Returns the way points (x, z) in meters of "x,z x,z ...", or of pairs; raises `UserError` if there are none."""
+def read_path(path: str | Waypoints) -> tuple[tuple[float, float], ...]:
+    """Returns the waypoints (x, z) in meters of "x,z x,z ..." or of pairs.
+
+    Raises:
+        UserError: If there are no waypoints, or they cannot be read.
+    """
     pairs = [point.split(",") for point in path.split()] if isinstance(path, str) else path
     try:
         points = tuple((float(x), float(z)) for x, z in pairs)
@@ -421,12 +441,15 @@ def read_path(path: str | WayPoints) -> tuple[tuple[float, float], ...]:
         points = ()
     if not points:
         shown = shortened(one_line(str(path)[:500]), 60)
-        raise UserError(f"path={shown}: give way points as x,z in meters, such as 0,1 0.5,2")
+        raise UserError(f"path={shown}: give waypoints as x,z in meters, such as 0,1 0.5,2")
     return points
 
 
-def path_targets(path: WayPoints, seconds: float) -> dict[str, Any]:
-    """Returns targets that lead a motion of `seconds` along a path from x = z = 0, at an even speed."""
+def path_targets(path: Waypoints, seconds: float) -> dict[str, Any]:
+    """Returns targets that lead a motion of `seconds` along a path at a constant speed.
+
+    The path starts at x = z = 0.
+    """
     steps = pairwise([(0.0, 0.0), *path])
     distances = list(accumulate(math.dist(*step) for step in steps))
     total = distances[-1] or 1.0

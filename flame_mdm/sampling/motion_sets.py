@@ -1,5 +1,8 @@
 # pyright: standard
-"""Sets of motions for game engines: loops, starts, stops and turns that fit together, from one file that names them."""
+"""Sets of motions for game engines: loops, starts, stops and turns that fit together.
+
+A file lists the motions of a set.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -39,8 +42,8 @@ from flame_mdm.visualize import contact_sheet, write_player
 from flame_mdm.visualize.body import Mesh
 
 SETS = Path(__file__).parent / "sets"
-IN_PLACE = "_InPlace"  # end of the names of files without a path
-SEPARATION = 1.0  # seconds between two clips while their rotations are solved for
+IN_PLACE = "_InPlace"  # suffix of the names of files without a path
+SEPARATION = 1.0  # seconds between two clips while their rotations are computed
 NAME = r"^[A-Za-z0-9_-]{1,60}$"
 WRITERS: dict[str, Callable[[Path, RiggedClip], None]] = {
     "fbx": fbx_writer.write,
@@ -49,11 +52,11 @@ WRITERS: dict[str, Callable[[Path, RiggedClip], None]] = {
     "usdc": usd.write,
     "usdz": usd.write,
 }
-"""Format -> function that writes a clip."""
+"""Functions that write a clip, by format."""
 # Score per meter that a foot slides, relative to the score per meter of difference between poses
 SLIDING = 200.0
-PIVOTING = 0.1  # score per degree that a planted foot turns
-JOLTING = 0.1  # score per m/s² by which a foot accelerates
+PIVOTING = 0.1  # score per degree of rotation of a planted foot
+JOLTING = 0.1  # score per m/s² of acceleration of a foot
 FAULTY = 0.2  # score of a frame with a fault
 
 
@@ -81,7 +84,11 @@ class MotionSet(ClosedSchema):
 
 
 def read_set(source: str) -> MotionSet:
-    """Reads a set by its name, such as "locomotion", or from a YAML file; raises `UserError` if it is invalid."""
+    """Reads a set by its name, such as "locomotion", or from a YAML file.
+
+    Raises:
+        UserError: If the set is invalid.
+    """
     names = sorted(path.stem for path in SETS.glob("*.yaml"))
     path = Path(source)
     if source in names:
@@ -111,7 +118,11 @@ def read_set(source: str) -> MotionSet:
 
 
 def changed(content: MotionSet, **values: Any) -> MotionSet:
-    """Returns a set with other values of `rig`, `format` or `fps`; raises `UserError` if one is invalid."""
+    """Returns a set with other values of `rig`, `format` or `fps`.
+
+    Raises:
+        UserError: If a value is invalid.
+    """
     try:
         content = check_shape(content.model_dump() | values, MotionSet)
     except ValueError as error:
@@ -129,7 +140,7 @@ def _check_rig(content: MotionSet, name: str) -> None:
 
 @dataclass(frozen=True, eq=False)
 class MadeSet:
-    """The clips of a set, and why motions were left out, by their names."""
+    """The clips of a set, and the reasons for motions that were left out, by name."""
 
     clips: list[Clip]
     left_out: dict[str, str]
@@ -138,17 +149,19 @@ class MadeSet:
 def make_set(model: MotionGenerator, content: MotionSet, seed: int = 0, **options: Any) -> MadeSet:
     """Generates the motions of a set and cuts them into clips, with a progress bar.
 
-    Of the candidates for each motion, the one whose clips fit best is kept: poses that differ little where the clips
-    are cut, feet that stay in place and do not jerk, few faults. A motion that the model cannot do is left out.
+    Of the candidates for each motion, the one with the best clips is kept: similar poses at the
+    cuts, feet that stay in place and do not jerk, and few faults. A motion that the model cannot
+    do is left out.
 
     Args:
         model: a model of SMPL's 22 joints that samples texts in windows.
         content: the set.
         seed: seed of the noise.
-        options: how the motions are sampled, as in `generate`.
+        options: sampling options, as in `generate`.
 
     Raises:
-        UserError: If the model has another skeleton or cannot do what is requested, or no person stands.
+        UserError: If the model has another skeleton or cannot do what is requested, or if no
+            person stands.
     """
     if model.representation.skeleton.joints != SMPL22.joints:
         raise UserError(
@@ -182,7 +195,10 @@ def _takes(
     seed: int,
     options: Mapping[str, Any],
 ) -> list[GroundedMotion]:
-    """Samples the candidates for a motion; of a loop, each has three repetitions and one frame more."""
+    """Samples the candidates for a motion.
+
+    Candidates for a loop have three repetitions + 1 frame.
+    """
     is_loop, representation = motion.kind == "loop", model.representation
     sampling: SamplerKeywords = {**options}  # type: ignore[typeddict-item]
     sampled = generate(
@@ -210,7 +226,10 @@ def _takes(
 def _clips(
     name: str, motion: SetMotion, take: GroundedMotion, stand: np.ndarray
 ) -> tuple[float, list[Clip]] | None:
-    """Returns the clips of a candidate and their score, lower is better; None if it does not show the motion."""
+    """Returns the score of a candidate, lower is better, and its clips.
+
+    Returns None if the candidate does not show the motion.
+    """
     score = 0.0
     if motion.kind == "loop":
         clips = [Clip(name, "loop", gaits.loop(take), motion.text)]
@@ -251,9 +270,10 @@ def motion_of(clip: Clip) -> Motion:
 
 
 def rig_clips(clips: list[Clip], rig: str | None, body: Mesh | None = None) -> list[RiggedClip]:
-    """Returns clips in place on one skeleton, with one skin; rotations of all clips are solved for together.
+    """Returns clips in place on one skeleton, with one skin.
 
-    Programs apply all animations of a set to the skeleton of the first file, so the rest pose must be the same.
+    Rotations of all clips are computed together. Programs apply all animations of a set to the
+    skeleton of the first file, so the rest pose must be the same.
     """
     fps = clips[0].motion.fps
     joints, frames = gaits.with_neighbors(clips, round(SEPARATION * fps))
@@ -269,10 +289,10 @@ def rig_clips(clips: list[Clip], rig: str | None, body: Mesh | None = None) -> l
 def write_set(
     folder: Path, clips: MadeSet, content: MotionSet, facts: Mapping[str, Any], body: Mesh
 ) -> list[str]:
-    """Writes the files of a set into a folder, all or none; returns their names.
+    """Writes all files of a set into a folder, or none. Returns their names.
 
-    Each clip is a file with the path of the root and a file in place. `set.json` describes them, `set.png` and
-    `player.html` show them.
+    For each clip, there is a file with the path of the root, and a file in place. `set.json`
+    describes the clips, and `set.png` and `player.html` show them.
     """
     in_place = rig_clips(clips.clips, content.rig, body)
     entries = []
@@ -302,7 +322,7 @@ def write_set(
 
 
 def _entry(clip: Clip, still: RiggedClip, files: Mapping[str, str]) -> dict[str, Any]:
-    """Returns what `set.json` says about a clip; lengths in meters, angles in degrees, times in seconds."""
+    """Returns the entry of a clip in `set.json`: lengths in meters, angles in degrees, times in seconds."""
     motion = clip.motion
     seconds = (len(motion) - 1) / motion.fps
     travel = motion.path[-1] - motion.path[0]
@@ -332,7 +352,10 @@ def _entry(clip: Clip, still: RiggedClip, files: Mapping[str, str]) -> dict[str,
 
 
 def closure(clip: RiggedClip) -> tuple[float, float]:
-    """Returns how far the last pose of a clip in place is from the first: meters, and degrees of local rotations."""
+    """Returns the differences between the first and the last pose of a clip in place.
+
+    They are a distance in meters, and an angle of local rotations in degrees.
+    """
     positions, _ = clip.world()
     distance = float(np.linalg.norm(positions[-1] - positions[0], axis=-1).max())
     cosines = (np.trace(clip.turns[0].mT @ clip.turns[-1], axis1=-2, axis2=-1) - 1) / 2

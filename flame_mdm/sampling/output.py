@@ -1,5 +1,5 @@
 # pyright: standard
-"""Output of the commands that sample: folders, files, and the lines that tell what was written."""
+"""Output of the commands that sample: folders, files, and summaries of what was written."""
 
 import hashlib
 import re
@@ -18,11 +18,11 @@ from flame_mdm.visualize.body import Mesh
 
 SAMPLES = "samples"  # default folder of the motions
 REQUEST_FILES = re.compile(r"motion_\d{3,}\.npz|motions\.mp4|trajectory\.png")
-"""Files that some requests write and others do not."""
+"""Files that only some requests write."""
 
 
 def refuse_no_condition(model: MotionGenerator) -> None:
-    """Raises the `UserError` of a command that names no condition, with examples that the model knows."""
+    """Raises the `UserError` for a command without condition, with examples that the model knows."""
     examples = list(
         model.facts["actions"]
         if model.conditioned_on == "action"
@@ -34,12 +34,11 @@ def refuse_no_condition(model: MotionGenerator) -> None:
 
 
 def default_folder(model: MotionGenerator, title: str, *request: object) -> Path:
-    """Returns `samples/<experiment>/<title>-<hash>`, where the hash covers the title and all of
-    `request`.
+    """Returns `samples/<experiment>/<title>-<hash>`. The hash covers the title and `request`.
 
-    Requests for different motions thus go to different folders, also where the file system
-    ignores case. The folder is within `SAMPLES`, whatever an untrusted checkpoint calls its
-    experiment.
+    Requests for different motions thus have different folders, even if the file system ignores
+    case. The folder is always inside `SAMPLES`, even if an untrusted checkpoint has another name
+    of its experiment.
     """
     digest = hashlib.sha256(repr((title, request)).encode()).hexdigest()[:6]
     name = re.sub(r"[^\w]+", "-", title.lower()).strip("-")[:40].strip("-")
@@ -49,14 +48,14 @@ def default_folder(model: MotionGenerator, title: str, *request: object) -> Path
 
 
 def summary(folder: Path, motions: Sequence[Motion], *, mp4: bool) -> str:
-    """Returns the line that tells what `write_motions` wrote to a folder."""
+    """Returns a line about the files that `write_motions` wrote to a folder."""
     count = "1 motion" if len(motions) == 1 else f"{len(motions)} motions"
     files = f"{folder / 'player.html'}, motions.gif" + (", motions.mp4" if mp4 else "")
     return f"{count} of {len(motions[0].joints)} frames: {files}"
 
 
 def degenerate_notes(motions: Sequence[Motion]) -> list[str]:
-    """Returns one line about the frames of motions whose features determine no rotations, if there are such frames."""
+    """Returns one line if the features of some frames determine no rotations; otherwise []."""
     degenerate = sum(motion.degenerate for motion in motions)
     if not degenerate:
         return []
@@ -75,11 +74,12 @@ def write_motions(
     *,
     within: str | Path | None = None,
 ) -> None:
-    """Writes `motion_000.npz` ..., `motions.gif`, `motions.png` and `player.html` into a folder, all or none.
+    """Writes `motion_000.npz` ..., `motions.gif`, `motions.png` and `player.html` into a folder.
 
-    Such files of an earlier request that are not written again are removed. The first eight motions are drawn, and the
-    stages of a sampling run in `trajectory.png`; `facts` are added to each `.npz`. Links must not lead out of `within`,
-    as for `flame_mdm.safe_io.atomic_folder`.
+    Either all of them are written, or none. Files of an earlier request that are not written
+    again are removed. Only the first eight motions are drawn. The stages of a sampling run are
+    drawn in `trajectory.png`. `facts` are added to each `.npz`. Links must not lead out of
+    `within`; see `flame_mdm.safe_io.atomic_folder`.
     """
     scene = [replace(motion, text=motion.text or "unconditioned") for motion in motions]
     title = motions[0].text if len({motion.text for motion in motions}) == 1 else ""

@@ -1,4 +1,4 @@
-"""Places of bodies in the world: turns about the vertical and shifts over the floor, which join blocks of a motion."""
+"""Positions and directions of bodies in the world, with which blocks of a motion are joined."""
 
 from __future__ import annotations
 
@@ -13,22 +13,26 @@ from flame_mdm.representations.rotation import rotate_y
 
 @dataclass(frozen=True)
 class Placement:
-    """Turn (B,) in radians and shift (B, 3) in meters, y = 0, of B bodies in the world, float64."""
+    """Rotations about the vertical and shifts over the floor of B bodies in the world.
+
+    The rotation (B,) is in radians. The shift (B, 3) is in meters, with y = 0. Both are float64.
+    """
 
     turn: Tensor
     shift: Tensor
 
     @classmethod
     def origin(cls, count: int, device: torch.device) -> Placement:
-        """Returns the place in which nothing moves."""
+        """Returns the placement that moves nothing."""
         turn = torch.zeros(count, dtype=torch.float64, device=device)
         return cls(turn, torch.zeros(count, 3, dtype=torch.float64, device=device))
 
     @classmethod
     def fit(cls, local: Tensor, world: Tensor) -> Placement:
-        """Returns the place that moves poses `local` (B, J, 3) to `world` (B, J, 3) with the least squared error.
+        """Returns the placement that moves poses `local` (B, J, 3) to `world` (B, J, 3).
 
-        Heights are not changed. For equal poses, the error is 0 (Kabsch 1976, for a turn about one axis).
+        It has the least squared error. Heights are not changed. For equal poses, the error is 0
+        (Kabsch 1976, for a rotation about one axis).
         """
         local, world = local.double(), world.double()
         floor = local.new_tensor([1.0, 0.0, 1.0])
@@ -46,17 +50,22 @@ class Placement:
         return rotate_y(joints.double(), turn) + self.shift.view(-1, *ones, 3)
 
     def undo(self, points: Tensor) -> Tensor:
-        """Moves points (B, ..., 3) of the world to where `apply` would move them from."""
+        """Moves points (B, ..., 3) in the world back: the inverse of `apply`."""
         ones = (1,) * (points.ndim - 2)
         turn = self.turn.view(-1, *ones).expand(points.shape[:-1])
         return rotate_y(points.double() - self.shift.view(-1, *ones, 3), -turn)
 
 
 def step_after(representation: Representation, last: Tensor, world: Tensor) -> Placement:
-    """Returns the place of the frame after frames with features `last` (B, D) and joints `world` (B, J, 3).
+    """Returns the placement of the next frame.
 
-    A frame holds the turn and the step of the root to the next frame, so that this place does not depend on what the
-    next frame is. Decoding starts from the first frame, which is at this place.
+    A frame contains the turn and the step of the root to the next frame. Therefore this placement
+    does not depend on the next frame. When the next frames are decoded, they start at this place.
+
+    Args:
+        representation: the representation of the features.
+        last: (B, D), features of the last frame.
+        world: (B, J, 3), joints of the last frame in the world.
     """
     joints = representation.decode(torch.stack([last, last], 1))
     here = Placement.fit(joints[:, 0], world)

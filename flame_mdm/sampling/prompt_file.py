@@ -1,5 +1,5 @@
 # pyright: standard
-"""Files of prompts. Nothing here imports torch, so that wrong files are refused at once."""
+"""Files of prompts. They are read without torch, so wrong files fail quickly."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from flame_mdm.sampling.motion_request import check_length, read_parts
 
 @dataclass(frozen=True)
 class PromptFile:
-    """A text file with one prompt per line, of which some may be refused while the others are sampled.
+    """A text file with one prompt per line. Refused prompts do not prevent sampling of the others.
 
     Attributes:
         path: its name, as the user typed it.
-        lines: the prompts by the numbers of their lines, from 1; blank lines are left out.
-        refused: why a prompt cannot be sampled, by the number of its line.
+        lines: the prompts by line number, from 1. Blank lines are left out.
+        refused: reasons why prompts cannot be sampled, by line number.
     """
 
     path: str
@@ -28,7 +28,11 @@ class PromptFile:
 
     @classmethod
     def read(cls, path: str) -> PromptFile:
-        """Reads a file, and refuses prompts that no model can sample; raises `UserError` if it has no prompts."""
+        """Reads a file, and refuses prompts that no model can sample.
+
+        Raises:
+            UserError: If the file has no prompts.
+        """
         text = read_text(path, MEBIBYTE)
         lines = enumerate(text.removeprefix("\ufeff").splitlines(), start=1)
         prompts = {number: line.strip() for number, line in lines if line.strip()}
@@ -46,18 +50,21 @@ class PromptFile:
 
     @property
     def accepted(self) -> dict[int, str]:
-        """The prompts that are not refused, by the numbers of their lines."""
+        """The prompts that are not refused, by line number."""
         return {
             number: prompt for number, prompt in self.lines.items() if number not in self.refused
         }
 
     def refuse(self, errors: Mapping[int, UserError]) -> None:
-        """Refuses prompts for errors by their positions among the accepted ones."""
+        """Refuses prompts, given by error and position among the accepted prompts."""
         numbers = list(self.accepted)
         self.refused.update({numbers[position]: error for position, error in errors.items()})
 
     def lengths(self, key: str, lengths: Any) -> Any:
-        """Returns the lengths of the accepted prompts if `lengths` lists one per prompt, otherwise `lengths` itself."""
+        """Returns the lengths of the accepted prompts, if `lengths` is a list with one per prompt.
+
+        Otherwise, returns `lengths` unchanged.
+        """
         if not isinstance(lengths, Sequence):
             return lengths
         if len(lengths) != len(self.lines):
@@ -70,7 +77,7 @@ class PromptFile:
         ]
 
     def report(self) -> list[str]:
-        """Returns the lines that name the refused prompts; empty if there are none."""
+        """Returns one line per refused prompt."""
         return [
             f"{self.path}, line {number}: {first_line(self.refused[number])}"
             for number in sorted(self.refused)

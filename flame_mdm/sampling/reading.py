@@ -33,13 +33,23 @@ def read_motion(
     cut: Sequence[float] | None = None,
     data_root: str | Path = "data",
 ) -> Motion:
-    """Reads a motion file, or `dataset:id`, a clip of a prepared data set, and computes the features of a model.
+    """Reads a motion and computes the features of a model.
 
     Features of the same representation and frame rate are kept. Other motions are converted as in
-    `flame_mdm.formats.conversion` and made canonical; `notes` of the result tell what was fitted, with the error.
-    `fps`, `unit`, `up` (y, z or -y) and `animation` describe the file, as in `flame_mdm.formats.readers.read`; `cut`
-    is begin and end of the part to use, in seconds. Raises `FileNotFoundError` or `UserError` if the motion does not
-    exist or is damaged, `cut` is outside of it, or it cannot be encoded.
+    `flame_mdm.formats.conversion` and made canonical. `notes` of the result say what was fitted,
+    with the error.
+
+    Args:
+        representation: the representation of the model.
+        source: a motion file, or `dataset:id`, a clip of a prepared data set.
+        fps, unit, up, animation: descriptions of the file, as in
+            `flame_mdm.formats.readers.read`.
+        cut: begin and end in seconds of the part to use. Default: the entire motion.
+        data_root: folder of the prepared data sets.
+
+    Raises:
+        FileNotFoundError: If the motion does not exist.
+        UserError: If the motion is damaged or cannot be encoded, or `cut` is outside of it.
     """
     name = str(source)
     if Path(source).suffix.lower() in ENDINGS:
@@ -67,9 +77,12 @@ def read_motion(
 
 
 def part_of(representation: Representation, motion: Motion, cut: Sequence[float]) -> Motion:
-    """Returns the part [begin, end], in seconds, of a motion with features; it begins at the origin.
+    """Returns the part [begin, end], in seconds, of a motion with features.
 
-    Raises `UserError` if it is not a range of the motion.
+    The part begins at the origin.
+
+    Raises:
+        UserError: If [begin, end] is not a range of the motion.
     """
     if not is_range(cut):
         raise UserError(f"cut={cut}: write [begin, end], in seconds")
@@ -84,7 +97,10 @@ def part_of(representation: Representation, motion: Motion, cut: Sequence[float]
 
 
 def with_features(representation: Representation, motion: Motion) -> Motion:
-    """Returns the motion if it has features of this representation, otherwise computes them from its joints."""
+    """Returns the motion with features of this representation.
+
+    If the motion has none, they are computed from its joints.
+    """
     name = f"{motion.id}: " if motion.id else ""
     if motion.representation == representation.name and math.isclose(
         motion.fps, representation.fps
@@ -98,8 +114,8 @@ def with_features(representation: Representation, motion: Motion) -> Motion:
             check_size(motion.joints, 1.0, children=True)
         raw = raw_motion(motion, representation)
         features = representation.encode(raw.values)
-        # Some representations have one row per step between frames. Another step keeps the number
-        # of frames.
+        # Some representations have one row per pair of neighboring frames. A repeated frame keeps
+        # the number of frames.
         if len(features) < len(raw.values):
             step = (raw.values[-1:] - raw.values[-2:-1]) * raw.values.new_tensor([1.0, 0.0, 1.0])
             features = representation.encode(torch.cat([raw.values, raw.values[-1:] + step]))
@@ -111,7 +127,7 @@ def with_features(representation: Representation, motion: Motion) -> Motion:
 
 
 def decoded(representation: Representation, features: Tensor, text: str, name: str) -> Motion:
-    """Returns the motion of features (F, D)."""
+    """Returns the motion of features (F, D) in the data's units."""
     joints, fps, skeleton = (
         representation.decode(features).cpu().numpy(),
         representation.fps,

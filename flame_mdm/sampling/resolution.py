@@ -1,5 +1,5 @@
 # pyright: standard
-"""Resolution of requests: what a request means for one model, found out once, before anything is sampled."""
+"""Resolution of requests: everything that depends on the model is determined before sampling."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -37,18 +37,19 @@ from flame_mdm.sampling.targets import Targets, read_targets
 
 @dataclass(frozen=True)
 class ResolvedPrompt:
-    """A text or an action, as a model samples it.
+    """A text or an action in the form in which a model samples it.
 
     Attributes:
-        text: the prompt; a sentence of several actions is written as a sequence, "walks | sits".
+        text: the prompt. A sentence with several actions is written as a sequence, "walks | sits".
         is_split: whether the prompt was such a sentence.
-        conditions: caption or action of each part, as the model reads it.
+        conditions: caption or action of each part, for the model.
         texts: words of the prompt for each part.
-        frames: number of frames of each part. In a continued motion, the first part includes the frames that overlap
-            with the motion before.
+        frames: number of frames of each part. In a continued motion, the first part includes the
+            frames that overlap with the motion before.
         unknown: words of the text that the model has never seen in training, or does not read.
-        summary: what was understood, in one line; "" unless the model's captions have single actions.
-        changes: lines about what is sampled differently from what the text says.
+        summary: what was understood, in one line; "" unless the model's captions have single
+            actions.
+        changes: lines about differences between the text and what is sampled.
     """
 
     text: str
@@ -63,7 +64,7 @@ class ResolvedPrompt:
 
 @dataclass(frozen=True)
 class _Parts:
-    """Parts of a prompt: their words and seconds, the captions that the model reads, and what was understood."""
+    """Parts of a prompt: words, seconds, captions for the model, and what was understood."""
 
     parts: Sequence[Part]
     captions: tuple[str, ...]
@@ -72,17 +73,18 @@ class _Parts:
 
 @dataclass(frozen=True)
 class ResolvedRequest:
-    """A request for one model: sentences are split, lengths are frames, and motions and targets have been read.
+    """A request for one model. Sentences are split, lengths are frames, and files have been read.
 
     Attributes:
-        request: what was requested.
-        prompts: its texts or actions in their order, without refused ones.
+        request: the original request.
+        prompts: its texts or actions in order, without refused ones.
         is_sequence: whether the motions are sampled in overlapping windows.
         before: features (F, D), in the data's units, of the motion that all motions continue.
-        targets: places in the world to reach.
+        targets: positions and poses to reach.
         edit: part of a motion that all motions keep, with `known` and `keep` (1, F, D).
-        warnings: lines about the motion to continue (what was left out of its file, or looks wrong), about what is
-            sampled differently from what a text says, and about words that the model does not know or read.
+        warnings: lines for the user: about the motion to continue (what was left out of its file,
+            or looks wrong), about differences between a text and what is sampled, and about words
+            that the model does not know or read.
     """
 
     request: SamplingRequest
@@ -101,16 +103,19 @@ def resolve(
     *,
     check_words: bool = True,
 ) -> ResolvedRequest:
-    """Finds out what a request means for a model.
+    """Determines what a model does for a request.
 
     Args:
-        request: what is requested.
+        request: the request.
         model: the model that samples the motions.
-        refused: gets the error of each prompt that the model cannot sample, by the number of the prompt; the others
-            are resolved. Default: the first error is raised.
-        check_words: whether to refuse a text of which the model knows no word that says what happens.
+        refused: mapping to which the error of each prompt that the model cannot sample is added,
+            by the number of the prompt. Other prompts are resolved. Default: the first error is
+            raised.
+        check_words: whether to refuse a text if the model knows none of its words that say what
+            happens.
 
-    Raises `UserError` if the model cannot do what is requested.
+    Raises:
+        UserError: If the model cannot do what is requested.
     """
     _check_model(request, model)
     read: dict[int, _Parts] = {}
@@ -164,7 +169,7 @@ def resolve(
 
 @contextmanager
 def _collected(refused: dict[int, UserError] | None, number: int) -> Iterator[None]:
-    """Stores a `UserError` about a prompt in `refused`, unless that is None."""
+    """Stores a `UserError` about a prompt in `refused`, unless `refused` is None."""
     try:
         yield
     except UserError as error:
@@ -174,7 +179,7 @@ def _collected(refused: dict[int, UserError] | None, number: int) -> Iterator[No
 
 
 def _check_model(request: SamplingRequest, model: MotionGenerator) -> None:
-    """Checks what holds for all prompts: sampler, kind of condition, and windows."""
+    """Checks the conditions of all prompts: sampler, kind of condition, and windows."""
     model.process.find_sampler(request.options.over(model.sampler_options))
     if model.denoiser.context_frames:
         check_streams(model)
@@ -203,7 +208,7 @@ def _check_windows(model: MotionGenerator) -> None:
 def _parts(
     request: SamplingRequest, model: MotionGenerator, prompt: str, check_words: bool
 ) -> _Parts:
-    """Returns the parts of a prompt; a sentence with several actions has a part per action."""
+    """Returns the parts of a prompt. A sentence with several actions has one part per action."""
     if request.kind == "none":
         return _Parts([(prompt, None)], (prompt,))
     splits = (
@@ -227,10 +232,10 @@ def _parts(
 
 
 def _read(reader: Reader, prompt: str, splits: bool) -> _Parts:
-    """Returns the parts of a prompt as a model of single actions reads them.
+    """Returns the parts of a prompt for a model of single actions.
 
-    Unless it is split, a prompt keeps its parts. If one of them names several actions, the model reads its words as
-    they are.
+    Unless it is split, a prompt keeps its parts. If a part names several actions, the model gets
+    its words unchanged.
     """
     if splits:
         reading = reader.read(prompt)
@@ -262,7 +267,10 @@ def _unknown_words(prompt: _Parts, model: MotionGenerator) -> tuple[str, ...]:
 
 
 def _warnings(prompts: Sequence[ResolvedPrompt], model: MotionGenerator) -> list[str]:
-    """Returns lines about prompts that are read differently, or have words unknown to the model or not read."""
+    """Returns warnings about prompts.
+
+    They are about prompts that are read differently, and about unknown or unread words.
+    """
     lines = []
     for prompt in prompts:
         about = f"'{shortened(prompt.text, 60)}': " if len(prompts) > 1 else ""
@@ -279,10 +287,11 @@ def _warnings(prompts: Sequence[ResolvedPrompt], model: MotionGenerator) -> list
 def _continued(
     request: SamplingRequest, model: MotionGenerator
 ) -> tuple[Tensor | None, Edit | None, tuple[str, ...]]:
-    """Returns the features (F, D) of the motion to continue, the edit that keeps its last frames, and its notes.
+    """Returns the motion to continue: features (F, D), the edit that keeps its end, and its notes.
 
-    These frames are generated again, so that the new frames fit to them. A model that continues frames reads these
-    frames and needs no edit. The notes of a motion in memory are left out: its reader has shown them.
+    The last frames are generated again, so that the new frames fit them. A model that continues
+    frames reads these frames and needs no edit. The notes of a motion in memory are left out,
+    because its reader has shown them.
     """
     if request.after is None:
         return None, None, ()
@@ -308,7 +317,7 @@ def _continued(
 def _targets(
     request: SamplingRequest, model: MotionGenerator, prompts: Sequence[ResolvedPrompt]
 ) -> Targets | None:
-    """Reads the targets of a request; way points of a path are reached at an even speed."""
+    """Reads the targets of a request. The waypoints of a path are reached at a constant speed."""
     if request.path is not None and prompts:
         lengths = {sum(prompt.frames) for prompt in prompts}
         if len(lengths) > 1:

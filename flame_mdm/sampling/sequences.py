@@ -10,12 +10,15 @@ from flame_mdm.generator import MotionGenerator
 from flame_mdm.processes.windows import Windows, cover, spans
 from flame_mdm.sampling.motion_request import Part, SamplingRequest
 
-OVERLAP = 0.5  # seconds that neighboring windows share; see docs/sequences.md
+OVERLAP = 0.5  # duration that neighboring windows share, in seconds; see docs/sequences.md
 MAX_SECONDS = 600  # maximum length of a sequence; all its windows are denoised at the same time
 
 
 def overlap(model: MotionGenerator) -> int:
-    """Returns the number of frames that neighboring windows share, which is even; 0 if the model continues frames."""
+    """Returns the number of frames that neighboring windows share.
+
+    It is even, and 0 if the model continues frames.
+    """
     if model.denoiser.context_frames:
         return 0
     return 2 * round(min(OVERLAP * model.representation.fps, model.facts["max_frames"] / 3) / 2)
@@ -33,12 +36,16 @@ def part_frames(
     """Returns the number of frames of each part of a prompt.
 
     Args:
-        model: the model that samples the motion; `UserError` if a part is too short or too long for it.
+        model: the model that samples the motion.
         text: the prompt, for messages.
-        parts: its parts, with their seconds if the prompt gives them.
-        usual: frames of a part without seconds, not rounded. Default: 3 seconds, or what fits into one window.
-        is_sequence: whether the motion is sampled in windows; otherwise, it has a single part.
+        parts: its parts, with their seconds if the prompt states them.
+        usual: frames of a part without seconds, not rounded. Default: 3 seconds, or as many as
+            fit into one window.
+        is_sequence: whether the motion is sampled in windows. Otherwise, it has a single part.
         loop: whether the last frame leads to the first one.
+
+    Raises:
+        UserError: If a part is too short or too long for the model.
     """
     fps, longest = model.representation.fps, model.facts["max_frames"]
     if is_sequence or model.denoiser.context_frames:
@@ -87,12 +94,15 @@ def windows(
     conditions: Sequence[Sequence[str]],
     lengths: Sequence[Sequence[int]],
 ) -> Windows:
-    """Returns the windows of several sequences, by text or action and frames of each part."""
+    """Returns the windows of several sequences.
+
+    `conditions` and `lengths` are the texts or actions of the parts, and their numbers of frames.
+    """
     longest, shared, device = model.facts["max_frames"], overlap(model), model.device
     spans_of = [spans(parts, longest, shared, request.loop) for parts in lengths]
     covering = [(row, *span) for row, parts in enumerate(spans_of) for span in parts]
     names = [conditions[row][part] for row, part, _, _ in covering]
-    # A denoiser that attends to its padding sees as many frames as in training.
+    # A denoiser that attends to its padding gets as many frames as in training.
     width = max(size for *_, size in covering) if model.denoiser.mask_padding else longest
     positions = [(row, first, size) for row, _, first, size in covering]
     covered = cover(positions, [sum(parts) for parts in lengths], shared, width, device)

@@ -1,5 +1,8 @@
 # pyright: standard
-"""Streams: motions without an end, whose texts change while they run; each block continues the frames before it."""
+"""Streams: endless motions with texts that can change.
+
+Each block continues the frames before it.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +34,7 @@ from flame_mdm.sampling.placement import Placement, step_after
 from flame_mdm.sampling.reading import read_motion, with_features
 from flame_mdm.sampling.targets import Targets
 
-# Number of blocks of a stream that can be cut, such as those that a page has not shown yet
+# Number of blocks of a stream that can be cut, for example because a page has not shown them yet
 HELD = 4
 
 
@@ -45,26 +48,28 @@ def stream(
     cleanup: bool = False,
     **options: Unpack[SamplerKeywords],
 ) -> Stream:
-    """Starts a motion without an end, whose text can be changed at any time.
+    """Starts an endless motion. Its text can be changed at any time.
 
     Args:
         model: a model that continues frames (DiP), from `flame_mdm.load`.
         text: what the person does at first.
-        start: the motion to continue: a motion, a file, or "dataset:id", a clip of a prepared data set. Only its last
-            frames count. Default: a person who stands still.
+        start: the motion to continue: a motion, a file, or "dataset:id", a clip of a prepared
+            data set. Only its last frames are used. Default: a person who stands still.
         seed: seed of the noise.
-        block: number of frames per block, up to what the model predicts at once. Shorter blocks react sooner to a new
-            text, and cost more per second of motion. Default: as many as the model predicts at once.
-        cleanup: smooth motions, constant bone lengths, feet that do not slide. A block is returned after the next
-            block was computed, because it must fit that block.
-        options: `guidance_scale`, `sampler`, `num_inference_steps`, `eta` and `spacing`; default: the model's.
+        block: number of frames per block, at most as many as the model predicts at once, which is
+            the default. Shorter blocks react sooner to a new text, but cost more per second of
+            motion.
+        cleanup: smooth motions, constant bone lengths, feet that do not slide. A block is
+            returned after the next block was computed, because it must fit that block.
+        options: `guidance_scale`, `sampler`, `num_inference_steps`, `eta` and `spacing`. Default:
+            the model's.
 
     Returns:
         An iterator of blocks; see `Stream`.
 
     Raises:
-        UserError: If the model does not continue frames, knows no word of the text that says what happens, or the
-            motion to continue cannot be read or is too short.
+        UserError: If the model does not continue frames, knows no word of the text that says what
+            happens, or the motion to continue cannot be read or is too short.
 
     Example:
         >>> import flame_mdm
@@ -85,11 +90,11 @@ def stream(
 
 
 class Stream(Iterator[Motion]):
-    """A motion without an end, from `flame_mdm.stream`: an iterator of blocks, whose text may change at any time.
+    """An endless motion, from `flame_mdm.stream`: an iterator of blocks. Its text may change.
 
-    Each block is a `Motion`, placed in the world after the block before. A block is computed when it is asked for; with
-    `cleanup`, the block after it is computed, too. The same texts at the same times and the same seed give the same
-    motion.
+    Each block is a `Motion`, placed in the world after the block before. A block is computed when
+    it is requested; with `cleanup`, the block after it is computed, too. The same texts at the
+    same times and the same seed give the same motion.
 
     Example:
         >>> import itertools, flame_mdm
@@ -105,7 +110,7 @@ class Stream(Iterator[Motion]):
 
     @property
     def frames(self) -> int:
-        """Number of frames of all blocks that were computed so far."""
+        """Number of frames of all blocks so far."""
         return self._streams.frames[0]
 
     @property
@@ -115,16 +120,18 @@ class Stream(Iterator[Motion]):
         return self._streams.texts[condition]
 
     def change(self, text: str, at: float | None = None) -> None:
-        """Changes the text from the next block on, or from a given time on.
+        """Changes the text from the next block or a given time on.
 
-        A block ends early if the text changes in the middle of it. Blocks that were computed do not change.
+        If the text changes in the middle of a block, the block ends there. Blocks that were
+        computed already do not change.
 
         Args:
-            text: what the person does then.
-            at: time in seconds since the start of the stream. Default: the end of the blocks so far.
+            text: what the person does from then on.
+            at: time in seconds since the start of the stream. Default: the end of the last block.
 
         Raises:
-            UserError: If the model knows no word of the text that says what happens, or the time has passed.
+            UserError: If the model knows no word of the text that says what happens, or the time
+                has passed.
         """
         fps = self._streams.model.representation.fps
         frame = self.frames if at is None else round(at * fps)
@@ -138,10 +145,10 @@ class Stream(Iterator[Motion]):
         self._streams.schedules[0].add(frame, condition)
 
     def go_back(self, at: float) -> None:
-        """Drops the frames from a time on, which were not used yet: the next block continues the frames before.
+        """Drops frames from a time on that were not used yet. The next block continues from there.
 
-        A text is then seen at once, although blocks were computed ahead. The result is the stream whose text changes
-        at that time. Texts that were to change later are dropped, too.
+        A new text is then visible at once, although blocks were computed ahead. The result is the
+        stream whose text changes at that time. Later changes of the text are dropped, too.
 
         Args:
             at: time in seconds since the start of the stream, in one of the last four blocks.
@@ -163,11 +170,11 @@ class Stream(Iterator[Motion]):
 
 
 class OnlineCleanup:
-    """Cleanup of a motion that comes in blocks: each is cleaned together with the block before it and the one after.
+    """Cleanup of a motion that comes in blocks.
 
-    A block is cleaned twice: as the last of three blocks, and as the middle one. The first version continues the
-    previous block without a jump. The second version fits the next block. The result blends from the first version to
-    the second.
+    A block is cleaned twice: as the last of three blocks, and as the middle one. The first
+    version continues the previous block without a jump. The second version fits the next block.
+    The result blends from the first version to the second.
     """
 
     def __init__(self, representation: Representation):
@@ -176,7 +183,7 @@ class OnlineCleanup:
         self.version: np.ndarray | None = None  # the first version of the middle block
 
     def add(self, block: Motion) -> Motion | None:
-        """Takes the next block, and returns the cleaned one before it; None for the first."""
+        """Takes the next block, and returns the cleaned previous block; None at the first block."""
         self.blocks = [*self.blocks[-2:], block]
         if len(self.blocks) == 1:
             return None
@@ -189,8 +196,8 @@ class OnlineCleanup:
         begin = len(joints) - len(block.joints) - len(middle.joints)
         cleaned = joints[begin : begin + len(middle.joints)]
         if self.version is not None:
-            # The body follows its feet from the first frame of the three blocks on, so that
-            # places differ.
+            # The body follows its feet from the first frame of the three blocks on, so the
+            # positions of both versions differ.
             shift = (self.version[0, 0] - cleaned[0, 0]) * np.array([1, 0, 1], np.float32)
             joints, cleaned = joints + shift, cleaned + shift
             weight = np.linspace(0, 1, len(cleaned), dtype=np.float32)[:, None, None]
@@ -206,7 +213,10 @@ class OnlineCleanup:
 
 
 class PastBlock(NamedTuple):
-    """A block of a single stream that can be cut: `begin` is its first frame, `number` the number of its noise."""
+    """A block of a single stream that can be cut.
+
+    `begin` is the number of its first frame, and `number` is the number of its noise.
+    """
 
     begin: int
     number: int
@@ -231,7 +241,7 @@ class Schedule:
         return schedule
 
     def add(self, frame: int, condition: str) -> None:
-        """Changes the condition from a frame on, until the next change after it."""
+        """Changes the condition from a frame on, until the next change."""
         changes = {**dict(self.changes), frame: condition}
         self.changes = sorted(changes.items())
 
@@ -240,34 +250,36 @@ class Schedule:
         return [condition for begin, condition in self.changes if begin <= frame][-1]
 
     def drop(self, frame: int) -> None:
-        """Drops the changes from a frame on; the first condition stays."""
+        """Drops the changes from a frame on. The first condition stays."""
         self.changes = [entry for entry in self.changes if entry[0] < max(frame, 1)]
 
     def until_change(self, frame: int) -> int | None:
-        """Returns the number of frames from a frame to the next change; None if there is none."""
+        """Returns the number of frames from a frame to the next change; None without a change."""
         return next((begin - frame for begin, _ in self.changes if begin > frame), None)
 
 
 class Streams(Iterator[list[Motion]]):
-    """Several streams that are sampled in one batch; each is the same as alone, up to rounding.
+    """Several streams that are sampled in one batch. Each is the same as alone, up to rounding.
 
     Args:
         model: a model that continues frames.
-        ids: B names of the streams, which seed their noise.
+        ids: B names of the streams; they seed the noise.
         conditions: B texts or actions at the beginning; "" for unconditioned motions.
         prefix: (B, C, D) normalized features of the frames before the streams.
-        placement: place in the world of the first frames. None = the first frame is at x = z = 0 and faces +z.
-        options: options of the sampler; those that are None have the values of the model.
+        placement: placement of the first frames in the world. None = the first frame is at
+            x = z = 0 and faces +z.
+        options: options of the sampler. An option that is None has the value of the model.
         kind: "text", "action", or "none" for unconditioned motions.
         seed: seed of the noise.
-        block: number of frames per block; default: all that the model predicts at once.
+        block: number of frames per block. Default: as many as the model predicts at once.
 
     Attributes:
         schedules: conditions of each stream over its frames.
-        texts: texts of the conditions as they were typed, which name the blocks; a condition may be its own text.
+        texts: texts as they were typed, by condition. They name the blocks. A missing condition
+            is its own text.
         frames: number of frames of each stream so far.
-        targets: places in the world that a single stream reaches, by the guidance of sampling and, if the model was
-            trained with targets, also by its own condition. None = it goes anywhere.
+        targets: positions that a single stream reaches. The guidance of sampling leads to them
+            and, if the model was trained with targets, also its own condition. None = no targets.
     """
 
     def __init__(
@@ -301,12 +313,12 @@ class Streams(Iterator[list[Motion]]):
         )
         self.texts = {condition: condition for condition in conditions}
         self.targets: Targets | None = None
-        self._root = [0.0, 0.0]  # x and z in the world of the last frame of the first stream
+        self._root = [0.0, 0.0]  # x and z in the world of the first stream's last frame
         self._encoded: tuple[list[str], Condition] | None = None
         self._past: deque[PastBlock] = deque(maxlen=HELD)
 
     def __next__(self) -> list[Motion]:
-        """Returns the next block of each stream; it ends where the next condition begins."""
+        """Returns the next block of each stream. It ends where the next condition begins."""
         conditions = self._conditions()
         kept = [self._until_change(row) for row in range(len(self.frames))]
         x, joints = self._advance(kept)
@@ -319,7 +331,7 @@ class Streams(Iterator[list[Motion]]):
         ]
 
     def go_back(self, frame: int) -> None:
-        """Drops the frames of a single stream from `frame` on, and the changes of its text from then on.
+        """Drops the frames of a single stream from `frame` on, and later changes of its text.
 
         Raises:
             UserError: If the frame is not in one of the last `HELD` blocks.
@@ -344,7 +356,7 @@ class Streams(Iterator[list[Motion]]):
         self.frames = [frame]
 
     def take(self, lengths: Sequence[int]) -> list[Tensor]:
-        """Returns the next frames (F, D) of each stream, normalized, as many as `lengths` says."""
+        """Returns the next frames (F, D) of each stream, normalized; `lengths` are their numbers."""
         ends = [frame + length for frame, length in zip(self.frames, lengths, strict=True)]
         parts: list[list[Tensor]] = [[] for _ in ends]
         while self.frames != ends:
@@ -363,12 +375,12 @@ class Streams(Iterator[list[Motion]]):
         ]
 
     def _until_change(self, row: int) -> int:
-        """Returns the number of frames of the next block of a stream."""
+        """Returns the number of frames in the next block of a stream."""
         change = self.schedules[row].until_change(self.frames[row])
         return self.block if change is None else min(self.block, change)
 
     def _advance(self, kept: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """Samples the next block, of which each stream keeps the first `kept` frames.
+        """Samples the next block. Each stream keeps the first `kept` frames of it.
 
         Returns normalized features (B, P, D), and joints (B, P, J, 3) in the world, float64.
         """
@@ -401,7 +413,7 @@ class Streams(Iterator[list[Motion]]):
         return x, joints
 
     def _aimed(self, cond: Condition) -> tuple[Condition, Edit | None]:
-        """Returns the condition and the edit of the next block that lead the first stream to its targets."""
+        """Returns a condition and an edit for the next block that lead the first stream to targets."""
         if self.targets is None:
             return cond, None
         model, placement, frames = self.model, self.placement, self.model.block_frames
@@ -418,7 +430,7 @@ class Streams(Iterator[list[Motion]]):
 
     @torch.no_grad()
     def _encode(self, conditions: list[str]) -> Condition:
-        """Returns the encoded conditions, which are computed again only when they change."""
+        """Returns the encoded conditions. They are computed again only if they have changed."""
         if self._encoded is None or self._encoded[0] != conditions:
             model, device = self.model, self.model.device
             x = torch.zeros(len(conditions), 1, model.representation.features, device=device)
@@ -449,7 +461,7 @@ class Streams(Iterator[list[Motion]]):
 
 
 def in_world(representation: Representation, placement: Placement, x: Tensor) -> Tensor:
-    """Decodes normalized features (..., F, D) to joints (..., F, J, 3) in the world, at the place of one stream."""
+    """Decodes normalized features (..., F, D) of a stream to joints (..., F, J, 3) in the world."""
     joints = representation.to_joints(x)
     turn = placement.turn[0].to(joints).expand(joints.shape[:-1])
     return rotate_y(joints, turn) + placement.shift[0].to(joints)
@@ -487,9 +499,12 @@ def check_streams(model: MotionGenerator) -> None:
 
 
 def read_text(model: MotionGenerator, text: str) -> str:
-    """Returns a text as a model reads it: in the words of its captions, if it names one action that they have.
+    """Returns a text in the form that a model reads.
 
-    Raises `UserError` if the text is empty or too long, or the model does not know what it says.
+    If the text names one action of the model's captions, it is in the words of these captions.
+
+    Raises:
+        UserError: If the text is empty or too long, or the model does not know what it says.
     """
     if not isinstance(text, str) or not text.strip():
         raise UserError(
@@ -510,9 +525,10 @@ def read_text(model: MotionGenerator, text: str) -> str:
 def starting_point(
     model: MotionGenerator, start: str | Path | Motion | None
 ) -> tuple[Tensor, Placement | None]:
-    """Returns the frames (1, C, D) that a stream continues, normalized, and the place of the frame after them.
+    """Returns the normalized frames (1, C, D) that a stream continues, and the next placement.
 
-    Raises `UserError` if the model cannot stream, or the motion cannot be read, or is too short.
+    Raises:
+        UserError: If the model cannot stream, or the motion cannot be read or is too short.
     """
     check_streams(model)
     context, representation = model.denoiser.context_frames, model.representation

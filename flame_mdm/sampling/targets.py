@@ -1,5 +1,5 @@
 # pyright: standard
-"""Targets in the world: way points of the root, joint positions, and whole poses at given times."""
+"""Targets in the world: waypoints of the root, joint positions, and whole poses at given times."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -21,35 +21,36 @@ from flame_mdm.sampling.reading import read_motion
 from flame_mdm.schemas import ClosedSchema, check_shape, read_json
 
 SMOOTHNESS = 0.2  # seconds over which a correction fades; see docs/targets.md
-MAX_SPEED = 8.0  # meters per second that way points may require
-# Meters that a joint can be above the floor, and away from the point where the body stands.
+MAX_SPEED = 8.0  # maximum speed, in meters per second, that waypoints may require
+# Maximum height of a joint above the floor, and maximum distance from the body's position on the
+# floor, in meters
 REACH = 2.5
-MAX_COORDINATES = 600  # maximum number of coordinates; they are solved for together in every step
-Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)] | None  # meters; None = free
+MAX_COORDINATES = 600  # maximum number of coordinates; every step solves for all of them together
+Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)] | None  # in meters; None = free
 OnFloor = Annotated[Sequence[Coordinate], Field(min_length=2, max_length=2)]  # x and z
 
 
 class Timed(ClosedSchema):
-    """What a motion should meet at a time."""
+    """A target at a time."""
 
     time: Annotated[float, Field(ge=0, le=1e4)]  # seconds
 
 
-class WayPoint(Timed):
-    """A place of the root over the floor."""
+class Waypoint(Timed):
+    """A position of the root over the floor."""
 
     position: OnFloor
 
 
 class JointTarget(Timed):
-    """A place of a joint."""
+    """A position of a joint."""
 
     position: Annotated[Sequence[Coordinate], Field(min_length=3, max_length=3)]
     joint: str
 
 
 class PoseTarget(Timed):
-    """A frame of a motion, at a place or anywhere; `heading` is in degrees."""
+    """A frame of a motion, at a given position or anywhere. `heading` is in degrees."""
 
     position: OnFloor | None = None
     file: str
@@ -60,13 +61,16 @@ class PoseTarget(Timed):
 class TargetFile(ClosedSchema):
     """Content of a JSON file of targets; see docs/targets.md."""
 
-    root: Sequence[WayPoint] = ()
+    root: Sequence[Waypoint] = ()
     joints: Sequence[JointTarget] = ()
     poses: Sequence[PoseTarget] = ()
 
 
 class Goal(NamedTuple):
-    """A position (3,) in meters that a joint should have in a frame, NaN = free; `source` names it in messages."""
+    """A position (3,) in meters that a joint should have in a frame. NaN = free.
+
+    `source` is its name in messages.
+    """
 
     source: str
     frame: int
@@ -76,26 +80,22 @@ class Goal(NamedTuple):
 
 @dataclass(frozen=True)
 class PositionGuide:
-    """Leads motions to positions in the world; a `flame_mdm.batch.Guide`."""
+    """A `flame_mdm.batch.Guide` that leads motions to positions in the world."""
 
-    # Normalized features (..., F, D) -> joints (..., F, J, 3) in the world
+    # Converts normalized features (..., F, D) to joints (..., F, J, 3) in the world
     to_joints: Callable[[Tensor], Tensor]
     fps: float
     positions: Positions
     bones: Tensor  # (3, N) frame, parent and child of the bones that keep their lengths
-    poses: Tensor  # (1, F, D) features that are imposed in any case
-    keep: Tensor  # (1, F, D) bool, where features are imposed
+    poses: Tensor  # (1, F, D) features that are always imposed
+    keep: Tensor  # (1, F, D) bool, True = the feature is imposed
 
     def steer(self, clean: Callable[[Tensor], Tensor], x_t: Tensor) -> Tensor:
-        """Returns the noisy motion `x_t`, changed such that its clean estimate approaches the
-        positions.
-        """
+        """Returns a noisy motion like `x_t`, but with a clean estimate nearer to the positions."""
         return steer(clean, x_t, self.to_joints, self.positions)
 
     def reach(self, x0_hat: Tensor) -> Tensor:
-        """Returns a clean estimate (B, F, D) that reaches the positions and keeps the poses at
-        targets.
-        """
+        """Returns a clean estimate (B, F, D) that reaches the positions and keeps poses at targets."""
         imposed, free = torch.where(self.keep, self.poses, x0_hat), ~self.keep.expand_as(x0_hat)
         return reach(
             imposed, self.to_joints, self.positions, self.bones, free, SMOOTHNESS * self.fps
@@ -104,11 +104,11 @@ class PositionGuide:
 
 @dataclass(frozen=True)
 class Targets:
-    """What motions should reach."""
+    """Targets that motions should reach."""
 
     positions: Positions  # coordinates in the world
-    # Frames of poses, and their features (D,) in the units of the data. Poses have no fixed
-    # position.
+    # Frames of poses, and their features (D,) in the units of the data. These poses may be
+    # anywhere.
     poses: tuple[tuple[int, Tensor], ...]
 
     def check_end(self, frames: int, fps: float) -> None:
@@ -121,10 +121,16 @@ class Targets:
             )
 
     def window(self, begin: int, frames: int, here: Sequence[float]) -> "Targets":
-        """Returns the targets of the window of `frames` frames from `begin` on, with frames counted from there.
+        """Returns the targets in a window of `frames` frames from `begin` on.
 
-        If the root is to be somewhere later, it goes part of the way in the window: `here` is its x and z at the start
-        of the window, from where, or from the last target of the root in the window, it moves at an even speed.
+        Frames are counted from the beginning of the window. If the root has a target after the
+        window, it must go a part of the way in the window. Its speed is constant, starting from
+        the last target of the root in the window or, without one, from `here`.
+
+        Args:
+            begin: first frame of the window.
+            frames: number of frames of the window.
+            here: x and z of the root at the beginning of the window.
         """
         end = begin + frames
         positions, inside = (
@@ -167,9 +173,10 @@ class Targets:
         device: torch.device,
         to_joints: Callable[[Tensor], Tensor] | None = None,
     ) -> Edit:
-        """Returns the edit (1, F, D) that leads to the targets: poses are imposed, positions guide the estimates.
+        """Returns the edit (1, F, D) that leads to the targets.
 
-        `to_joints` maps normalized features to joints in the world; default: motions start at the origin.
+        Poses are imposed, and positions guide the estimates. `to_joints` maps normalized features
+        to joints in the world. By default, motions start at the origin.
         """
         imposed = torch.zeros(1, frames, representation.features, device=device)
         keep = torch.zeros_like(imposed, dtype=torch.bool)
@@ -179,7 +186,7 @@ class Targets:
                 range(1, len(representation.skeleton))
             ).to(device)
         positions = Positions(*(x.to(device) for x in vars(self.positions).values()))
-        # Joints that are reached by stretching the body and not by moving the root.
+        # Joints that are reached by stretching the body, not by moving the root
         stretched = sorted(set(self.positions.frames[self.positions.joints > 0].tolist()))
         edges = [(frame, *edge) for frame in stretched for edge in representation.skeleton.edges]
         bones = torch.tensor(edges, dtype=torch.long, device=device).reshape(-1, 3).T
@@ -189,7 +196,10 @@ class Targets:
 
 
 def errors(motion: Motion, targets: Targets) -> np.ndarray:
-    """Returns the distance in meters of a motion from each target position, along the coordinates that are not free."""
+    """Returns the distance in meters of a motion from each target position.
+
+    Free coordinates are ignored.
+    """
     goal = targets.positions
     off = goal.of(torch.from_numpy(motion.joints)) - goal.values
     targeted, index = torch.stack([goal.frames, goal.joints], 1).unique(dim=0, return_inverse=True)
@@ -197,7 +207,11 @@ def errors(motion: Motion, targets: Targets) -> np.ndarray:
 
 
 def read_targets(representation: Representation, source: str | Path | Mapping[str, Any]) -> Targets:
-    """Reads targets from a JSON file, or from its content (docs/targets.md); raises `UserError` if they are invalid."""
+    """Reads targets from a JSON file, or from its content (docs/targets.md).
+
+    Raises:
+        UserError: If the targets are invalid.
+    """
     if isinstance(source, Mapping):
         name, folder = "targets", Path()
         try:
@@ -249,7 +263,7 @@ def read_targets(representation: Representation, source: str | Path | Mapping[st
 def _pose(
     representation: Representation, entry: PoseTarget, folder: Path, where: str
 ) -> tuple[np.ndarray, Tensor]:
-    """Returns joints (J, 3) of a pose with the root at x = z = 0, and its features (D,)."""
+    """Returns the joints (J, 3) of a pose with the root at x = z = 0, and its features (D,)."""
     motion = read_motion(
         representation, folder / entry.file if Path(entry.file).suffix else entry.file
     )

@@ -1,4 +1,4 @@
-"""`Body`: a motion in the form in which claims are measured, whatever its frame rate, size, place and heading."""
+"""`Body`: a motion on which claims are measured, for any frame rate, size, position and heading."""
 
 from functools import cached_property
 
@@ -10,14 +10,14 @@ from flame_mdm.formats.resampling import resample
 from flame_mdm.representations.skeleton import JOINT
 
 RATE = 30.0  # frames per second at which motions are measured
-SMOOTHING = 0.05  # seconds, standard deviation of the filter over time
-LEG = 0.8  # meters from hip to ankle of the body that distances are measured for
-# seconds around a frame in which the lowest foot is on the floor, which a jump does not exceed
+SMOOTHING = 0.05  # standard deviation of the filter over time, in seconds
+LEG = 0.8  # length of the legs from hip to ankle, in meters, to which bodies are scaled
+# Seconds around a frame in which the lowest foot is on the floor; a jump is shorter
 FLOOR_WINDOW = 1.6
 
 
 def pair(name: str) -> list[int]:
-    """Returns the left and the right joint of a name: "wrist" -> left_wrist, right_wrist."""
+    """Returns the left and the right joint of a name: "wrist" gives left_wrist and right_wrist."""
     return [JOINT[f"left_{name}"], JOINT[f"right_{name}"]]
 
 
@@ -27,17 +27,17 @@ SHOULDERS, ELBOWS, WRISTS = (pair(name) for name in ("shoulder", "elbow", "wrist
 
 
 class Body:
-    """A motion with joints (F, 22, 3), resampled to `RATE`, smoothed, and scaled to legs of `LEG` meters.
+    """A motion with joints (F, 22, 3), resampled to `RATE`, smoothed, and scaled to legs of `LEG`.
 
-    All numbers are of this size. Positions "as seen by the body" have the axes left, up and forward of its heading,
-    and the point on the floor below the pelvis as their origin.
+    All numbers refer to this size, in meters. Positions "as seen by the body" have the axes left,
+    up and forward of its heading. Their origin is the point on the floor below the pelvis.
 
     Args:
         joints: (F, 22, 3) joints of SMPL in meters, y up.
         fps: frames per second.
 
     Raises:
-        UserError: the joints have another shape, contain NaN, or have legs of no length.
+        UserError: If the joints have another shape or contain NaN, or the legs have no length.
     """
 
     def __init__(self, joints: np.ndarray, fps: float):
@@ -69,7 +69,7 @@ class Body:
 
     @cached_property
     def floor(self) -> np.ndarray:
-        """Height (F,) of the floor: the lowest joint within `FLOOR_WINDOW`, since floors may have steps."""
+        """Height (F,) of the floor: the lowest joint within `FLOOR_WINDOW`, as floors may have steps."""
         lowest = self.joints[..., 1].min(1)
         return minimum_filter1d(lowest, max(1, round(FLOOR_WINDOW * RATE)), mode="nearest")
 
@@ -94,7 +94,10 @@ class Body:
 
     @cached_property
     def yaw(self) -> np.ndarray:
-        """Heading (F,) in degrees without jumps at full turns; turns to the left are positive."""
+        """Heading (F,) in degrees without jumps by a full turn.
+
+        Turns to the left are positive.
+        """
         return np.degrees(np.unwrap(np.arctan2(self.forward[:, 0], self.forward[:, 1])))
 
     @cached_property
@@ -107,7 +110,7 @@ class Body:
 
     @cached_property
     def velocity(self) -> np.ndarray:
-        """Velocity (F, 2) of the pelvis to the left and forward, in m/s, without the sway of single steps."""
+        """Velocity (F, 2) of the pelvis to the left and forward, in m/s, without sway of steps."""
         ground = gaussian_filter1d(
             self.joints[:, PELVIS][:, [0, 2]], 0.15 * RATE, axis=0, mode="nearest"
         )

@@ -1,4 +1,4 @@
-"""Claims: checkable statements of a sentence about a motion, and how to falsify them."""
+"""Claims: statements about a motion in a sentence that can be checked, and their falsification."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,7 +13,7 @@ FLIPPED = {**MIRRORED, "forward": "backward", "backward": "forward"}
 FLIPPED_SPEED = {"slow": "fast", "fast": "slow"}
 FLIPPED_END = {"start": "end", "end": "start"}
 EXCLUDED = {"upright": "lie", "sit": "upright", "kneel": "upright", "lie": "upright"}
-"""Posture -> a posture that a body cannot have at the same time."""
+"""For each posture, a posture that a body cannot have at the same time."""
 
 
 @dataclass(frozen=True)
@@ -24,12 +24,13 @@ class Claim:
         kind: what is claimed, a key of `flame_mdm.sampling.referee.kinds.KINDS`.
         words: the part of the sentence that states it.
         side: "left", "right" or "both" limbs; "" = any.
-        direction: "forward", "backward", "left", "right", "clockwise" or "counterclockwise"; "" = any.
+        direction: "forward", "backward", "left", "right", "clockwise" or "counterclockwise"; "" =
+            any.
         speed: "slow" or "fast"; "" = any.
         amount: number of repetitions or steps, or angle of a turn in degrees; None = not stated.
-        when: "start" or "end" of the motion, if it is claimed to be so there; "" = at any time.
-        seconds: how long it lasts; None = not stated.
-        parts: the two claims of an order, the first one first.
+        when: "start" or "end" of the motion if the claim is about it; "" = at any time.
+        seconds: claimed duration; None = not stated.
+        parts: the two claims of an order, in this order.
     """
 
     kind: str
@@ -64,10 +65,11 @@ class Claim:
 
 
 def falsified(claim: Claim) -> list[tuple[str, Claim]]:
-    """Returns claims that are wrong if `claim` is right, and what was changed in each.
+    """Returns claims that are false if `claim` is true, with the kind of change.
 
-    The changes are "side", "direction", "speed", "count" (one more, and one fewer), "duration" (twice and half of
-    it), "start or end" (the other one), "posture" (one that excludes the claimed one at that time) and "order".
+    The changes are "side", "direction", "speed", "count" (one more, and one fewer), "duration"
+    (double and half), "start or end" (the other one), "posture" (one that excludes the claimed
+    posture at that time) and "order".
     """
     if claim.parts:
         return [("order", replace(claim, parts=claim.parts[::-1]))]
@@ -86,14 +88,17 @@ def falsified(claim: Claim) -> list[tuple[str, Claim]]:
         wrong += [("duration", replace(claim, seconds=value)) for value in durations if value > 0]
     if claim.when and claim.kind in EXCLUDED:
         wrong.append(("posture", replace(claim, kind=EXCLUDED[claim.kind])))
-    # A body stands at both ends of most motions
+    # A body stands at both ends of most motions.
     if claim.when and claim.kind not in ("upright", "return pose", "return place"):
         wrong.append(("start or end", replace(claim, when=FLIPPED_END[claim.when])))
     return wrong
 
 
 def unique(claims: Sequence[Claim]) -> list[Claim]:
-    """Returns the claims without repetitions: claims that differ only in their words are the same."""
+    """Returns the claims without repetitions.
+
+    Claims that differ only in their words are the same.
+    """
     kept: dict[Claim, Claim] = {}
     for claim in claims:
         kept.setdefault(_without_words(claim), claim)

@@ -17,21 +17,21 @@ from flame_mdm.sampling.referee.readings import AWAY, Reading, held, spans_of
 from flame_mdm.sampling.referee.sentences import read_claims
 
 Answer = Literal["yes", "no", "cannot tell"]
-SHORTEST = 0.4  # seconds of the shortest motion that is judged
-END = 0.6  # seconds of the start and of the end, in which a posture is looked for
-HELD = 0.2  # seconds for which the posture is held there
-BREAK = 0.5  # the longest break of something that lasts, in seconds
+SHORTEST = 0.4  # minimum duration of a motion that is judged, in seconds
+END = 0.6  # seconds at the start and at the end in which a posture is measured
+HELD = 0.2  # seconds for which the posture must be held there
+BREAK = 0.5  # maximum break, in seconds, of something that lasts
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """The answer to whether a motion shows a claim, and the evidence.
+    """The answer to the question whether a motion shows a claim, with the evidence.
 
     Attributes:
         claim: the claim.
         answer: "yes", "no" or "cannot tell".
-        reading: what was measured.
-        band: score up to which the answer is "no", and from which it is "yes".
+        reading: the measurement.
+        band: two scores. Up to the first one, the answer is "no"; from the second one on, "yes".
     """
 
     claim: Claim
@@ -41,12 +41,12 @@ class Verdict:
 
     @property
     def group(self) -> str:
-        """What the claim is about, such as "side" or "count"."""
+        """The subject of the claim, such as "side" or "count"."""
         return group_of(self.claim)
 
     @property
     def evidence(self) -> str:
-        """Number, unit, joint and times that decided: "left wrist: 0.21 m above the head, 1.2-1.9 s"."""
+        """The decisive number, unit, joint and times: "left wrist: 0.21 m above the head, 1.2-1.9 s"."""
         reading = self.reading
         shown = ", ".join(f"{start:.1f}-{end:.1f} s" for start, end in reading.spans[:3])
         times = f", {shown}" if shown else ""
@@ -57,7 +57,7 @@ class Verdict:
         return f"{self.answer}: {self.claim}; {self.evidence}"
 
     def marks(self, fps: float, frames: int) -> list[tuple[int, int, str, str]]:
-        """Returns the spans of the evidence on the time line of a player, in frames of the motion."""
+        """Returns the time spans of the evidence for a player's time line, in frames."""
         marks = []
         for start, end in self.reading.spans[:3]:
             first = min(max(0, round(start * fps)), frames - 1)
@@ -72,7 +72,8 @@ class Judgment:
 
     Attributes:
         text: the sentence.
-        verdicts: one per claim, in the order of the sentence; empty if it has no claim that can be checked.
+        verdicts: one per claim, in the order of the sentence; empty if the sentence has no claim
+            that can be checked.
     """
 
     text: str
@@ -90,7 +91,7 @@ class Judgment:
 
     @property
     def accuracy(self) -> float | None:
-        """Share of the decided claims that are true; None if none is decided."""
+        """Fraction of the decided claims that are true; None if no claim is decided."""
         return self.true / self.decided if self.decided else None
 
     def __str__(self) -> str:
@@ -104,17 +105,17 @@ def judge(
 ) -> Judgment:
     """Judges whether a motion does what a sentence says.
 
-    Reads the claims of the sentence, measures each on the motion, and answers "yes", "no" or "cannot tell".
-    docs/referee.md says what can be checked.
+    The claims of the sentence are read, and each is measured on the motion. The answer is "yes",
+    "no" or "cannot tell". docs/referee.md says what can be checked.
 
     Args:
         motion: a motion on SMPL's 22 joints, or joints (F, 22, 3) in meters, y up.
-        text: the sentence; default: the motion's own text.
+        text: the sentence. Default: the motion's own text.
         fps: frames per second; required for joints.
 
     Raises:
-        UserError: the motion has another skeleton, is shorter than 0.4 seconds or not finite, there is no text, or
-            joints were given without `fps`.
+        UserError: If the motion has another skeleton, is shorter than 0.4 seconds or not finite,
+            if there is no text, or if joints are given without `fps`.
     """
     if isinstance(motion, Motion):
         if motion.skeleton != SMPL22:
@@ -133,7 +134,10 @@ def judge(
 
 
 def try_judge(motion: Motion) -> Judgment | None:
-    """Returns the judgment of a motion by its own text; None if it cannot be judged, or its text has no claim."""
+    """Returns the judgment of a motion by its own text.
+
+    Returns None if the motion cannot be judged, or its text has no claim.
+    """
     is_long = len(motion.joints) > (SHORTEST + 0.1) * motion.fps
     if motion.skeleton != SMPL22 or not motion.text.strip() or not is_long:
         return None
@@ -142,7 +146,7 @@ def try_judge(motion: Motion) -> Judgment | None:
 
 
 def evidence_marks(motion: Motion) -> list[tuple[int, int, str, str]]:
-    """Returns the evidence for the claims of a motion's own text, as marks of a player's time line."""
+    """Returns the evidence for the claims of a motion's own text, as marks of a time line."""
     judgment = try_judge(motion)
     if judgment is None:
         return []
@@ -151,7 +155,10 @@ def evidence_marks(motion: Motion) -> list[tuple[int, int, str, str]]:
 
 
 def claim_score(motions: Sequence[Motion]) -> list[float]:
-    """Returns the true claims minus the false claims of each motion's own text; 0 for a text without claims."""
+    """Returns the number of true claims minus false claims of each motion's own text.
+
+    It is 0 for a text without claims.
+    """
     judged = [try_judge(motion) for motion in motions]
     return [0.0 if one is None else float(2 * one.true - one.decided) for one in judged]
 
@@ -188,9 +195,10 @@ def decide(body: Body, claim: Claim) -> Verdict:
 
 
 def _order(body: Body, claim: Claim) -> Reading:
-    """Measures how much later the second part of an order can begin than the first one, in seconds.
+    """Measures how much later the second part of an order begins than the first one, in seconds.
 
-    An order is undecided unless both parts are true, and if the reverse order happens, too.
+    Of several times of a part, those with the largest difference count. An order is undecided if
+    a part is not true, or if the reverse order happens, too.
     """
     first, second = (decide(body, part) for part in claim.parts)
     firsts = [start for start, _ in first.reading.spans]
@@ -207,9 +215,11 @@ def _order(body: Body, claim: Claim) -> Reading:
 
 
 def _at_an_end(body: Body, claim: Claim) -> Reading:
-    """Measures a claim at the start or the end: postures and contacts in `END` seconds, movements in half the motion.
+    """Measures a claim at the start or at the end.
 
-    It is unclear if the other end shows the same, except for standing, which is usual at both ends.
+    Postures and contacts are measured in `END` seconds, movements in half the motion. The claim
+    is unclear if the other end shows the same. Standing is an exception, because it is usual at
+    both ends.
     """
     kind = KINDS[claim.kind]
     reading = kind.measure(body, replace(claim, when=""))
@@ -231,10 +241,10 @@ def _at_an_end(body: Body, claim: Claim) -> Reading:
 
 
 def _duration(body: Body, claim: Claim) -> Reading:
-    """Measures how long a claim is true without a break of more than `BREAK` seconds.
+    """Measures how long a claim is true, without a break of more than `BREAK` seconds.
 
-    The score is minus the difference from the claimed seconds, in doublings. It is undecided unless the claim without
-    its duration is true.
+    The score is minus the difference from the claimed seconds, in doublings. It is undecided if
+    the claim without its duration is not true.
     """
     verdict = decide(body, replace(claim, seconds=None))
     reading = verdict.reading

@@ -1,8 +1,9 @@
-"""All kinds of claims: how each is measured, what it belongs to, and its thresholds.
+"""All kinds of claims: their measurements, groups and thresholds.
 
-A kind is one function in `postures.py` or `movements.py`, one row of `KINDS`, and a pattern in `sentences.py`. The
-thresholds in `thresholds.yaml` are written by `tools/referee.py` from captioned motions; a row's `no` and `yes` are
-used until then, and for kinds of which there are too few motions.
+A kind is one function in `postures.py` or `movements.py`, one row of `KINDS`, and a pattern in
+`sentences.yaml`. `tools/referee.py` writes the thresholds in `thresholds.yaml` from captioned
+motions. If there are no thresholds, or too few motions of a kind, the `no` and `yes` of its row
+are used.
 """
 
 from collections.abc import Callable
@@ -40,11 +41,13 @@ class Kind:
     """A kind of claims.
 
     Attributes:
-        group: what it is about, one of `GROUPS`. A claim about a start, an end, a duration, a side, a direction or a
-            speed is in that group instead.
+        group: subject of the claims, one of `GROUPS`. A claim about a start, an end, a duration,
+            a side, a direction or a speed is in that group instead.
         measure: function of a body and the claim.
-        no, yes: scores up to which a claim is false, and from which it is true, by hand; in between, it is undecided.
-        is_timed: whether the reading's spans say when it happens, so that an order can be read from them.
+        no, yes: scores that were set by hand. Up to `no`, a claim is false; from `yes` on, it is
+            true; in between, it is undecided.
+        is_timed: whether the spans of the reading say when it happens. An order can then be read
+            from them.
     """
 
     group: str
@@ -116,11 +119,11 @@ KINDS: dict[str, Kind] = {
     "count steps": Kind("count", movements.steps, -1.5, -0.25, is_timed=False),
 }
 # fmt: on
-"""Kind -> how it is measured and decided."""
+"""Measurement and thresholds by kind."""
 
 
 def group_of(claim: Claim) -> str:
-    """Returns what a claim is about, one of `GROUPS`."""
+    """Returns the subject of a claim, one of `GROUPS`."""
     if claim.parts:
         return ORDER
     if claim.seconds is not None:
@@ -138,7 +141,10 @@ def group_of(claim: Claim) -> str:
 
 
 def threshold_key(claim: Claim) -> str:
-    """Returns the name of the thresholds of a claim: its kind, and whether it states a side, direction or speed."""
+    """Returns the name of the thresholds of a claim.
+
+    It is the kind, and whether the claim states a side, direction or speed.
+    """
     if claim.parts:
         return ORDER
     if claim.speed:
@@ -150,14 +156,14 @@ def threshold_key(claim: Claim) -> str:
 
 @cache
 def thresholds() -> dict[str, Any]:
-    """Returns the calibrated thresholds, by `threshold_key`: "no", "yes" and how many motions they come from."""
+    """Returns the calibrated thresholds by `threshold_key`: "no", "yes" and number of motions."""
     return read_yaml(FILE)["thresholds"] if FILE.exists() else {}
 
 
 def band(claim: Claim) -> tuple[float, float]:
-    """Returns the score up to which a claim is false, and from which it is true.
+    """Returns two scores: up to the first one, a claim is false; from the second one on, true.
 
-    A start and an end have the band of the kind at any time.
+    Claims about a start or an end have the band of the kind at any time.
     """
     if claim.seconds is not None:
         return DURATION

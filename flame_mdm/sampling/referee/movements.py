@@ -1,4 +1,4 @@
-"""Measurements of travel, turns, gaits, repetitions and strokes; `kinds.py` lists them."""
+"""Measurements of travel, turns, gaits, repetitions and strokes. `kinds.py` lists them."""
 
 from dataclasses import replace
 
@@ -34,7 +34,7 @@ SEEN = {"left": (1.0, 0.0), "right": (-1.0, 0.0), "forward": (0.0, 1.0), "backwa
 
 
 def travel(body: Body, claim: Claim) -> Reading:
-    """Measures the distance traveled in a direction as seen by the body; without a direction, in any."""
+    """Measures the distance traveled in a direction as seen by the body; by default, in any."""
     speed = body.speed
     if claim.direction:
         toward = body.velocity @ np.array(SEEN[claim.direction])
@@ -51,7 +51,7 @@ def travel(body: Body, claim: Claim) -> Reading:
 
 
 def veer(body: Body, claim: Claim) -> Reading:
-    """Measures how much farther the body gets to one side, as seen from its start, than to the other side."""
+    """Measures how much farther the body moves to one side of its start than to the other."""
     ground = (body.joints[:, PELVIS] - body.joints[0, PELVIS])[:, [0, 2]]
     sign = 1.0 if claim.direction == "left" else -1.0
     start = body.forward[: max(1, round(0.3 * RATE))].mean(0)
@@ -71,7 +71,7 @@ def veer(body: Body, claim: Claim) -> Reading:
 
 
 def turn(body: Body, claim: Claim) -> Reading:
-    """Measures the largest turn in a direction in degrees; without a direction, in any.
+    """Measures the largest turn in a direction, by default in any, in degrees.
 
     A direction is unclear if the body turns nearly as far to the other side.
     """
@@ -86,7 +86,7 @@ def turn(body: Body, claim: Claim) -> Reading:
 
 
 def turn_amount(body: Body, claim: Claim) -> Reading:
-    """Measures how much the largest turn differs from the claimed angle, relative to it."""
+    """Measures the relative difference between the largest turn and the claimed angle."""
     reading = turn(body, claim)
     claimed = claim.amount or 180
     score = -abs(reading.number - claimed) / claimed
@@ -94,7 +94,7 @@ def turn_amount(body: Body, claim: Claim) -> Reading:
 
 
 def _turn(yaw: np.ndarray, direction: str) -> Reading:
-    """Returns a reading of the largest rise of an angle (F,), with the times at which most of it happens."""
+    """Returns a reading of the largest rise of an angle (F,), with the times of most of the rise."""
     lowest = np.minimum.accumulate(yaw)
     end = int((yaw - lowest).argmax())
     start = int(yaw[: end + 1].argmin())
@@ -145,7 +145,7 @@ def walk(body: Body, claim: Claim) -> Reading:
 
 
 def pace(body: Body, claim: Claim) -> Reading:
-    """Measures the median speed of travel, against 1.1 m/s; a lower speed speaks for "slow"."""
+    """Compares the median speed of travel with 1.1 m/s. A lower speed supports "slow"."""
     moving = body.speed[body.speed > MOVING]
     if len(moving) < 0.4 * RATE:
         return Reading(np.nan, 0.0, "m/s", "pelvis", (), "it hardly travels")
@@ -155,7 +155,7 @@ def pace(body: Body, claim: Claim) -> Reading:
 
 
 def stop(body: Body, claim: Claim) -> Reading:
-    """Measures by how much the speed of travel falls, from its highest to that of the last 0.3 seconds."""
+    """Measures the decrease from the highest speed of travel to the speed in the last 0.3 seconds."""
     last = float(body.speed[-max(1, round(0.3 * RATE)) :].mean())
     fastest = held(body.speed, 0.3)
     share = 1 - last / fastest if fastest > 0.3 else np.nan
@@ -163,7 +163,11 @@ def stop(body: Body, claim: Claim) -> Reading:
 
 
 def steps(body: Body, claim: Claim) -> Reading:
-    """Counts steps: how often the distance between the ankles along the heading changes its sign and grows to 15 cm."""
+    """Counts steps.
+
+    In a step, the distance between the ankles along the heading changes its sign and grows to
+    15 cm.
+    """
     ahead = body.seen[:, ANKLES, 2]
     stride = ahead[:, 0] - ahead[:, 1]
     loose = len(cycles(stride, 0.2)) + len(cycles(-stride, 0.2))
@@ -230,7 +234,7 @@ def count_push_ups(body: Body, claim: Claim) -> Reading:
 
 
 def count_kicks(body: Body, claim: Claim) -> Reading:
-    """Counts how often an ankle gets far above the other one."""
+    """Counts how often an ankle is far above the other one."""
     height = np.abs(body.joints[:, ANKLES[0], 1] - body.joints[:, ANKLES[1], 1])
     if claim.side in SIDES:
         side = SIDES.index(claim.side)
@@ -268,7 +272,7 @@ def count_raises(body: Body, claim: Claim) -> Reading:
 
 
 def count_spins(body: Body, claim: Claim) -> Reading:
-    """Counts full turns, from the largest turn in any direction."""
+    """Counts full turns in the largest turn in any direction."""
     reading = turn(body, claim)
     turns = reading.number / 360
     claimed = claim.amount or 1
@@ -276,7 +280,7 @@ def count_spins(body: Body, claim: Claim) -> Reading:
 
 
 def kick(body: Body, claim: Claim) -> Reading:
-    """Measures the speed of an ankle as seen from the pelvis, while the foot is higher than the other one."""
+    """Measures the speed of an ankle relative to the pelvis, while the foot is the higher one."""
     higher = body.joints[:, ANKLES, 1] - body.joints[:, ANKLES[::-1], 1]
     speed = np.where(higher > 0.12, body.foot_speed, 0.0)
     readings = [existence(speed[:, side], "m/s", f"{SIDES[side]} foot", 0.06) for side in (0, 1)]
@@ -284,7 +288,7 @@ def kick(body: Body, claim: Claim) -> Reading:
 
 
 def strike(body: Body, claim: Claim) -> Reading:
-    """Measures the speed of a wrist as seen from the chest."""
+    """Measures the speed of a wrist relative to the chest."""
     readings = [
         existence(body.hand_speed[:, side], "m/s", f"{SIDES[side]} wrist", 0.06) for side in (0, 1)
     ]
@@ -306,14 +310,14 @@ def _dominance(activity: np.ndarray, claim: Claim, limb: str, least: float) -> R
 
 
 def use_hand(body: Body, claim: Claim) -> Reading:
-    """Compares the mean speed of the wrists, as seen from the chest and counted more if the hand is raised."""
+    """Compares the mean speeds of the wrists relative to the chest. Raised hands count more."""
     raised = body.joints[:, WRISTS, 1] - body.joints[:, [PELVIS], 1]
     weight = np.clip(raised / 0.3, 0.1, 1.0)
     return _dominance(body.hand_speed * weight, claim, "hand", 0.05)
 
 
 def use_foot(body: Body, claim: Claim) -> Reading:
-    """Compares the mean speed of the ankles above the floor, as seen from the pelvis."""
+    """Compares the mean speeds of the ankles above the floor, relative to the pelvis."""
     weight = np.clip((body.height[:, ANKLES] - 0.12) / 0.2, 0.02, 1.0)
     return _dominance(body.foot_speed * weight, claim, "foot", 0.05)
 

@@ -1,4 +1,4 @@
-"""Measurements of postures and of the contact between parts of the body; `kinds.py` lists them."""
+"""Measurements of postures, and of contacts between parts of the body. `kinds.py` lists them."""
 
 import numpy as np
 
@@ -20,12 +20,12 @@ from flame_mdm.sampling.referee.claims import Claim
 from flame_mdm.sampling.referee.readings import Reading, existence, of_side, spans_of
 
 SIDES = ("left", "right")
-MOVING = 0.25  # the body travels if its pelvis is faster than this, in m/s
+MOVING = 0.25  # speed of the pelvis in m/s above which the body travels
 STANDING = 0.9  # height of the pelvis of a standing body of the usual size, in meters
 
 
 def thighs(body: Body) -> np.ndarray:
-    """Returns the angle (F, 2) between each thigh and the vertical in degrees; 90 is level."""
+    """Returns the angle (F, 2) between each thigh and the vertical in degrees; 90 = horizontal."""
     thigh = body.joints[:, KNEES] - body.joints[:, HIPS]
     return np.degrees(np.arctan2(np.linalg.norm(thigh[..., [0, 2]], axis=-1), -thigh[..., 1]))
 
@@ -37,7 +37,7 @@ def upright(body: Body, claim: Claim) -> Reading:
 
 
 def sit(body: Body, claim: Claim) -> Reading:
-    """Measures by how much the pelvis is lower than in standing, with raised thighs and an upright trunk."""
+    """Measures how much lower the pelvis is than in standing, with raised thighs, upright trunk."""
     lowered = STANDING - body.height[:, PELVIS]
     is_folded = (thighs(body).min(1) > 40) & (body.tilt < 60)
     return existence(np.where(is_folded, lowered, 0.0), "m lower", "pelvis", 0.3)
@@ -64,7 +64,7 @@ def all_fours(body: Body, claim: Claim) -> Reading:
 
 
 def crouch(body: Body, claim: Claim) -> Reading:
-    """Measures by how much the pelvis is lower than in standing."""
+    """Measures how much lower the pelvis is than in standing."""
     return existence(STANDING - body.height[:, PELVIS], "m lower", "pelvis", 0.15)
 
 
@@ -74,7 +74,7 @@ def bend(body: Body, claim: Claim) -> Reading:
 
 
 def head_down(body: Body, claim: Claim) -> Reading:
-    """Measures how far the head comes down, by bending the trunk or the knees."""
+    """Measures how far the head is lowered by bending the trunk or the knees."""
     top = np.percentile(body.height[:, HEAD], 95)
     return existence(max(top, 1.3) - body.height[:, HEAD], "m lower", "head", 0.15)
 
@@ -100,7 +100,7 @@ def get_down(body: Body, claim: Claim) -> Reading:
 
 
 def _change(signal: np.ndarray) -> Reading:
-    """Returns a reading of the largest rise of a signal (F,) in meters, with the times from its start to its end."""
+    """Returns a reading of the largest rise of a signal (F,) in meters, with its start and end."""
     lowest = np.minimum.accumulate(signal)
     end = int((signal - lowest).argmax())
     start = int(signal[: end + 1].argmin())
@@ -109,7 +109,7 @@ def _change(signal: np.ndarray) -> Reading:
 
 
 def stand_still(body: Body, claim: Claim) -> Reading:
-    """Measures how far the pelvis gets from its median position on the floor."""
+    """Measures how far the pelvis moves from its median position on the floor."""
     ground = body.joints[:, PELVIS][:, [0, 2]]
     away = np.linalg.norm(ground - np.median(ground, axis=0), axis=-1)
     farthest = float(np.percentile(away, 98))
@@ -121,7 +121,10 @@ def stand_still(body: Body, claim: Claim) -> Reading:
 
 
 def return_pose(body: Body, claim: Claim) -> Reading:
-    """Measures the largest distance of a joint at the end from its place at the start, as seen by the body."""
+    """Measures how far a joint is at the end from its position at the start, as seen by the body.
+
+    The joint with the largest distance counts.
+    """
     ends = max(1, round(0.2 * RATE))
     first, last = body.seen[:ends].mean(0), body.seen[-ends:].mean(0)
     away = np.linalg.norm(last - first, axis=-1)
@@ -132,7 +135,7 @@ def return_pose(body: Body, claim: Claim) -> Reading:
 
 
 def return_place(body: Body, claim: Claim) -> Reading:
-    """Measures how far the body is at the end from its start, as a share of its largest distance from it."""
+    """Measures the body's distance from its start at the end, relative to its largest distance."""
     ground = body.joints[:, PELVIS][:, [0, 2]]
     away = np.linalg.norm(ground - ground[0], axis=-1)
     farthest, last = float(away.max()), float(away[-1])
@@ -221,7 +224,7 @@ def raise_foot(body: Body, claim: Claim) -> Reading:
 
 
 def one_leg(body: Body, claim: Claim) -> Reading:
-    """Measures for how long one foot, the standing one, is on the floor and the other in the air, in seconds."""
+    """Measures how long one foot stands on the floor and the other is in the air, in seconds."""
     toes = body.height[:, TOES]
     readings = []
     for side in (0, 1):

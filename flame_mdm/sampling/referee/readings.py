@@ -9,22 +9,25 @@ from flame_mdm.sampling.referee.body import RATE
 
 Spans = tuple[tuple[float, float], ...]
 
-# Units of distances: a smaller distance speaks for a claim
+# Units of distances. A smaller distance supports a claim.
 AWAY = ("m above the floor", "m apart", "m from")
 
 
 @dataclass(frozen=True)
 class Reading:
-    """What was measured for a claim.
+    """The measurement for a claim.
 
     Attributes:
-        score: number that is compared with the thresholds of the kind; higher speaks for the claim. NaN is undecided.
-        number, unit: what was measured, in a unit that people read.
+        score: number that is compared with the thresholds of the kind. A higher score supports
+            the claim. NaN is undecided.
+        number, unit: the measured value, in a unit for people.
         joint: joint or part of the body.
-        spans: first and last second of each time at which the claim is true, or nearly.
+        spans: first and last second of each time at which the claim is true, or nearly true.
         unclear: reason why a high score does not make the claim true; "" = none.
-        signal: values (F,) that show by frame whether it is so; None if single frames do not show it.
-        level: value of `signal` from which it is so; None = the middle of the band of the kind.
+        signal: values (F,) that show for each frame whether the claim is true; None if single
+            frames do not show it.
+        level: value of `signal` from which on the claim is true; None = the middle of the band of
+            the kind.
     """
 
     score: float
@@ -38,7 +41,7 @@ class Reading:
 
 
 def spans_of(flags: np.ndarray, shortest: float = 0.0) -> Spans:
-    """Returns first and last second of each run of true frames (F,) of at least `shortest` seconds."""
+    """Returns first and last second of each run of true frames (F,), at least `shortest` long."""
     edges = np.flatnonzero(np.diff(np.r_[0, flags.astype(int), 0])).reshape(-1, 2)
     return tuple(
         (start / RATE, end / RATE)
@@ -48,7 +51,7 @@ def spans_of(flags: np.ndarray, shortest: float = 0.0) -> Spans:
 
 
 def held(signal: np.ndarray, seconds: float) -> float:
-    """Returns the highest value that a signal (F,) keeps for some seconds in total."""
+    """Returns the highest value that a signal (F,) reaches for some seconds in total."""
     count = min(len(signal), max(1, round(seconds * RATE)))
     return float(np.sort(signal)[-count])
 
@@ -56,24 +59,24 @@ def held(signal: np.ndarray, seconds: float) -> float:
 def existence(
     signal: np.ndarray, unit: str, joint: str, seconds: float = 0.1, share: float = 0.5
 ) -> Reading:
-    """Returns a reading of how high a signal (F,) gets for `seconds`.
+    """Returns a reading of the value that a signal (F,) reaches for `seconds`.
 
-    The spans are the frames above a share of the way from the median, or from the lowest value of a short signal, to
-    the highest value.
+    The spans are the frames above a level. The level is at the fraction `share` between the
+    median and the highest value. For a short signal, the lowest value replaces the median.
     """
     score = held(signal, seconds)
     low = float(np.percentile(signal, 20))
     bound = low + share * (score - low)
-    # a signal of a distance is negative: less speaks for the claim
+    # The signal of a distance is negative: a smaller distance supports the claim.
     number = -score if unit.startswith(AWAY) else score
     return Reading(score, number, unit, joint, spans_of(signal >= bound), signal=signal)
 
 
 def of_side(readings: Sequence[Reading], side: str, margin: float) -> Reading:
-    """Returns the reading of a limb, from the readings of the left and the right one.
+    """Returns the reading of a limb, from the readings of the left and the right limb.
 
-    For "both", the lower reading counts, and for "", the higher one. A left or right limb is unclear if the other one
-    shows the same: less than `margin` separates them.
+    For "both", the lower reading counts. For "", the higher one counts. A left or right limb is
+    unclear if the other limb shows the same, that is, if their difference is less than `margin`.
     """
     left, right = readings
     if side == "both":
@@ -92,9 +95,10 @@ def of_side(readings: Sequence[Reading], side: str, margin: float) -> Reading:
 
 
 def cycles(signal: np.ndarray, depth: float) -> list[int]:
-    """Returns the frames of the peaks of a signal (F,) that rise by `depth` above the valleys on both sides.
+    """Returns the frames of the peaks of a signal (F,).
 
-    A signal that begins or ends high has a valley there only if it comes back down within the motion.
+    A peak is `depth` above the valleys on both sides. If a signal begins or ends high, there is a
+    valley only if the signal returns to a low value within the motion.
     """
     peaks: list[int] = []
     low, high, at = signal[0], -np.inf, 0
@@ -116,10 +120,11 @@ def cycles(signal: np.ndarray, depth: float) -> list[int]:
 def counted(
     signal: np.ndarray, depths: tuple[float, float], amount: int | None, joint: str, unit: str
 ) -> Reading:
-    """Returns a reading of how often a signal repeats: it counts the peaks, with a lower and a higher depth.
+    """Returns a reading of the number of repetitions, which are peaks of a signal.
 
-    The score is minus the distance between the claimed count and the counts for both depths: 0 if both are the claimed
-    one, -0.5 if one of them is, at most -1 if the claimed count is outside of them.
+    Peaks are counted with a lower and a higher depth. The score is 0 if both counts are the
+    claimed count, and -0.5 if the claimed count is between them. Otherwise, it is minus the
+    distance between the claimed count and the nearest count, at most -1.
     """
     loose, strict = (cycles(signal, depth) for depth in depths)
     few, many = sorted((len(strict), len(loose)))
@@ -136,7 +141,10 @@ def counted(
 
 
 def _is_cut(signal: np.ndarray, depth: float) -> bool:
-    """Returns whether a signal (F,) begins in a repetition: it falls by `depth` before it rises by it."""
+    """Returns whether a signal (F,) begins in a repetition.
+
+    It then falls by `depth` before it rises by `depth`.
+    """
     falls = np.flatnonzero(signal < signal[0] - depth)
     rises = np.flatnonzero(signal > signal[0] + depth)
     return len(falls) > 0 and (len(rises) == 0 or falls[0] < rises[0])

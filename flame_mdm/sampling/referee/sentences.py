@@ -1,7 +1,8 @@
-"""Claims of a sentence, by rules: precise rather than complete, so that what is not understood is left out.
+"""Claims of a sentence, found by rules. Parts that are not understood are left out.
 
-Patterns are in `sentences.yaml`, forms of verbs in `flame_mdm.conditions.language`. Left out are sentences with a
-negation, an alternative or several people, comparisons ("like a zombie"), and everything that no pattern states.
+The rules are precise rather than complete. Patterns are in `sentences.yaml`, and forms of verbs
+in `flame_mdm.conditions.language`. Sentences with a negation, an alternative or several people
+are left out. So are comparisons ("like a zombie") and everything that matches no pattern.
 """
 
 import re
@@ -22,7 +23,7 @@ BOUNDARY = re.compile(
 )
 LATER = ("then", "followed by", "before", "|")
 SIDES = re.compile(r"\b(left|right)\b")
-# Maximum length of a sentence, in characters; the rest is not read
+# Maximum length of a sentence in characters. The rest is not read.
 LONGEST = 600
 COUNT_NOUNS = {
     "count jumps": "jumps?|hops?|leaps?",
@@ -80,7 +81,10 @@ class Pattern:
 
 
 def read_claims(text: str) -> list[Claim]:
-    """Returns the claims of a sentence, in its order, without repetitions; [] if it has none that can be checked."""
+    """Returns the claims of a sentence in order, without repetitions.
+
+    The list is empty if the sentence has no claim that can be checked.
+    """
     plain = _plain(text)
     if any(pattern.search(plain) for pattern in _unread()):
         return []
@@ -102,7 +106,7 @@ def read_claims(text: str) -> list[Claim]:
 
 
 def _plain(text: str) -> str:
-    """Returns a text in lower case, without hyphens and apostrophes, with joined phrases as one word."""
+    """Returns a text in lower case, without hyphens and apostrophes; joined phrases are one word."""
     plain = re.sub(r"[-'’\"]", " ", text[:LONGEST].lower())
     plain = re.sub(r"\b(?:counter|anti) ?clockwise\b", "counterclockwise", plain)
     plain = re.sub(r"\s+", " ", plain).strip()
@@ -112,7 +116,7 @@ def _plain(text: str) -> str:
 
 
 def _clauses(plain: str) -> list[Clause]:
-    """Splits a sentence at its connectives, and cuts each clause at a comparison."""
+    """Splits a sentence at its connectives, and cuts each clause off at a comparison."""
     clauses: list[Clause] = []
     start, is_later = 0, False
     for match in [*BOUNDARY.finditer(plain), None]:
@@ -142,7 +146,7 @@ def _of_clause(text: str) -> list[Claim]:
 
 
 def _at_ends(clause: Clause, *, is_last: bool) -> list[Claim]:
-    """Returns the claims of a clause about the start or the end of the motion: "ends seated"."""
+    """Returns the claims of a clause about the start or the end of the motion, as in "ends seated"."""
     text, returns = clause.text, _content()["returns"]
     for kind in ("return pose", "return place"):
         if re.search(rf"\b(?:{returns[kind]})\b", text):
@@ -158,7 +162,7 @@ def _at_ends(clause: Clause, *, is_last: bool) -> list[Claim]:
     for state in _states():
         if state.when.search(text) and not (state.unless and state.unless.search(text)):
             claims += _claims(state, text)
-    # "Starts to walk" may mean that it stood before
+    # "Starts to walk" may mean that the person stood before.
     if not claims and (when == "end" or _has(text, "by")):
         claims = [claim for claim in _of_clause(text) if claim.kind in AT_AN_END]
     return [replace(claim, when=when) for claim in claims]
@@ -170,7 +174,7 @@ def _has(text: str, words: str) -> bool:
 
 
 def _lasting(text: str, claims: Sequence[Claim]) -> list[Claim]:
-    """Returns the claims of a clause with the seconds that it states: "stands still for three seconds"."""
+    """Returns the claims of a clause with its seconds, as in "stands still for three seconds"."""
     numbers = {word: int(value) for word, value in phrases()["numbers"].items()}
     number = "|".join([r"\d{1,2}", *numbers])
     match = re.search(rf"\bfor (?:\w+ )?({number}) (?:\w+ )?(?:seconds?|secs?|s)\b", text)
@@ -207,7 +211,7 @@ def _claims(pattern: Pattern, text: str) -> list[Claim]:
 
 
 def _further(take: str, claim: Claim, text: str) -> list[Claim]:
-    """Returns the claims of a clause beside that of its pattern."""
+    """Returns the claims of a clause beside the claim of its pattern."""
     if take == "travel" or take == "jumped":
         direction = _direction(text)
         kind = "step" if take == "jumped" or claim.kind == "step" else "travel"
@@ -224,7 +228,7 @@ def _further(take: str, claim: Claim, text: str) -> list[Claim]:
 
 
 def _turns(claim: Claim, text: str) -> list[Claim]:
-    """Returns the claims of a turn: its direction, its angle, and that there is one."""
+    """Returns the claims of a turn: its existence, its direction and its angle."""
     direction = _way(text) or ""
     angle = re.search(r"\b(45|90|180|270|360)\b", text)
     claims = [replace(claim, direction=direction)]
@@ -240,7 +244,10 @@ def _is_turning(text: str) -> bool:
 
 
 def _way(text: str) -> str | None:
-    """Returns left, right, clockwise or counterclockwise as a direction; None if there is none, or several."""
+    """Returns left, right, clockwise or counterclockwise as a direction.
+
+    Returns None if there is no direction, or if there are several.
+    """
     ways = set()
     for match in re.finditer(r"\b(left|right|clockwise|counterclockwise)\b", text):
         after = text[match.end() :].split()[:1]
@@ -253,7 +260,10 @@ def _way(text: str) -> str | None:
 
 
 def _direction(text: str) -> str:
-    """Returns forward or backward as a direction of travel; "" if there is none, or both, or it is diagonal."""
+    """Returns forward or backward as a direction of travel.
+
+    Returns "" if there is no direction, if there are both, or if it is diagonal.
+    """
     if re.search(r"\b(?:diagonal|diagonally|sideways|backandforth|zig ?zag)\b", text):
         return ""
     stated = [name for name, words in DIRECTIONS.items() if re.search(rf"\b(?:{words})\b", text)]
@@ -267,7 +277,10 @@ def _direction(text: str) -> str:
 
 
 def _side(text: str, limb: str) -> str | None:
-    """Returns the side of a limb in a clause: left, right, both or "" if none is stated; None if it is ambiguous."""
+    """Returns the side of a limb in a clause: left, right, both, or "" if none is stated.
+
+    Returns None if it is ambiguous.
+    """
     limbs = _content()[limb]
     stated = {match[1] for match in re.finditer(rf"\b(left|right) (?:\w+ )?(?:{limbs})\b", text)}
     if limb == "hands":
@@ -276,7 +289,7 @@ def _side(text: str, limb: str) -> str | None:
         return None
     if stated:
         return stated.pop()
-    # "Kicks his legs" does not mean both at the same time
+    # "Kicks his legs" does not mean both at the same time.
     if limb == "legs" or re.search(r"\bone of\b", text):
         return ""
     return "both" if re.search(r"\b(?:hands|arms|fists|wrists)\b", text) else ""
@@ -301,14 +314,14 @@ def _amount(text: str, kind: str) -> int | None:
 
 
 def _speed(text: str) -> str:
-    """Returns slow or fast, if a clause states one of them; "normal" and both together state none."""
+    """Returns slow or fast if a clause states one of them. "normal" or both together state none."""
     words = text.split()
     values = {value for word, value in word_values("speed").items() if word in words}
     return values.pop() if values in ({"slow"}, {"fast"}) else ""
 
 
 def _orders(before: Sequence[Claim], after: Sequence[Claim]) -> list[Claim]:
-    """Returns the claim that the first event of a clause comes before the first event of the next one."""
+    """Returns the claim that the first event of a clause is before the first event of the next."""
     first = next((claim for claim in before if _is_event(claim)), None)
     second = next((claim for claim in after if _is_event(claim)), None)
     if first is None or second is None or first.kind == second.kind:
@@ -325,8 +338,8 @@ def _is_event(claim: Claim) -> bool:
 def _consistent(claims: Sequence[Claim], plain: str) -> list[Claim]:
     """Removes the claims that the rest of the sentence makes doubtful.
 
-    A body that also travels does not stand still all the time, a person who stands up after a bow
-    was standing before, and if both sides are named, neither moves more.
+    A body that also travels does not stand still all the time. A person who stands up after a bow
+    was standing before. If both sides are named, neither moves more.
     """
     doubtful: set[str] = set()
     kinds = {claim.kind for claim in claims}
@@ -335,7 +348,7 @@ def _consistent(claims: Sequence[Claim], plain: str) -> list[Claim]:
     if kinds & {"bend", "head down"} and not kinds & {"sit", "kneel", "crouch", "lie", "all fours"}:
         doubtful.add("stand up")
     if kinds & MOVING:
-        # After a walk, the "starting position" may be a place
+        # After a walk, the "starting position" may be a location.
         doubtful.add("return pose")
     for kind, limb in (("use hand", "hands"), ("use foot", "legs")):
         sides = re.findall(rf"\b(left|right)(?: \w+)? (?:{_content()[limb]})\b", plain)
@@ -351,7 +364,7 @@ def _content() -> dict[str, Any]:
 
 @cache
 def _sided_words() -> str:
-    """Returns the alternatives of words that have a side: "left hand"."""
+    """Returns the alternatives of words that have a side, as in "left hand"."""
     return "|".join(phrases()["sides_of"].split())
 
 

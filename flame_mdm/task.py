@@ -62,7 +62,7 @@ class Task(Model, LightningModule):
         return type(getattr(self, "network", self)).__name__
 
     def prepare_data(self) -> None:
-        """Encodes all captions of the data once, in one process, if the text encoder is frozen."""
+        """Encodes all captions of the data once, in one process, if the encoder is frozen."""
         self.encoder().precompute(*self._captions())
 
     def setup(self, stage: str) -> None:
@@ -273,7 +273,7 @@ class GeneratorTask(Task):
             self.pretrain()
 
     def pretrain(self) -> None:
-        """Trains the text encoder on captions alone before the first step, if the recipe says so."""
+        """Trains the text encoder on captions before the first step, if the recipe says so."""
         self.encoder().pretrain([clip.captions for clip in self.data.train.clips], self.seed)
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:

@@ -59,7 +59,7 @@ def words(text: str) -> list[str]:
 def hashed(word: str, buckets: int) -> tuple[int, int]:
     """Returns two rows of a table of `buckets` word vectors. A word's vector is their sum.
 
-    The rows are two parts of the word's hash (Svenstrup et al. 2017, "Hash embeddings"). Two words
+    The rows are two parts of the word's hash (Svenstrup et al. 2017, "Hash embeddings"). Words
     are confused only if both parts are equal. The hash (CRC-32) is the same on every machine.
     """
     # Two hashes of the word with different prefixes would not do: CRC is linear, so both would
@@ -196,9 +196,11 @@ def in_parts(text: str, verbs: Collection[str]) -> list[str]:
     """Splits a sentence with several actions.
 
     For example, "walks, turns left and waves. Then she sits" has four parts.
+
     A text is split at ends of sentences and at "then". With `verbs`, it is also split at each
-    comma that a verb follows. After such a comma, "and" before a verb splits, too; otherwise it does not:
-    "raises both hands and waves" is one action. A part without a verb is joined with its neighbor.
+    comma that a verb follows. After such a comma, "and" before a verb splits, too. Otherwise, it
+    does not: "raises both hands and waves" is one action. A part without a verb is joined with
+    its neighbor.
     "In limp style" at the end, which adapters teach, is added to all parts.
 
     Args:

@@ -1,4 +1,4 @@
-"""HumanML3D: motions of AMASS and HumanAct12 with descriptions, as features and as SMPL parameters.
+"""HumanML3D: motions of AMASS and HumanAct12 with descriptions, as features or SMPL parameters.
 
 Source: Guo et al., "Generating Diverse and Natural 3D Human Motions From Text", CVPR 2022. See
 `docs/humanml3d.md`.

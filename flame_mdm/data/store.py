@@ -351,7 +351,7 @@ def _pack(
 
 
 def _write_header(file: IO[bytes], frames: int, features: int) -> None:
-    """Writes the header of features.npy. NumPy pads it to the same size for any number of frames."""
+    """Writes the header of features.npy. NumPy pads it to the same size for any frame count."""
     np.lib.format.write_array_header_1_0(
         file, {"descr": "<f4", "fortran_order": False, "shape": (frames, features)}
     )

@@ -181,7 +181,7 @@ def _one(rng: np.random.Generator, choices: Any) -> Any:
 
 
 def _joints(rng: np.random.Generator, t: np.ndarray, attributes: Attributes) -> np.ndarray:
-    """Returns the joints (F, 22, 3) of a motion with these attributes at times (F,) in seconds."""
+    """Returns the joints (F, 22, 3) of a motion with these attributes at times (F,) in s."""
     margin = round(MARGIN / (t[1] - t[0])) if attributes.get("ends") == "cycle" else 0
     times = np.arange(len(t) + 2 * margin) * (t[1] - t[0]) if margin else t
     body = Body(rng, times, entry(content()["widths"], attributes))

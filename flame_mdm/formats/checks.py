@@ -129,7 +129,10 @@ def rest_frames(joints: np.ndarray, fps: float) -> int:
 
 
 def _is_rest_pose(pose: np.ndarray) -> bool:
-    """Returns whether joints (22, 3) stand with straight legs and straight, equally raised arms."""
+    """Returns whether joints (22, 3) stand with straight legs and straight arms.
+
+    Both arms must be raised equally.
+    """
     trunk = _trunk(pose[None])[0]
     raised = []
     for side in ("left", "right"):

@@ -49,7 +49,7 @@ class RawMotion:
 
 
 def needs_rotations(representation: Representation) -> bool:
-    """Returns whether a representation encodes rotations of SMPL's joints instead of joint positions."""
+    """Returns whether a representation encodes SMPL's rotations instead of joint positions."""
     return isinstance(representation, SMPL | Rot6D | Motion272)
 
 

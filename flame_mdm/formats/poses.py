@@ -60,7 +60,7 @@ class Poses:
         return forward_kinematics(SMPL22, self.rotations, self.offsets, self.root)
 
     def rest(self) -> Tensor:
-        """Returns joint positions (22, 3) of the rest pose, with the lowest joint on the floor."""
+        """Returns the joints (22, 3) of the rest pose, with the lowest joint on the floor."""
         joints = SMPL22.assemble(self.offsets, self.offsets.new_zeros(3))
         return joints - joints.new_tensor([0, 1, 0]) * joints[:, 1].min()
 

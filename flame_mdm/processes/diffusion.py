@@ -1,4 +1,7 @@
-"""Gaussian diffusion (Ho et al. 2020) with a fixed or a learned variance (Nichol and Dhariwal 2021)."""
+"""Gaussian diffusion with a fixed or a learned variance.
+
+Sources: Ho et al. 2020; Nichol and Dhariwal 2021.
+"""
 
 import itertools
 import math

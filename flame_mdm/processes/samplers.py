@@ -182,7 +182,8 @@ def dpm_solver_pp_2m(x: Tensor, run: Descent, i: int) -> Tensor:
 def consistency(x: Tensor, run: Descent, i: int) -> Tensor:
     """Estimates the clean motion and adds new noise for the next step.
 
-    This is how distilled models are sampled (Song et al. 2023, "Consistency Models", algorithm 1).
+    This is how distilled models are sampled. Source: Song et al. 2023, "Consistency Models",
+    algorithm 1.
 
     Args:
         x: (B, F, D) noisy motion at step i.

@@ -94,7 +94,7 @@ class Representation(nn.Module, ABC):
 
     @abstractmethod
     def encode(self, motion: Tensor) -> Tensor:
-        """Encodes a raw motion as features (F', D) float32 in the data's units, not normalized."""
+        """Encodes a raw motion as features (F', D) float32 in the data's units."""
 
     def encode_many(self, motions: Sequence[Tensor]) -> list[Tensor]:
         """Encodes several motions. Subclasses may do so in one pass."""

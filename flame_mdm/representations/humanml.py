@@ -1,4 +1,4 @@
-"""HumanML3D's features: root velocity, local joints, 6D rotations, joint velocities and foot contacts."""
+"""HumanML3D's features: root trajectory, local joints, rotations, velocities, contacts."""
 
 from collections.abc import Iterable, Sequence
 from typing import Literal
@@ -111,7 +111,7 @@ class HumanML(Representation):
         self.units_per_metre, self.contact_threshold = units_per_metre, contact_threshold
 
     def encode(self, motion: Tensor) -> Tensor:
-        """Encodes finite joints (T >= 3, J, 3) in meters, y up, as features (T - 1, D) float32."""
+        """Encodes finite joints (T >= 3, J, 3) in meters, y up, as (T - 1, D) float32."""
         return self.encode_many([motion])[0]
 
     def encode_many(self, motions: Sequence[Tensor]) -> list[Tensor]:

@@ -74,7 +74,7 @@ class Skeleton:
         return joints - joints[..., [max(parent, 0) for parent in self.parents], :]
 
     def assemble(self, bones: Tensor, root: Tensor) -> Tensor:
-        """Returns joints (..., J, 3) from the vectors of `bones` and the root's position (..., 3)."""
+        """Returns joints (..., J, 3) from `bones` vectors and the root's position (..., 3)."""
         paths = [[0.0] * len(self)]
         for joint, parent in enumerate(self.parents[1:], 1):
             paths.append([1.0 if bone == joint else on for bone, on in enumerate(paths[parent])])

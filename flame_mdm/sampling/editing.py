@@ -1,5 +1,5 @@
 # pyright: standard
-"""Motion editing without additional training: a part of a motion is kept, and the rest is resampled."""
+"""Motion editing without additional training: part of a motion is kept, the rest is resampled."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -105,7 +105,7 @@ def edit(
             `flame_mdm.sampling.motion_request.EditRequest`. The keywords of `flame_mdm.generate`
             also apply, such as `samples` (1), `seed` (0) and `guidance_scale`. `cleanup` also
             changes the kept part, usually by millimeters; `Edited.joint_error` says by how much.
-            changes the kept part, by millimeters as a rule; `Edited.joint_error` says by how much.
+            changes the kept part, usually by millimeters. `Edited.joint_error` says by how much.
 
     Returns:
         One edited motion per sample, `samples` for each text: all samples of the first text in

@@ -152,7 +152,9 @@ class EditRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class SamplingRequest:
-    """Motions to sample for texts or actions, or unconditioned motions: keywords of `flame_mdm.generate`.
+    """Motions to sample: keywords of `flame_mdm.generate`.
+
+    They are sampled for texts or actions. Without both, they are unconditioned.
 
     A text or action may have several parts with their seconds, "walks forward @3 | turns left |
     sits down @2". They are generated together as one motion, in overlapping windows; see

@@ -322,7 +322,10 @@ def write_set(
 
 
 def _entry(clip: Clip, still: RiggedClip, files: Mapping[str, str]) -> dict[str, Any]:
-    """Returns the entry of a clip in `set.json`: lengths in meters, angles in degrees, times in seconds."""
+    """Returns the entry of a clip in `set.json`.
+
+    Lengths are in meters, angles in degrees, and times in seconds.
+    """
     motion = clip.motion
     seconds = (len(motion) - 1) / motion.fps
     travel = motion.path[-1] - motion.path[0]

@@ -22,7 +22,7 @@ REQUEST_FILES = re.compile(r"motion_\d{3,}\.npz|motions\.mp4|trajectory\.png")
 
 
 def refuse_no_condition(model: MotionGenerator) -> None:
-    """Raises the `UserError` for a command without condition, with examples that the model knows."""
+    """Raises the `UserError` for a missing condition, with examples that the model knows."""
     examples = list(
         model.facts["actions"]
         if model.conditioned_on == "action"

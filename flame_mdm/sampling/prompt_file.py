@@ -14,7 +14,7 @@ from flame_mdm.sampling.motion_request import check_length, read_parts
 
 @dataclass(frozen=True)
 class PromptFile:
-    """A text file with one prompt per line. Refused prompts do not prevent sampling of the others.
+    """A text file with one prompt per line. If some are refused, the others are still sampled.
 
     Attributes:
         path: its name, as the user typed it.
@@ -61,7 +61,7 @@ class PromptFile:
         self.refused.update({numbers[position]: error for position, error in errors.items()})
 
     def lengths(self, key: str, lengths: Any) -> Any:
-        """Returns the lengths of the accepted prompts, if `lengths` is a list with one per prompt.
+        """Returns the lengths of the accepted prompts, if `lengths` has one per prompt.
 
         Otherwise, returns `lengths` unchanged.
         """

@@ -40,7 +40,7 @@ class ResolvedPrompt:
     """A text or an action in the form in which a model samples it.
 
     Attributes:
-        text: the prompt. A sentence with several actions is written as a sequence, "walks | sits".
+        text: the prompt. A sentence with several actions becomes a sequence, "walks | sits".
         is_split: whether the prompt was such a sentence.
         conditions: caption or action of each part, for the model.
         texts: words of the prompt for each part.
@@ -287,7 +287,9 @@ def _warnings(prompts: Sequence[ResolvedPrompt], model: MotionGenerator) -> list
 def _continued(
     request: SamplingRequest, model: MotionGenerator
 ) -> tuple[Tensor | None, Edit | None, tuple[str, ...]]:
-    """Returns the motion to continue: features (F, D), the edit that keeps its end, and its notes.
+    """Returns the features (F, D) of the motion to continue, the edit, and the motion's notes.
+
+    The edit keeps the end of the motion.
 
     The last frames are generated again, so that the new frames fit them. A model that continues
     frames reads these frames and needs no edit. The notes of a motion in memory are left out,

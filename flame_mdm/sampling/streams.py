@@ -145,7 +145,7 @@ class Stream(Iterator[Motion]):
         self._streams.schedules[0].add(frame, condition)
 
     def go_back(self, at: float) -> None:
-        """Drops frames from a time on that were not used yet. The next block continues from there.
+        """Drops frames that were not used yet, from a time on. The next block continues there.
 
         A new text is then visible at once, although blocks were computed ahead. The result is the
         stream whose text changes at that time. Later changes of the text are dropped, too.
@@ -183,7 +183,7 @@ class OnlineCleanup:
         self.version: np.ndarray | None = None  # the first version of the middle block
 
     def add(self, block: Motion) -> Motion | None:
-        """Takes the next block, and returns the cleaned previous block; None at the first block."""
+        """Takes the next block and returns the cleaned previous block; None at first."""
         self.blocks = [*self.blocks[-2:], block]
         if len(self.blocks) == 1:
             return None
@@ -356,7 +356,7 @@ class Streams(Iterator[list[Motion]]):
         self.frames = [frame]
 
     def take(self, lengths: Sequence[int]) -> list[Tensor]:
-        """Returns the next frames (F, D) of each stream, normalized; `lengths` are their numbers."""
+        """Returns the next frames (F, D) of each stream, normalized; `lengths` = their number."""
         ends = [frame + length for frame, length in zip(self.frames, lengths, strict=True)]
         parts: list[list[Tensor]] = [[] for _ in ends]
         while self.frames != ends:
@@ -413,7 +413,10 @@ class Streams(Iterator[list[Motion]]):
         return x, joints
 
     def _aimed(self, cond: Condition) -> tuple[Condition, Edit | None]:
-        """Returns a condition and an edit for the next block that lead the first stream to targets."""
+        """Returns a condition and an edit that lead the next block to the targets.
+
+        Only the first stream has targets.
+        """
         if self.targets is None:
             return cond, None
         model, placement, frames = self.model, self.placement, self.model.block_frames
@@ -461,14 +464,17 @@ class Streams(Iterator[list[Motion]]):
 
 
 def in_world(representation: Representation, placement: Placement, x: Tensor) -> Tensor:
-    """Decodes normalized features (..., F, D) of a stream to joints (..., F, J, 3) in the world."""
+    """Decodes normalized features (..., F, D) of a stream to joints in the world.
+
+    Joints are (..., F, J, 3).
+    """
     joints = representation.to_joints(x)
     turn = placement.turn[0].to(joints).expand(joints.shape[:-1])
     return rotate_y(joints, turn) + placement.shift[0].to(joints)
 
 
 def root_target(window: Targets, frames: int, placement: Placement) -> Tensor | None:
-    """Returns the target condition (1, 8, 4) for the position of the root in the last frame of a block.
+    """Returns the target condition (1, 8, 4) for the root's position in a block's last frame.
 
     Returns None if the window has no such target.
     """

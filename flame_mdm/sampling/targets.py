@@ -1,5 +1,5 @@
 # pyright: standard
-"""Targets in the world: waypoints of the root, joint positions, and whole poses at given times."""
+"""Targets in the world: waypoints of the root, joint positions, and poses at given times."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -91,11 +91,11 @@ class PositionGuide:
     keep: Tensor  # (1, F, D) bool, True = the feature is imposed
 
     def steer(self, clean: Callable[[Tensor], Tensor], x_t: Tensor) -> Tensor:
-        """Returns a noisy motion like `x_t`, but with a clean estimate nearer to the positions."""
+        """Returns a noisy motion like `x_t`, with a clean estimate nearer to the positions."""
         return steer(clean, x_t, self.to_joints, self.positions)
 
     def reach(self, x0_hat: Tensor) -> Tensor:
-        """Returns a clean estimate (B, F, D) that reaches the positions and keeps poses at targets."""
+        """Returns a clean estimate (B, F, D) that reaches the positions and keeps the poses."""
         imposed, free = torch.where(self.keep, self.poses, x0_hat), ~self.keep.expand_as(x0_hat)
         return reach(
             imposed, self.to_joints, self.positions, self.bones, free, SMOOTHNESS * self.fps

@@ -1,1 +1,1 @@
-"""The referee: reads claims from a sentence, measures them on a motion, and shows its evidence."""
+"""The referee: reads claims from a sentence, measures them on a motion, and shows evidence."""

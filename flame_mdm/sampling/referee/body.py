@@ -1,4 +1,4 @@
-"""`Body`: a motion on which claims are measured, for any frame rate, size, position and heading."""
+"""`Body`: a motion on which claims are measured, with any frame rate, size and position."""
 
 from functools import cached_property
 
@@ -17,7 +17,7 @@ FLOOR_WINDOW = 1.6
 
 
 def pair(name: str) -> list[int]:
-    """Returns the left and the right joint of a name: "wrist" gives left_wrist and right_wrist."""
+    """Returns the left and the right joint of a name: "wrist" is left_wrist and right_wrist."""
     return [JOINT[f"left_{name}"], JOINT[f"right_{name}"]]
 
 
@@ -27,10 +27,11 @@ SHOULDERS, ELBOWS, WRISTS = (pair(name) for name in ("shoulder", "elbow", "wrist
 
 
 class Body:
-    """A motion with joints (F, 22, 3), resampled to `RATE`, smoothed, and scaled to legs of `LEG`.
+    """A motion with joints (F, 22, 3), resampled, smoothed, and scaled to legs of `LEG` meters.
 
-    All numbers refer to this size, in meters. Positions "as seen by the body" have the axes left,
-    up and forward of its heading. Their origin is the point on the floor below the pelvis.
+    Its frame rate is `RATE`. All measured distances refer to the scaled body, in meters. Positions
+    "as seen by the body" have the axes left, up and forward of its heading. Their origin is the
+    point on the floor below the pelvis.
 
     Args:
         joints: (F, 22, 3) joints of SMPL in meters, y up.
@@ -69,7 +70,10 @@ class Body:
 
     @cached_property
     def floor(self) -> np.ndarray:
-        """Height (F,) of the floor: the lowest joint within `FLOOR_WINDOW`, as floors may have steps."""
+        """Height (F,) of the floor: the lowest joint within `FLOOR_WINDOW`.
+
+        Floors may have steps, so it can change.
+        """
         lowest = self.joints[..., 1].min(1)
         return minimum_filter1d(lowest, max(1, round(FLOOR_WINDOW * RATE)), mode="nearest")
 
@@ -110,7 +114,10 @@ class Body:
 
     @cached_property
     def velocity(self) -> np.ndarray:
-        """Velocity (F, 2) of the pelvis to the left and forward, in m/s, without sway of steps."""
+        """Velocity (F, 2) of the pelvis to the left and forward, in m/s.
+
+        It does not contain the sway of single steps.
+        """
         ground = gaussian_filter1d(
             self.joints[:, PELVIS][:, [0, 2]], 0.15 * RATE, axis=0, mode="nearest"
         )

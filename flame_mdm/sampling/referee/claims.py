@@ -1,4 +1,4 @@
-"""Claims: statements about a motion in a sentence that can be checked, and their falsification."""
+"""Claims: statements about a motion in a sentence that can be checked, and false variants."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

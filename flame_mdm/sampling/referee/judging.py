@@ -46,7 +46,10 @@ class Verdict:
 
     @property
     def evidence(self) -> str:
-        """The decisive number, unit, joint and times: "left wrist: 0.21 m above the head, 1.2-1.9 s"."""
+        """The decisive number, unit, joint and times.
+
+        An example is "left wrist: 0.21 m above the head, 1.2-1.9 s".
+        """
         reading = self.reading
         shown = ", ".join(f"{start:.1f}-{end:.1f} s" for start, end in reading.spans[:3])
         times = f", {shown}" if shown else ""

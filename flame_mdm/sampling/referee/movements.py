@@ -94,7 +94,7 @@ def turn_amount(body: Body, claim: Claim) -> Reading:
 
 
 def _turn(yaw: np.ndarray, direction: str) -> Reading:
-    """Returns a reading of the largest rise of an angle (F,), with the times of most of the rise."""
+    """Returns a reading of the largest rise of an angle (F,), with the times of its main part."""
     lowest = np.minimum.accumulate(yaw)
     end = int((yaw - lowest).argmax())
     start = int(yaw[: end + 1].argmin())
@@ -155,7 +155,7 @@ def pace(body: Body, claim: Claim) -> Reading:
 
 
 def stop(body: Body, claim: Claim) -> Reading:
-    """Measures the decrease from the highest speed of travel to the speed in the last 0.3 seconds."""
+    """Measures how much slower the travel is in the last 0.3 seconds than at its fastest."""
     last = float(body.speed[-max(1, round(0.3 * RATE)) :].mean())
     fastest = held(body.speed, 0.3)
     share = 1 - last / fastest if fastest > 0.3 else np.nan

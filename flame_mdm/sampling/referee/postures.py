@@ -25,7 +25,7 @@ STANDING = 0.9  # height of the pelvis of a standing body of the usual size, in 
 
 
 def thighs(body: Body) -> np.ndarray:
-    """Returns the angle (F, 2) between each thigh and the vertical in degrees; 90 = horizontal."""
+    """Returns the angle (F, 2) between each thigh and the vertical in degrees; 90 = level."""
     thigh = body.joints[:, KNEES] - body.joints[:, HIPS]
     return np.degrees(np.arctan2(np.linalg.norm(thigh[..., [0, 2]], axis=-1), -thigh[..., 1]))
 
@@ -37,7 +37,10 @@ def upright(body: Body, claim: Claim) -> Reading:
 
 
 def sit(body: Body, claim: Claim) -> Reading:
-    """Measures how much lower the pelvis is than in standing, with raised thighs, upright trunk."""
+    """Measures how much lower the pelvis is than in standing.
+
+    The thighs must be raised, and the trunk must be upright.
+    """
     lowered = STANDING - body.height[:, PELVIS]
     is_folded = (thighs(body).min(1) > 40) & (body.tilt < 60)
     return existence(np.where(is_folded, lowered, 0.0), "m lower", "pelvis", 0.3)
@@ -57,7 +60,7 @@ def lie(body: Body, claim: Claim) -> Reading:
 
 
 def all_fours(body: Body, claim: Claim) -> Reading:
-    """Measures how low the hands are while the trunk is level and the pelvis is above the floor."""
+    """Measures how low the hands are while the trunk is level and the pelvis is off the floor."""
     is_level = (body.tilt > 40) & (body.height[:, PELVIS] > 0.2)
     hands = body.height[:, WRISTS].max(1)
     return existence(np.where(is_level, -hands, -1.0), "m above the floor", "hands", 0.2)
@@ -100,7 +103,7 @@ def get_down(body: Body, claim: Claim) -> Reading:
 
 
 def _change(signal: np.ndarray) -> Reading:
-    """Returns a reading of the largest rise of a signal (F,) in meters, with its start and end."""
+    """Returns a reading of the largest rise of a signal (F,) in meters, with start and end."""
     lowest = np.minimum.accumulate(signal)
     end = int((signal - lowest).argmax())
     start = int(signal[: end + 1].argmin())
@@ -135,7 +138,7 @@ def return_pose(body: Body, claim: Claim) -> Reading:
 
 
 def return_place(body: Body, claim: Claim) -> Reading:
-    """Measures the body's distance from its start at the end, relative to its largest distance."""
+    """Measures the final distance from the start, relative to the largest distance from it."""
     ground = body.joints[:, PELVIS][:, [0, 2]]
     away = np.linalg.norm(ground - ground[0], axis=-1)
     farthest, last = float(away.max()), float(away[-1])
@@ -197,7 +200,7 @@ def hand_on_hip(body: Body, claim: Claim) -> Reading:
 
 
 def arms_out(body: Body, claim: Claim) -> Reading:
-    """Measures how far both wrists are to the sides of the shoulders, relative to the length of an arm."""
+    """Measures how far both wrists are to the sides of the shoulders, in lengths of an arm."""
     aside = body.seen[:, WRISTS, 0] - body.seen[:, SHOULDERS, 0]
     outward = np.minimum(aside[:, 0], -aside[:, 1]) / body.reach
     is_up = (body.joints[:, WRISTS, 1] - body.joints[:, SHOULDERS, 1]).min(1) > -0.35

@@ -1,4 +1,4 @@
-"""`Reading`, the evidence for or against a claim, and helpers that find it in signals over time."""
+"""`Reading`, the evidence for or against a claim, and helpers that find it in signals."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

@@ -106,7 +106,10 @@ def read_claims(text: str) -> list[Claim]:
 
 
 def _plain(text: str) -> str:
-    """Returns a text in lower case, without hyphens and apostrophes; joined phrases are one word."""
+    """Returns a text in lower case, without hyphens and apostrophes.
+
+    Joined phrases become one word.
+    """
     plain = re.sub(r"[-'’\"]", " ", text[:LONGEST].lower())
     plain = re.sub(r"\b(?:counter|anti) ?clockwise\b", "counterclockwise", plain)
     plain = re.sub(r"\s+", " ", plain).strip()
@@ -146,7 +149,7 @@ def _of_clause(text: str) -> list[Claim]:
 
 
 def _at_ends(clause: Clause, *, is_last: bool) -> list[Claim]:
-    """Returns the claims of a clause about the start or the end of the motion, as in "ends seated"."""
+    """Returns the claims of a clause about the start or the end, as in "ends seated"."""
     text, returns = clause.text, _content()["returns"]
     for kind in ("return pose", "return place"):
         if re.search(rf"\b(?:{returns[kind]})\b", text):
@@ -296,7 +299,7 @@ def _side(text: str, limb: str) -> str | None:
 
 
 def _amount(text: str, kind: str) -> int | None:
-    """Returns the number of repetitions that a clause states for a kind; None if it states none."""
+    """Returns the number of repetitions that a clause states for a kind; None = not stated."""
     numbers = {word: int(value) for word, value in phrases()["numbers"].items()}
     number = "|".join([r"\d{1,2}", *numbers])
     nouns = COUNT_NOUNS[kind]
@@ -314,14 +317,17 @@ def _amount(text: str, kind: str) -> int | None:
 
 
 def _speed(text: str) -> str:
-    """Returns slow or fast if a clause states one of them. "normal" or both together state none."""
+    """Returns slow or fast if a clause states one of them.
+
+    "normal", or slow and fast together, state none.
+    """
     words = text.split()
     values = {value for word, value in word_values("speed").items() if word in words}
     return values.pop() if values in ({"slow"}, {"fast"}) else ""
 
 
 def _orders(before: Sequence[Claim], after: Sequence[Claim]) -> list[Claim]:
-    """Returns the claim that the first event of a clause is before the first event of the next."""
+    """Returns the claim that the first event of a clause precedes the first event of the next."""
     first = next((claim for claim in before if _is_event(claim)), None)
     second = next((claim for claim in after if _is_event(claim)), None)
     if first is None or second is None or first.kind == second.kind:

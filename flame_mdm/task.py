@@ -105,7 +105,7 @@ class Task(Model, LightningModule):
         optimizer = self.make_optimizer()
         share = self.config.get("lr_decay") or 0.0
         if not 0 <= share <= 1:
-            raise UserError(f"lr_decay={share}: give the share of the training, from 0 to 1")
+            raise UserError(f"lr_decay={share}: give a fraction of the training, from 0 to 1")
         warmup = self.config.get("lr_warmup") or 0
         if warmup < 0:
             raise UserError(f"lr_warmup={warmup}: give a number of steps, 0 or more")
@@ -241,7 +241,7 @@ class GeneratorTask(Task):
         if context >= shortest:
             advice = "Increase data.crop.min_frames, or decrease denoiser.context_frames"
             raise UserError(
-                f"data.crop: a sample of {shortest} frames has none after a prefix of {context}. {advice}"
+                f"data.crop: a sample of {shortest} frames has no frames after a prefix of {context}. {advice}"
             )
         if self.generator.conditioned_on == "text":
             clips, may_share = data.train.clips, data.source.may_share_captions

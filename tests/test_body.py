@@ -116,7 +116,7 @@ def test_a_motion_that_no_body_fits_says_why(subtests):
     for motion, reason in (
         (
             posed(scale=3.0),
-            r"left_knee is 1\.17 m long, the body's is 0\.392 m\. Is the unit right\?",
+            r"left_knee is 1\.17 m long, but the body's is 0\.392 m\. Is the unit right\?",
         ),
         (sway(3, skeleton=KIT21), "computed only for the 22 joints of SMPL"),
         (Motion(np.zeros((3, 22, 3)), 20), "has no length"),

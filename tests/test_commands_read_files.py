@@ -52,7 +52,10 @@ ROWS = {
     "f09_prefix_underscore.bvh": [Row(STANDS)],
     "f09_smpl_capital.bvh": [Row(STANDS)],
     "f12_thirty_joints.npz": [
-        Row("", "30 joints, not those of SOMA.*Write the names of all joints.*skeleton.yaml")
+        Row(
+            "",
+            "30 joints, but not the joints of SOMA.*Write the names of all joints.*skeleton.yaml",
+        )
     ],
     "f12_body_only_66.npz": [Row(STANDS)],
     "f12_rate_of_one_element.npz": [Row(STANDS)],

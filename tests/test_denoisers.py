@@ -219,7 +219,7 @@ def test_the_prefix_acts_on_every_frame_and_has_no_output(subtests) -> None:
             subtests.test(prefix=prefix, frames=frames),
             pytest.raises(
                 UserError,
-                match=f"a prefix of {frames} frames: this denoiser continues 3 clean frames",
+                match=f"the prefix has {frames} frames, but this denoiser continues 3 clean frames",
             ),
         ):
             decoder(x_t, t, mask, replace(cond, prefix=prefix))

@@ -265,7 +265,9 @@ def test_clips_without_a_frame_to_predict_are_refused_before_training(tmp_path, 
         "denoiser.context_frames=40",
     ]
     assert main(["train", "synthetic/dip", *words]) == 1
-    assert "data.crop: a sample of 40 frames has none after a prefix of 40" in one_error(capsys)
+    assert "data.crop: a sample of 40 frames has no frames after a prefix of 40" in one_error(
+        capsys
+    )
 
 
 RUN = [

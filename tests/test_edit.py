@@ -333,7 +333,7 @@ def test_motions_that_cannot_be_read_are_one_line(diffusion, store, tmp_path):
         (
             clean | {"features": joints[..., 0]},
             {},
-            r"motion\.npz.* features of shape \(9, 22\), not",
+            r"motion\.npz.* features have shape \(9, 22\), not",
         ),
         (tmp_path / "absent.npz", {}, r"absent\.npz: no such file"),
         ("kit:1", {}, "no prepared data set"),
@@ -349,7 +349,7 @@ def test_motions_that_cannot_be_read_are_one_line(diffusion, store, tmp_path):
             read_motion(diffusion.representation, path, data_root=store, **options)
     np.savez(file, joints=joints[:, :21], fps=20)
     with one_line_error(
-        r"motion.npz: the model needs rotations of SMPL's joints, which kit21 does not determine"
+        r"motion.npz: the model needs rotations of SMPL's joints, but kit21 does not determine them"
     ):
         read_motion(SMPL(), file)
 

@@ -355,11 +355,14 @@ REFUSED = {
         header() + struct.pack("<IIIB", 10**6, 0, 0, 0) + bytes(40),
         "ends outside",
     ),
-    "many properties": (header(7700) + wide_record(b"A", b"C\x01", 10**9), "properties in 2 bytes"),
+    "many properties": (
+        header(7700) + wide_record(b"A", b"C\x01", 10**9),
+        "properties do not fit into 2 bytes",
+    ),
     "unknown property": (header(7700) + wide_record(b"A", b"Z\x01", 1), "unknown property"),
-    "bomb": (bomb(), "an array of"),
-    "large claim": (claim(2**31), "arrays of more than"),
-    "short array": (claim(10), "an array of"),
+    "bomb": (bomb(), "an array has"),
+    "large claim": (claim(2**31), "arrays have more than"),
+    "short array": (claim(10), "an array has"),
     "unknown encoding": (claim(10, 9), "unknown encoding 9"),
     "nested": (nested(), "nested"),
 }

@@ -312,7 +312,7 @@ def test_a_rig_without_a_root_moves_its_hips(tmp_path: Path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"stand: Idle": "stand: Walk"}, "stand is Walk, which is not a motion with kind: loop"),
+        ({"stand: Idle": "stand: Walk"}, "stand is Walk, which is not a loop"),
         ({", degrees: 90}\n  Strafe": "}\n  Strafe"}, "motions.Turn is a turn without degrees"),
         ({"fps: 30": "fps: 0"}, "fps is 0"),
         ({"fps: 30": "rate: 30"}, "unknown key: rate"),

@@ -537,7 +537,7 @@ REFUSED: dict[type[Process], list[tuple[dict[str, Any], str]]] = {
         ({"edit": {"mode": "trajectory"}}, "x0, x_t"),
         (
             {"edit": {"mode": "x_t", "known": torch.zeros(1, 5, 2)}},
-            "^edit does not match the shape",
+            "^the edit does not have the shape",
         ),
         (
             {"sampler": "dpm_solver_pp_2m", "edit": {"mode": "x_t", "resample": 2}},
@@ -546,7 +546,7 @@ REFUSED: dict[type[Process], list[tuple[dict[str, Any], str]]] = {
     ],
     FlowMatching: [
         ({"sampler": "ddim"}, "has euler, midpoint, heun, rk4, dopri5"),
-        ({"sampler": "euler", "num_inference_steps": [0, 2]}, "a number of equal steps"),
+        ({"sampler": "euler", "num_inference_steps": [0, 2]}, "a flow takes equal steps"),
         (
             {"sampler": "euler", "spacing": "stride"},
             "spacing=stride: the sampler euler has no such",

@@ -326,7 +326,7 @@ def test_values_of_wrong_kinds_are_refused_when_a_model_is_loaded(attacked, trai
             refuses(changed(**{key: value}), name)
     for value in ([3, 1], [0, 99_999]):
         path = changed(config__task__num_inference_steps=value)
-        attacked("sample", f"ckpt={path}", TEXT, says="sampling steps must be")
+        attacked("sample", f"ckpt={path}", TEXT, says="increasing steps")
     attacked("evaluate", f"ckpt={changed(config__data=3)}", "extractor=none", "quick=true")
     refuses(
         model_file(bad / "x.safetensors", trained, text='{"a":' * 100_000), "x.safetensors: damaged"

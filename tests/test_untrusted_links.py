@@ -397,7 +397,7 @@ def test_prepare_replaces_an_intact_store_only_and_keeps_the_files_of_others(tmp
     folder = tmp_path / "mine-humanml"
     (folder / "clips").mkdir(parents=True)
     (folder / "clips" / "walk.bvh").write_bytes(VICTIM)
-    with one_line_error(f"{folder}: exists, and is not a prepared data set"):
+    with one_line_error(f"{folder}: exists, but is not a prepared data set"):
         prepare(tmp_path)
     assert (folder / "clips" / "walk.bvh").read_bytes() == VICTIM
     folder.rename(tmp_path / "source")

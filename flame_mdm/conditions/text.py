@@ -365,7 +365,7 @@ class EncodedCaptions:
         self.rows = {caption: row for row, caption in enumerate(captions)}
         self.pooled, self.tokens, self.offsets = pooled, tokens, offsets.numpy()
         if not len(pooled) + 1 == len(offsets) == len(captions) + 1 or offsets[-1] != len(tokens):
-            raise ValueError("its arrays do not belong together")
+            raise ValueError("its arrays do not match")
 
     @classmethod
     def open(cls, path: Path) -> "EncodedCaptions":

@@ -94,7 +94,7 @@ def _zip_members(
         for info in archive.infolist():
             name = info.filename
             if not name:  # `zipfile` cuts names at a null character
-                raise UserError("a file without a name")
+                raise UserError("it contains a file without a name")
             # macOS adds a folder __MACOSX with attributes of the files
             if not info.is_dir() and "__MACOSX" not in name and is_wanted(name):
                 check_member(info)
@@ -119,7 +119,7 @@ def _tar_members(
             if not member.isdir() and is_wanted(member.name):
                 if not member.isreg() or member.issparse():
                     raise UserError(
-                        f"{member.name}: a link or another special file, not a regular file"
+                        f"{member.name}: it is a link or another special file, not a regular file"
                     )
                 _check_size(member.name, member.size)
                 yield member.name, archive.extractfile(member).read()
@@ -129,7 +129,7 @@ def _tar_members(
 
 def _check_size(name: str, size: int) -> None:
     if size > MEMBER_LIMIT:
-        raise UserError(f"{name}: {size:,} bytes, too many for a motion")
+        raise UserError(f"{name}: {size:,} bytes are too many for a motion")
 
 
 class _Member(tarfile.TarInfo):
@@ -139,7 +139,7 @@ class _Member(tarfile.TarInfo):
         if self.type == tarfile.GNUTYPE_SPARSE:
             raise UserError(f"{self.name}: a sparse file")
         if self.type in _HEADERS and self.size > HEADER_LIMIT:
-            raise UserError(f"a header of {self.size:,} bytes")
+            raise UserError(f"a header has {self.size:,} bytes, which is too many")
         return super()._proc_member(archive)  # pyright: ignore[reportAttributeAccessIssue]
 
     def _proc_gnusparse_10(self, *_: Any) -> None:

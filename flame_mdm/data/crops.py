@@ -77,7 +77,7 @@ class Units(Crop):
     def __post_init__(self) -> None:
         if not 1 <= self.unit <= self.min_frames <= self.max_frames or self.max_frames % self.unit:
             raise UserError(
-                f"crop: needs 1 <= unit <= min_frames <= max_frames and whole units, not {self}"
+                f"crop: needs 1 <= unit <= min_frames <= max_frames, in whole units, not {self}"
             )
 
     def draw(self, frames: Any, below: Below | None) -> tuple[Any, Any]:

@@ -124,10 +124,11 @@ class Folder(MotionSource):
         name = representation.name
         if needs_rotations(representation) and self.motion == "joints":
             raise UserError(
-                f"{name} is made of rotations. Add data.source.motion=smpl: they are read, or fitted to joints"
+                f"{name} is made of rotations. Add data.source.motion=smpl: rotations are "
+                "then read from the files, or fitted to joints"
             )
         if isinstance(representation, HumanML | Rifke) and self.motion == "smpl":
-            raise UserError(f"{name} is made of joints. Drop data.source.motion=smpl")
+            raise UserError(f"{name} is made of joints. Remove data.source.motion=smpl")
         self._representation = representation
 
     def count(self) -> int:

@@ -144,7 +144,9 @@ class _Unpickler(pickle._Unpickler):
         """Returns an array: a view of its bytes, or a copy of a list of objects."""
         code, data = dtype.arguments[0], self.plain(data)
         if not DTYPE.fullmatch(code):
-            raise pickle.UnpicklingError(f"an array of dtype {code[:40]!r}")
+            raise pickle.UnpicklingError(
+                f"it contains an array of dtype {code[:40]!r}, which cannot be read"
+            )
         kind = np.dtype(code)
         if dtype.state and dtype.state[1] in ("<", ">"):
             kind = kind.newbyteorder(dtype.state[1])
@@ -171,7 +173,7 @@ class _Unpickler(pickle._Unpickler):
         self.append(bytearray(self.read(struct.unpack("<Q", self.read(8))[0])))
 
     def _refuse_set(self) -> None:
-        raise pickle.UnpicklingError("a set, which no data set contains")
+        raise pickle.UnpicklingError("it contains a set, but no data set has one")
 
     dispatch = pickle._Unpickler.dispatch | {
         pickle.BUILD[0]: _load_build,

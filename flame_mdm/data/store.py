@@ -235,7 +235,7 @@ def _replaceable(folder: Path) -> list[Path]:
         return []
     if not (folder / "store.json").is_file():
         raise UserError(
-            f"{folder}: exists, and is not a prepared data set. It is not replaced: choose another data_root or "
+            f"{folder}: exists, but is not a prepared data set, so it is not replaced. Choose another data_root or "
             "data.name, or move that folder away"
         )
     store = Store(folder)

@@ -59,7 +59,7 @@ def content() -> dict[str, Any]:
     for name in ("captions", "phrases", "stated", "widths"):
         if both := grammar[name].keys() & more[name].keys():
             raise ValueError(
-                f"synthetic_more.yaml: {name}: {sorted(both)} are in synthetic.yaml, too"
+                f"synthetic_more.yaml: {name}: {sorted(both)} are also in synthetic.yaml"
             )
         grammar[name] |= more[name]
 

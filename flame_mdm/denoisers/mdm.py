@@ -168,7 +168,7 @@ class MDMDecoder(Denoiser):
         self.condition_frames = condition_frames
         if memory == "concat" and not token_memory:
             raise UserError(
-                "denoiser.memory=concat: a token of the time needs the other tokens. Set token_memory=true"
+                "denoiser.memory=concat: a token of the time needs other tokens beside it. Set token_memory=true"
             )
         if type(context_frames) is not int or context_frames < 0:
             raise UserError(
@@ -227,7 +227,7 @@ class MDMDecoder(Denoiser):
         frames = 0 if cond.prefix is None else cond.prefix.shape[1]
         if cond.prefix is None or frames != self.context_frames:
             raise UserError(
-                f"a prefix of {frames} frames: this denoiser continues {self.context_frames} clean frames"
+                f"the prefix has {frames} frames, but this denoiser continues {self.context_frames} clean frames"
             )
         return torch.cat([cond.prefix.to(x_t), x_t], 1)
 

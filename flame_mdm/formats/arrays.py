@@ -71,7 +71,7 @@ def read_arrays(path: Path) -> dict[str, Any]:
         data["poses"] = _joined([data[name] for name in BODY])
     if not {"joints", "poses"} & data.keys():
         raise UserError(
-            "contains neither joints nor poses; a motion has joints and fps, or poses, trans and a rate"
+            "contains neither joints nor poses. A motion needs joints and fps, or poses, trans and a rate"
         )
     for name in {"joints", "poses", "trans"} & data.keys():
         check_numbers(name, data[name])
@@ -112,7 +112,9 @@ def _joined(parts: list[np.ndarray]) -> np.ndarray:
     try:
         return np.concatenate([part.reshape(len(part), -1) for part in parts], 1)
     except (TypeError, ValueError) as error:
-        raise UserError(f"{' and '.join(BODY)} are not arrays of equally many frames") from error
+        raise UserError(
+            f"{' and '.join(BODY)} must be arrays with the same number of frames"
+        ) from error
 
 
 def _axis_angles(poses: np.ndarray) -> np.ndarray:

@@ -130,7 +130,7 @@ def proportions(body: Mesh, offsets: np.ndarray) -> tuple[np.ndarray, float]:
     for joint in LIMBS:
         if not LONGER[0] <= ratio[joint] <= LONGER[1]:
             raise UserError(
-                f"the bone that ends in {SMPL22.joints[joint]} is {lengths[joint]:.3g} m long, the body's is "
+                f"the bone that ends in {SMPL22.joints[joint]} is {lengths[joint]:.3g} m long, but the body's is "
                 f"{usual[joint]:.3g} m. Is the unit right? Such a motion is drawn without a body"
             )
     wide = float(lengths[list(LIMBS)].sum() / usual[list(LIMBS)].sum())

@@ -72,7 +72,7 @@ def _read_bvh(path: Path) -> BvhCharacter:
     for joint, number in joints.items():
         if len(turning := _order(file.channels[number])) < 3:
             name = f"{file.joints[number]} ({joint})"
-            raise UserError(f"{path}: {name} has {len(turning)} rotation channels. Give it three")
+            raise UserError(f"{path}: {name} has {len(turning)} rotation channels. It needs three")
     if not any(_moves(names) for names in _above(file, joints["pelvis"]).values()):
         name = file.joints[joints["pelvis"]]
         raise UserError(

@@ -95,7 +95,7 @@ def _rotations(motion: Motion, fps: float, axes: Tensor) -> RawMotion:
     """Returns rotations of SMPL in coordinates that `axes` (3, 3) converts to y up."""
     if motion.skeleton.joints[: len(SMPL22)] != SMPL22.joints:
         raise UserError(
-            f"the model needs rotations of SMPL's joints, which {motion.skeleton.name} does not determine. Give a "
+            f"the model needs rotations of SMPL's joints, but {motion.skeleton.name} does not determine them. Give a "
             "motion of SMPL's 22 joints"
         )
     note, error = "", 0.0

@@ -117,14 +117,14 @@ def read(path: Path) -> Record:
     if not content.startswith(MAGIC[:18]):
         if content.lstrip()[:1] == b";" or b"FBXHeaderExtension" in content[:4096]:
             raise UserError(
-                f"{path}: an FBX file in ASCII. Export it as binary FBX, the default of most programs"
+                f"{path}: this FBX file is in ASCII. Export it as binary FBX, the default of most programs"
             )
         raise UserError(f"{path}: not an FBX file")
     try:
         (version,) = struct.unpack_from("<I", content, len(MAGIC))
         if not OLDEST_VERSION <= version < 9000:
             raise UserError(
-                f"{path}: FBX version {version / 1000:g}, but only version 7 can be read. "
+                f"{path}: this is FBX version {version / 1000:g}, but only version 7 can be read. "
                 "Export it as FBX 2014 or later"
             )
         return _Reader(content, version).read()
@@ -177,7 +177,7 @@ class _Reader:
 
     def _properties(self, position: int, end: int, count: int) -> list[Any]:
         if count > end - position:
-            raise ValueError(f"{count} properties in {end - position} bytes")
+            raise ValueError(f"{count} properties do not fit into {end - position} bytes")
         values = []
         for _ in range(count):
             code = chr(self.content[position])
@@ -207,15 +207,15 @@ class _Reader:
         size = items * kind.itemsize
         self.expanded += size
         if self.expanded > EXPANDED_LIMIT:
-            raise ValueError(f"arrays of more than {EXPANDED_LIMIT // MEBIBYTE} MiB")
+            raise ValueError(f"its arrays have more than {EXPANDED_LIMIT // MEBIBYTE} MiB")
         if encoding == 1:
             unpacker = zlib.decompressobj()
             # One byte more than declared is unpacked, to detect arrays that are too long.
             packed = unpacker.decompress(packed, size + 1)
         elif encoding != 0:
-            raise ValueError(f"unknown encoding {encoding} of an array")
+            raise ValueError(f"an array has the unknown encoding {encoding}")
         if len(packed) != size:
-            raise ValueError(f"an array of {len(packed)} bytes, not {size}")
+            raise ValueError(f"an array has {len(packed)} bytes, not {size}")
         return np.frombuffer(packed, kind)
 
 

@@ -138,7 +138,7 @@ class _Document(_Object):
 def _item(items: Sequence[Item], index: int, name: str) -> Item:
     """Returns an item of a list in the document. Raises `ValueError` if it does not exist."""
     if not 0 <= index < len(items):
-        raise ValueError(f"{name}: there is no number {index}, only {len(items)} of them")
+        raise ValueError(f"{name}: there is no number {index}, because there are only {len(items)}")
     return items[index]
 
 
@@ -201,7 +201,7 @@ def read(path: Path) -> Glb:
         parts = _Document.model_validate(document)
         if unread := [name for name in parts.extensionsRequired if not HARMLESS.match(name)]:
             raise UserError(
-                f"it requires {unread[0][:80]}, which is not read. Export it without this compression"
+                f"it requires {unread[0][:80]}, which cannot be read. Export it without this compression"
             )
         order, above = _ordered(parts.nodes)
         rank = np.argsort(order).tolist()  # index in the document -> number
@@ -232,7 +232,7 @@ def _chunks(content: bytes) -> tuple[Any, bytes]:
     """Returns the parsed document and the binary part of a file."""
     version, _, size, kind = struct.unpack_from("<III4s", content, 4)
     if version != 2 or kind != b"JSON" or size > DOCUMENT_LIMIT:
-        raise ValueError(f"version {version}, a first part {kind!r} of {size} bytes")
+        raise ValueError(f"it has version {version} and a first part {kind!r} of {size} bytes")
     if len(content) < 20 + size:
         raise ValueError("the file ends too early")
     document = parse_json(content[20 : 20 + size])
@@ -241,7 +241,7 @@ def _chunks(content: bytes) -> tuple[Any, bytes]:
     length, kind = struct.unpack_from("<I4s", content, 20 + size)
     if kind != b"BIN\0" or len(content) < 28 + size + length:
         raise ValueError(
-            f"a second part {kind!r} of {length} bytes, which the file does not contain"
+            f"its second part {kind!r} should have {length} bytes, but the file is shorter"
         )
     return document, content[28 + size : 28 + size + length]
 
@@ -268,7 +268,7 @@ def _corners(parts: _Document, primitive: _Primitive) -> np.ndarray:
     """Returns the corners (8, 3) of the box around a part of a mesh."""
     accessor = _item(parts.accessors, primitive.attributes.get("POSITION", -1), "POSITION")
     if {len(accessor.min), len(accessor.max)} != {3}:
-        raise ValueError("a mesh without bounds of its positions")
+        raise ValueError("a mesh has no bounds of its positions")
     box = np.array([accessor.min, accessor.max], float)
     box /= WHOLE.get(accessor.componentType, 1) if accessor.normalized else 1
     return np.array([box[[i, j, k], [0, 1, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])

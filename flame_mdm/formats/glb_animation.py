@@ -252,7 +252,7 @@ def _tracks(file: glb.Glb, animation: _Animation) -> dict[int, dict[str, Track]]
         if target.path not in WIDTHS or target.node < 0:
             continue
         if target.node not in rank or channel.sampler >= len(animation.samplers):
-            raise ValueError("a channel of an animation without its node or sampler")
+            raise ValueError("a channel of an animation has no node or no sampler")
         sampler = animation.samplers[channel.sampler]
         track = _track(file, sampler, WIDTHS[target.path])
         tracks.setdefault(rank[target.node], {})[target.path] = track

@@ -487,8 +487,8 @@ def check_order(joints: np.ndarray, count: int, skeleton: str) -> None:
             else "the limbs change their length"
         )
         raise UserError(
-            f"{count} joints, not those of {skeleton} in their order: {fault}. Write the names of all joints and a map "
-            "into skeleton.yaml"
+            f"{count} joints, but not the joints of {skeleton} in order: {fault}. Write the names of all "
+            "joints and a map into skeleton.yaml"
         )
 
 

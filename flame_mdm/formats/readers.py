@@ -179,7 +179,8 @@ def read_recording(
     fields = find_skeleton(path, up) | said
     if animation is not None and path.suffix.lower() not in SCENES:
         raise UserError(
-            f"{path}: animation={animation} has no effect, {path.suffix} files have one. Drop animation="
+            f"{path}: animation={animation} has no effect, because {path.suffix} files have one animation. "
+            "Remove animation="
         )
     with naming(path, ValueError):
         if path.suffix.lower() in SCENES:
@@ -395,7 +396,7 @@ def _of_ours(
     """
     for key, value in said.items():
         raise UserError(
-            f"{key}={value} has no effect: this project wrote the file, in meters, y up. Drop {key}="
+            f"{key}={value} has no effect: this project wrote the file, in meters, y up. Remove {key}="
         )
     rate = _rate(data, rate, {})
     notes = ("skeleton.yaml does not apply: this project wrote the file",) if fields else ()
@@ -438,7 +439,7 @@ def _checked(fields: dict[str, Any]) -> dict[str, Any]:
     except ValueError as error:
         stated = ", ".join(f"{key}: {fields[key]}" for key in ("up", "unit") if key in fields)
         raise UserError(
-            f"{stated[:80]}: up is y, z or -y, and unit a number of meters, or m, cm or mm"
+            f"{stated[:80]}: up must be y, z or -y, and unit must be a number of meters, or m, cm or mm"
         ) from error
     return fields
 
@@ -524,7 +525,7 @@ def _poses(data: dict[str, Any]) -> Poses | None:
     if "poses" in data:
         if len(data["poses"]) != len(data["joints"]):
             raise UserError(
-                f"{len(data['poses'])} frames of poses, but {len(data['joints'])} of joints"
+                f"{len(data['poses'])} frames of poses, but {len(data['joints'])} frames of joints"
             )
         translation, turns = smpl_motion(data)  # it does not contain the template's pelvis
         return _smpl_poses(translation, rotation.quaternion_to_matrix(turns), AMASS_AXES)

@@ -221,5 +221,5 @@ class Process(nn.Module, ABC):
         shapes = [tuple(x.shape) for x in (edit.known, edit.keep, mask)]
         if shapes[0] != shapes[1] or shapes[0][:2] != shapes[2]:
             raise UserError(
-                f"edit does not match the shape of the motions: known, keep and mask have shapes {shapes}"
+                f"the edit does not have the shape of the motions: known, keep and mask have shapes {shapes}"
             )

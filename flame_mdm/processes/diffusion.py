@@ -258,7 +258,7 @@ class GaussianDiffusion(Process):
             steps = list(chosen)
             if len(steps) < 2 or steps != sorted(set(steps)) or steps[-1] >= total:
                 raise UserError(
-                    f"sampling steps must be 2 or more from 0 to {total - 1}, increasing: got {steps}"
+                    f"num_inference_steps={steps}: give 2 or more increasing steps from 0 to {total - 1}"
                 )
             return steps
         least = 1 if options.sampler == "consistency" else 2

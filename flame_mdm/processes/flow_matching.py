@@ -135,7 +135,9 @@ class FlowMatching(Process):
         """
         sampler, count = self.find_sampler(options), options.num_inference_steps
         if not isinstance(count, int):
-            raise UserError(f"num_inference_steps={count}: a flow takes a number of equal steps")
+            raise UserError(
+                f"num_inference_steps={count}: a flow takes equal steps. Give their number"
+            )
         if edit is not None:
             self.check_edit(edit, mask, options)
         imposed = edit if edit is not None and edit.mode == "x0" else None

@@ -94,7 +94,7 @@ class HumanML(Representation):
         joints = len(SKELETONS[skeleton])
         if bone_lengths is not None and len(bone_lengths) != joints:
             raise UserError(
-                f"bone_lengths: {len(bone_lengths)} numbers for the {joints} joints of {skeleton}"
+                f"bone_lengths: {len(bone_lengths)} numbers, but {skeleton} has {joints} joints"
             )
         widths = {"turn": 1, "root_velocity": 2, "root_height": 1, "positions": 3 * (joints - 1)}
         name = f"humanml-{variant}-{skeleton}"

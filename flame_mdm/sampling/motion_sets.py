@@ -106,12 +106,12 @@ def read_set(source: str) -> MotionSet:
     stand = content.motions.get(content.stand)
     if stand is None or stand.kind != "loop":
         raise UserError(
-            f"{path}: stand is {content.stand}, which is not a motion with kind: loop. Name such a motion"
+            f"{path}: stand is {content.stand}, which is not a loop. Name a motion with kind: loop"
         )
     for name, motion in content.motions.items():
         if motion.kind == "turn" and not motion.degrees:
             raise UserError(
-                f"{path}: motions.{name} is a turn without degrees. Give degrees, 90 is to the left"
+                f"{path}: motions.{name} is a turn without degrees. Give degrees; 90 is to the left"
             )
     _check_rig(content, f"{path}: rig: ")
     return content

@@ -107,7 +107,9 @@ def with_features(representation: Representation, motion: Motion) -> Motion:
     ):
         shape, size = motion.features.shape, representation.features
         if shape[1:] != (size,) or not np.isfinite(motion.features).all():
-            raise UserError(f"{name}features of shape {shape}, not (frames, {size}), or not finite")
+            raise UserError(
+                f"{name}features have shape {shape}, not (frames, {size}), or are not finite"
+            )
         return motion
     try:
         if motion.skeleton.joints[: len(SMPL22)] == SMPL22.joints:

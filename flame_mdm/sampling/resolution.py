@@ -200,7 +200,7 @@ def _check_windows(model: MotionGenerator) -> None:
     if not model.representation.relative:
         name = model.representation.name
         raise UserError(
-            f"representation {name} has positions in the world, so that windows of a sequence do not fit together. "
+            f"representation {name} has positions in the world, so windows of a sequence do not fit together. "
             "Use a model of humanml3d features"
         )
 

@@ -79,7 +79,7 @@ def _sequence_frames(
         if length < shared:
             short = f"a part of {length / fps:g} seconds is too short"
             raise UserError(
-                f"'{name}': {short}. Give at least {shared / fps:g}, which it shares with its neighbors"
+                f"'{name}': {short}. Give at least {shared / fps:g}, as many as it shares with its neighbors"
             )
     if sum(lengths) > MAX_SECONDS * fps:
         raise UserError(

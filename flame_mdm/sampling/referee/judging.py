@@ -132,7 +132,9 @@ def judge(
     if fps is None:
         raise UserError("fps is missing: joints have no frame rate. Give fps=20 or another rate")
     if not text or not text.strip():
-        raise UserError("text is missing: the motion has none. Give the sentence to judge it by")
+        raise UserError(
+            "text is missing: the motion has none. Give the sentence by which to judge it"
+        )
     return Judgment(text, tuple(verdicts(joints, fps, read_claims(text))))
 
 

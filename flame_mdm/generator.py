@@ -207,8 +207,8 @@ class MotionGenerator(Model, nn.Module):
             unconditioned: sample a conditional model with its null condition.
             shared_noise: the noise does not depend on the id: it is a function of (seed,
                 replication) alone.
-            trajectory: list to which the normalized clean estimate (B, F, D) of each call of the
-                denoiser is added.
+            trajectory: list that receives the normalized clean estimate (B, F, D) of each call of
+                the denoiser.
 
         Returns:
             Normalized features (B, F, D), 0 past the end of each motion.

@@ -143,7 +143,7 @@ class Cost(Schema):
 class Measured(Schema):
     """The values that an evaluation measures, by metric.
 
-    `values` are of the evaluated motions, `ground_truth` of real motions; None = not measured.
+    `values` belong to the evaluated motions, `ground_truth` to real motions. None = not measured.
     """
 
     ground_truth: dict[str, Value | None] | None
@@ -158,7 +158,7 @@ class Measured(Schema):
 
 
 class Result(Measured):
-    """A result of `flame-mdm evaluate`: values, and what was evaluated with which settings."""
+    """A result of `flame-mdm evaluate`: values, the evaluated model or motions, and settings."""
 
     quick: bool  # not for publication
     protocol: ProtocolVersion

@@ -69,7 +69,7 @@ _adapter = functools.cache(TypeAdapter)
 def check_shape(content: Any, kind: type[T] | Any, strict: bool = True) -> T:
     """Converts the content of a file to a `Schema` or another type that pydantic supports.
 
-    Dataclasses need `strict` = False, with which "1" is a number.
+    Dataclasses need `strict` = False. The text "1" is then accepted as a number.
 
     Raises:
         ValueError: If the content has another shape; names key, found value and expected type.

@@ -100,7 +100,7 @@ class Task(Model, LightningModule):
         """Returns the optimizer and the schedule of its learning rate.
 
         The learning rate rises linearly over the first `lr_warmup` steps. It falls linearly to 0
-        over the last part of the training, whose share is `lr_decay`.
+        over the last fraction `lr_decay` of the training.
         """
         optimizer = self.make_optimizer()
         share = self.config.get("lr_decay") or 0.0

@@ -21,7 +21,10 @@ FUNCTION_WORDS = frozenset(
         "boy girl guy lady someone somebody will"
     )
 )
-"""Words that do not say what happens. A text needs other words, too; these cause no warning."""
+"""Words that do not say what happens.
+
+A text of only these words says nothing. A model that does not know them gives no warning.
+"""
 NUMBERS = frozenset(
     [
         "zero",
@@ -151,7 +154,7 @@ def unread_words(text: str, max_words: int | None) -> list[str]:
 
 
 def unknown_words(text: str, facts: Mapping[str, Any]) -> list[str]:
-    """Returns the content words of a text of which the model knows no form."""
+    """Returns the content words of a text that the model does not know in any form."""
     seen = facts.get("vocabulary")
     return (
         [] if seen is None else [word for word in _content(text) if known_form(word, seen) is None]

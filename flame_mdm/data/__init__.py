@@ -50,7 +50,6 @@ class Clip:
     reference: np.ndarray | None = None
     # Identifier of the license of this motion, such as "MIT". Empty if the data set has one
     # license for all motions.
-    # for all motions.
     license: str = ""
 
 

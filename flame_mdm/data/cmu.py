@@ -486,7 +486,7 @@ def standardize(tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
     """
     is_original, unit, blended = "lfemur" in tree.joints, LAYOUTS["CMU ASF"].unit, 0
     # The MotionBuilder-friendly conversion lacks a bone of the trunk and of each hand. Each of
-    # them is restored: it gets its share of the neighboring bone that contains it.
+    # them is restored: it gets a part of the neighboring bone with which it was merged.
     if "LHipJoint" in tree.joints:
         offsets, at = tree.offsets.copy(), tree.joints.index
         for child, (share, bone) in FACTS["lost"].items():

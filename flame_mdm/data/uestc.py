@@ -162,9 +162,9 @@ def front_view(pose: np.ndarray, root: np.ndarray, camera: np.ndarray, video: Vi
     """Converts VIBE's estimates to a raw motion (F, 75) float32.
 
     VIBE's camera is weak-perspective: a scale s and a shift. ACTOR's code places the body at x, y
-    = the shift. The depth z is the distance at which a camera of focal length f shows the body in
-    that size: z = f / (s w / 2) in an image w pixels wide. Videos of side 2 are rotated about the
-    vertical axis by their view.
+    = the shift. The depth z follows from the scale: at z = f / (s w / 2), a camera of focal
+    length f shows the body in that size, in an image w pixels wide. Videos of side 2 are rotated
+    about the vertical axis by their view.
 
     Args:
         pose: (F, 72), axis-angle vectors.

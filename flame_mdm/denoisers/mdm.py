@@ -128,8 +128,8 @@ class MDMDecoder(Denoiser):
         target_encoder: network that embeds `Condition.target`. The result is added to the time.
             "none" ignores targets.
         target_layers: number of hidden layers of the target encoders "single" and "split".
-        condition_frames: also add time + condition to every noisy frame: a small network follows
-            the text after fewer steps, and noisy frames differ from clean ones.
+        condition_frames: also add time + condition to every noisy frame. A small network then
+            learns to follow the text in fewer steps, and noisy frames differ from clean frames.
 
     Raises:
         UserError: If arguments contradict each other.

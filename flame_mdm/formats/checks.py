@@ -13,10 +13,9 @@ AVERAGED = 0.05  # seconds over which the speed of the pelvis is averaged
 # Speed of an ankle relative to the pelvis, in m/s, above which a leg has flipped between frames.
 # The fastest kicks reach 20.
 KICK = 30.0
-UNDER = 0.02  # depth in meters below the floor from which on a body is reported as too small
+UNDER = 0.02  # maximum depth in meters below the floor; a deeper body is reported as too small
 
 # Seconds between a rest pose in front of a motion and the motion. Some conversions blend these
-# frames.
 # frames.
 BLEND = 0.04
 CALM = 8  # number of subsequent frames with which the first steps are compared
@@ -61,8 +60,8 @@ def uprightness(joints: np.ndarray) -> float:
 def lying(joints: np.ndarray, up: str, axes: np.ndarray) -> str:
     """Returns a line if the body lies in most frames, with the axis that would make it stand.
 
-    Returns "" otherwise. `joints` (F, 22, 3) are y up. `axes` (3, 3) have turned them from the
-    axes of the file, in which `up` was the axis that points up.
+    Returns "" otherwise. `joints` (F, 22, 3) are y up. They were turned by `axes` (3, 3) from the
+    axes of the file. In the file, `up` was the axis that points up.
     """
     if uprightness(joints) >= LYING:
         return ""

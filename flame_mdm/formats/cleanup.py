@@ -36,7 +36,7 @@ DRIFT = 0.2
 
 Above 1.5 times this speed, the body follows its feet entirely.
 """
-CLEAR = 0.15  # seconds before a hand would be inside the body, in which it starts to avoid it
+CLEAR = 0.15  # a hand starts to avoid the body this many seconds before it would be inside
 # Maximum distance from hip to ankle, relative to the straight leg, unless it was longer before
 REACH = 0.999
 

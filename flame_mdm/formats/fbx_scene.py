@@ -55,7 +55,7 @@ TIME_MODES = {
 
 CONSTANT, CUBIC = 0x2, 0x8  # bits of `KeyAttrFlags`; without them, interpolation is linear
 NEXT_VALUE = 0x100  # bit of a constant segment that has the value of the key after it
-UNSTEPPED = 1e-6  # seconds by which a frame may be before the key whose value it takes
+UNSTEPPED = 1e-6  # a frame takes the value of a key up to this many seconds later
 
 ZERO, ONE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 

@@ -27,7 +27,7 @@ SPINE = {
     6: 2 / 3,
 }
 BENDS = {1: -1.0, 2: -1.0, 16: 1.0, 17: 1.0}
-"""By hip and shoulder: z of the direction to which the knee or elbow bends in the rest pose."""
+"""For hips and shoulders: z of the direction in which knee or elbow bends in the rest pose."""
 STRAIGHT = 0.15
 """Sine of the bend of a knee or elbow at which two cues of the limb's twist have the same weight.
 
@@ -39,7 +39,8 @@ dominates.
 FOOT = 0.3
 # Seconds over which bends are averaged, so that an arm does not spin while it is nearly straight
 SMOOTH = 0.1
-SQUARINGS = 12  # squarings that isolate an eigenvector: others shrink with the power 4,096
+# Number of squarings. They give the power 4,096, in which only the largest eigenvector remains.
+SQUARINGS = 12
 
 
 @dataclass(eq=False)

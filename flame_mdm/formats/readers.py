@@ -73,8 +73,8 @@ class Doubts:
     """Findings that look wrong in a motion, but may be intended.
 
     Attributes:
-        upright: mean vertical component of the direction of the trunk, -1 to 1. NaN = not
-            measured, in files of this project and with KIT-ML's skeleton.
+        upright: mean vertical component of the direction of the trunk, -1 to 1. It is NaN (not
+            measured) for files of this project and for KIT-ML's skeleton.
         lying: a line if the body lies, "" otherwise.
         jump: a line if the body jumps or a leg flips, "" otherwise.
     """

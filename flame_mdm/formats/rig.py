@@ -200,8 +200,8 @@ def rest_pose(
     def middle(name: str) -> np.ndarray:
         return (at[f"left_{name}"] + at[f"right_{name}"]) / 2
 
-    # First, the pose must be a pose from which rotations can start: limbs with a length, an
-    # upright trunk and upright legs, left and right apart.
+    # First, the pose must be usable: limbs have a length, trunk and legs are upright, and left
+    # and right joints are apart.
     trunk, legs = middle("shoulder") - middle("hip"), middle("hip") - middle("ankle")
     up = np.array(vertical)
     shortest = max(1e-4 * float(np.linalg.norm(legs)), 1e-9)

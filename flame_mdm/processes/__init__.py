@@ -168,8 +168,8 @@ class Process(nn.Module, ABC):
             cond: conditions of the batch.
             options: the sampler, its number of steps and its options.
             edit: part of a motion to keep.
-            trajectory: list to which the clean estimate (B, F, D) of each call of the denoiser is
-                added.
+            trajectory: list that receives the clean estimate (B, F, D) of each call of the
+                denoiser.
 
         Returns:
             Normalized motion (B, F, D); frames past the end of a motion are 0.

@@ -98,14 +98,13 @@ def edit(
         fps: frames per second of an array or an .npy file. For other files, it overrides the rate
             in the file.
         cut: [begin, end] in seconds of the part of the motion to use. Default: all of it.
-        stages: list to which clean estimates of the first motion are added, at equal intervals of
-            the sampling, followed by the motion.
+        stages: list that receives clean estimates of the first motion, at equal intervals of the
+            sampling, and then the motion itself.
         keywords: `region` or `region_seconds`, `joints` and `strength` say what is resampled.
             `method`, `until` and `resample` say how. All of them are described in
             `flame_mdm.sampling.motion_request.EditRequest`. The keywords of `flame_mdm.generate`
             also apply, such as `samples` (1), `seed` (0) and `guidance_scale`. `cleanup` also
             changes the kept part, usually by millimeters; `Edited.joint_error` says by how much.
-            changes the kept part, usually by millimeters. `Edited.joint_error` says by how much.
 
     Returns:
         One edited motion per sample, `samples` for each text: all samples of the first text in

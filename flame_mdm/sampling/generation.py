@@ -52,8 +52,8 @@ def generate(
             Default: the candidate with the fewest faulty frames is kept.
         edit: part of a motion of the same length to keep in every sample, with `known` and `keep`
             (1, F, D).
-        stages: list to which clean estimates of the first motion are added, at equal intervals of
-            the sampling, followed by the motion (MFM, figure 5).
+        stages: list that receives clean estimates of the first motion, at equal intervals of the
+            sampling, and then the motion itself (MFM, figure 5).
         keywords: number and length of the motions, and how they are sampled: `actions` (instead
             of texts), `seconds` or `frames` (default: 3 seconds), `samples` (1) per text,
             `candidates` (1) per sample, `seed` (0), `after`, `split` (True), `loop` (False),
@@ -61,7 +61,6 @@ def generate(
             `sampler`, `num_inference_steps`, `eta` and `spacing` (default: the model's).
             `flame_mdm.sampling.motion_request.SamplingRequest` and
             `flame_mdm.sampler_options.SamplerOptions` describe them.
-            describe them.
 
     Returns:
         One motion per sample, `samples` for each text: all samples of the first text in the order

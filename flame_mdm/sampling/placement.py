@@ -1,4 +1,4 @@
-"""Positions and directions of bodies in the world, with which blocks of a motion are joined."""
+"""Placements of bodies in the world, with which the blocks of a motion are joined."""
 
 from __future__ import annotations
 

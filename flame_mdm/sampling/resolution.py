@@ -108,9 +108,8 @@ def resolve(
     Args:
         request: the request.
         model: the model that samples the motions.
-        refused: mapping to which the error of each prompt that the model cannot sample is added,
-            by the number of the prompt. Other prompts are resolved. Default: the first error is
-            raised.
+        refused: mapping that receives the errors of prompts that the model cannot sample, by the
+            number of the prompt. Other prompts are resolved. Default: the first error is raised.
         check_words: whether to refuse a text if the model knows none of its words that say what
             happens.
 

@@ -68,8 +68,8 @@ def stream(
         An iterator of blocks; see `Stream`.
 
     Raises:
-        UserError: If the model does not continue frames, knows no word of the text that says what
-            happens, or the motion to continue cannot be read or is too short.
+        UserError: If the model does not continue frames or knows no word of the text that says
+            what happens. Also if the motion to continue cannot be read or is too short.
 
     Example:
         >>> import flame_mdm

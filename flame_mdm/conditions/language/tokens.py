@@ -1,4 +1,4 @@
-"""Words of a sentence, correction of typos, and a test whether the sentence is English."""
+"""Words of a sentence, correction of typos, and detection of other languages than English."""
 
 import re
 import unicodedata

@@ -44,8 +44,8 @@ class Kind:
         group: subject of the claims, one of `GROUPS`. A claim about a start, an end, a duration,
             a side, a direction or a speed is in that group instead.
         measure: function of a body and the claim.
-        no, yes: scores that were set by hand. Up to `no`, a claim is false; from `yes` on, it is
-            true; in between, it is undecided.
+        no, yes: scores that were set by hand. A claim is false up to `no`, and true from `yes`
+            on. In between, it is undecided.
         is_timed: whether the spans of the reading say when it happens. An order can then be read
             from them.
     """

@@ -26,8 +26,8 @@ class Reading:
         unclear: reason why a high score does not make the claim true; "" = none.
         signal: values (F,) that show for each frame whether the claim is true; None if single
             frames do not show it.
-        level: value of `signal` from which on the claim is true; None = the middle of the band of
-            the kind.
+        level: minimum value of `signal` at which the claim is true; None = the middle of the band
+            of the kind.
     """
 
     score: float

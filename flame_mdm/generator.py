@@ -92,10 +92,14 @@ def sampling_defaults(
 class Model:
     """Base class of the models that checkpoints hold."""
 
-    noun = "a model"  # what its checkpoints contain, for messages
-    config: Config  # the recipe, saved in checkpoints
-    facts: dict[str, Any]  # about the training data: actions, maximum length, fingerprint
-    steps: int | None = None  # number of training steps of the loaded checkpoint; None if unknown
+    # What its checkpoints contain, for messages
+    noun = "a model"
+    # The recipe, saved in checkpoints
+    config: Config
+    # About the training data: actions, maximum length, fingerprint
+    facts: dict[str, Any]
+    # Number of training steps of the loaded checkpoint; None if unknown
+    steps: int | None = None
 
     def add_facts(self, facts: Mapping[str, Any]) -> None:
         """Adds facts about the training data."""

@@ -15,8 +15,10 @@ from flame_mdm.schemas import ClosedSchema, Int, Number, Plain, Schema, read_jso
 class Value(Schema):
     """A metric's value over replications, with the number of motions it was computed from."""
 
-    mean: Number | None  # None if it cannot be computed
-    ci: Number | None  # half width of the 95 % interval over replications; None if there is one
+    # None if it cannot be computed
+    mean: Number | None
+    # Half width of the 95 % interval over replications; None if there is one
+    ci: Number | None
     replications: Int | None
     n: Int | None  # motions per replication; None if replications have different numbers
     per_replication: list[Number | None] = Field(default_factory=list)
@@ -148,8 +150,10 @@ class Measured(Schema):
 
     ground_truth: dict[str, Value | None] | None
     values: dict[str, Value | None] | None
-    not_computed: dict[str, str]  # metric -> reason
-    invalid_because: list[str]  # [] if the values are valid
+    # Metric -> reason
+    not_computed: dict[str, str]
+    # [] if the values are valid
+    invalid_because: list[str]
     # Whether motions were generated although real motions do not have the expected values
     forced: bool = False
     warnings: list[str] = Field(default_factory=list)
@@ -173,9 +177,12 @@ class Result(Measured):
     checkpoint: Checkpoint | None
     samples_sha256: str | None = None  # hash of the motion files from another system
     baseline: str | None = None
-    audit: str | None = None  # path of the audit card of the extractor; None = not audited
-    audit_motions: Int | None = None  # number of motions in the audit
-    skeleton: UsedSkeleton | None = None  # None if the data has joint positions
+    # Path of the audit card of the extractor; None = not audited
+    audit: str | None = None
+    # Number of motions in the audit
+    audit_motions: Int | None = None
+    # None if the data has joint positions
+    skeleton: UsedSkeleton | None = None
     device: str
     precision: str = ""
     environment: dict[str, Any] = Field({})
@@ -234,9 +241,12 @@ class AuditedMetric(ClosedSchema):
     unit: str = ""
     # Whether it can detect that a motion shows something other than requested
     sees_meaning: bool = True
-    sums_up: bool = True  # whether the value sums up the metric's other values
-    exact: bool = False  # whether it reads attributes from the joints, without a network
-    depends_on_count: bool = False  # whether it is biased by the number of motions
+    # Whether the value sums up the metric's other values
+    sums_up: bool = True
+    # Whether it reads attributes from the joints, without a network
+    exact: bool = False
+    # Whether it is biased by the number of motions
+    depends_on_count: bool = False
 
 
 class AuditedExtractor(Schema):
@@ -260,7 +270,8 @@ class AuditCard(ClosedSchema):
     packages: dict[str, str]
     # Whether higher values are better. None = the best values are near the values of real motions
     metrics: dict[str, bool | None]
-    facts: dict[str, AuditedMetric] = Field({})  # by metric; earlier versions wrote none
+    # By metric; earlier versions wrote none
+    facts: dict[str, AuditedMetric] = Field({})
     # By metric, the value of real motions and the half width of its interval
     real: dict[str, Annotated[list[Number | None], Field(min_length=2, max_length=2)]]
     perturbations: Annotated[list[AuditedPerturbation], Field(min_length=1)]

@@ -27,15 +27,19 @@ Value = TypeVar("Value")
 class Clip:
     """One motion of a data set, to be written into a store."""
 
-    id: str  # unique name; a mirrored copy has the name `M` + the name of its original
+    # Unique name; a mirrored copy has the name `M` + the name of its original
+    id: str
     # Input of the representation, at its frame rate. Representations of joints take positions
     # (F, J, 3) in meters, y up, in the joint order of the skeleton.
     motion: np.ndarray
     # Descriptions of the motion, each complete; empty for data sets with action labels only
     captions: list[str]
-    split: Split  # mirrored copies and cuts of a take are in the split of the take
-    source: str  # the take that the clip comes from; clips of one source are never in two splits
-    action: int | None = None  # index into the data set's `actions`, or None
+    # Mirrored copies and cuts of a take are in the split of the take
+    split: Split
+    # The take that the clip comes from; clips of one source are never in two splits
+    source: str
+    # Index into the data set's `actions`, or None
+    action: int | None = None
     # Exact facts about the motion, such as side, count and direction, or tagged words, as JSON
     # values.
     attributes: Mapping[str, Any] = field(default_factory=dict)
@@ -65,7 +69,8 @@ class MotionSource(ABC):
     Paths and numbers of workers do not belong to them. The arguments are saved in the store, and
     commands compare them with the recipe.
     """
-    actions: tuple[str, ...] = ()  # names of the action labels, in the order of their numbers
+    # Names of the action labels, in the order of their numbers
+    actions: tuple[str, ...] = ()
     # All forms of the verbs in the captions. Sentences are split into actions at these verbs.
     # Empty = sentences are not split.
     verbs: tuple[str, ...] = ()
@@ -93,8 +98,10 @@ class MotionSource(ABC):
     It is complete after `clips` has ended. Commands then exit with code 1, because the user
     should correct the files.
     """
-    workers: int = 0  # processes that read and encode; 0 = one per core, 1 = only this process
-    exclude: Collection[str] = ()  # names to leave out
+    # Processes that read and encode; 0 = one per core, 1 = only this process
+    workers: int = 0
+    # Names to leave out
+    exclude: Collection[str] = ()
 
     @cached_property
     def excluded(self) -> Counter[str]:

@@ -20,8 +20,10 @@ from flame_mdm.progress import ProgressBar
 from flame_mdm.safe_io import naming, read_json
 
 FPS = 20.0
-LENGTH, STRIDE = 128, 10  # number of frames of a clip, and between windows of the same label
-Segment = tuple[str, list[str] | None, float | None, float | None]  # words, categories, start, end
+# Number of frames of a clip, and between windows of the same label
+LENGTH, STRIDE = 128, 10
+# Words, categories, start, end
+Segment = tuple[str, list[str] | None, float | None, float | None]
 GET_IT = "BABEL v1.0 is published at https://babel.is.tue.mpg.de: unpack it, then run `make prepare SOURCE=/path/to/it`"
 
 # Files of each part. In files called extra, only the labels of the first annotator are used.

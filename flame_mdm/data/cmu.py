@@ -45,10 +45,14 @@ SUFFIXES = (
     ".yaml",
     ".zip",
 )
-RATES = (120.0, 60.0)  # frame rates of the recordings, the usual one first
-SLACK = 0.05  # tolerance of durations in seconds: one frame at 20 fps
-SHORTEST = 40  # minimum number of feature rows of a clip, as in HumanML3D
-BLENDED = 3  # number of frames after the T-pose of a Daz-friendly file that are blended with it
+# Frame rates of the recordings, the usual one first
+RATES = (120.0, 60.0)
+# Tolerance of durations in seconds: one frame at 20 fps
+SLACK = 0.05
+# Minimum number of feature rows of a clip, as in HumanML3D
+SHORTEST = 40
+# Number of frames after the T-pose of a Daz-friendly file that are blended with it
+BLENDED = 3
 # Columns of a table of the user's captions
 COLUMNS = (
     "id",

@@ -31,8 +31,10 @@ Below = Callable[[Any], Any]
 class Crop(ABC):
     """A rule that selects the frames of a training sample from a clip of any length."""
 
-    min_frames: int  # minimum length of a clip
-    max_frames: int  # maximum length of a sample
+    # Minimum length of a clip
+    min_frames: int
+    # Maximum length of a sample
+    max_frames: int
 
     def longest(self) -> int:
         """Returns the maximum number of frames of a sample."""

@@ -33,7 +33,8 @@ from flame_mdm.representations.skeleton import KIT21, SMPL22
 from flame_mdm.representations.smpl import SMPL
 from flame_mdm.safe_io import naming, read_text
 
-SHORTEST = 3  # minimum number of frames that representations need
+# Minimum number of frames that representations need
+SHORTEST = 3
 # Maximum number of copies of a clip in a balanced set. A model would memorize a clip with more.
 MOST_COPIES = 16
 
@@ -376,8 +377,10 @@ class _Attempt:
 
     error: str = ""
     motion: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
-    layout: str = ""  # skeleton, unit and frame rate of the file
-    upright: float = math.nan  # as in `Recording`
+    # Skeleton, unit and frame rate of the file
+    layout: str = ""
+    # As in `Recording`
+    upright: float = math.nan
     notes: Sequence[str] = ()
 
 

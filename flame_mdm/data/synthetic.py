@@ -29,16 +29,23 @@ from flame_mdm.data.synthetic_motions.body import Attributes, Body
 from flame_mdm.errors import UserError
 from flame_mdm.safe_io import read_yaml
 
-MIN_SECONDS, MAX_SECONDS = 2.0, 3.0  # durations of clips
-CAPTIONS = 8  # captions per clip
-SIMULTANEOUS = 0.08  # fraction of clips that show two simultaneous actions, with actions="all"
-CYCLIC = 0.04  # fraction of clips that show a part of a cycle, such as two steps of a walk
-MARGIN = 1.0  # seconds of motion before and after such a part, in which the body starts and stops
+# Durations of clips
+MIN_SECONDS, MAX_SECONDS = 2.0, 3.0
+# Captions per clip
+CAPTIONS = 8
+# Fraction of clips that show two simultaneous actions, with actions="all"
+SIMULTANEOUS = 0.08
+# Fraction of clips that show a part of a cycle, such as two steps of a walk
+CYCLIC = 0.04
+# Seconds of motion before and after such a part, in which the body starts and stops
+MARGIN = 1.0
 # Fraction of the training clips with captions that leave out attributes. Captions of val and test
 # state all of them, so that every attribute can be measured.
 PARTIAL = 0.25
-ALWAYS = ("action", "while")  # attributes that each caption states
-UNSAID = {"speed": "normal", "amount": "quarter"}  # values that a caption may leave out
+# Attributes that each caption states
+ALWAYS = ("action", "while")
+# Values that a caption may leave out
+UNSAID = {"speed": "normal", "amount": "quarter"}
 CHOICE = re.compile(r"\[([^\[\]]*)\]")
 SLOT = re.compile(r"\{(\w+)(?:\.(\w+))?\}")
 VERB = re.compile(r"((?:\w+ly )?)<([^>]*)>")  # with an adverb before it: "is slowly walking"

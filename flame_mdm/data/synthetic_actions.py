@@ -26,12 +26,15 @@ class Action(NamedTuple):
 
     # Moves a body at times (F,) in seconds, as the attributes say
     motion: Callable[[Body, np.random.Generator, np.ndarray, Attributes], None]
-    share: float = 1  # frequency of the action, relative to the other actions
+    # Frequency of the action, relative to the other actions
+    share: float = 1
     # Values of each attribute: equally frequent, or with their probabilities. Attributes are
     # drawn in this order; `speed` is drawn only for the direction forward.
     values: Mapping[str, Sequence[str | int] | Mapping[str, float]] = {}
-    seconds: float = 0.0  # minimum duration
-    reverse: bool = False  # whether the motion is played backward
+    # Minimum duration
+    seconds: float = 0.0
+    # Whether the motion is played backward
+    reverse: bool = False
 
     def draw(self, rng: np.random.Generator, name: str) -> Attributes:
         """Draws the attributes of a clip."""

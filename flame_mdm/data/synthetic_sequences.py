@@ -8,12 +8,18 @@ from flame_mdm.data.synthetic_actions import ACTIONS, move
 from flame_mdm.data.synthetic_motions.body import Attributes, Body
 from flame_mdm.data.synthetic_motions.joining import frames_of, join
 
-SECONDS = 2.0, 3.0  # duration of the motion that the captions describe
-EARLIER_SECONDS = 1.4, 2.0  # duration of the visible end of the earlier motion
-AGAIN = 0.25  # fraction of clips in which the earlier motion shows the same action
-RESTING = 0.25  # fraction of clips in which the person stands before the motion
-FROM_THE_FLOOR = 0.15  # fraction of clips that stand up before a motion that begins standing
-OVERLAP = 0.45  # maximum duration, in seconds, of the overlap of both motions
+# Duration of the motion that the captions describe
+SECONDS = 2.0, 3.0
+# Duration of the visible end of the earlier motion
+EARLIER_SECONDS = 1.4, 2.0
+# Fraction of clips in which the earlier motion shows the same action
+AGAIN = 0.25
+# Fraction of clips in which the person stands before the motion
+RESTING = 0.25
+# Fraction of clips that stand up before a motion that begins standing
+FROM_THE_FLOOR = 0.15
+# Maximum duration, in seconds, of the overlap of both motions
+OVERLAP = 0.45
 # Motions that have no natural end. Clips show up to 6 seconds of them and leave out their end, so
 # that a stream keeps moving until its text changes.
 ENDLESS = (
@@ -22,8 +28,10 @@ ENDLESS = (
     *("look around", "talk", "laugh", "cry", "guitar", "phone", "seated", "type"),
     "fighting stance",
 )
-LONGEST = 6.0  # maximum duration of an endless motion, in seconds
-STOPPING = 0.9  # duration of its end that is left out, in seconds
+# Maximum duration of an endless motion, in seconds
+LONGEST = 6.0
+# Duration of its end that is left out, in seconds
+STOPPING = 0.9
 # Posture at the beginning or at the end of actions that do not stand there
 STARTS = {
     **dict.fromkeys(("rise", "seated", "type"), "seated"),

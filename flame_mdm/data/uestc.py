@@ -27,9 +27,12 @@ TRAIN_SUBJECTS = (
 )
 # fmt: on
 """Training subjects of the cross-subject protocol: 51 of 118. The other 67 are for testing."""
-VAL_SUBJECTS = 5  # number of training subjects that our split uses for validation
-MIN_FRAMES = 45  # minimum length of a training clip: three quarters of 60
-ROOT = 8  # index of the middle of the hips in VIBE's 49 joints; ACTOR uses it as the root
+# Number of training subjects that our split uses for validation
+VAL_SUBJECTS = 5
+# Minimum length of a training clip: three quarters of 60
+MIN_FRAMES = 45
+# Index of the middle of the hips in VIBE's 49 joints; ACTOR uses it as the root
+ROOT = 8
 # Focal length and image size in pixels that ACTOR assumes, because VIBE estimates only a scale.
 FOCAL_LENGTH = 500.0
 IMAGE_SIZE = 540.0

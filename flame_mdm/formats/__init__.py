@@ -8,11 +8,14 @@ from pathlib import Path
 
 from flame_mdm.errors import UserError
 
-SCENES = (".fbx", ".glb", ".vrm", ".vrma")  # files with a scene of nodes and its animations
+# Files with a scene of nodes and its animations
+SCENES = (".fbx", ".glb", ".vrm", ".vrma")
 # Endings of motion files that can be read
 ENDINGS = (".npz", ".bvh", *SCENES, ".amc", ".json", ".npy")
-TREES = (".bvh", ".amc")  # endings of files with a tree of joints and their rotations
-USD = (".usda", ".usdc", ".usdz")  # Universal Scene Description
+# Endings of files with a tree of joints and their rotations
+TREES = (".bvh", ".amc")
+# Universal Scene Description
+USD = (".usda", ".usdc", ".usdz")
 # Endings of files that can have the skeleton of another program
 RIGGED = (".bvh", ".glb", ".fbx", *USD)
 # Endings of the files that `Motion.save` writes

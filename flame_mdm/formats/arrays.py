@@ -20,7 +20,8 @@ RATES = (
     "mocap_framerate",
     "mocap_frame_rate",
 )  # names under which files store the frame rate
-BODY = ("root_orient", "pose_body")  # names of parts of `poses` in AMASS's SMPL-X files
+# Names of parts of `poses` in AMASS's SMPL-X files
+BODY = ("root_orient", "pose_body")
 NEEDED = {
     "joints",
     "posed_joints",

@@ -19,7 +19,8 @@ TRUNK = {"pelvis": 0.0, "spine1": 0.35, "spine2": 0.75, "spine3": 1.0}
 # Limits of the scale of hips and shoulders, relative to the scale of the limbs. Joints at unusual
 # positions must not make the trunk too thin or too wide.
 WIDER = (0.8, 1.25)
-LONGER = (0.4, 2.5)  # limits of a limb's length, relative to the mesh's length
+# Limits of a limb's length, relative to the mesh's length
+LONGER = (0.4, 2.5)
 # Limits of the scale of the other parts' lengths, relative to the scale of the limbs
 TALLER = (0.6, 1.6)
 ORTHONORMAL = 0.1  # maximum error of the products of two rows of a rotation matrix

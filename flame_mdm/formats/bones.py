@@ -23,7 +23,8 @@ from flame_mdm.formats.rig import LIMBS, SIDES, rest_pose
 from flame_mdm.representations.skeleton import JOINT, SMPL22
 from flame_mdm.representations.smpl import ADULT
 
-APART = 0.03  # rotations agree with positions up to this mean distance of joints, in meters
+# Rotations agree with positions up to this mean distance of joints, in meters
+APART = 0.03
 # Maximum angle between a limb of a known skeleton in its T-pose and SMPL's limb, as a cosine
 ALIKE = np.cos(np.radians(30))
 VERTICALS = ((0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))

@@ -25,8 +25,10 @@ from flame_mdm.formats.resampling import MAX_FRAMES, RATES, check_tree, frame_pa
 from flame_mdm.safe_io import TEXT_LIMIT, naming, regular_file, write_text
 
 CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "XYZ")
-MAX_JOINTS = 4096  # maximum number of joints and end sites of a file
-LARGEST = 1e9  # maximum number that is read, and maximum sum of the numbers in a line
+# Maximum number of joints and end sites of a file
+MAX_JOINTS = 4096
+# Maximum number that is read, and maximum sum of the numbers in a line
+LARGEST = 1e9
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +40,10 @@ class Bvh:
 
     # J names. The end site of a joint is a joint without channels, called `NAME.end`.
     joints: tuple[str, ...]
-    parents: tuple[int, ...]  # index of each joint's parent, smaller than its own; -1 for a root
-    offsets: np.ndarray  # (J, 3) float64, rest position of each joint in its parent's frame
+    # Index of each joint's parent, smaller than its own; -1 for a root
+    parents: tuple[int, ...]
+    # (J, 3) float64, rest position of each joint in its parent's frame
+    offsets: np.ndarray
     # Names of each joint's channels in the order of its columns, from `CHANNELS`
     channels: tuple[tuple[str, ...], ...]
     # (F, C) float64, the channels of all joints in joint order; angles in degrees

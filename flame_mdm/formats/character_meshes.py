@@ -13,9 +13,12 @@ from flame_mdm.formats.body import PosedFigure
 from flame_mdm.formats.characters import Character, moved
 from flame_mdm.formats.rigged import Material, RiggedClip, Skin
 
-TRIANGLES = 4  # mode of a primitive with triangles
-MAX_VERTICES = 2_000_000  # maximum number of vertices of a character
-MAX_IMAGE = 64 * 2**20  # maximum size of an image file in bytes
+# Mode of a primitive with triangles
+TRIANGLES = 4
+# Maximum number of vertices of a character
+MAX_VERTICES = 2_000_000
+# Maximum size of an image file in bytes
+MAX_IMAGE = 64 * 2**20
 
 
 def character_clip(character: Character, motion: PosedFigure, name: str) -> RiggedClip:

@@ -7,9 +7,12 @@ from flame_mdm.representations.skeleton import SMPL22
 
 # A body lies if the vertical component of its trunk's direction is smaller on average.
 LYING = 0.3
-STANDING = 0.7  # with another axis up, a body stands if the component is larger than this
-FASTEST = 15.0  # maximum speed of the pelvis in m/s; faster files are damaged, sprinters reach 12
-AVERAGED = 0.05  # seconds over which the speed of the pelvis is averaged
+# With another axis up, a body stands if the component is larger than this
+STANDING = 0.7
+# Maximum speed of the pelvis in m/s; faster files are damaged, sprinters reach 12
+FASTEST = 15.0
+# Seconds over which the speed of the pelvis is averaged
+AVERAGED = 0.05
 # Speed of an ankle relative to the pelvis, in m/s, above which a leg has flipped between frames.
 # The fastest kicks reach 20.
 KICK = 30.0
@@ -18,14 +21,16 @@ UNDER = 0.02  # maximum depth in meters below the floor; a deeper body is report
 # Seconds between a rest pose in front of a motion and the motion. Some conversions blend these
 # frames.
 BLEND = 0.04
-CALM = 8  # number of subsequent frames with which the first steps are compared
+# Number of subsequent frames with which the first steps are compared
+CALM = 8
 # Minimum length in meters of the step from a rest pose to the motion, and minimum ratio to the
 # following steps
 JUMP = (
     0.15,
     3.0,
 )
-STRAIGHT = np.cos(np.radians(25))  # cosine of the maximum bend of arms and legs in a rest pose
+# Cosine of the maximum bend of arms and legs in a rest pose
+STRAIGHT = np.cos(np.radians(25))
 # Arms in a rest pose are raised from the trunk by at least 25 degrees
 HANGING = np.cos(np.radians(25))
 SYMMETRIC = 0.2  # maximum difference between the cosines of the left and the right arm

@@ -20,8 +20,10 @@ from flame_mdm.representations.skeleton import Skeleton
 # Weight of the squared third differences of a joint's path, relative to its squared change. Third
 # differences are changes of acceleration, so steady accelerations of fast motions are kept.
 SMOOTHNESS = 0.034
-OUTLIER = 0.03  # distance in meters from the smooth path at which a position has half its weight
-LOW = 0.07  # height in meters above which a toe counts as off the floor
+# Distance in meters from the smooth path at which a position has half its weight
+OUTLIER = 0.03
+# Height in meters above which a toe counts as off the floor
+LOW = 0.07
 # Horizontal speed in m/s above which a low toe counts as off the floor, while the body stands
 # still
 SLOW = 0.5
@@ -36,7 +38,8 @@ DRIFT = 0.2
 
 Above 1.5 times this speed, the body follows its feet entirely.
 """
-CLEAR = 0.15  # a hand starts to avoid the body this many seconds before it would be inside
+# A hand starts to avoid the body this many seconds before it would be inside
+CLEAR = 0.15
 # Maximum distance from hip to ankle, relative to the straight leg, unless it was longer before
 REACH = 0.999
 

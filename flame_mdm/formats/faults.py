@@ -56,9 +56,12 @@ docs/motion-faults.md reports the share of real clips with each fault.
 # Distance from the wrist to the middle of the hand, relative to the forearm. The hand is assumed
 # to continue the direction of the forearm.
 PALM = 0.3
-TRUNK = 0.18  # radius of the trunk from front to back, relative to its length from pelvis to neck
-WIDTH = 1.4  # width of the trunk relative to its depth
-THIGH = 0.17  # radius of a thigh, relative to its length
+# Radius of the trunk from front to back, relative to its length from pelvis to neck
+TRUNK = 0.18
+# Width of the trunk relative to its depth
+WIDTH = 1.4
+# Radius of a thigh, relative to its length
+THIGH = 0.17
 
 
 class Fault(NamedTuple):

@@ -23,14 +23,20 @@ from flame_mdm.safe_io import MEBIBYTE, atomic_write, regular_file
 MAGIC = b"Kaydara FBX Binary  \x00\x1a\x00"
 # FBX 7.4 of 2014 is the newest version with 32-bit offsets. All programs read it.
 VERSION = 7400
-WIDE_VERSION = 7500  # first version whose records have 64-bit offsets
-OLDEST_VERSION = 7000  # earlier files store animations in another structure
-LIMIT = 512 * MEBIBYTE  # maximum size of a file that is read
+# First version whose records have 64-bit offsets
+WIDE_VERSION = 7500
+# Earlier files store animations in another structure
+OLDEST_VERSION = 7000
+# Maximum size of a file that is read
+LIMIT = 512 * MEBIBYTE
 # Maximum total size of all decompressed arrays of a file in bytes
 EXPANDED_LIMIT = 512 * MEBIBYTE
-MAX_DEPTH = 32  # maximum nesting of records; programs write about 8
-MAX_RECORDS = 1_000_000  # maximum number of records of a file
-MAX_NAME = 255  # the length of a name is stored in one byte
+# Maximum nesting of records; programs write about 8
+MAX_DEPTH = 32
+# Maximum number of records of a file
+MAX_RECORDS = 1_000_000
+# The length of a name is stored in one byte
+MAX_NAME = 255
 
 # Format of a number by the code of its type
 SCALARS = {

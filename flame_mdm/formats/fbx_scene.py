@@ -23,10 +23,14 @@ from flame_mdm.formats import fbx
 from flame_mdm.formats.animated import LARGEST, AnimatedNodes, choose, parents_first, world_matrices
 from flame_mdm.formats.resampling import MAX_FRAMES, RATES
 
-TICKS = 46_186_158_000  # units of time per second in FBX files
-CENTIMETER = 0.01  # meters per centimeter; `UnitScaleFactor` is the number of centimeters per unit
-MAX_MODELS = 4096  # maximum number of models of a scene
-MAX_CELLS = 4_000_000  # maximum number of frames times models
+# Units of time per second in FBX files
+TICKS = 46_186_158_000
+# Meters per centimeter; `UnitScaleFactor` is the number of centimeters per unit
+CENTIMETER = 0.01
+# Maximum number of models of a scene
+MAX_MODELS = 4096
+# Maximum number of frames times models
+MAX_CELLS = 4_000_000
 
 # Order of Euler angles by `RotationOrder`, as in scipy: "xyz" rotates about the fixed axes x, y
 # and z, in this order.
@@ -53,9 +57,12 @@ TIME_MODES = {
     18: 120000 / 1001,
 }
 
-CONSTANT, CUBIC = 0x2, 0x8  # bits of `KeyAttrFlags`; without them, interpolation is linear
-NEXT_VALUE = 0x100  # bit of a constant segment that has the value of the key after it
-UNSTEPPED = 1e-6  # a frame takes the value of a key up to this many seconds later
+# Bits of `KeyAttrFlags`; without them, interpolation is linear
+CONSTANT, CUBIC = 0x2, 0x8
+# Bit of a constant segment that has the value of the key after it
+NEXT_VALUE = 0x100
+# A frame takes the value of a key up to this many seconds later
+UNSTEPPED = 1e-6
 
 ZERO, ONE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 

@@ -20,12 +20,15 @@ from flame_mdm.formats.fbx_scene import TICKS, TIME_MODES
 from flame_mdm.formats.retarget import continuous_euler
 from flame_mdm.formats.rigged import CONTACTS, Material, RiggedClip, Skin
 
-PER_METER = 100  # the files are in centimeters
-CUSTOM_RATE = 14  # `TimeMode` of a rate in `CustomFrameRate`
+# The files are in centimeters
+PER_METER = 100
+# `TimeMode` of a rate in `CustomFrameRate`
+CUSTOM_RATE = 14
 # A fixed time, so that equal motions give equal files. Readers compare it with `FileId`.
 CREATED = "1970-01-01 10:00:00:000"
 FILE_ID = bytes.fromhex("28b32aebb624ccc2bfc8b02aa92bfcf1")
-EULER = "ZYX"  # R = Rz Ry Rx, the order that FBX calls eEulerXYZ
+# R = Rz Ry Rx, the order that FBX calls eEulerXYZ
+EULER = "ZYX"
 # Flags of a key: linear interpolation and its tangents, as Blender and the SDK write them
 LINEAR_KEY = 0x4 | 0x100 | 0x2000 | 0x4000
 # Distance in meters by which a root is moved back. Blender does not move a pelvis that is exactly

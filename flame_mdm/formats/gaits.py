@@ -24,17 +24,28 @@ from flame_mdm.formats.grounding import (
 )
 
 Kind = Literal["loop", "start", "stop", "turn"]
-CYCLE = (0.5, 1.8)  # minimum and maximum cycle of a gait in seconds
-STEADY = 0.85  # a gait is steady above this fraction of its full speed
-EVEN = 0.2  # seconds over which the speed is averaged, because side steps stop and go
-SLOWEST = 0.2  # minimum speed of a gait in m/s
-ASIDE = 35.0  # maximum angle in degrees between the gait and the requested direction
-VELOCITY = 0.1  # weight, in seconds, of velocities beside positions when poses are compared
-SETTLED = 0.12  # a body stands if no joint is faster than this relative to the root, in m/s
-MARGIN = 0.15  # seconds of standing that are kept before a start and after a stop
-FADE = 0.5  # seconds in which the first or the last pose of a clip changes into the motion
-OVERSHOOT = (0.6, 1.6)  # minimum and maximum turn relative to the requested turn
-PART = 0.5  # minimum length of a start or stop in seconds
+# Minimum and maximum cycle of a gait in seconds
+CYCLE = (0.5, 1.8)
+# A gait is steady above this fraction of its full speed
+STEADY = 0.85
+# Seconds over which the speed is averaged, because side steps stop and go
+EVEN = 0.2
+# Minimum speed of a gait in m/s
+SLOWEST = 0.2
+# Maximum angle in degrees between the gait and the requested direction
+ASIDE = 35.0
+# Weight, in seconds, of velocities beside positions when poses are compared
+VELOCITY = 0.1
+# A body stands if no joint is faster than this relative to the root, in m/s
+SETTLED = 0.12
+# Seconds of standing that are kept before a start and after a stop
+MARGIN = 0.15
+# Seconds in which the first or the last pose of a clip changes into the motion
+FADE = 0.5
+# Minimum and maximum turn relative to the requested turn
+OVERSHOOT = (0.6, 1.6)
+# Minimum length of a start or stop in seconds
+PART = 0.5
 # Meters and degrees from one repetition of a loop to the next. A loop that moves less stays in
 # place.
 STILL = (

@@ -39,11 +39,14 @@ COMPONENTS = {
 }
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}  # numbers per item
 KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
-LIMIT = 512 * MEBIBYTE  # maximum size of a file that is read
+# Maximum size of a file that is read
+LIMIT = 512 * MEBIBYTE
 # Maximum size of the JSON part in bytes. Parsed, it takes many times as much memory.
 DOCUMENT_LIMIT = 16 * MEBIBYTE
-MAX_NODES, MAX_ITEMS = 4096, 65_536  # maximum number of nodes, and of all other items of one list
-LARGEST = 1e9  # largest coordinate or matrix entry that is read
+# Maximum number of nodes, and of all other items of one list
+MAX_NODES, MAX_ITEMS = 4096, 65_536
+# Largest coordinate or matrix entry that is read
+LARGEST = 1e9
 HARMLESS = re.compile(r"KHR_(materials|texture|lights|mesh|draco)_|EXT_texture_|VRM")
 """Required extensions that change neither nodes, skins nor bounds. Characters may use them."""
 
@@ -177,13 +180,20 @@ class Glb:
 
     # The JSON part, with the lists `buffers`, `bufferViews` and `accessors`
     document: dict[str, Any]
-    data: bytes  # the binary part
-    nodes: tuple[int, ...]  # index of each node in the document
-    names: tuple[str, ...]  # name of each node
-    parents: tuple[int, ...]  # number of each node's parent, -1 for a root
-    locals: np.ndarray  # (N, 4, 4), from each node's coordinates to its parent's coordinates
-    worlds: np.ndarray  # (N, 4, 4), from each node's coordinates to the world
-    skins: tuple[Skin, ...]  # skins of meshes
+    # The binary part
+    data: bytes
+    # Index of each node in the document
+    nodes: tuple[int, ...]
+    # Name of each node
+    names: tuple[str, ...]
+    # Number of each node's parent, -1 for a root
+    parents: tuple[int, ...]
+    # (N, 4, 4), from each node's coordinates to its parent's coordinates
+    locals: np.ndarray
+    # (N, 4, 4), from each node's coordinates to the world
+    worlds: np.ndarray
+    # Skins of meshes
+    skins: tuple[Skin, ...]
 
 
 def read(path: Path) -> Glb:

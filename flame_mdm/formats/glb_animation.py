@@ -20,10 +20,12 @@ from flame_mdm.formats.animated import LARGEST, AnimatedNodes, choose, world_mat
 from flame_mdm.formats.fbx_scene import hermite
 from flame_mdm.formats.resampling import MAX_FRAMES, RATES
 
-MAX_CELLS = 4_000_000  # maximum number of frames times nodes
+# Maximum number of frames times nodes
+MAX_CELLS = 4_000_000
 # Keys at a lower rate than this were placed by hand. Sampled motions have denser keys.
 SPARSE_RATE = 24.0
-USUAL_RATE = 30.0  # rate at which motions with keys placed by hand are sampled
+# Rate at which motions with keys placed by hand are sampled
+USUAL_RATE = 30.0
 # Numbers per key, for the properties that move nodes
 WIDTHS = {
     "translation": 3,

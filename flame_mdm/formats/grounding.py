@@ -19,10 +19,14 @@ from flame_mdm.representations.skeleton import JOINT, SMPL22
 
 # Seconds over which the path of the root is smoothed, so that it does not follow single steps
 SMOOTHNESS = 0.15
-LOW = 0.05  # a toe touches the floor up to this height in meters above its lowest position
-SLOW = 0.25  # maximum speed of a planted toe over the floor in m/s
-SHORT = 0.1  # seconds; shorter contacts, and shorter gaps between contacts, are ignored
-LOWERING = 0.2  # seconds in which the body is lowered for a leg that is too short
+# A toe touches the floor up to this height in meters above its lowest position
+LOW = 0.05
+# Maximum speed of a planted toe over the floor in m/s
+SLOW = 0.25
+# Seconds; shorter contacts, and shorter gaps between contacts, are ignored
+SHORT = 0.1
+# Seconds in which the body is lowered for a leg that is too short
+LOWERING = 0.2
 # Number of repetitions of a loop that are planted together. The middle one has neighbors on both
 # sides.
 COPIES = 3

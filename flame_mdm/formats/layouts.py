@@ -32,14 +32,17 @@ LEG, USUAL_LEG = (
     (0.6, 1.2),
     0.83,
 )
-CHILD = 0.25  # minimum leg of a child in meters, at about one year
-FOOT = 0.02  # minimum foot in meters, ankle to toes
+# Minimum leg of a child in meters, at about one year
+CHILD = 0.25
+# Minimum foot in meters, ankle to toes
+FOOT = 0.02
 # If left and right limbs differ by more than this ratio, the joints are not in the assumed order.
 UNEQUAL = 1.5
 # The order is also wrong if the lengths of limbs vary by more than this fraction of their mean.
 CHANGING = 0.25
 LIMBS = (("hip", "knee"), ("knee", "ankle"), ("shoulder", "elbow"), ("elbow", "wrist"))
-SIDES = ("left_", "right_")  # prefixes of SMPL's joints
+# Prefixes of SMPL's joints
+SIDES = ("left_", "right_")
 UNITS = {  # in meters
     "meters": 1.0,
     "centimeters": 0.01,
@@ -62,13 +65,18 @@ class Layout(BaseModel):
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
     # Name of the joint in the files, by the name of each of SMPL's joints
     map: dict[str, Source] = {joint: joint for joint in SMPL22.joints}
-    joints: list[str] = []  # names of the joints of arrays, in order; BVH files contain their own
-    unit: Annotated[FiniteFloat, Field(gt=0)] = 1.0  # meters per unit of length in the files
-    up: Literal["y", "z", "-y"] = "y"  # the axis that points up
+    # Names of the joints of arrays, in order; BVH files contain their own
+    joints: list[str] = []
+    # Meters per unit of length in the files
+    unit: Annotated[FiniteFloat, Field(gt=0)] = 1.0
+    # The axis that points up
+    up: Literal["y", "z", "-y"] = "y"
     # frame rate of files that do not contain it
     fps: Annotated[float, Field(ge=RATES[0], le=RATES[1])] | None = None
-    mirrored: bool = False  # the files contain mirrored motion; the sign of x is changed
-    children: bool = False  # whether bodies may be children
+    # The files contain mirrored motion; the sign of x is changed
+    mirrored: bool = False
+    # Whether bodies may be children
+    children: bool = False
     _name: str = PrivateAttr("own map")
     _bones: dict[str, str] = PrivateAttr(default_factory=dict)
     _rig: str = PrivateAttr("")

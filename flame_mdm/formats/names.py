@@ -12,10 +12,14 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-SIDES = (("left", "l"), ("right", "r"))  # marks of the left and of the right side in names
-SHARED = 10  # minimum number of joints with a prefix; without hands, skeletons have about 20
-PREFIXES = 16  # maximum number of prefixes that are tried
-JOINED = re.compile(r"mixamorig\d*")  # a prefix that may have no separator after it
+# Marks of the left and of the right side in names
+SIDES = (("left", "l"), ("right", "r"))
+# Minimum number of joints with a prefix; without hands, skeletons have about 20
+SHARED = 10
+# Maximum number of prefixes that are tried
+PREFIXES = 16
+# A prefix that may have no separator after it
+JOINED = re.compile(r"mixamorig\d*")
 
 
 class Match(NamedTuple):

@@ -10,8 +10,10 @@ import numpy as np
 
 from flame_mdm.errors import UserError
 
-RATES = (0.1, 1000.0)  # lowest and highest frame rate of a motion file, in frames per second
-MAX_FRAMES = 500_000  # maximum number of frames of a motion: 70 minutes at 120 frames per second
+# Lowest and highest frame rate of a motion file, in frames per second
+RATES = (0.1, 1000.0)
+# Maximum number of frames of a motion: 70 minutes at 120 frames per second
+MAX_FRAMES = 500_000
 # Maximum number of frames times joints of a tree: an hour of 57 joints at 120 frames per second
 MAX_POSITIONS = 25_000_000
 # Number of frames times joints that a file of any size may have; reading it takes 300 MB

@@ -19,13 +19,16 @@ LEGS = (("hip", "knee"), ("knee", "ankle"))
 LIMBS = {"hip": "knee", "knee": "ankle", "shoulder": "elbow", "elbow": "wrist"}
 """Joints whose bone takes the direction of the motion's bone, with the joint at its end."""
 SPINE = ("spine1", "spine2", "spine3")
-TILT = 45  # maximum angle in degrees between the trunk of a rest pose and the vertical
-SNAP = 8  # a facing direction within this angle of an axis, in degrees, is replaced by the axis
+# Maximum angle in degrees between the trunk of a rest pose and the vertical
+TILT = 45
+# A facing direction within this angle of an axis, in degrees, is replaced by the axis
+SNAP = 8
 # Minimum sine of the bend of an elbow or knee in the rest pose. The twist of a straighter limb
 # cannot be determined. The limbs of people also bend sideways, in SMPL's body by 7 degrees at the
 # knees and by 5 degrees at the elbows. A small bend is therefore far from the axis of the joint.
 BEND = 0.25
-GROUND = 0.1  # maximum height in meters of the lowest joint of a clip that stands on the floor
+# Maximum height in meters of the lowest joint of a clip that stands on the floor
+GROUND = 0.1
 # Distance of the knee from the line of the leg, in lengths of the thigh, at which the bend and
 # the front of the thigh have the same weight
 STRAIGHT = 0.05
@@ -36,16 +39,22 @@ REACH = 0.999  # maximum distance from hip to ankle relative to the length of th
 class Rig:
     """A skeleton with J joints in its rest pose, in meters, y up, facing +z."""
 
-    joints: tuple[str, ...]  # names; parents precede their children
-    parents: tuple[int, ...]  # index of each joint's parent, -1 for a root
-    positions: np.ndarray  # (J, 3), positions of the joints
-    turns: np.ndarray  # (J, 3, 3), rotations of the joints in the world
+    # Names; parents precede their children
+    joints: tuple[str, ...]
+    # Index of each joint's parent, -1 for a root
+    parents: tuple[int, ...]
+    # (J, 3), positions of the joints
+    positions: np.ndarray
+    # (J, 3, 3), rotations of the joints in the world
+    turns: np.ndarray
     # For each joint, the index of the joint of SMPL whose rotation it takes, or -1
     sources: tuple[int, ...]
     # (J, 3, 3), rotations of these joints in the world while SMPL is in its rest pose
     neutral: np.ndarray
-    orders: tuple[str, ...]  # order of the Euler angles of each joint in BVH files
-    unit: float = CENTIMETER  # meters per unit of length in BVH files
+    # Order of the Euler angles of each joint in BVH files
+    orders: tuple[str, ...]
+    # Meters per unit of length in BVH files
+    unit: float = CENTIMETER
     # (3, 3), rotation from the world of the file
     frame: np.ndarray = field(default_factory=lambda: np.eye(3))
     # (J,), world units per unit of a joint; an empty array means 1
@@ -164,9 +173,12 @@ def matched(
 class RestPose:
     """A character's skeleton in its rest pose, y up, facing +z, in its own unit."""
 
-    rig: Rig  # the skeleton; `fitted` replaces its neutral rotations for a motion
-    map: Mapping[str, int]  # index of the character's joint by joint of SMPL
-    floor: float  # height of the lowest point in the rest pose
+    # The skeleton; `fitted` replaces its neutral rotations for a motion
+    rig: Rig
+    # Index of the character's joint by joint of SMPL
+    map: Mapping[str, int]
+    # Height of the lowest point in the rest pose
+    floor: float
 
     def position(self, joint: str) -> np.ndarray:
         """Returns the position (3,) of SMPL's joint in the rest pose."""

@@ -195,8 +195,10 @@ class ContactEvent(NamedTuple):
 
     time: float  # seconds
     frame: int
-    foot: str  # left or right
-    event: str  # plant or lift
+    # Left or right
+    foot: str
+    # Plant or lift
+    event: str
 
 
 def contact_events(contacts: np.ndarray, fps: float) -> list[ContactEvent]:

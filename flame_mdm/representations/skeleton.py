@@ -22,11 +22,14 @@ LEG, ARM = (
 class Skeleton:
     """A tree of joints. Parents precede their children, and joint 0 is the root."""
 
-    name: str  # key in `SKELETONS`
+    # Key in `SKELETONS`
+    name: str
     # Names in the order of the data. The prefixes `left_` and `right_` mark the sides.
     joints: tuple[str, ...]
-    parents: tuple[int, ...]  # parent of each joint, -1 for the root
-    chains: tuple[tuple[int, ...], ...]  # paths of HumanML3D's inverse kinematics
+    # Parent of each joint, -1 for the root
+    parents: tuple[int, ...]
+    # Paths of HumanML3D's inverse kinematics
+    chains: tuple[tuple[int, ...], ...]
     # (J, 3), rest direction of the bone that ends in each joint, of unit length; 0 for the root.
     # From HumanML3D's `paramUtil.py`.
     raw_offsets: tuple[tuple[int, int, int], ...]

@@ -42,8 +42,10 @@ from flame_mdm.visualize import contact_sheet, write_player
 from flame_mdm.visualize.body import Mesh
 
 SETS = Path(__file__).parent / "sets"
-IN_PLACE = "_InPlace"  # suffix of the names of files without a path
-SEPARATION = 1.0  # seconds between two clips while their rotations are computed
+# Suffix of the names of files without a path
+IN_PLACE = "_InPlace"
+# Seconds between two clips while their rotations are computed
+SEPARATION = 1.0
 NAME = r"^[A-Za-z0-9_-]{1,60}$"
 WRITERS: dict[str, Callable[[Path, RiggedClip], None]] = {
     "fbx": fbx_writer.write,
@@ -55,9 +57,12 @@ WRITERS: dict[str, Callable[[Path, RiggedClip], None]] = {
 """Functions that write a clip, by format."""
 # Score per meter that a foot slides, relative to the score per meter of difference between poses
 SLIDING = 200.0
-PIVOTING = 0.1  # score per degree of rotation of a planted foot
-JOLTING = 0.1  # score per m/s² of acceleration of a foot
-FAULTY = 0.2  # score of a frame with a fault
+# Score per degree of rotation of a planted foot
+PIVOTING = 0.1
+# Score per m/s² of acceleration of a foot
+JOLTING = 0.1
+# Score of a frame with a fault
+FAULTY = 0.2
 
 
 class SetMotion(ClosedSchema):

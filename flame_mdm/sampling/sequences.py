@@ -10,8 +10,10 @@ from flame_mdm.generator import MotionGenerator
 from flame_mdm.processes.windows import Windows, cover, spans
 from flame_mdm.sampling.motion_request import Part, SamplingRequest
 
-OVERLAP = 0.5  # duration that neighboring windows share, in seconds; see docs/sequences.md
-MAX_SECONDS = 600  # maximum length of a sequence; all its windows are denoised at the same time
+# Duration that neighboring windows share, in seconds; see docs/sequences.md
+OVERLAP = 0.5
+# Maximum length of a sequence; all its windows are denoised at the same time
+MAX_SECONDS = 600
 
 
 def overlap(model: MotionGenerator) -> int:

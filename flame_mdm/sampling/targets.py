@@ -20,14 +20,19 @@ from flame_mdm.representations import Representation, rotation
 from flame_mdm.sampling.reading import read_motion
 from flame_mdm.schemas import ClosedSchema, check_shape, read_json
 
-SMOOTHNESS = 0.2  # seconds over which a correction fades; see docs/targets.md
-MAX_SPEED = 8.0  # maximum speed, in meters per second, that waypoints may require
+# Seconds over which a correction fades; see docs/targets.md
+SMOOTHNESS = 0.2
+# Maximum speed, in meters per second, that waypoints may require
+MAX_SPEED = 8.0
 # Maximum height of a joint above the floor, and maximum distance from the body's position on the
 # floor, in meters
 REACH = 2.5
-MAX_COORDINATES = 600  # maximum number of coordinates; every step solves for all of them together
-Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)] | None  # in meters; None = free
-OnFloor = Annotated[Sequence[Coordinate], Field(min_length=2, max_length=2)]  # x and z
+# Maximum number of coordinates; every step solves for all of them together
+MAX_COORDINATES = 600
+# In meters; None = free
+Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)] | None
+# x and z
+OnFloor = Annotated[Sequence[Coordinate], Field(min_length=2, max_length=2)]
 
 
 class Timed(ClosedSchema):
@@ -86,9 +91,12 @@ class PositionGuide:
     to_joints: Callable[[Tensor], Tensor]
     fps: float
     positions: Positions
-    bones: Tensor  # (3, N) frame, parent and child of the bones that keep their lengths
-    poses: Tensor  # (1, F, D) features that are always imposed
-    keep: Tensor  # (1, F, D) bool, True = the feature is imposed
+    # (3, N) frame, parent and child of the bones that keep their lengths
+    bones: Tensor
+    # (1, F, D) features that are always imposed
+    poses: Tensor
+    # (1, F, D) bool, True = the feature is imposed
+    keep: Tensor
 
     def steer(self, clean: Callable[[Tensor], Tensor], x_t: Tensor) -> Tensor:
         """Returns a noisy motion like `x_t`, with a clean estimate nearer to the positions."""
@@ -106,7 +114,8 @@ class PositionGuide:
 class Targets:
     """Targets that motions should reach."""
 
-    positions: Positions  # coordinates in the world
+    # Coordinates in the world
+    positions: Positions
     # Frames of poses, and their features (D,) in the units of the data. These poses may be
     # anywhere.
     poses: tuple[tuple[int, Tensor], ...]

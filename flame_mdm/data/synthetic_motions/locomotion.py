@@ -24,17 +24,25 @@ Path = Callable[[np.ndarray, float], tuple[np.ndarray, np.ndarray, np.ndarray]]
 class Gait:
     """Parameters of steps, in seconds, meters and radians."""
 
-    step: float  # approximate time from one footprint to the next
+    # Approximate time from one footprint to the next
+    step: float
     # Time of a foot in the air, in steps. Above 1, both feet are in the air between two steps, as
     # in a run.
     swing: float
-    lift: float  # height of the foot in the middle of its swing
-    heel_off: float  # angle of the heel when the foot leaves the floor
-    toe_up: float  # angle of the toes when the foot lands; negative: the toes land first
-    width: float  # half the distance between the tracks of the feet
-    sink: float = 0.03  # how much the pelvis is lowered while moving
-    bounce: float = 0.0  # amplitude of the pelvis; it is highest when both feet are in the air
-    behind: float = 0.0  # distance by which the feet land farther back than they stand
+    # Height of the foot in the middle of its swing
+    lift: float
+    # Angle of the heel when the foot leaves the floor
+    heel_off: float
+    # Angle of the toes when the foot lands; negative: the toes land first
+    toe_up: float
+    # Half the distance between the tracks of the feet
+    width: float
+    # How much the pelvis is lowered while moving
+    sink: float = 0.03
+    # Amplitude of the pelvis; it is highest when both feet are in the air
+    bounce: float = 0.0
+    # Distance by which the feet land farther back than they stand
+    behind: float = 0.0
 
 
 def walk_along(

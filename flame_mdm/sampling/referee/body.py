@@ -9,9 +9,12 @@ from flame_mdm.errors import UserError
 from flame_mdm.formats.resampling import resample
 from flame_mdm.representations.skeleton import JOINT
 
-RATE = 30.0  # frames per second at which motions are measured
-SMOOTHING = 0.05  # standard deviation of the filter over time, in seconds
-LEG = 0.8  # length of the legs from hip to ankle, in meters, to which bodies are scaled
+# Frames per second at which motions are measured
+RATE = 30.0
+# Standard deviation of the filter over time, in seconds
+SMOOTHING = 0.05
+# Length of the legs from hip to ankle, in meters, to which bodies are scaled
+LEG = 0.8
 # Seconds around a frame in which the lowest foot is on the floor; a jump is shorter
 FLOOR_WINDOW = 1.6
 

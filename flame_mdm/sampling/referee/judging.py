@@ -17,10 +17,14 @@ from flame_mdm.sampling.referee.readings import AWAY, Reading, held, spans_of
 from flame_mdm.sampling.referee.sentences import read_claims
 
 Answer = Literal["yes", "no", "cannot tell"]
-SHORTEST = 0.4  # minimum duration of a motion that is judged, in seconds
-END = 0.6  # seconds at the start and at the end in which a posture is measured
-HELD = 0.2  # seconds for which the posture must be held there
-BREAK = 0.5  # maximum break, in seconds, of something that lasts
+# Minimum duration of a motion that is judged, in seconds
+SHORTEST = 0.4
+# Seconds at the start and at the end in which a posture is measured
+END = 0.6
+# Seconds for which the posture must be held there
+HELD = 0.2
+# Maximum break, in seconds, of something that lasts
+BREAK = 0.5
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,10 @@ from flame_mdm.sampling.referee.claims import Claim
 from flame_mdm.sampling.referee.readings import Reading, existence, of_side, spans_of
 
 SIDES = ("left", "right")
-MOVING = 0.25  # speed of the pelvis in m/s above which the body travels
-STANDING = 0.9  # height of the pelvis of a standing body of the usual size, in meters
+# Speed of the pelvis in m/s above which the body travels
+MOVING = 0.25
+# Height of the pelvis of a standing body of the usual size, in meters
+STANDING = 0.9
 
 
 def thighs(body: Body) -> np.ndarray:

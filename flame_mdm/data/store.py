@@ -466,6 +466,8 @@ def _entries(path: Path, frames: int, actions: int) -> list[Entry]:
                         f"{clip.id}: frames {clip.start} to {clip.start + clip.length} exceed {frames}"
                     )
                 if clip.action is not None and clip.action >= actions:
-                    raise ValueError(f"{clip.id}: action {clip.action} of {actions}")
+                    raise ValueError(
+                        f"{clip.id}: action {clip.action} is not one of the {actions} actions"
+                    )
             clips.append(clip)
     return clips

@@ -63,7 +63,7 @@ class Layout(BaseModel):
     """
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
-    # Name of the joint in the files, by the name of each of SMPL's joints
+    # For each joint of SMPL, the name of its joint in the files
     map: dict[str, Source] = {joint: joint for joint in SMPL22.joints}
     # Names of the joints of arrays, in order; BVH files contain their own
     joints: list[str] = []
@@ -395,7 +395,7 @@ def check_size(joints: np.ndarray, unit: float, children: bool = False, doubt: s
     """Checks the length of the legs.
 
     Args:
-        joints: (F, 22, 3) of SMPL, in meters.
+        joints: (F, 22, 3), SMPL's joints in meters.
         unit: unit of the file, in meters.
         children: whether bodies may be children.
         doubt: a line about another fault of the motion, for the message.
@@ -475,7 +475,7 @@ def check_order(joints: np.ndarray, count: int, skeleton: str) -> None:
     another order of joints or another skeleton, the same pairs of joints are not bones.
 
     Args:
-        joints: (F, 22, 3) of SMPL, mapped as if the array had the joints of the skeleton.
+        joints: (F, 22, 3), SMPL's joints, mapped as if the array had the joints of the skeleton.
         count: number of joints of the array.
         skeleton: name of the skeleton.
 

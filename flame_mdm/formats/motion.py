@@ -142,7 +142,8 @@ class Motion(PosedFigure):
                 expect it.
             rig: the skeleton of a `.bvh`, `.glb`, `.fbx` or USD file, one of
                 `flame_mdm.formats.retarget.presets`. Default: SMPL's.
-            character: your own character: a file, or the result of `characters.read`. A `.glb`
+            character: your own character, as a file or as the result of `characters.read`. A
+                `.glb`
                 file with a skin can be written with this motion as a `.glb`, `.fbx` or USD file.
                 A `.bvh` file can be written as a `.bvh` file.
             body: the body in `.glb`, `.fbx`, USD, `.gif` and `.mp4` files, from

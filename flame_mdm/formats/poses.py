@@ -115,8 +115,8 @@ def solve(joints: Tensor, fps: float) -> Poses:
     """
     if joints.ndim != 3 or not len(joints) or joints.shape[1:] != (len(SMPL22), 3):
         raise UserError(
-            "joint rotations are computed only for the 22 joints of SMPL, (frames, 22, 3); these joints have shape "
-            f"{tuple(joints.shape)}: write them as .json or .npy"
+            "joint rotations are computed only for SMPL's 22 joints, (frames, 22, 3), but these joints have shape "
+            f"{tuple(joints.shape)}. Write them as .json or .npy"
         )
     joints = joints.double()
     lengths = torch.linalg.vector_norm(SMPL22.bones(joints), dim=-1).mean(0)

@@ -131,7 +131,7 @@ class Schedule:
         return self.number(name, i) if isinstance(i, int) else self.at(name, i, x)
 
     def respace(self, steps: list[int]) -> "Schedule":
-        """Returns the schedule of only these steps, which must increase.
+        """Returns the schedule for some of the steps, given in increasing order.
 
         Source: Nichol and Dhariwal 2021, section 4.
         """

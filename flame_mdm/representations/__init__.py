@@ -125,13 +125,13 @@ class Representation(nn.Module, ABC):
 
     @abstractmethod
     def joint_features(self, joints: Iterable[int]) -> Tensor:
-        """Returns (D,) bool, True = feature of these joints.
+        """Returns (D,) bool, True for features of these joints.
 
         Features of the root trajectory belong to joint 0.
         """
 
     def joint_mask(self, joints: Iterable[int]) -> Tensor:
-        """Returns (J,) bool, True = one of these joints."""
+        """Returns (J,) bool, True for these joints."""
         mask = torch.zeros(len(self.skeleton), dtype=torch.bool)
         mask[list(joints)] = True
         return mask

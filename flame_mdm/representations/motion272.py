@@ -147,7 +147,7 @@ class Motion272(Representation):
         return cut
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
-        """Returns (272,) bool, True = feature of these joints.
+        """Returns (272,) bool, True for features of these joints.
 
         The root trajectory belongs to joint 0.
         """

@@ -103,7 +103,7 @@ class Rifke(Representation):
         return torch.atan2(-across[:, 2], across[:, 0])
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
-        """Returns (64,) bool, True = feature of these joints.
+        """Returns (64,) bool, True for features of these joints.
 
         The root trajectory belongs to joint 0.
         """

@@ -66,7 +66,7 @@ class Rot6D(Representation):
         return joints * joints.new_tensor([1.0, -1.0, -1.0])
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
-        """Returns (150,) bool, True = feature of these joints.
+        """Returns (150,) bool, True for features of these joints.
 
         The translation belongs to joint 0.
         """

@@ -102,7 +102,7 @@ def rot6d_to_matrix(rot6d: Tensor, convention: SixD) -> Tensor:
 
 
 def is_degenerate(rot6d: Tensor) -> Tensor:
-    """Returns (...,) bool, True = a pair of vectors (..., 6) defines no rotation.
+    """Returns (...,) bool: whether a pair of vectors (..., 6) defines no rotation.
 
     One vector is 0, or both are parallel. `rot6d_to_matrix` completes such pairs.
     """
@@ -119,7 +119,7 @@ def _orthogonal(rot6d: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _degenerate(rot6d: Tensor, first: Tensor, across: Tensor) -> Tensor:
-    """Returns (..., 1) bool, True = two vectors (..., 6) define no rotation.
+    """Returns (..., 1) bool: whether two vectors (..., 6) define no rotation.
 
     `first` and `across` are the results of `_orthogonal`. If the vectors are parallel, `across`
     consists of rounding errors. NaN is not degenerate, so it stays NaN.
@@ -133,7 +133,7 @@ def _degenerate(rot6d: Tensor, first: Tensor, across: Tensor) -> Tensor:
 
 
 def _shorter(normalized: Tensor) -> Tensor:
-    """Returns (..., 1) bool, True = a normalized vector (..., 3) is shorter than 1.
+    """Returns (..., 1) bool: whether a normalized vector (..., 3) is shorter than 1.
 
     The original vector was about 0.
     """

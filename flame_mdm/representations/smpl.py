@@ -101,7 +101,7 @@ class SMPL(Representation):
         return joints[..., [0, 2, 1]] * joints.new_tensor([-1.0, 1.0, 1.0])
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
-        """Returns (147,) bool, True = feature of these joints.
+        """Returns (147,) bool, True for features of these joints.
 
         The translation belongs to joint 0.
         """

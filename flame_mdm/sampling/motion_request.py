@@ -93,7 +93,7 @@ class EditRequest:
     )
     strength: float | None = option(
         None,
-        "starts from the motion with noise added, and takes this fraction of the sampling steps, above 0 and up to 1. "
+        "varies the motion: noise is added to it, and this fraction of the sampling steps is taken, above 0 and up to 1. "
         "With a smaller fraction, the result is closer to the motion",
     )
 
@@ -187,7 +187,8 @@ class SamplingRequest:
     samples: int = option(1, "motions per text or action")
     candidates: int = option(
         1,
-        "motions generated for each kept motion. The best one without faults is kept. If all have faults, the best is",
+        "motions generated for each motion that is kept: the best motion without faults, or the best of all if all have "
+        "faults",
     )
     seed: int = option(0, "seed of the noise")
     after: str | Path | Motion | None = option(

@@ -115,7 +115,7 @@ def solve(joints: Tensor, fps: float) -> Poses:
     """
     if joints.ndim != 3 or not len(joints) or joints.shape[1:] != (len(SMPL22), 3):
         raise UserError(
-            "joint rotations are computed only for SMPL's 22 joints, (frames, 22, 3), but these joints have shape "
+            "joint rotations are computed only for the 22 joints of SMPL, (frames, 22, 3), but these have shape "
             f"{tuple(joints.shape)}. Write them as .json or .npy"
         )
     joints = joints.double()

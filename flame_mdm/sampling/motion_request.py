@@ -93,8 +93,8 @@ class EditRequest:
     )
     strength: float | None = option(
         None,
-        "varies the motion: noise is added to it, and this fraction of the sampling steps is taken, above 0 and up to 1. "
-        "With a smaller fraction, the result is closer to the motion",
+        "varies the motion: noise is added to it, and this fraction of the sampling steps is taken, above 0 and up to "
+        "1. With a smaller fraction, the result is closer to the motion",
     )
 
     def __post_init__(self) -> None:
@@ -187,8 +187,8 @@ class SamplingRequest:
     samples: int = option(1, "motions per text or action")
     candidates: int = option(
         1,
-        "motions generated for each motion that is kept: the best motion without faults, or the best of all if all have "
-        "faults",
+        "motions generated for each motion that is kept: the best motion without faults, or the best of all if all "
+        "have faults",
     )
     seed: int = option(0, "seed of the noise")
     after: str | Path | Motion | None = option(

@@ -341,7 +341,7 @@ class Blocks:
         if prefix is None or tuple(prefix.shape) != expected:
             shape = None if prefix is None else tuple(prefix.shape)
             raise UserError(
-                f"prefix of shape {shape}: this model continues frames of shape {expected}. Give such frames"
+                f"the prefix has shape {shape}, but this model continues frames of shape {expected}. Give such frames"
             )
         self.model, self.ids, self.prefix, self.options = model, list(ids), prefix, options
         self.seed, self.replication, self.unconditioned = seed, replication, unconditioned

@@ -327,7 +327,7 @@ def test_motions_that_cannot_be_read_are_one_line(diffusion, store, tmp_path):
         (
             {"joints": joints[..., 0], "fps": 20},
             {},
-            r"motion\.npz.* joints of shape \(9, 22\), not",
+            r"motion\.npz.* joints have shape \(9, 22\), not",
         ),
         ({"fps": 20}, {}, r"motion\.npz.* contains neither joints nor poses"),
         (

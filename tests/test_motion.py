@@ -126,14 +126,14 @@ def test_arrays_are_edited_and_what_cannot_be_edited_is_refused_in_one_line(
         (
             joints[:, :13],
             30,
-            r"joints of shape \(79, 13, 3\), not \(frames, joints, 3\) with 22 \(smpl22\)",
+            r"joints have shape \(79, 13, 3\), not \(frames, joints, 3\) with 22 \(smpl22\)",
         ),
-        (joints[0], 30, r"joints of shape \(22, 3\), not \(frames, joints, 3\)"),
+        (joints[0], 30, r"joints have shape \(22, 3\), not \(frames, joints, 3\)"),
         (joints[:0], 30, "have no frames"),
         (
             joints[:, :21],
             30,
-            r"^motion: shape \(.*, 21, 3\), but humanml-clean-smpl22 takes \(frames, 22, 3\)",
+            r"^motion: it has shape \(.*, 21, 3\), but humanml-clean-smpl22 takes \(frames, 22, 3\)",
         ),
         (
             joints * 100,

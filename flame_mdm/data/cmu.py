@@ -415,7 +415,9 @@ def _part_in_table(cells: Mapping[str, str]) -> _Part:
         first = round(float(begin) * FPS) if begin else 0
         last = round(float(end) * FPS) if end else None
     if first < 0 or (last is not None and last <= first):
-        raise UserError(f"begin {begin!r}, end {end!r}: not a part of a recording, in seconds")
+        raise UserError(
+            f"begin {begin!r}, end {end!r}: this is not a part of a recording, in seconds"
+        )
     name = f"{trial}@{begin or 0}-{end or 'end'}" if begin or end else trial
     split = known_split(cells["split"]) if cells.get("split") else None
     return _Part(

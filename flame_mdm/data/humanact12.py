@@ -96,10 +96,10 @@ class HumanAct12(MotionSource):
                 label = int(action)
                 if pose.shape[1:] != (72,) or joint.shape != (len(pose), 24, 3) or not len(pose):
                     raise UserError(
-                        f"poses {pose.shape} and joints {joint.shape}, not (F, 72) and (F, 24, 3)"
+                        f"poses have shape {pose.shape} and joints {joint.shape}, not (F, 72) and (F, 24, 3)"
                     )
                 if not 0 <= label < len(self.actions):
-                    raise UserError(f"label {label}, not one of 0 to {len(self.actions) - 1}")
+                    raise UserError(f"label {label} is not one of 0 to {len(self.actions) - 1}")
             motions.append((np.concatenate([joint[:, 0], pose], 1), label))
         return motions
 
@@ -113,7 +113,9 @@ def read_unconstrained(path: Path) -> np.ndarray:
     """
     data = read_npy(path)
     if data.dtype.kind not in "fiu" or data.ndim != 4 or data.shape[1] < 15 or data.shape[2] != 3:
-        raise UserError(f"{path}: shape {data.shape}, not (motions, 15 or more joints, 3, frames)")
+        raise UserError(
+            f"{path}: it has shape {data.shape}, not (motions, 15 or more joints, 3, frames)"
+        )
     return np.ascontiguousarray(data[:, :15].transpose(0, 3, 1, 2), np.float32)
 
 

@@ -266,7 +266,7 @@ def _read_joints(path: Path) -> np.ndarray:
         or joints.shape[2] != 3
     ):
         raise UserError(
-            f"{path}: shape {joints.shape} of {joints.dtype}, not numbers (frames, 22 joints or more, 3)"
+            f"{path}: it has shape {joints.shape} and type {joints.dtype}, not numbers (frames, 22 joints or more, 3)"
         )
     return joints[:, :22]
 

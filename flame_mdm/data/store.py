@@ -120,7 +120,7 @@ class Store:
             self.features: np.ndarray = read_npy(path, mmap=True)
             if self.features.shape != (frames, width) or self.features.dtype != np.float32:
                 raise ValueError(
-                    f"shape {self.features.shape}, not {(frames, width)}, or not float32"
+                    f"it has shape {self.features.shape} instead of {(frames, width)}, or is not float32"
                 )
         self.clips = _entries(self.folder / "clips.jsonl", frames, len(self.info["actions"]))
         with _intact(self.folder / "statistics.npz") as path:
@@ -128,7 +128,7 @@ class Store:
             self.mean, self.std = statistics["mean"], statistics["std"]
             kinds = {self.mean.dtype.kind, self.std.dtype.kind}
             if not self.mean.shape == self.std.shape == (width,) or kinds != {"f"}:
-                raise ValueError(f"not a mean and std of {width} features")
+                raise ValueError(f"it does not contain the mean and std of {width} features")
         name, fps = self.info["representation"], self.info["fps"]
         with _intact(contents):
             version = self.info.get("version", 1)
@@ -406,7 +406,7 @@ def _encode(encoder: Representation, named: tuple[str, str, np.ndarray]) -> np.n
     name, encoded, motion = named
     if encoded and encoded not in (encoder.name, encoder.part_of):
         raise UserError(
-            f"clip {name}: published as {encoded}, which cannot be converted to {encoder.name}"
+            f"clip {name}: its features are {encoded}, which cannot be converted to {encoder.name}"
         )
     if not encoded:
         try:
@@ -417,7 +417,9 @@ def _encode(encoder: Representation, named: tuple[str, str, np.ndarray]) -> np.n
         motion[:, : encoder.features] if encoded == encoder.part_of else motion, np.float32
     )
     if features.ndim != 2 or features.shape[1] != encoder.features:
-        raise UserError(f"clip {name}: shape {features.shape}, not (frames, {encoder.features})")
+        raise UserError(
+            f"clip {name}: its features have shape {features.shape}, not (frames, {encoder.features})"
+        )
     if not np.isfinite(features).all():
         frame = int(np.argwhere(~np.isfinite(features).all(1))[0, 0])
         raise UserError(

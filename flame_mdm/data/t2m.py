@@ -249,7 +249,7 @@ class T2MFolder(MotionSource):
         array = read_npy(required(path, self.get_it), mmap=mmap)
         if array.ndim != dimensions or array.dtype.kind not in "fiu":
             raise UserError(
-                f"{path}: shape {array.shape} of {array.dtype}, not numbers of {dimensions} dimensions"
+                f"{path}: it has shape {array.shape} and type {array.dtype}, not numbers with {dimensions} dimensions"
             )
         return array
 

@@ -131,7 +131,7 @@ def _axis_angles(poses: np.ndarray) -> np.ndarray:
         elif count in (6 * joints for joints in AXIS_ANGLES.values()):
             advice = ". They seem to be 6D rotations: convert them to axis-angle vectors"
         raise UserError(
-            f"poses of shape {poses.shape}, not {NUMBERS} axis-angle numbers per frame{advice}"
+            f"poses have shape {poses.shape}, not {NUMBERS} axis-angle numbers per frame{advice}"
         )
     vectors = poses.reshape(len(poses), count)[:, :72].astype(float)
     return np.pad(vectors, ((0, 0), (0, 72 - vectors.shape[1])))

@@ -84,7 +84,7 @@ def meshes(file: glb.Glb) -> list[Skin]:
             bound = file.skins[node["skin"]] if "skin" in node else None
             skins.append(_part(file, primitive, title, bound, rank[index], palette))
             if sum(len(skin.points) for skin in skins) > MAX_VERTICES:
-                raise ValueError(f"more than {MAX_VERTICES:,} vertices")
+                raise ValueError(f"it has more than {MAX_VERTICES:,} vertices")
     return skins
 
 
@@ -190,7 +190,7 @@ def _image(file: glb.Glb, number: int | None) -> bytes:
     start = view.get("byteOffset", 0)
     content = file.data[start : start + view["byteLength"]]
     if len(content) > MAX_IMAGE:
-        raise ValueError("an image of more than 64 MiB")
+        raise ValueError("an image has more than 64 MiB")
     with Image.open(io.BytesIO(content), formats=["PNG", "JPEG"]) as picture:
         picture.verify()
     return content

@@ -168,7 +168,7 @@ class _Reader:
         if not position <= after <= end <= limit:
             raise ValueError(f"a record at byte {start} ends outside its parent")
         if depth > MAX_DEPTH or self.records > MAX_RECORDS:
-            raise ValueError(f"more than {MAX_DEPTH} nested or {MAX_RECORDS:,} records")
+            raise ValueError(f"it has more than {MAX_DEPTH} nested or {MAX_RECORDS:,} records")
 
         name = self.content[position - length : position].decode("utf-8", "replace")
         record = Record(name, self._properties(position, after, count))

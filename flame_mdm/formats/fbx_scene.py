@@ -224,14 +224,14 @@ class _Scene:
             if record.name == "Model":
                 self.models[number] = _Model(_name(record), defaults | _properties(record))
         if len(self.models) > MAX_MODELS:
-            raise ValueError(f"more than {MAX_MODELS} models")
+            raise ValueError(f"it has more than {MAX_MODELS} models")
 
         # By object id: ids of the objects connected to the object, each with the property it is
         # connected to
         self.below: dict[int, list[tuple[int, str]]] = defaultdict(list)
         for record in connections.all("C"):
             if len(record.properties) < 3:
-                raise ValueError("a connection without ends")
+                raise ValueError("a connection has no ends")
             kind, child, parent, *names = record.properties
             self.below[parent].append((child, str(names[0]) if kind == "OP" and names else ""))
             if child in self.models and parent in self.models and kind == "OO":
@@ -376,7 +376,7 @@ def _curve(record: fbx.Record) -> Curve:
     times = np.atleast_1d(np.asarray(record.value("KeyTime", ()), float)) / TICKS
     values = np.atleast_1d(np.asarray(record.value("KeyValueFloat", ()), float))
     if not len(times) or len(times) != len(values):
-        raise ValueError("an animation curve without keys, or without a value for each key")
+        raise ValueError("an animation curve has no keys, or lacks a value for a key")
     if not (np.diff(times) > 0).all() or not (np.abs(values) < LARGEST).all():
         raise ValueError("keys of an animation curve are not in order, or not finite")
 

@@ -266,7 +266,7 @@ def _skins(parts: _Document, data: bytes, rank: Sequence[int]) -> tuple[Skin, ..
             for primitive in _item(parts.meshes, node.mesh, "mesh").primitives
         ]
         if sum(map(len, corners)) > MAX_ITEMS:
-            raise ValueError(f"more than {MAX_ITEMS:,} parts of meshes with a skin")
+            raise ValueError(f"it has more than {MAX_ITEMS:,} parts of meshes with a skin")
     skins = []
     for skin, boxes in zip(parts.skins, corners, strict=True):
         joints = [_item(rank, joint, "joint of a skin") for joint in skin.joints]

@@ -164,7 +164,7 @@ def read(path: Path, animation: str | int | None = None) -> AnimatedNodes:
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         location = ".".join(map(str, first["loc"]))
-        raise UserError(f"{path}: damaged: an animation: {location}: {first['msg']}") from error
+        raise UserError(f"{path}: an animation is damaged: {location}: {first['msg']}") from error
     except (ValueError, OverflowError) as error:
         raise UserError(f"{path}: damaged: {error}") from error
 
@@ -175,7 +175,7 @@ def animations(path: Path) -> list[str]:
     try:
         return [name for name, _ in _animations(file)]
     except ValueError as error:
-        raise UserError(f"{path}: damaged: an animation: {error}") from error
+        raise UserError(f"{path}: an animation is damaged: {error}") from error
 
 
 def _animations(file: glb.Glb) -> list[tuple[str, _Animation]]:
@@ -266,7 +266,7 @@ def _track(file: glb.Glb, sampler: _Sampler, width: int) -> Track:
     values = glb.numbers(file, sampler.output, f"VEC{width}")
     cubic = sampler.interpolation == "CUBICSPLINE"
     if len(values) != len(times) * (3 if cubic else 1):
-        raise ValueError("an animation without a value for each key")
+        raise ValueError("an animation lacks a value for a key")
     if not len(times) or not (np.diff(times) > 0).all() or times[0] < 0 or not times[-1] < 1e5:
         raise ValueError("keys of an animation are not in order, or not finite")
     if not (np.abs(values) < LARGEST).all():

@@ -259,7 +259,7 @@ def array_layout(joints: np.ndarray, fields: Mapping[str, Any]) -> tuple[Layout,
     They come from `fields`, or from the number of joints.
     """
     if joints.ndim != 3 or joints.shape[2] != 3 or not len(joints):
-        raise UserError(f"joints of shape {joints.shape}, not (frames, joints, 3)")
+        raise UserError(f"joints have shape {joints.shape}, not (frames, joints, 3)")
     count = joints.shape[1]
     names: Sequence[str] = fields.get("joints", ())
     if not names and count in (22, 24, 52):

@@ -535,7 +535,7 @@ def _poses(data: dict[str, Any]) -> Poses | None:
     expected = (len(data["joints"]), ROTATED[representation])
     if data["features"].shape != expected:
         raise UserError(
-            f"features of shape {data['features'].shape}, but {representation} has {expected}"
+            f"features have shape {data['features'].shape}, but {representation} has {expected}"
         )
     x = torch.from_numpy(data["features"]).double()
     if representation == "motion272":
@@ -556,4 +556,6 @@ def _skeleton(joints: np.ndarray) -> Skeleton:
         if joints.ndim == 3 and joints.shape[1:] == (len(skeleton), 3):
             return skeleton
     sizes = " or ".join(f"{len(skeleton)} ({skeleton.name})" for skeleton in SKELETONS.values())
-    raise UserError(f"joints of shape {joints.shape}, not (frames, joints, 3) with {sizes} joints")
+    raise UserError(
+        f"joints have shape {joints.shape}, not (frames, joints, 3) with {sizes} joints"
+    )

@@ -172,7 +172,7 @@ class HumanML(Representation):
             name = f"motion {number}" if len(motions) > 1 else "motion"
             if motion.ndim != 3 or motion.shape[1:] != (joints := len(self.skeleton), 3):
                 raise UserError(
-                    f"{name}: shape {tuple(motion.shape)}, but {self.name} takes (frames, {joints}, 3)"
+                    f"{name}: it has shape {tuple(motion.shape)}, but {self.name} takes (frames, {joints}, 3)"
                 )
             if len(motion) < 3:
                 raise UserError(

@@ -55,7 +55,7 @@ class Rifke(Representation):
         """Encodes finite joints (T, 21, 3) in meters, y up, as features (T, 64) float32."""
         if motion.ndim != 3 or motion.shape[1:] != (21, 3) or not len(motion):
             raise UserError(
-                f"motion: shape {tuple(motion.shape)}, but {self.name} takes (frames, 21, 3)"
+                f"motion: it has shape {tuple(motion.shape)}, but {self.name} takes (frames, 21, 3)"
             )
         check_finite(motion)
         joints = motion.double() * self.units_per_metre

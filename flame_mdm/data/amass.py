@@ -187,8 +187,8 @@ class Amass:
         Yields (key, result), sorted by key.
 
         Args:
-            arguments: argument of the function by the key of the recording. Keys and arguments
-                must be picklable.
+            arguments: argument of the function for each recording, by the key of the recording.
+                Keys and arguments must be picklable.
             function: called as `function(argument, recording)`. It must be picklable.
             workers: number of processes; 0 = one per core.
         """

@@ -71,9 +71,9 @@ class Folder(MotionSource):
             them. For other files, they are fitted to the joints.
         mirror: yield a mirrored copy after each clip of the training split; joints only.
         exclude: motions to leave out, by their path in the folder without extension.
-        balance: minimum number of training clips per action, mirrored copies included. If an
-            action has fewer clips, each clip is repeated until there are about as many, at most
-            16 times. 0 = no repetition.
+        balance: requested number of training clips per action, mirrored copies included. If an
+            action has fewer clips, its clips are repeated until there are about as many. Each
+            clip occurs at most 16 times. 0 = no repetition.
         license: license of the motions for which the table states none, a key of `licenses.yaml`.
             Empty = unknown.
     """
@@ -389,9 +389,9 @@ def _read(
 ) -> _Attempt:
     """Reads joints or, if `kind` is "smpl", a raw motion of SMPL's rotations.
 
-    The motion has `fps` frames per second. Without a `representation`, joints are SMPL's 22, and
-    rotations are in AMASS's axes. KIT-ML's representations get its 21 joints. Representations in
-    the camera's axes get rotations in these axes.
+    The motion has `fps` frames per second. Without a `representation`, the joints are SMPL's 22
+    joints, and rotations are in AMASS's axes. KIT-ML's representations get its 21 joints.
+    Representations in the camera's axes get rotations in these axes.
     """
     path = file.path
     try:

@@ -32,7 +32,8 @@ ENDLESS = (
 LONGEST = 6.0
 # Duration of its end that is left out, in seconds
 STOPPING = 0.9
-# Posture at the beginning or at the end of actions that do not stand there
+# Posture at the beginning of actions that do not begin standing, and at the end of actions that
+# do not end standing
 STARTS = {
     **dict.fromkeys(("rise", "seated", "type"), "seated"),
     **{"get up": "lying", "crawl": "on all fours", "push-ups": "a plank"},

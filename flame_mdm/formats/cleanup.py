@@ -125,7 +125,7 @@ def _least_squares(
     """Returns x (frames, N) with the minimum sum of all terms.
 
     A term (n, weight, target) is weight (n-th differences of x - target)^2. The weight is
-    (frames - n,) or a number. The target is (frames - n, N) or a number; at least one target is
+    (frames - n,) or a number. The target is (frames - n, N) or a number. At least one target is
     an array.
     """
     # An n-th difference has binomial coefficients with alternating signs. It couples frames that

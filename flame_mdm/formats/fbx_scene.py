@@ -226,8 +226,8 @@ class _Scene:
         if len(self.models) > MAX_MODELS:
             raise ValueError(f"it has more than {MAX_MODELS} models")
 
-        # By object id: ids of the objects connected to the object, each with the property it is
-        # connected to
+        # For each object id, the ids of the connected objects and the properties to which they
+        # are connected
         self.below: dict[int, list[tuple[int, str]]] = defaultdict(list)
         for record in connections.all("C"):
             if len(record.properties) < 3:

@@ -152,7 +152,7 @@ def recognized(
 def matched(
     source: object, names: Mapping[int, str], candidates: Mapping[str, Sequence[int]]
 ) -> tuple[dict[str, int], list[str]]:
-    """Returns the number of a character's joint for each joint of SMPL, and missing joints.
+    """Returns the numbers of a character's joints, by joint of SMPL, and the missing joints.
 
     Only required joints are reported as missing. Each joint of SMPL has at most one number.
     """

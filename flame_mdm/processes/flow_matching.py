@@ -29,8 +29,8 @@ class FlowMatching(Process):
         quantize_time: pass floor(1000 t), a row of the time table, to the denoiser, as in MFM's
             code.
         odeint_grid: use float32 multiples of 1 / N as times, like torchdiffeq's Euler steps in
-            MFM's code. For some N, a time then has another row of the table, one row lower than
-            with N equal steps. This never happens for N = 10, 20 or 30.
+            MFM's code. For some N, the row of a time in the table is then one lower than with N
+            equal steps. This never happens for N = 10, 20 or 30.
 
     Raises:
         UserError: If `sigma_min` is not in [0, 1).

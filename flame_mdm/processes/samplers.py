@@ -1,8 +1,8 @@
 """Samplers: functions that take one step from noise toward motion, with their capabilities.
 
-Diffusion samplers descend the numbers i of steps of a `Schedule`. At step i, they get the clean
-motion and the log-variance from `estimate`. ODE solvers follow a velocity field. Coefficients and
-times are Python numbers, so no step waits for the device.
+Diffusion samplers take the steps i of a `Schedule` in decreasing order. At step i, they get the
+clean motion and the log-variance from `estimate`. ODE solvers follow a velocity field.
+Coefficients and times are Python numbers, so no step waits for the device.
 """
 
 import math

@@ -102,7 +102,8 @@ def cover(
     is followed by its first frame.
 
     Args:
-        windows: motion, first frame and number of frames of each of the W windows.
+        windows: W windows, each as the index of its motion, its first frame and its number of
+            frames.
         totals: number of frames of each motion.
         overlap: number of frames over which a weight rises or falls.
         width: L, the padded length of the windows.

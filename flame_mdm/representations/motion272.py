@@ -49,7 +49,7 @@ class Motion272(Representation):
         self.offsets = offsets
 
     def encode(self, motion: Tensor) -> Tensor:
-        """Encodes a raw motion (F >= 2, 3 + 3 K), see `smpl.read_pose`, as (F, 272) float32."""
+        """Encodes a raw motion (F >= 2, 3 + 3 K) of `smpl.read_pose` as (F, 272) float32."""
         translation, rotations = read_pose(motion)
         if len(motion) < 2:
             raise UserError("motion: 1 frame, but encoding needs at least 2; leave the motion out")

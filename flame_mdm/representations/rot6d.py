@@ -37,7 +37,7 @@ class Rot6D(Representation):
         self.offsets = offsets
 
     def encode(self, motion: Tensor) -> Tensor:
-        """Encodes a raw motion (F, 3 + 3 K), see `smpl.read_pose`, as (F, 150) float32."""
+        """Encodes a raw motion (F, 3 + 3 K) of `smpl.read_pose` as (F, 150) float32."""
         translation, rotations = read_pose(motion)
         rows = rotation.matrix_to_rot6d(rotations, "rows").flatten(1)
         return torch.cat([rows, F.pad(translation - translation[:1], (0, 3))], 1).float()

@@ -40,8 +40,8 @@ def read_pose(motion: Tensor) -> tuple[Tensor, Tensor]:
     are used, so the hands are its left_index1 and left_index2.
 
     Raises:
-        UserError: If the shape is another one, such as 24 rotation matrices, or a number is not
-            finite.
+        UserError: If the motion has another shape, for example 24 rotation matrices, or a number
+            is not finite.
     """
     widths = [3 + numbers for numbers, joints in AXIS_ANGLES.items() if joints >= 24]
     if motion.ndim != 2 or not len(motion) or motion.shape[1] not in widths:

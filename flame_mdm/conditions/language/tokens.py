@@ -91,7 +91,7 @@ def is_foreign(tokens: Sequence[Token]) -> bool:
 
 
 def is_english(word: str) -> bool:
-    """Returns whether a word is frequent, or is in the tables in any form or with a typo."""
+    """Returns whether a word is frequent, or is a form or a typo of a word in the tables."""
     rank = word_table().rank(word)
     is_frequent = rank is not None and rank < RARE
     return (

@@ -62,7 +62,7 @@ def rotation(axis: int, angle: np.ndarray) -> np.ndarray:
 
 
 class Body:
-    """Curves over the frames, which an action controls. Initially, a person stands and breathes.
+    """Curves over the frames that actions change. Initially, the person stands and breathes.
 
     Angles are in radians. The first axis of feet and arms is the side: 0 = left, 1 = right.
     """

@@ -214,7 +214,7 @@ def _claims(pattern: Pattern, text: str) -> list[Claim]:
 
 
 def _further(take: str, claim: Claim, text: str) -> list[Claim]:
-    """Returns the claims of a clause beside the claim of its pattern."""
+    """Returns further claims of a clause, in addition to the claim of its pattern."""
     if take == "travel" or take == "jumped":
         direction = _direction(text)
         kind = "step" if take == "jumped" or claim.kind == "step" else "travel"

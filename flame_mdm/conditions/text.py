@@ -57,9 +57,9 @@ class PretrainedText(ConditionEncoder):
         freeze: False = fine-tune the language model together with the motion model.
 
     Raises:
-        UserError: When a caption is encoded: if the model is not pinned, its file is not the
+        UserError: When a caption is encoded and the model is not pinned, its file is not the
             published one, or its width is not `features`.
-        FileNotFoundError: When a caption is encoded: if the model is not in the cache and cannot
+        FileNotFoundError: When a caption is encoded and the model is not in the cache and cannot
             be downloaded.
 
     Example:

@@ -281,7 +281,7 @@ def mirror(motion: np.ndarray) -> np.ndarray:
 
 
 def side_of(content: str) -> str:
-    """Returns the side that moves or that the body moves to: left, right or both.
+    """Returns the side that moves, or to which the body moves: left, right or both.
 
     The result is "" if a content has no side.
     """

@@ -20,7 +20,7 @@ def table_rows(
 ) -> Iterator[tuple[str, dict[str, str]]]:
     """Yields the rows of a table of captions.
 
-    A row is its file and line, for error messages, and its cells by column.
+    For each row, these are its file and line (for error messages), and its cells by column.
 
     Raises:
         UserError: If the table is damaged, has no column `id`, or has a column that is not in

@@ -110,7 +110,7 @@ class Folder(MotionSource):
             self.options["balance"] = balance
         if license:
             self.options["license"] = license
-        # By layout, how upright the body is in each motion read so far
+        # For each layout, how upright the body is in each motion read so far
         self._uprights: defaultdict[str, list[float]] = defaultdict(list)
         self._notes: Counter[str] = Counter()  # lines about the motions read so far
         # The representation of the raw motions to yield; see `suit`

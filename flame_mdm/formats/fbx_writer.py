@@ -1,8 +1,8 @@
 """Writes a motion with its skeleton and skin as an FBX file: binary 7.4, centimeters, y up.
 
-The structure of the scene follows files of Autodesk's FBX SDK. Programs need different details;
-comments name the reader that fails without a detail. The bones are at the top level, because
-Unreal and Unity treat a node above them as a bone. The rest pose of the bones is in
+The structure of the scene follows files of Autodesk's FBX SDK. Programs need different details.
+If a reader fails without a detail, a comment names this reader. The bones are at the top level,
+because Unreal and Unity treat a node above them as a bone. The rest pose of the bones is in
 `PreRotation`, so rotations of 0 are the rest pose in every program.
 """
 

@@ -142,10 +142,9 @@ class Motion(PosedFigure):
                 expect it.
             rig: the skeleton of a `.bvh`, `.glb`, `.fbx` or USD file, one of
                 `flame_mdm.formats.retarget.presets`. Default: SMPL's.
-            character: your own character, as a file or as the result of `characters.read`. A
-                `.glb`
-                file with a skin can be written with this motion as a `.glb`, `.fbx` or USD file.
-                A `.bvh` file can be written as a `.bvh` file.
+            character: your own character, as a file or as the result of `characters.read`. The
+                motion of a `.glb` character with a skin can be saved as a `.glb`, `.fbx` or USD
+                file, the motion of a `.bvh` character as a `.bvh` file.
             body: the body in `.glb`, `.fbx`, USD, `.gif` and `.mp4` files, from
                 `formats.people.load_body`. Default: the mannequin.
             root_motion: the joint on the floor of `rig` follows the hips in a `.glb`, `.fbx` or

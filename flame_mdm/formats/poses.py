@@ -20,7 +20,8 @@ CHILDREN = tuple(
 )
 PELVIS, SPINE3 = 0, 9
 ALIKE = ((0,), (1, 2), (3,), (4, 5), (6,), (7, 8), (9,), (12,), (13, 14), (16, 17), (18, 19))
-"""Joints with children, from the root outward. Left and right joints are together."""
+"""Joints with children, from the root outward. Each left joint is grouped with its right
+joint."""
 # For each joint between pelvis and chest, its fraction of the rotation from pelvis to chest
 SPINE = {
     3: 1 / 3,
@@ -96,7 +97,7 @@ class BoneRotations:
 
 
 def solve(joints: Tensor, fps: float) -> Poses:
-    """Computes a body and rotations that reproduce its joint positions in every frame.
+    """Computes a body and its rotations, which reproduce joint positions in every frame.
 
     Bones get their mean length over the clip. Pelvis and chest have three bones each. They are
     rotated for the best fit of all three bones (Kabsch 1976). Every other joint aims its bone at

@@ -35,9 +35,9 @@ def complete(
             3, 3) of these parts in the world, and the offsets (22, 3) of a body that stands on
             flat feet.
     """
-    # A person who stands upright looks straight ahead. The head is therefore level in the median
-    # direction from neck to head, relative to an upright chest. Toes stay flat on the floor while
-    # the heel rises.
+    # A person who stands upright looks straight ahead. Therefore the median direction from neck
+    # to head, relative to an upright chest, is the direction of a level head. Toes stay flat on
+    # the floor while the heel rises.
     neutral, offsets = np.tile(np.eye(3), (len(SMPL22), 1, 1)), offsets.copy()
     for side in ("left", "right"):
         ankle, toe = JOINT[f"{side}_ankle"], JOINT[f"{side}_foot"]

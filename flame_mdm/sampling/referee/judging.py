@@ -35,7 +35,8 @@ class Verdict:
         claim: the claim.
         answer: "yes", "no" or "cannot tell".
         reading: the measurement.
-        band: two scores. Up to the first one, the answer is "no"; from the second one on, "yes".
+        band: two scores. The answer is "no" up to the first one, and "yes" from the second one
+            on.
     """
 
     claim: Claim

@@ -20,8 +20,7 @@ CHILDREN = tuple(
 )
 PELVIS, SPINE3 = 0, 9
 ALIKE = ((0,), (1, 2), (3,), (4, 5), (6,), (7, 8), (9,), (12,), (13, 14), (16, 17), (18, 19))
-"""Joints with children, from the root outward. Each left joint is grouped with its right
-joint."""
+"""Joints with children, from the root outward. Left and right joints form groups."""
 # For each joint between pelvis and chest, its fraction of the rotation from pelvis to chest
 SPINE = {
     3: 1 / 3,

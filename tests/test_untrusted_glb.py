@@ -121,7 +121,7 @@ FAULTS: dict[str, tuple[Change, str]] = {
     "matrix of 15 numbers": (node(matrix=[1] * 15), "at least 16 items"),
     "no bounds": (
         lambda document: [a.pop("min", None) for a in document["accessors"]],
-        "without bounds",
+        "has no bounds",
     ),
     "no document": (lambda document: document.clear(), "asset: Field required"),
 }

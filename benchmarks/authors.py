@@ -1,8 +1,8 @@
 """The training step of the authors' code, GuyTevet/motion-diffusion-model, from a clone of it.
 
-The authors' network, diffusion, optimizer and loss logging are used as they are. CLIP is replaced
-by a stub that returns zeros, as in the framework's step, and the body model is left out, because
-a step on HumanML3D does not use it.
+The authors' network, diffusion, optimizer and loss logging are unchanged. CLIP is replaced with a
+stub that returns zeros, as in the framework's step. The body model is left out, because a step on
+HumanML3D does not use it.
 """
 
 import sys
@@ -20,21 +20,21 @@ CLIP_WIDTH, CLIP_TOKENS = 512, 77
 
 
 class _Clip(nn.Module):
-    """CLIP whose text features are zeros."""
+    """A stub of CLIP that returns zeros as text features."""
 
     def encode_text(self, tokens: Tensor) -> Tensor:
         return torch.zeros(len(tokens), CLIP_WIDTH, device=tokens.device)
 
 
 class _Rotation2xyz:
-    """The converter of SMPL's rotations, which a step on HumanML3D does not call."""
+    """A stub of the converter of SMPL's rotations, which a step on HumanML3D does not call."""
 
     def __init__(self, *_: Any, **__: Any) -> None:
         self.smpl_model = nn.Module()
 
 
 def _stubs() -> dict[str, ModuleType]:
-    """Returns modules in place of CLIP and of the body model."""
+    """Returns the stubs of CLIP and of the body model, as modules."""
     clip: Any = ModuleType("clip")
     clip.load = lambda *_, **__: (_Clip(), None)
     clip.tokenize = lambda texts, context_length=CLIP_TOKENS, **_: torch.zeros(

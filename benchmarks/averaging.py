@@ -1,4 +1,4 @@
-"""Time of one update of the averaged weights: `python benchmarks/averaging.py`."""
+"""Times one update of the averaged weights: `python benchmarks/averaging.py`."""
 
 from collections.abc import Callable
 from copy import deepcopy

@@ -1,10 +1,10 @@
-"""Time of an evaluation of the size of HumanML3D, without networks: `python benchmarks/evaluation.py`.
+"""Times an evaluation of HumanML3D's size without networks: `python benchmarks/evaluation.py`.
 
-A protocol measures random motions with the lengths of HumanML3D
-(40 to 196 frames at 20 fps, 22 joints). The extractor returns numbers of the motion and random
-text features, 512 each, and the source returns other windows of the same clips. What is left is
-the cost of the evaluation itself: reading and decoding motions, and metrics. FID alone is
-compared to torchmetrics' implementation on the same features.
+A protocol measures random motions with HumanML3D's lengths (40 to 196 frames at 20 frames per
+second, 22 joints). The extractor returns 512 numbers of the motion and 512 random text features,
+and the source returns other windows of the same clips. The remaining time is the cost of the
+evaluation itself: reading and decoding motions, and computing metrics. FID is also compared to
+torchmetrics' implementation on the same features.
 """
 
 from collections.abc import Sequence
@@ -33,7 +33,9 @@ TORCHMETRICS, FRAMEWORK = "torchmetrics' FrechetInceptionDistance", "framework"
 
 
 class Stub(Extractor):
-    """The first numbers of a motion as its features, and random features of captions."""
+    """An extractor without a network:
+    the first numbers of a motion, and random features of captions.
+    """
 
     sha256 = "stub"
 
@@ -54,7 +56,7 @@ class Stub(Extractor):
 
 
 class Windows:
-    """A source of motions: the requested clips themselves, as if a model had generated them."""
+    """A source that returns the requested clips themselves, as if a model had generated them."""
 
     def __init__(self, clips: Clips):
         self.clips = clips
@@ -64,7 +66,9 @@ class Windows:
 
 
 def random_clips(count: int) -> Clips:
-    """Returns clips of random features; a third of them have the maximum length, as in HumanML3D."""
+    """Returns clips with random features;
+    a third of the clips have the maximum length, as in HumanML3D.
+    """
     generator = np.random.default_rng(0)
     lengths = np.minimum(generator.integers(40, 275, count), 199)
     ends = np.cumsum(lengths)
@@ -96,7 +100,7 @@ def random_clips(count: int) -> Clips:
 
 
 class Identity(nn.Module):
-    """An extractor of images that are features already."""
+    """An extractor for torchmetrics whose "images" already are features."""
 
     num_features = WIDTH
 
@@ -106,7 +110,7 @@ class Identity(nn.Module):
 
 
 def fid(motions: int, rounds: int) -> list[Row]:
-    """Returns the time of FID from features in batches, in the framework and in torchmetrics."""
+    """Times FID on batches of features, in the framework and in torchmetrics."""
     generated, real = torch.randn(motions, WIDTH), torch.randn(motions, WIDTH) + 0.1
 
     def torchmetrics() -> Tensor:

@@ -1,4 +1,4 @@
-"""Speed of HumanML3D's features on one core, compared to a loop in NumPy: `python benchmarks/features.py`."""
+"""Times HumanML3D's features, compared to a loop in NumPy: `python benchmarks/features.py`."""
 
 import time
 from collections.abc import Callable
@@ -17,7 +17,9 @@ STILL = 0.002  # squared displacement of a foot that is in contact with the floo
 
 
 def motion(seed: int) -> Tensor:
-    """Returns joints (FRAMES, 22, 3) in meters of a body that bends its joints while moving in a circle."""
+    """Returns the joints (FRAMES, 22, 3) in meters of a body
+    that bends its limbs and moves in a circle.
+    """
     rng = torch.Generator().manual_seed(seed)
     phase = torch.linspace(0, 2 * torch.pi, FRAMES, dtype=torch.float64)
     bend = (
@@ -32,7 +34,9 @@ def motion(seed: int) -> Tensor:
 
 
 def arc(rest: np.ndarray, bone: np.ndarray) -> np.ndarray:
-    """Returns the shortest rotation (3, 3) from the direction of a bone at rest, a unit vector, to its direction."""
+    """Returns the shortest rotation (3, 3) from the direction of a bone at rest,
+    a unit vector, to its current direction.
+    """
     direction = bone / np.linalg.norm(bone)
     axis, cosine = np.cross(rest, direction), rest @ direction
     cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])

@@ -1,10 +1,11 @@
-"""Cost of the framework per training step, compared to bare Lightning: `python benchmarks/host.py`.
+"""Times the framework's share of a training step: `python benchmarks/host.py`.
 
-A transformer of one layer and width 16 without a text encoder is trained, so that most of the
-time is spent outside of the network. Bare Lightning trains the same network with the same loss,
-optimizer and batches, without averaged weights, logger and checkpoints. All run on one thread and
-alternate. Times are times of the thread, which exclude other programs on the machine, between the
-ends of two steps. The parts of the framework's step are timed one by one, without Lightning.
+The network is a transformer with one layer of width 16 and no text encoder, so that most of the
+time is spent outside of the network. The framework is compared to bare Lightning. Bare Lightning
+trains the same network with the same loss, optimizer and batches, without averaged weights,
+logger and checkpoints. All run on one thread and alternate. Times are measured between the ends
+of two steps. They are times of the thread, which exclude other programs on the machine. The parts
+of the framework's step are timed one by one, without Lightning.
 """
 
 import itertools
@@ -49,13 +50,13 @@ BATCHES = 16  # distinct batches of bare Lightning and of the plain loop
 
 
 class Clock(Callback):
-    """Records the time of the thread after every step."""
+    """Records the time of the thread at the end of every step."""
 
     def __init__(self) -> None:
         self.times: list[float] = []
 
     def on_train_batch_end(self, *_: Any) -> None:
-        """Keeps the time of the thread after each step."""
+        """Records the time of the thread."""
         self.times.append(time.thread_time())
 
     def median(self) -> float:
@@ -89,7 +90,7 @@ class Bare(LightningModule):
 
     def __init__(self, task: GeneratorTask):
         super().__init__()
-        # The task is in a list, so that its parameters are not registered twice.
+        # In a list, the parameters of the task are not registered a second time.
         self.denoiser = task.generator.denoiser
         self.task = [task]
 

@@ -1,10 +1,11 @@
-"""Speed of both ways to load batches compared to a training step: `python benchmarks/loading.py`.
+"""Times two ways to load batches, compared to a training step: `python benchmarks/loading.py`.
 
-A synthetic data set is packed into a temporary folder. Batches gathered from memory
-(data.resident=true), batches of the data loader in the training process, and forward pass,
-backward pass and update of the small MDM encoder alternate; they are measured in processor time
-of one core, which excludes other programs on the machine. Loading with workers is measured in
-wall time, which includes passing batches between processes and the load of the machine.
+A synthetic data set is packed into a temporary folder. Three measurements alternate: batches
+gathered from memory (data.resident=true), batches of the data loader in the training process, and
+training steps of the small MDM encoder (forward pass, backward pass and update). They are
+measured in processor time of one core, which excludes other programs on the machine. Loading with
+workers is measured in wall time, which includes passing batches between processes and the load of
+the machine.
 """
 
 import itertools
@@ -25,12 +26,14 @@ from flame_mdm.losses import masked_mse
 from flame_mdm.representations.humanml import HumanML
 
 BATCH = 64
-GOAL = 5000  # target clips per second and worker
+GOAL = 5000  # target of clips per second and worker
 STEP, LOADER, RESIDENT = "step", "loader, one core", "resident, one core"
 
 
 def training(features: int) -> Callable[[MotionBatch], None]:
-    """Returns a training step (forward, backward, update) of MDM's encoder in its size for CPU runs."""
+    """Returns a training step (forward, backward, update)
+    of MDM's encoder in the size for CPUs.
+    """
     model = MDMEncoder(
         features, features, 512, latent_dim=128, ff_size=256, num_layers=4, num_heads=4, dropout=0.0
     )

@@ -1,10 +1,11 @@
-"""Speed and memory of `make prepare` at several sizes: `python benchmarks/preparation.py`.
+"""Measures speed and memory
+of `make prepare` at several sizes: `python benchmarks/preparation.py`.
 
 For each size, a fresh process prepares synthetic clips of about 51 frames in a temporary folder
-(1.1 KB of disk per frame), with one worker per core. Gives the processor time of all processes
-together, the maximum resident memory of the process and of its largest worker, of each the part
-that is not shared with other processes (sampled), and by how many bytes the process grows per
-frame.
+(1.1 KB of disk per frame), with one worker per core. The results are the processor time of all
+processes together, the maximum resident memory of the main process and of its largest worker, and
+the private part of each, which is not shared with other processes and is sampled. Another result
+is the number of bytes by which the main process grows per frame.
 """
 
 import json
@@ -24,7 +25,9 @@ MEMORY = ("main process, MiB", "worker, MiB", "private to main, MiB", "private t
 
 
 def private(process: int) -> int:
-    """Returns the bytes of memory that a process shares with no other; 0 after its end, and on other systems."""
+    """Returns the private memory of a process in bytes;
+    0 after its end, and on systems without /proc.
+    """
     try:
         lines = Path(f"/proc/{process}/smaps_rollup").read_text().splitlines()
     except OSError:
@@ -49,7 +52,9 @@ class Peaks(threading.Thread):
 
 
 def prepare(clips: int) -> None:
-    """Prepares clips in this process; prints frames, seconds of processor time, and bytes of memory as JSON."""
+    """Prepares clips in this process;
+    prints as JSON the frames, processor seconds and bytes of memory.
+    """
     from flame_mdm.data.store import write_store
     from flame_mdm.data.synthetic import Synthetic
     from flame_mdm.representations.humanml import HumanML
@@ -73,8 +78,8 @@ def prepare(clips: int) -> None:
 
 
 def measure(settings: Settings) -> Section:
-    """Measures memory and time of the preparation of large data sets and returns the section of
-    the page.
+    """Measures memory and time of the preparation
+    of large data sets and returns the section of the page.
     """
     rows: list[Row] = []
     growth: list[tuple[float, float]] = []

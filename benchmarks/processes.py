@@ -1,9 +1,10 @@
-"""Scaling of DDP: seconds per step of two gloo processes and of one, `python benchmarks/processes.py`.
+"""Times training steps of one process and
+of two gloo processes: `python benchmarks/processes.py`.
 
-Both train on the same batches of 16 clips, one process with all 16 and two processes with 8 each,
-one thread per process. With one core per process, the ideal ratio is 0.5; two processes on one
-core cannot be below 1. The overhead is reducing the gradients and waiting for the slower process.
-Times are between steps, so they do not include imports.
+Both trainings use the same batches of 16 clips: one process has all 16 clips, two processes have
+8 clips each. Each process has one thread. With one core per process, the ideal ratio is 0.5; two
+processes on one core cannot be below 1. The overhead consists of reducing the gradients and
+waiting for the slower process. Times are measured between steps, so they do not include imports.
 """
 
 import json
@@ -16,7 +17,7 @@ from pathlib import Path
 
 from sections import QUIET, Section, Settings, ratios, section, show
 
-CLIPS = 16  # per step
+CLIPS = 16  # number of clips per step
 SMALL = [
     "data.source.clips=60",
     "denoiser.latent_dim=128",

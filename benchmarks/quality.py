@@ -1,9 +1,9 @@
-"""Quality of models trained in both speeds: `make bench ONLY=quality RUNS=FOLDER`.
+"""Compares the quality of models at both speeds: `make bench ONLY=quality RUNS=FOLDER`.
 
-Trains nothing: reads the runs in a folder, each trained by `make train ... speed=...` and
-evaluated by `make evaluate`, with two or more seeds per data set and speed. Gives the mean over
-the seeds and its 95 % interval by Student's t. The differences are between runs with the same
-seed, which begin with the same weights and see the same batches.
+This script trains nothing. It reads the runs in a folder, which were trained by `make train ...
+speed=...` and evaluated by `make evaluate`, with two or more seeds per data set and speed. The
+figures are means over the seeds with 95 % intervals by Student's t. Differences are between runs
+with the same seed, which begin with the same weights and see the same batches.
 """
 
 import statistics
@@ -46,7 +46,9 @@ def values(run: Run) -> dict[str, float]:
 
 
 def read_runs(folder: Path) -> dict[str, dict[str, BySeed]]:
-    """Returns the values of the runs in a folder, by data set and training, speed, and seed."""
+    """Returns the values of the runs in a folder,
+    by training (with its data set), speed and seed.
+    """
     runs: dict[str, dict[str, BySeed]] = {}
     for path in sorted(folder.glob(f"*/{CONFIG}")):
         run = read_run(path.parent)
@@ -63,7 +65,9 @@ def read_runs(folder: Path) -> dict[str, dict[str, BySeed]]:
 
 
 def shown(mean: float, half: float, sign: str = "") -> str:
-    """Returns mean and half width with as many decimals as the half width has in two significant digits."""
+    """Returns mean and half width as text;
+    both have the decimals of a half width with two significant digits.
+    """
     decimals = next((count for count in range(6) if half >= 10 ** (1 - count)), 6 if half else 2)
     return f"{mean:{sign},.{decimals}f} ± {half:,.{decimals}f}"
 
@@ -76,14 +80,16 @@ def interval(sample: Sequence[float]) -> tuple[float, float]:
 
 
 def measure(settings: Settings) -> Section:
-    """Compares the metrics of runs that differ in speed only and returns the section of the page."""
+    """Compares the metrics of runs that differ only in speed,
+    and returns the section of the page.
+    """
     folder = Path(settings.runs or ".")
     tables: dict[str, list[Row]] = {}
     differing: list[str] = []
     for name, speeds in read_runs(folder).items():
         seeds = sorted(speeds["reference"])
         if len(seeds) < 2 or seeds != sorted(speeds["fast"]):
-            raise SystemExit(f"{folder}: {name}: needs the same two or more seeds in both speeds")
+            raise SystemExit(f"{folder}: {name}: needs two or more seeds, the same in both speeds")
 
         rows = tables.setdefault(f"{name}, {len(seeds)} seeds", [])
         for metric in speeds["reference"][seeds[0]]:

@@ -1,7 +1,7 @@
 """Measures the speed of the framework and writes docs/benchmarks/speed.md: `make bench [ONLY=a,b] [DEVICE=cuda]`.
 
-Each script is run in its own process, one after another. With ONLY, the other sections keep their
-figures. DEVICE=cuda measures the sections that use a GPU, which are added to the page.
+The scripts run one after another, each in its own process. With ONLY, the other sections keep
+their figures. DEVICE=cuda measures the sections that use a GPU, which are added to the page.
 MDM_REPO=PATH, a clone of the authors' code, adds the authors' training step. ONLY=quality
 RUNS=FOLDER compares the quality of trained runs.
 """
@@ -38,7 +38,7 @@ SECTIONS = (
     "preparation",
 )
 ON_GPU = ("steps", "sampling")
-ON_REQUEST = ("quality",)  # takes trained models
+ON_REQUEST = ("quality",)  # requires trained models
 HEAD = """# Speed
 
 `make bench` measures the speed of the framework and writes this page and [speed.json](speed.json). Every comparison is
@@ -51,7 +51,7 @@ measured next to the framework's. Sections that name a commit were measured by a
 
 
 def machine() -> dict[str, str | int]:
-    """Returns the hardware and versions that a measurement depends on."""
+    """Returns the hardware and the versions on which a measurement depends."""
     capabilities, software = torch.cpu.get_capabilities(), environment()
     has_affinity = hasattr(os, "sched_getaffinity")
     bfloat16 = [name for name in ("avx512_bf16", "amx_bf16") if capabilities.get(name)]
@@ -70,7 +70,7 @@ def machine() -> dict[str, str | int]:
 
 
 def run(name: str, settings: Settings) -> dict[str, Any]:
-    """Returns a section that is measured in another process."""
+    """Measures a section in another process and returns it."""
     part = PAGE.with_suffix(f".{name}.part")
     line = [sys.executable, __file__, "--child", name, str(part), json.dumps(asdict(settings))]
     try:
@@ -116,13 +116,18 @@ def render(sections: dict[str, Any]) -> str:
 
 
 def _position(name: str) -> tuple[int, bool]:
-    """Returns the position of a section on the page: in the order of the scripts, the CPU before the GPU."""
+    """Returns the position of a section on the page,
+    in the order of the scripts, CPU before GPU.
+    """
     scripts = [*SECTIONS, *ON_REQUEST]
     return scripts.index(name.removesuffix("_cuda")), name.endswith("_cuda")
 
 
 def chosen(only: str, settings: Settings) -> list[str]:
-    """Returns the scripts to run; ends with one line if they, or what they need, do not exist."""
+    """Returns the scripts to run.
+
+    Ends the program with one line if a script, or something that it needs, does not exist.
+    """
     if settings.device not in ("cpu", "cuda"):
         raise SystemExit(
             f"DEVICE={settings.device}: give cpu, or cuda on a machine with a CUDA GPU"

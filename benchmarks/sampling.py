@@ -1,9 +1,10 @@
-"""Cost of sampling: `python benchmarks/sampling.py`.
+"""Times sampling: `python benchmarks/sampling.py`.
 
-Three tables: latency at batch 1 and throughput at batch 64 of MDM's encoder, for 1, 2 and 4 steps
-of a distilled model, which has no guidance, and for 10, 50 and 1000 steps; the samplers with that
-encoder, which alternate; and milliseconds per network call that the sampling loop itself takes,
-with a denoiser that returns a stored tensor.
+The first table has the latency at batch 1 and the throughput at batch 64 of MDM's encoder: for 1,
+2 and 4 steps of a distilled model, which has no guidance, and for 10, 50 and 1000 steps. The
+second table compares the samplers with this encoder; they alternate. The third table has the
+milliseconds per network call that the sampling loop itself takes, measured with a denoiser that
+returns a stored tensor.
 """
 
 from collections.abc import Callable
@@ -55,14 +56,15 @@ class Counted:
 
 @dataclass(frozen=True)
 class Size:
-    """How much is sampled."""
+    """Number and size of the sampled motions."""
 
     device: str
     frames: int = 60
     latent_dim: int = 128
     num_layers: int = 4
     rounds: int = 5
-    longest: float = 20.0  # seconds above which a run is estimated from one of 10 steps
+    # a run that would take more seconds is estimated from a run of 10 steps
+    longest: float = 20.0
 
 
 def inputs(batch: int, size: Size) -> tuple[Tensor, Tensor, Condition]:
@@ -83,7 +85,10 @@ def options(sampler: str, steps: int) -> SamplerOptions:
 
 
 def latency(denoise: Denoise, size: Size) -> list[Row]:
-    """Returns seconds per run and motions per second by batch size and number of steps, distilled and ancestral."""
+    """Times the distilled and the ancestral sampler by batch size and number of steps.
+
+    Returns seconds per run and motions per second.
+    """
     guided = classifier_free_guidance(denoise, GUIDANCE, FEATURES)
     rows: list[Row] = []
     first: float | None = None
@@ -146,7 +151,7 @@ def samplers(denoise: Denoise, size: Size) -> list[Row]:
 
 
 def loops(size: Size) -> list[Row]:
-    """Returns the host cost of each sampler per network call, at batch 1, and the cost of drawing noise."""
+    """Times the loop of each sampler per network call, at batch 1, and the drawing of noise."""
     fixed, mask, cond = inputs(1, size)
     keep = torch.zeros_like(fixed, dtype=torch.bool)
     keep[:, : size.frames // 4] = True

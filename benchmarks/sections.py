@@ -1,4 +1,7 @@
-"""Form of the benchmarks: each script has a function `measure`, which returns a section of the page of speed."""
+"""Common parts of the benchmarks.
+
+Each script has a function `measure`, which returns a section of the page.
+"""
 
 from __future__ import annotations
 
@@ -23,15 +26,15 @@ QUIET = [
     "callbacks.checkpoints.every_n_steps=1000000",
     "logger=csv",
 ]
-"""Settings of runs whose steps are measured: nothing but steps."""
+"""Settings of runs that only train, for timing their steps."""
 
 
 @dataclass(frozen=True)
 class Settings:
     """What `make bench` passes to each script."""
 
-    quick: bool = False  # tiny sizes, which show only that everything runs
-    device: str = "cpu"  # or cuda
+    quick: bool = False  # tiny sizes, which only show that everything runs
+    device: str = "cpu"  # cpu or cuda
     mdm_repo: str | None = (
         None  # path of a clone of the authors' code, GuyTevet/motion-diffusion-model
     )
@@ -51,7 +54,7 @@ def section(title: str, text: str, summary: str, tables: Mapping[str, Sequence[R
 def ratios(
     times: Mapping[str, float], reference: str, name: str, unit: str = "ms per step"
 ) -> list[Row]:
-    """Returns rows of times in milliseconds, with their ratios to one of them."""
+    """Returns rows of times in milliseconds, with their ratios to the time of one row."""
     return [
         {name: key, unit: 1000 * taken, "ratio": taken / times[reference]}
         for key, taken in times.items()
@@ -103,8 +106,9 @@ def take_turns(
     Args:
         runs: the functions, by name.
         rounds: number of counted calls of each function.
-        device: cuda waits for the GPU at the end of each call.
-        clock: returns seconds; `time.process_time` excludes other programs on the machine.
+        device: with cuda, each call ends when the GPU has finished.
+        clock: function that returns seconds; `time.process_time` excludes other programs on the
+            machine.
     """
     times: dict[str, list[float]] = {name: [] for name in runs}
     for _ in range(rounds + 1):

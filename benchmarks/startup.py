@@ -1,8 +1,9 @@
-"""Startup time of commands: `python benchmarks/startup.py`.
+"""Times the start of commands: `python benchmarks/startup.py`.
 
-`--help` and a misspelled key answer without importing torch. The work itself is minimal (one
-training step, one motion, one replication of eight motions), so that mainly imports and
-preparation are measured. Ratios are relative to `python -c "import torch"`, to compare machines.
+Commands answer `--help` and misspelled keys without importing torch. The work itself is minimal
+(one training step, one motion, one replication of eight motions), so that mainly imports and
+preparation are measured. For comparisons of machines, times are also given relative to `python -c
+"import torch"`.
 """
 
 import itertools
@@ -48,7 +49,7 @@ WORK: dict[str, tuple[list[str], list[str]]] = {
     "sample": ([CHECKPOINT, "text=a person walks", "samples=1", "seconds=0.5"], ["out=samples{}"]),
     "evaluate": ([CHECKPOINT, *EVALUATION], ["seed={}", "out=result{}.json"]),
 }
-"""Words of each command; those in the second list differ from run to run."""
+"""Words of each command. The words in the second list differ from run to run."""
 TORCH = "python -c 'import torch'"
 
 

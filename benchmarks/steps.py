@@ -1,10 +1,10 @@
-"""Training steps in both speeds, compared to the authors' step and to plain PyTorch: `python benchmarks/steps.py`.
+"""Times training steps in both speeds: `python benchmarks/steps.py`.
 
-The full-size step is a step of humanml3d/mdm with lengths as in HumanML3D. The authors' step,
-from a clone of their code, and a plain PyTorch loop, which trains `nn.TransformerEncoder` of the
-same size, take the same clips, padded to 196 frames as in the published codes. Then follow a step
-of every network in its size for CPU runs, and on the CPU the quickstart by the complete
-framework. All take turns in one run.
+The full-size step is a step of humanml3d/mdm with lengths as in HumanML3D. It is compared to the
+authors' step, from a clone of their code, and to a plain PyTorch loop, which trains an
+`nn.TransformerEncoder` of the same size. Both get the same clips, padded to 196 frames as in the
+published codes. Further tables have a step of every network in the size for CPUs and, on the CPU,
+the quickstart in the complete framework. All measurements alternate in one run.
 """
 
 import statistics
@@ -33,7 +33,8 @@ from flame_mdm.training.speed import accelerate
 
 WIDTH, LONGEST = 263, 196
 TOKENS = 30  # tokens of a caption
-ROUNDS, BATCHES = 2, 8  # of the full-size step: each batch is trained on twice by everybody in turn
+# rounds of the full-size step: all implementations train on each batch in turn, twice
+ROUNDS, BATCHES = 2, 8
 BACKBONES = {
     "MDM, encoder": ["synthetic/mdm"],
     "MDM, decoder": ["synthetic/mdm_decoder"],
@@ -47,7 +48,7 @@ SPEEDS = ("reference", "fast")
 
 
 def training_step(task: GeneratorTask, batch: MotionBatch) -> Tensor:
-    """Returns the loss of a step, with a condition of the right shape instead of an encoded text."""
+    """Returns the loss of a step. A condition of the right shape replaces the encoded text."""
     generator = task.generator
     rows, features = len(batch), generator.condition.features
     real = torch.ones(rows, TOKENS, dtype=torch.bool)
@@ -176,7 +177,7 @@ def full_size(settings: Settings) -> tuple[list[Row], str]:
 
 
 def backbones(names: Sequence[str], rounds: int, device: str) -> list[Row]:
-    """Returns a row per network of `BACKBONES`, in its size for CPU runs."""
+    """Returns one row per network of `BACKBONES`, in the size for CPUs."""
     rows: list[Row] = []
     lengths = np.random.default_rng(1).integers(36, 61, 32)
     for name in names:
@@ -201,7 +202,10 @@ def backbones(names: Sequence[str], rounds: int, device: str) -> list[Row]:
 
 
 def quickstart(clips: int, steps: int, rounds: int) -> list[Row]:
-    """Returns a row per speed of the quickstart's step, trained by the complete framework; the speeds take turns."""
+    """Returns one row per speed: the quickstart's step in the complete framework.
+
+    The speeds alternate.
+    """
     times: dict[str, list[float]] = {speed: [] for speed in SPEEDS}
     with tempfile.TemporaryDirectory() as name:
         words = [
@@ -230,7 +234,7 @@ def quickstart(clips: int, steps: int, rounds: int) -> list[Row]:
 
 
 def summary(rows: Sequence[Row]) -> str:
-    """Returns how many times as fast both speeds are as the first row, the slowest peer."""
+    """Returns a sentence on both speeds, compared to the first row, the slowest peer."""
     peer = str(rows[0]["training"]).partition(",")[0]
     reference, fast = (row["times as fast"] for row in rows[-2:])
     return (

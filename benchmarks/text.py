@@ -1,6 +1,7 @@
-"""Speed of text encoding from the cache and with the language model: `python benchmarks/text.py`.
+"""Times text encoding with the language model and from the cache: `python benchmarks/text.py`.
 
-Uses sentence-BERT from the extra `offline`, with tokens, so that nothing is downloaded.
+The language model is sentence-BERT of the extra `offline`, with tokens, so that nothing is
+downloaded.
 """
 
 import itertools

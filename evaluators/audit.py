@@ -1,5 +1,7 @@
 # pyright: standard
-"""Evaluator audit: real motions, perturbed at graded strengths, are measured like generated ones."""
+"""Evaluator audit: perturbs real motions at graded strengths
+and measures them like generated motions.
+"""
 
 from __future__ import annotations
 
@@ -46,14 +48,15 @@ CACHE = 2  # version of the cached metric inputs
 OF_TEXTS = {"text", "text_keys", "captions", "requested"}
 """Inputs that depend on the captions of the motions."""
 AVAILABLE = OF_TEXTS | {"keys", "joints", "mask", "contacts", "generated", "real"}
-"""Inputs that an audit has; metrics that require others are not audited."""
+"""Inputs that an audit has. Metrics that require other inputs are not audited."""
 
 
 def audit(request: EvaluationRequest, cache: Path, resamples: int) -> AuditCard:
-    """Measures perturbations of the motions of a split, with intervals from bootstrap resamples; see docs/audit.md.
+    """Measures perturbed motions of a split,
+    with intervals from bootstrap resamples; see docs/audit.md.
 
-    A killed audit continues with the metric inputs in the folder `cache`. Raises `UserError` if data, protocol and
-    extractor do not match.
+    A killed audit continues with the metric inputs in the folder `cache`. Raises `UserError` if
+    data, protocol and extractor do not match.
     """
     data = open_data(request, None)
     info, representation = data.store.info, data.representation.to(request.device or "cpu")
@@ -118,7 +121,9 @@ def _measured(
     texts: Sequence[Text],
     bar: ProgressBar,
 ) -> dict[str, Any]:
-    """Returns what a card says about the metrics and about each perturbation at each grade."""
+    """Returns the parts of a card:
+    the metrics, and the values of each perturbation at each grade.
+    """
     base = measure(measure.inputs[BASE], texts)
     scores, listed = [measure.scores(measure.inputs[BASE], texts)], []
     for perturbation in perturbations:
@@ -145,7 +150,7 @@ def _measured(
 
 
 def _inputs(evaluator: Evaluator, path: Path, ids: list[str], make: Motions) -> Inputs:
-    """Returns the metric inputs of motions, from the cache or else from one feature pass."""
+    """Returns the metric inputs of motions: cached inputs, or the results of one feature pass."""
     if path.exists():
         return read_npz(path)
     extracted = evaluator.extract(MotionsOf(ids, make()))
@@ -162,7 +167,7 @@ def _inputs(evaluator: Evaluator, path: Path, ids: list[str], make: Motions) -> 
 
 
 def audited_metrics(evaluator: Evaluator) -> dict[str, SampleMetric]:
-    """Returns the metrics of an evaluator whose inputs an audit has, by name."""
+    """Returns the metrics that an audit can compute, because it has all their inputs, by name."""
     metrics = make_metrics(evaluator.metrics)
     return {
         name: metric
@@ -176,10 +181,11 @@ def _named(metric: str, part: str) -> str:
 
 
 class _Measure:
-    """Values of metrics, without resampling and in each bootstrap resample of motions, from cached inputs.
+    """Computes metrics from cached inputs, for all motions and for each bootstrap resample.
 
-    Values of motions or pairs are weighted by how often they are drawn, so candidates of retrieval are not resampled;
-    FID is computed again. Retrieval and diversity are means over all pools and pairs that a protocol may draw.
+    The value of a motion or pair is weighted by the number of times that it is drawn, so the
+    candidates of retrieval are not resampled. FID is computed again for each resample. Retrieval
+    and diversity are means over all pools and pairs that a protocol may draw.
     """
 
     def __init__(
@@ -245,7 +251,9 @@ class _Measure:
         return self.metrics[metric].direction_of(part)
 
     def facts_of(self, name: str) -> dict[str, Any]:
-        """Returns what a card says about a value besides its direction; see `AuditedMetric`."""
+        """Returns the facts about a value that a card states,
+        except its direction; see `AuditedMetric`.
+        """
         metric, _, part = name.partition("/")
         declared = self.metrics[metric]
         return {
@@ -258,7 +266,9 @@ class _Measure:
 
     @property
     def truth(self) -> str | None:
-        """Name of the value that reads every requested attribute exactly; None if no metric does."""
+        """Name of the value that reads every requested attribute exactly;
+        None if there is no such value.
+        """
         exact = {
             name: metric.exact for name, metric in self.metrics.items() if metric.exact is not None
         }
@@ -266,7 +276,9 @@ class _Measure:
 
     @property
     def judges(self) -> dict[str, int]:
-        """Values that judge pairs of motion and text by features, and 1, or -1 if lower values are better."""
+        """Signs of the values that judge pairs of motion and text by features:
+        1, or -1 if lower is better.
+        """
         names = {}
         for name, metric in self.metrics.items():
             if "text" in required_inputs(metric):
@@ -277,7 +289,9 @@ class _Measure:
     def _rows(
         self, name: str, metric: SampleMetric, inputs: Inputs, texts: Sequence[Text]
     ) -> dict[str, Any] | None:
-        """Returns the inputs of a metric, float64, with its readings; None if they are not known."""
+        """Returns the inputs of a metric, float64, with its readings;
+        None if some are unknown.
+        """
         required = set(required_inputs(metric)) | (
             {"generated"} if "generated" in metric.states else set()
         )
@@ -310,7 +324,7 @@ class _Measure:
         }
 
     def _encoded(self, texts: Sequence[Text]) -> Tensor:
-        """Returns features (N, E) of texts, float64; each caption is encoded once."""
+        """Returns features (N, E) of texts, float64; each distinct caption is encoded once."""
         assert self.extractor is not None
         new = {text.caption: text for text in texts if text.caption not in self.encoded}
         if new:
@@ -325,7 +339,9 @@ def _is_audited(metric: SampleMetric, part: str) -> bool:
 
 
 def _interval(values: np.ndarray) -> list[float | None]:
-    """Returns the value and the half width of its 95 % interval; None if it cannot be computed."""
+    """Returns a value and the half width of its 95 % interval;
+    None for values that cannot be computed.
+    """
     pair = [float(values[0]), float(1.96 * values[1:].std())]
     return [float(f"{x:.6g}") for x in pair] if np.isfinite(pair).all() else [None, None]
 
@@ -333,7 +349,9 @@ def _interval(values: np.ndarray) -> list[float | None]:
 def _differences(
     values: Mapping[str, np.ndarray], base: Mapping[str, np.ndarray]
 ) -> dict[str, list[float | None]]:
-    """Returns value and interval, difference from real motions and its interval, by metric."""
+    """Returns for each metric its value and interval,
+    and its difference from real motions with interval.
+    """
     pairs = {
         name: (values.get(name, np.full_like(real, np.nan)), real) for name, real in base.items()
     }
@@ -345,10 +363,12 @@ def _agreement(
     scores: Sequence[Mapping[str, np.ndarray]],
     perturbations: Sequence[Mapping[str, Any]],
 ) -> dict[str, dict[str, float | None]]:
-    """Returns how well metrics of pairs agree with exact attributes, by metric; {} if these are not known.
+    """Returns how well metrics of pairs agree with exact attributes, by metric.
 
-    "auc" is the probability that a pair with every requested attribute has a better score than one without, among real
-    motions and the strongest perturbations of the meaning; "correlation" is Spearman's over all of them and grades.
+    "auc" is the probability that a pair with every requested attribute has a better score than a
+    pair without. Its pairs are real motions and the strongest perturbations of the meaning.
+    "correlation" is Spearman's rank correlation over these perturbations at all grades. Returns
+    {} if the exact attributes are unknown.
     """
     truth = measure.truth
     if truth is None or truth not in scores[0]:

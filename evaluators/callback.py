@@ -22,20 +22,21 @@ from flame_mdm.training.loggers import log_table
 class Evaluate(Callback):
     """Evaluates the model on the validation split under a protocol, and logs val/<protocol>/<metric>.
 
-    Checkpoints can be selected by these values. Dashboards show them with their units, as
-    val/<protocol>/<metric> (<unit>), beside the value of real motions, .../real. With several
-    replications, .../ci is the half width of the 95 % interval. The evaluation runs at the first
-    validation and then at multiples of `every_n_steps`, with averaged weights if the recipe
-    averages them. The motions are divided among all processes.
+    Checkpoints can be selected by these values. Dashboards show each value with its unit, as
+    val/<protocol>/<metric> (<unit>), next to the value of real motions, .../real. With several
+    replications, .../ci is the half width of the 95 % interval.
+
+    The evaluation runs at the first validation and then at multiples of `every_n_steps`. It uses
+    averaged weights if the recipe averages weights. All processes share the motions.
 
     Args:
         protocol: a name in experiments/evaluation, or the path of a file.
-        extractor: file, folder, model in the package or run directory from which the protocol's
-            extractor is loaded, like the key of `flame-mdm evaluate`; None = the protocol's own; "none"
-            skips metrics of features.
+        extractor: source of the protocol's extractor, as in `flame-mdm evaluate`: a file, a
+            folder, a model in the package or a run directory. None = the extractor that the
+            protocol names; "none" = skip metrics that need features.
         samples: motions per replication; None = the protocol's number.
 
-    Raises `UserError` before training begins if the extractor does not exist.
+    Raises `UserError` before training begins, if the extractor does not exist.
     """
 
     def __init__(
@@ -57,7 +58,9 @@ class Evaluate(Callback):
         self.real: dict[str, Value | None] = {}
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Opens protocol and extractor, which fail here if they do not fit the data."""
+        """Opens protocol and extractor,
+        so that a mismatch with the data is reported before training.
+        """
         assert isinstance(pl_module, GeneratorTask)
         data: MotionDataModule = trainer.datamodule  # type: ignore[attr-defined]
         model = pl_module.generator
@@ -103,7 +106,7 @@ class Evaluate(Callback):
                 )
 
     def _add(self, name: str, value: Value, real: Value | None) -> None:
-        """Adds the value by which checkpoints are selected, and the curves of dashboards."""
+        """Adds the value that selects checkpoints, and the curves of dashboards."""
         assert value.mean is not None
         self.values[name] = value.mean
         label = f"{name} ({value.unit})" if value.unit else name
@@ -114,7 +117,8 @@ class Evaluate(Callback):
             self.curves[f"{label}/real"] = real.mean
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        # Computed at the start, since averaged weights are swapped out by now.
+        # The values were computed at the start of the epoch: by now, the averaged weights are
+        # swapped out.
         """Logs the values of the last evaluation."""
         pl_module.log_dict(self.curves)
         pl_module.log_dict(
@@ -124,7 +128,7 @@ class Evaluate(Callback):
 
 
 def _find_extractor(source: str) -> None:
-    """Raises `UserError` if an extractor does not exist, and says how to get it."""
+    """Raises `UserError` if an extractor does not exist; the message says how to get it."""
     try:
         find(source)
     except (UserError, FileNotFoundError) as error:

@@ -1,5 +1,8 @@
 # pyright: standard
-"""Work shared by the processes of an evaluation. Without a process group, there is one process."""
+"""Shares the work of an evaluation among processes.
+
+Without a process group, there is one process.
+"""
 
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -22,12 +25,14 @@ def world_size() -> int:
 
 
 def is_first() -> bool:
-    """Returns whether this process computes metrics, writes files and shows progress."""
+    """Whether this process is the first one,
+    which computes metrics, writes files and shows progress.
+    """
     return world_size() == 1 or dist.get_rank() == 0
 
 
 def shared(value: T) -> T:
-    """Returns the value of the first process, on all of them."""
+    """Returns the value of the first process in every process."""
     box = [value]
     if world_size() > 1:
         dist.broadcast_object_list(box)
@@ -35,7 +40,9 @@ def shared(value: T) -> T:
 
 
 def dealt(function: Callable[[Item], T], items: Sequence[Item]) -> list[T]:
-    """Returns the results for all items, on all processes; of N processes, each computes every N-th result."""
+    """Returns the results for all items in every process;
+    each of N processes computes every N-th result.
+    """
     count = world_size()
     if count == 1:
         return [function(item) for item in items]
@@ -49,9 +56,10 @@ def dealt(function: Callable[[Item], T], items: Sequence[Item]) -> list[T]:
 
 @contextmanager
 def processes(device: str | None) -> Iterator[str]:
-    """Joins the processes started by torchrun, if any, and yields the device: by default, a GPU if there is one.
+    """Joins the process group that torchrun started, if any, and yields the device.
 
-    Raises `UserError` if this machine has no such device.
+    By default, the device is a GPU if this machine has one. Raises `UserError` if this machine
+    lacks the requested device.
     """
     if device is None:
         local = int(os.environ.get("LOCAL_RANK", 0))

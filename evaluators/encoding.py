@@ -1,5 +1,5 @@
 # pyright: standard
-"""Encoding of changed joint positions as features, at their own height."""
+"""Encodes changed joint positions as features, without changing their height."""
 
 from collections.abc import Sequence
 
@@ -13,9 +13,10 @@ Joints = np.ndarray
 
 
 def encode(representation: HumanML, motions: Sequence[Joints]) -> list[np.ndarray]:
-    """Encodes motions as features (F, D) float32, with as many rows as frames, and at their own height.
+    """Encodes motions as features (F, D) float32, with one row per frame and at their own height.
 
-    The encoder needs one more frame, and puts the lowest joint on the floor, which would hide floating and sinking.
+    The encoder of a representation needs one more frame. It also puts the lowest joint on the
+    floor, which would hide floating and sinking; here, the height is restored.
     """
     longer = [torch.from_numpy(np.concatenate([x, 2 * x[-1:] - x[-2:-1]])) for x in motions]
     encoded = []

@@ -1,5 +1,5 @@
 # pyright: standard
-"""Evaluations: real motions are measured first, then motions are generated and measured, and the result is written."""
+"""Evaluations: measure real motions, generate motions, measure them, and write the result."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -34,21 +34,21 @@ SKIPPED = {"extractor": "extractor=none: metrics that need features were not com
 def evaluate(request: EvaluationRequest) -> None:
     """Evaluates a checkpoint, motion files of another system or a baseline, and writes the result file.
 
-    Real motions are measured first. If they do not have the values that the protocol expects,
-    data or extractor are wrong, and nothing is generated. `docs/evaluation.md` is the guide.
+    Real motions are measured first. If they do not have the values that the protocol expects, the
+    data or the extractor is wrong, and nothing is generated. The guide is `docs/evaluation.md`.
 
     Args:
         request: what is evaluated and how; its fields are the keys of `flame-mdm evaluate`.
 
     Raises:
-        UserError: If model, data, protocol and extractor do not match, or real motions miss the
-            expected values.
+        UserError: If model, data, protocol and extractor do not match, or if real motions do not
+            have the expected values.
 
     Example:
         >>> from evaluators.evaluation_request import EvaluationRequest
         >>> evaluate(EvaluationRequest(ckpt="runs/quickstart/default", quick=True))  # doctest: +SKIP
     """
-    if request.out is not None:  # checked here, before hours of work
+    if request.out is not None:  # checked now, before hours of work
         if Path(request.out).is_dir():
             raise UserError(f"out={request.out} is a folder. Name the JSON file to write")
         Path(request.out).parent.mkdir(parents=True, exist_ok=True)
@@ -69,11 +69,14 @@ def evaluate(request: EvaluationRequest) -> None:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A protocol on a split of a data set. If there are several processes, all create and run it together."""
+    """Evaluates a split of a data set under a protocol.
+
+    All processes create and run it together.
+    """
 
     protocol: Protocol  # what is measured
     clips: Clips  # the split
-    # An opened extractor; None = metrics that need features have no value
+    # The opened extractor. With None, metrics that need features have no value.
     extractor: Extractor | None
     representation: Representation  # representation of the motions, on the device to compute on
     seed: int = 0  # seed of all random draws
@@ -89,18 +92,18 @@ class Evaluation:
         force: bool = False,
         resamples: int = 0,
     ) -> Measured:
-        """Evaluates real motions of all replications, and then the motions of the source, if there is one.
+        """Evaluates real motions of all replications, and then the motions of the source.
 
-        Of several processes, each generates and extracts a share of the batches. The first one
-        computes the metrics; all return the result. Raises `UserError` before anything is
-        generated if real motions do not have the expected values, unless `force`.
+        Each process generates a share of the batches and computes their features. The first
+        process computes the metrics; all processes return the result. Raises `UserError` before
+        anything is generated if real motions do not have the expected values, unless `force`.
 
         Args:
             source: source of the motions; None = only real motions are measured.
-            ground_truth: whether real motions are measured, too.
+            ground_truth: whether to measure real motions, too.
             force: whether to generate even if real motions do not have the expected values.
-            resamples: number of sets drawn from the motions of the first replication, for
-                intervals over motions.
+            resamples: number of sets that are drawn from the motions of the first replication,
+                for intervals over motions.
         """
         real_sets, real = self._measure_real(source, ground_truth)
         unexpected = shared(self._unexpected(real.values))
@@ -131,8 +134,8 @@ class Evaluation:
 
     @cached_property
     def evaluator(self) -> Evaluator:
-        """Evaluator of the motions of each replication."""
-        # With extractor=none
+        """The evaluator for the motions of each replication."""
+        # True with extractor=none
         skips = self.extractor is None and self.protocol.extractor is not None
         evaluator = Evaluator(
             self.extractor,
@@ -152,7 +155,7 @@ class Evaluation:
 
     @cached_property
     def several(self) -> Evaluator | None:
-        """Evaluator of several motions per prompt, if the protocol has one."""
+        """The evaluator for several motions per prompt; None if the protocol has no such part."""
         several = self.protocol.multimodality
         return several and replace(self.evaluator, metrics=several.metrics)
 
@@ -169,9 +172,10 @@ class Evaluation:
     def _measure_real(
         self, source: Source | None, ground_truth: bool
     ) -> tuple[list[tuple[Rows, Rows]], Outcome]:
-        """Measures real motions; also returns what the source's motions of each replication are compared with.
+        """Measures real motions, and returns them for comparisons with the source's motions.
 
-        The first entry has the real motions of the same clips, the second a set for comparisons of sets.
+        The comparisons of each replication have two entries: the real motions of the same clips,
+        and a set of real motions for comparisons of sets.
         """
         scores = []
         real_sets = []
@@ -191,8 +195,8 @@ class Evaluation:
                 # Before motions are generated
                 for checked in filter(None, (self.evaluator, self.several)):
                     checked.check(paired)
-                # All replications are kept in memory; joints, the largest part, only if metrics
-                # compare them.
+                # All replications are kept in memory. Joints are the largest part, and are kept
+                # only if metrics compare them.
                 real_sets.append(
                     (
                         paired if self.evaluator.reads("real_joints") else _without_joints(paired),
@@ -228,7 +232,7 @@ class Evaluation:
 
     def _expected(self) -> dict[str, list[float]]:
         """Returns value and tolerance of real motions by metric; {} for other splits than the test split."""
-        # Without test clips (HumanAct12), the training clips are the test split, so they are
+        # A data set without test clips (HumanAct12) is tested on its training clips, so they are
         # checked.
         info = self.clips.store.info
         if self.clips.clips[0].split != "test" and info["clips"]["test"]:
@@ -241,7 +245,9 @@ class Evaluation:
         }
 
     def _conditions(self) -> list[str]:
-        """Returns what restricts the meaning of the values: repeated clips, and bounds that were not checked."""
+        """Returns notes that restrict the meaning of the values:
+        repeated clips, and unchecked values of real motions.
+        """
         lines = []
         clips = len(self.protocol.selected(self.clips))
         drawn = {
@@ -251,12 +257,13 @@ class Evaluation:
         for purpose, count in drawn.items():
             if count is not None and count > clips:
                 lines.append(
-                    f"{count} {purpose} of {clips} clips: clips are repeated, which changes distances of sets"
+                    f"{count} {purpose} of {clips} clips: clips are repeated, which changes the "
+                    f"distances between sets"
                 )
         if self.protocol.resized_samples and self._expected():
             lines.append(
-                "the expected values of real motions were not checked: they hold for the number of motions of the "
-                "protocol alone"
+                "the expected values of real motions were not checked: they hold only for the "
+                "protocol's number of motions"
             )
         if self.protocol.cuts_motions and self._expected():
             lines.append(
@@ -267,7 +274,9 @@ class Evaluation:
     def _measure(
         self, source: Source, real_sets: Sequence[tuple[Rows, Rows]], resamples: int
     ) -> Outcome:
-        """Measures the source's motions of each replication, compared with the real ones."""
+        """Measures the source's motions of each replication,
+        in comparison with the real motions.
+        """
         scores, costs, warnings = [], [], []
         resampled: Mapping[str, list[float | None]] = {}
         for replication, (paired, real) in enumerate(real_sets):
@@ -322,7 +331,10 @@ class Evaluation:
         )
 
     def _generated(self, samples: Samples) -> Motions:
-        """Returns the motions to measure; smooths each over time, without padding, as FLAME's code does."""
+        """Returns the motions to measure.
+
+        Each motion is smoothed over time without padding, as in FLAME's code.
+        """
         sigma, features = self.protocol.smoothing, samples.features
         if sigma is not None:
             features = [gaussian_filter1d(motion, sigma, axis=0) for motion in features]
@@ -352,7 +364,10 @@ class Evaluation:
         features: list[np.ndarray],
         captions: list[str] | None = None,
     ) -> Motions:
-        """Returns motions with the conditions of their rows; `captions` replace the captions of the rows."""
+        """Returns motions with the conditions of their rows.
+
+        `captions`, if given, replace the captions of the rows.
+        """
         condition = self.protocol.condition
         texts = captions or [row.text for row in rows] if condition == "text" else None
         attributes = [row.clip.attributes for row in rows]

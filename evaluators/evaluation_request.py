@@ -1,5 +1,8 @@
 # pyright: standard
-"""The keys of an evaluation. Nothing here imports torch, so that wrong keys are reported at once."""
+"""The keys of an evaluation.
+
+This module does not import torch, so that wrong keys are reported at once.
+"""
 
 from __future__ import annotations
 
@@ -19,19 +22,21 @@ MIN_RESAMPLES = 100
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationKeys:
-    """Keys of an evaluation that are the same on the command line and in Python, with their help texts."""
+    """Keys of an evaluation that the command line and Python share, with their help texts."""
 
     protocol: str | None = option(
         None, "a name in experiments/evaluation, or a file; default: the model decides"
     )
     extractor: str | None = option(
-        None, "a motion-CLIP, or as the protocol requires; none = no extractor"
+        None,
+        "motion-CLIP or another extractor that the protocol requires: a path; none = no extractor",
     )
     smpl: str | None = option(
-        lambda: os.environ.get("FLAME_MDM_SMPL"), "SMPL's model file (.pkl or .npz), for joints"
+        lambda: os.environ.get("FLAME_MDM_SMPL"),
+        "SMPL's model file (.pkl or .npz), to compute joints",
     )
     from_samples: str | None = option(
-        None, "a folder of motions of other systems, instead of ckpt; needs data="
+        None, "a folder with the motions of another system, instead of ckpt; needs data="
     )
     baseline: str | None = option(
         None, "real, shuffled, noisy or static motions, instead of ckpt; needs data="
@@ -39,39 +44,43 @@ class EvaluationKeys:
     split: Literal["train", "val", "test"] = option("test", "train, val or test")
     seed: int = option(0, "seed of the noise and of the drawn motions")
     replications: int | None = option(
-        None, "repetitions of the evaluation, instead of the protocol's number; the result says so"
+        None, "repetitions of the evaluation, instead of the protocol's number; noted in the result"
     )
     samples: int | None = option(
-        None, "motions per replication, instead of the protocol's number; the result says so"
+        None, "motions per replication, instead of the protocol's number; noted in the result"
     )
     resamples: int = option(
-        0, "sets of motions drawn with replacement, for 95 % intervals over motions, such as 200"
+        0,
+        "number of sets of motions, such as 200, that are drawn with replacement for 95 % "
+        "intervals",
     )
     multimodality: bool = option(
-        True, "false = skip metrics that need several samples per prompt; the result says so"
+        True, "false = skip metrics that need several samples per prompt; noted in the result"
     )
     quick: bool = option(
-        False, "two replications of 64 motions, to check that everything works; the result says so"
+        False, "two replications of 64 motions, to check that everything works; noted in the result"
     )
     force: bool = option(
-        False, "generate even if real motions miss the expected values; the result says so"
+        False, "generate even if real motions do not have the expected values; noted in the result"
     )
     method: str | None = same_option(EditRequest, "method")
     until: float | None = same_option(EditRequest, "until")
     strength: float | None = same_option(EditRequest, "strength")
     batch_size: int | None = option(
-        None, "motions per batch; default: 64, or the number in a protocol that measures time"
+        None, "motions per batch; default: 64, or the protocol's number if it measures time"
     )
     device: str | None = option(None, "default: cuda if available")
     data_root: str = option(
         "", "folder of the prepared data sets; default: the checkpoint's, or FLAME_MDM_DATA"
     )
-    out: str | None = option(None, "the JSON file; default: next to the generated motions")
+    out: str | None = option(
+        None, "the JSON file to write; default: a file next to the generated motions"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationRequest(EvaluationKeys):
-    """The keys of `flame-mdm evaluate`, with data set and representation composed.
+    """The keys of `flame-mdm evaluate`, with the composed data set and representation.
 
     Raises `UserError` if keys contradict each other, or a value is out of range.
     """
@@ -84,12 +93,14 @@ class EvaluationRequest(EvaluationKeys):
 
     @property
     def editing(self) -> EditRequest:
-        """How motions are edited, where the protocol edits."""
+        """The options of the edit, for protocols that edit motions."""
         return EditRequest(method=self.method, until=self.until, strength=self.strength)
 
     @classmethod
     def of(cls, config: Config) -> EvaluationRequest:
-        """Returns the request of a mapping from keys to values; keys of the sampler become `options`."""
+        """Creates a request from a mapping of keys to values;
+        keys of the sampler become `options`.
+        """
         kinds = (cls, SamplerOptions)
         keywords, options = (
             {key.name: config[key.name] for key in fields(kind) if key.name in config}

@@ -28,15 +28,18 @@ from flame_mdm.sampling.editing import kept_parts
 from flame_mdm.sampling.motion_request import EditRequest
 from flame_mdm.seeds import key
 
-CHUNK = 64  # motions per metric update; more do not fit into a processor's cache
-FEATURES = {"generated", "real", "text", "logits"}  # inputs of metrics that an extractor provides
+CHUNK = 64  # motions per update of a metric; more motions do not fit into a processor's cache
+# inputs of metrics that come from an extractor
+FEATURES = {"generated", "real", "text", "logits"}
 PAIRED = {
     "generated": "real",
     "joints": "real_joints",
     "nearest": "real_nearest",
     "references": "references",
 }
-"""Inputs of paired real motions -> their names among the inputs of the generated motions."""
+"""Names of the inputs from paired real motions,
+and the names of the same inputs from generated motions.
+"""
 
 
 @dataclass
@@ -46,11 +49,11 @@ class Motions:
     ids: list[str]  # unique names
     features: list[np.ndarray]  # (F, D) float32 each, in the data's units
     captions: list[str] | None = None  # captions of motions with text
-    # "word/PART" tokens of the captions, if the data has them
+    # "word/PART" tokens of the captions, if the data has tokens
     tokens: list[list[str] | None] | None = None
-    # Further inputs, by the names in `evaluators.metrics`
+    # Further inputs by their names in `evaluators.metrics`
     inputs: dict[str, Any] = field(default_factory=dict)
-    # parts kept from real motions: `region` and `joints` of `kept_parts`
+    # the parts kept from real motions: arguments `region` and `joints` of `kept_parts`
     edit: Mapping[str, Any] | None = None
 
     def __len__(self) -> int:
@@ -58,7 +61,9 @@ class Motions:
 
 
 Rows = dict[str, Any]
-"""Metric inputs of N motions by the names in `evaluators.metrics`: tensors or, such as joints, lists of N entries."""
+"""Metric inputs of N motions by their names in `evaluators.metrics`:
+tensors, or lists of N entries (such as joints).
+"""
 
 
 @dataclass
@@ -66,8 +71,8 @@ class Evaluator:
     """Computes metrics of motions, with one feature pass for all metrics.
 
     For the same features, all values are bit-identical for any batch size and order. Several
-    processes share the feature pass, in whole batches, so that features do not depend on their
-    number. The first one computes the metrics.
+    processes share the feature pass. Each process gets whole batches, so that features do not
+    depend on the number of processes. The first process computes the metrics.
 
     Example:
         >>> from flame_mdm.representations.humanml import HumanML
@@ -82,14 +87,17 @@ class Evaluator:
     metrics: Mapping[str, Config]  # mappings with the `_target_` of a metric, by name
     representation: Representation
     batch_size: int = 64
-    # whether metrics of features have no value, instead of raising for lack of input
+    # whether metrics that lack features have no value, instead of raising an error
     skip_features: bool = False
-    # motions that generated ones may be copies of; None = not measured
+    # training motions, to find copies of them among generated motions; None = not measured
     training: TrainingMotions | None = None
 
     @torch.no_grad()
     def extract(self, motions: Motions) -> Rows:
-        """Runs the feature pass over the same motions in all processes; raises `UserError` if one is not finite."""
+        """Computes the metric inputs of motions; all processes pass the same motions.
+
+        Raises `UserError` if a motion is not finite.
+        """
         rows: Rows = {"keys": keys_of(motions.ids), **motions.inputs}
         # Batches of similar lengths need little padding.
         order = np.argsort([len(x) for x in motions.features], kind="stable").tolist()
@@ -124,7 +132,9 @@ class Evaluator:
         return rows
 
     def training_motions(self, whole: Motions, windows: Motions) -> TrainingMotions:
-        """Returns the training motions to which others are compared: all their frames, and features of windows."""
+        """Returns the training motions for comparisons:
+        all their frames, and the features of windows.
+        """
         facing = self.representation.skeleton.facing
         joints = replace(self, extractor=None).extract(whole)["joints"]
         frames = [poses(motion, facing) for motion in joints]
@@ -135,7 +145,9 @@ class Evaluator:
 
     @torch.no_grad()
     def reference(self) -> Rows | None:
-        """Returns features of the extractor's own real motions; None = sets are compared with motions of the data."""
+        """Returns features of the extractor's own real motions;
+        None = sets are compared with the data set.
+        """
         features = self.extractor and self.extractor.reference()
         if features is None:
             return None
@@ -169,7 +181,10 @@ class Evaluator:
         }
 
     def _texts(self, motions: Motions, indices: Sequence[int]) -> Tensor | None:
-        """Returns features of some captions. Every process computes all of them, since extractors cache captions."""
+        """Returns features of captions.
+
+        Every process computes all features, since extractors cache captions.
+        """
         if self.extractor is None or motions.captions is None:
             return None
         tokens = motions.tokens or [None] * len(motions)
@@ -181,12 +196,14 @@ class Evaluator:
     def score(
         self, generated: Rows, paired: Rows, real: Rows, seed: int
     ) -> tuple[dict[str, float | None], dict[str, str]]:
-        """Computes all metrics of generated motions and of the real ones paired with them, in the same order.
+        """Computes all metrics of generated motions and their paired real motions,
+        in the same order.
 
         Comparisons of sets use `real`, a separate draw, since the distance of a set from itself
-        is 0. Returns the values by name, `metric` or `metric/part`, None if not computable; and
-        by metric, why a value is missing. Both are empty in all processes but the first. Raises
-        `UserError` if the motions lack an input that a metric needs.
+        is 0. Returns the values by name (`metric` or `metric/part`), and the reasons for missing
+        values by metric. A value that cannot be computed is None. Both mappings are empty in all
+        processes except the first. Raises `UserError` if the motions lack an input that a metric
+        needs.
         """
         if not is_first():
             return {}, {}
@@ -196,11 +213,12 @@ class Evaluator:
     def resample(
         self, generated: Rows, paired: Rows, real: Rows, seed: int, resamples: int
     ) -> dict[str, list[float | None]]:
-        """Computes all metrics of `resamples` sets of motions drawn with replacement, for a bootstrap; see `score`.
+        """Computes all metrics of `resamples` sets
+        of motions drawn with replacement, for a bootstrap.
 
-        Metrics that compare two sets draw from both. The draws depend only on `seed` and the
-        numbers of motions, so that the same clips are drawn for two models. Returns (resamples,)
-        values by name, like `score`.
+        Metrics that compare two sets draw from both sets. The draws depend only on `seed` and the
+        numbers of motions, so that the same clips are drawn for two models. The arguments are
+        described in `score`. Returns values (resamples,) by name.
         """
         count, others = len(generated["keys"]), len(real["keys"])
         if not is_first() or not count or not resamples:
@@ -224,10 +242,12 @@ class Evaluator:
     def _updated(
         self, generated: Rows, paired: Rows, real: Rows, seed: int
     ) -> tuple[dict[str, SampleMetric], dict[str, SampleMetric]]:
-        """Returns all metrics, updated with the motions, and the metrics that can be computed."""
+        """Returns all metrics after their update with the motions,
+        and the names of computable metrics.
+        """
         metrics = make_metrics(self.metrics, seed=key("metric", seed) % 2**32)
         for metric in metrics.values():
-            # returns False: no synchronization, this process has all motions
+            # returns False: metrics are not synchronized, since this process has all motions
             metric.distributed_available_fn = bool
         count = len(generated["keys"])
         usable = self.check(generated, metrics) if count else {}
@@ -246,16 +266,16 @@ class Evaluator:
 
     @cached_property
     def declared(self) -> dict[str, SampleMetric]:
-        """The metrics by name, for what they declare."""
+        """The metrics by name, for their declarations."""
         return make_metrics(self.metrics)
 
     def unit_of(self, name: str) -> str:
-        """Returns the unit of a value, `metric` or `metric/part`."""
+        """Returns the unit of a value, named `metric` or `metric/part`."""
         metric, _, part = name.partition("/")
         return self.declared[metric].unit_of(part)
 
     def compares_sets(self, name: str) -> bool:
-        """Returns whether a value compares the set of motions with a set of real ones."""
+        """Returns whether a value compares the set of motions with a set of real motions."""
         return isinstance(self.declared[name.partition("/")[0]], TwoSets)
 
     def reads(self, name: str) -> bool:
@@ -267,7 +287,7 @@ class Evaluator:
     ) -> dict[str, SampleMetric]:
         """Returns the metrics that can be computed.
 
-        With `skip_features`, metrics that lack features are left out; otherwise a missing input
+        With `skip_features`, metrics that lack features are left out. Any other missing input
         raises `UserError`.
         """
         available = {
@@ -295,7 +315,7 @@ def keys_of(names: Sequence[str]) -> Tensor:
 
 
 def _chunk(generated: Rows, paired: Rows, part: slice) -> Rows:
-    """Returns the inputs of some motions and of the real ones paired with them, padded, with masks."""
+    """Returns the padded inputs of some motions and of their paired real motions, with masks."""
     rows = {name: values[part] for name, values in generated.items()}
     rows |= {real: paired[name][part] for name, real in PAIRED.items() if name in paired}
     for joints, mask in (("joints", "mask"), ("real_joints", "real_mask")):

@@ -5,21 +5,23 @@ from collections.abc import Sequence
 
 from flame_mdm.data.store import Entry
 
-# Names of the attribute that says what is done; clips without it have no near misses
+# Names of the attribute for the action; clips without it have no near misses
 ACTION = (
     "action",
     "content",
 )
-UNSAID = "normal"  # value that captions do not mention: such captions are less exact, but not wrong
+# value that a caption need not mention: without it, a caption is less exact, but not wrong
+UNSAID = "normal"
 
 _Stated = frozenset[tuple[str, str | int | float]]
 
 
 def near_misses(clips: Sequence[Entry]) -> list[dict[str, list[str]]]:
-    """Returns the near misses of each clip among the captions of the others, sorted, by the attribute that differs.
+    """Returns sorted near misses of each clip, by the attribute that differs.
 
-    A caption of another clip is a near miss if both clips show the same action, and of the attributes that both have
-    (side, style, count, ...), exactly one differs: "walks backward" is a near miss of a slow walk forward.
+    A caption of another clip is a near miss if both clips show the same action, and exactly one
+    differs of the attributes that both clips have (side, style, count, ...). For example, "walks
+    backward" is a near miss of a slow walk forward.
     """
     stated = [_stated(clip) for clip in clips]
     captions: dict[_Stated, set[str]] = {}
@@ -30,7 +32,9 @@ def near_misses(clips: Sequence[Entry]) -> list[dict[str, list[str]]]:
 
 
 def _stated(clip: Entry) -> _Stated:
-    """Returns the attributes of a clip; in its action, they are slots: "wave-left-hand" is "wave-{side}-hand"."""
+    """Returns the attributes of a clip,
+    with slots in the action: "wave-left-hand" is "wave-{side}-hand".
+    """
     stated = {
         name: value
         for name, value in clip.attributes.items()

@@ -1,9 +1,10 @@
 # pyright: standard
-"""Graded perturbations of real motions, to audit evaluators with: what a metric should see, or should ignore.
+"""Graded perturbations of real motions for audits:
+changes that a metric should notice, or ignore.
 
-Each function of joints (F, J, 3) in meters, y up, returns as many frames unless it says
-otherwise. Random draws come from a generator alone, so that the grades of a perturbation share
-theirs.
+Each function takes joints (F, J, 3) in meters, y up, and keeps the number of frames unless its
+docstring says otherwise. All random draws come from a generator, so that the grades of a
+perturbation share their draws.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from flame_mdm.seeds import key
 Draws = np.random.Generator
 GROUND = np.array([1.0, 0.0, 1.0])
 WOBBLE = 1.0  # frequency of the wobble, in Hz
-BLEND = 0.4  # seconds over which the poses of another motion are blended in
+BLEND = 0.4  # seconds over which a motion is blended into another motion
 SHARES = (5, 10, 20, 50, 100)  # grades of replaced motions, in percent
 
 
@@ -39,7 +40,7 @@ def jitter(joints: Joints, millimeters: float, draws: Draws) -> Joints:
 
 
 def wobble(joints: Joints, millimeters: float, draws: Draws, fps: float) -> Joints:
-    """Moves each joint along a line in a random direction, as a sine of 1 Hz with this amplitude."""
+    """Moves each joint along a line in a random direction, as a 1 Hz sine with this amplitude."""
     along = draws.standard_normal(joints.shape[1:])
     phase = draws.uniform(0, 2 * np.pi, (1, joints.shape[1]))
     sine = np.sin(2 * np.pi * WOBBLE / fps * np.arange(len(joints))[:, None] + phase)
@@ -59,13 +60,17 @@ def lift(joints: Joints, centimeters: float) -> Joints:
 
 
 def resize(joints: Joints, percent: float) -> Joints:
-    """Makes all bones longer by this share; the root's track on the floor stays the same, and so does the floor."""
+    """Makes all bones longer by this share,
+    without changing the floor or the root's path on it.
+    """
     ground = joints[:, :1] * GROUND
     return ground + (1 + percent / 100) * (joints - ground)
 
 
 def pop(joints: Joints, centimeters: float, draws: Draws, *, last: bool = False) -> Joints:
-    """Displaces the whole body in one random inner frame, or in the last frame, in a random direction."""
+    """Moves the whole body in a random direction,
+    in one random inner frame or in the last frame.
+    """
     frame = int(draws.integers(1, len(joints) - 1))
     direction = draws.standard_normal(3)
     popped = joints.copy()
@@ -97,12 +102,16 @@ def freeze(joints: Joints, percent: float) -> Joints:
 
 
 def play(joints: Joints, factor: float, fps: float) -> Joints:
-    """Plays the motion faster, which shortens it, or slower, and then cuts it to its length."""
+    """Plays the motion faster, which shortens it,
+    or slower, which is cut to the original length.
+    """
     return resample(joints, fps * factor, fps)[: len(joints)]
 
 
 def through_rate(joints: Joints, rate: float, fps: float) -> Joints:
-    """Resamples to another frame rate and back, linearly; frames past the last new one repeat the last."""
+    """Resamples linearly to another frame rate and back;
+    frames after the last new frame repeat it.
+    """
     back = resample(resample(joints, fps, rate), rate, fps)
     return back[np.minimum(np.arange(len(joints)), len(back) - 1)]
 
@@ -115,8 +124,8 @@ def crop(joints: Joints, percent: float) -> Joints:
 def drop_repetition(joints: Joints, count: int) -> Joints:
     """Cuts one of `count` repetitions out of a motion, which becomes shorter.
 
-    The cut joins the two frames about one period apart, by 20 % at most, whose poses are nearest. The rest moves on
-    from the place before the cut.
+    The cut joins two frames with similar poses: the nearest poses whose distance in time is one
+    period, give or take 20 %. The second part continues from the place of the first part.
     """
     poses = joints - joints[:, :1] * GROUND
     change = np.linalg.norm(np.diff(poses, axis=0), axis=-1).mean(1)
@@ -134,7 +143,8 @@ def drop_repetition(joints: Joints, count: int) -> Joints:
 
 
 def continue_with(joints: Joints, other: Joints, fps: float) -> Joints:
-    """Replaces the second half by the second half of another motion, from the same place.
+    """Replaces the second half with the second half of another motion,
+    starting at the same place.
 
     Poses are blended over `BLEND` seconds.
     """
@@ -147,15 +157,17 @@ def continue_with(joints: Joints, other: Joints, fps: float) -> Joints:
 
 
 BASE, STORED, REAL = "decoded and encoded", "as stored", "reference"
-"""Sets of motions of every audit: `BASE`, with which all perturbed motions are compared;
-`STORED`, the features as stored; and `REAL`, a second draw of real motions for metrics that
-compare sets."""
+"""Sets of motions in every audit.
+
+All perturbed motions are compared with `BASE`. `STORED` has the stored features. `REAL` is a
+second draw of real motions, for metrics that compare sets.
+"""
 
 Inputs = dict[str, np.ndarray]
-"""Metric inputs of N motions by name: features (N, E), and what the metrics read from the motions."""
+"""Metric inputs of N motions by name: features (N, E), and the readings of the metrics."""
 
 Motions = Callable[[], list[np.ndarray]]
-"""Computes a set of N motions, as features (F, D)."""
+"""A function that computes a set of N motions as features (F, D)."""
 
 
 @dataclass(frozen=True)
@@ -163,27 +175,33 @@ class Perturbation:
     """A perturbation of a set of motions, and its grades."""
 
     name: str
-    group: str  # joints, meaning, set or plumbing
+    group: str  # kind of perturbation: joints, meaning, set or plumbing
     about: str
     unit: str = ""  # unit of the grades
-    grades: Sequence[float] = (1,)  # from weak to strong
+    grades: Sequence[float] = (1,)  # the grades, from weak to strong
 
     def offered(self, scene: Scene, captioned: bool) -> Sequence[Perturbation]:
-        """Returns the perturbation with the grades that the motions allow, or several by kind; [] if none is."""
+        """Returns the perturbation with the grades that the motions allow, or one per kind;
+        [] if none is possible.
+        """
         return [self]
 
     def motions(self, scene: Scene) -> dict[str, Motions]:
-        """Returns the sets of motions that `apply` takes from, by name."""
+        """Returns by name the sets of motions from which `apply` selects."""
         return {}
 
     def apply(
         self, scene: Scene, grade: float, sets: Mapping[str, Inputs], texts: Sequence[Text]
     ) -> tuple[Inputs, Sequence[Text]]:
-        """Returns the motions and texts at a grade; pair i belongs to real motion i, with texts[i]."""
+        """Returns the motions and texts at a grade;
+        pair i belongs to real motion i with texts[i].
+        """
         raise NotImplementedError
 
     def order(self, scene: Scene) -> np.ndarray:
-        """Returns the motions (N,) in the order in which they are perturbed, the same at all grades."""
+        """Returns the motions (N,) in the order in which they are perturbed,
+        which is the same at all grades.
+        """
         return scene.draws("order", self.name).permutation(len(scene))
 
 
@@ -192,9 +210,9 @@ class ChangedJoints(Perturbation):
     """Changes the joints of all motions; the draws of a motion are the same at all grades.
 
     Attributes:
-        change: function of joints (F, J, 3), the grade, and the options that `takes` names.
-        takes: options of `change`: "draws", a generator, and "fps", frames per second.
-        sign: multiplies the grade.
+        change: function of joints (F, J, 3), the grade, and the options in `takes`.
+        takes: names of options of `change`: "draws" (a generator) and "fps" (frames per second).
+        sign: factor of the grade, 1 or -1.
     """
 
     change: Callable[..., Joints] = lambda joints, grade: joints
@@ -228,7 +246,7 @@ class ChangedJoints(Perturbation):
 
 @dataclass(frozen=True)
 class ChangedSet(Perturbation):
-    """Replaces all motions; `make` computes the new ones from the scene."""
+    """Replaces all motions; `make` computes the new motions from the scene."""
 
     make: Callable[[Scene], list[np.ndarray]] = lambda scene: scene.features
 
@@ -253,7 +271,9 @@ class ReplacedShare(ChangedSet):
     def apply(
         self, scene: Scene, grade: float, sets: Mapping[str, Inputs], texts: Sequence[Text]
     ) -> tuple[Inputs, Sequence[Text]]:
-        """Returns the motions, of which this share (in percent) is replaced, with the same texts."""
+        """Returns the motions after this share of them (in percent) was replaced,
+        with the same texts.
+        """
         count = round(len(scene) * grade / 100)
         replaced = np.isin(np.arange(len(scene)), self.order(scene)[:count])
         base, other = sets[BASE], sets[self.name]
@@ -272,13 +292,17 @@ class DroppedRepetition(ReplacedShare):
 
 @dataclass(frozen=True)
 class ReplacedCaptions(Perturbation):
-    """Replaces a share of the captions by wrong ones of the kind `name` in `Scene.wrong`, in percent."""
+    """Replaces a share of the captions, in percent,
+    with wrong captions of the kind `name` in `Scene.wrong`.
+    """
 
     unit: str = "% of captions"
     grades: Sequence[float] = (1, 2, 5, 10, 20, 50, 100)
 
     def offered(self, scene: Scene, captioned: bool) -> Sequence[Perturbation]:
-        """Returns a perturbation for each kind of wrong captions that the scene has, up to the share that it has."""
+        """Returns a perturbation for each kind of wrong captions,
+        up to the share of motions that have one.
+        """
         offered = []
         for kind in scene.wrong if captioned else ():
             if kind.partition(":")[0] == self.name:
@@ -290,7 +314,9 @@ class ReplacedCaptions(Perturbation):
     def apply(
         self, scene: Scene, grade: float, sets: Mapping[str, Inputs], texts: Sequence[Text]
     ) -> tuple[Inputs, Sequence[Text]]:
-        """Returns the same motions with texts of which this share (in percent) is replaced."""
+        """Returns the same motions and the texts,
+        of which this share (in percent) is replaced.
+        """
         wrong, replaced = scene.wrong[self.name], list(texts)
         for i in [i for i in self.order(scene) if wrong[i]][: round(len(scene) * grade / 100)]:
             replaced[i] = wrong[i] or texts[i]
@@ -299,7 +325,10 @@ class ReplacedCaptions(Perturbation):
 
 @dataclass(frozen=True)
 class DroppedActions(Perturbation):
-    """Drops a share of the actions, in percent; other motions repeat in their place, with their texts."""
+    """Drops a share of the actions, in percent.
+
+    Other motions are repeated instead, with their texts.
+    """
 
     unit: str = "% of actions"
 
@@ -310,7 +339,9 @@ class DroppedActions(Perturbation):
     def apply(
         self, scene: Scene, grade: float, sets: Mapping[str, Inputs], texts: Sequence[Text]
     ) -> tuple[Inputs, Sequence[Text]]:
-        """Returns the motions of the remaining actions, repeated up to the same number, with their texts."""
+        """Returns motions of the remaining actions with their texts,
+        repeated up to the same number.
+        """
         actions = sorted(set(scene.actions), key=lambda action: key("missing", scene.seed, action))
         gone = set(actions[: max(1, round(len(actions) * grade / 100))])
         kept = [i for i in self.order(scene) if scene.actions[i] not in gone]
@@ -323,7 +354,7 @@ class DroppedActions(Perturbation):
 
 @dataclass(frozen=True)
 class FewerMotions(Perturbation):
-    """Keeps only the first motions, as many as the grade."""
+    """Keeps only the first motions; the grade is their number."""
 
     unit: str = "motions"
 
@@ -340,7 +371,7 @@ class FewerMotions(Perturbation):
 
 
 def base_motions(scene: Scene) -> list[np.ndarray]:
-    """Returns the real motions, decoded and encoded like perturbed ones."""
+    """Returns the real motions, decoded and encoded like perturbed motions."""
     return encode(scene.representation, scene.joints)
 
 
@@ -381,7 +412,9 @@ def _other_half(scene: Scene) -> list[np.ndarray]:
 
 
 def _memorized(scene: Scene) -> list[np.ndarray]:
-    """Returns for each motion a training motion with the same captions or the same action, or the motion itself."""
+    """Returns for each motion a training motion with the same captions or action;
+    otherwise the motion itself.
+    """
     training, copies = scene.data.clips("train"), []
     for row in scene.rows:
         same = [clip for clip in training.clips if clip.captions == row.clip.captions]
@@ -402,7 +435,7 @@ def _through(other: HumanML, scene: Scene) -> list[np.ndarray]:
 
 
 def through_others(representation: HumanML) -> list[Perturbation]:
-    """Returns a perturbation for each other representation of the same skeleton and frame rate."""
+    """Returns one perturbation per other representation with the same skeleton and frame rate."""
     files = sorted((EXPERIMENTS / "representation").glob("humanml*.yaml"))
     others: list[HumanML] = [instantiate(read_yaml(path)) for path in files]
     about, skeleton, fps = (
@@ -418,7 +451,9 @@ def through_others(representation: HumanML) -> list[Perturbation]:
 
 
 def perturbations_of(scene: Scene, captioned: bool) -> list[Perturbation]:
-    """Returns the perturbations that motions and their captions allow; near misses also by attribute."""
+    """Returns all perturbations that the motions and captions allow;
+    near misses also by attribute.
+    """
     listed = [*PERTURBATIONS, *through_others(scene.representation)]
     return [
         offered for perturbation in listed for offered in perturbation.offered(scene, captioned)
@@ -461,4 +496,6 @@ PERTURBATIONS: list[Perturbation] = [
     ChangedJoints("cropped", "plumbing", "end removed", "% of time", (10, 25, 50), crop),
 ]
 # fmt: on
-"""All perturbations, apart from those that depend on the data: near misses by attribute, other representations."""
+"""All perturbations except near misses by attribute and other representations,
+which depend on the data.
+"""

@@ -1,5 +1,5 @@
 # pyright: standard
-"""From the request of an evaluation to its parts: model, data, protocol, extractor, source and file names."""
+"""The parts of an evaluation: model, data, protocol, extractor, source and file names."""
 
 import os
 from pathlib import Path
@@ -32,12 +32,12 @@ class Plan:
     extractor do not match.
 
     Attributes:
-        model, file, sampling: the model, its checkpoint and its sampling options; None and {}
-            without a model.
-        clips, representation: the evaluated split of `data`, and its representation, on its
+        model, file, sampling: the model, its checkpoint and its sampling options. Without a
+            model, they are None, None and {}.
+        clips, representation: the evaluated split of `data`, and the representation on its
             device.
-        skeleton: the bones of joints computed from SMPL's rotations; None if the data has joint
-            positions.
+        skeleton: the source of bone lengths for joints that are computed from SMPL's rotations;
+            None if the data has joint positions.
         protocol, changed: the protocol in the requested size, and the options that differ.
         path: path of the result file.
     """
@@ -98,9 +98,10 @@ class Plan:
         self.path = Path(request.out or path.with_name(f"{path.name}{suffix}.json"))
 
     def _motions_folder(self, request: EvaluationRequest, file: Path, protocol: Protocol) -> Path:
-        """Returns the folder of motions of a checkpoint and options, in its run directory or next to it.
+        """Returns the folder for the motions of a checkpoint with these options.
 
-        Motions of models in this package or on the hub go to runs/NAME in the working directory.
+        The folder is in the run directory of the checkpoint, or next to the checkpoint. Motions
+        of models in this package or on the hub go to runs/NAME in the working directory.
         """
         if not Path(str(request.ckpt)).exists():
             run = Path("runs") / str(request.ckpt)
@@ -114,15 +115,15 @@ class Plan:
         used |= {"data": self.data.store.fingerprint}
         used |= {"batch_size": self.batch_size} if protocol.batch_size else {}
         folder = run / "evaluation" / protocol.title / f"{sha256(file)[:16]}-{digest(used)[:8]}"
-        check_within(folder, run)  # somebody else may have made the run directory
+        check_within(folder, run)  # another user may own the run directory
         return folder
 
 
 def open_data(request: EvaluationRequest, model: MotionGenerator | None) -> MotionDataModule:
-    """Returns the prepared data, with its own representation.
+    """Returns the prepared data with the representation of its store.
 
-    Raises `UserError` if no data set is named, it is not prepared, or the model generates another
-    representation.
+    Raises `UserError` if no data set is named, the data set is not prepared, or the model
+    generates another representation.
     """
     module, encoding, root = request.data, request.representation, "data"
     if model is not None and not module:
@@ -148,7 +149,10 @@ def open_data(request: EvaluationRequest, model: MotionGenerator | None) -> Moti
 
 
 def set_bones(smpl: str | None, representation: Representation) -> UsedSkeleton | None:
-    """Sets the bones of a representation of SMPL's rotations from its model file; without one, a stand-in remains."""
+    """Sets the bones of a representation of SMPL's rotations from SMPL's model file.
+
+    Without this file, the stand-in bones remain.
+    """
     if not isinstance(representation, SMPL | Rot6D):
         return None
     if smpl is None:
@@ -163,7 +167,9 @@ def sampling_options(
     options: SamplerOptions | None = None,
     editing: EditRequest | None = None,
 ) -> tuple[SamplerOptions, dict[str, Any]]:
-    """Returns the options of the sampler and of `Edit`: the requested ones, by default the recipe's."""
+    """Returns the options of the sampler and of `Edit`:
+    the requested values, by default the recipe's values.
+    """
     options, editing = options or SamplerOptions(), editing or EditRequest()
     edit: dict[str, Any] = {}
     if protocol.edit is not None:

@@ -29,13 +29,15 @@ from flame_mdm.seeds import key
 
 FOLDER = EXPERIMENTS / "evaluation"
 QUICK_REPLICATIONS, QUICK_SAMPLES = 2, 64
-CONTEXT_STARTS = 5  # in DiP's code, the context begins at one of this number of first frames
+CONTEXT_STARTS = 5  # DiP's code begins the context at one of this number of first frames
 Count = Annotated[Int, Field(ge=1)]
 
 
 @dataclass(frozen=True)
 class DrawnClip:
-    """A clip, and the frames and caption drawn from it for one motion to generate."""
+    """A clip, with the frames and the caption
+    that were drawn from it for one generated motion.
+    """
 
     #: Unique name of the motion.
     id: str
@@ -47,7 +49,7 @@ class DrawnClip:
     caption: int | None
     #: Name shared by all motions with the same caption and length.
     prompt: str
-    #: Indices of the frames that a model gets and continues; they are not measured.
+    #: Indices of the frames that the model gets and continues. They are not measured.
     context: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
 
     @property
@@ -58,7 +60,9 @@ class DrawnClip:
 
     @property
     def requested(self) -> dict[str, Any]:
-        """The attributes of the clip that rules know; clips with one of `UNREAD` are not scored."""
+        """The attributes of the clip that rules can read;
+        {} for clips with an attribute of `UNREAD`.
+        """
         return {
             name: value
             for name, value in self.clip.attributes.items()
@@ -66,7 +70,7 @@ class DrawnClip:
         }
 
     def tokens(self, caption: str) -> list[str] | None:
-        """Returns the "word/PART" tokens of a caption of the clip, if the data has them."""
+        """Returns the "word/PART" tokens of a caption of the clip, if the data has tokens."""
         tagged = self.clip.attributes.get("tokens")
         return (
             tagged[self.clip.captions.index(caption)]
@@ -89,57 +93,62 @@ class Multimodality(ClosedSchema):
 
 
 class Protocol(ClosedSchema):
-    """A named and versioned evaluation procedure, as a file in experiments/evaluation describes it.
+    """A named and versioned evaluation procedure, described by a file in experiments/evaluation.
 
-    The caption and crop of a clip, and the noise of its generated motion, are functions of (seed,
-    replication, id). Motions are generated at the length of the real clip. Real motions are
-    compared with a second draw of them.
+    The caption and crop of a clip, and the noise of the generated motion, are functions of (seed,
+    replication, id). Motions are generated at the length of the real clip. For the values of real
+    motions, they are compared with a second draw of real motions.
     """
 
     model_config = ConfigDict(strict=True, frozen=True)
 
-    #: Name of the file, with the name of the variant.
+    #: Name of the file and, for variants, the name of the variant.
     name: str
-    #: Raised when the protocol changes; values of different versions are not comparable.
+    #: Number that increases with each change of the protocol. Values of different versions are
+    #: not comparable.
     version: Int
     #: Condition of the generated motions.
     condition: Literal["text", "action", "none"]
-    #: Mapping with the `_target_` of an `Extractor`, and its `path` unless it must be given.
+    #: Mapping with the `_target_` of an `Extractor`, and its `path`, unless the user must give
+    #: the path.
     extractor: Config | None
     #: Mappings with the `_target_` of a metric, by name.
     metrics: dict[str, Config]
     #: Number of repetitions of the evaluation.
     replications: Count
-    #: Motions per replication; clips are drawn at random. None = each clip once.
+    #: Motions per replication, from randomly drawn clips. None = each clip once.
     samples: Count | None = None
-    #: Real motions in comparisons of sets; clips are drawn at random. None = each clip once.
+    #: Real motions in comparisons of sets, from randomly drawn clips. None = each clip once.
     real_samples: Count | None = None
     #: A second evaluation with several motions per prompt.
     multimodality: Multimodality | None = None
-    #: If given, motions are edits of real motions: `region` and `joints` of `kept_parts`.
+    #: If given, motions are edits of real motions; arguments `region` and `joints` of
+    #: `kept_parts`.
     edit: dict[str, Any] | None = None
-    #: Standard deviation, in frames, of a Gaussian filter over time of generated features.
+    #: Standard deviation, in frames, of the Gaussian filter that smooths generated features over
+    #: time.
     smoothing: Number | None = None
-    #: Motions per batch of a protocol that measures time; a first batch is not timed.
+    #: Motions per batch, if the protocol measures time. The first batch is not timed.
     batch_size: Count | None = None
-    #: Which frames a model that continues frames gets. "drawn": the first of the drawn frames,
-    #: which are then not measured. "start": frames of the clip from one of the first five on,
-    #: before motions as long as the drawn frames, as in DiP's code.
+    #: Which frames are given to a model that continues frames. "drawn": the first of the drawn
+    #: frames, which are not measured. "start": as in DiP's code, frames of the clip that begin at
+    #: one of its first five frames; the motion that follows is as long as the drawn frames.
     context: Literal["drawn", "start"] = "drawn"
-    #: Number of frames that the model gets, set by `open_protocol`.
+    #: Number of frames that the model gets; `open_protocol` sets it.
     context_frames: Int = 0
-    #: Attributes that evaluated clips must have; {} = all clips of the split.
+    #: Attributes that evaluated clips must have. {} = all clips of the split.
     only: dict[str, Any] = Field({})
-    #: Values of real motions of the test split, by data set or sha256 of the extractor: metric ->
-    #: [value, tolerance]. If they differ, nothing is generated.
+    #: Expected values of real motions of the test split, by data set or sha256 of the extractor:
+    #: a mapping from metrics to [value, tolerance]. If the measured values differ, nothing is
+    #: generated.
     expected: dict[str, dict[str, Annotated[list[Number], Field(min_length=2, max_length=2)]]] = (
         Field({})
     )
-    #: Whether the evaluation is a quick one, set by `resized`.
+    #: Whether this is a quick evaluation; `resized` sets it.
     quick: bool = False
-    #: Whether the number of motions differs from the number in the file, set by `resized`.
+    #: Whether the number of motions differs from the number in the file; `resized` sets it.
     resized_samples: bool = False
-    #: Hash of the content of the file, set by `load_protocol`.
+    #: Hash of the content of the file; `load_protocol` sets it.
     sha256: str = ""
 
     def resized(
@@ -152,10 +161,10 @@ class Protocol(ClosedSchema):
         quick: bool = False,
         multimodality: bool = True,
     ) -> tuple[Protocol, dict[str, Any]]:
-        """Returns the protocol with another size for a split of `clips`, and the options that changed.
+        """Returns the protocol in another size, and the options that changed.
 
-        A quick evaluation has few motions and replications. `batch_size` is for protocols that
-        measure time.
+        `clips` is the number of clips in the split. A quick evaluation has few motions and
+        replications. `batch_size` only changes protocols that measure time.
         """
         defaults = (
             {"replications": QUICK_REPLICATIONS, "samples": min(QUICK_SAMPLES, clips)}
@@ -188,9 +197,10 @@ class Protocol(ClosedSchema):
     def open_extractor(
         self, path: str | None, representation: Representation, dataset: str
     ) -> Extractor | None:
-        """Opens the extractor at `path`, by default the protocol's; None if none is needed, or `path` is "none".
+        """Opens the extractor at `path`, by default the protocol's extractor.
 
-        Raises `UserError` or `FileNotFoundError` if it is missing, or belongs to another
+        Returns None if the protocol needs no extractor, or if `path` is "none". Raises
+        `UserError` or `FileNotFoundError` if the extractor is missing, or belongs to another
         representation or data set.
         """
         if self.extractor is None or path == "none":
@@ -209,16 +219,18 @@ class Protocol(ClosedSchema):
 
     @property
     def cuts_motions(self) -> bool:
-        """Whether the first frames of motions are not measured, since the model gets them."""
+        """Whether the first frames of motions are cut off before measuring,
+        since the model gets them.
+        """
         return self.context_frames > 0 and self.context == "drawn"
 
     @property
     def title(self) -> str:
-        """Name and version, such as "text_to_motion-1"."""
+        """The name and version, such as "text_to_motion-1"."""
         return f"{self.name}-{self.version}"
 
     def selected(self, clips: Clips) -> list[Entry]:
-        """Returns the clips with the attributes of `only` that are long enough for the context and a frame after it."""
+        """Returns the clips with the attributes of `only` that are longer than the context."""
         shortest = self.context_frames + (CONTEXT_STARTS if self.context == "start" else 1)
         chosen = [clip for clip in clips.clips if self.only.items() <= clip.attributes.items()]
         return [clip for clip in chosen if not self.context_frames or clip.length >= shortest]
@@ -226,9 +238,10 @@ class Protocol(ClosedSchema):
     def rows(
         self, clips: Clips, seed: int, replication: int, *, purpose: str = "generated"
     ) -> list[DrawnClip]:
-        """Returns the motions of one replication; another `purpose` gives another draw of clips, captions and crops.
+        """Returns the motions of one replication.
 
-        Raises `UserError` if the split has no clip to evaluate on.
+        Each `purpose` has its own draw of clips, captions and crops. Raises `UserError` if the
+        split has no suitable clip.
         """
         drawn = () if purpose == "generated" else (purpose,)
         entries = sorted(
@@ -267,7 +280,9 @@ class Protocol(ClosedSchema):
         return rows
 
     def prompts(self, clips: Clips, seed: int, replication: int) -> list[DrawnClip]:
-        """Returns the motions of one replication of multimodality: several for each of the first prompts."""
+        """Returns the motions of one replication of multimodality:
+        several motions for each of the first prompts.
+        """
         assert self.multimodality is not None
         prompts = self.rows(clips, seed, replication)[: self.multimodality.prompts]
         numbers = range(self.multimodality.samples)
@@ -278,7 +293,7 @@ class Protocol(ClosedSchema):
         ]
 
     def count(self, clips: Clips) -> int:
-        """Returns the number of motions that a model generates in the whole evaluation."""
+        """Returns the number of motions that a model generates in a whole evaluation."""
         rows = self.samples or len(self.selected(clips))
         several = None if self.quick else self.multimodality
         again = (
@@ -289,7 +304,11 @@ class Protocol(ClosedSchema):
         return self.replications * rows + again
 
     def check(self, clips: Clips, model: MotionGenerator | None) -> None:
-        """Raises `UserError` if there is no clip, a caption or label is missing, or the model has another condition."""
+        """Checks that the clips and the model fit the protocol.
+
+        Raises `UserError` if there is no clip, a caption or label is missing, or the model has
+        another condition.
+        """
         rows, condition, fault = self.rows(clips, 0, 0), self.condition, ""
         drawn = {
             "text": [row.caption for row in rows],
@@ -312,11 +331,11 @@ def protocol_names(folder: Path = FOLDER) -> list[str]:
 
 
 def protocol_config(name: str) -> Config:
-    """Returns the options of a protocol, named in experiments/evaluation, or of a .yaml file.
+    """Returns the options of a protocol: a name in experiments/evaluation, or a .yaml file.
 
-    A file may hold `variants`. Protocol `editing_in_between` is the variant `in_between` of
-    editing.yaml; its options replace options of the file. Raises `UserError` if there is no such
-    protocol.
+    A file may hold `variants`. For example, protocol `editing_in_between` is the variant
+    `in_between` of editing.yaml; the options of the variant replace options of the file. Raises
+    `UserError` if there is no such protocol.
     """
     path = Path(name) if name.endswith((".yaml", ".yml")) else FOLDER / f"{name}.yaml"
     for file in [path] if path.is_file() else sorted(path.parent.glob("*.yaml")):
@@ -332,23 +351,26 @@ def protocol_config(name: str) -> Config:
 
 
 def _protocols(path: Path) -> dict[str, Config]:
-    """Returns the protocols in a file by name: its own, if it has metrics, and its variants."""
+    """Returns the protocols in a file by name:
+    its variants and, if it has metrics, the file itself.
+    """
     content = read_yaml(path)
     variants = content.pop("variants", {}) if isinstance(content, dict) else None
     if not isinstance(variants, dict) or not all(
         isinstance(variant, dict) for variant in variants.values()
     ):
         raise UserError(
-            f"{path}: not a protocol: it needs keys such as condition and metrics; variants are mappings"
+            f"{path}: not a protocol, which has keys such as condition and metrics; variants "
+            f"are mappings"
         )
     protocols = {f"{path.stem}_{name}": content | variant for name, variant in variants.items()}
     return {path.stem: content} | protocols if "metrics" in content else protocols
 
 
 def load_protocol(name: str, representation: Representation) -> Protocol:
-    """Loads a protocol, see `protocol_config`, for motions of a representation.
+    """Loads a protocol (see `protocol_config`) for motions of a representation.
 
-    Its file may use ${representation.fps}, ${representation.feet}, ${representation.toes} and
+    The file may use ${representation.fps}, ${representation.feet}, ${representation.toes} and
     ${representation.parents}.
     """
     skeleton = representation.skeleton
@@ -373,7 +395,7 @@ def load_protocol(name: str, representation: Representation) -> Protocol:
         raise UserError(f"protocol {name}: {error}") from error
     check(config)
     several = protocol.multimodality
-    make_metrics(several.metrics if several else {})  # raises if one cannot be created
+    make_metrics(several.metrics if several else {})  # raises if a metric cannot be created
     values = _value_names(make_metrics(protocol.metrics))
     for bounds in protocol.expected.values():
         for metric in bounds:
@@ -385,13 +407,13 @@ def load_protocol(name: str, representation: Representation) -> Protocol:
 
 
 def _value_names(metrics: Mapping[str, SampleMetric]) -> list[str]:
-    """Returns the names of all values of metrics: `metric` or `metric/part`."""
+    """Returns the names of all values of the metrics: `metric` or `metric/part`."""
     parts = [(name, part) for name, metric in metrics.items() for part in metric.names or [""]]
     return [f"{name}/{part}" if part else name for name, part in parts]
 
 
 def digest(values: Any) -> str:
-    """Returns the sha256 of values that JSON can hold."""
+    """Returns the sha256 of JSON values."""
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 
@@ -402,7 +424,9 @@ def open_protocol(
     model: MotionGenerator | None,
     **size: Any,
 ) -> tuple[Protocol, dict[str, Any]]:
-    """Returns a protocol that matches a split and a model, and the options changed by `Protocol.resized`."""
+    """Returns a protocol that matches a split and a model,
+    and the options that `Protocol.resized` changed.
+    """
     protocol = load_protocol(name, representation)
     if model is not None:
         protocol = protocol.model_copy(update={"context_frames": model.denoiser.context_frames})
@@ -414,7 +438,7 @@ def open_protocol(
 
 
 def default_protocol(model: MotionGenerator) -> str:
-    """Returns the name of the protocol for a model, by its condition and data set."""
+    """Returns the name of the default protocol for the condition and the data set of a model."""
     condition, dataset = model.conditioned_on, model.facts.get("dataset", "")
     if condition == "none":
         return "unconditioned"

@@ -1,5 +1,5 @@
 # pyright: standard
-"""Results of evaluations: averages over replications, provenance, and what is printed."""
+"""Results of evaluations: averages over replications, provenance, and printed output."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -32,21 +32,23 @@ from flame_mdm.training.start import recipe_changes
 class Scores:
     """Values of all metrics in one replication."""
 
-    # values by name, `metric` or `metric/part`; None if not computable
+    # values by name, `metric` or `metric/part`; None = cannot be computed
     values: Mapping[str, float | None]
     reasons: Mapping[str, str]  # why a value is missing, by metric
-    count: int  # motions
-    # Real motions that sets are compared with, by the names of such values
+    count: int  # number of motions
+    # Numbers of real motions in comparisons of sets, by the names of the values
     real_counts: Mapping[str, int]
     units: Mapping[str, str]  # units of the values by name
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a part of an evaluation measured: real motions, generated ones, or several per prompt."""
+    """Scores of one part of an evaluation:
+    real motions, generated motions, or several per prompt.
+    """
 
     scores: Sequence[Scores] = ()  # scores by replication
-    # By name, see `Value`
+    # Values drawn for intervals over motions, by name; see `Value`
     resampled: Mapping[str, list[float | None]] = field(default_factory=dict)
     warnings: Sequence[str] = ()
     costs: Sequence[Cost] = ()
@@ -54,7 +56,7 @@ class Outcome:
 
     @property
     def values(self) -> dict[str, Value | None]:
-        """Means over replications, None if one has no value."""
+        """Means over replications; None if a replication has no value."""
         table: dict[str, Value | None] = {}
         counts = [scores.count for scores in self.scores]
         for name in self.scores[0].values if self.scores else ():
@@ -76,7 +78,7 @@ class Outcome:
 
     @property
     def reasons(self) -> dict[str, str]:
-        """Why values are missing, by metric."""
+        """Reasons for missing values, by metric."""
         reasons: dict[str, str] = {}
         for scores in self.scores:
             reasons |= scores.reasons
@@ -84,18 +86,19 @@ class Outcome:
 
 
 def mean_ci(values: Sequence[float]) -> tuple[float, float | None]:
-    """Returns the mean of R replications, at least one, and the half width of its 95 % confidence interval.
+    """Returns the mean of R >= 1 replications,
+    and the half width of its 95 % confidence interval.
 
     The half width is 1.96 std / sqrt(R), with R in the denominator of the variance, as in the
-    code of Guo et al. 2022, MDM and MFM. ACTOR's tables show 1.96 times the variance instead. A
-    single replication has no interval.
+    code of Guo et al. 2022, MDM and MFM. ACTOR's tables show 1.96 times the variance instead.
+    With a single replication, there is no interval.
     """
     half = float(1.96 * np.std(values) / len(values) ** 0.5) if len(values) > 1 else None
     return float(np.mean(values)), half
 
 
 def mean_cost(costs: Sequence[Cost]) -> Cost:
-    """Returns the mean cost over replications; None if one of them used no model."""
+    """Returns the mean cost over replications; None if a replication used no model."""
     values = {name: [getattr(cost, name) for cost in costs] for name in Cost.model_fields}
     return Cost(
         **{
@@ -106,7 +109,7 @@ def mean_cost(costs: Sequence[Cost]) -> Cost:
 
 
 def make_result(request: EvaluationRequest, plan: Plan) -> Result:
-    """Returns a result with the provenance of its values, which are still to be measured."""
+    """Returns a result with its provenance; its values are measured later."""
     info, extractor, protocol = plan.data.store.info, plan.extractor, plan.protocol
     device, crop, short = plan.representation.mean.device, plan.data.crop, plan.clips.too_short
     reason = f"{request.split} clips shorter than {crop.min_frames} frames"
@@ -150,12 +153,12 @@ def make_result(request: EvaluationRequest, plan: Plan) -> Result:
 
 
 def _extractor_path(request: EvaluationRequest, plan: Plan) -> str:
-    """Returns what was given as the extractor, or the path that the protocol names."""
+    """Returns the extractor that the user gave, or the path that the protocol names."""
     return request.extractor or str((plan.protocol.extractor or {}).get("path", ""))
 
 
 def _checkpoint(plan: Plan) -> Checkpoint | None:
-    """Describes the checkpoint, and how it was selected from its run, judging by its file name."""
+    """Describes the checkpoint. Its file name shows how it was selected from its run."""
     model, file = plan.model, plan.file
     if model is None or file is None:
         return None
@@ -179,7 +182,10 @@ def _checkpoint(plan: Plan) -> Checkpoint | None:
 
 
 def _overlaps(request: EvaluationRequest, plan: Plan) -> list[str]:
-    """Returns reasons why values are not valid: evaluated clips may be training clips of the model or extractor."""
+    """Returns the reasons why values are not valid.
+
+    Evaluated clips may be training clips of the model or the extractor.
+    """
     evaluated, extractor, reasons = plan.data.store.fingerprint, plan.extractor, []
     trained = {"training data": plan.model.facts.get("fingerprint") if plan.model else None}
     trained["training data of the extractor"] = extractor.fingerprint if extractor else None
@@ -194,7 +200,7 @@ def _overlaps(request: EvaluationRequest, plan: Plan) -> list[str]:
 
 
 def show(result: Result, path: Path) -> None:
-    """Prints a result: its values, intervals and warnings, and the path of its file."""
+    """Prints the values, intervals and warnings of a result, and the path of its file."""
     protocol, data, values = result.protocol, result.data, result.values or {}
     mark = " QUICK RUN, NOT FOR PUBLICATION" if result.quick else ""
     say(f"{protocol.name} version {protocol.version}, {data.dataset} {result.split}{mark}")
@@ -221,23 +227,25 @@ def show(result: Result, path: Path) -> None:
         say(f"not computed: {name}: {reason}")
     if result.stand_in_skeleton:
         say(
-            "warning: joints were computed with a stand-in skeleton. Give SMPL's model file for its own: smpl=FILE"
+            "warning: joints were computed with a stand-in skeleton. Give SMPL's model file for "
+            "SMPL's skeleton: smpl=FILE"
         )
     for reason in result.warnings:
         say(f"warning: {reason}")
     for reason in result.invalid_because:
         say(f"NOT VALID: {reason}")
     if result.audit is not None:
-        say(f"audit of this evaluator, of {result.audit_motions} motions: {result.audit}")
+        say(f"audit of this evaluator, on {result.audit_motions} motions: {result.audit}")
     else:
         say(
-            f"not audited: no one has checked what this evaluator sees. To do so: make audit DATA={data.dataset}"
+            f"not audited: no one has checked which faults this evaluator notices. To do so: "
+            f"make audit DATA={data.dataset}"
         )
     say(f"written: {path}")
 
 
 def _intervals(values: Mapping[str, Value | None]) -> str:
-    """Returns what the intervals are about, as the end of a line; "" if there are none."""
+    """Returns the end of a line that explains the intervals; "" without intervals."""
     shown = [value for value in values.values() if value and value.half is not None]
     if not shown:
         return ""
@@ -247,7 +255,9 @@ def _intervals(values: Mapping[str, Value | None]) -> str:
 
 
 def _cell(value: Value | None, usual: str) -> str:
-    """Formats a value with its interval, if there is one, and with its own numbers of motions if they are unusual."""
+    """Formats a value with its interval, if any,
+    and with its numbers of motions if they are unusual.
+    """
     if value is None or value.mean is None:
         return "-"
     half = f" +- {value.half:.2g}" if value.half is not None else ""

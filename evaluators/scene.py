@@ -16,11 +16,13 @@ from flame_mdm.representations.humanml import HumanML
 from flame_mdm.seeds import key
 
 RANDOM, NEAR = "wrong captions", "near misses"
-"""Kinds of wrong captions: captions of random other motions, and captions that are wrong in one attribute."""
+"""Kinds of wrong captions:
+captions of random other motions, and captions with one wrong attribute.
+"""
 
 
 class Text(NamedTuple):
-    """A caption, its tagged words, and the attributes that it requests."""
+    """A caption, its tagged words, and the requested attributes."""
 
     caption: str
     tokens: Sequence[str] | None
@@ -34,7 +36,9 @@ def text_of(row: DrawnClip, caption: str) -> Text:
 
 @dataclass
 class Scene:
-    """Real motions of a split: the clips, their features (F, D) each, and the seed of all draws."""
+    """Real motions of a split:
+    the clips, the features (F, D) of each clip, and the seed of all draws.
+    """
 
     data: MotionDataModule
     rows: list[DrawnClip]
@@ -63,15 +67,15 @@ class Scene:
         return [row.clip.action or 0 for row in self.rows]
 
     def draws(self, *parts: str | int) -> np.random.Generator:
-        """Returns a generator that is a function of the seed and the parts."""
+        """Returns a random generator, which is a function of the seed and the parts."""
         return np.random.default_rng(key("audit", self.seed, *parts))
 
     @cached_property
     def wrong(self) -> dict[str, list[Text | None]]:
-        """A wrong text for each motion, by kind; None if there is none.
+        """A wrong text for each motion, by kind; None for motions without such a text.
 
-        The kinds are `RANDOM`, `NEAR`, and, if near misses differ in several attributes, "near
-        misses: ATTRIBUTE".
+        The kinds are `RANDOM` and `NEAR`. If near misses differ in several attributes, there is
+        also a kind "near misses: ATTRIBUTE" for each attribute.
         """
         texts = {
             caption: text_of(row, caption) for row in self.rows for caption in row.clip.captions

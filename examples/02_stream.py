@@ -12,8 +12,8 @@ stream = flame_mdm.stream(model, "a person walks forward", seed=0)
 block = next(stream)
 print(block)
 
-stream.change("a person turns left")  # from the next block on
-for block in stream:  # placed in the world after the block before
+stream.change("a person turns left")  # takes effect in the next block
+for block in stream:  # continues the previous block in the world
     print(block, "until second", round(stream.frames / block.fps, 1))
     if stream.frames > 200:
         break

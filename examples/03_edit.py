@@ -1,4 +1,4 @@
-"""Parts of a motion are kept, the others are generated."""
+"""Keeps some parts of a motion and generates the others."""
 
 from pathlib import Path
 

@@ -10,7 +10,7 @@ from evaluators.metrics.samples import SampleMetric
 class Height(SampleMetric):
     """Mean height of the pelvis in meters."""
 
-    states = ("joints",)  # the input, which is kept of every motion
+    states = ("joints",)  # the input that is stored for every motion
     unit = "m"
 
     def value(self, joints: Tensor) -> float:

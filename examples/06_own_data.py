@@ -1,4 +1,4 @@
-"""A folder of motions and captions becomes a data set."""
+"""Turns a folder of motions and captions into a data set."""
 
 import csv
 from pathlib import Path
@@ -17,7 +17,7 @@ MOTIONS = FOLDER / "motions"
 def main() -> None:
     MOTIONS.mkdir(parents=True, exist_ok=True)
 
-    # Your recordings: .bvh, .fbx, .glb, .npz, ... Here, procedural motions stand in.
+    # Your recordings: .bvh, .fbx, .glb, .npz, ... Here, procedural motions take their place.
     with (MOTIONS / "captions.csv").open("w", newline="") as file:
         table = csv.writer(file)
         table.writerow(["id", "text", "license"])

@@ -17,7 +17,8 @@ def run(*words: str) -> None:
 if __name__ == "__main__":  # data sets are prepared by processes that import this file
     run("prepare", "synthetic", "force=true")
 
-    # `quick` checks that everything works: two replications of 64 motions, and the result says so.
+    # `quick` checks that everything works, with two replications of 64 motions; the result notes
+    # this.
     run(
         "evaluate",
         "quickstart",

@@ -16,7 +16,8 @@ def run(*words: str) -> None:
 
 
 if __name__ == "__main__":  # data sets are prepared by processes that import this file
-    # 10 steps only show that it runs. A teacher takes thousands, and a student a fifth of the steps of its teacher.
+    # 10 steps only show that it runs. A teacher takes thousands of steps, a student takes a fifth
+    # of its teacher's steps.
     run("train", "quickstart", f"run.dir={TEACHER}", "condition.pretrain_steps=0")
     run("distill", str(TEACHER), str(STUDENT))
 

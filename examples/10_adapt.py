@@ -11,7 +11,7 @@ CLIPS = FOLDER / "clips"
 
 
 def main() -> None:
-    # Your clips: .bvh, .fbx, .npz, ... Here, walks with raised arms stand in.
+    # Your clips: .bvh, .fbx, .npz, ... Here, walks with raised arms take their place.
     CLIPS.mkdir(parents=True, exist_ok=True)
     model = flame_mdm.load("quickstart")
     for number, motion in enumerate(

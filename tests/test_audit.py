@@ -198,7 +198,7 @@ def test_a_grade_is_seen_from_where_all_stronger_ones_differ_and_findings_are_se
         None, None, rewarded=False, monotone=False
     )
     assert findings(card) == [
-        "No metric sees: still.",
+        "No metric notices: still.",
         "jitter rates better than real motions: noise.",
     ]
 

@@ -113,7 +113,7 @@ def test_what_is_not_paired_has_no_difference(three, tmp_path, capsys, subtests)
         ({"seed": 1}, "not compared: other seed"),
         (
             {"data": result()["data"] | {"frames": [24, 40]}},
-            "not compared: other seed, limits of length or skeleton",
+            "not compared: the seeds, limits of length or skeletons differ",
         ),
         (
             {"invalid_because": ["real motions are off"]},
@@ -123,7 +123,7 @@ def test_what_is_not_paired_has_no_difference(three, tmp_path, capsys, subtests)
             {"values": {"fid": of(4.2, [4.1, 4.3], n=65)}},
             "not compared: no metric has values per replication",
         ),
-        ({"values": result()["values"]}, "evaluate both again; motions are not generated again"),
+        ({"values": result()["values"]}, "evaluate both again. Motions are not generated again"),
         ({"protocol": {"name": "q", "version": 3}}, "q version 3, synthetic test, data abc"),
         ({"extractor": {"sha256": "0" * 64}}, "No evaluation in common"),
     ):

@@ -432,7 +432,7 @@ def test_each_number_carries_its_own_number_of_motions(runs, full, tmp_path):
 def test_more_motions_than_clips_are_said_to_repeat_clips(runs):
     evaluation = runs.evaluation(samples=500)
     assert evaluation._conditions() == [
-        f"500 motions of {len(evaluation.clips)} clips: clips are repeated, which changes distances of sets"
+        f"500 motions of {len(evaluation.clips)} clips: clips are repeated, which changes the distances between sets"
     ]
     assert runs.evaluation(samples=5)._conditions() == []
 

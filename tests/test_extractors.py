@@ -61,7 +61,8 @@ TINY = dict.fromkeys(
 
 def t2m(arrays: Arrays) -> T2MEvaluator:
     state = weights(arrays)
-    mardm = "in/feats" in arrays  # MARDM's evaluator sees 67 features and has statistics of its own
+    # MARDM's evaluator sees 67 features and has statistics of its own
+    mardm = "in/feats" in arrays
     features = 67 if mardm else arrays["in/motions"].shape[2]
     mean, std = (
         torch.from_numpy(arrays[f"in/{n}"]) if mardm else torch.full((features,), v)
@@ -198,7 +199,10 @@ def test_words_have_vectors_and_parts_of_speech(tmp_path, subtests):
     index = tmp_path / "our_vab_idx.pkl"
     for content, message in (
         (index.read_bytes()[:20], r"our_vab_idx\.pkl"),
-        (pickle.dumps({"a": 0}), "not the released GloVe vectors: sos, eos, unk"),
+        (
+            pickle.dumps({"a": 0}),
+            "not the released GloVe vectors, which have one row each for sos, eos, unk",
+        ),
         (pickle.dumps({"unk": 0, "sos": 1, "eos": 99}), "each with a row"),
     ):
         with subtests.test(content=content, message=message):

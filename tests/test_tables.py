@@ -226,9 +226,9 @@ def test_a_recipe_changed_in_place_is_not_ranked_beside_the_recipe(folder):
     assert [lines[name].marks for name in ("MDM", "MFM", "FLAME <b>")] == ["a", "b", "a"]
     assert all(cell is None or cell.rank == 0 for cell in lines["MFM"].cells)
     changes = (
-        "the model differs from the recipe synthetic/mdm: denoiser._target_=my_package.MyDenoiser"
+        "The model differs from the recipe synthetic/mdm: denoiser._target_=my_package.MyDenoiser."
     )
-    assert ("b", f"as a, but {changes}") in part.notes
+    assert ("b", f"As a, with these differences: {changes}") in part.notes
 
 
 def test_changes_of_a_recipe_are_found_in_the_configuration_of_a_model(subtests):
@@ -257,7 +257,7 @@ def test_footnotes_tell_what_was_left_out_the_skeleton_and_how_checkpoints_were_
     change(folder, "MFM", checkpoint={"selected_by": "best val/text_to_motion_t2m/fid"})
     notes = [note for _, note in made(folder).parts[0].notes]
     assert "MFM: best checkpoint by val/text_to_motion_t2m/fid" in notes
-    assert "MDM; FLAME <b>: last checkpoint, not chosen by validation" in notes
+    assert "MDM, FLAME <b>: last checkpoint, not chosen by validation" in notes
     assert "FID of real motions is 0 by construction: clips are taken whole" in rendered(
         made(folder), "md"
     )
@@ -270,9 +270,9 @@ def test_footnotes_tell_what_was_left_out_the_skeleton_and_how_checkpoints_were_
         checkpoint=sampled,
     )
     text = rendered(made(folder), "md")
-    assert "differs from the protocol: samples = 4, seed = 2" in text
+    assert "Differs from the protocol: samples = 4, seed = 2." in text
     assert "sampler ddim, eta 0.5, steps 0, 5, 9" in text
-    words = "; excluded from the data set: 1,191 motions of HumanAct12, as data.source.humanact12 is not given"
+    words = "Excluded from the data set: 1,191 motions of HumanAct12, as data.source.humanact12 is not given."
     assert [words in note for _, note in made(folder).parts[0].notes].count(True) == 1
     lengths = {"fingerprint": "f" * 16, "fps": 20.0, "lengths": [50, 60], "excluded": left_out}
     (folder / "results" / "lengths").mkdir()
@@ -280,20 +280,20 @@ def test_footnotes_tell_what_was_left_out_the_skeleton_and_how_checkpoints_were_
     table = build(
         "x", {"title": "Lengths", "parts": {"All": {"lengths": ["mine"]}}}, folder / "results"
     )
-    assert table.parts[0].notes[1] == ("", f"mine{words}")
+    assert table.parts[0].notes[1] == ("", f"mine: {words}")
     for skeleton, note in (
         (
             {"stand_in": True, "smpl_sha256": None},
-            "joints of a stand-in skeleton, whose bones are not SMPL's",
+            "Joints have the bones of a stand-in skeleton, not SMPL's bones.",
         ),
         (
             {"stand_in": False, "smpl_sha256": "5" * 64},
-            "joints of SMPL's model file, sha256 555555555555",
+            "Joints have the bones of SMPL's model file, sha256 555555555555.",
         ),
         ({"stand_in": False, "smpl_sha256": None}, ""),
     ):
         change(folder, "MDM", skeleton=skeleton)
-        notes = [text for _, text in made(folder).parts[0].notes if "joints of" in text]
+        notes = [text for _, text in made(folder).parts[0].notes if "Joints have" in text]
         assert [note in text for text in notes] == [True] * bool(note)
 
 
@@ -306,7 +306,7 @@ def test_a_missing_extractor_is_noted_beside_a_missing_checkpoint(folder):
     notes = [note for mark, note in part.notes if not mark]
     assert next(line.state for line in part.lines if line.label == "missing") == "no checkpoint"
     assert "missing: make train EXP=synthetic/mdm" in notes
-    note = 'MDM; MFM; FLAME <b>; missing: assets/t2m/kit is missing; see "Extractors" in docs/evaluation.md'
+    note = 'MDM, MFM, FLAME <b>, missing: assets/t2m/kit is missing; see "Extractors" in docs/evaluation.md'
     assert note in notes, "one line for all rows"
 
 
@@ -319,10 +319,15 @@ def test_footnotes_list_what_differs_and_group_rows(folder):
         path.write_text(json.dumps(json.loads(path.read_text()) | reasons | {"seed": number // 2}))
     table = made(folder)
     notes = table.parts[1].notes
-    conditions = "protocol synthetic version 1; test split of synthetic (fingerprint ffffffffffffffff); N = 400, 5 "
-    conditions += "replications; seed 0; extractor sha256 eeeeeeeeeeee; not audited"
-    assert [note for note in notes if note[0]] == [("a", conditions), ("b", "as a, but seed 1")]
-    labels = "MDM (guidance scale 1.0); MDM (guidance scale 2.5)"
+    conditions = "Protocol synthetic, version 1. Data: test split of synthetic (fingerprint ffffffffffffffff). "
+    conditions += (
+        "5 replications with N = 400 motions. Seed 0. Extractor sha256 eeeeeeeeeeee. Not audited."
+    )
+    assert [note for note in notes if note[0]] == [
+        ("a", conditions),
+        ("b", "As a, with these differences: Seed 1."),
+    ]
+    labels = "MDM (guidance scale 1.0), MDM (guidance scale 2.5)"
     assert ("", f"{labels}: NOT VALID: real motions have fid 3, expected 0.002 +- 0.02") in notes
     assert sum("NOT VALID" in note for _, note in notes) == 1
     (line,) = [line for line in rendered(table, "md").splitlines() if line.startswith("- Steps: ")]
@@ -382,7 +387,9 @@ def test_times_are_compared_in_batches_of_the_same_size_alone(folder):
         ["1", "1.000", "velocity", "12.2", "7.5"],
     ]
     assert [line.marks for line in lines] == ["a", "b", "a"]
-    assert "as a, but timed in batches of 64 on cpu" in [note for _, note in part.notes]
+    assert "As a, with these differences: Timed in batches of 64 on cpu." in [
+        note for _, note in part.notes
+    ]
     assert [cell.rank for line in lines if (cell := line.cells[1])] == [1, 0, 1]
     assert "predicts – / – / velocity" in rendered(Table("timed", "", [part]), "md")
 
@@ -445,7 +452,7 @@ def test_rows_are_measured_from_their_checkpoint(trained, data_root, tmp_path, m
     first = files(Path("runs/tables"))
     assert b"elsewhere: make train EXP=synthetic/mdm" in first["mine.md"]
     assert b"ddim, eta 0.5" in first["mine.html"]
-    assert b"differs from the protocol: replications = 1, samples = 4" in first["mine.md"]
+    assert b"Differs from the protocol: replications = 1, samples = 4." in first["mine.md"]
     assert main(["tables", *words]) == 0
     assert "evaluating" not in capsys.readouterr().out
     assert files(Path("runs/tables")) == first
@@ -480,7 +487,7 @@ def test_published_numbers_are_marked_and_ranked_among_themselves(folder, monkey
     assert [line.cells[0].rank for line in reported if line.cells[0]] == [2, 1, 0]
     assert reported[0].options == {"nfe": 1000.0}
     text = rendered(made(folder), "md")
-    assert "†: as reported: Someone, table 1; measured with an evaluator of theirs" in text
+    assert "†: Reported in Someone, table 1. Measured with an evaluator of theirs." in text
     assert "They print percent." in text
     for wrong, message in (
         (
@@ -538,8 +545,8 @@ def test_a_corrected_table_is_ranked_by_its_own_real_row_and_names_its_own_evalu
     }
     assert ranked == {"near": 1, "far": 2, "near, corrected": 1, "far, corrected": 2}
     text = rendered(made(folder), "md")
-    assert "†: as reported: a paper; measured with an evaluator" in text
-    assert "††: as reported: their repository; measured with a corrected evaluator" in text
+    assert "†: Reported in a paper. Measured with an evaluator." in text
+    assert "††: Reported in their repository. Measured with a corrected evaluator." in text
 
 
 def test_a_legend_names_the_rows_that_are_not_ranked(folder, subtests):
@@ -601,9 +608,9 @@ def test_multimodality_is_measured_for_tables_that_show_it_alone(folder):
     ), "as the spec says"
 
     change(folder, "MFM", changed={"multimodality": False})
-    assert "differs from the protocol" not in rendered(made(folder), "md"), "no column shows it"
+    assert "Differs from the protocol" not in rendered(made(folder), "md"), "no column shows it"
     change(folder, "MFM", changed={"samples": 5})
-    assert "differs from the protocol: samples = 5" in rendered(made(folder), "md")
+    assert "Differs from the protocol: samples = 5." in rendered(made(folder), "md")
 
 
 def test_ranks(subtests):
@@ -729,7 +736,7 @@ def test_multimodality_is_computed_if_a_column_shows_it(folder, monkeypatch, sub
             assert main(words) == 0
             assert requests == expected
     page = (folder / "out" / "several.md").read_text()
-    assert "differs from the protocol" not in page
+    assert "Differs from the protocol" not in page
 
 
 def test_a_footnote_states_the_numbers_of_generated_and_of_real_motions(folder):
@@ -739,7 +746,7 @@ def test_a_footnote_states_the_numbers_of_generated_and_of_real_motions(folder):
     put(request_of(folder, "MDM"), folder, content)
     notes = dict(made(folder).parts[0].notes)
     assert any(
-        "N = 64, 5 replications (real motions: N = 378), compared with sets of 378 real motions"
+        "5 replications with N = 64 motions (real motions: N = 378), compared with sets of 378 real motions"
         in text
         for text in notes.values()
     )

@@ -1,6 +1,7 @@
-"""Builds the extension of Blender 4.2 or later, build/flame_mdm-PLATFORM.zip: `make blender [PLATFORM=windows-x64]`.
+"""Builds the extension for Blender 4.2 or later: `make blender [PLATFORM=windows-x64]`.
 
-It samples with the model in this package. Wheels of onnxruntime come from the package index.
+The file is build/flame_mdm-PLATFORM.zip. The extension samples with the model in this package.
+The wheels of onnxruntime come from the package index.
 """
 
 from __future__ import annotations
@@ -23,13 +24,13 @@ from flame_mdm.safe_io import atomic_write, write_json, write_text
 
 SOURCE = Path(__file__).with_suffix("")
 PYTHON = "3.11"
-"""Python of Blender 4.2 to 5.0."""
+"""Python version of Blender 4.2 to 5.0."""
 PLATFORMS = {
     "linux-x64": ("manylinux_2_28_x86_64", "manylinux2014_x86_64"),
     "windows-x64": ("win_amd64",),
     "macos-arm64": ("macosx_14_0_arm64",),
 }
-"""Names of Blender -> tags of wheels."""
+"""Blender's names of platforms, and the tags of their wheels."""
 MODULES = (
     RUNNER,
     *(
@@ -37,7 +38,7 @@ MODULES = (
         for module in (skeleton, names, posture, rig, sys.modules[UserError.__module__])
     ),
 )
-"""Modules that the extension contains as they are here; they need numpy alone."""
+"""Modules that the extension contains unchanged. They require only numpy."""
 
 
 def this_machine() -> str:
@@ -47,7 +48,7 @@ def this_machine() -> str:
 
 
 def build(model: str, out: Path, target: str) -> None:
-    """Writes the extension with a model, for one platform.
+    """Writes the extension with a model for one platform.
 
     Raises:
         UserError: If the platform is unknown, or pip finds no wheels for it.
@@ -62,7 +63,7 @@ def build(model: str, out: Path, target: str) -> None:
         export_onnx(model, folder / "model", half=True)
         (folder / "model" / RUNNER.name).unlink()
         for path in (*MODULES, SOURCE / "__init__.py"):
-            # inside Blender, the extension is not a package of its own name
+            # inside Blender, the extension is imported under another package name
             code = re.sub(
                 r"from flame_mdm\.(\w+\.)*(\w+) import",
                 r"from .\2 import",
@@ -84,13 +85,16 @@ def build(model: str, out: Path, target: str) -> None:
 
 
 def fetch_wheels(folder: Path, target: str) -> None:
-    """Downloads the wheels of onnxruntime, in the version that exported the model, and of what it requires."""
+    """Downloads the wheels of onnxruntime and its requirements.
+
+    The version of onnxruntime is the version that exported the model.
+    """
     names = [
         re.split(r"[^\w-]", line)[0]
         for line in requires("onnxruntime") or []
         if "extra ==" not in line
     ]
-    # Blender has numpy
+    # numpy is part of Blender
     pinned = [f"{name}=={version(name)}" for name in ("onnxruntime", *names) if name != "numpy"]
     command = [
         sys.executable,
@@ -110,7 +114,7 @@ def fetch_wheels(folder: Path, target: str) -> None:
     done = subprocess.run(command, check=False, capture_output=True, text=True)
     if done.returncode:
         reason = (done.stderr.strip().splitlines() or ["no message"])[-1]
-        raise UserError(f"pip cannot fetch wheels of onnxruntime for {target}: {reason}")
+        raise UserError(f"pip cannot download the wheels of onnxruntime for {target}: {reason}")
 
 
 if __name__ == "__main__":

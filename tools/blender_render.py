@@ -1,9 +1,10 @@
-"""Renders frames of motion files that Blender imports, as small PNG files, with Cycles.
+"""Imports motion files in Blender and renders frames with Cycles, as small PNG files.
 
-PYTHON blender_render.py JOB.json, with a Python that has the package bpy (Blender 4.2 or later). The
-job has `width`, `height` and `samples`, and a list of `files`: `path`, `out` (beginning of the names
-of the pictures; _000.png and so on follow), `every` (frames from one picture to the next; 0 = first
-to last in `count` pictures), and `bones` (true = the skeleton without the skin).
+Run `PYTHON blender_render.py JOB.json` with a Python that has the package bpy (Blender 4.2 or
+later). The job has `width`, `height`, `samples`, and a list of `files`. Each file has `path`;
+`out`, the beginning of the names of the pictures, which end in _000.png and so on; `every`, the
+number of frames from one picture to the next (0 = `count` pictures from the first to the last
+frame); and `bones` (true = the skeleton without the skin).
 """
 
 import json
@@ -16,10 +17,11 @@ import bpy  # pyright: ignore[reportMissingImports]
 import mathutils  # pyright: ignore[reportMissingImports]
 
 OPERATORS = {".fbx": bpy.ops.import_scene.fbx, ".glb": bpy.ops.import_scene.gltf}
-BONE = (0.75, 0.18, 0.03, 1)  # color of bones
+BONE = (0.75, 0.18, 0.03, 1)  # color of the bones
 THICK = 0.16  # width of a bone relative to its length
-TILE = 0.5  # meters, size of the squares of the floor
-CAMERA = mathutils.Vector((2.9, -2.9, 1.6))  # meters from the person, who faces -y in Blender
+TILE = 0.5  # size of the floor's squares in meters
+# distance from the person in meters; the person faces -y in Blender
+CAMERA = mathutils.Vector((2.9, -2.9, 1.6))
 
 
 def material(name, color):
@@ -65,12 +67,15 @@ def stage(job):
 
 
 def heads(armature):
-    """Returns positions in the world of the bones of a pose, by name."""
+    """Returns the world positions of the bones' heads in a pose, by name."""
     return {bone.name: armature.matrix_world @ bone.head for bone in armature.pose.bones}
 
 
 def draw_bones(mesh, armature):
-    """Gives a mesh the shape of the bones: each is a double pyramid from its parent's head to its head."""
+    """Gives a mesh the shape of the bones.
+
+    Each bone is a double pyramid from the head of its parent to its own head.
+    """
     points, faces, at = [], [], heads(armature)
     for bone in armature.pose.bones:
         # the bone from a root on the floor to the hips would hide the legs
@@ -103,7 +108,8 @@ def render(job, file):
     scene = bpy.context.scene
     armature = next(item for item in scene.objects if item.type == "ARMATURE")
     skins = [item for item in scene.objects if item.type == "MESH"]
-    for item in [*skins, armature]:  # glTF brings a mesh for the shape of bones, which is no skin
+    # the importer of glTF adds a mesh for the shape of bones, which is not a skin
+    for item in [*skins, armature]:
         is_skin = item.type == "MESH" and any(part.type == "ARMATURE" for part in item.modifiers)
         item.hide_render = bool(file.get("bones")) or not is_skin
     stage(job)

@@ -1,7 +1,7 @@
 """Draws the pictures of docs/engines.md with Blender: `python tools/engine_pictures.py [SET]`.
 
-`FLAME_MDM_BLENDER` names a Python that has the package bpy. With SET, the folder of a set of FBX files, every frame of
-each clip is drawn into SET/frames.
+`FLAME_MDM_BLENDER` names a Python that has the package bpy. SET is the folder of a set of FBX
+files; with it, every frame of each clip is drawn into SET/frames.
 """
 
 import json
@@ -22,8 +22,8 @@ ASSETS = Path(__file__).parents[1] / "docs" / "assets" / "engines"
 RENDER = Path(__file__).with_name("blender_render.py")
 TEXT = "a person walks forward, then waves with the left hand"
 COUNT = 8  # pictures per row
-SIZE = (108, 150)  # of one picture
-SMALL = (84, 112)  # of one picture of a sheet with every frame
+SIZE = (108, 150)  # size of one picture
+SMALL = (84, 112)  # size of one picture of a sheet with every frame
 QUALITY = 82  # of the WebP files
 LABEL = (20, 20, 20)
 CLIPS = ("Walk_Fwd_Start", "Walk_Fwd_Loop", "Walk_Fwd_Stop", "Run_Fwd_Loop", "Turn_90_Left")
@@ -35,7 +35,8 @@ def rendered(
     """Renders files in Blender; returns the pictures of each file, in the order of the frames.
 
     Args:
-        files: `path` and how it is drawn, as `blender_render.py` says; `out` is added here.
+        files: the path and the drawing options of each file, as in `blender_render.py`. This
+            function adds `out`.
         size: width and height in pixels.
         samples: rays per pixel.
         folder: the folder for the pictures.
@@ -71,7 +72,7 @@ def sheet(path: Path, rows: Sequence[Sequence[Path]], labels: Sequence[str]) -> 
 
 
 def draw_files() -> None:
-    """Draws a motion as the skinned person of an FBX and of a GLB file, and as the bones of two rigs."""
+    """Draws a motion as skinned persons (an FBX and a GLB file), and as the bones of two rigs."""
     motion = flame_mdm.generate(flame_mdm.load("quickstart"), TEXT)[0]
     versions = {
         "walk.fbx, rig=unreal": (".fbx", "unreal", False),
@@ -100,7 +101,7 @@ def draw_set() -> None:
 
 
 def draw_frames(folder: Path) -> None:
-    """Draws every frame of all clips of a set with root motion, one file per clip."""
+    """Draws every frame of all clips with root motion in a set, one file per clip."""
     described = json.loads((folder / "set.json").read_text())["clips"]
     paths = [folder / entry["files"]["root_motion"] for entry in described]
     with tempfile.TemporaryDirectory() as temporary:

@@ -1,8 +1,9 @@
-"""Models the mannequin of pictures and files, and writes flame_mdm/visualize/mannequin.npz: python tools/mannequin.py
+"""Models the mannequin of pictures and files: `python tools/mannequin.py`.
 
-The figure contains no third-party data. Ellipses along the bones of `ADULT`, with the widths and depths of an adult of
-1.78 m, are joined by smooth unions into one surface. Its left half is triangulated and simplified; the right half is
-its mirror image. This needs the packages in tools/requirements.txt.
+Writes flame_mdm/visualize/mannequin.npz. The figure contains no third-party data. Its parts have
+elliptic cross sections along the bones of `ADULT`, with the widths and depths of an adult of 1.78
+m. Smooth unions join the parts into one surface. The left half is triangulated and simplified;
+the right half is its mirror image. This script requires the packages in tools/requirements.txt.
 """
 
 from __future__ import annotations
@@ -31,13 +32,17 @@ from flame_mdm.visualize.body import (
 )
 
 A_POSE = {"shoulder": (0, 0, -46), "elbow": (0, -14, 0), "hip": (0, 0, 4), "ankle": (0, 0, -4)}
-"""Degrees about x, y, z from the rest pose of SMPL to the pose in which the mesh is stored, for the left side. Arms
-mostly hang, so the skin is stretched less from here than from outstretched arms."""
+"""Rotations of the left side, in degrees about x, y and z,
+from SMPL's rest pose to the stored pose.
+
+The arms are lowered in the stored pose: arms mostly hang, so the skin is stretched less than from
+outstretched arms.
+"""
 KNUCKLES, CURL = 0.088, 0.034
 """Distance of the knuckles from the wrist, and radius of the arc of the fingers, in meters."""
 CELL = 0.005
 VERTICES = 1150
-"""Number of vertices of a half before it is mirrored."""
+"""Number of vertices of a half, before it is mirrored."""
 SOLE = -0.981
 """Height of the sole below the pelvis."""
 LIPS, EYES = (192, 138, 120), (92, 74, 64)
@@ -47,14 +52,17 @@ ORIGIN, UP = np.zeros(3), np.array([[0, 1, 0], [1, 0, 0], [0, 0, 1.0]])
 
 
 def tube(origin: np.ndarray, axes: np.ndarray, stations: str, power: float = 2.0) -> Field:
-    """Returns the approximate signed distance from a body with elliptic cross sections and round ends.
+    """Returns a function: the approximate signed distance from a tube
+    with elliptic cross sections and round ends.
 
     Args:
-        origin: where the length is 0.
+        origin: the point at length 0.
         axes: (3, 3) rows: the directions of the length and of the two half widths.
-        stations: length, the two coordinates of the center and the two half widths, in millimeters, of several cross
-            sections, separated by semicolons; interpolated without overshoot.
-        power: 2 = ellipses; larger ones are more like rectangles.
+        stations: several cross sections, separated by semicolons: the length, the two coordinates
+            of the center and the two half widths, in millimeters. They are interpolated without
+            overshoot.
+        power: exponent of the cross section; 2 = ellipses, larger values look more like
+            rectangles.
     """
     table = np.array(stations.replace(";", " ").split(), float).reshape(-1, 5) / 1000
     shape = PchipInterpolator(table[:, 0], table[:, 1:])
@@ -78,13 +86,17 @@ def ellipsoid(center: Sequence[float], radii: Sequence[float]) -> Field:
 
 
 def union(first: np.ndarray, second: np.ndarray, blend: float) -> np.ndarray:
-    """Joins two distances; surfaces closer than `blend` meters are rounded into each other."""
+    """Joins two signed distances;
+    surfaces closer than `blend` meters are rounded into each other.
+    """
     share = np.maximum(blend - np.abs(first - second), 0) / blend
     return np.minimum(first, second) - share**2 * blend / 4
 
 
 def pose() -> tuple[np.ndarray, np.ndarray]:
-    """Returns the joints (22, 3) of the stored pose, pelvis at 0, and their world rotations (22, 3, 3)."""
+    """Returns the joints (22, 3) of the stored pose,
+    with the pelvis at 0, and their world rotations (22, 3, 3).
+    """
     joints, turned = np.zeros((22, 3)), np.tile(np.eye(3), (22, 1, 1))
     for joint, parent in enumerate(SMPL22.parents):
         side, _, name = SMPL22.joints[joint].rpartition("_")
@@ -219,7 +231,9 @@ def axes_of_hand(wrist: np.ndarray) -> np.ndarray:
 
 
 def curled(points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns points and normals (V, 3) of the left half with fingers bent into a loose fist."""
+    """Returns the points and normals (V, 3) of the left half,
+    with the fingers bent into a loose fist.
+    """
     joints, turned = pose()
     wrist, axes = joints[JOINT["left_wrist"]], axes_of_hand(turned[JOINT["left_wrist"]])
     local = (points - wrist) @ axes.T
@@ -300,7 +314,9 @@ def gradient(distance: Field, points: np.ndarray) -> np.ndarray:
 
 
 def magnified(points: np.ndarray, inverse: bool = False) -> np.ndarray:
-    """Enlarges head and hand, so that they keep more of the vertices, and shrinks their surroundings in turn."""
+    """Enlarges head and hand and shrinks their surroundings,
+    so that head and hand keep more vertices.
+    """
     joints, turned = pose()
     hand = joints[JOINT["left_wrist"]] + turned[JOINT["left_wrist"]] @ np.array([0.09, 0, 0])
     radii = np.linspace(0, 3, 6001)
@@ -328,7 +344,7 @@ def triangulate(distance: Field) -> tuple[np.ndarray, np.ndarray]:
     points, triangles, _, _ = measure.marching_cubes(values, 0.0, spacing=(CELL,) * 3)
     points = points + [axis[0] for axis in axes]
     share = 1 - 2 * VERTICES / len(triangles)
-    # The result depends on the order of axes; this one keeps the border closed
+    # The result depends on the order of the axes; this order keeps the border closed
     order = np.array([1, 2, 0])
     points, triangles = fast_simplification.simplify(
         np.ascontiguousarray(magnified(points)[:, order], np.float32),
@@ -402,7 +418,7 @@ def skin(points: np.ndarray, parts: dict[str, Field]) -> np.ndarray:
     }
     for name in ("spine1", "spine2", "spine3", "left_collar"):
         share[name] = np.maximum(share[name], on_arm)
-    whole = np.zeros((len(points), 22))  # weight of a joint and all below it
+    whole = np.zeros((len(points), 22))  # weight of a joint and all joints below it
     whole[:, 0] = 1
     for joint, parent in enumerate(SMPL22.parents):
         if parent >= 0 and SMPL22.joints[joint] in share:
@@ -412,7 +428,8 @@ def skin(points: np.ndarray, parts: dict[str, Field]) -> np.ndarray:
         children = [child for child, parent in enumerate(SMPL22.parents) if parent == joint]
         below = whole[:, children].sum(1)
         too_much = np.maximum(1, below / np.maximum(whole[:, joint], 1e-9))
-        for child in children:  # joints on both sides of the middle share what their parent has
+        # joints on both sides of the middle share the weight of their parent
+        for child in children:
             for joint_below in descendants(child):
                 weights[:, joint_below] /= too_much
         weights[:, joint] = whole[:, joint] - below / too_much
@@ -477,7 +494,7 @@ def make() -> dict[str, np.ndarray]:
     points, normals = curled(points, normals)
     normals = np.concatenate([normals, normals[beside] * flip])
     near = normals[triangles].sum(1)
-    # Folds are softer than the surface's gradient
+    # Softer normals in folds than the gradient of the surface
     np.add.at(normals, triangles.ravel(), np.repeat(near, 3, axis=0))
     return packed(
         np.concatenate([points, points[beside] * flip]),

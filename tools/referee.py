@@ -1,20 +1,25 @@
-"""Calibrates the referee on captioned motions: writes its thresholds, and prints how often its verdicts are right.
+"""Calibrates the referee on captioned motions:
+writes its thresholds and prints how often it is right.
 
-    python tools/referee.py data/bandai-humanml-clean-smpl22 data/cmu-humanml-clean-smpl22 ... [figures=FILE.json]
+python tools/referee.py data/bandai-humanml-clean-smpl22 data/cmu-humanml-clean-smpl22 ... [figures=FILE.json]
 
-docs/benchmarks/referee_calibration.json holds the figures of this repository, and `tools/referee_page.py` shows them.
+The figures of this repository are in docs/benchmarks/referee_calibration.json;
+`tools/referee_page.py` shows them.
 
-Takes prepared data sets on SMPL's 22 joints. Recordings are split in two halves by a hash of their names: thresholds
-come from one half, figures from the other. Sums over both halves are "crossed": each half is judged with thresholds of
-the other one. Procedural motions set no thresholds, their figures are separate.
+The arguments are prepared data sets with SMPL's 22 joints. A hash of their names splits the
+recordings into two halves. Thresholds come from one half, figures from the other half. Sums over
+both halves are "crossed": each half is judged with the thresholds of the other half. Procedural
+motions set no thresholds, and have separate figures.
 
-A claim of a caption is taken to be true of its motion, and a falsified claim (another side, direction or speed, one
-repetition more or fewer, the reverse order, another duration, the other end of the motion) to be false. Captions are
-sometimes wrong, which the figures include.
+A claim of a caption counts as true of its motion. A falsified claim counts as false: it states
+another side, direction or speed, one repetition more or fewer, the reverse order, another
+duration, or the other end of the motion. Captions are sometimes wrong, and the figures include
+their errors.
 
-Captions hardly state durations. A recording whose captions state nothing but that the body walks, runs or stands still
-is cut to two, three and four seconds, so that "for three seconds" is true of it. A body that walks is taken to stand at
-the start and at the end. Claims about durations and ends set no thresholds.
+Captions hardly ever state durations. If the captions of a recording only state that the body
+walks, runs or stands still, the recording is cut to two, three and four seconds, so that "for
+three seconds" is true of the cut. A walking body is assumed to stand at the start and at the end.
+Claims about durations and ends set no thresholds.
 """
 
 import re
@@ -40,15 +45,16 @@ from flame_mdm.sampling.referee.sentences import read_claims
 from flame_mdm.seeds import key
 
 RECORDING = re.compile(r"\d{2,3}_\d{2,3}")
-FEWEST = 10  # claims from which thresholds are calibrated
-MOST_REFUSED = 0.015  # share of true claims of the first half that may be judged false
-LEAST_REFUSED = 0.95  # share of decided falsified claims of the first half to be judged false
+FEWEST = 10  # minimum number of claims to calibrate a threshold
+MOST_REFUSED = 0.015  # maximum share of the first half's true claims that are judged false
+# minimum share of the first half's decided falsified claims that are judged false
+LEAST_REFUSED = 0.95
 SYNTHETIC = "synthetic"
 UNCALIBRATED = ("count", "duration", "start", "end")
 LASTING = ("walk", "run", "stand still")
 BESIDE = {"travel", "veer", "pace"}
-"""Claims beside which a body may walk or run from the first to the last frame."""
-MOST_SYNTHETIC = 600  # procedural motions, of the test split
+"""Claims that do not exclude that the body walks or runs from the first to the last frame."""
+MOST_SYNTHETIC = 600  # procedural motions of the test split
 HEAD = """# Thresholds of the referee by kind of claim, written by `tools/referee.py`: the score up to which a claim is
 # false, the score from which it is true, and the numbers of true and falsified claims that they come from. The units
 # are stated by the functions in `postures.py` and `movements.py`; a score is negative if less speaks for the claim.
@@ -57,7 +63,7 @@ HEAD = """# Thresholds of the referee by kind of claim, written by `tools/refere
 
 @dataclass(frozen=True)
 class Example:
-    """A motion, its captions, the set and the half that it belongs to, and its name."""
+    """A motion with its name, its captions, its data set and its half of the recordings."""
 
     dataset: str
     half: int
@@ -68,9 +74,10 @@ class Example:
 
 @dataclass(frozen=True)
 class Case:
-    """A claim about a motion, and what was changed in it: "" = nothing, so that it is true.
+    """A claim about a motion, and the change that falsified it;
+    "" = no change, so the claim is true.
 
-    `is_built` says that the claim is from `built_cases`, not from a caption.
+    `is_built`: whether the claim comes from `built_cases`, not from a caption.
     """
 
     example: Example
@@ -84,7 +91,7 @@ def main(folders: Sequence[Path], figures: Path | None) -> None:
     cases = [case for example in examples for case in cases_of(example)]
     cases += [case for example in examples for case in built_cases(example)]
     halves = [[case for case in cases if case.example.half == half] for half in (0, 1)]
-    # The last calibration is the one that stays
+    # The calibration on this half comes last, so its thresholds remain
     calibrate(halves[1])
     other = tally(halves[0])
     calibrate(halves[0])
@@ -126,7 +133,9 @@ def read(folder: Path) -> Iterator[Example]:
 
 
 def cases_of(example: Example) -> list[Case]:
-    """Returns the claims of all captions of a motion, and their falsified versions, without repetitions."""
+    """Returns the claims of all captions of a motion
+    and their falsified versions, without duplicates.
+    """
     claims = {str(claim): claim for text in example.captions for claim in read_claims(text)}
     cases = []
     for claim in claims.values():
@@ -139,7 +148,9 @@ def cases_of(example: Example) -> list[Case]:
 
 
 def built_cases(example: Example) -> list[Case]:
-    """Returns claims about durations, the start and the end that are assumed to be true, and falsified ones."""
+    """Returns claims about durations, the start and the end:
+    claims assumed to be true, and falsified claims.
+    """
     if example.dataset == SYNTHETIC:
         return []
     sets = [{claim.kind for claim in read_claims(text)} for text in example.captions]
@@ -168,7 +179,7 @@ def cut(example: Example, seconds: int) -> Example:
 
 
 def calibrate(cases: Sequence[Case]) -> None:
-    """Writes the thresholds of all kinds for which there are enough claims."""
+    """Writes the thresholds of all kinds with enough claims."""
     kinds.FILE.unlink(missing_ok=True)
     kinds.thresholds.cache_clear()
     scores: defaultdict[str, tuple[list[float], list[float]]] = defaultdict(lambda: ([], []))
@@ -194,10 +205,12 @@ def calibrate(cases: Sequence[Case]) -> None:
 
 
 def chosen(true: np.ndarray, wrong: np.ndarray, no: float, yes: float) -> tuple[float, float]:
-    """Returns the scores up to which claims are false and from which they are true.
+    """Returns two thresholds: claims are false up to the first score,
+    and true from the second score.
 
-    The first is the one set by hand, lowered until at most `MOST_REFUSED` of the true claims are judged false. The
-    second is raised until `LEAST_REFUSED` of the falsified claims that are decided are judged false.
+    The first threshold is set by hand and lowered until at most `MOST_REFUSED` of the true claims
+    are judged false. The second threshold is raised until `LEAST_REFUSED` of the decided
+    falsified claims are judged false.
     """
     refused = int(MOST_REFUSED * len(true))
     lowest = float(np.sort(true)[refused])
@@ -212,7 +225,7 @@ def chosen(true: np.ndarray, wrong: np.ndarray, no: float, yes: float) -> tuple[
 
 
 def tally(cases: Sequence[Case]) -> list[dict[str, Any]]:
-    """Returns how many true and falsified claims are decided, and how many rightly, by set and group."""
+    """Counts true and falsified claims, decided claims and right verdicts, by set and group."""
     counts: defaultdict[tuple[str, str], dict[str, int]] = defaultdict(
         lambda: dict.fromkeys(
             ("true", "true_decided", "true_right", "false", "false_decided", "false_right"), 0
@@ -239,7 +252,9 @@ def tally(cases: Sequence[Case]) -> list[dict[str, Any]]:
 
 
 def name_of(claim: Claim) -> str:
-    """Returns the kind of a claim, and whether it is about a duration, the start or the end."""
+    """Returns the kind of a claim,
+    with a mark for claims about a duration, the start or the end.
+    """
     if claim.seconds is not None:
         return f"{claim.kind}, duration"
     return f"{claim.kind}, {claim.when}" if claim.when else claim.kind
@@ -248,7 +263,9 @@ def name_of(claim: Claim) -> str:
 def crossed(
     rows: Sequence[dict[str, Any]], other: Sequence[dict[str, Any]]
 ) -> list[dict[str, Any]]:
-    """Returns the sums of `tally` over both halves, each with the thresholds of the other one."""
+    """Returns the sums of `tally` over both halves,
+    each judged with the thresholds of the other half.
+    """
     sums: defaultdict[tuple[str, str], dict[str, int]] = defaultdict(lambda: defaultdict(int))
     for row in (*rows, *other):
         for name, value in row.items():
@@ -269,7 +286,9 @@ def by_set(examples: Sequence[Example]) -> dict[str, list[Example]]:
 
 
 def coverage(examples: Sequence[Example]) -> dict[str, Any]:
-    """Returns the numbers of captions, of captions with a claim, and of captions with a decided claim."""
+    """Returns three numbers: captions, captions with a claim,
+    and captions with a decided claim.
+    """
     captions = with_claim = with_decided = 0
     for example in examples:
         for text in example.captions:

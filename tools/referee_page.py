@@ -19,12 +19,12 @@ this folder.
 
 ## Right verdicts on real motions
 
-Thresholds come from one half of the recordings, these figures from the other half. A claim of a caption is taken to be
-true of its motion. A falsified claim states the other side, direction or speed, one repetition more or fewer, the
-reverse order, another duration, or the other end of the motion, and is taken to be false. Wrong captions count as
-errors. Patterns and measurements were corrected while the errors on both halves were known, so that the figures are
-optimistic for other data. The last correction concerns CMU: "kicking his legs" was read as both legs at the same time,
-which made one of 30 decided claims false (96.7 %). It was corrected after it had been seen.
+Thresholds come from one half of the recordings, these figures from the other half. A claim of a caption counts as true
+of its motion. A falsified claim states the other side, direction or speed, one repetition more or fewer, the reverse
+order, another duration, or the other end of the motion, and is taken to be false. Wrong captions count as errors.
+Patterns and measurements were corrected while the errors on both halves were known, so that the figures are optimistic
+for other data. The last correction concerns CMU: "kicking his legs" was read as both legs at the same time, which made
+one of 30 decided claims false (96.7 %). It was corrected after it had been seen.
 
 CMU's captions come from HumanML3D's test split and from KIT-ML, for the recordings at hand. Bandai-Namco's captions
 are templates of its labels, so that its many clips have few different sentences. Read the sets one by one.
@@ -48,7 +48,7 @@ def read(name: str) -> dict[str, Any]:
 
 
 def share(right: int, total: int) -> str:
-    """Returns a share in percent and the number that it is of; "" of nothing."""
+    """Returns a share in percent and its total, such as "50.0 % of 8"; "–" if the total is 0."""
     return f"{100 * right / total:.1f} % of {total}" if total else "–"
 
 
@@ -89,7 +89,9 @@ def calibration_tables(rows: list[dict[str, Any]]) -> list[str]:
 
 
 def crossed_table(by_name: Mapping[tuple[str, str], dict[str, Any]]) -> list[str]:
-    """Returns the figures over both halves of the recordings, each with the thresholds of the other half."""
+    """Returns the figures of both halves of the recordings,
+    each judged with the other half's thresholds.
+    """
     lines = [
         "",
         "Both halves of the recordings, each judged with thresholds from the other half:",
@@ -114,7 +116,7 @@ def crossed_table(by_name: Mapping[tuple[str, str], dict[str, Any]]) -> list[str
 
 
 def built_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Returns the figures of built claims about durations, starts and ends."""
+    """Returns the figures of built claims about durations, the start and the end."""
     lines = [
         "",
         "Captions hardly state a duration, a start or an end. These claims are built, not written by people: a",
@@ -136,7 +138,10 @@ def built_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def below_the_targets(kinds: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Returns the kinds of which fewer than 97 % of true, or 90 % of falsified claims, are judged rightly."""
+    """Returns the kinds of claims below the targets.
+
+    The targets are right verdicts on 97 % of true claims and 90 % of falsified claims.
+    """
     missed = [
         f"{row['group'].removeprefix('kind ')} ({side}: {share(right, decided)})"
         for row in kinds

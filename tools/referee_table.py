@@ -1,10 +1,11 @@
-"""Compares systems by the referee and by R-precision: writes docs/benchmarks/referee_systems.json.
+"""Compares systems by the referee and by R-precision, in docs/benchmarks/referee_systems.json.
 
     python tools/referee_table.py [data/bandai-humanml-clean-smpl22 ... runs/bandai/mdm_small/default ...]
 
-On clips of the synthetic test split: motions of the package's model, the real motions, their mirror images, and real
-motions with the captions of others. R-precision is `MotionsForText` with the package's motion-CLIP. Prepared data sets
-on SMPL's 22 joints are added without R-precision, and runs trained on them as rows of models.
+Four systems are compared on clips of the synthetic test split: motions of the package's model,
+the real motions, their mirror images, and real motions with captions of other motions.
+R-precision is `MotionsForText` with the package's motion-CLIP. The arguments add prepared data
+sets with SMPL's 22 joints, without R-precision, and models that were trained on them.
 """
 
 import sys
@@ -32,8 +33,8 @@ from flame_mdm.seeds import key
 OUT = Path(__file__).resolve().parents[1] / "docs" / "benchmarks" / "referee_systems.json"
 FPS = 20.0
 COUNT = 128  # motions per row
-CLIPS = 1600  # synthetic clips, of which the test split is taken
-LONGEST = 3.0  # seconds of the longest motion of the package's model
+CLIPS = 1600  # number of synthetic clips; their test split is used
+LONGEST = 3.0  # duration in seconds of the longest motion of the package's model
 REAL, MIRRORED, SHUFFLED = "real motions", "mirrored real motions", "captions of other motions"
 
 Joints = Sequence[np.ndarray]
@@ -87,7 +88,7 @@ def synthetic() -> tuple[list[str], list[np.ndarray], list[str]]:
 
 
 def stored(folder: Path) -> tuple[list[str], list[np.ndarray], list[str]]:
-    """Returns ids, joints and first captions of clips of the test split of a prepared data set."""
+    """Returns ids, joints and first captions of test clips of a prepared data set."""
     store = Store(folder)
     representation = instantiate(read_yaml(EXPERIMENTS / "representation" / "humanml_clean.yaml"))
     clips = [clip for clip in store.clips if clip.split == "test" and clip.id[0] != "M"]
@@ -110,7 +111,11 @@ def label(run: Path) -> str:
 
 
 def sampled(run: Path, joints: Joints, captions: Sequence[str]) -> list[np.ndarray]:
-    """Returns motions (F, 22, 3) of a run for captions, each as long as a motion, up to `LONGEST` seconds."""
+    """Returns motions (F, 22, 3) that a run generates for captions,
+    each as long as a real motion.
+
+    The maximum is `LONGEST` seconds.
+    """
     seconds = [min(LONGEST, len(motion) / FPS) for motion in joints]
     model = flame_mdm.load(run)
     motions = flame_mdm.generate(model, captions, seconds=seconds, seed=0, split=False)
@@ -118,7 +123,9 @@ def sampled(run: Path, joints: Joints, captions: Sequence[str]) -> list[np.ndarr
 
 
 def baselines(joints: Joints, captions: list[str]) -> Mapping[str, tuple[Joints, list[str]]]:
-    """Returns real motions, mirrored motions, and real motions with captions of others, by name."""
+    """Returns by name real motions, mirrored motions,
+    and real motions with captions of other motions.
+    """
     mirrored = [SMPL22.mirror(torch.from_numpy(motion)).numpy() for motion in joints]
     order = np.random.default_rng(0).permutation(len(captions))
     shuffled = list(captions)
@@ -137,7 +144,9 @@ def measured(
     captions: Sequence[str],
     extractor: MotionCLIPExtractor | None,
 ) -> dict[str, Any]:
-    """Returns the claim accuracy, by group, and the R-precision of motions; None without an extractor."""
+    """Returns the claim accuracy by group,
+    and the R-precision, which is None without an extractor.
+    """
     keys = torch.tensor([key(name) for name in ids])
     lengths = torch.tensor([len(motion) for motion in motions])
     joints = torch.zeros(len(motions), int(lengths.max()), 22, 3)

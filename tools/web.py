@@ -56,13 +56,13 @@ from flame_mdm.visualize.player import player_page
 from flame_mdm.visualize.render import thumbnail
 
 SOURCE = Path(__file__).with_suffix("")
-# The stream on a page, which the demo may share
+# The page of streams, which the demo may share
 LIVE = [Path(flame_mdm.demo.__file__).with_name(name) for name in ("live.js", "live.css")]
 RUNTIME, INTEGRITY = (
     "onnxruntime-web@1.30.0",
     "q0y+JrrtukXSzsBWEMccVfqX25LRmosXHF+CaRJmg8pZClzcV7svNc4rKY3jL02Vb7QmRMDs1SigqR4CXAfKYQ==",
 )
-"""Package of npm and the SHA-512 of its archive."""
+"""The npm package and the SHA-512 of its archive."""
 RUNTIME_FILES = ("ort.wasm.min.mjs", "ort-wasm-simd-threaded.mjs", "ort-wasm-simd-threaded.wasm")
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; base-uri 'none'; form-action 'none'"
@@ -70,7 +70,9 @@ POLICY = (
 
 
 def build(model: MotionGenerator, out: Path) -> None:
-    """Writes the page of a model with a learned text encoder, captions of single actions and SMPL's 22 joints.
+    """Writes the page of a model.
+
+    The model must have a learned text encoder, captions of single actions and SMPL's 22 joints.
 
     Raises:
         UserError: If the model's captions do not name single actions, or onnxruntime-web cannot be fetched.
@@ -106,9 +108,11 @@ def build(model: MotionGenerator, out: Path) -> None:
 
 
 def write_language(out: Path) -> None:
-    """Writes `language.json` and `language.bin`: the tables by which the page understands texts.
+    """Writes `language.json` and `language.bin`,
+    the tables with which the page understands texts.
 
-    `language.bin` has the vectors of the words, of 8 bits per number, followed by the words.
+    `language.bin` contains the vectors of the words, with 8 bits per number, followed by the
+    words.
     """
     arrays = read_npz(vectors.FILE)
     count, dimensions = arrays["vectors"].shape
@@ -124,7 +128,9 @@ def write_language(out: Path) -> None:
 
 
 def language_constants() -> dict[str, Any]:
-    """Returns the constants of `flame_mdm.conditions.language` that the page needs besides its tables."""
+    """Returns the constants of `flame_mdm.conditions.language`
+    that the page needs in addition to the tables.
+    """
     return {
         "vowels": morphology.VOWELS,
         "never_corrected": spelling.NEVER_CORRECTED,
@@ -157,7 +163,9 @@ def language_constants() -> dict[str, Any]:
 
 
 def write_pictures(out: Path, actions: Sequence[str]) -> None:
-    """Writes a picture of each action that the synthetic set has, and their names to `pictures.json`."""
+    """Writes a picture of each action of the synthetic set,
+    and the names of the pictures to `pictures.json`.
+    """
     (out / "pictures").mkdir(exist_ok=True)
     pictures = {}
     for number, action in enumerate(actions):
@@ -172,7 +180,9 @@ def write_pictures(out: Path, actions: Sequence[str]) -> None:
 
 
 def figure(example: Motion) -> dict[str, Any]:
-    """Returns what the page needs to dress a motion with the mannequin: numbers of the example's body."""
+    """Returns the body of the example motion,
+    with which the page draws motions as the mannequin.
+    """
     body, names = fit_body(example), list(SMPL22.joints)
     offsets = np.asarray(example.posed().offsets)
     helpers = []
@@ -200,21 +210,21 @@ def _quaternions(turns: np.ndarray) -> list[list[float]]:
 
 
 def fetch_runtime(folder: Path) -> None:
-    """Fetches onnxruntime-web by npm.
+    """Downloads onnxruntime-web with npm.
 
     Raises:
-        UserError: If npm is missing or fails, or the archive is not the pinned one.
+        UserError: If npm is missing or fails, or if the archive is not the pinned archive.
     """
     if shutil.which("npm") is None:
-        raise UserError("make web needs npm, which fetches onnxruntime-web: install Node.js")
+        raise UserError("make web needs npm to download onnxruntime-web. Install Node.js")
     with tempfile.TemporaryDirectory() as temporary:
         command = ["npm", "pack", RUNTIME, "--silent", "--pack-destination", temporary]
         if subprocess.run(command, check=False, stdout=subprocess.DEVNULL).returncode:
-            raise UserError(f"npm cannot fetch {RUNTIME}. Is the registry reachable?")
+            raise UserError(f"npm cannot download {RUNTIME}. Is the registry reachable?")
         (archive,) = Path(temporary).iterdir()
         if base64.b64encode(hashlib.sha512(archive.read_bytes()).digest()).decode() != INTEGRITY:
             raise UserError(
-                f"{RUNTIME}: the archive of npm is not the pinned one (its SHA-512 differs)"
+                f"{RUNTIME}: npm's archive is not the pinned archive (its SHA-512 differs)"
             )
         folder.mkdir(exist_ok=True)
         with tarfile.open(archive) as packed:

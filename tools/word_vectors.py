@@ -3,12 +3,13 @@
     pip install "flame-mdm[offline]"
     python tools/word_vectors.py [OUT.npz]
 
-The method is model2vec's (Tulkens & van Dongen 2024): each word is encoded by itself, and principal components reduce
-the outputs to `WIDTH` numbers. Words are encoded after "a person", so that a word that is both a verb and a noun has
-the meaning of the verb: of the words for actions, the nearest word to 83 % of the most certain third is one for the
-same action, instead of 69 %. Frequent words count less in a mean of several words (smooth inverse frequency, Arora et
-al. 2017), which `flame_mdm.conditions.language.vectors` computes from the rank of a word. Vectors have length 1 and 8
-bits per number.
+The method is model2vec (Tulkens & van Dongen 2024): each word is encoded alone, and principal
+components reduce the outputs to `WIDTH` numbers. Words are encoded after "a person", so that a
+word that is both a verb and a noun has the meaning of the verb. This was checked on the most
+certain third of the words for actions: for 83 % of them, the nearest word means the same action;
+without "a person", for 69 %. Frequent words count less in a mean of several words (smooth inverse
+frequency, Arora et al. 2017); `flame_mdm.conditions.language.vectors` computes the weight from
+the rank of a word. Vectors have length 1, and 8 bits per number.
 
 The words are the first `FREQUENT` whole words of BERT's vocabulary, which is sorted by frequency, and the words of
 `actions.yaml`, `phrases.yaml` and `MOTION`. Model and vocabulary are under the Apache License 2.0.
@@ -79,7 +80,9 @@ def main(out: Path) -> None:
 
 
 def listed(model: Pretrained) -> list[str]:
-    """Returns the words of the table: frequent ones by frequency, then words for motion and things."""
+    """Returns the words of the table:
+    frequent words by frequency, then words for motion and things.
+    """
     ranks = model.tokenizer.get_vocab()
     frequent = sorted((word for word in ranks if WORD.fullmatch(word)), key=ranks.__getitem__)[
         :FREQUENT
@@ -95,7 +98,9 @@ def listed(model: Pretrained) -> list[str]:
 
 
 def encoded(model: Pretrained, words: list[str]) -> np.ndarray:
-    """Returns the outputs (N, C) of the model for single words: the mean over tokens, special ones included."""
+    """Returns the model's outputs (N, C) for single words:
+    means over tokens, including special tokens.
+    """
     texts = [f"a person {word}" for word in words]
     outputs = []
     for first in range(0, len(texts), AT_ONCE):

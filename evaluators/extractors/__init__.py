@@ -34,9 +34,10 @@ from flame_mdm.seeds import key
 class Extractor(ABC):
     """A network that computes features of motions, and of texts if it supports them."""
 
-    # Of its weights or files. Values of extractors with different hashes are not comparable.
+    # Hash of the weights or files. Values from extractors with different hashes are not
+    # comparable.
     sha256: str
-    # fingerprint of the data that the network was trained on, if known
+    # fingerprint of the training data, if known
     fingerprint: str | None = None
 
     @abstractmethod
@@ -45,20 +46,26 @@ class Extractor(ABC):
 
     @abstractmethod
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
-        """Returns "features" (B, E) of motions, and "logits" (B, A) of classifiers.
+        """Returns "features" (B, E) of motions; classifiers also return "logits" (B, A).
 
-        Motions are `features` (B, F, D) in the data's units, and joints (B, F, J, 3) in meters, y
-        up, with mask (B, F).
+        Motions are passed as `features` (B, F, D) in the data's units and as joints (B, F, J, 3)
+        in meters, y up, with mask (B, F).
         """
 
     def texts(
         self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]
     ) -> Tensor | None:
-        """Returns features (B, E) of captions with "word/PART" tokens, if known; None if it does not read text."""
+        """Returns features (B, E) of captions, whose "word/PART" tokens are passed if known.
+
+        Returns None if the extractor does not read text.
+        """
         return None
 
     def reference(self) -> Tensor | None:
-        """(N, E) features of real motions that belong to the network, to compare sets with; None = the data set's."""
+        """Features (N, E) of the network's own real motions, for comparisons of sets.
+
+        None = sets are compared with motions of the data set.
+        """
         return None
 
 
@@ -66,11 +73,14 @@ TrainedTask = TypeVar("TrainedTask", bound=ExtractorTask)
 
 
 class OwnExtractor(Extractor, Generic[TrainedTask]):
-    """A network trained with `make train`, loaded from its checkpoint; raises `UserError` if it holds another one."""
+    """A network trained with `make train`, loaded from its checkpoint.
+
+    Raises `UserError` if the checkpoint holds another kind of model.
+    """
 
     task: TrainedTask
     trained: type[TrainedTask]
-    recipes: str  # folder of the recipes that train it
+    recipes: str  # folder of the recipes that train the network
 
     def __init__(self, path: str, device: str | torch.device = "cpu"):
         self.path = find(path)
@@ -89,7 +99,7 @@ class OwnExtractor(Extractor, Generic[TrainedTask]):
             )
 
     def reads(self, other: Representation) -> bool:
-        """Returns whether the network reads motions in a representation."""
+        """Whether the network reads motions in this representation."""
         trained = self.task.representation
         return (trained.name, trained.fps, trained.features) == (
             other.name,
@@ -120,9 +130,11 @@ class MotionCLIPExtractor(OwnExtractor[MotionCLIPTask]):
 
     @torch.no_grad()
     def fit(self, motions: Sequence[Motion]) -> list[float]:
-        """Returns how well motions fit their texts: the cosine similarity, its mean over the parts of a motion.
+        """Returns how well motions fit their texts:
+        the mean cosine similarity over the parts of a motion.
 
-        A motion-CLIP overrates motions that it has selected: evaluate such motions with a different one.
+        A motion-CLIP overrates motions that it has selected: evaluate such motions with a
+        different motion-CLIP.
         """
         scores = []
         for motion in motions:
@@ -142,15 +154,17 @@ class OwnT2MExtractor(OwnExtractor[T2MTask]):
     trained, recipes = T2MTask, "t2m"
 
     def reads(self, other: Representation) -> bool:
-        """Returns whether the network reads motions in a representation, also if it sees only their common part."""
+        """Whether the network reads motions in this representation,
+        or at least the features that both share.
+        """
         trained = self.task.representation
         is_part = (other.part_of, other.fps) == (trained.name, trained.fps)
         reads_part = is_part and self.task.network.used <= other.features
         return reads_part or super().reads(other)
 
     def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
-        """Returns features (B, E) of captions, from their words or, if the extractor reads these,
-        from their tagged words.
+        """Returns features (B, E) of captions, from their words or,
+        if the extractor reads tags, from their tagged words.
         """
         return self.task.text(
             list(map(words, captions)) if self.task.learns_words else _tagged(self.path, tokens)
@@ -180,7 +194,9 @@ def _tagged(path: Path, tokens: Sequence[Sequence[str] | None]) -> list[Sequence
 
 
 class ReleasedExtractor(Extractor, Generic[Network]):
-    """A network with the weights that its authors released, from a folder of `FILES`, or from one file."""
+    """A network with its authors' released weights,
+    loaded from one file or from a folder of `FILES`.
+    """
 
     FILES: tuple[str, ...] = ()
     network: Network
@@ -195,7 +211,7 @@ class ReleasedExtractor(Extractor, Generic[Network]):
         missing = [str(file) for file in files if not file.is_file()]
         if missing:
             raise FileNotFoundError(
-                f"{', '.join(missing)}: no such file. Give the path of what the authors released"
+                f"{', '.join(missing)}: no such file. Give the path of the authors' release"
             )
         hashes = [sha256(file) for file in files]
         self.sha256 = (
@@ -219,11 +235,12 @@ class ReleasedExtractor(Extractor, Generic[Network]):
 
 
 class T2MExtractor(ReleasedExtractor[T2MEvaluator]):
-    """The evaluator of Guo et al. 2022, or MARDM's first evaluator, as released, from a folder with five files.
+    """The released evaluator of Guo et al.
+    2022, or MARDM's first one, from a folder with five files.
 
-    They are finest.tar (from text_mot_match/model), mean.npy and std.npy (t2m_... in MDM, kit_...
-    for KIT, eval_... in MARDM), our_vab_data.npy and our_vab_idx.pkl (GloVe). `full_length` is a
-    legacy option, see `WordVectors`.
+    The files are finest.tar (from text_mot_match/model), mean.npy and std.npy (t2m_... in MDM,
+    kit_... for KIT, eval_... in MARDM), our_vab_data.npy and our_vab_idx.pkl (GloVe).
+    `full_length` is a legacy option, see `WordVectors`.
     """
 
     FILES = ("finest.tar", "mean.npy", "std.npy", "our_vab_data.npy", "our_vab_idx.pkl")
@@ -250,7 +267,8 @@ class T2MExtractor(ReleasedExtractor[T2MEvaluator]):
 
 
 class MARDMClipExtractor(ReleasedExtractor[MARDMClip]):
-    """The second evaluator of MARDM as released, for its CLIP-score: `MotionCLIPScore` of its features.
+    """The released second evaluator of MARDM.
+    Its CLIP-score is the `MotionCLIPScore` of its features.
 
     The files are finest.tar (from text_mot_match_clip/model), mean.npy and std.npy (eval_mean and
     eval_std).
@@ -276,17 +294,19 @@ CLASSIFIERS: dict[str, tuple[type[ActionGRU | UESTC | Unconstrained], str | None
     "humanact12_unconstrained": (Unconstrained, None, "humanact12"),
     "uestc": (UESTC, None, "uestc"),
 }
-"""Released action classifiers: network, key of the weights in its file, and data set. The
-authors' files are action_recognition_model_humanact12.tar (humanact12_gru.tar in MDM),
-humanact12_gru_modi_struct.pth.tar (not a GRU despite its name) and uestc_rot6d_stgcn.tar."""
+"""Released action classifiers: the network, the key of the weights in its file, and the data set.
+
+The authors' files are action_recognition_model_humanact12.tar (humanact12_gru.tar in MDM),
+humanact12_gru_modi_struct.pth.tar (not a GRU despite its name) and uestc_rot6d_stgcn.tar.
+"""
 
 
 class ClassifierExtractor(ReleasedExtractor[ActionGRU | UESTC | Unconstrained]):
-    """A released action classifier, one of `CLASSIFIERS`, which reads rotations or joints of 24 SMPL joints.
+    """A released action classifier (one of `CLASSIFIERS`) of 24 SMPL joints or their rotations.
 
-    `random_start` is a legacy option of Guo et al. 2020 and all later work: the initial state of
-    the humanact12 GRU is drawn from a normal distribution, separately for features and scores;
-    here, as a function of the motion.
+    `random_start` is a legacy option, as in Guo et al. 2020 and all later work: the initial state
+    of the humanact12 GRU is drawn from a normal distribution, separately for features and scores.
+    Here, the draw is a function of the motion.
     """
 
     def __init__(
@@ -305,7 +325,9 @@ class ClassifierExtractor(ReleasedExtractor[ActionGRU | UESTC | Unconstrained]):
         )
         self.made_for, self.random_start = ("rot6d-25", dataset), random_start
         if random_start and network is not ActionGRU:
-            raise UserError(f"random_start: the classifier {kind} is not recurrent")
+            raise UserError(
+                f"random_start: the classifier {kind} is not recurrent and has no initial state"
+            )
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
         """Returns "features" (B, E) and "logits" (B, actions) of motions, with mask (B, F)."""

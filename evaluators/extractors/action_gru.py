@@ -10,11 +10,11 @@ NUM_ACTIONS = 12
 
 
 class ActionGRU(nn.Module):
-    """Action classifier with two GRU layers over joint positions; it classifies the state at the last real frame.
+    """Action classifier with two GRU layers over joint positions.
 
-    The released weights provide the features and the accuracy in every HumanAct12 table. The
-    authors draw the initial state from a normal distribution in every call; here, `state`
-    (layers, B, hidden) is zero, unless it is passed.
+    It classifies the state at the last real frame. The released weights provide the features and
+    the accuracy in every HumanAct12 table. The authors draw the initial state from a normal
+    distribution in every call. Here, the initial `state` (layers, B, hidden) is zero by default.
     """
 
     features = 30

@@ -1,5 +1,7 @@
 # pyright: standard
-"""Training of action classifiers, whose features measure action-to-motion on data sets without a released one."""
+"""Training of action classifiers,
+to evaluate action-to-motion on data sets without a released classifier.
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -23,7 +25,9 @@ from flame_mdm.representations import Representation
 
 
 class ClassifierTask(ExtractorTask[ActionGRU | JointSTGCN]):
-    """Trains an action classifier of joint positions, in any representation (`make train EXP=classifier/...`)."""
+    """Trains an action classifier on the joints
+    of any representation (`make train EXP=classifier/...`).
+    """
 
     noun = "an action classifier"
 
@@ -66,11 +70,13 @@ class ClassifierTask(ExtractorTask[ActionGRU | JointSTGCN]):
     def _classified(self, batch: MotionBatch) -> tuple[Tensor, Tensor]:
         assert batch.action is not None
         joints = self.representation.to_joints(batch.x)
-        past_end = ~batch.mask[..., None, None]  # features of 0 in the padding may not be a pose
+        past_end = ~batch.mask[..., None, None]  # zeros in the padding may not decode to a pose
         return self.network.logits(joints.masked_fill(past_end, 0), batch.mask), batch.action
 
     def on_validation_epoch_start(self) -> None:
-        """Gives all processes the running statistics of the first, which checkpoints contain."""
+        """Copies the running statistics of the first process,
+        which checkpoints contain, to all processes.
+        """
         if world_size() > 1:
             for buffer in self.network.buffers():
                 torch.distributed.broadcast(buffer, 0)

@@ -14,7 +14,9 @@ from flame_mdm.conditions.text import Pretrained
 from flame_mdm.denoisers.layers import sinusoid
 
 CLIP = ("openai/clip-vit-base-patch32", "3d74acf9a28c67741b2f4f2ea7635f0aaf6f0268")
-"""CLIP's tokenizer on the Hugging Face hub, the same for all sizes, and its commit."""
+"""CLIP's tokenizer on the Hugging Face hub,
+which is the same for all model sizes, and its commit.
+"""
 
 
 def _transformer(width: int, heads: int, hidden: int, layers: int) -> nn.TransformerEncoder:
@@ -40,7 +42,10 @@ class _MotionEncoder(nn.Module):
 
 
 class MARDMClip(nn.Module):
-    """Embeds the essential features of motions, with `mean` and `std` (67,), and captions, as vectors of length 1."""
+    """Embeds the essential features of motions, and captions, as vectors of length 1.
+
+    `mean` and `std` (67,) normalize the features.
+    """
 
     mean: Tensor
     std: Tensor

@@ -31,22 +31,25 @@ from flame_mdm.denoisers.layers import Transformer, with_prefix
 from flame_mdm.errors import UserError
 from flame_mdm.representations import Representation
 
-POOL = 32  # pairs per pool in which validation ranks, as in R-precision
+POOL = 32  # number of pairs in a pool, as in R-precision
 
 
 class MotionCLIP(nn.Module):
-    """A transformer over [CLS, length, frame 1, frame 2, ...], and a linear map of the text encoder's pooled vector.
+    """A transformer over [CLS, length, frame 1, frame 2, ...],
+    and a linear map of the pooled text vector.
 
-    The features are not scaled to length 1, since Fréchet distance and MID use them unscaled. The
-    temperature is learned, with an initial value of 0.07.
+    The features are not scaled to length 1, since Fréchet distance and MID use unscaled features.
+    The temperature is learned; its initial value is 0.07.
 
     Args:
-        in_features, text_features, embedding_dim: D of the motions, C of the pooled condition, E
-            of the joint space.
-        blind_features: number of features at the beginning of each frame that are set to 0. It is
-            3 in FLAME's code, whose motions begin with the root's translation: scores do not
+        in_features: number D of features per frame of the motions.
+        text_features: number C of features of the pooled condition.
+        embedding_dim: number E of features in the joint space.
+        blind_features: number of features at the beginning of each frame that are set to 0.
+            FLAME's code sets 3: each frame begins with the root's translation, so scores do not
             depend on position and height.
-        roughness: whether absolute second differences over time are inputs, too. They show noise.
+        roughness: whether absolute second differences over time, which show noise, are inputs,
+            too.
     """
 
     def __init__(
@@ -67,8 +70,8 @@ class MotionCLIP(nn.Module):
         super().__init__()
         self.max_frames, self.blind_features, self.roughness = max_frames, blind_features, roughness
         self.cls = nn.Parameter(torch.randn(latent_dim))
-        # Row 0, unused in the authors' code, embeds the length of the longest motion: see the
-        # FLAME denoiser.
+        # Row 0, which the authors' code does not use, embeds the length of the longest motion;
+        # see the FLAME denoiser.
         self.length_embedding = nn.Embedding(max_frames, latent_dim)
         self.input = nn.Linear((1 + roughness) * in_features, latent_dim)
         self.transformer = Transformer(latent_dim, ff_size, num_layers, num_heads, dropout, nn.ReLU)
@@ -110,16 +113,16 @@ def info_nce(
     """Contrastive loss over the pairs of all processes: the mean of both cross-entropies.
 
     Oord et al. 2018, eq. 4; symmetric, as in Radford et al. 2021. Each process compares its own
-    pairs (B, E) with all motions and texts. If all processes have the same number of pairs, the
-    average over processes, as of gradients in DDP, is the loss and gradient of a single process
-    with all pairs.
+    pairs (B, E) with the motions and texts of all processes. DDP averages gradients over
+    processes. If all processes have the same number of pairs, the averages of losses and
+    gradients equal the loss and gradient of a single process with all pairs.
 
     Args:
         motion: (B, E) features of the motions of this process.
         text: (B, E) features of their texts.
         logit_scale: (), logarithm of the inverse temperature.
-        meaning: (B, M) int64. Pairs that are equal in one of the M numbers are not negatives of
-            each other.
+        meaning: (B, M) int64. Two pairs with the same value in a column are not negatives of each
+            other.
         wrong_text: (B, K, E) features of texts that are negatives of one motion each.
     """
     motion, text = F.normalize(motion, dim=-1), F.normalize(text, dim=-1)
@@ -148,13 +151,16 @@ def _of_all_processes(x: Tensor) -> Tensor:
 
 
 class PooledLoss(SampleMetric):
-    """InfoNCE in pools of 32 by key; the pairs of an incomplete last pool are compared with the last 32 pairs."""
+    """InfoNCE in pools of 32 pairs, sorted by key.
+
+    The pairs of an incomplete last pool are compared with the last 32 pairs.
+    """
 
     higher_is_better = False
     states = ("generated", "text")
 
     def update(self, generated: Tensor, text: Tensor, keys: Tensor, scale: Tensor) -> None:
-        """Adds features of length 1, and the inverse temperature `scale` ()."""
+        """Adds features of length 1 and the inverse temperature `scale`, a scalar tensor."""
         super().update(keys=keys, generated=scale * generated, text=text)
 
     def value(self, motion: Tensor, text: Tensor) -> float:
@@ -169,7 +175,7 @@ class PooledLoss(SampleMetric):
 
 
 class MotionCLIPTask(ExtractorTask[MotionCLIP]):
-    """Trains motion-CLIP (`make train EXP=motion_clip/...`); the text encoder is frozen in FLAME."""
+    """Trains motion-CLIP (`make train EXP=motion_clip/...`). FLAME's text encoder is frozen."""
 
     noun = "a motion-CLIP"
 
@@ -192,11 +198,12 @@ class MotionCLIPTask(ExtractorTask[MotionCLIP]):
 
     @classmethod
     def import_released(cls, state: Mapping[str, Tensor], config: Config) -> Self:
-        """Imports FLAME's released motion-CLIP, by the authors' names, into the task of a recipe
-        with the same sizes.
+        """Imports the weights of FLAME's released motion-CLIP into the task
+        of a recipe with the same sizes.
 
-        The text encoder takes its pooler, with the random weights of the training. Raises
-        `ValueError` if weights or sizes do not match.
+        The weights have the authors' names. The pooler of the text encoder is imported, too,
+        since it has random weights from the authors' training. Raises `ValueError` if weights or
+        sizes do not match.
         """
         representation: Representation = instantiate(config["representation"])
         task = cls.build(config, representation)
@@ -224,7 +231,7 @@ class MotionCLIPTask(ExtractorTask[MotionCLIP]):
     def text_features(self, batch: MotionBatch) -> Tensor:
         """Returns features (B, E) of the captions of a batch."""
         cond = self.condition(batch)
-        # Gives a learned null, which is not used here, a gradient, as DDP requires
+        # A learned null is not used here, but DDP requires a gradient for it
         if cond.null is not None:
             cond = cond.drop(torch.zeros(len(cond.pooled), dtype=torch.bool, device=self.device))
         return self.network.text(cond.pooled)
@@ -258,7 +265,11 @@ _MCLIP = {
 
 
 def our_names(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Returns the weights of FLAME's released network by our names, without its RoBERTa, or raises `ValueError`."""
+    """Returns the weights of FLAME's released network
+    by this project's names, without its RoBERTa.
+
+    Raises `ValueError` for unexpected weights.
+    """
     learned = {name: value for name, value in state.items() if not name.startswith("text_model.")}
     layers, _ = layer_names(learned, "motion_encoder.motion_encoder", ENCODER_LAYER)
     ours = renamed(learned, {**layers, **_MCLIP})

@@ -1,5 +1,7 @@
 # pyright: standard
-"""Motion-CLIP calibrated by hard cases: near-miss captions, and copies of motions with noise of known strength."""
+"""Motion-CLIP calibrated with near-miss captions,
+and with copies of motions with noise of known strength.
+"""
 
 import json
 from collections.abc import Sequence
@@ -21,27 +23,31 @@ from flame_mdm.representations import Representation
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.seeds import key
 
-NEAR_MISSES = 2  # Near-miss captions per motion and step, of different attributes if possible
-# Standard deviation of joint positions, in meters, at which the strength of noise is 1
+# Near-miss captions per motion and step; they differ in different attributes if possible
+NEAR_MISSES = 2
+# Noise of strength 1 on the joints has this standard deviation, in meters.
 JITTER = 0.02
-# Standard deviation of normalized features at which the strength is 1; joints then err by about 20 mm, too.
+# Noise of strength 1 on the features has this standard deviation, in normalized features. It also
+# moves joints by about 20 mm.
 FEATURE_NOISE = 0.3
-WEIGHT = 5.0  # weight of `calibration_error`, compared with `info_nce`
-# Length of all features. With it, the FID of noise of strength s, which moves all motions alike, is about (10 s)^2.
+WEIGHT = 5.0  # weight of `calibration_error` relative to `info_nce`
+# Length of all features. Noise of strength s moves all motions alike, so its FID is about (10
+# s)^2.
 LENGTH = 10.0
 
 
 class CalibratedMotionCLIPTask(MotionCLIPTask):
-    """Trains motion-CLIP so that its distances have a known scale, and texts differ by their details.
+    """Trains motion-CLIP with distances of a known scale, and with texts that differ in details.
 
-    - Texts: motions of clips with the same captions or attributes are not negatives of each other's captions. Near-miss
-      captions (see `near_misses`) are additional negatives.
-    - Motions: half of them have a noisy copy. The distance of both, scaled to length 1, is trained to be the strength
-      of the noise, drawn from [0, 1], small values more often. One half of the copies has white
-      noise on the joints and is encoded again, as motions from files are; the other half on
-      normalized features, as generated motions have.
+    - Texts: motions of clips with the same captions or attributes are not negatives of each
+      other's captions. Near-miss captions (see `near_misses`) are additional negatives.
+    - Motions: half of them have a noisy copy. The strength of its noise is drawn from [0, 1],
+      small values more often. The distance between motion and copy, both scaled to length 1, is
+      trained to be this strength. One half of the copies has white noise on the joints and is
+      encoded again, like motions from files. The other half has noise on normalized features,
+      like generated motions.
 
-    Features have the same length, since the lengths that cosines leave undetermined would disturb
+    All features have the same length: cosines leave lengths undetermined, which would disturb
     Euclidean distances.
     """
 
@@ -83,7 +89,7 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
             self.near_misses[clip.id] = list(texts.values())
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
-        """Returns the loss of a batch against its captions and near misses of them."""
+        """Returns the loss of a batch with its captions and their near misses."""
         self.seed_step(batch_idx)
         assert batch.text is not None
         wrong = [
@@ -122,7 +128,9 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
         return loss
 
     def near_miss(self, name: str, number: int, step: int) -> str:
-        """Returns a near miss of a clip, a function of (seed, step, clip, number); "" if the clip has none."""
+        """Returns a near miss of a clip as a function of (seed, step, clip, number);
+        "" if the clip has none.
+        """
         attributes = self.near_misses[name] or [[""]]
         draw = key("near miss", self.seed, step, name)
         texts = attributes[(draw + number) % len(attributes)]
@@ -130,7 +138,11 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
 
 
 def calibration_error(motion: Tensor, copy: Tensor, strength: Tensor) -> Tensor:
-    """Returns the mean absolute error of the distances of features (B, E), scaled to length 1, from `strength` (B,)."""
+    """Returns the mean absolute difference between distances
+    of features (B, E) and `strength` (B,).
+
+    Features are scaled to length 1 before their distance is computed.
+    """
     distance = torch.linalg.vector_norm(
         F.normalize(motion, dim=-1) - F.normalize(copy, dim=-1), dim=-1
     )
@@ -138,10 +150,10 @@ def calibration_error(motion: Tensor, copy: Tensor, strength: Tensor) -> Tensor:
 
 
 def noisy_copies(representation: HumanML, x: Tensor, lengths: Tensor, strength: Tensor) -> Tensor:
-    """Returns copies (B, F, D) of normalized motions with noise, drawn from torch's generator of the processor.
+    """Returns noisy copies (B, F, D) of normalized motions.
 
-    The `strength` (B,) is of noise on the joints in the first half of the motions, and on the
-    features in the others.
+    The first half of the motions gets noise on the joints, the second half on the features, with
+    `strength` (B,). Noise is drawn from torch's generator of the CPU.
     """
     half, frames = (len(x) + 1) // 2, lengths.tolist()
     joints = representation.to_joints(x[:half]).cpu()

@@ -1,9 +1,9 @@
 # pyright: standard
-"""The evaluator of HumanML3D and KIT-ML (Guo et al. 2022, "Generating Diverse and Natural 3D
-Human Motions from Text").
+"""The evaluator of HumanML3D
+and KIT-ML (Guo et al. 2022, "Generating Diverse and Natural 3D Human Motions from Text").
 
-The authors' code returns embeddings in the order of descending length, ours in the order of the
-input.
+The authors' code returns embeddings in the order of descending length; this code keeps the order
+of the input.
 """
 
 import itertools
@@ -25,7 +25,7 @@ from flame_mdm.data.t2m import MAX_TOKENS, frame_tokens
 from flame_mdm.errors import UserError
 from flame_mdm.safe_io import read_npy
 
-SLOTS = MAX_TOKENS + 2  # number of tokens of a caption, with start and end marks
+SLOTS = MAX_TOKENS + 2  # number of tokens of a caption, including start and end marks
 UNIT = 4  # frames per vector of the movement encoder
 CONTACTS = 4  # number of features at the end of each frame that the evaluator ignores
 PARTS_OF_SPEECH = (
@@ -53,14 +53,19 @@ class Words(NamedTuple):
 
 
 class WordVectors:
-    """Vectors (N, 300) of words, such as GloVe's of the captions of HumanML3D and KIT-ML, and the row of each word."""
+    """Word vectors (N, 300),
+    such as GloVe's for the captions of HumanML3D and KIT-ML, with each word's row.
+    """
 
     def __init__(self, rows: dict[str, int], vectors: Tensor):
         self.rows, self.vectors = rows, vectors
 
     @classmethod
     def read(cls, folder: Path) -> Self:
-        """Reads our_vab_data.npy and our_vab_idx.pkl; raises `FileNotFoundError`, or `UserError` for other content."""
+        """Reads our_vab_data.npy and our_vab_idx.pkl.
+
+        Raises `FileNotFoundError` if a file is missing, and `UserError` for other content.
+        """
         rows = restricted_pickle.read(folder / "our_vab_idx.pkl")
         vectors = _read_numbers(folder / "our_vab_data.npy").astype(np.float32)
         named = (
@@ -70,7 +75,8 @@ class WordVectors:
             isinstance(row, int | np.integer) and 0 <= row < len(vectors) for row in rows.values()
         ):
             raise UserError(
-                f"{folder}: not the released GloVe vectors: sos, eos, unk and other words, each with a row"
+                f"{folder}: not the released GloVe vectors, which have one row each for sos, "
+                f"eos, unk and other words"
             )
         return cls(rows, torch.from_numpy(vectors))
 
@@ -78,9 +84,10 @@ class WordVectors:
         """Returns the text encoder's input for captions.
 
         Captions are lists of "word/PART" tokens, without start and end marks. Tokens after the
-        20th are dropped. A word without a vector is unknown, and so is its part of speech.
-        `full_length` is a legacy option of MDM's code before January 2024, and of MFM's: every
-        caption is treated as filling all 22 slots, which lowers R-precision.
+        20th are dropped. If a word has no vector, both the word and its part of speech are
+        encoded as unknown. `full_length` is a legacy option of MFM's code and of MDM's code
+        before January 2024: every caption is treated as if it filled all 22 slots, which lowers
+        R-precision.
         """
         framed, lengths = zip(*map(frame_tokens, captions), strict=True)
         rows, parts = [], []
@@ -95,15 +102,20 @@ class WordVectors:
 
 
 class LearnedWords(nn.Module):
-    """Word vectors learned with the evaluator, for data sets without tagged words; vectors of parts of speech are 0."""
+    """Word vectors learned with the evaluator, for data sets without tagged words.
+
+    Vectors of parts of speech are 0.
+    """
 
     def __init__(self):
         super().__init__()
         self.table = nn.Embedding(2048, _TextEncoder.WORD)
-        nn.init.normal_(self.table.weight, std=0.3)  # about the scale of GloVe vectors
+        nn.init.normal_(self.table.weight, std=0.3)  # similar to the scale of GloVe vectors
 
     def forward(self, captions: Sequence[Sequence[str]]) -> Words:
-        """Returns the text encoder's input for the words of captions; those after the 20th are dropped."""
+        """Returns the text encoder's input for the words of captions;
+        words after the 20th are dropped.
+        """
         framed, lengths = zip(*map(frame_tokens, captions), strict=True)
         rows = [
             [hashed(token.partition("/")[0], self.table.num_embeddings) for token in tokens]
@@ -118,13 +130,13 @@ class LearnedWords(nn.Module):
 
 
 class T2MEvaluator(nn.Module):
-    """Embeds motions and captions in a joint space, for R-precision, MM-Dist, FID and diversity
-    on HumanML3D and KIT.
+    """Embeds motions and captions in a joint space, for the metrics of HumanML3D and KIT.
 
-    Features are in the data's units, and are normalized with the `mean` and `std` (D,) of the
-    released weights. As in the authors' code for real motions, motions are padded to `max_frames`
-    with zeros after normalization; the convolutions see 3 frames past the end. The network sees
-    the first `used_features` (MARDM's 67, KIT: 64); None = all but the contacts.
+    The metrics are R-precision, MM-Dist, FID and diversity. Features are in the data's units, and
+    are normalized with the `mean` and `std` (D,) of the released weights. As in the authors' code
+    for real motions, motions are padded with zeros to `max_frames` after normalization, so the
+    convolutions see 3 frames past the end. The network sees the first `used_features` features
+    (MARDM: 67; KIT: 64); None = all features except the contacts.
     """
 
     mean: Tensor
@@ -157,12 +169,12 @@ class T2MEvaluator(nn.Module):
         lengths = mask.sum(1)
         shortest, longest = int(lengths.min()), int(lengths.max())
         if shortest < UNIT or longest > self.max_frames:
-            takes = f"the T2M evaluator takes motions of {UNIT} to {self.max_frames} frames"
+            takes = f"the T2M evaluator reads motions of {UNIT} to {self.max_frames} frames"
             raise UserError(f"{takes}, but these have {shortest} to {longest}")
         used = slice(self.used)
         x = (x[..., used] - self.mean[used]) / self.std[used] * mask[..., None]
         x = pad_to(x[:, : self.max_frames], self.max_frames)
-        with torch.no_grad():  # it is frozen when texts and motions are matched
+        with torch.no_grad():  # The movement encoder is frozen when texts and motions are matched
             movements = self.movement_encoder(x)
         return self.motion_encoder(movements, lengths // UNIT)
 
@@ -246,7 +258,9 @@ def read_statistics(folder: Path) -> list[Tensor]:
 
 
 def load_t2m(folder: Path) -> T2MEvaluator:
-    """Loads the evaluator, or MARDM's with 67 or 64 features, from a folder that `T2MExtractor` describes."""
+    """Loads the evaluator, or MARDM's evaluator of 67 or 64 features,
+    from the folder of a `T2MExtractor`.
+    """
     mean, std = read_statistics(folder)
     network = T2MEvaluator(mean, std, used_features=len(mean) if len(mean) in (67, 64) else None)
     path = folder / "finest.tar"

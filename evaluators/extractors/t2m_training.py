@@ -1,5 +1,7 @@
 # pyright: standard
-"""Training of Guo et al.'s evaluator (`evaluators.extractors.t2m`), if the released one cannot be used."""
+"""Training of Guo et al.'s evaluator (`evaluators.extractors.t2m`),
+for data that its released weights do not fit.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,7 +25,9 @@ from flame_mdm.representations import Representation
 
 
 class _MovementDecoder(nn.Module):
-    """The counterpart of the movement encoder: two transposed convolutions decode one vector to 4 frames."""
+    """The decoder for the movement encoder:
+    two transposed convolutions decode one vector to 4 frames.
+    """
 
     def __init__(self, latent: int, hidden: int, out_features: int):
         super().__init__()
@@ -42,7 +46,9 @@ class _MovementDecoder(nn.Module):
 def reconstruction_terms(
     network: T2MEvaluator, decoder: nn.Module, batch: MotionBatch
 ) -> dict[str, Tensor]:
-    """Returns loss terms (B,) of the movement autoencoder, over the real frames and vectors of each motion."""
+    """Returns the loss terms (B,) of the movement autoencoder,
+    over the real frames of each motion.
+    """
     frames = batch.x.shape[1] // UNIT * UNIT
     x, mask = batch.x[:, :frames, : network.used], batch.mask[:, :frames]
     latents, units = network.movement_encoder(x), mask[:, UNIT - 1 :: UNIT]
@@ -60,18 +66,17 @@ def reconstruction_terms(
 def matching_loss(
     motion: Tensor, text: Tensor, margin: float, fits: Tensor | None = None
 ) -> Tensor:
-    """Contrastive loss () of Guo et al. 2022 (Hadsell et al. 2006, eq. 4, without its factor
-    1/2), of B pairs (B, E).
+    """Contrastive loss of Guo et al. 2022 (Hadsell et al. 2006, eq. 4, without its factor 1/2).
 
-    Each text is compared with its own motion, and with the motion of the nearest previous pair
-    that it does not fit. The second motion adds no loss if it is farther than `margin`. The
-    authors shift the motions by a random number of places instead, which also pushes matching
-    pairs apart.
+    Returns a scalar for B pairs. Each text is compared with its own motion, and with a wrong
+    motion: the motion of the nearest previous pair that the text does not fit. The wrong motion
+    adds no loss if its distance is larger than `margin`. The authors shift the motions by a
+    random number of places instead, which also pushes matching pairs apart.
 
     Args:
         motion: (B, E) features of the motions.
         text: (B, E) features of the texts.
-        margin: distance from which a wrong motion adds no loss.
+        margin: distance beyond which a wrong motion adds no loss.
         fits: (B, B) bool, True = the text of the row describes the motion of the column; None =
             only its own.
     """
@@ -88,7 +93,7 @@ def matching_loss(
 
 
 class MatchingLoss(SampleMetric):
-    """`matching_loss` over all pairs in the order of their keys."""
+    """The `matching_loss` of all pairs, sorted by key."""
 
     higher_is_better = False
     states = ("generated", "text")
@@ -106,15 +111,16 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
     """Trains the evaluator (`make train EXP=t2m/...`).
 
     Until step `movement_steps`, the movement encoder is trained with a decoder to reconstruct
-    motions. It is then frozen, and the encoders of text and motion are trained to match. A motion
-    is a wrong one for a text only if the text is not among its captions. Checkpoints contain the
-    word vectors.
+    motions. Then the movement encoder is frozen, and the encoders of text and motion are trained
+    to match. A motion counts as wrong for a text only if the text is not among its captions.
+    Checkpoints contain the word vectors.
 
     Args:
-        words: folder of our_vab_data.npy and our_vab_idx.pkl, see `WordVectors`, only read for
-            training; "learned" for data sets whose words are not tagged, see `LearnedWords`.
-        sparsity, smoothness: weights of the mean magnitude of movement vectors, and of
-            differences of successive ones.
+        words: folder of our_vab_data.npy and our_vab_idx.pkl (see `WordVectors`), which is only
+            read for training. "learned" = learn the vectors, for data sets whose words are not
+            tagged; see `LearnedWords`.
+        sparsity, smoothness: weights of two losses, the mean magnitude of movement vectors and
+            the mean magnitude of differences between successive vectors.
     """
 
     noun = "a trained evaluator of Guo et al."
@@ -179,14 +185,15 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
                 if self.learns_words
                 else clip.attributes.get("tokens", ())
             )
-            # The first of equal captions counts.
+            # Only the first of equal captions counts.
             self.tokens[clip.id] = dict(reversed(list(zip(clip.captions, tagged, strict=False))))
         bare = [name for name, tokens in self.tokens.items() if not tokens]
         if bare:
             kind = "captions" if self.learns_words else "captions with tagged words"
             raise UserError(
-                f"{data.folder}: {len(bare)} clips have no {kind}, such as {bare[0]}. Choose a data set with captions; "
-                "tagged words are not needed with task.words=learned"
+                f"{data.folder}: {len(bare)} clips have no {kind}, such as {bare[0]}. Choose a "
+                f"data set with captions, or give task.words=learned if only the tagged words "
+                f"are missing"
             )
 
     @property
@@ -195,11 +202,15 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
         return isinstance(self.words, LearnedWords)
 
     def get_extra_state(self) -> Tensor:
-        """Returns the given word vectors (words, 300); `facts` maps words to rows."""
+        """Returns the word vectors (words, 300) that were read from a file;
+        `facts` maps words to rows.
+        """
         return self.words.vectors if isinstance(self.words, WordVectors) else torch.zeros(0)
 
     def set_extra_state(self, state: Tensor) -> None:
-        """Restores the word vectors of a checkpoint; raises `UserError` if a resumed run is given others."""
+        """Restores the word vectors of a checkpoint;
+        raises `UserError` if a resumed run reads other vectors.
+        """
         if self.learns_words:
             return
         if isinstance(self.words, WordVectors) and not torch.equal(self.words.vectors, state.cpu()):
@@ -209,7 +220,9 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
         self.words = WordVectors(self.facts["words"], state.cpu())
 
     def text(self, tokens: Sequence[Sequence[str]]) -> Tensor:
-        """Returns features (B, E) of captions, given as "word/PART" tokens, or as words if they are learned."""
+        """Returns features (B, E) of captions,
+        given as "word/PART" tokens, or as words if vectors are learned.
+        """
         assert self.words is not None
         return self.network.text(self.words(tokens))
 
@@ -231,11 +244,13 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
                 *self._embed(batch), self.margin, torch.tensor(fits, device=self.device)
             )
         self.log("train/loss", loss, batch_size=len(batch))
-        # Gives all a gradient, as DDP requires
+        # Gives all parameters a gradient, as DDP requires
         return loss + 0 * sum(parameter.sum() for parameter in self._idle())
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
-        """Removes the gradients of idle parameters: with a gradient of 0, momentum would still change them."""
+        """Removes the gradients of idle parameters,
+        which momentum would change even with a gradient of 0.
+        """
         for parameter in self._idle():
             parameter.grad = None
 

@@ -22,7 +22,9 @@ Network = TypeVar("Network", bound=nn.Module)
 
 
 class ExtractorTask(Task, Generic[Network]):
-    """Task that trains a network whose features evaluate motions, independent of the parts of the evaluated model."""
+    """Task that trains a feature extractor,
+    which shares no parts with the models that it evaluates.
+    """
 
     network: Network
 
@@ -36,7 +38,7 @@ class ExtractorTask(Task, Generic[Network]):
         seed: int = 0,
     ):
         super().__init__(optimizer=optimizer, seed=seed)
-        # Optimizer states in checkpoints number the parameters in this order.
+        # The order of the parts determines the numbers of parameters in saved optimizer states.
         self.condition, self.representation = condition, representation
         self.network, self.val_metrics = network, nn.ModuleDict()
 
@@ -44,7 +46,7 @@ class ExtractorTask(Task, Generic[Network]):
     def build(
         cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()
     ) -> Self:
-        """Builds the task of a recipe; `actions` are the names of the actions in its data."""
+        """Builds the task of a recipe; `actions` are the names of the actions in the data."""
         options = {name: value for name, value in config["task"].items() if name != "_target_"}
         options |= {
             "representation": representation,
@@ -56,7 +58,7 @@ class ExtractorTask(Task, Generic[Network]):
         return task
 
     def encoder(self) -> ConditionEncoder:
-        """Returns the encoder of the captions in the data."""
+        """Returns the encoder of the data set's captions."""
         return self.condition
 
     @classmethod
@@ -71,7 +73,7 @@ class ExtractorTask(Task, Generic[Network]):
         raise NotImplementedError
 
     def setup(self, stage: str) -> None:
-        """Also creates the validation metrics."""
+        """Sets up the task and creates the validation metrics."""
         super().setup(stage)
         self.val_metrics.update(self.metrics())
 
@@ -103,7 +105,10 @@ class ExtractorTask(Task, Generic[Network]):
         update_metrics(of_samples, **inputs)
 
     def on_validation_epoch_end(self) -> None:
-        """Logs and resets the validation metrics. Metrics with too few samples are skipped, except the loss."""
+        """Logs and resets the validation metrics.
+
+        Except for the loss, metrics with too few samples are skipped.
+        """
         for name, metric in self.val_metrics.items():
             assert isinstance(metric, Metric)
             try:

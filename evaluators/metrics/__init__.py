@@ -1,7 +1,7 @@
 # pyright: standard
-"""Metrics of generated motions: torchmetrics classes whose inputs have common names.
+"""Metrics of generated motions, as torchmetrics classes.
 
-Every `update` takes some of these inputs by name, of B generated and R real motions.
+Every `update` takes some of these inputs by name, for B generated and R real motions.
 
 | name | shape | content |
 |---|---|---|
@@ -26,14 +26,14 @@ Every `update` takes some of these inputs by name, of B generated and R real mot
 | nearest, real_nearest | (B, 1 or 2) | distances from the nearest training motion, see `memorization` |
 | references | B of (F', J, 3) | real motions at the frame rate of their recording |
 
-A key is `flame_mdm.seeds.key` of an id, and of the number of the sample if there are several.
-Metrics that compare motions one by one (MID, position and displacement errors) take real motions
-in the order of the generated ones.
+A key is the `flame_mdm.seeds.key` of an id. With several samples per id, the number of the sample
+is part of the key. Metrics that compare motions one by one (MID, position and displacement
+errors) take real motions in the order of the generated motions.
 
 `compute()` returns a number, or a dict of numbers by name; None without samples. It raises
-UserError if a number would be meaningless, for example with too few samples. For the same
-features, values are bit-identical for any batch size, order and number of processes; random draws
-depend on `seed` alone.
+`UserError` if a number would be meaningless, for example with too few samples. For the same
+features, values are bit-identical for any batch size, order and number of processes. Random draws
+depend only on `seed`.
 """
 
 from __future__ import annotations
@@ -52,7 +52,9 @@ if TYPE_CHECKING:
 
 
 def make_metrics(configs: Mapping[str, Config], **options: Any) -> dict[str, SampleMetric]:
-    """Creates metrics from mappings with a `_target_`, by name; `options` are passed to those that take them."""
+    """Creates metrics by name from mappings with a `_target_`;
+    each metric gets the `options` that it takes.
+    """
     metrics: dict[str, SampleMetric] = {}
     for name, config in configs.items():
         legal = parameters(config["_target_"]) if "_target_" in config else ()
@@ -63,7 +65,7 @@ def make_metrics(configs: Mapping[str, Config], **options: Any) -> dict[str, Sam
 
 
 def inputs_of(metric: Metric) -> dict[str, bool]:
-    """Returns the names of the inputs that `update` takes, and whether it requires them."""
+    """Returns the names of the inputs that `update` takes, and whether each input is required."""
     parameters = inspect.signature(metric.update).parameters
     if "rows" in parameters:  # `SampleMetric.update`
         return dict.fromkeys(("keys", *getattr(metric, "states", ())), True)
@@ -87,7 +89,7 @@ def update_metrics(metrics: Mapping[str, Metric], **inputs: Any) -> None:
 
 
 def missing_input(name: str, metric: Metric, needed: str) -> UserError:
-    """Returns the error for a metric that lacks the input `needed`."""
+    """Returns the error for a metric without its input `needed`."""
     return UserError(
         f"metric {name} ({type(metric).__name__}): missing input: {needed}. Remove the metric from the protocol, or "
         "choose data, an extractor or a protocol with this input"

@@ -21,10 +21,11 @@ def equally_weighted(values: Tensor) -> Tensor:
 
 
 def retrieval_ranks(queries: Tensor, candidates: Tensor, pools: Tensor, correct: Tensor) -> Tensor:
-    """Returns (N,) how many candidates are closer than the correct one, or equally close and earlier in the pool.
+    """Returns the rank (N,) of the correct candidate of each query, 0 = first.
 
-    `pools` (N, P) are the indices of the candidates (M, E) of each query (N, E), `correct` (N,)
-    is the position of the correct one in each pool.
+    The rank is the number of candidates that are closer than the correct one, or equally close
+    and earlier in the pool. `pools` (N, P) has the indices of the candidates (M, E) of each query
+    (N, E), and `correct` (N,) is the position of the correct candidate in each pool.
     """
     pools, correct = pools.to(queries.device), correct.to(queries.device)
     ranks = []
@@ -39,13 +40,14 @@ def retrieval_ranks(queries: Tensor, candidates: Tensor, pools: Tensor, correct:
 
 
 class RPrecision(SampleMetric):
-    """Base class of R-precision: the fraction of queries whose correct candidate is among the k nearest of a pool.
+    """Base class of R-precision.
 
-    `update` takes `generated` (B, E), `text` (B, E), `text_keys` (B,) and `keys` (B,). The values
-    `top1`, `top2` and `top3` are in [0, 1]; higher is better.
+    R-precision is the fraction of queries with their correct candidate among the k nearest of a
+    pool. `update` takes `generated` (B, E), `text` (B, E), `text_keys` (B,) and `keys` (B,). The
+    values `top1`, `top2` and `top3` are in [0, 1]; higher is better.
 
     Args:
-        pool: number of candidates of a query, the correct one included.
+        pool: number of candidates of a query, including the correct candidate.
         seed: seed of the random draws.
     """
 
@@ -69,15 +71,18 @@ class RPrecision(SampleMetric):
         raise NotImplementedError
 
     def in_random_pools(self, distance: Tensor, correct: Tensor) -> dict[str, Tensor]:
-        """Returns how probable it is that the correct candidate is among the k nearest of a random pool, by query.
+        """Returns for each query the probability
+        that its correct candidate is among the k nearest.
+
+        The pool is random.
 
         Args:
-            distance: (N, M) from queries to candidates.
+            distance: (N, M) distances from queries to candidates.
             correct: (N,) index of the correct candidate of each query.
         """
-        # A random pool has pool - 1 of the other candidates, so the number of closer ones in it
-        # is hypergeometric: the probability is exact, without drawing pools. Of the candidates at
-        # an equal distance, half count as closer.
+        # A random pool has pool - 1 of the other candidates. The number of closer candidates in
+        # it has a hypergeometric distribution, so the probability is exact without drawing pools.
+        # Half of the candidates at an equal distance count as closer.
         others = distance.shape[1] - 1
         if others + 1 < self.pool:
             raise UserError(f"{others + 1} candidates are fewer than a pool of {self.pool}")
@@ -94,14 +99,14 @@ class RPrecision(SampleMetric):
 class TextsForMotion(RPrecision):
     """R-precision, texts for a motion: is the motion's text among the k nearest of 32?
 
-    The definition of the papers (FLAME, "Evaluation Metrics"; MDM, B.2; MFM, 9.1) and of FLAME's
-    code. A motion ranks its own text and 31 others, drawn without replacement from captions that
-    differ from it, by Euclidean distance. In FLAME's code, the last pools are smaller, since a
-    pool is a batch. The own text is at a random position, so that an extractor that cannot tell
+    This is the definition of the papers (FLAME, "Evaluation Metrics"; MDM, B.2; MFM, 9.1) and of
+    FLAME's code. A motion ranks 32 texts by Euclidean distance: its own text, and 31 texts drawn
+    without replacement from other captions. In FLAME's code, a pool is a batch, so the last pool
+    may be smaller. The own text is at a random position, so that an extractor that cannot tell
     texts apart gets k / 32.
 
     Args:
-        pool: number of texts in a pool, the own text included.
+        pool: number of texts in a pool, including the own text.
         seed: seed of the pools.
 
     Example:
@@ -113,9 +118,9 @@ class TextsForMotion(RPrecision):
 
     def ranks(self, generated: Tensor, text: Tensor, text_keys: Tensor) -> Tensor:
         """Returns the rank (N,) of each motion's own text in its pool, 0 = first."""
-        # Each motion draws its other texts from the captions without its own: numbers from the
-        # own caption on move up by one. Then the own caption, which is last, swaps places with a
-        # random one.
+        # Each motion draws its other texts from the captions except its own: drawn indices at or
+        # above the own caption are increased by one. Then the own caption, which is last, swaps
+        # places with a random text.
         generator = np.random.default_rng(self.seed)
         _, first, correct = np.unique(
             text_keys.cpu().numpy(), return_index=True, return_inverse=True
@@ -143,19 +148,21 @@ class TextsForMotion(RPrecision):
 class MotionsForText(RPrecision):
     """R-precision, motions for a text: is the text's motion among the k nearest of 32?
 
-    The definition of the code of Guo et al. 2022, which the tables of MDM and MFM use. Test pairs
-    in random order are split into pools of 32, in which each text ranks the motions by Euclidean
-    distance; equal captions may be in the same pool. In that code, an incomplete last pool is
-    dropped, and distances are float32, so that a motion whose features equal the features of its
-    text may rank last (square root of a negative number). Here, the texts of an incomplete last
-    pool rank the last 32 motions, so that every text counts once.
+    This is the definition in the code of Guo et al. 2022, which the tables of MDM and MFM use.
+    Test pairs in random order are split into pools of 32. In a pool, each text ranks the motions
+    by Euclidean distance; equal captions may be in the same pool.
+
+    The code differs in two ways. It drops an incomplete last pool; here, the texts of an
+    incomplete last pool rank the last 32 motions, so that every text counts once. Its distances
+    are float32: if a motion and its text have the same features, the motion may rank last (square
+    root of a negative number).
 
     Args:
-        pool: number of motions in a pool, the own motion included.
+        pool: number of motions in a pool, including the own motion.
         seed: seed of the pools.
-        normalize: scale features to length 1 first, which ranks by cosine. An extractor trained
-            with cosines, such as motion-CLIP, does not constrain lengths; the motions with the
-            shortest features would be nearest to every text.
+        normalize: whether to scale features to length 1 first, which ranks by cosine. An
+            extractor trained with cosines, such as motion-CLIP, does not constrain lengths: the
+            motions with the shortest features would be nearest to every text.
 
     Example:
         >>> metric, features, keys = MotionsForText(pool=3), torch.eye(3), torch.arange(3)
@@ -169,7 +176,10 @@ class MotionsForText(RPrecision):
         self.normalize = normalize
 
     def ranks(self, generated: Tensor, text: Tensor, text_keys: Tensor) -> Tensor:
-        """Returns the rank (N,) of each text's own motion in its pool, 0 = first, in random order of the texts."""
+        """Returns the rank (N,) of each text's own motion in its pool, 0 = first.
+
+        The texts are in random order.
+        """
         self.need(len(generated), self.pool, "motions")
         if self.normalize:
             generated, text = F.normalize(generated, dim=-1), F.normalize(text, dim=-1)
@@ -185,23 +195,26 @@ class MotionsForText(RPrecision):
 
 
 def own_pools(count: int, pool: int, seed: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Returns samples in random order (N,), the pool of each (N, P) for `MotionsForText`, and its place there (N,)."""
+    """Returns the pools of `MotionsForText`.
+
+    The three tensors are the samples (N,) in random order, the pool (N, P) of each sample, and
+    the position (N,) of the sample in its pool.
+    """
     order = torch.from_numpy(np.random.default_rng(seed).permutation(count))
     start = (torch.arange(count) // pool * pool).clamp(max=count - pool)
     return order, order[start[:, None] + torch.arange(pool)], torch.arange(count) - start
 
 
 class MultimodalDistance(SampleMetric):
-    """MM-Dist (MFM, eq. 10), "matching score" of Guo et al. 2022: mean Euclidean distance of
-    motions and their texts.
+    """MM-Dist (MFM, eq. 10), the mean Euclidean distance between motions and their texts.
 
-    The code of Guo et al. computes in float32 and drops an incomplete last batch; here, every
-    motion counts. Lower is better. `update` takes `generated` (B, E), `text` (B, E) and `keys`
-    (B,).
+    Guo et al. 2022 call it "matching score". Their code computes in float32 and drops an
+    incomplete last batch; here, every motion counts. Lower is better. `update` takes `generated`
+    (B, E), `text` (B, E) and `keys` (B,).
 
     Args:
-        normalize: scale features to length 1 first, for extractors trained with cosines; the
-            value is then in [0, 2].
+        normalize: whether to scale features to length 1 first, for extractors trained with
+            cosines. The value is then in [0, 2].
 
     Example:
         >>> metric = MultimodalDistance()
@@ -232,9 +245,11 @@ class MultimodalDistance(SampleMetric):
 
 
 class MotionCLIPScore(SampleMetric):
-    """mCLIP score of FLAME ("Evaluation Metrics"): mean cosine of the features of motions and texts, in [-1, 1].
+    """mCLIP score of FLAME ("Evaluation Metrics"):
+    mean cosine of the features of motions and their texts.
 
-    Higher is better. `update` takes `generated` (B, E), `text` (B, E) and `keys` (B,).
+    The value is in [-1, 1]; higher is better. `update` takes `generated` (B, E), `text` (B, E)
+    and `keys` (B,).
 
     Example:
         >>> metric = MotionCLIPScore()
@@ -259,18 +274,18 @@ class MotionCLIPScore(SampleMetric):
 def pointwise_mutual_information(
     real: Tensor, text: Tensor, generated: Tensor, requested: Tensor, eps: float
 ) -> Tensor:
-    """Computes the terms (M,) whose mean is MID, of motions (M, E) generated for texts (M, T), in float64.
+    """Computes the terms (M,) whose mean is MID, for motions (M, E) generated for texts (M, T).
 
-    Kim et al. 2022, "Mutual Information Divergence": the mean pointwise mutual information of
-    generated motions and their texts under a normal distribution fitted to real motions (N, E)
-    and their texts (N, T),
+    Kim et al. 2022, "Mutual Information Divergence". MID is the mean pointwise mutual information
+    of generated motions and their texts, under a normal distribution fitted to real motions (N,
+    E) and their texts (N, T). In float64:
 
         (log det S_x + log det S_y - log det S_z) / 2 + (tr S_x^-1 S_x' + tr S_y^-1 S_y - tr
         S_z^-1 S_z') / 2
 
-    where x is real, y is text, and z is both. Covariances of generated motions (') are about the
-    means of the real ones. S + eps I is inverted instead of S. The denominators are N - 1 and M -
-    1.
+    where x is the motion, y is the text, and z is both. Covariances of generated motions (') are
+    about the means of the real motions. S + eps I is inverted instead of S. The denominators are
+    N - 1 and M - 1.
     """
     both, fake = torch.cat([real, text], 1), torch.cat([generated, requested], 1)
     value = real.new_zeros(len(generated))
@@ -285,12 +300,12 @@ def pointwise_mutual_information(
 
 
 class MutualInformationDivergence(SampleMetric):
-    """MID, in nats: mean `pointwise_mutual_information` of generated motions, their texts and the real motions.
+    """MID in nats: the mean of `pointwise_mutual_information` over generated motions.
 
-    Kim et al. 2022. Higher is better. It needs more samples than motion and text have features
-    together, or the joint covariance is singular; the authors' code requires half as many.
-    `update` takes `generated` (B, E), `text` (B, E), `real` (B, E) and `keys` (B,); row i of
-    `real` is the real motion of text i.
+    Kim et al. 2022. Higher is better. MID needs more samples than motion and text have features
+    together, because the joint covariance is singular otherwise. The authors' code requires only
+    half as many samples. `update` takes `generated` (B, E), `text` (B, E), `real` (B, E) and
+    `keys` (B,); row i of `real` is the real motion of text i.
 
     Args:
         eps: added to the diagonals of covariances before they are inverted; 5e-4 in FLAME, 0 in

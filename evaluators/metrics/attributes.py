@@ -1,8 +1,9 @@
 # pyright: standard
-"""Attributes of a motion, read from its joints by geometric rules: action, side, count, direction, speed, amount.
+"""Attributes of a motion, read from its joints by geometric rules.
 
-The rules read what a person would see in a clip of a few seconds that shows one action of the
-synthetic set; each threshold is stated next to its rule. The joints are the 22 of SMPL.
+The attributes are action, side, count, direction, speed and amount. The rules read what a person
+would see in a clip of a few seconds that shows one action of the synthetic set. Each threshold is
+stated next to its rule. The joints are SMPL's 22 joints.
 """
 
 import json
@@ -47,26 +48,28 @@ BONES = [
     (19, 21),
 ]
 ATTRIBUTES = ("action", "side", "count", "direction", "speed", "amount")
-# Attributes of synthetic clips that no rule reads; such clips are not scored
+# No rule reads these attributes of synthetic clips, so clips with them are not scored
 UNREAD = (
     "while",
     "ends",
 )
-UNDECIDED = MORE.keys() - CHECKED.keys()  # actions without a rule, which are not scored either
+# No rule reads these actions, so clips with them are not scored either
+UNDECIDED = MORE.keys() - CHECKED.keys()
 
 
 def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
-    """Reads one clip (F, 22, 3) of SMPL's joints in meters, y up, with any position and heading.
+    """Reads the attributes of one clip.
 
     The rules are tried in order: motions that lower the body, jumps, walks and runs, whole-body
     actions, then gestures of the arms and the head.
 
     Args:
-        joints: (F, 22, 3).
+        joints: (F, 22, 3) positions of SMPL's joints in meters, y up, with any position and
+            heading.
         fps: frames per second.
 
     Returns:
-        "action" and the others of `ATTRIBUTES` that the motion has; {} if no action of the set is
+        "action", and the further `ATTRIBUTES` that the motion has. {} if no action of the set is
         recognized, for example in noise, or if the joints do not form a body.
 
     Example:
@@ -82,8 +85,8 @@ def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
     floor = np.percentile(smooth[:, TOES, 1], 10)
     forward, left, turned = heading_of(smooth)
 
-    # Standing, the neck is 25 cm above the pelvis and the pelvis 50 cm above the toes, half of
-    # the time.
+    # The body stands if the neck is 25 cm above the pelvis, and the pelvis is 50 cm above the
+    # toes, half of the time.
     pelvis = smooth[:, PELVIS, 1]
     stands = (
         np.median(smooth[:, NECK, 1] - pelvis) > 0.25
@@ -93,9 +96,9 @@ def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
     if lowered or not stands:
         return lowered
     jumps = count_rises((smooth[:, TOES, 1] - floor).min(1), 0.07, 0.035)
-    # A leap goes more than 45 cm with both feet side by side, a dance sways at least three times
-    # by more than 3.5 cm to one side and the other, and a hand that picks something up comes
-    # within 42 cm of the floor.
+    # A leap covers more than 45 cm with both feet side by side. A dance sways at least three
+    # times by more than 3.5 cm from side to side. A hand that picks something up comes within 42
+    # cm of the floor.
     stride = ((smooth[:, TOES[0]] - smooth[:, TOES[1]])[:, [0, 2]] * forward).sum(-1)
     if (
         jumps
@@ -130,7 +133,9 @@ def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
 
 
 def read_all(joints: np.ndarray, fps: float) -> dict[str, Any]:
-    """Returns `read_attributes` of one clip (F, 22, 3) and, as "checks", what each check of `CHECKED` reads."""
+    """Returns the attributes of one clip (F, 22, 3) and,
+    as "checks", the result of each check of `CHECKED`.
+    """
     seen: dict[str, Any] = dict(read_attributes(joints, fps))
     joints = np.asarray(joints, np.float64)
     if len(joints) < fps or not np.isfinite(joints).all():
@@ -143,7 +148,11 @@ def read_all(joints: np.ndarray, fps: float) -> dict[str, Any]:
 
 
 def _is_a_body(joints: np.ndarray, smooth: np.ndarray) -> bool:
-    """Returns whether limbs have 15 to 60 cm and vary by less than 25 %, and joints are within 2 cm of a curve."""
+    """Whether the joints form a body:
+    limbs of 15 to 60 cm that vary by less than 25 %, and smooth joints.
+
+    A joint is smooth if it stays within 2 cm of a curve.
+    """
     bones = np.stack([np.linalg.norm(smooth[:, a] - smooth[:, b], axis=-1) for a, b in BONES])
     length = np.median(bones, 1, keepdims=True)
     steady = (np.abs(bones / np.maximum(length, 1e-6) - 1) < 0.25).mean() > 0.9
@@ -154,11 +163,11 @@ def _is_a_body(joints: np.ndarray, smooth: np.ndarray) -> bool:
 def _lowered(
     smooth: np.ndarray, floor: float, forward: np.ndarray, fps: float
 ) -> dict[str, str | int]:
-    """Reads crawling, lying down, sitting down and standing up from the height of the pelvis and
-    the tilt of the trunk.
+    """Reads crawling, lying down, sitting down and standing up.
 
-    A standing pelvis is higher than 78 cm, a seated one at 35 to 72 cm, a lying one below 35 cm.
-    The trunk of a person who lies or crawls is tilted by more than 55 degrees.
+    The pelvis of a standing person is higher than 78 cm, of a seated person at 35 to 72 cm, of a
+    lying person below 35 cm. The trunk of a person who lies or crawls is tilted by more than 55
+    degrees.
     """
     pelvis, tilt = smooth[:, PELVIS, 1] - floor, tilt_of(smooth)
     first, last = (slice(0, max(1, round(0.1 * fps))), slice(-max(1, round(0.1 * fps)), None))
@@ -180,14 +189,16 @@ def _lowered(
 def _locomotion(
     smooth: np.ndarray, forward: np.ndarray, left: np.ndarray, turned: float, fps: float
 ) -> dict[str, str | int]:
-    """Reads walks and runs, which move more than 33 cm from where they began and lift both ankles by 4 cm."""
+    """Reads walks and runs,
+    which move more than 33 cm from their start and lift both ankles by 4 cm.
+    """
     ground = gaussian_filter1d(smooth[:, PELVIS][:, [0, 2]], 0.15 * fps, axis=0, mode="nearest")
     if np.linalg.norm(ground - ground[0], axis=-1).max() < 0.33:
         return {}
     if np.ptp(np.percentile(smooth[:, ANKLES, 1], (5, 95), axis=0), axis=0).min() < 0.04:
         return {}
     velocity = np.gradient(ground, 1 / fps, axis=0)
-    # Of the middle: walks begin and end in standing
+    # The speed in the middle counts, since walks begin and end with standing
     speed = np.percentile(np.linalg.norm(velocity, axis=-1), 90)
     ahead, aside = (velocity * forward).sum(-1).mean(), (velocity * left).sum(-1).mean()
     if abs(turned) > 90:
@@ -218,7 +229,9 @@ def _kick(smooth: np.ndarray, floor: float, forward: np.ndarray) -> dict[str, st
 
 
 def _arms(smooth: np.ndarray, forward: np.ndarray, fps: float) -> dict[str, str | int]:
-    """Reads throws, salutes, raised arms, waves, claps and punches, or standing if there is none."""
+    """Reads throws, salutes, raised arms, waves, claps and punches;
+    without any of them, standing.
+    """
     upper = smooth[:, ELBOWS] - smooth[:, SHOULDERS]
     fore = smooth[:, WRISTS] - smooth[:, ELBOWS]
     arm = smooth[:, WRISTS] - smooth[:, SHOULDERS]
@@ -230,7 +243,8 @@ def _arms(smooth: np.ndarray, forward: np.ndarray, fps: float) -> dict[str, str 
     from_head = smooth[:, WRISTS] - smooth[:, [HEAD]]
     near = (np.linalg.norm(from_head, axis=-1) < 0.225) & (from_head[..., 1] > -0.08)
     for side, name in enumerate(SIDES):
-        # A throw brings the hand from above the shoulder far to the front within half a second.
+        # In a throw, the hand moves from above the shoulder far to the front within half a
+        # second.
         drawn = np.flatnonzero((above[:, side] > 0) & (ahead[:, side] < 0.1))
         if any((ahead[i : i + round(0.5 * fps), side] > 0.38).any() for i in drawn):
             return {"action": "throw", "side": name}
@@ -241,7 +255,7 @@ def _arms(smooth: np.ndarray, forward: np.ndarray, fps: float) -> dict[str, str 
         up = (fore[:, side, 1] > 0.2 * length[side]) & (above[:, side] > 0.1)
         if up.sum() < 0.35 * fps:
             continue
-        # A wave swings the forearm about the elbow; a raised arm holds still.
+        # In a wave, the forearm swings about the elbow; a raised arm stays still.
         swing = straight[up, side] - gaussian_filter1d(
             straight[up, side], 0.25 * fps, mode="nearest"
         )
@@ -266,7 +280,9 @@ def _arms(smooth: np.ndarray, forward: np.ndarray, fps: float) -> dict[str, str 
 
 
 def _nods(smooth: np.ndarray, forward: np.ndarray) -> int:
-    """Counts how often the head pitches forward by more than 32 degrees and comes back, seen from the shoulders."""
+    """Counts how often the head pitches forward by more than 32 degrees and comes back,
+    relative to the shoulders.
+    """
     base = smooth[:, [NECK, *COLLARS, *SHOULDERS]].mean(1)
     head = smooth[:, HEAD] - base - (smooth[:, NECK] - base).mean(0)
     nod = np.degrees(np.arctan2((head[:, [0, 2]] * forward).sum(-1), head[:, 1]))
@@ -274,17 +290,18 @@ def _nods(smooth: np.ndarray, forward: np.ndarray) -> int:
 
 
 def right_attributes(seen: Mapping[str, Any], requested: Mapping[str, Any]) -> dict[str, bool]:
-    """Returns for each requested attribute whether it was read from the motion, and for combinations of them.
+    """Returns whether each requested attribute,
+    and combinations of attributes, were read from a motion.
 
-    Actions of `CHECKED` are read by their own check; {} for actions that have no rule.
+    Each action of `CHECKED` is read by its own check. Returns {} for actions without a rule.
 
     Args:
-        seen: what `read_all` or `read_attributes` returns.
+        seen: the attributes that `read_all` or `read_attributes` returned.
         requested: the attributes of the request.
 
     Returns:
-        Whether the attributes are right, by name. `action_and_side`: both are, or the action if
-        no side was requested; `all`: every requested attribute is.
+        Whether each attribute is right, by name. `action_and_side`: whether both are right, or
+        the action if no side was requested. `all`: whether every requested attribute is right.
     """
     if requested["action"] in UNDECIDED or requested.keys() & set(UNREAD):
         return {}
@@ -300,8 +317,8 @@ def right_attributes(seen: Mapping[str, Any], requested: Mapping[str, Any]) -> d
 class AttributeAccuracy(Timed, MotionMean):
     """Fraction of motions that show the requested value, by attribute. A metric of this project.
 
-    The values, in [0, 1], are one for each of `ATTRIBUTES`, `action_and_side` and `all`; higher
-    is better. Attributes are read from the joints by rules, without a network: see
+    There is one value in [0, 1] for each of `ATTRIBUTES`, for `action_and_side` and for `all`;
+    higher is better. Rules read the attributes from the joints, without a network; see
     `right_attributes`.
 
     Args:
@@ -320,12 +337,14 @@ class AttributeAccuracy(Timed, MotionMean):
     names = (*ATTRIBUTES, "action_and_side", "all")
 
     def readings(self, motions: Rows) -> dict[str, np.ndarray]:
-        """Returns the attributes of each motion of `read_all` as JSON: `seen` (N,)."""
+        """Returns the attributes that `read_all` finds in each motion as JSON: `seen` (N,)."""
         seen = [json.dumps(read_all(joints.numpy(), self.fps)) for joints in motions["joints"]]
         return {"seen": np.array(seen)}
 
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
-        """Returns whether each motion shows the requested value, by attribute, and whether it was requested."""
+        """Returns by attribute whether each motion shows the requested value,
+        and whether a value was requested.
+        """
         pairs = zip(rows["seen"], rows["requested"], strict=True)
         shown = [right_attributes(json.loads(str(seen)), requested) for seen, requested in pairs]
         weighted: dict[str, Tensor] = {}
@@ -344,7 +363,7 @@ class AttributeAccuracy(Timed, MotionMean):
             joints: (B, F, 22, 3) positions of SMPL's joints in meters, y up.
             mask: (B, F) bool, True = real frame.
             requested: B mappings from names of `ATTRIBUTES` to values, such as {"action": "walk",
-                "speed": "slow"}. Requests without a rule do not count.
+                "speed": "slow"}. Requests that no rule reads do not count.
             keys: (B,) int64, unique keys of the motions.
         """
         rows = []
@@ -358,9 +377,10 @@ class AttributeAccuracy(Timed, MotionMean):
 def read_side(joints: np.ndarray, content: str, fps: float) -> str:
     """Reads the side, left or right, of a motion (F, 22, 3) of the Bandai set.
 
-    Contents walk-turn-left and -right are read from the turn of the body, walk-left and -right
-    from the direction of travel, all others from the hand that rises higher above its shoulder.
-    The side in the content's name is not used.
+    The side of walk-turn-left and walk-turn-right is read from the turn of the body, the side of
+    walk-left and walk-right from the direction of travel. For all other contents, it is the side
+    of the hand that rises higher above its shoulder. The side in the name of the content is not
+    used.
 
     Args:
         joints: (F, 22, 3) in meters, y up.
@@ -379,11 +399,11 @@ def read_side(joints: np.ndarray, content: str, fps: float) -> str:
 
 
 class SideAccuracy(Timed, MotionMean):
-    """Share of motions that show the requested side, left or right, on the Bandai set. A metric of this project.
+    """Share of motions of the Bandai set that show the requested side, left or right.
 
-    `hand` is about gestures, `path` about turns and sideways walks, `hand_or_path` about both.
-    Chance is 0.5; higher is better. Sides are read from the joints by rules, without a network:
-    see `read_side`.
+    A metric of this project. `hand` covers gestures, `path` covers turns and sideways walks, and
+    `hand_or_path` covers both. Chance is 0.5; higher is better. Rules read the sides from the
+    joints, without a network; see `read_side`.
 
     Args:
         fps: frames per second of the motions.
@@ -409,8 +429,8 @@ class SideAccuracy(Timed, MotionMean):
         Args:
             joints: (B, F, 22, 3) positions of SMPL's joints in meters, y up.
             mask: (B, F) bool, True = real frame.
-            sides: B pairs of requested content and side. Requests with another side than left and
-                right do not count.
+            sides: B pairs of requested content and side. Only requests for the left or right side
+                count.
             keys: (B,) int64, unique keys of the motions.
         """
         rows = []

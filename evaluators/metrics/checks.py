@@ -1,9 +1,9 @@
 """Checks of single actions: whether a motion shows a certain action, and with which side, count or direction.
 
-`evaluators.metrics.attributes` reads one of 22 actions from a motion. Other actions are too
-similar to be told apart by rules, so that a check only verifies one that was requested. A hand at
-the head for half a second shows a drink, a phone call and a scratch alike. Thresholds are next to
-the rules.
+`evaluators.metrics.attributes` reads one of 22 actions from a motion. Rules cannot tell further
+actions apart: a hand at the head for half a second may be a drink, a phone call or a scratch. A
+check therefore only verifies the action that was requested. Thresholds are stated next to the
+rules.
 """
 
 from collections.abc import Callable
@@ -18,7 +18,9 @@ SIDES = ("left", "right")
 
 
 def heading_of(smooth: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Returns the directions (F, 2) forward and left on the ground, and the turn to the left in degrees."""
+    """Returns the directions (F, 2) to the front and to the left on the ground,
+    and the turn to the left in degrees.
+    """
     across = (
         smooth[:, HIPS[0]] - smooth[:, HIPS[1]] + smooth[:, SHOULDERS[0]] - smooth[:, SHOULDERS[1]]
     )[:, [0, 2]]
@@ -47,13 +49,13 @@ def count_rises(signal: np.ndarray, high: float, low: float) -> int:
 
 @dataclass(frozen=True)
 class View:
-    """A smoothed motion and what several checks need of it.
+    """A smoothed motion, and quantities that several checks need.
 
     Attributes:
         smooth: joints (F, 22, 3) in meters.
         fps: frames per second.
         forward: direction (F, 2) that the body faces, on the ground.
-        left: direction (F, 2) to its left.
+        left: direction (F, 2) to the left of the body, on the ground.
         turned: turn to the left over the clip, in degrees.
         floor: height of the lowest toes in meters.
     """
@@ -72,15 +74,17 @@ class View:
         return cls(smooth, fps, forward, left, turned, float(np.percentile(smooth[:, TOES, 1], 10)))
 
     def ahead(self, joints: np.ndarray, origin: np.ndarray) -> np.ndarray:
-        """Returns how far joints (F, N, 3) are ahead of other ones (F, N, 3)."""
+        """Returns how far joints (F, N, 3) are in front of other joints (F, N, 3)."""
         return ((joints - origin)[..., [0, 2]] * self.forward[:, None]).sum(-1)
 
     def aside(self, joints: np.ndarray, origin: np.ndarray) -> np.ndarray:
-        """Returns how far joints (F, N, 3) are to the left of other ones (F, N, 3)."""
+        """Returns how far joints (F, N, 3) are to the left of other joints (F, N, 3)."""
         return ((joints - origin)[..., [0, 2]] * self.left[:, None]).sum(-1)
 
     def path(self) -> np.ndarray:
-        """Returns the position (F, 2) of the pelvis, to the left and ahead of its start, as seen from there."""
+        """Returns how far the pelvis is to the left of its start and in front of it (F, 2),
+        in the first heading.
+        """
         moved = (self.smooth[:, PELVIS] - self.smooth[0, PELVIS])[:, [0, 2]]
         return np.stack([moved @ self.left[0], moved @ self.forward[0]], -1)
 
@@ -89,7 +93,7 @@ Shown = dict[str, str | int]
 
 
 def _raised_hand(view: View) -> int:
-    """Returns the side of the hand that is higher, as seen from its shoulder, at its highest."""
+    """Returns the side of the hand that rises higher, relative to its shoulder."""
     return int((view.smooth[:, WRISTS, 1] - view.smooth[:, SHOULDERS, 1]).max(0).argmax())
 
 
@@ -101,7 +105,10 @@ def _to_head(view: View) -> Shown:
 
 
 def _to_front(view: View) -> Shown:
-    """Reads a hand more than 15 cm ahead of its shoulder, and above the elbow of a hanging arm, for 0.4 seconds."""
+    """Reads a hand that is more than 15 cm in front of its shoulder for 0.4 seconds.
+
+    The hand must also be above the height of the elbow of a hanging arm.
+    """
     side = _raised_hand(view)
     hand, shoulder = view.smooth[:, [WRISTS[side]]], view.smooth[:, [SHOULDERS[side]]]
     out = (view.ahead(hand, shoulder) > 0.15) & (hand[..., 1] - shoulder[..., 1] > -0.3)
@@ -109,7 +116,9 @@ def _to_front(view: View) -> Shown:
 
 
 def _point(view: View) -> Shown:
-    """Reads an arm of 90 % of its length that is less than 35 degrees from level for 0.4 seconds."""
+    """Reads an arm that is stretched to 90 % of its length
+    and within 35 degrees of level for 0.4 seconds.
+    """
     side = _raised_hand(view)
     shoulder, elbow, wrist = (view.smooth[:, joint[side]] for joint in (SHOULDERS, ELBOWS, WRISTS))
     length = np.median(
@@ -122,7 +131,9 @@ def _point(view: View) -> Shown:
 
 
 def _knock(view: View) -> Shown:
-    """Counts how often a hand in front goes 4 cm ahead of the middle of its strokes."""
+    """Counts how often a hand in front
+    of the body moves 4 cm beyond the middle of its strokes.
+    """
     shown = _to_front(view)
     if not shown:
         return {}
@@ -133,7 +144,9 @@ def _knock(view: View) -> Shown:
 
 
 def _slash(view: View) -> Shown:
-    """Reads a hand that comes from 20 cm above the shoulder to below it and 15 cm inward within half a second."""
+    """Reads a hand that moves from 20 cm above the shoulder to below it,
+    and 15 cm inward, within half a second.
+    """
     side = _raised_hand(view)
     hand, shoulder = view.smooth[:, [WRISTS[side]]], view.smooth[:, [SHOULDERS[side]]]
     above = (hand - shoulder)[:, 0, 1]
@@ -147,7 +160,9 @@ def _slash(view: View) -> Shown:
 
 
 def _hop(view: View) -> Shown:
-    """Reads one foot held 12 cm higher than the other for half the hops' time, and counts the flights of the other."""
+    """Reads hops on one foot and counts its flights;
+    the other foot is 12 cm higher half of the time.
+    """
     toes = view.smooth[:, TOES, 1] - view.floor
     side = int(toes.mean(0).argmin())
     if (toes[:, 1 - side] - toes[:, side] > 0.12).sum() < 0.4 * view.fps:
@@ -192,7 +207,9 @@ def _spin(view: View) -> Shown:
 
 
 def _dodge(view: View) -> Shown:
-    """Reads a way of more than 25 cm to a side, or backward, with one quick movement: above 0.6 m/s."""
+    """Reads a path of more than 25 cm to a side, or backward,
+    with one quick movement (above 0.6 m/s).
+    """
     path = view.path()
     speed = np.linalg.norm(np.gradient(path, 1 / view.fps, axis=0), axis=-1)
     aside, ahead = path[-3:].mean(0)
@@ -204,7 +221,9 @@ def _dodge(view: View) -> Shown:
 
 
 def _strafe(view: View) -> Shown:
-    """Reads a way of more than 33 cm to a side, more than twice as far as ahead or back."""
+    """Reads a path of more than 33 cm to a side,
+    which is more than twice as far as forward or backward.
+    """
     aside, ahead = view.path()[-3:].mean(0)
     if abs(aside) < max(0.33, 2 * abs(ahead)):
         return {}

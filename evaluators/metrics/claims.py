@@ -15,25 +15,25 @@ from flame_mdm.sampling.referee.judging import SHORTEST, Verdict, verdicts
 from flame_mdm.sampling.referee.kinds import GROUPS
 from flame_mdm.sampling.referee.sentences import read_claims
 
-# Seconds of a motion that an audit keeps; all sets of motions have the same size
+# Seconds of a motion that an audit keeps, so that all sets of motions have the same size
 KEPT_SECONDS = 10.0
 STEP = 0.0005  # meters per unit of the kept positions
 
 
 @lru_cache(maxsize=20_000)
 def claims_of(caption: str) -> tuple[Claim, ...]:
-    """Returns the claims of a caption, which is often the caption of many motions."""
+    """Returns the claims of a caption; cached, since many motions may have the same caption."""
     return tuple(read_claims(caption))
 
 
 class ClaimAccuracy(Timed, MotionMean):
     """Share of the decided claims of captions that are true of the motions. A metric of this project.
 
-    The referee (`flame_mdm.sampling.referee`) reads the claims of a caption and measures each on the joints. The
-    values, in [0, 1], are the shares by group of claims, such as "side" and "count", and over "all" claims; higher is
-    better. "decided" is the share of all claims that are decided, "captions" the share of captions with at least one
-    decided claim. Motions on other skeletons than SMPL's 22 joints, and motions shorter than 0.5 seconds, are not
-    judged.
+    The referee (`flame_mdm.sampling.referee`) reads the claims of a caption and measures each on
+    the joints. The values are shares in [0, 1] for each group of claims, such as "side" and
+    "count", and for "all" claims; higher is better. "decided" is the share of all claims that are
+    decided. "captions" is the share of captions with at least one decided claim. Motions shorter
+    than 0.5 seconds, and motions of other skeletons than SMPL's 22 joints, are not judged.
 
     Args:
         fps: frames per second of the motions.
@@ -79,7 +79,7 @@ class ClaimAccuracy(Timed, MotionMean):
 
     @staticmethod
     def _shares(judged: Sequence[Verdict]) -> dict[str, Tensor]:
-        """Returns 1 or 0 for each claim that counts, by the names of the values."""
+        """Returns 1 or 0 for each claim that counts toward a value, by the name of the value."""
         decided = [verdict for verdict in judged if verdict.answer != "cannot tell"]
         true = {
             name: [verdict.answer == "yes" for verdict in decided if name in (verdict.group, "all")]
@@ -92,9 +92,10 @@ class ClaimAccuracy(Timed, MotionMean):
         return {name: torch.tensor(values, dtype=torch.float64) for name, values in flags.items()}
 
     def readings(self, motions: Rows) -> dict[str, np.ndarray]:
-        """Returns the joints of each motion, since the captions say what to measure on them.
+        """Returns the joints of each motion, since the captions decide what is measured.
 
-        "positions" (N, F, 3 J) are int16 in units of `STEP` from the start on the floor, "frames" (N,) their lengths.
+        "positions" (N, F, 3 J) are int16, in units of `STEP`, relative to the start on the floor.
+        "frames" (N,) are the lengths of the motions.
         """
         longest = round(KEPT_SECONDS * self.fps)
         motions_of = motions["joints"]
@@ -109,7 +110,9 @@ class ClaimAccuracy(Timed, MotionMean):
         return {"positions": positions, "frames": frames}
 
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
-        """Returns the number of true claims and of decided claims (N, 2) of each motion, by the names of the values."""
+        """Returns the numbers of true and of decided claims (N, 2) of each motion,
+        by the name of the value.
+        """
         pairs: dict[str, list[list[float]]] = {name: [] for name in self.names}
         for packed, frames, caption in zip(
             rows["positions"], rows["frames"], rows["captions"], strict=True

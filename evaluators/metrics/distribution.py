@@ -14,18 +14,19 @@ NEIGHBORS = 3
 
 
 def frechet_distance(a: Tensor, b: Tensor) -> Tensor:
-    """Computes the Fréchet distance of normal distributions fitted to the rows of a (N, E) and b (M, E), float64.
+    """Computes the Fréchet distance of normal distributions fitted
+    to the rows of a (N, E) and b (M, E).
 
-    |m_a - m_b|^2 + tr S_a + tr S_b - 2 tr (S_a S_b)^(1/2) (Dowson and Landau 1982).
+    In float64: |m_a - m_b|^2 + tr S_a + tr S_b - 2 tr (S_a S_b)^(1/2) (Dowson and Landau 1982).
 
     Example:
         >>> a = torch.randn(50, 2, dtype=torch.float64)
         >>> round(frechet_distance(a, a + 1).item(), 9)  # only the means differ, by 1 in each feature
         2.0
     """
-    # No matrix square root is needed: with the QR decomposition A / sqrt(N - 1) = Q_a R_a of the
+    # No matrix square root is needed. With the QR decomposition A / sqrt(N - 1) = Q_a R_a of the
     # centered rows, and likewise for b, the last trace is the sum of the singular values of R_a
-    # R_b^T. This also holds if covariances are rank-deficient, where an iterative square root
+    # R_b^T. This also holds for rank-deficient covariances, for which an iterative square root
     # fails.
     r_a, r_b = (torch.linalg.qr((x - x.mean(0)) / (len(x) - 1) ** 0.5, mode="r").R for x in (a, b))
     shared = torch.linalg.svdvals(r_a @ r_b.T).sum()
@@ -33,14 +34,15 @@ def frechet_distance(a: Tensor, b: Tensor) -> Tensor:
 
 
 class FrechetMotionDistance(TwoSets):
-    """Fréchet distance of motion features, "FID" (Heusel et al. 2017) or "FD" (FLAME): `frechet_distance`.
+    """Fréchet distance of motion features,
+    "FID" (Heusel et al. 2017) or "FD" (FLAME): `frechet_distance`.
 
-    Covariances have N - 1 in the denominator, as in the authors' code. The authors' code computes
-    means in float32 and scipy's `sqrtm` of the product, and adds 1e-6 to the diagonals if that
-    fails; the relative difference is 1e-8.
+    Covariances have N - 1 in the denominator, as in the authors' code. That code computes means
+    in float32 and scipy's `sqrtm` of the product. If `sqrtm` fails, it adds 1e-6 to the
+    diagonals. The relative difference from its values is 1e-8.
 
-    Lower is better. The value is biased upward, and more so with fewer samples: compare only
-    values for equal N. `update` takes `generated` (B, E) with `keys` (B,), and `real` (R, E) with
+    Lower is better. The value is biased upward, most of all with few samples: compare only values
+    for equal N. `update` takes `generated` (B, E) with `keys` (B,), and `real` (R, E) with
     `real_keys` (R,).
 
     Example:
@@ -60,7 +62,9 @@ class FrechetMotionDistance(TwoSets):
         return max(frechet_distance(generated, real).item(), 0.0)
 
     def weighted(self, rows: Rows, weights: np.ndarray) -> dict[str, np.ndarray]:
-        """Computes the distance of sets in which each motion is repeated as often as it was drawn."""
+        """Computes the distance of two sets in
+        which each motion is repeated as often as it was drawn.
+        """
         generated, real = rows["generated"], rows["real"]
         values = []
         for times in map(torch.from_numpy, weights):
@@ -72,8 +76,8 @@ class FrechetMotionDistance(TwoSets):
 def polynomial_mmd2(a: Tensor, b: Tensor) -> Tensor:
     """Computes the unbiased squared MMD of a (n, E) and b (n, E) with the kernel (x . y / E + 1)^3.
 
-    Bińkowski et al. 2018, eq. 4, including the pairs (i, i) across the sets, as in the authors'
-    code.
+    Bińkowski et al. 2018, eq. 4. The pairs (i, i) across the sets are included, as in the
+    authors' code.
 
     Example:
         >>> polynomial_mmd2(torch.ones(4, 1), torch.ones(4, 1)).item()
@@ -86,16 +90,18 @@ def polynomial_mmd2(a: Tensor, b: Tensor) -> Tensor:
 
 
 class KernelMotionDistance(TwoSets):
-    """Kernel distance of motion features, "KID" (Bińkowski et al. 2018): mean `polynomial_mmd2` of random subsets.
+    """Kernel distance of motion features, "KID" (Bińkowski et al. 2018).
 
-    The values are `mean`, lower is better, and `std` over the subsets. `update` takes `generated`
-    (B, E) with `keys` (B,), and `real` (R, E) with `real_keys` (R,).
+    `mean` is the mean of `polynomial_mmd2` over random subsets; lower is better. `std` is the
+    standard deviation over the subsets. `update` takes `generated` (B, E) with `keys` (B,), and
+    `real` (R, E) with `real_keys` (R,).
 
     Args:
         subsets: number of random subsets.
-        subset_size: number of samples of either set in a subset; neither set may be smaller.
-        replace: draw with replacement, as the code of MoDi and MDM does if there are more real
-            motions than `subset_size`; samples that are drawn twice increase the value.
+        subset_size: number of samples that a subset takes from each set; neither set may be
+            smaller.
+        replace: whether to draw with replacement. The code of MoDi and MDM does so if there are
+            more real motions than `subset_size`. Samples that are drawn twice increase the value.
         seed: seed of the draws.
 
     Example:
@@ -122,7 +128,10 @@ class KernelMotionDistance(TwoSets):
         )
 
     def value(self, generated: Tensor, real: Tensor) -> dict[str, float | None]:
-        """Returns `mean` and `std` of features (N, E), (M, E); `UserError` if there are fewer than `subset_size`."""
+        """Returns `mean` and `std` for features (N, E), (M, E).
+
+        Raises `UserError` if a set has fewer than `subset_size` samples.
+        """
         for name, features in (("generated", generated), ("real", real)):
             self.need(
                 len(features), self.subset_size, f"{name} motions for subsets of {self.subset_size}"
@@ -140,9 +149,9 @@ class KernelMotionDistance(TwoSets):
 def manifold_coverage(points: Tensor, samples: Tensor) -> Tensor:
     """Returns the fraction of `points` (M, E) in the manifold of `samples` (N, E).
 
-    A point is in the manifold if it is within the distance from some sample to that sample's
-    third-nearest neighbor. Kynkäänniemi et al. 2019, eq. 1 and 2. A sample is not a neighbor of
-    itself.
+    A point is in the manifold if, for some sample, it is at most as far from the sample as the
+    sample's third-nearest neighbor. Kynkäänniemi et al. 2019, eq. 1 and 2. A sample is not a
+    neighbor of itself.
 
     Example:
         >>> samples = torch.tensor([[0.0], [1.0], [2.0], [3.0]])
@@ -160,11 +169,11 @@ def _squared_distances(a: Tensor, b: Tensor) -> Tensor:
 class PrecisionRecall(TwoSets):
     """Precision and recall of generated motions (Kynkäänniemi et al. 2019), in [0, 1].
 
-    `precision` is the fraction of generated motions in the manifold of the real motions, `recall`
-    the fraction of real motions in the manifold of the generated motions (`manifold_coverage`);
-    higher is better. Since neighbor distances shrink with the number of samples, both sets are
-    cut to the size of the smaller one, in the order of the keys; the authors' code cuts in the
-    order of the files.
+    `precision` is the fraction of generated motions in the manifold of the real motions. `recall`
+    is the fraction of real motions in the manifold of the generated motions. Higher is better;
+    see `manifold_coverage`. Neighbor distances shrink with the number of samples, so both sets
+    are cut to the size of the smaller set, in the order of the keys. The authors' code cuts in
+    the order of the files.
 
     `update` takes `generated` (B, E) with `keys` (B,), and `real` (R, E) with `real_keys` (R,).
 
@@ -180,7 +189,10 @@ class PrecisionRecall(TwoSets):
     names = ("precision", "recall")
 
     def value(self, generated: Tensor, real: Tensor) -> dict[str, float | None]:
-        """Returns `precision` and `recall` of features (N, E), (M, E); `UserError` with fewer than four motions."""
+        """Returns `precision` and `recall` of features (N, E), (M, E).
+
+        Raises `UserError` if a set has fewer than four motions.
+        """
         size = min(len(generated), len(real))
         self.need(size, NEIGHBORS + 1, "motions in the smaller set")
         generated, real = generated[:size], real[:size]

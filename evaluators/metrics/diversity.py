@@ -9,17 +9,23 @@ from evaluators.metrics.samples import Rows, SampleMetric
 
 
 def pair_distance(a: Tensor, b: Tensor) -> float:
-    """Returns the mean Euclidean distance of features a (..., E) and b (..., E)."""
+    """Returns the mean Euclidean distance between features a (..., E) and b (..., E)."""
     return torch.linalg.vector_norm(a - b, dim=-1).mean().item()
 
 
 def distances(a: Tensor, b: Tensor) -> Tensor:
-    """Returns the Euclidean distances (N, M) of features a (N, E) and b (M, E), each computed from its difference."""
+    """Returns the Euclidean distances (N, M) between features a (N, E) and b (M, E).
+
+    Each distance is computed from its difference, not from products.
+    """
     return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
 
 
 def _random_pairs(count: int, pairs: int, replace: bool, seed: int) -> tuple[Tensor, Tensor]:
-    """Draws both sides (pairs,) of pairs of `count` motions, each with or without replacement."""
+    """Draws the first and second motions (pairs,) of random pairs of `count` motions.
+
+    Each side is drawn with or without replacement.
+    """
     draw = np.random.default_rng(seed).choice
     return torch.from_numpy(draw(count, pairs, replace)), torch.from_numpy(
         draw(count, pairs, replace)
@@ -29,14 +35,14 @@ def _random_pairs(count: int, pairs: int, replace: bool, seed: int) -> tuple[Ten
 class Diversity(SampleMetric):
     """Diversity: mean distance of random pairs of motions (Guo et al. 2020; MDM, eq. 6).
 
-    Best if equal to the diversity of real motions. Published are 300 pairs, drawn as two sets
-    without replacement, for text-to-motion, and 200 pairs with replacement for action-to-motion
-    and unconstrained synthesis. In both cases, a motion may be paired with itself. `update` takes
-    `generated` (B, E) and `keys` (B,).
+    The best value is the diversity of real motions. Published values use 300 pairs for
+    text-to-motion, drawn as two sets without replacement, and 200 pairs with replacement for
+    action-to-motion and unconstrained synthesis. In both cases, a motion may be paired with
+    itself. `update` takes `generated` (B, E) and `keys` (B,).
 
     Args:
         pairs: number of pairs.
-        replace: draw both sides of the pairs with replacement.
+        replace: whether to draw both sides of the pairs with replacement.
         seed: seed of the draws.
 
     Example:
@@ -62,7 +68,7 @@ class Diversity(SampleMetric):
         return pair_distance(features[first], features[second])
 
     def weighted(self, rows: Rows, weights: np.ndarray) -> dict[str, np.ndarray]:
-        """Computes the mean distance over all pairs that may be drawn."""
+        """Computes the mean distance over all possible pairs."""
         features = rows["generated"]
         times = weights[:, : len(features)]
         between = distances(features, features).numpy()
@@ -70,12 +76,14 @@ class Diversity(SampleMetric):
 
 
 class TextMultimodality(SampleMetric):
-    """Multimodality of Guo et al. 2022 (MDM, B.2; MFM, eq. 12): 10 random pairs out of 30 motions per text.
+    """Multimodality of Guo et al. 2022 (MDM, B.2; MFM, eq. 12):
+    mean distance of random pairs per text.
 
-    As in their code, two sets of 10 are drawn without replacement from the 30, with the same
-    indices for all texts; a motion that is in both may be paired with itself. Published for 100
-    texts; the code of MDM and MFM uses whole batches, that is 128 texts. `update` takes
-    `generated` (B, E), `groups` (B,) and `keys` (B,).
+    There are 10 pairs out of 30 motions per text. As in their code, two sets of 10 motions are
+    drawn without replacement, with the same indices for all texts. A motion that is in both sets
+    may be paired with itself. Published values are for 100 texts; the code of MDM and MFM uses
+    whole batches, that is, 128 texts. `update` takes `generated` (B, E), `groups` (B,) and `keys`
+    (B,).
 
     Args:
         samples: number of motions per text.
@@ -98,7 +106,10 @@ class TextMultimodality(SampleMetric):
         self.samples, self.pairs, self.seed = samples, pairs, seed
 
     def value(self, features: Tensor, groups: Tensor) -> float:
-        """Returns the multimodality of features (N, E); `UserError` if a text of `groups` has not `samples` motions."""
+        """Returns the multimodality of features (N, E).
+
+        Raises `UserError` if a text of `groups` does not have `samples` motions.
+        """
         features = features[self.by_group(groups, self.samples)]
         first, second = _random_pairs(self.samples, self.pairs, False, self.seed)
         return pair_distance(features[:, first], features[:, second])
@@ -107,8 +118,8 @@ class TextMultimodality(SampleMetric):
 class PairedMultimodality(SampleMetric):
     """Multimodality of FLAME (eq. 19): two sets of `samples` motions per text, compared one by one.
 
-    FLAME published no code for it. Its Table 3 has 10 motions per text, but eq. 19 uses two sets
-    of 10. `update` takes `generated` (B, E), `groups` (B,) and `keys` (B,).
+    FLAME published no code for this metric. FLAME's Table 3 has 10 motions per text, but eq. 19
+    uses two sets of 10. `update` takes `generated` (B, E), `groups` (B,) and `keys` (B,).
 
     Args:
         samples: number of motions of each of the two sets per text.
@@ -129,7 +140,10 @@ class PairedMultimodality(SampleMetric):
         self.samples = samples
 
     def value(self, features: Tensor, groups: Tensor) -> float:
-        """Returns the value of features (N, E); `UserError` if a text of `groups` (N,) has not 2 `samples` motions."""
+        """Returns the value of features (N, E).
+
+        Raises `UserError` if a text of `groups` (N,) does not have 2 `samples` motions.
+        """
         first, second = features[self.by_group(groups, 2 * self.samples)].chunk(2, dim=1)
         return pair_distance(first, second)
 
@@ -161,7 +175,10 @@ class ActionMultimodality(SampleMetric):
         self.pairs, self.seed = pairs, seed
 
     def value(self, features: Tensor, labels: Tensor) -> float:
-        """Returns the value of features (N, E) with labels (N,); `UserError` if a class has a single motion."""
+        """Returns the value of features (N, E) with labels (N,).
+
+        Raises `UserError` if a class has only one motion.
+        """
         generator = np.random.default_rng(self.seed)
         pairs = []
         for label in labels.unique():
@@ -176,10 +193,11 @@ class ActionMultimodality(SampleMetric):
 class JointVariance(SampleMetric):
     """Variance of joint positions among the motions of a text, in square meters.
 
-    The variance over the `samples` motions of a text, of equal length (n - 1 in the denominator),
-    is summed over x, y and z, and averaged over joints, frames and texts. It is not comparable
-    with FLAME's numbers: Table 3 averages "the variance of joints for the 10 generated motions",
-    by eq. 18, a variance over the frames of one motion, without code.
+    The variance over the `samples` motions of a text, which have equal length, is summed over x,
+    y and z, and averaged over joints, frames and texts. Its denominator is n - 1. The value is
+    not comparable with FLAME's numbers. FLAME's Table 3 averages "the variance of joints for the
+    10 generated motions"; according to eq. 18, this is a variance over the frames of one motion.
+    There is no code for it.
 
     Args:
         samples: number of motions per text.
@@ -219,7 +237,10 @@ class JointVariance(SampleMetric):
         super().update(keys=keys, groups=groups)
 
     def value(self, groups: Tensor) -> float:
-        """Returns the variance; `UserError` if a text has not `samples` motions, or they differ in length."""
+        """Returns the variance.
+
+        Raises `UserError` if a text does not have `samples` motions, or they differ in length.
+        """
         order, values = self.order("keys"), []
         for members in self.by_group(groups, self.samples):
             motions = [self.motions[index].double() for index in order[members].tolist()]

@@ -1,5 +1,7 @@
 # pyright: standard
-"""Memorization: are generated motions closer to the training motions than held-out real motions are?"""
+"""Memorization: whether generated motions are closer
+to training motions than held-out real motions.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,15 +11,19 @@ from torch import Tensor
 
 from evaluators.metrics.samples import SampleMetric
 
-# Every fourth frame of a motion is compared, which takes a quarter of the time. A copy still has
-# distance 0.
+# Only every fourth frame of a motion is compared, which takes a quarter of the time. A copy still
+# has distance 0.
 STEP = 4
-# Share of the held-out real motions that are closer to a training motion than the limit of a copy
+# A motion counts as a copy if it is closer to a training motion than all but this share of the
+# held-out real motions.
 CLOSE = 0.01
 
 
 def poses(joints: Tensor, facing: Sequence[int]) -> Tensor:
-    """Returns joints (F, J, 3) relative to the pelvis on the ground, turned to face z in every frame, as (F, 3J)."""
+    """Returns poses (F, 3J) of joints (F, J, 3), independent of place and heading.
+
+    Joints are relative to the pelvis on the ground, and turned to face z in every frame.
+    """
     right_hip, left_hip, right_shoulder, left_shoulder = facing
     left = (
         joints[:, left_hip]
@@ -34,7 +40,7 @@ def poses(joints: Tensor, facing: Sequence[int]) -> Tensor:
 
 @dataclass
 class TrainingMotions:
-    """The training motions that a motion may be a copy of."""
+    """The training motions, to find the nearest one of a motion."""
 
     #: (N, 3J) poses of all frames of all motions, one after another; see `poses`.
     poses: Tensor
@@ -53,9 +59,10 @@ class TrainingMotions:
             features: (B, E) features of the motions, or None.
 
         Returns:
-            (B, 2), or (B, 1) without features. First, the root mean square distance of the joints
-            in every fourth frame, in meters, from the best window of the same length; infinite if
-            no training motion is as long. Second, the distance of the features.
+            (B, 2), or (B, 1) without features. The first column is the root mean square distance
+            of the joints in every fourth frame, in meters, from the best window of the same
+            length; it is infinite if no training motion is long enough. The second column is the
+            distance of the features.
         """
         squares = self.poses.square().sum(-1)
         # Number of frames from each frame to the end of its motion
@@ -65,7 +72,8 @@ class TrainingMotions:
         )
         if features is None or self.features is None:
             return of_joints[:, None]
-        exact = "donot_use_mm_for_euclid_dist"  # matrix products would cancel in a copy
+        # With matrix products, rounding errors would dominate the distance of a copy.
+        exact = "donot_use_mm_for_euclid_dist"
         return torch.stack(
             [of_joints, torch.cdist(features, self.features, compute_mode=exact).min(1).values], 1
         )
@@ -92,16 +100,16 @@ class TrainingMotions:
 
 
 class NearestTraining(SampleMetric):
-    """Distance from the nearest training motion, and the share of motions that are closer than
-    held-out real motions.
+    """Distance from the nearest training motion, and the share of copies.
 
-    A motion counts as a copy if its joints are closer to a training motion than 99 % of the
-    held-out real motions are (all but `CLOSE`). About 1 % of real motions are copies in this
-    sense, and all motions of a model that repeats the training set. A metric of this project.
+    A metric of this project. A motion counts as a copy if its joints are closer to a training
+    motion than 99 % of the held-out real motions are (all but `CLOSE`). In this sense, about 1 %
+    of real motions are copies, and all motions of a model that repeats the training set are
+    copies.
 
-    The values are the medians `joints`, in meters, and `features`, and the share `copies`, in [0,
-    1]. `update` takes `nearest` (B, 1 or 2), `real_nearest` (B, 1 or 2), both from
-    `TrainingMotions.nearest`, and `keys` (B,).
+    The values `joints`, in meters, and `features` are the medians of the distances. `copies` is
+    the share of copies, in [0, 1]. `update` takes `nearest` (B, 1 or 2), `real_nearest` (B, 1 or
+    2), both from `TrainingMotions.nearest`, and `keys` (B,).
 
     Example:
         >>> metric = NearestTraining()
@@ -118,7 +126,9 @@ class NearestTraining(SampleMetric):
     summary = "copies"
 
     def value(self, nearest: Tensor, real: Tensor) -> dict[str, float | None]:
-        """Returns medians `joints` (meters) and `features`, and `copies` in [0, 1]."""
+        """Returns the medians `joints` (in meters) and `features`,
+        and the share `copies` in [0, 1].
+        """
         joints, *features = nearest.quantile(0.5, dim=0).tolist()
         limit = real[:, 0].quantile(CLOSE)
         return {

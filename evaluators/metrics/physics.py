@@ -18,12 +18,12 @@ STANDING = 0.03
 class FootSkating(Timed, JointMean):
     """Foot skating ratio: fraction of frame transitions in which a foot that touches the floor slides.
 
-    A toe joint touches the floor if it is below 5 cm in two adjacent frames, and slides if it
-    moves more than 2.5 cm over the ground between them (Karunratanakul et al. 2023, "Guided
-    Motion Diffusion"). The 2.5 cm are for 20 frames per second; at other frame rates, the same
-    speed of 0.5 m/s is the limit. The code released with the paper also requires this speed in
-    the mean of five frames, which the paper does not, and averages the ratios of the motions;
-    here, every frame transition has the same weight. Lower is better.
+    A toe joint touches the floor if it is below 5 cm in two adjacent frames. It slides if it
+    moves more than 2.5 cm over the ground between these frames (Karunratanakul et al. 2023,
+    "Guided Motion Diffusion"). The 2.5 cm are for 20 frames per second; at other frame rates, the
+    same speed of 0.5 m/s is the limit. The code released with the paper also requires this speed
+    in the mean of five frames, and averages the ratios of the motions. Here, as in the paper, two
+    frames decide, and every frame transition has the same weight. Lower is better.
 
     Args:
         fps: frames per second of the motions.
@@ -44,7 +44,9 @@ class FootSkating(Timed, JointMean):
         self.toes = list(toes)
 
     def measure(self, motion: Tensor) -> Tensor:
-        """Returns whether each frame transition of a motion (F, J, 3) skates, (F - 1,) bool."""
+        """Returns whether a foot skates in each frame transition of a motion (F, J, 3),
+        (F - 1,) bool.
+        """
         toes = motion[:, self.toes].double()
         fast = toes[..., [0, 2]].diff(dim=0).norm(dim=-1) * self.fps > LIMITS["skating"][0]
         low = toes[..., 1] < LOW
@@ -52,9 +54,10 @@ class FootSkating(Timed, JointMean):
 
 
 class Penetration(JointMean):
-    """Mean depth over frames of the lowest joint below the floor, y = 0, in meters; depths up to 5 mm count as 0.
+    """Mean depth of the lowest joint below the floor, y = 0, in meters.
 
-    Yuan et al. 2023 (PhysDiff) measure the lowest vertex of a mesh instead. Lower is better.
+    The mean is over frames; depths up to 5 mm count as 0. Yuan et al. 2023 (PhysDiff) measure the
+    lowest vertex of a mesh instead. Lower is better.
 
     Example:
         >>> metric, joints = Penetration(), torch.full((1, 3, 22, 3), -0.25)
@@ -75,9 +78,10 @@ class Penetration(JointMean):
 
 
 class Floating(Penetration):
-    """Mean height over frames of the lowest joint above the floor, in meters; heights up to 5 mm count as 0.
+    """Mean height of the lowest joint above the floor, y = 0, in meters.
 
-    Jumps count as floating, too. Lower is better.
+    The mean is over frames; heights up to 5 mm count as 0. Jumps count as floating, too. Lower is
+    better.
 
     Example:
         >>> metric, joints = Floating(), torch.full((1, 3, 22, 3), 0.25)
@@ -90,9 +94,10 @@ class Floating(Penetration):
 
 
 class Jitter(Timed, JointMean):
-    """Mean jerk of the joints, the third difference of their positions, in m/s^3, as in Yi et al. 2022 (PIP).
+    """Mean jerk of the joints in m/s^3, as in Yi et al. 2022 (PIP).
 
-    It grows with the frame rate: compare only values for equal frame rates. Lower is better.
+    The jerk is computed from the third difference of the positions. It grows with the frame rate:
+    compare only values for equal frame rates. Lower is better.
 
     Args:
         fps: frames per second of the motions.
@@ -115,8 +120,8 @@ class Jitter(Timed, JointMean):
 class StaticShare(Timed, JointMean):
     """Fraction of motions that hardly move: less than 3 cm/s on average over joints and frames.
 
-    Real data sets have static motions, too, of standing people: compare with their value. Lower
-    is better.
+    Real data sets have static motions, too, of standing people: compare with the value of real
+    motions. Lower is better.
 
     Args:
         fps: frames per second of the motions.

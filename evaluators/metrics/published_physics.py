@@ -1,8 +1,8 @@
 # pyright: standard
-"""Physics metrics of published benchmarks, each with its own units, thresholds and frame rate; the floor is y = 0.
+"""Physics metrics of published benchmarks. The floor is y = 0.
 
-Values of different benchmarks are not comparable with one another, nor with values of
-`evaluators.metrics.physics`.
+Each benchmark has its own units, thresholds and frame rate. The values are not comparable between
+benchmarks, nor with values of `evaluators.metrics.physics`.
 """
 
 import math
@@ -23,14 +23,14 @@ FEET = (
     11,
 )
 JERK_OF_REAL_MOTIONS: dict[float, float] = {20: 0.033031363, 30: 0.016383045}
-"""Mean jerk of FlowMDM by frame rate: of HumanML3D at 20 frames per second, and of BABEL at 30."""
+"""FlowMDM's mean jerk of HumanML3D (20 frames per second) and BABEL (30), by frame rate."""
 Values = dict[str, Tensor | float]
 
 
 class PublishedPhysics(Timed, JointMean):
-    """Base class of published physics metrics: means over motions of values by name.
+    """Base class of published physics metrics, which are means over motions.
 
-    `measured` is the fraction of motions that have all values.
+    `measured` is the fraction of motions for which all values are defined.
 
     Args:
         fps: frames per second of the motions.
@@ -39,7 +39,7 @@ class PublishedPhysics(Timed, JointMean):
 
     higher_is_better = False
     summary = None
-    # the only frame rate at which the values are defined; None = any
+    # the only frame rate at which the values are defined; None = any frame rate
     required_fps: float | None = None
 
     def __init__(self, fps: float, feet: Sequence[int] = FEET):
@@ -47,7 +47,9 @@ class PublishedPhysics(Timed, JointMean):
         self.feet = list(feet)
 
     def value(self, sums: Tensor, counts: Tensor) -> dict[str, float | None]:
-        """Returns the means by name; raises `UserError` if they are not defined at the frame rate."""
+        """Returns the means by name;
+        raises `UserError` if they are undefined at the frame rate.
+        """
         if not self.defined:
             raise self.error(
                 f"defined at {self.required_fps:g} frames per second, but the motions have {self.fps:g}"
@@ -60,22 +62,26 @@ class PublishedPhysics(Timed, JointMean):
         return self.required_fps in (None, self.fps)
 
     def readings(self, motions: Rows) -> dict[str, np.ndarray]:
-        """Returns the sum and the number (N, 2) of the values of each motion, by name; {} if they are not defined."""
+        """Returns by name the sum and the number (N, 2)
+        of the values of each motion; {} if undefined.
+        """
         return super().readings(motions) if self.defined else {}
 
 
 class MBenchQuality(PublishedPhysics):
     """Motion quality of MBench (ViMoGen, bf891de), in meters per frame, only at 20 frames per second.
 
-    `jitter_degree`: mean length of the second difference of joint positions, plus the same
-    relative to the root; `dynamic_degree`: the same of the first difference, higher = more
-    motion; `ground_penetration`: mean depth of the toes that are deeper than 5 mm, or 0;
-    `foot_sliding`: mean step over the ground of toes in contact; `foot_floating`: frames in which
-    the body moves without a foot that carries it, per frame; it can exceed 1. A toe is in contact
-    if it moves less than 1 cm per frame, also in the air, or is lower than 2 cm.
+    - `jitter_degree`: mean length of the second difference of joint positions, plus the mean
+      length of the second difference of positions relative to the root.
+    - `dynamic_degree`: computed likewise from the first difference; higher = more motion.
+    - `ground_penetration`: mean depth of the toes that are deeper than 5 mm, otherwise 0.
+    - `foot_sliding`: mean step over the ground of toes in contact.
+    - `foot_floating`: frames in which the body moves without a foot that carries it, per frame.
+      The value can exceed 1.
 
-    The code takes z as height, although its published pipeline passes motions in which y is
-    height. Here, it is y.
+    A toe is in contact if it moves less than 1 cm per frame, even in the air, or if it is lower
+    than 2 cm. The published code uses z as the height, although its pipeline passes motions in
+    which y is the height. Here, the height is y.
 
     Args:
         fps: frames per second of the motions; at other rates than 20, `compute` raises
@@ -125,24 +131,32 @@ class MBenchQuality(PublishedPhysics):
 
 
 def mbench_contact(feet: Tensor) -> Tensor:
-    """Returns whether feet (F, 2, 3) are in contact, (F, 2) bool; (0, 2) for a single frame."""
+    """Returns whether feet (F, 2, 3) are in contact, (F, 2) bool.
+
+    The shape is (0, 2) for a single frame.
+    """
     speed = _speed(feet)
     return (speed < 0.01) | (feet[: len(speed), :, 1] < 0.02)
 
 
 def _speed(points: Tensor) -> Tensor:
-    """(F, ..., 3) -> (F, ...), meters to the next frame; the last one is repeated. One frame has none."""
+    """Returns the distances (F, ...) of positions (F, ..., 3) to the next frame, in meters.
+
+    The last distance is repeated. A single frame has no distances.
+    """
     speed = points.diff(dim=0).norm(dim=-1)
     return torch.cat([speed, speed[-1:]])
 
 
 def mbench_floating(motion: Tensor, feet: Tensor, contact: Tensor) -> tuple[int, int, int]:
-    """Counts the frames of `foot_floating` of a motion (F, J, 3) with two feet (F, 2, 3) in contact or not (F, 2).
+    """Counts the frames of `foot_floating` in a motion (F, J, 3).
+
+    The positions of the two feet are (F, 2, 3), their contacts (F, 2) bool.
 
     Returns:
-        Three numbers of frames: frames in which the feet on the ground move unlike the body;
-        frames in which a foot in the air moves much less than the body, which count half in the
-        score; and frames in which both feet swing to and fro in the air.
+        Three numbers of frames. In the first kind, the feet on the ground move unlike the body.
+        In the second, a foot in the air moves much less than the body; these frames count half in
+        the score. In the third, both feet swing to and fro in the air.
     """
     root = _speed(motion[:, 0])
     rate = _speed(feet - motion[:, :1]) / (root[:, None] + 1e-6)
@@ -163,26 +177,34 @@ def mbench_floating(motion: Tensor, feet: Tensor, contact: Tensor) -> tuple[int,
 
 
 def _runs(aloft: Tensor) -> list[tuple[int, int]]:
-    """Returns begin and end (exclusive) of the runs of at least four True in (F,)."""
+    """Returns begin and end (exclusive) of each run
+    of at least four True values in a mask (F,).
+    """
     runs = torch.nn.functional.pad(aloft.int(), (1, 1)).diff().nonzero().view(-1, 2).tolist()
     return [(begin, end) for begin, end in runs if end - begin >= 4]
 
 
 class KimodoQuality(PublishedPhysics):
-    """Foot skating of Kimodo (7330e7e), in m/s, from joints and from the contacts that the model predicts.
+    """Foot skating of Kimodo (7330e7e), in m/s,
+    from joints and from the contacts that the model predicts.
 
-    `skate_from_height`: mean speed of toes that are lower than 5 cm; `skate_ratio`: fraction of
-    their steps with more than 0.2 m/s, among steps that begin and end lower than 5 cm; `low`:
-    mean fraction of steps that begin there: if it is 0, so are the two. If the representation has
-    contacts: `skate_from_contacts` and `skate_max` are mean and largest speed of heels and toes
-    in contact; `contact_consistency` is the fraction of contacts that agree with a heuristic
-    (slower than 0.15 m/s and lower than 10 cm), higher is better.
+    - `skate_from_height`: mean speed of toes that are lower than 5 cm.
+    - `skate_ratio`: fraction of the toes' steps that are faster than 0.2 m/s, among steps that
+      begin and end lower than 5 cm.
+    - `low`: mean fraction of steps that begin lower than 5 cm. If it is 0, the first two values
+      are 0, too.
 
-    Speeds are in three dimensions; a motion of one frame has none.
+    If the representation has contacts:
+
+    - `skate_from_contacts`, `skate_max`: mean and largest speed of heels and toes in contact.
+    - `contact_consistency`: fraction of contacts that agree with a heuristic (slower than 0.15
+      m/s and lower than 10 cm); higher is better.
+
+    Speeds are in three dimensions. A motion of one frame has no speed.
 
     Args:
         fps: frames per second of the motions.
-        feet: indices of left heel and toe, right heel and toe.
+        feet: indices of the left heel, left toe, right heel and right toe.
 
     Example:
         >>> metric, joints = KimodoQuality(fps=20), torch.zeros(1, 5, 22, 3)
@@ -218,8 +240,8 @@ class KimodoQuality(PublishedPhysics):
             joints: (B, F, J, 3) positions in meters, y up, floor at y = 0.
             mask: (B, F) bool, True = real frame.
             keys: (B,) int64, unique keys of the motions.
-            contacts: (B, F, 4) bool, predicted contacts of the feet. None = values of contacts
-                are not measured.
+            contacts: (B, F, 4) bool, predicted contacts of the feet. None = values that need
+                contacts are not computed.
 
         Raises:
             UserError: If a motion is not finite.
@@ -233,11 +255,13 @@ class KimodoQuality(PublishedPhysics):
         self.add(keys, [self.measure(*pair) for pair in zip(motions, labels, strict=True)])
 
     def extras(self, motions: Rows, i: int) -> dict[str, Tensor]:
-        """Returns the contacts of the motion with number i, if it has any."""
+        """Returns the contacts of motion number i, if it has any."""
         return {"contacts": motions["contacts"][i][None]} if "contacts" in motions else {}
 
     def measure(self, motion: Tensor, contacts: Tensor | None = None) -> Values:
-        """Computes the values of a motion (F, J, 3) with contacts (F, 4) bool of its feet, as far as it has them."""
+        """Computes the values of a motion (F, J, 3),
+        and of the contacts (F, 4) bool of its feet if given.
+        """
         if len(motion) < 2:
             return {}
         feet = motion[:, self.feet]
@@ -259,13 +283,19 @@ class KimodoQuality(PublishedPhysics):
 
 
 class KimodoConstraints(MotionMean):
-    """Constraint errors of Kimodo (7330e7e), for edits: distance of kept parts from the real motion, in meters.
+    """Constraint errors of Kimodo (7330e7e) for edits:
+    distances of kept parts from the real motion.
 
-    `root2d_err`: over the ground, of the root in frames that keep it; `root2d_err_p95`: its 95th
-    percentile over motions; `root2d_acc`: fraction of those frames with at most 10 cm;
-    `fullbody_keyframe`: of all joints in frames that keep all; `end_effector`: of the kept joints
-    in other frames. In the code, the user draws the trajectory of the root; here, it is the
-    trajectory of the real motion.
+    Distances are in meters.
+
+    - `root2d_err`: distance of the root over the ground, in frames that keep the root.
+    - `root2d_err_p95`: 95th percentile of `root2d_err` over motions.
+    - `root2d_acc`: fraction of these frames with a distance of at most 10 cm.
+    - `fullbody_keyframe`: distance of all joints, in frames that keep all joints.
+    - `end_effector`: distance of the kept joints in the other frames.
+
+    In Kimodo's code, the user draws the trajectory of the root. Here, it is the trajectory of the
+    real motion.
 
     Example:
         >>> metric, real = KimodoConstraints(), torch.zeros(1, 5, 22, 3)
@@ -321,7 +351,10 @@ class KimodoConstraints(MotionMean):
 
 
 def constraint_errors(root: Tensor, full: Tensor, parts: Tensor) -> dict[str, Tensor]:
-    """Computes the values of `KimodoConstraints` from offsets of a motion, (N, 2) or (..., 3); NaN without any."""
+    """Computes the values of `KimodoConstraints` from the offsets (N, 2) or (..., 3) of a motion.
+
+    Values without offsets are NaN.
+    """
     root, full, parts = (offset.norm(dim=-1) for offset in (root, full, parts))
     near = (root <= 0.1).double()
     values = (root.mean(), near.mean(), full.mean(), parts.mean())
@@ -329,17 +362,19 @@ def constraint_errors(root: Tensor, full: Tensor, parts: Tensor) -> dict[str, Te
 
 
 class PhysicalFootContact(PublishedPhysics):
-    """Physical foot contact score (PFC) of EDGE (17c3428), x 10^4: acceleration of the root without a planted foot.
+    """Physical foot contact score (PFC) of EDGE (17c3428), x 10^4:
+    acceleration without a planted foot.
 
-    Mean over frames of the product of both feet's steps over the ground, in meters per frame, and
-    the root's acceleration, divided by its largest value; downward accelerations count as 0. A
-    foot's step is the smaller one of its ankle and toe. Motions without acceleration, which the
-    code averages as NaN, have no value. Lower is better.
+    The score is the mean over frames of a product of three factors: the step of each foot over
+    the ground, in meters per frame, and the acceleration of the root, divided by its largest
+    value. Downward accelerations count as 0. The step of a foot is the smaller step of its ankle
+    and its toe. Motions without acceleration have no value; EDGE's code averages their NaN. Lower
+    is better.
 
     Args:
         fps: frames per second of the motions; at other rates than 30, `compute` raises
             `UserError`.
-        feet: indices of left ankle and toe, right ankle and toe.
+        feet: indices of the left ankle, left toe, right ankle and right toe.
 
     Example:
         >>> metric, joints = PhysicalFootContact(fps=30), torch.zeros(1, 4, 22, 3)
@@ -354,10 +389,13 @@ class PhysicalFootContact(PublishedPhysics):
     required_fps = 30
 
     def measure(self, motion: Tensor) -> Values:
-        """Computes the score of a motion (F, J, 3); NaN if the root does not accelerate or frames are fewer than 3."""
+        """Computes the score of a motion (F, J, 3).
+
+        The score is NaN if the root does not accelerate, or the motion has fewer than 3 frames.
+        """
         motion = motion.double()
-        # The code divides by the frame duration first, which decides whether rounding errors of a
-        # steady root are 0.
+        # EDGE's code divides by the frame duration first. The order decides whether the rounding
+        # errors of a steady root become 0.
         acceleration = (motion[:, 0].diff(dim=0) * self.fps).diff(dim=0) * self.fps
         acceleration[:, 1].clamp_(min=0)
         acceleration = acceleration.norm(dim=-1)
@@ -369,19 +407,21 @@ class PhysicalFootContact(PublishedPhysics):
 
 
 class TransitionJerk(SampleMetric):
-    """Peak jerk and area under the jerk of transitions between kept and generated frames, of FlowMDM (e81c67f).
+    """FlowMDM's peak jerk, and area under the jerk,
+    at transitions between kept and generated frames.
 
-    The jerk of a frame is the largest L1 norm of the third difference of a joint's position, in
-    meters per frame^3. Windows are centered at the first frame after each change from kept to
-    generated frames or back, if the motion contains them. `peak` is the maximum of the mean over
-    windows, frame by frame. `area` is the sum of the mean's distances from
-    `JERK_OF_REAL_MOTIONS`, above or below; it grows with the window. `windows` is the number of
-    windows. Frame rates that `JERK_OF_REAL_MOTIONS` lacks have no area.
+    As in FlowMDM's code (e81c67f). The jerk of a frame is the largest L1 norm, over joints, of
+    the third difference of the position, in meters per frame^3. A window is centered at the first
+    frame after each change between kept and generated frames, if the motion contains the whole
+    window. The jerk is averaged over windows, frame by frame. `peak` is the maximum of this mean
+    curve. `area` is the sum of its distances from `JERK_OF_REAL_MOTIONS`, above or below; it
+    grows with the window. `windows` is the number of windows. At frame rates without an entry in
+    `JERK_OF_REAL_MOTIONS`, there is no area.
 
     Args:
         fps: frames per second of the motions.
-        window: number of frames of a window; published are 60 at 20 frames per second, and 30 at
-            30.
+        window: number of frames of a window. Published values use 60 frames at 20 frames per
+            second, and 30 frames at 30 frames per second.
 
     Example:
         >>> metric, joints = TransitionJerk(fps=20, window=8), torch.zeros(1, 12, 22, 3)
@@ -438,7 +478,7 @@ class TransitionJerk(SampleMetric):
 
 
 def transition_jerk(window: Tensor) -> Tensor:
-    """Returns the jerk of each frame: positions (F, J, 3) -> (F - 3,), meters per frame^3."""
+    """Returns the jerk (F - 3,) of the frames of positions (F, J, 3), in meters per frame^3."""
     return window.double().diff(n=3, dim=0).abs().sum(-1).amax(-1)
 
 

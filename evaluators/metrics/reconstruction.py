@@ -1,5 +1,7 @@
 # pyright: standard
-"""Errors of generated motions against the real motion of the same text, or the motion that was edited."""
+"""Errors of motions relative to the real motion of the same text,
+or to the motion before an edit.
+"""
 
 from collections.abc import Mapping, Sequence
 
@@ -15,13 +17,13 @@ RIFKE = Rifke()
 
 
 def temos_parts(joints: Tensor) -> dict[str, Tensor]:
-    """Returns root (F, 3), trajectory (F, 2), local (F, 20, 3) and global (F, 21, 3) positions,
-    as compared by TEMOS.
+    """Returns the positions that TEMOS compares.
 
-    The motion (F, 21, 3), in KIT units, is placed on the floor, with its first root at x = z = 0
-    and its first heading along +z. Local positions, of all joints except the root, have the root
-    at x = z = 0 and the heading along +z in each frame. `Rifke` defines floor and heading, with
-    the peculiarities of the published code.
+    The positions are root (F, 3), trajectory (F, 2), local (F, 20, 3) and global (F, 21, 3). The
+    motion (F, 21, 3), in KIT units, is placed on the floor. Its root starts at x = z = 0, with a
+    heading along +z. Local positions are positions of all joints except the root. For them, each
+    frame is moved and turned so that the root is at x = z = 0 and the heading is along +z.
+    `Rifke` defines floor and heading, with the peculiarities of the published code.
     """
     ground = joints[:, :1] * joints.new_tensor([1.0, 0.0, 1.0])
     floor = joints.new_tensor([0.0, 1.0, 0.0]) * RIFKE.floor(joints)
@@ -36,7 +38,9 @@ def temos_parts(joints: Tensor) -> dict[str, Tensor]:
 
 
 def flame_parts(joints: Tensor, root: Tensor, parents: Sequence[int]) -> dict[str, Tensor]:
-    """Returns root (F, 3), trajectory (F, 2), bones (F, J - 1, 3) and joints (F, J, 3), as compared by FLAME's code.
+    """Returns the positions that FLAME's code compares.
+
+    They are root (F, 3), trajectory (F, 2), bones (F, J - 1, 3) and joints (F, J, 3).
 
     Args:
         joints: (F, J, 3) in meters.
@@ -48,13 +52,14 @@ def flame_parts(joints: Tensor, root: Tensor, parents: Sequence[int]) -> dict[st
 
 
 class PositionErrors(MotionMean):
-    """Base class of position errors: APE and AVE of each of `PARTS`, such as `ape_root`. Lower is better.
+    """Base class of position errors:
+    APE and AVE for each of `PARTS`, such as `ape_root`. Lower is better.
 
     Args:
-        samples: number of motions per text. With several, as in TEMOS, `best_ape_root`, ... are
-            errors of the motion with the smallest APE of the root, and `worst_ape_root`, ... of
-            the motion with the largest.
-        upsampling: number of frames of a recording per frame of a motion. Above 1, motions are
+        samples: number of motions per text. With several motions, as in TEMOS, `best_ape_root`,
+            ... are the errors of the motion with the smallest APE of the root, and
+            `worst_ape_root`, ... are the errors of the motion with the largest.
+        upsampling: number of recorded frames per frame of a motion. If it is above 1, motions are
             interpolated and compared with the recordings.
     """
 
@@ -92,8 +97,8 @@ class PositionErrors(MotionMean):
                 needed for `upsampling`.
 
         Raises:
-            UserError: If a motion is not finite or has fewer than two frames, or `references` are
-                needed and missing.
+            UserError: If a motion is not finite or has fewer than two frames, or if required
+                `references` are missing.
         """
         motions, real_motions = (
             self.real_frames(joints, mask),
@@ -119,7 +124,9 @@ class PositionErrors(MotionMean):
         self.add(keys, errors, groups=keys if groups is None or self.samples == 1 else groups)
 
     def value(self, sums: Tensor, counts: Tensor, groups: Tensor) -> dict[str, float | None]:
-        """Returns the errors by name; raises `UserError` if a text has not `samples` motions."""
+        """Returns the errors by name;
+        raises `UserError` if a text does not have `samples` motions.
+        """
         texts = (
             self.by_group(groups, self.samples)
             if self.samples > 1
@@ -133,25 +140,29 @@ class PositionErrors(MotionMean):
         return dict(zip(self.names, values, strict=True))
 
     def positions(self, joints: Tensor) -> dict[str, Tensor]:
-        """Returns the compared positions of a whole motion (F, J, 3), by the names of `PARTS`."""
+        """Returns the compared positions of a motion (F, J, 3), by the names of `PARTS`."""
         raise NotImplementedError
 
     def errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Returns the errors of a clip by name: "ape" per frame (F,), or their mean if clips have equal weight."""
+        """Returns the errors of a clip by name.
+
+        "ape" has one value per frame (F,), or is the mean over frames if clips have equal weight.
+        """
         raise NotImplementedError
 
 
 class TemosPositionErrors(PositionErrors):
     """APE and AVE of TEMOS (Petrovich et al. 2022), used by FLAME on KIT (eq. 16 to 18, Table 2).
 
-    APE is the distance of `temos_parts`, averaged over joints, and over all frames of all clips.
-    AVE is the distance of the variances over time (n - 1 in the denominator) of each coordinate,
-    averaged over joints, then over clips. Both are in 1000 KIT units, which are 1.56 m and which
-    the tables call meters. TEMOS compares at 100 frames per second: `upsampling=8`.
+    APE is the distance between `temos_parts`, averaged over joints and over all frames of all
+    clips. AVE is the distance between the variances of each coordinate over time (n - 1 in the
+    denominator), averaged over joints, then over clips. The unit of both is 1000 KIT units, which
+    are 1.56 m; the tables call it meters. TEMOS compares at 100 frames per second:
+    `upsampling=8`.
 
     Args:
         samples: number of motions per text; see `PositionErrors`.
-        upsampling: number of frames of a recording per frame of a motion.
+        upsampling: number of recorded frames per frame of a motion.
 
     Example:
         >>> metric, joints = TemosPositionErrors(), torch.rand(1, 5, 21, 3)
@@ -166,7 +177,10 @@ class TemosPositionErrors(PositionErrors):
     units_per_meter = 640.0
 
     def positions(self, joints: Tensor) -> dict[str, Tensor]:
-        """Returns `temos_parts` of a motion (F, 21, 3), in 1000 KIT units; `UserError` for other skeletons."""
+        """Returns `temos_parts` of a motion (F, 21, 3), in 1000 KIT units.
+
+        Raises `UserError` for other skeletons.
+        """
         if joints.shape[1] != 21:
             raise self.error(f"{joints.shape[1]} joints, but defined only for KIT's 21 (MMM)")
         return {part: x / 1000 for part, x in temos_parts(joints * self.units_per_meter).items()}
@@ -181,13 +195,14 @@ class TemosPositionErrors(PositionErrors):
 
 
 class FlamePositionErrors(PositionErrors):
-    """APE and AVE of `flame_parts` as in FLAME's code, which its tables do not use. In meters and square meters.
+    """APE (in meters) and AVE (in square meters) of FLAME's code,
+    which FLAME's tables do not use.
 
-    The error of the trajectory is the sum of the distances along its two axes; the local error is
-    the error of bones. Variances of global positions are averaged over joints before they are
-    compared. Each clip has the same weight. FLAME's joints lack the orientation of the root and
-    start from its translation; here, `joints` are compared unchanged, and the first one is the
-    root.
+    The compared positions are `flame_parts`. The error of the trajectory is the sum of the
+    distances along its two axes. The local error is the error of the bones. Variances of global
+    positions are averaged over joints before they are compared. Each clip has the same weight.
+    FLAME's joints lack the orientation of the root and start from its translation. Here, `joints`
+    are compared unchanged, and the first joint is the root.
 
     Args:
         parents: parent of each joint of the skeleton, -1 for the root.
@@ -226,7 +241,10 @@ class FlamePositionErrors(PositionErrors):
 
 
 class EditErrors(MotionMean):
-    """Base class of the distances between the joints of edited and real motions, in meters. Lower is better."""
+    """Base class of distances between the joints of edited and real motions, in meters.
+
+    Lower is better.
+    """
 
     higher_is_better = False
     unit = "m"
@@ -241,7 +259,10 @@ class EditErrors(MotionMean):
         keys: Tensor,
         kept: Tensor | None,
     ) -> None:
-        """Adds the errors of B pairs of motions, up to the end of the shorter one; see `update` for the arguments."""
+        """Adds the errors of B pairs of motions; the arguments are described in `update`.
+
+        Two motions are compared up to the end of the shorter one.
+        """
         motions = zip(
             self.real_frames(joints, mask), self.real_frames(real_joints, real_mask), strict=True
         )
@@ -258,16 +279,19 @@ class EditErrors(MotionMean):
         self.add(keys, errors)
 
     def errors_of(self, distance: Tensor, kept: Tensor) -> dict[str, Tensor]:
-        """Returns the errors of a motion from distances (F, J) and kept joints (F, J) bool; {} if it has none."""
+        """Returns the errors of a motion from distances (F, J) and kept joints (F, J) bool;
+        {} if there are none.
+        """
         raise NotImplementedError
 
 
 class DisplacementErrors(EditErrors):
-    """ADE and FDE: mean distance of the joints in all predicted frames, and in the last of them, in meters.
+    """ADE and FDE: mean distance of the joints in all predicted frames,
+    and in the last one, in meters.
 
-    As usual in motion prediction (Yuan and Kitani 2020), averaged over joints and frames of a
-    clip, then over clips. The part that an edit kept does not count. MFM (Table 3) gives no
-    formula, code or unit for its numbers, which are too large for meters: they are not
+    As usual in motion prediction (Yuan and Kitani 2020), distances are averaged over joints and
+    frames of a clip, then over clips. The part that an edit kept does not count. MFM (Table 3)
+    gives no formula, code or unit for its numbers. They are too large for meters, so they are not
     comparable.
 
     Example:
@@ -307,7 +331,9 @@ class DisplacementErrors(EditErrors):
         self.compare(joints, mask, real_joints, real_mask, keys, kept)
 
     def errors_of(self, distance: Tensor, kept: Tensor) -> dict[str, Tensor]:
-        """Returns ADE and FDE of a motion from distances (F, J) and kept joints (F, J) bool."""
+        """Returns the ADE and FDE of a motion
+        from distances (F, J) and kept joints (F, J) bool.
+        """
         new = ~kept
         if not new.any():
             raise self.error("a motion has no generated frame to compare")
@@ -318,9 +344,9 @@ class DisplacementErrors(EditErrors):
 class KeptDrift(EditErrors):
     """Distance in the world, in meters, by which the kept part of an edit has moved. A metric of this project.
 
-    `mean` is over the kept joints and frames of a motion, then over motions, `largest` over all.
-    With features relative to the root, an edit can keep steps and poses exactly, and still move a
-    kept ending to where the new part leads.
+    `mean` is averaged over the kept joints and frames of a motion, then over motions. `largest`
+    is the maximum over all of them. If features are relative to the root, an edit can keep steps
+    and poses exactly, and still move a kept ending to the place where the new part leads.
 
     Example:
         >>> metric, real = KeptDrift(), torch.zeros(1, 5, 22, 3)
@@ -358,13 +384,17 @@ class KeptDrift(EditErrors):
         self.compare(joints, mask, real_joints, real_mask, keys, kept)
 
     def errors_of(self, distance: Tensor, kept: Tensor) -> dict[str, Tensor]:
-        """Returns mean and largest distance of the kept joints of a motion; {} if the edit kept none."""
+        """Returns the mean and the largest distance of the kept joints of a motion;
+        {} without kept joints.
+        """
         return (
             {"mean": distance[kept].mean(), "largest": distance[kept].max()} if kept.any() else {}
         )
 
     def value(self, sums: Tensor, counts: Tensor) -> dict[str, float | None]:
-        """Returns `mean` and `largest` over the motions with kept joints; None if there are none."""
+        """Returns `mean` and `largest` over the motions with kept joints;
+        None without such motions.
+        """
         drift = sums[counts[:, 0] > 0]
         values = (
             (drift[:, 0].mean().item(), drift[:, 1].max().item()) if len(drift) else (None, None)

@@ -24,7 +24,7 @@ from flame_mdm.seeds import key
 SAME = 0.9
 # The k of recall
 TMR_TOP = (1, 2, 3, 5, 10)
-# Number of motions in a batch, and maximum number of dissimilar motions, of TMR
+# TMR's number of motions in a batch, and maximum number of dissimilar motions
 BATCH, DISSIMILAR = 32, 100
 
 
@@ -35,7 +35,11 @@ def _encoder(config: str) -> ConditionEncoder:
 
 @functools.cache
 def embedding(config: str, caption: str) -> Tensor:
-    """Returns the vector (C,) of length 1 of a caption, encoded alone; `config` is the JSON of an encoder's mapping."""
+    """Returns the vector (C,) of a caption, of length 1;
+    `config` is the JSON of an encoder's mapping.
+
+    The caption is encoded alone, not in a batch.
+    """
     empty = torch.zeros(1, 1, 1)
     with torch.no_grad():
         vector = _encoder(config)(
@@ -50,16 +54,16 @@ def plain_caption(caption: str) -> str:
 
 
 def whole_set_retrieval(similarity: Tensor, correct: Tensor | None = None) -> dict[str, float]:
-    """Computes recall and median rank of TMR from similarities (N, N) of texts (rows) and motions (columns).
+    """Computes TMR's recall and median rank from the similarities of texts and motions.
 
     Args:
-        similarity: (N, N).
-        correct: (N, N) bool, symmetric, True = correct pair; the best of the correct candidates
-            counts. None = the diagonal.
+        similarity: (N, N) similarities of texts (rows) and motions (columns).
+        correct: (N, N) bool, symmetric, True = correct pair. The best correct candidate counts.
+            None = only the diagonal is correct.
 
     Returns:
-        Recall `t2m_top1`, ... in [0, 1] and median rank `t2m_median`, 1 = best, of motions for
-        texts, and `m2t_` of texts for motions.
+        Recall `t2m_top1`, ... in [0, 1] and median rank `t2m_median` (1 = best) of motions for
+        texts. The values of texts for motions begin with `m2t_`.
 
     Example:
         >>> values = whole_set_retrieval(torch.eye(4))
@@ -77,7 +81,10 @@ def whole_set_retrieval(similarity: Tensor, correct: Tensor | None = None) -> di
 
 
 def best_ranks(similarity: Tensor, correct: Tensor) -> Tensor:
-    """Returns the rank (N,) of the best correct candidate, 0 = first; equal similarities (N, M) share a mean rank."""
+    """Returns the rank (N,) of the best correct candidate, 0 = first.
+
+    Candidates with equal similarities (N, M) share their mean rank.
+    """
     best = similarity.where(correct, -torch.inf).amax(1, keepdim=True)
     return (similarity > best).sum(1) + ((similarity == best).sum(1) - 1) / 2
 
@@ -130,13 +137,18 @@ class CaptionMetric(SampleMetric):
 
 
 class MultiPositiveRPrecision(CaptionMetric):
-    """R-precision, motions for a text, where motions with the same caption are correct, too. A
-    metric of this project.
+    """R-precision, motions for a text, in which motions with the same caption are correct, too.
 
-    - `topK`: the fraction of texts with a correct motion among the K nearest; ties share their mean rank.
-    - `proper`: R-precision as in information retrieval, the fraction of a text's R correct motions among its R nearest.
-    - `single_topK`: only the text's own motion is correct, as in `MotionsForText`; equal to its values up to ties.
-    - `chance_topK`: expected values of a random order, since similar captions raise all values.
+    A metric of this project.
+
+    - `topK`: the fraction of texts with a correct motion among the K nearest; ties share their
+      mean rank.
+    - `proper`: R-precision as in information retrieval. A text with R correct motions adds the
+      fraction of them among its R nearest motions.
+    - `single_topK`: only the text's own motion is correct. Except for ties, the values equal
+      those of `MotionsForText`.
+    - `chance_topK`: values expected from a random order, for comparison: similar captions raise
+      all values.
     - `positives`: the mean number R of correct motions.
 
     Args:
@@ -144,7 +156,7 @@ class MultiPositiveRPrecision(CaptionMetric):
             text.
         pool: number of motions in a pool, as in `MotionsForText`.
         seed: seed of the pools.
-        normalize: scale features to length 1 first, which ranks by cosine.
+        normalize: whether to scale features to length 1 first, which ranks by cosine.
 
     Example:
         >>> metric, features = MultiPositiveRPrecision(pool=3), torch.eye(3)
@@ -194,11 +206,13 @@ class MultiPositiveRPrecision(CaptionMetric):
 
 
 def multi_positive(similarity: Tensor, correct: Tensor) -> dict[str, float | None]:
-    """Computes hit rates, R-precision and chance from similarity and correctness (N, M) of candidates."""
+    """Computes hit rates, R-precision and chance
+    from the similarity (N, M) and correctness (N, M) of candidates.
+    """
     rank, count, size = best_ranks(similarity, correct), correct.sum(1), similarity.shape[1]
     values: dict[str, float | None] = {f"top{k}": (rank < k).double().mean().item() for k in TOP}
-    # In a random order, the probability that none of the first k candidates is correct is a
-    # product over k draws without replacement.
+    # In a random order, the first k candidates are k draws without replacement. The probability
+    # that none of them is correct is a product over the draws.
     missed = torch.ones(len(count), dtype=torch.float64)
     for k in TOP:
         missed = missed * ((size - count - k + 1).clamp(min=0) / (size - k + 1))
@@ -214,18 +228,23 @@ def multi_positive(similarity: Tensor, correct: Tensor) -> dict[str, float | Non
 
 
 class TMRRetrieval(CaptionMetric):
-    """Retrieval by cosine with the protocols of Petrovich et al. 2023 (TMR, 6d74688), both ways.
+    """Retrieval by cosine with the protocols of Petrovich et al.
+    2023 (TMR, 6d74688), in both directions.
 
-    `all`: all motions, the own one is correct; `threshold`: motions of the same captions are
-    correct, too; `dissimilar`: only among 100 motions with different captions, at most half of
-    all, and none without an encoder; `batches`: in batches of 32, the rest is left out; their
-    medians are averaged. Each has recall `t2m_top1`, ... in [0, 1] and median rank `t2m_median`
-    (1 = best) of motions for texts, and `m2t_` of texts for motions.
+    - `all`: among all motions; only the text's own motion is correct.
+    - `threshold`: motions with the same captions are correct, too.
+    - `dissimilar`: among 100 motions with different captions, or half of all motions if this is
+      less. Without an encoder, there is no value.
+    - `batches`: in batches of 32; an incomplete last batch is left out. The medians of the
+      batches are averaged.
 
-    TMR's encoder of captions is all-mpnet-base-v2; its dissimilar motions and batches are lists
+    Each protocol has recall `t2m_top1`, ... in [0, 1] and median rank `t2m_median` (1 = best) of
+    motions for texts. The values of texts for motions begin with `m2t_`.
+
+    TMR's encoder of captions is all-mpnet-base-v2. TMR's dissimilar motions and batches are lists
     for HumanML3D and KIT. Here, batches are drawn. Without `ids`, the dissimilar subset starts
-    with the first motion by key; the motion whose caption is least similar to those already
-    chosen is added next.
+    with the first motion by key. Then the motion whose caption is least similar to the captions
+    already chosen is added, again and again.
 
     Args:
         encoder: mapping with the `_target_` of a text encoder; None = captions are compared as
@@ -294,9 +313,11 @@ class TMRRetrieval(CaptionMetric):
 
 
 def dissimilar(meaning: Tensor) -> list[int]:
-    """Returns the indices of the `dissimilar` motions of `TMRRetrieval` from the vectors (N, C) of their captions."""
-    # Greedy farthest-point selection: `nearest` is each caption's similarity to the most similar
-    # chosen caption.
+    """Returns the indices of the `dissimilar` motions of `TMRRetrieval`,
+    from caption vectors (N, C).
+    """
+    # Greedy farthest-point selection. `nearest` is the similarity of each caption to its most
+    # similar chosen caption.
     chosen = [0]
     nearest = meaning @ meaning[0]
     while len(chosen) < min(DISSIMILAR, len(meaning) // 2):
@@ -306,6 +327,6 @@ def dissimilar(meaning: Tensor) -> list[int]:
 
 
 def batched_retrieval(similarity: Tensor, batches: Tensor) -> dict[str, float]:
-    """Returns the means over batches (N, B) of indices of `whole_set_retrieval` in each."""
+    """Returns the mean values of `whole_set_retrieval` over batches of indices (N, B)."""
     results = [whole_set_retrieval(similarity[batch][:, batch]) for batch in batches]
     return {name: float(np.mean([result[name] for result in results])) for name in results[0]}

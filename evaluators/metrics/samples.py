@@ -1,5 +1,5 @@
 # pyright: standard
-"""Base classes of metrics, which compute their values from all samples, sorted by key."""
+"""Base classes of metrics. A metric computes its values from all samples, sorted by key."""
 
 from __future__ import annotations
 
@@ -15,27 +15,28 @@ from torchmetrics.utilities import dim_zero_cat
 from flame_mdm.errors import UserError
 
 Value = float | dict[str, float | None] | None
-"""What `compute` returns: a number, or numbers by name; None without samples."""
+"""Result of `compute`: a number, or numbers by name; None without samples."""
 
 Rows = Mapping[str, Any]
-"""Inputs of N motions by the names in `evaluators.metrics`, such as tensors whose first dimension is N."""
+"""Inputs of N motions by their names in `evaluators.metrics`, such as tensors with N rows."""
 
 
 class Declared:
-    """Base class of metrics: what a metric declares about its values, and values of single samples and of resamples.
+    """Base class of metrics:
+    declarations about values, and values of single samples and of resamples.
 
     Attributes:
         unit: unit of the values; "" = a number without a unit.
         units: units of single values by name, if they differ from `unit`.
-        directions: of single values by name, if they differ from `higher_is_better`: whether
-            higher is better; None = neither.
-        summary: name of the value that sums up the others; None = there is none.
-        audited: names of the values that audits show; None = all.
-        sees_meaning: whether the metric may see that a motion shows something other than
+        directions: whether higher is better, by the names of the values that differ from
+            `higher_is_better`; None = neither direction is better.
+        summary: name of the value that sums up the other values; None = there is no such value.
+        audited: names of the values that audits show; None = all values.
+        sees_meaning: whether the metric may notice that a motion does not show what was
             requested.
         exact: name of the value that reads the requested attributes without a network; None =
-            there is none.
-        depends_on_count: whether the value is biased by the number of motions.
+            there is no such value.
+        depends_on_count: whether the number of motions biases the value.
     """
 
     higher_is_better: bool | None
@@ -49,33 +50,37 @@ class Declared:
     depends_on_count = False
 
     def unit_of(self, name: str) -> str:
-        """Returns the unit of the value with a name; "" is the name of the only value."""
+        """Returns the unit of the value with this name; the name of an only value is ""."""
         return self.units.get(name, self.unit)
 
     def direction_of(self, name: str) -> bool | None:
-        """Returns whether higher values with a name are better; None = neither, or closer to real motions is."""
+        """Whether higher is better for the value with this name.
+
+        None = neither direction is better, or the value of real motions is best.
+        """
         return self.directions.get(name, self.higher_is_better)
 
     def readings(self, motions: Rows) -> dict[str, np.ndarray]:
-        """Returns what the metric reads from motions without their conditions, by name, as arrays of N rows.
+        """Returns what the metric reads from motions without their conditions, by name.
 
-        Metrics of features need no readings.
+        Each reading is an array with N rows. Metrics of features need no readings.
         """
         return {}
 
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
-        """Returns the value and the weight (N, 2) of each sample, by the names of the values; {} if there are none.
+        """Returns the value and the weight (N, 2) of each sample, by the name of the value.
 
-        The metric is the weighted mean, and, if it draws pools at random, the mean over all
-        draws. `rows` has the inputs of the metric and its `readings`. Raises `UserError` if there
-        are too few samples.
+        The metric is the weighted mean; a metric with random pools is also averaged over all
+        draws. Returns {} for metrics without values of single samples. `rows` has the inputs of
+        the metric and its `readings`. Raises `UserError` if there are too few samples.
         """
         return {}
 
     def weighted(self, rows: Rows, weights: np.ndarray) -> dict[str, np.ndarray]:
-        """Computes the values (R,) of R resamples of N samples, by name; {} if the metric cannot be resampled.
+        """Computes the values (R,) of R resamples of N samples, by name.
 
-        `weights` (R, N) says how often each sample was drawn; see `per_sample` for the rest.
+        `weights` (R, N) is the number of times that each sample was drawn. `rows` are described
+        in `per_sample`. Returns {} if the metric cannot be resampled.
         """
         values = {}
         for name, pairs in self.per_sample(rows).items():
@@ -86,17 +91,19 @@ class Declared:
 
 
 class SampleMetric(Declared, Metric):
-    """Base class of all metrics: keeps one row per sample and computes its value from all rows, sorted by key.
+    """Base class of all metrics,
+    which compute their value from one row per sample, sorted by key.
 
-    The value therefore does not depend on the batches, their order or the number of processes, of
-    which some may have no samples. `value` is the formula. If a metric draws at random, its
+    The value therefore does not depend on the batches, their order or the number of processes; a
+    process may also have no samples. `value` is the formula. If a metric draws at random, its
     argument `seed` determines the draws.
 
-    A class also declares what readers of its values need to know, see `Declared`.
+    A class also declares facts that readers of its values need; see `Declared`.
 
     Attributes:
-        states: names of the kept rows, in the order of the arguments of `value`. Each row also
-            has a key. Unless `update` is overridden, they are its inputs.
+        states: names of the tensors with one row per sample, in the order of the arguments of
+            `value`. Each row also has a key. Unless a class overrides `update`, these are its
+            inputs.
         names: names of the values; empty if there is only one.
 
     Example:
@@ -121,14 +128,16 @@ class SampleMetric(Declared, Metric):
 
     @property
     def update_called(self) -> bool:
-        """True, since a metric without samples returns None, without a warning."""
+        """Always True, so that torchmetrics does not warn about a metric
+        without samples, which returns None.
+        """
         return True
 
     def update(self, *_: Any, **rows: Any) -> None:
         """Stores a batch of B samples.
 
         Args:
-            rows: one keyword argument per state and `keys`, (B,) int64, all with B rows;
+            rows: one keyword argument per state, and `keys` (B,) int64, all with B rows.
                 `evaluators.metrics` lists shapes and units.
 
         Raises:
@@ -141,7 +150,7 @@ class SampleMetric(Declared, Metric):
             getattr(self, name).append(values.detach())
 
     def compute(self) -> Any:
-        """Returns the value of all samples; None, or None by name, without samples."""
+        """Returns the value of all samples. Without samples, it is None, or None by name."""
         rows = self.rows("keys", *self.states)
         return self.value(*rows) if rows else self.nothing
 
@@ -158,8 +167,8 @@ class SampleMetric(Declared, Metric):
         """Computes the value of samples drawn with replacement, for a bootstrap.
 
         Args:
-            drawn: (N,) indices of the samples, in the order in which they were added.
-            real_drawn: (M,) indices of the real motions, if the metric compares two sets.
+            drawn: (N,) indices of the drawn samples, in the order in which they were added.
+            real_drawn: (M,) indices of the drawn real motions, if the metric compares two sets.
         """
         return self.value(*self._taken(drawn, *self.states))
 
@@ -168,7 +177,10 @@ class SampleMetric(Declared, Metric):
         return [values.double() if values.is_floating_point() else values for values in rows]
 
     def rows(self, keys: str, *names: str) -> list[Tensor]:
-        """Returns finite rows in the order of their keys, floats as float64; [] if there are none."""
+        """Returns the rows, which must be finite, in the order of their keys; [] without rows.
+
+        Floats are returned as float64.
+        """
         if not getattr(self, keys):
             return []
         order = self.order(keys)
@@ -189,12 +201,16 @@ class SampleMetric(Declared, Metric):
         values, order = dim_zero_cat(getattr(self, keys)).sort()
         if twice := int((values[1:] == values[:-1]).sum()):
             raise self.error(
-                f"{twice} samples were given twice ({keys}). Evaluate each once, with a key of its own"
+                f"{twice} samples were given twice ({keys}). Evaluate each sample once, with "
+                f"its own key"
             )
         return order
 
     def by_group(self, groups: Tensor, samples: int) -> Tensor:
-        """Returns the indices (C, S) of the samples of each group; raises `UserError` if one has not S samples."""
+        """Returns the indices (C, S) of the samples of each group.
+
+        Raises `UserError` if a group does not have S samples.
+        """
         names, sizes = groups.unique(return_counts=True)
         if wrong := int((sizes != samples).sum()):
             have = f"{wrong} of {len(names)} prompts do not have {samples} motions"
@@ -213,14 +229,14 @@ class SampleMetric(Declared, Metric):
             raise self.error(f"got {count} {noun}, needs at least {least}")
 
     def real_frames(self, joints: Tensor, mask: Tensor) -> list[Tensor]:
-        """Splits joints (B, F, J, 3) with mask (B, F) into motions (F, J, 3), whose sums are the
-        same in every batch.
+        """Splits padded joints (B, F, J, 3) with mask (B, F) into motions (F, J, 3).
 
-        Raises `UserError` if a motion contains NaN or infinity.
+        Sums over a motion are the same in every batch. Raises `UserError` if a motion contains
+        NaN or infinity.
         """
         frames = joints.detach()[mask]
         motions = list(frames.split(mask.sum(1).tolist()))
-        # A sum is finite only if all numbers are, and is faster to compute.
+        # A sum is finite only if all numbers are finite, and is faster to check.
         if not frames.sum().isfinite():
             bad = sum(not bool(motion.isfinite().all()) for motion in motions)
             raise self.error(
@@ -229,7 +245,10 @@ class SampleMetric(Declared, Metric):
         return motions
 
     def _sync_dist(self, dist_sync_fn: Any = None, process_group: Any | None = None) -> None:
-        """Gathers the rows of all processes. The default of torchmetrics fails if a process has none."""
+        """Gathers the rows of all processes.
+
+        The default of torchmetrics fails if a process has no rows.
+        """
         states = {name: [rows.cpu() for rows in getattr(self, name)] for name in self._reductions}
         group = process_group or self.process_group
         gathered: list[Any] = [None] * torch.distributed.get_world_size(group)
@@ -239,7 +258,7 @@ class SampleMetric(Declared, Metric):
 
 
 class Timed(SampleMetric):
-    """Base class of metrics that depend on `fps`, the frames per second of the motions."""
+    """Base class of metrics that depend on `fps`, the number of frames per second."""
 
     def __init__(self, fps: float):
         super().__init__()
@@ -247,10 +266,13 @@ class Timed(SampleMetric):
 
 
 class MotionMean(SampleMetric):
-    """Base class of means of values of motions. A motion adds any number of values, such as one, or one per frame."""
+    """Base class of means over values of motions.
+
+    A motion adds one value, one per frame, or any other number.
+    """
 
     states = ("sums", "counts")
-    #: Names of the values of a motion, if `names` has more.
+    #: Names of the values that a motion has, if `names` contains further names.
     parts: Sequence[str] = ()
 
     def add(self, keys: Tensor, motions: Sequence[Any], **more: Tensor) -> None:
@@ -258,10 +280,10 @@ class MotionMean(SampleMetric):
 
         Args:
             keys: (B,) int64, unique keys of the motions.
-            motions: B numbers or tensors, such as one number per frame; if the metric has
-                `names`, B mappings of them by name. NaN or missing = undefined; undefined values
-                do not count.
-            more: further states, with B rows each.
+            motions: B numbers or tensors, such as one number per frame. If the metric has
+                `names`, B mappings from names to numbers or tensors. NaN or missing values are
+                undefined and do not count.
+            more: further states with B rows each.
         """
         names, rows = self.parts or self.names, []
         for motion in motions:
@@ -278,13 +300,15 @@ class MotionMean(SampleMetric):
         return self.means(*rows)
 
     def means(self, sums: Tensor, counts: Tensor) -> Any:
-        """Returns the mean of all values, by name if the metric has `names`; None for a name without values."""
+        """Returns the mean of all values,
+        by name if the metric has `names`; None without values.
+        """
         totals = zip(sums.sum(0).tolist(), counts.sum(0).tolist(), strict=True)
         means = [total / count if count else None for total, count in totals]
         return dict(zip(self.parts or self.names, means, strict=True)) if self.names else means[0]
 
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
-        """Returns the sum and the number (N, 2) of the values of each motion, by name."""
+        """Returns by name the sum and the number (N, 2) of the values of each motion."""
         names = self.parts or self.names or [""]
         return {name: torch.as_tensor(rows[name]) for name in names if name in rows}
 
@@ -308,11 +332,14 @@ class JointMean(MotionMean):
         self.add(keys, [self.measure(motion) for motion in self.real_frames(joints, mask)])
 
     def measure(self, motion: Tensor) -> Any:
-        """Computes the values of a motion (F, J, 3), by name if the metric has `names`; NaN or missing = undefined."""
+        """Computes the values of a motion (F, J, 3), by name if the metric has `names`.
+
+        NaN or missing values are undefined.
+        """
         raise NotImplementedError
 
     def readings(self, motions: Rows) -> dict[str, np.ndarray]:
-        """Returns the sum and the number (N, 2) of the values of each motion, by name."""
+        """Returns by name the sum and the number (N, 2) of the values of each motion."""
         self.reset()
         for i, joints in enumerate(motions["joints"]):
             mask = torch.ones(1, len(joints), dtype=torch.bool)
@@ -324,12 +351,14 @@ class JointMean(MotionMean):
         return {name: pairs[..., k] for k, name in enumerate(names) if pairs[:, 1, k].any()}
 
     def extras(self, motions: Rows, i: int) -> dict[str, Any]:
-        """Returns further inputs of `update` for the motion with number i."""
+        """Returns further inputs of `update` for motion number i."""
         return {}
 
 
 class TwoSets(SampleMetric):
-    """Base class of metrics that compare the set of features of generated motions with the set of real motions."""
+    """Base class of metrics that compare two sets of features:
+    generated motions and real motions.
+    """
 
     states = ("generated",)
     depends_on_count = True
@@ -350,9 +379,9 @@ class TwoSets(SampleMetric):
 
         Args:
             generated: (B, E) features of generated motions.
-            keys: (B,) int64, their unique keys.
+            keys: (B,) int64, unique keys of the generated motions.
             real: (R, E) features of real motions.
-            real_keys: (R,) int64, their unique keys.
+            real_keys: (R,) int64, unique keys of the real motions.
 
         Raises:
             ValueError: If features and keys have different numbers of rows.
@@ -363,7 +392,10 @@ class TwoSets(SampleMetric):
             super().update(real_keys=real_keys, real=real)
 
     def compute(self) -> Any:
-        """Returns the value of both sets; None, or None by name, if one of them is empty."""
+        """Returns the value of both sets.
+
+        If a set is empty, the value is None, or None by name.
+        """
         generated, real = self.rows("keys", "generated"), self.rows("real_keys", "real")
         return self.value(*generated, *real) if generated and real else self.nothing
 

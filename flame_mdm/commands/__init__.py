@@ -1,4 +1,7 @@
-"""Commands, one file each; `flame_mdm.__main__` lists them. This module has the keys that several commands share."""
+"""Commands, with one file per command; `flame_mdm.__main__` lists them.
+
+This module has the keys that several commands share.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +33,7 @@ STORE = "store.json"
 
 
 def usual_data_root() -> str:
-    """Returns the folder of prepared data sets: FLAME_MDM_DATA, or `data`."""
+    """Returns the folder of prepared data sets: FLAME_MDM_DATA, by default `data`."""
     return os.environ.get("FLAME_MDM_DATA", "data")
 
 
@@ -41,19 +44,24 @@ def existing(key: str, source: str) -> None:
 
 
 def motion_file(key: str, source: str) -> None:
-    """Checks that a motion file exists and has a known ending; `dataset:id` is left to its reader."""
+    """Checks that a motion file exists and has a known ending;
+    `dataset:id` is checked when it is read.
+    """
     if Path(source).suffix.lower() in ENDINGS:
         existing(key, source)
     elif Path(source).suffix.lower() in ADVICE:
         raise unread(Path(source))
     elif ":" not in source:
         raise UserError(
-            f"{key}={source}: neither a motion file ({', '.join(ENDINGS)}) nor dataset:id"
+            f"{key}={source}: not a motion file ({', '.join(ENDINGS)}) and not dataset:id"
         )
 
 
 def finish(failures: Sequence[str], total: int, done: str) -> None:
-    """Prints the errors of the files in a folder that failed. If there are any, exits with 1; the others are `done`."""
+    """Prints the errors of files that failed, and exits with code 1 if there are any.
+
+    `done` is the verb for the message, such as "converted".
+    """
     if failures:
         say(*(f"error: {failure}" for failure in failures), error=True)
         say(f"error: {len(failures)} of {total} motions could not be {done}", error=True)
@@ -105,7 +113,7 @@ class ModelSettings:
     ckpt: str = required(
         "a checkpoint, run directory, model file, shipped model (quickstart), or hub id"
     )
-    which: Which = option("last", "checkpoint of a run directory: last or best")
+    which: Which = option("last", "which checkpoint of a run directory: last or best")
 
     def model_file(self) -> Path:
         """Returns the file of the model; see `flame_mdm.checkpoints.locating.find`."""
@@ -120,7 +128,9 @@ class AdaptedSettings(ModelSettings):
         None, "adapters of this model, written by `flame-mdm adapt`, separated by spaces"
     )
     adapter_strength: float | Sequence[float] = option(
-        1.0, "strength of all adapters, or a list with one per adapter; 0 = the model without them"
+        1.0,
+        "strength of all adapters, or a list with one number per adapter; 0 = the model "
+        "without adapters",
     )
 
     def adapters(self) -> dict[str, Any]:
@@ -133,13 +143,14 @@ class FileSettings:
     """Keys that describe a motion file."""
 
     fps: float | None = option(
-        None, "frames per second; overrides the value in the file; required for .npy, .amc"
+        None, "frames per second, instead of the value in the file; required for .npy and .amc"
     )
     unit: float | None = option(
-        None, "meters per length unit of the file; default 0.01 for most .bvh, 1 for .npy"
+        None, "meters per length unit of the file; default: 0.01 for most .bvh files, 1 for .npy"
     )
     up: str | None = option(
-        None, "axis of the file that points up: y, z or -y; default: from skeleton.yaml, or y"
+        None,
+        "axis of the file that points up: y, z or -y; default: the axis in skeleton.yaml, or y",
     )
     animation: str | None = option(
         None, "name or number of an animation in an .fbx or .glb file; default: the first"
@@ -149,7 +160,10 @@ class FileSettings:
 def read_motions(
     source: str, settings: FileSettings, failures: list[str]
 ) -> tuple[str, int, Iterator[Motion]]:
-    """Returns name, number and motions of a file or folder; errors of files of a folder are added to `failures`."""
+    """Returns the name, the number and the motions of a file or folder.
+
+    Errors of files in a folder are added to `failures`.
+    """
     from flame_mdm.formats.readers import read
 
     path = Path(source)
@@ -180,28 +194,35 @@ class BodySettings:
 
     body: str = option(
         "mannequin",
-        'body to draw: mannequin, a file, or Anny with a shape, such as "anny gender=1 age=0.9": docs/formats.md',
+        'body to draw: mannequin, a file, or Anny with a shape, such as "anny gender=1 age=0.9"; see docs/formats.md',
         body_name,
     )
 
 
 @dataclass(frozen=True, kw_only=True)
 class WritingSettings:
-    """Keys of the motion files that are written."""
+    """Keys of written motion files."""
 
     rig: str | None = option(
         None, "skeleton: mixamo, unreal, unity, rigify, lafan1, soma, cmu or 100style"
     )
     root_motion: bool = option(
-        False, "true = the root of rig=unreal or soma follows the hips on the floor"
+        False, "true = with rig=unreal or rig=soma, the root follows the hips on the floor"
     )
-    resample: float | None = option(None, "frames per second of OUT; default: as in the motion")
+    resample: float | None = option(
+        None, "frames per second of OUT; default: the frame rate of the motion"
+    )
     character: str | None = option(
-        None, "your own .glb with a skin, or .bvh, to move: docs/characters.md", existing
+        None,
+        "your own character to move: a .glb with a skin, or a .bvh; see docs/characters.md",
+        existing,
     )
 
     def read_character(self) -> Character | BvhCharacter | None:
-        """Reads `character`; prints the lines of a file to complete if names of its joints are unknown."""
+        """Reads `character`.
+
+        If names of its joints are unknown, prints a file for the user to complete.
+        """
         from flame_mdm.formats import characters
 
         try:
@@ -211,7 +232,7 @@ class WritingSettings:
             raise
 
     def at_rate(self, motion: Motion) -> Motion:
-        """Returns a motion at the frame rate of `resample`."""
+        """Returns a motion at the frame rate `resample`."""
         from flame_mdm.formats.resampling import frame_rate
 
         return (
@@ -241,18 +262,19 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
     cleanup: bool = same_option(SamplingRequest, "cleanup")
     targets: str | None = same_option(SamplingRequest, "targets", existing)
     trajectory: bool = option(
-        False, "draw the clean estimates along the sampling of the first motion: trajectory.png"
+        False,
+        "also draw the clean estimates of the first motion during sampling, as trajectory.png",
     )
     mp4: bool = option(False, 'also write motions.mp4; needs pip install "flame-mdm[video]"', video)
     device: str | None = option(None, "cpu or cuda; default: cuda if available", device_name)
 
     def conditions(self) -> list[str]:
-        """Returns the given keys that say what the motions show."""
+        """Returns the given keys that determine the content of the motions."""
         names = [name for name in ("text", "action") if getattr(self, name) is not None]
         return names + (["unconditioned"] if self.unconditioned else [])
 
     def request(self, **values: Any) -> SamplingRequest:
-        """Returns what is requested of the model; `values` replace values of these keys.
+        """Returns the request to the model; `values` replace values of these keys.
 
         Raises `UserError` if more than one condition is requested, or a value is invalid.
         """
@@ -281,7 +303,10 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
         }
 
     def load(self) -> LoadedModel:
-        """Loads the model and the body; raises `UserError` with examples if no key says what motions show."""
+        """Loads the model and the body.
+
+        If no key determines the content of the motions, raises a `UserError` with examples.
+        """
         file = find(self.ckpt, self.which)  # before PyTorch is imported
         import torch
 
@@ -303,15 +328,15 @@ class DataSettings:
     """Keys of commands that open a data set."""
 
     data: str | None = option(
-        None, "data set: a file in experiments/data; data.KEY=... overrides its keys"
+        None, "data set, a file in experiments/data; data.KEY=... overrides its keys"
     )
     representation: str | None = option(
-        None, "a file in experiments/representation; default: the data set's"
+        None, "a file in experiments/representation; default: the representation of the data set"
     )
     data_root: str = option(
         usual_data_root, "folder of the prepared data sets; default: FLAME_MDM_DATA, or data"
     )
-    seed: int = option(0, "seed of generated data")
+    seed: int = option(0, "seed of generated data sets")
     composed: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -319,7 +344,7 @@ class DataSettings:
             _ = self.nodes  # composed now, to report errors before any work
         elif self.composed:
             raise UserError(
-                f"{self.composed[0]} belongs to a data set, and none is named. Add data=NAME"
+                f"{self.composed[0]} belongs to a data set, but no data set is named. Add data=NAME"
             )
 
     @cached_property

@@ -11,15 +11,16 @@ from flame_mdm.config.options import option, required
 class AdaptSettings(ModelSettings):
     """usage: flame-mdm adapt CKPT [OUT] source=FOLDER name=limp [trainer.max_steps=2000] [key=value ...]
 
-    Teaches a trained model the motions in a folder, and keeps what it knows. Prompts that end with "in limp style" then
-    ask for them. Writes the adapter OUT/limp.safetensors, for `sample` and `load`, and a page that compares motions
-    before and after. Run the same command to resume. docs/own-motion.md explains the steps.
+    Teaches a trained model the motions in a folder; the model keeps what it knows. Prompts that
+    end with "in limp style" then request such motions. Writes the adapter OUT/limp.safetensors,
+    for `sample` and `load`, and a page that compares motions before and after training. Run the
+    same command to resume. docs/own-motion.md explains the steps.
     """
 
     OBJECTS: ClassVar = ("ckpt", "out")
     COMPOSED: ClassVar = ("ema", "logger", "lr_decay", "lr_warmup", "seed")
     source: str = required("folder of motions with captions: docs/own-data.md")
-    name: str = required("one word for prompts: 'a person walks in NAME style'")
+    name: str = required("one word for prompts such as 'a person walks in NAME style'")
     out: str | None = option(None, "run directory; default runs/adapt/NAME")
     action: bool = option(
         False, "true = the clips show an action that the model does not know, instead of a style"
@@ -30,7 +31,8 @@ class AdaptSettings(ModelSettings):
     force: bool = option(False, "true = accept clips that drift upward or float")
     rank: int = option(
         8,
-        "of the changes of the weights; more for motions far from what the model knows",
+        "rank of the changes of the weights; increase it for motions that differ much from the "
+        "model's training data",
         above_zero,
     )
     data_root: str = option(usual_data_root, "folder of the prepared data sets")

@@ -1,4 +1,4 @@
-"""`flame-mdm audit data=NAME extractor=FILE`: audits an evaluator, and writes its card."""
+"""`flame-mdm audit data=NAME extractor=FILE`: audits an evaluator and writes its card."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,26 +13,32 @@ from flame_mdm.safe_io import write_json
 
 @dataclass(frozen=True, kw_only=True)
 class AuditSettings(DataSettings):
-    """usage: flame-mdm audit data=NAME extractor=FILE|none [key=value ...]
-           flame-mdm audit cards="A.json B.json"
+    """usage: flame-mdm audit data=NAME extractor=FILE|none [key=value
+    ...] flame-mdm audit cards="A.json B.json"
 
-    Perturbs the real motions of a data set at graded strengths, measures them like generated ones, and writes a card:
-    what each metric sees, from which strength, and what it cannot see. extractor=none audits the metrics of joint
-    positions. If interrupted, the same command continues where it stopped. cards= renders a card again, or two cards
-    side by side.
+    Perturbs the real motions of a data set at graded strengths, measures them like generated
+    motions, and writes a card. The card shows which perturbations each metric notices, from which
+    strength, and which it does not notice. extractor=none audits the metrics of joint positions.
+    If interrupted, the same command continues where it stopped. cards= renders one card again, or
+    two cards side by side.
     """
 
     OBJECTS: ClassVar = ("data", "extractor")
     extractor: str | None = option(
-        None, "a motion-CLIP, or as the protocol requires; none = metrics of joints", model_source
+        None,
+        "motion-CLIP or another extractor that the protocol requires: a path; none = "
+        "metrics of joints",
+        model_source,
     )
     protocol: str | None = option(
         None, "protocol whose metrics are audited; default: synthetic or text_to_motion"
     )
     split: Literal["train", "val", "test"] = option("test", "train, val or test")
-    samples: int | None = option(None, "number of motions; default: all of the split")
-    resamples: int = option(100, "bootstrap resamples of motions, for the intervals")
-    cards: list[str] | None = option(None, "one card (.json) to render again, or two, side by side")
+    samples: int | None = option(None, "number of motions; default: all motions of the split")
+    resamples: int = option(100, "number of bootstrap resamples of motions, for the intervals")
+    cards: list[str] | None = option(
+        None, "one card (.json) to render again, or two cards to render side by side"
+    )
     batch_size: int = option(64, "motions per batch")
     device: str | None = option(None, "cpu or cuda; default: cpu", device_name)
     data_root: str = option(
@@ -59,7 +65,8 @@ def main(settings: AuditSettings) -> None:
         )
     if settings.resamples < 100 or (settings.samples or 64) < 8:
         raise UserError(
-            f"resamples={settings.resamples}, samples={settings.samples}: give 100, and 8, or more"
+            f"resamples={settings.resamples}, samples={settings.samples}: too few. Give at "
+            f"least resamples=100 and samples=8"
         )
     from evaluators.audit import audit as measure
     from evaluators.evaluation_request import EvaluationRequest

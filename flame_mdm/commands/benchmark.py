@@ -21,17 +21,19 @@ from flame_mdm.safe_io import read_yaml
 class BenchmarkSettings:
     """usage: flame-mdm benchmark NAME [out=FOLDER]
 
-    Trains a motion-CLIP and a model of each kind, evaluates them, writes a table, and compares its values with the
-    expected ranges. If interrupted, the same command continues where it stopped.
-    NAME is a file in experiments/benchmark: synthetic and synthetic_medium, which need no download, bandai and
-    few_steps, or bandai_full, for one GPU.
+    Trains a motion-CLIP and a model of each kind, evaluates them, writes a table, and compares
+    its values with the expected ranges. If interrupted, the same command continues where it
+    stopped.
+
+    NAME is a file in experiments/benchmark: synthetic and synthetic_medium need no
+    download; there are also bandai, few_steps and bandai_full, which is for one GPU.
     """
 
     OBJECTS: ClassVar = ("exp",)
     exp: str = required("a file in experiments/benchmark")
     out: str | None = option(None, "folder; default runs/benchmark/<exp>")
     device: str | None = option(
-        None, "device of the evaluations, such as cpu or cuda; default: cuda if there is one"
+        None, "device of the evaluations, such as cpu or cuda; default: cuda if available"
     )
     batch_size: int = option(64, "motions per batch")
     data_root: str = option(
@@ -46,7 +48,7 @@ def main(settings: BenchmarkSettings) -> None:
         raise UserError(f"no benchmark is called '{settings.exp}'. Available: {', '.join(names)}")
     plan = read_yaml(EXPERIMENTS / "benchmark" / f"{settings.exp}.yaml")
     out = Path(settings.out or Path("runs") / "benchmark" / settings.exp)
-    out.mkdir(parents=True, exist_ok=True)  # fails before hours of work, not after
+    out.mkdir(parents=True, exist_ok=True)  # reports an error before hours of work, not after
     for words in plan["train"]:
         train(words, settings.data_root)
     name, spec = plan["table"], load_spec(plan["table"])
@@ -82,7 +84,9 @@ def train(words: Sequence[str], data_root: str) -> None:
 def check(
     table: Table, expected: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]]
 ) -> list[tuple[str, bool]]:
-    """Returns a line for each expected range of a value of a table, and whether the value is within it."""
+    """Returns a line for each expected range of a table,
+    and whether the value is in this range.
+    """
     parts = {part.name: part for part in table.parts}
     checks = []
     for part, rows in expected.items():

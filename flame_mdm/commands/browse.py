@@ -16,25 +16,27 @@ class BrowseSettings(BodySettings, DataSettings):
     """usage: flame-mdm browse data=NAME [source=PATH] [split=train] [search="waves left"] [clips=200] [out=FILE.html]
            flame-mdm browse data=NAME split=test clips=10 motions=FOLDER
 
-    NAME is a data set that `prepare` takes; for your own motions, data=folder data.name=NAME.
-    Writes a single web page that opens from disk. It shows clips of a data set with their captions, mirrored copies
-    next to their originals, a search field, a choice of splits, and statistics. motions=FOLDER also writes the shown
-    clips as motion files, to compare generated motions with them.
+    NAME is a data set, as in `prepare`; for your own motions, give data=folder data.name=NAME.
+    Writes a single web page that opens from disk. It shows clips of the data set with their
+    captions, and mirrored copies next to their originals. It also has a search field, a choice of
+    splits, and statistics. motions=FOLDER also writes the shown clips as motion files, to compare
+    generated motions with them.
     """
 
     OBJECTS: ClassVar = ("data", "out")
     out: str | None = option(None, "HTML file; default runs/browse/<store>.html")
     source: str | None = option(
-        None, "folder or archive, if the data set is not prepared yet and needs one"
+        None, "source folder or archive, if the data set is not prepared yet and requires a source"
     )
     split: Split | None = option(None, "train, val or test; default: all")
     search: str | None = option(None, "words that must occur in the id or the captions of a clip")
     clips: int = option(
         200,
-        "maximum number of clips, evenly spaced; mirrored copies come with their originals",
+        "maximum number of clips, which are evenly spaced; mirrored copies come with their "
+        "originals",
         above_zero,
     )
-    motions: str | None = option(None, "folder: also write the shown clips as motion files")
+    motions: str | None = option(None, "also write the shown clips to this folder, as motion files")
 
 
 def main(settings: BrowseSettings) -> None:
@@ -49,11 +51,12 @@ def main(settings: BrowseSettings) -> None:
     representation = instantiate(settings.nodes["representation"])
     data = instantiate(node, representation=representation)
     if (data.folder / STORE).exists() and data.source.named_by_recipe:
-        info = Store(data.folder).info  # own data are shown as they were prepared
+        info = Store(data.folder).info  # the user's own data is shown as it was prepared
         data.source.options, data.source.version = info.get("source", {}), info.get("version", 1)
         if settings.source is not None:
             say(
-                f"{data.folder}: already prepared; source={settings.source} is not read (prepare it with force=true)"
+                f"{data.folder}: already prepared, so source={settings.source} is not read. To "
+                f"read it, prepare the data set with force=true"
             )
     data.prepare_data()
     store = data.open()

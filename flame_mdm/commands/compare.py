@@ -37,12 +37,13 @@ class CompareSettings(BodySettings):
            flame-mdm compare A B FOLDER rate=true [prompts=FILE.txt]
            flame-mdm compare ratings="ann.json bob.json" out=ratings.json
 
-    Compares runs side by side on one page: configuration differences, curves, evaluations and motions for the same
-    prompts. If the runs have results of the same protocol, data and extractor, prints the difference of each metric
-    with its 95 % interval, and says whether the interval contains 0. A run may also be a FOLDER of motion files, such
-    as real motions (`browse motions=FOLDER`) or motions of another program. The runs are then sampled for the
-    captions of its motions, at their lengths. rate=true writes a blind user study instead: a page that asks which of
-    two motions fits a text better. ratings= counts the answers.
+    Compares runs side by side on one page: configuration differences, curves, evaluations and
+    motions for the same prompts. If the runs have results of the same protocol, data and
+    extractor, prints the difference of each metric with its 95 % interval, and says whether the
+    interval contains 0. Instead of a run, a FOLDER of motion files may be given, such as real
+    motions (`browse motions=FOLDER`) or motions of another program. The runs are then sampled for
+    the captions and lengths of these motions. rate=true writes a blind user study instead: a page
+    that asks which of two motions fits a text better. ratings= counts the answers.
     """
 
     OBJECTS: ClassVar = ("runs",)
@@ -51,20 +52,23 @@ class CompareSettings(BodySettings):
     )
     prompts: str | None = option(
         None,
-        "a file with one prompt per line, sampled by each last.ckpt; default: the captions of the first folder of "
-        "motion files; without such a folder, the newest samples of each run",
+        "a file with one prompt per line, which each last.ckpt samples; default: the captions "
+        "of the first folder of motion files or, without such a folder, the newest samples of "
+        "each run",
     )
     seconds: float | None = option(
         None,
-        "length of the sampled motions; default 3, or the lengths of the motions in the folder",
+        "length of the sampled motions in seconds; default: 3, or the lengths of the motions in "
+        "the folder",
     )
     seed: int = option(0, "seed of sampling, and of the order in which motions are rated")
     rate: bool = option(
-        False, "write a rating page: motions of the first run against motions of each other run"
+        False,
+        "write a rating page that compares motions of the first run with motions of each other run",
     )
     ratings: list[str] | None = option(None, "files saved by the rating page, to be counted")
     out: str | None = option(
-        None, "file to write; default runs/compare.html, runs/rate.html or runs/ratings.json"
+        None, "file to write; default: runs/compare.html, runs/rate.html or runs/ratings.json"
     )
 
 
@@ -126,8 +130,9 @@ def _motions(
 ) -> list[dict[Prompt, Motion]]:
     """Returns the motions of each run and folder, by prompt.
 
-    The last checkpoint of each run is sampled for the requested prompts or else for the captions of the first folder of
-    motions, at the lengths of its motions. Without either, a run shows its newest samples.
+    The last checkpoint of each run is sampled for the requested prompts. Without prompts, it is
+    sampled for the captions and lengths of the motions in the first folder. Without a folder, the
+    newest samples of each run are shown.
     """
     from_files = {
         entry.label: read_motions(entry.folder) for entry in compared if entry.run is None
@@ -156,7 +161,9 @@ def _motions(
 
 
 def _texts(prompts: PromptFile) -> list[str]:
-    """Returns the prompts of a file; raises the error of the first one that no model can sample."""
+    """Returns the prompts of a file;
+    raises the error of the first prompt that no model can sample.
+    """
     for number in sorted(prompts.refused):
         raise prompts.refused[number]
     return list(prompts.lines.values())
@@ -169,9 +176,10 @@ def _sampled(
 
     Args:
         entry: the run.
-        prompts: length of each motion in seconds, all of them or none; None = the default of sampling. Motions longer
-            than the model supports are shortened.
-        seed: seed of the noise, which differs between the motions for a prompt that is there twice.
+        prompts: the prompts, with the length of each motion in seconds. Either all motions have a
+            length, or none; None = the default of sampling. Lengths above the model's maximum are
+            shortened.
+        seed: seed of the noise. If a prompt is listed twice, its motions have different noise.
     """
     import torch
 
@@ -197,6 +205,6 @@ def _sampled(
         seed=seed,
         split=False,
     )
-    # Runs may know different words: each is compared on all prompts.
+    # Runs may know different words. Every run is compared on all prompts.
     motions = sample(model, resolve(request, model, check_words=False))
     return dict(zip(prompts, motions, strict=True))

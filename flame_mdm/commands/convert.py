@@ -23,26 +23,34 @@ class ConvertSettings(BodySettings, WritingSettings, FileSettings):
            flame-mdm convert MOTION OUT character=hero.glb
            flame-mdm convert FOLDER OUT format=glb ...
 
-    Converts a motion file, or all motion files in a folder and the folders below it. The nearest skeleton.yaml in its
-    folder or above applies (docs/own-data.md).
-    Inputs: .npz of `make sample` and of AMASS, .bvh, animations in .fbx, .glb, .vrm and .vrma, .amc with its .asf,
-    .json, and .npy with joint positions.
-    Outputs: .fbx, .glb, .bvh, .usda, .usdc and .usdz for Blender and game engines, .vrma for VRM avatars, .npz in the
-    layout of AMASS, and .json and .npy with joint positions; .mp4 and .gif to look at.
-    Which file a program reads: docs/engines.md. Units, axes and joint names: docs/formats.md
+    Converts a motion file, or all motion files in a folder and its subfolders. The nearest
+    skeleton.yaml, in the folder of the file or above it, applies (docs/own-data.md).
+
+    Inputs: .npz of `make sample` and of AMASS, .bvh, animations in .fbx, .glb, .vrm and .vrma,
+    .amc with its .asf, .json, and .npy with joint positions.
+
+    Outputs: .fbx, .glb, .bvh, .usda, .usdc and .usdz for Blender and game engines, .vrma for VRM
+    avatars, .npz in the layout of AMASS, .json and .npy with joint positions, and .mp4 and .gif
+    to watch.
+
+    docs/engines.md lists which files a program reads. docs/formats.md explains units, axes and
+    joint names.
     """
 
     OBJECTS: ClassVar = ("motion", "out")
     motion: str = required(
-        "a file, or a folder of files; .npy holds joint positions (frames, joints, 3)"
+        "a motion file, or a folder of motion files; .npy contains joint positions (frames, "
+        "joints, 3)"
     )
     out: str = required(
-        ".fbx, .glb, .bvh, .usdz, .vrma, .npz (AMASS), .json or .npy; .mp4 or .gif to look at"
+        ".fbx, .glb, .bvh, .usdz, .vrma, .npz (AMASS), .json or .npy; or .mp4 or .gif to watch"
     )
     format: str | None = option(
-        None, "if MOTION is a folder: ending of the files that are written to the folder OUT"
+        None, "if MOTION is a folder: ending of the files in the folder OUT"
     )
-    rest_pose: bool = option(False, "true = .bvh begins with a frame of the rest pose, arms out")
+    rest_pose: bool = option(
+        False, "true = a .bvh file begins with a frame of the rest pose, with the arms out"
+    )
 
 
 def main(settings: ConvertSettings) -> None:
@@ -51,7 +59,10 @@ def main(settings: ConvertSettings) -> None:
     if path.is_dir():
         targets = _targets(settings, path, out)
     elif settings.format is not None:
-        raise UserError("format=... is for folders; the ending of OUT is the format of one file")
+        raise UserError(
+            "format=... is for folders. For one file, the ending of OUT determines "
+            "the format: remove format"
+        )
     else:
         motion_file("motion", settings.motion)
         targets = {out: path}
@@ -74,13 +85,14 @@ def _targets(settings: ConvertSettings, folder: Path, out: Path) -> dict[Path, P
     )
     if ending is None:
         raise UserError(
-            f"{folder} is a folder: name the format of the files too, such as format=glb"
+            f"{folder} is a folder. Give the format of the files, too, such as format=glb"
         )
     files = motion_files(folder)
     targets = {out / file.relative_to(folder).with_suffix(f".{ending}"): file for file in files}
     if double := [file for file in files if file not in targets.values()]:
         raise UserError(
-            f"{double[0]}: another motion has the same name, so both would become one file. Rename one"
+            f"{double[0]}: another motion has the same name, so both would be written to one "
+            f"file. Rename one of them"
         )
     return targets
 
@@ -97,18 +109,18 @@ def _convert(
     motion = read(path, settings.fps, settings.unit, settings.up, animation=settings.animation)
     if out.exists() and out.samefile(path):
         raise UserError(
-            f"{out}: the same file as the input, which stays as it is. Choose another name for the output"
+            f"{out}: the output would overwrite the input. Choose another name for the output"
         )
     motion = settings.at_rate(motion)
     if out.suffix.lower() == ".npz":
-        motion.poses = motion.posed()  # other programs expect AMASS's keys
+        motion.poses = motion.posed()  # other programs expect the keys of AMASS
     try:
         say(
             motion.save(
                 out, settings.rest_pose, settings.rig, character, body, settings.root_motion
             )
         )
-    except UserError as error:  # the motion is at fault, if not the output
+    except UserError as error:  # if the output is not at fault, the motion is
         if str(out) in str(error):
             raise
         raise UserError(f"{path}: {error}") from error

@@ -12,8 +12,9 @@ from flame_mdm.errors import UserError
 class DemoSettings:
     """usage: flame-mdm demo [CKPT ...] [adapter=FILE] [host=127.0.0.1] [port=7860] [hosts=NAME] [device=cuda]
 
-    Serves a page where you type a sentence, watch the motion, edit it and download it. Without CKPT, it uses the model
-    in the package. It needs the extra demo: pip install "flame-mdm[demo]". docs/demo.md explains the page.
+    Serves a page where you type a sentence, watch the motion, edit it and download it. Without
+    CKPT, the demo uses the model in the package. It requires the extra demo: pip install
+    "flame-mdm[demo]". docs/demo.md explains the page.
     """
 
     OBJECTS: ClassVar = ("ckpt",)
@@ -22,16 +23,17 @@ class DemoSettings:
         "one or more models, separated by spaces: names, files, runs or hub ids",
     )
     adapter: list[str] = option(
-        list, "adapters of the first model to choose from, separated by spaces"
+        list, "adapters of the first model, separated by spaces, from which users choose"
     )
     host: str = option(
         "127.0.0.1",
-        "address to listen on; the default accepts only this computer, 0.0.0.0 = all networks",
+        "address to listen on; the default accepts only this computer; 0.0.0.0 = all networks",
     )
     port: int = option(7860, "port to listen on; 0 = any free port")
     hosts: list[str] = option(
         list,
-        "names of this server, such as motion.example.org; localhost and IP addresses always work",
+        "host names of this server, such as motion.example.org; localhost and IP addresses "
+        "always work",
     )
     device: str | None = option(None, "cpu or cuda; default: cuda if available")
 
@@ -39,7 +41,7 @@ class DemoSettings:
 def main(settings: DemoSettings) -> None:
     """Serves the demo in the browser until it is stopped."""
     if not 0 <= settings.port <= 65535:
-        raise UserError(f"port={settings.port}: give a number from 0 to 65535; 0 is any free port")
+        raise UserError(f"port={settings.port}: give a number from 0 to 65535; 0 = any free port")
     if find_spec("gradio") is None:
         raise UserError('the demo needs the package gradio. Run pip install "flame-mdm[demo]"')
 

@@ -18,7 +18,10 @@ from flame_mdm.safe_io import read_yaml
 from flame_mdm.safe_io.paths import check_tree
 
 RECIPE = "student.yaml"
-"""Recipe of the student in its run directory, from which training starts, also in the jobs of a launcher."""
+"""Name of the student's recipe in its run directory.
+
+Training starts from it, also in the jobs of a launcher.
+"""
 SHARE_OF_STEPS, SHARE_OF_RATE = 0.2, 0.1
 
 
@@ -26,12 +29,13 @@ SHARE_OF_STEPS, SHARE_OF_RATE = 0.2, 0.1
 class DistillSettings(ModelSettings):
     """usage: flame-mdm distill CKPT [OUT] [key=value ...]
 
-    Trains a student of a model that predicts the clean motion or the velocity (MDM, MFM): it samples in 1, 2 or 4
-    steps, with the guidance built in. Its recipe is the recipe of the model, with the keys in
-    experiments/distillation/consistency.yaml, a fifth of the training steps and a tenth of the learning rate. Its data
-    are in FLAME_MDM_DATA, or in the folder of the model's data. trainer.max_steps=1000 overrides a key of the recipe.
-    Running the same command again resumes the run. --multirun seed=1,2 and launch= start sweeps and jobs, as in train.
-    See docs/few-steps.md.
+    Trains a student of a model that predicts the clean motion or the velocity (MDM, MFM). The
+    student samples in 1, 2 or 4 steps, with built-in guidance. Its recipe is the recipe of the
+    model with the keys of experiments/distillation/consistency.yaml, a fifth of the training
+    steps and a tenth of the learning rate. The data set is in FLAME_MDM_DATA, or in the folder of
+    the model's data set. Keys such as trainer.max_steps=1000 override keys of the recipe. Running
+    the same command again resumes the run. --multirun seed=1,2 and launch= start sweeps and jobs,
+    as in train. See docs/few-steps.md.
     """
 
     OBJECTS: ClassVar = ("ckpt", "out")
@@ -46,7 +50,7 @@ def main(settings: DistillSettings) -> None:
     folder = Path(recipe["run"]["dir"])
     path, new = folder / RECIPE, not folder.exists()
     check_tree(folder)
-    save(recipe, path)  # processes on other nodes read it, too
+    save(recipe, path)  # processes on other nodes read this file, too
     code = run_recipe(train, USAGE, [str(path), *settings.composed])
     if code and new and not any(folder.rglob("config.yaml")):  # no training started
         shutil.rmtree(folder, ignore_errors=True)
@@ -55,8 +59,8 @@ def main(settings: DistillSettings) -> None:
 
 
 def student_recipe(settings: DistillSettings) -> Config:
-    """Returns the recipe of a student: the recipe of its teacher with the changes of a
-    distillation.
+    """Returns the recipe of a student:
+    the recipe of its teacher with the changes of a distillation.
 
     Raises `UserError` if the model was not trained by this framework.
     """
@@ -67,7 +71,8 @@ def student_recipe(settings: DistillSettings) -> Config:
     recipe: Any = teacher.config
     if not teacher.steps or not isinstance(recipe.get("data"), dict) or "trainer" not in recipe:
         raise UserError(
-            f"{settings.ckpt}: was not trained by this framework, so that its data and steps are unknown"
+            f"{settings.ckpt}: was not trained by this framework, so its data and training "
+            f"steps are unknown"
         )
     name = f"{recipe['experiment']}_distilled"
     root = os.environ.get("FLAME_MDM_DATA", recipe["data_root"])

@@ -22,14 +22,16 @@ class EditSettings(OutputSettings, EditRequest, FileSettings):
     """
 
     OBJECTS: ClassVar = ("ckpt", "motion", "out")
-    motion: str = required("FILE (.npz, .bvh, .fbx, .glb, .json, .npy) or dataset:id", motion_file)
+    motion: str = required(
+        "a motion file (.npz, .bvh, .fbx, .glb, .json, .npy) or dataset:id", motion_file
+    )
     samples: int = same_option(SamplingRequest, "samples", default=3)
     cut: Sequence[float] | None = option(
         None, "[begin, end] in seconds: use only this part of the motion"
     )
     data_root: str = option(usual_data_root, "folder of the prepared data sets")
     out: str | None = option(
-        None, "folder; default samples/<experiment>/edit-<motion>-<text>-<hash>"
+        None, "folder for the results; default: samples/<experiment>/edit-<motion>-<text>-<hash>"
     )
 
 
@@ -92,5 +94,6 @@ def main(settings: EditSettings) -> None:
     )
     if moved > 0.01:
         say(
-            "a kept part that follows a generated one begins where that one ends, so its place in the world may differ"
+            "a kept part after a generated part begins where the generated part ends, so its "
+            "place in the world may differ"
         )

@@ -12,14 +12,15 @@ from flame_mdm.errors import say
 class ExportSettings(AdaptedSettings):
     """usage: flame-mdm export CKPT OUT [half=true] [format=onnx] [adapter=limp.safetensors]
 
-    Writes the averaged weights of a checkpoint, with its adapters merged into them, its recipe and the metadata of its
-    data set as one .safetensors file, or with format=onnx a folder to sample from without PyTorch: docs/export.md.
+    Writes one .safetensors file with the averaged weights of a checkpoint, its recipe and the
+    metadata of its data set. Adapters are merged into the weights. format=onnx writes a folder
+    for sampling without PyTorch instead. See docs/export.md.
     """
 
     OBJECTS: ClassVar = ("ckpt", "out")
-    out: str = required("a .safetensors file, or a folder; for format=onnx, a folder")
+    out: str = required("a .safetensors file or a folder; with format=onnx, a folder")
     format: Literal["safetensors", "onnx"] = option(
-        "safetensors", "safetensors, or onnx: graphs for onnxruntime with a script that samples"
+        "safetensors", "safetensors, or onnx (graphs for onnxruntime, with a script that samples)"
     )
     half: bool = option(False, "true = weight matrices in half precision")
 

@@ -24,19 +24,22 @@ class ImportSettings:
     )
     file: str = required("the released file: model000475000.pt, or FLAME's .ckpt", existing)
     args: str | None = option(None, "MDM's args.json, or MFM's .hydra/config.yaml", existing)
-    out: str = required("a .safetensors file, or a folder for model.safetensors")
+    out: str = required("a .safetensors file, or a folder in which model.safetensors is written")
     stats: str | None = option(
         None, "folder with Mean.npy and Std.npy of HumanML3D or KIT-ML", existing
     )
-    averaged: bool = option(True, "false = the raw weights, if the file also has averaged ones")
+    averaged: bool = option(
+        True, "false = use the raw weights if the file also contains averaged weights"
+    )
     num_heads: int | None = option(
         None, "number of attention heads, if it differs from the released models"
     )
     time_token: bool = option(
-        False, "decoder whose input token is the time alone, as in MDM's code since 2025"
+        False,
+        "true = the decoder's input token contains only the time, as in MDM's code since 2025",
     )
     run_code: bool = option(
-        False, "load pickles that hold more than weights: THIS RUNS ANY CODE IN THE FILE"
+        False, "also load pickles that contain more than weights: THIS RUNS ANY CODE IN THE FILE"
     )
 
 

@@ -27,32 +27,40 @@ from flame_mdm.progress import ProgressBar
 if TYPE_CHECKING:
     from flame_mdm.formats.motion import Motion
 
-MOST_LINES = 20  # faults that are printed per motion; the player shows all
+MOST_LINES = 20  # number of faults that are printed per motion; the player shows all faults
 
 
 @dataclass(frozen=True, kw_only=True)
 class InspectSettings(BodySettings, FileSettings, DataSettings):
     """usage: flame-mdm inspect MOTION|FOLDER|DATASET [OUT.html] [split=train] [clips=24] [fps=20] [unit=0.01] [up=z]
 
-    Finds physical faults of a motion file, of all motion files in a folder, or of a prepared data set, such as sliding
-    feet and jumps; their limits: docs/motion-faults.md
-    Prints the faults per frame and joint, and writes a player whose time line marks them; of a data set or a large
-    folder, it shows the worst motions, at most `clips`. Exits with 3 if there are faults.
+    Finds physical faults, such as sliding feet and jumps, in a motion file, in all motion files
+    of a folder, or in a prepared data set. docs/motion-faults.md lists the limits.
+
+    Prints the faults per frame and joint, and writes a player with marks on its time line. For a
+    data set or a large folder, the player shows the worst motions, at most `clips`. Exits with
+    code 3 if there are faults.
     """
 
     OBJECTS: ClassVar = ("motion", "out")
     motion: str = required(
-        "a motion file, a folder of them, or the name of a data set, also of your own (data.name)"
+        "a motion file, a folder of motion files, or the name of a data set, which may be your "
+        "own (data.name)"
     )
     out: str | None = option(None, "HTML file; default runs/inspect/<name>.html")
-    clips: int = option(24, "maximum number of motions in the player, the worst ones", above_zero)
+    clips: int = option(
+        24, "maximum number of motions in the player, which shows the worst motions", above_zero
+    )
     split: str | None = option(None, "train, val or test of a data set; default: all")
 
     def __post_init__(self) -> None:
         name = self.motion
-        if not (Path(name).suffix or Path(name).exists() or "/" in name):  # not a file: a data set
+        if not (
+            Path(name).suffix or Path(name).exists() or "/" in name
+        ):  # not a file, so the name of a data set
             is_prepared = any(Path(self.data_root).glob(f"{escape(name)}-*/{STORE}"))
-            # A prepared data set without a recipe of its name was made from the user's folder.
+            # If no recipe has the name of a prepared data set, the data set was made from the
+            # user's folder.
             if is_prepared and not (EXPERIMENTS / "data" / f"{name}.yaml").exists():
                 object.__setattr__(self, "data", "folder")
                 object.__setattr__(self, "composed", (*self.composed, f"data.name={name}"))

@@ -28,16 +28,21 @@ class JudgeSettings(BodySettings, FileSettings):
     """usage: flame-mdm judge MOTION text="a person waves with the left hand" [OUT.html] [fps=20] [unit=0.01] [up=z]
            flame-mdm judge FOLDER [OUT.html] [clips=24]
 
-    Reads the claims of a sentence, such as side, count, direction, posture and order, and measures each on the motion:
-    yes, no or cannot tell, with joint, number and time. Without text, motions are judged by their own texts.
-    Writes a player whose time line marks the evidence. Exits with 3 if a claim is false. docs/referee.md
+    Reads the claims of a sentence, such as side, count, direction, posture and order, and
+    measures each claim on the motion. The verdict is yes, no or cannot tell, with joint, number
+    and time. Without text, motions are judged by their own texts. Writes a player whose time line
+    marks the evidence. Exits with code 3 if a claim is false. See docs/referee.md.
     """
 
     OBJECTS: ClassVar = ("motion", "out")
-    motion: str = required("a motion file on SMPL's 22 joints, or a folder of them", existing)
+    motion: str = required(
+        "a motion file with SMPL's 22 joints, or a folder of motion files", existing
+    )
     text: str | None = option(None, "the sentence; default: the text in each motion file")
     out: str | None = option(None, "HTML file; default runs/judge/<name>.html")
-    clips: int = option(24, "maximum number of motions in the player, the worst ones", above_zero)
+    clips: int = option(
+        24, "maximum number of motions in the player, which shows the worst motions", above_zero
+    )
 
 
 def main(settings: JudgeSettings) -> None:

@@ -13,14 +13,15 @@ from flame_mdm.errors import say
 class PrepareSettings(DataSettings):
     """usage: flame-mdm prepare data=NAME [source=PATH] [representation=NAME] [check|verify|force=true]
 
-    Converts a data set, as distributed by its owners, into a packed store under data/. `check=true` only lists the
-    existing and the missing files; `verify=true` checks an existing store; `force=true` rewrites it.
+    Converts a data set from the files of its owners into a packed store in data/. `check=true`
+    only lists the existing and the missing files. `verify=true` checks an existing store.
+    `force=true` rewrites the store.
     """
 
     OBJECTS: ClassVar = ("data",)
-    source: str | None = option(None, "folder or archive, if the data set needs one")
-    check: bool = option(False, "list the existing and the missing files, prepare nothing")
-    verify: bool = option(False, "check and report on an existing store, write nothing")
+    source: str | None = option(None, "source folder or archive, if the data set requires one")
+    check: bool = option(False, "only list the existing and the missing files")
+    verify: bool = option(False, "only check an existing store and report on it")
     force: bool = option(False, "rewrite an existing store")
 
 
@@ -44,7 +45,7 @@ def main(settings: PrepareSettings) -> None:
         say(*lines(checked))
         if differ := deviations(checked):
             say("DIFFERS from the published figures:", *(f"  {line}" for line in differ))
-        say(f"{data.folder}: complete, every hash matches; the report is in verify.json")
+        say(f"{data.folder}: complete, and every hash matches. The report is in verify.json")
         return
     if (data.folder / STORE).exists() and not settings.force:
         store = data.open()

@@ -18,9 +18,9 @@ class PushSettings(ModelSettings):
 
     OBJECTS: ClassVar = ("ckpt", "repository", "out")
     repository: str = required("user/name on the Hugging Face hub")
-    out: str | None = option(None, "local folder for the files; default push/<name>")
+    out: str | None = option(None, "local folder for the files; default: push/<name>")
     private: bool = option(False, "true = the repository is private")
-    dry_run: bool = option(False, "true = write the folder, upload nothing")
+    dry_run: bool = option(False, "true = write the folder without uploading it")
 
 
 def main(settings: PushSettings) -> None:

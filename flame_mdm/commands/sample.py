@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     from flame_mdm.sampling.targets import Targets
     from flame_mdm.visualize.body import Mesh
 
-# Maximum number of motions on the page of a file of prompts; each takes about 20 kB
+# Maximum number of motions on the page for a file of prompts; each motion takes about 20 kB
 GALLERY = 200
-CLAIMS = "claims"  # scorer that judges the claims of the text: docs/referee.md
+CLAIMS = "claims"  # the scorer that judges the claims of the text; see docs/referee.md
 
 
 def scorer_source(key: str, source: str) -> None:
@@ -50,10 +50,11 @@ class SampleSettings(OutputSettings, WritingSettings):
            flame-mdm sample CKPT action=walk
            flame-mdm sample CKPT unconditioned=true
 
-    Writes motions (.npz), a GIF, and a player that opens in any browser. A file of prompts has one per line; each gets
-    its own folder, and one page shows all. Prompts that cannot be sampled are named at the end, and the exit code is 1.
-    A set is a folder of clips that fit together, for game engines: loops, starts, stops and turns.
-    If OUT is a file, .fbx, .glb, .bvh, .usdz, .vrma, .npz, .json, .npy, .mp4 or .gif, only this file is written.
+    Writes motions (.npz), a GIF, and a player that opens in any browser. A file of prompts has
+    one prompt per line. Each prompt gets its own folder, and one page shows all motions. Prompts
+    that cannot be sampled are named at the end, and the exit code is 1. A set is a folder of
+    clips that fit together, for game engines: loops, starts, stops and turns. If OUT is a file
+    (.fbx, .glb, .bvh, .usdz, .vrma, .npz, .json, .npy, .mp4 or .gif), only this file is written.
     """
 
     OBJECTS: ClassVar = ("ckpt", "out")

@@ -190,8 +190,8 @@ def _name(node: ast.expr) -> str:
 
 
 def check_same_kinds(base: Config, config: Config, path: str = "") -> None:
-    """Checks keys that no signature describes: raises `UserError` if an override changes the type
-    of the recipe's value.
+    """Checks keys that no signature describes:
+    raises `UserError` if an override changes the type of the recipe's value.
     """
     for name, value in base.items():
         key = f"{path}{name}"

@@ -1,1 +1,4 @@
-"""Tables, run reports, comparisons and data set pages, made from files alone. No model is loaded here."""
+"""Tables, run reports, comparisons and data set pages.
+
+They are made from files, without loading a model.
+"""

@@ -19,29 +19,32 @@ from flame_mdm.schemas import ClosedSchema, Int, read_json
 
 COMMITTED = "docs/benchmarks/audit"  # folder of the cards that audited.json lists
 SETS = {"fewer": "{:g} real motions", "as stored": "features as stored"}
-"""Perturbations of the set that show the bias of a metric, and what they measure at their strongest grade."""
-ROUNDING = 1e-6  # relative differences below this are not seen
+"""Perturbations of the set that show the bias of a metric,
+and the measured motions at their strongest grade.
+"""
+ROUNDING = 1e-6  # smaller relative differences count as rounding errors
 WIDE, HIGH = 132, 48
 LEGEND = (
-    "Smallest strength from which on the metric differs from real motions in a paired comparison; a → b: only from b "
-    "on does its value also leave the 95 % interval of real motions; –: never; ~: not monotone."
+    "Each cell has the smallest strength at which the metric differs from real motions in a paired comparison, there "
+    "and at all larger strengths. a → b: its value leaves the 95 % interval of real motions only at strength b. "
+    "–: never. ~: the difference does not always grow with the strength."
 )
 
 
 @dataclass(frozen=True)
 class Seen:
-    """How a metric responds to a perturbation; None = at no grade."""
+    """Response of a metric to a perturbation; None = at no grade."""
 
-    # weakest grade from which on the paired difference from real motions is not 0
+    # the paired difference from real motions is not 0 at this and all stronger grades
     grade: float | None
-    # weakest grade from which on values are outside the 95 % interval of real motions
+    # values are outside the 95 % interval of real motions at this and all stronger grades
     outside: float | None
     rewarded: bool  # whether the strongest grade is rated better than real motions
     monotone: bool  # whether every stronger grade differs at least as much, within its interval
 
 
 def seen(card: AuditCard, perturbation: AuditedPerturbation, metric: str) -> Seen | None:
-    """Returns how a metric responds to a perturbation; None if it was not computed at all grades."""
+    """Returns the response of a metric to a perturbation; None if a grade was not computed."""
     real, width = card.real[metric]
     graded = [(grade.grade, *grade.values[metric]) for grade in perturbation.grades]
     if real is None or width is None:
@@ -69,10 +72,10 @@ def seen(card: AuditCard, perturbation: AuditedPerturbation, metric: str) -> See
 
 
 def card_name(card: AuditCard) -> str:
-    """Returns the name of a card's files: data set, extractor, number of motions, and a hash of what was audited.
+    """Returns the name of a card's files: data set, extractor, number of motions, and a hash.
 
-    An audit of other motions, or of another crop, has another name, so that it does not overwrite
-    a stronger one.
+    An audit of other motions, or of another crop, has another hash, so that it does not overwrite
+    a stronger card.
     """
     extractor = card.extractor.sha256[:12] if card.extractor else "none"
     facts = card.model_dump(include={"protocol", "data", "split", "seed", "motions", "resamples"})
@@ -81,22 +84,22 @@ def card_name(card: AuditCard) -> str:
 
 
 class ListedCard(ClosedSchema):
-    """A card in this repository, as audited.json lists it."""
+    """A card in this repository, as listed in audited.json."""
 
     name: str
-    extractor: str | None  # first 12 characters of its sha256
+    extractor: str | None  # first 12 characters of the extractor's sha256
     motions: Int
     split: str
     data: Data
 
     def cited(self, folder: Path) -> CitedCard:
-        """Returns the card as results cite it, with the path of its page in `folder`."""
+        """Returns the card for citation in results, with the path of its page in `folder`."""
         return CitedCard(folder / f"{self.name}.html", self.motions, self.split, self.data)
 
 
 @dataclass(frozen=True)
 class CitedCard:
-    """The page of a card, and the motions that it is about."""
+    """The page of a card, and the audited motions."""
 
     path: Path
     motions: int
@@ -104,10 +107,11 @@ class CitedCard:
     data: Data
 
     def strength(self, data: Data) -> tuple[bool, bool, bool, int]:
-        """Returns how well the card fits evaluated data, as a tuple to compare cards by.
+        """Returns a tuple by which cards are compared:
+        the larger, the better the card fits the evaluated data.
 
-        Cards with the same limits of length come first, then cards of the test split, of the same
-        data, and of more motions.
+        Cards with the same limits of length are best, then cards of the test split, cards of the
+        same data, and cards of more motions.
         """
         same_frames = self.data.frames == data.frames
         return (
@@ -122,11 +126,12 @@ class CitedCard:
 
 
 def card_of(data: Data, sha256: str | None) -> CitedCard | None:
-    """Returns the strongest card of an extractor that fits evaluated data; None if it was not audited.
+    """Returns the strongest card of an extractor that fits the evaluated data;
+    None without such a card.
 
-    Without an extractor, it is a card of the metrics of joints. Cards are in the folder that
-    FLAME_MDM_AUDITS names, by default runs/audit, and in the repository; audited.json lists the
-    latter.
+    Without an extractor, the card is about the metrics of joints. Cards are in the folder of
+    FLAME_MDM_AUDITS (default: runs/audit) and in the repository, whose cards are listed in
+    audited.json.
     """
     extractor = sha256[:12] if sha256 else None
     listed = read_json(Path(__file__).with_name("audited.json"), list[ListedCard])
@@ -143,14 +148,14 @@ def card_of(data: Data, sha256: str | None) -> CitedCard | None:
 
 
 def read_card(path: Path) -> AuditCard:
-    """Reads the JSON of a card; raises `UserError` if an older version wrote it or it is damaged."""
+    """Reads the JSON of a card; raises `UserError` if it is damaged or from an older version."""
     return read_json(path, AuditCard, "run `flame-mdm audit` again")
 
 
 def write_card(cards: Sequence[AuditCard], out: Path, name: str = "") -> list[Path]:
     """Writes one card, or two side by side, as a web page and as Markdown; returns the paths.
 
-    `name` is the name of the files; default: the names of the cards.
+    `name` is the name of the files; the default consists of the names of the cards.
     """
     metrics = list(dict.fromkeys(metric for card in cards for metric in card.metrics))
     metrics.sort(key=lambda metric: any(_facts_of(card, metric).exact for card in cards))
@@ -181,7 +186,7 @@ def _evaluator(card: AuditCard) -> str:
 
 
 def _section(card: AuditCard) -> dict[str, object]:
-    """Returns what pages say about a single card."""
+    """Returns the content of a page for a single card."""
     return {
         "name": _evaluator(card),
         "facts": _facts(card),
@@ -194,7 +199,9 @@ def _section(card: AuditCard) -> dict[str, object]:
 
 
 def _rows(cards: Sequence[AuditCard], metrics: Sequence[str]) -> list[dict[str, object]]:
-    """Returns the perturbations of all cards, each with one cell per metric and card, and its curves by metric."""
+    """Returns one row per perturbation, with one cell per metric and card,
+    and with curves by metric.
+    """
     by_name = [
         {perturbation.name: perturbation for perturbation in card.perturbations} for card in cards
     ]
@@ -245,7 +252,9 @@ def _facts(card: AuditCard) -> list[list[str]]:
 
 
 def findings(card: AuditCard) -> list[str]:
-    """Returns what metrics do not see, or rate better than real motions, in plain sentences."""
+    """Returns sentences on perturbations that metrics do not notice,
+    or rate better than real motions.
+    """
     table = {
         (perturbation.name, metric): seen(card, perturbation, metric)
         for perturbation in card.perturbations
@@ -253,28 +262,28 @@ def findings(card: AuditCard) -> list[str]:
     }
     group = {perturbation.name: perturbation.group for perturbation in card.perturbations}
 
-    # A perturbation is seen by the metrics that respond to one of its grades. Metrics are
-    # expected to see perturbations that make motions or their meaning wrong; a name with a colon
-    # is a variant of one.
+    # A metric notices a perturbation if it responds to one of its grades. Metrics are expected to
+    # notice perturbations that make motions or their meaning wrong. A name with a colon is a
+    # variant of a perturbation.
     seen_by: dict[str, list[str]] = {name: [] for name in group}
     for (name, metric), response in table.items():
         if response and response.grade is not None:
             seen_by[name].append(metric)
     wrong = [name for name in group if group[name] in ("joints", "meaning") and ":" not in name]
     blind = [name for name in group if name in (*wrong, "memorized") and not seen_by[name]]
-    lines = [f"No metric sees: {', '.join(blind)}."] if blind else []
+    lines = [f"No metric notices: {', '.join(blind)}."] if blind else []
 
     for metric in card.metrics:
         alone = [name for name in wrong if seen_by[name] == [metric]]
         if alone:
-            lines.append(f"Only {metric} sees: {', '.join(alone)}.")
+            lines.append(f"Only {metric} notices: {', '.join(alone)}.")
     for metric in card.metrics:
         facts = _facts_of(card, metric)
         unseen = [name for name in wrong if metric not in seen_by[name] and name not in blind]
         if not facts.sees_meaning:
             unseen = [name for name in unseen if group[name] == "joints"]
         if unseen and facts.sums_up:
-            lines.append(f"{metric} does not see: {', '.join(unseen)}.")
+            lines.append(f"{metric} does not notice: {', '.join(unseen)}.")
     for metric in card.metrics:
         liked = [name for name in wrong if (response := table[name, metric]) and response.rewarded]
         if liked:
@@ -285,8 +294,8 @@ def findings(card: AuditCard) -> list[str]:
         if of_motions is not None:
             grade = perturbation.grades[-1]
             lines += [
-                f"{metric} of {of_motions.format(grade.grade)} is {number(grade.values[metric][0])}; of all of them, "
-                f"decoded and encoded, {number(card.real[metric][0])}."
+                f"{metric} of {of_motions.format(grade.grade)} is {number(grade.values[metric][0])}. For all motions, "
+                f"decoded and encoded, it is {number(card.real[metric][0])}."
                 for metric in biased
             ]
     return lines
@@ -299,7 +308,7 @@ def _facts_of(card: AuditCard, metric: str) -> AuditedMetric:
 def _cell(
     card: AuditCard, perturbation: AuditedPerturbation | None, metric: str
 ) -> tuple[str, str]:
-    """Returns the text of a cell of the summary, and its class."""
+    """Returns the text of a cell of the summary, and the CSS class of the cell."""
     response = seen(card, perturbation, metric) if perturbation and metric in card.metrics else None
     if perturbation is None or metric not in card.metrics:
         return "not computed", "faint"
@@ -319,7 +328,7 @@ def _cell(
 
 
 def _not_computed(card: AuditCard, perturbation: AuditedPerturbation, metric: str) -> str:
-    """Returns at which grades a metric lacks a value, if it has one at others."""
+    """Returns a text with the grades at which a metric has no value."""
     grades = [grade.grade for grade in perturbation.grades if None in grade.values[metric][2:]]
     if None in card.real[metric] or len(grades) == len(perturbation.grades):
         return "not computed"
@@ -329,7 +338,9 @@ def _not_computed(card: AuditCard, perturbation: AuditedPerturbation, metric: st
 def _curve(
     card: AuditCard, perturbation: AuditedPerturbation | None, metric: str
 ) -> dict[str, str] | None:
-    """Returns a response curve over real motions and all grades; None if the metric never changes."""
+    """Returns the response curve over real motions and all grades;
+    None if the metric never changes.
+    """
     if perturbation is None or metric not in card.metrics:
         return None
     pairs = [card.real[metric], *(grade.values[metric][:2] for grade in perturbation.grades)]
@@ -357,5 +368,7 @@ def _curve(
 
 
 def _metric_text(name: str) -> str:
-    """Returns the name of a metric as Markdown; the names that this project gives need no escapes."""
+    """Returns the name of a metric as Markdown;
+    names of this project's metrics need no escapes.
+    """
     return name if re.fullmatch(r"[\w/.-]+", name) else markdown_text(name)

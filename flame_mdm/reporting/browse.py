@@ -18,14 +18,15 @@ from flame_mdm.safe_io import atomic_folder
 from flame_mdm.visualize import write_player
 from flame_mdm.visualize.body import Mesh
 
-SECONDS = 15  # seconds shown of a longer clip, to keep the page small
+SECONDS = 15  # only the first seconds of a longer clip are shown, to keep the page small
 
 
 def find(clips: Sequence[Entry], split: str | None, search: str) -> list[list[Entry]]:
-    """Returns the clips of a split (None = all) whose id and captions contain all words of `search`, in any case.
+    """Returns the clips of a split (None = all) whose id
+    and captions contain all words of `search`.
 
-    Each clip is grouped with its mirrored copy, original first; a group matches if one of its
-    clips does.
+    Upper and lower case do not matter. Each clip is grouped with its mirrored copy, original
+    first. A group matches if one of its clips matches.
     """
     ids = {clip.id for clip in clips}
     families: dict[str, list[Entry]] = {}
@@ -40,12 +41,12 @@ def find(clips: Sequence[Entry], split: str | None, search: str) -> list[list[En
         for f in families.values()
         if any(all(word in texts[clip.id] for word in words) for clip in f)
     )
-    # A mirrored id is longer
+    # The id of a mirrored copy is longer
     return [sorted(family, key=lambda clip: len(clip.id)) for family in matching]
 
 
 def choose(families: Sequence[list[Entry]], most: int) -> list[list[Entry]]:
-    """Returns evenly spaced families with at most `most` clips in total, but at least one family."""
+    """Returns evenly spaced groups with at most `most` clips in total, but at least one group."""
     for count in range(min(len(families), max(1, most)), 0, -1):
         chosen = [families[k] for k in np.linspace(0, len(families) - 1, count).round().astype(int)]
         if sum(map(len, chosen)) <= most:
@@ -58,7 +59,8 @@ def motion(store: Store, representation: Representation, clip: Entry) -> Motion:
     shown = round(SECONDS * representation.fps)
     joints = representation.decode(torch.from_numpy(store.motion(clip)[:shown].copy())).numpy()
     below = joints[..., 1].min()
-    # The action data sets use camera coordinates, without a floor: put the lowest joint on it
+    # The action data sets use camera coordinates, which have no floor: put the lowest joint at
+    # height 0
     if below < -0.3:
         joints[..., 1] -= below
     actions = store.info["actions"]
@@ -76,7 +78,7 @@ def write_page(
     title: str,
     body: Mesh | None,
 ) -> None:
-    """Writes a player of clips, grouped by split; a mirrored copy is next to its original."""
+    """Writes a player of clips, grouped by split. A mirrored copy is next to its original."""
     write_player(
         path,
         [motion(store, representation, clip) for clip in clips],
@@ -93,8 +95,8 @@ def write_clips(
 ) -> None:
     """Writes clips as `motion_000_ID.npz` ..., in the layout of generated motions, each with one caption.
 
-    A clip with several captions gets the first one that no earlier clip has, so that captions are
-    unique if possible.
+    A clip with several captions gets the first caption that no earlier clip has, so that captions
+    are unique if possible.
 
     Args:
         folder: the folder to write.
@@ -104,7 +106,7 @@ def write_clips(
         longest: number of frames to which longer clips are cut, as in evaluations.
 
     Raises:
-        UserError: the folder holds other motions, which would be mistaken for these.
+        UserError: If the folder holds other motions, which would be mistaken for these clips.
     """
     ids = [re.sub(r"[^\w.-]+", "_", clip.id)[:100] for clip in clips]
     paths = [folder / f"motion_{number:03d}_{name}.npz" for number, name in enumerate(ids)]
@@ -113,7 +115,8 @@ def write_clips(
     )
     if others:
         raise UserError(
-            f"motions={folder}: the folder holds other motions, such as {others[0].name}. Delete it, or choose another"
+            f"motions={folder}: the folder holds other motions, such as {others[0].name}. "
+            f"Delete it, or choose another folder"
         )
 
     used: set[str] = set()

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from flame_mdm.formats.motion import Motion
     from flame_mdm.visualize.body import Mesh
 
-# Requested caption or action, and the index of the motion among those with the same request
+# The requested caption or action, and the index of the motion among motions with the same request
 Prompt = tuple[str, int]
 # First frame, last frame (exclusive), kind and description of a span of a time line
 Mark = tuple[int, int, str, str]
@@ -43,7 +43,10 @@ Mark = tuple[int, int, str, str]
 
 @dataclass(frozen=True)
 class ComparedRun:
-    """A run, or a folder of motion files, with its label on pages. `run` is None for a folder of motion files."""
+    """A run, or a folder of motion files, with its label on pages.
+
+    `run` is None for a folder of motion files.
+    """
 
     label: str
     folder: Path
@@ -53,12 +56,12 @@ class ComparedRun:
 def find(folders: Sequence[Path]) -> list[ComparedRun]:
     """Returns two or more runs and folders of motion files.
 
-    Runs are labeled by recipe and run name, folders of motions by their name, and both by their
-    path if two labels are the same.
+    The label of a run consists of recipe and run name; the label of a folder is its name. If two
+    labels are the same, they are replaced with paths.
     """
     if len(set(folders)) < 2:
         raise UserError(
-            f'a comparison needs two or more runs: runs="A B", not {" ".join(map(str, folders))}'
+            f'runs={" ".join(map(str, folders))}: a comparison needs two or more runs. Give runs="A B"'
         )
 
     compared = []
@@ -77,7 +80,7 @@ def find(folders: Sequence[Path]) -> list[ComparedRun]:
 
 
 def _direct_motions(folder: Path) -> list[Path]:
-    """Returns the motion files that are in a folder itself, sorted, without hidden ones."""
+    """Returns the sorted motion files directly in a folder, without hidden files."""
     files = (
         path for path in folder.iterdir() if path.suffix.lower() in ENDINGS and path.name[0] != "."
     )
@@ -97,7 +100,7 @@ def read_motions(folder: Path) -> dict[Prompt, Motion]:
 
 
 def in_all(shown: Sequence[Mapping[Prompt, Motion]]) -> list[Prompt]:
-    """Returns the prompts for which every run has a motion, in the order of the first run."""
+    """Returns the prompts for which all runs have motions, in the order of the first run."""
     return [prompt for prompt in shown[0] if all(prompt in motions for motions in shown)]
 
 
@@ -112,14 +115,14 @@ def comparison(
     mesh: Mesh | None = None,
     evidence: Callable[[Motion], Sequence[Mark]] = lambda motion: (),
 ) -> str:
-    """Returns the page that compares runs side by side. The same runs give the same bytes.
+    """Returns a page that compares runs side by side. The same runs give the same bytes.
 
     Args:
         compared: runs and folders of motions.
-        shown: the motions of each of them, by prompt; the page plays those for the prompts that
-            all have.
+        shown: the motions of each run and folder, by prompt. The page plays the motions for the
+            prompts that all have.
         mesh: the body to draw.
-        evidence: function that returns the marks on the time line of a motion.
+        evidence: function that returns the marks for the time line of a motion.
     """
     runs = only_runs(compared)
     labels = [entry.label for entry in compared]
@@ -187,7 +190,9 @@ def _player(
     body: Mesh | None,
     evidence: Callable[[Motion], Sequence[Mark]],
 ) -> str:
-    """Plays the motions for the prompts that all runs have, in the order of the first run."""
+    """Returns a player of the motions for the prompts that all runs have,
+    in the order of the first run.
+    """
     from flame_mdm.visualize import player_page
 
     scene = [
@@ -201,29 +206,36 @@ def _player(
 
 HEAD = ["", "difference", "95 % over replications", ""]  # column titles of differences
 EXPLAINED = (
-    "Differences of motions for the same texts and noise, over replications: other captions, crops and noise. The "
-    "intervals do not cover another training run. A difference is shown if its interval does not contain 0; of 20 "
-    "metrics that do not differ, one is shown by chance."
+    "Differences between motions for the same texts and noise. The intervals are over "
+    "replications, which have other captions, crops and noise; they do not cover another "
+    "training run. A difference is shown if its interval does not contain 0. Of 20 metrics that "
+    "do not differ, one is shown by chance."
 )
 
 
 def differences(first: Result, second: Result) -> list[list[str]] | str:
-    """Returns rows for `HEAD`, the differences of all metrics of two results of the same evaluation, or why not."""
+    """Returns rows for `HEAD`:
+    the differences of all metrics of two results, or a reason for no comparison.
+
+    Both results are of the same evaluation.
+    """
     if invalid := [*first.invalid_because, *second.invalid_because]:
         return f"not compared: not valid: {invalid[0]}"
     paired = [(r.seed, r.data.frames, r.skeleton) for r in (first, second)]
     if paired[0] != paired[1]:
-        return "not compared: other seed, limits of length or skeleton, so that the motions are not paired"
+        return "not compared: the seeds, limits of length or skeletons differ, so the motions "
+        "are not paired"
     one, two = first.values or {}, second.values or {}
     rows = [_difference(name, one[name], two[name]) for name in sorted(one.keys() & two.keys())]
     return [row for row in rows if row] or (
-        "not compared: no metric has values per replication of the same number of motions. Results of earlier versions "
-        "have none: evaluate both again; motions are not generated again"
+        "not compared: no metric has values per replication for the same number of motions. "
+        "Results of earlier versions have no such values: evaluate both again. Motions are not "
+        "generated again"
     )
 
 
 def _difference(name: str, first: Value | None, second: Value | None) -> list[str]:
-    """Returns a row of cells, second - first; [] if the results have no pairs of values of the metric."""
+    """Returns a row of cells for second - first; [] if the results have no pairs of values."""
     if first is None or second is None or first.n != second.n:
         return []
     count = min(len(first.per_replication), len(second.per_replication))
@@ -238,7 +250,10 @@ def _difference(name: str, first: Value | None, second: Value | None) -> list[st
 
 
 def paired_difference(first: ArrayLike, second: ArrayLike) -> tuple[float, float, float]:
-    """Returns the mean of second - first over R pairs, and its 95 % interval by Student's t, which is NaN if R is 1."""
+    """Returns the mean of second - first over R pairs, and its 95 % interval by Student's t.
+
+    The interval is NaN if R is 1.
+    """
     from scipy.stats import t
 
     difference = np.subtract(second, first)
@@ -252,7 +267,9 @@ def paired_difference(first: ArrayLike, second: ArrayLike) -> tuple[float, float
 
 
 def grouped(runs: Mapping[str, Run]) -> dict[str, list[tuple[str, Result]]]:
-    """Returns the results of the same protocol, data and extractor with the labels of their runs, by title."""
+    """Groups the results of the same protocol, data and extractor by title,
+    with the labels of their runs.
+    """
     groups: dict[str, list[tuple[str, Result]]] = {}
     for label, run in runs.items():
         for result in run.results.values():
@@ -262,7 +279,9 @@ def grouped(runs: Mapping[str, Run]) -> dict[str, list[tuple[str, Result]]]:
 
 
 def in_common(runs: Mapping[str, Run]) -> list[str]:
-    """Returns why no evaluation can be compared; [] if two runs have the same evaluation."""
+    """Returns the reason why no evaluation can be compared;
+    [] if two runs have the same evaluation.
+    """
     groups = grouped(runs)
     if len(runs) < 2 or any(
         len({label for label, _ in columns}) > 1 for columns in groups.values()
@@ -275,7 +294,9 @@ def in_common(runs: Mapping[str, Run]) -> list[str]:
 
 
 def tested(columns: Sequence[tuple[str, Result]]) -> list[tuple[str, list[list[str]]]]:
-    """Returns titles and rows of the differences of each result from the first; see `HEAD`."""
+    """Returns titles and rows (see `HEAD`) of the differences between each result
+    and the first result.
+    """
     (first, base), *others = columns
     tables = []
     for index, (label, result) in enumerate(others, 2):

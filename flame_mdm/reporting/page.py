@@ -1,4 +1,4 @@
-"""Self-contained web pages, one file each, from templates. The same input gives the same bytes."""
+"""Self-contained web pages from templates. The same input gives the same bytes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,10 @@ TEMPLATES = Path(__file__).parent / "templates"
 
 
 def render(template: str, **values: Any) -> Markup:
-    """Renders a file of `templates/`. In HTML and SVG, all text is escaped, except the output of other templates."""
+    """Renders a file of `templates/`.
+
+    In HTML and SVG, all text is escaped, except the output of other templates.
+    """
     from markupsafe import Markup
 
     return Markup(_environment().get_template(template).render(**values))
@@ -52,7 +55,7 @@ def _environment() -> Environment:
 
 
 def number(value: float | None) -> str:
-    """Formats a number for a table, with four digits; a missing value is a dash."""
+    """Formats a number for a table with four digits; a missing value is a dash."""
     if value is None:
         return "–"
     if isinstance(value, float) and math.isfinite(value) and 0 < abs(value) < 1e-3:
@@ -61,14 +64,16 @@ def number(value: float | None) -> str:
 
 
 def filled(head: Sequence[str], rows: Sequence[Sequence[str]]) -> tuple[list[str], list[list[str]]]:
-    """Returns a table without the columns and rows that have no value; the first column names the rows."""
+    """Returns a table without empty columns and rows;
+    the first column has the names of the rows.
+    """
     rows = [row for row in rows if {*row[1:]} - {"–", ""}]
     kept = [k for k in range(len(head)) if not k or {row[k] for row in rows} - {"–", ""}]
     return [head[k] for k in kept], [[row[k] for k in kept] for row in rows]
 
 
 def interval(mean: float | None, half: float | None) -> str:
-    """Formats a mean and the half width of its interval, if there is one."""
+    """Formats a mean and the half width of its interval, if any."""
     return number(mean) + (f" ± {half:.2g}" if mean is not None and half is not None else "")
 
 

@@ -16,9 +16,10 @@ if TYPE_CHECKING:
 WIDE, HIGH = 460, 230
 LEFT, RIGHT, TOP, BOTTOM = 58, 10, 8, 24
 ROW = 16  # height of a line of text
-# Maximum number of segments per curve; the lowest and the highest point of each are drawn
+# Maximum number of segments per curve. The lowest and the highest point of each segment are
+# drawn.
 MOST = 300
-LOG_RANGE = 15  # positive values that span more than this factor get a logarithmic axis
+LOG_RANGE = 15  # positive values get a logarithmic axis if they span more than this factor
 COLORS = 8
 # Numbers closer to 0 are treated as 0 on axes, since steps between ticks would underflow
 SMALLEST = 1e-300
@@ -28,7 +29,10 @@ Curve = Mapping[int, float]  # values by step
 
 @dataclass
 class Series:
-    """Points (x, y) of one color, in ascending order, with half widths of 95 % intervals; line, dashed or dots."""
+    """Points (x, y) of one color in ascending order, drawn as a line, a dashed line or dots.
+
+    Each point may have the half width of a 95 % interval.
+    """
 
     name: str
     points: Sequence[tuple[float, float]]
@@ -38,7 +42,7 @@ class Series:
 
 @dataclass
 class Histogram:
-    """Numbers of motions by length: the first bar is for 0 to `step` frames."""
+    """Numbers of motions by length. The first bar is for 0 to `step` frames."""
 
     step: int
     counts: Sequence[int]
@@ -46,7 +50,10 @@ class Histogram:
 
 @dataclass
 class Panel:
-    """One pair of axes, with their labels; the x-axis may be logarithmic, or begin at 0. `levels` are lines."""
+    """A pair of axes with labels.
+
+    The x-axis may be logarithmic, or begin at 0; `levels` are horizontal lines.
+    """
 
     content: Sequence[Series] | Histogram
     x: str = ""
@@ -58,7 +65,7 @@ class Panel:
 
 
 def svg(title: str, panels: Sequence[Panel]) -> Markup | None:
-    """Draws panels side by side, with the styles of the page; None if they have no points."""
+    """Draws panels side by side, with the styles of the page; returns None without points."""
     drawn = [_drawn(panel) for panel in panels]
     if not any(drawn):
         return None
@@ -77,7 +84,10 @@ def svg_file(drawing: Markup) -> str:
 def chart(
     title: str, curves: Mapping[str, Curve], bands: Mapping[str, Curve] | None = None
 ) -> Markup:
-    """Draws curves over training steps, and lists their last finite values; `bands` are half widths of intervals."""
+    """Draws curves over training steps and lists their last finite values.
+
+    `bands` are half widths of intervals.
+    """
     spread = {
         name: {x: abs(width) for x, width in _finite(curve)}
         for name, curve in (bands or {}).items()
@@ -172,15 +182,14 @@ def _bars(histogram: Histogram, at: Any) -> list[tuple[int, str, str, str, str, 
 
 
 def _finite(curve: Curve) -> list[tuple[float, float]]:
-    """Returns the points of a curve by step, without NaN and without values that would overflow."""
+    """Returns the points of a curve by step, without NaN and values that would overflow."""
     return [(x, y) for x, y in sorted(curve.items()) if abs(y) < 1e300]
 
 
 def _thinned(points: Sequence[tuple[float, float]]) -> Sequence[tuple[float, float]]:
     if len(points) <= 2 * MOST:
         return points
-    # Of each part of the curve, the smallest and the largest value stay, so that no spike is
-    # lost.
+    # The smallest and the largest value of each segment are kept, so that no spike is lost.
     size = math.ceil(len(points) / MOST)
     parts = [points[begin : begin + size] for begin in range(0, len(points), size)]
     return [
@@ -191,7 +200,7 @@ def _thinned(points: Sequence[tuple[float, float]]) -> Sequence[tuple[float, flo
 
 
 def _linear_axis(low: float, high: float, to_ticks: bool) -> _Axis:
-    """Returns an axis that ends at the extreme values, or at ticks."""
+    """Returns an axis whose ends are the extreme values, or ticks."""
     low, high = (value if abs(value) > SMALLEST else 0.0 for value in (low, high))
     if high - low <= 1e-9 * max(abs(low), abs(high)):
         low, high = low - (abs(low) or 1) / 10, high + (abs(high) or 1) / 10
@@ -210,7 +219,7 @@ def _linear_axis(low: float, high: float, to_ticks: bool) -> _Axis:
 def _log_axis(low: float, high: float) -> _Axis:
     low, high = max(low, SMALLEST), max(high, SMALLEST)
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-    every = math.ceil(len(decades) / 6)  # at most six powers of ten have a tick
+    every = math.ceil(len(decades) / 6)  # at most six powers of ten have ticks
     steps = (1, 2, 5) if len(decades) <= 3 else (1,)
     ticks = [m * 10.0**d for d in decades if (d - decades[0]) % every == 0 for m in steps]
     within = [tick for tick in ticks if low * 0.999 <= tick <= high * 1.001]

@@ -19,11 +19,14 @@ if TYPE_CHECKING:
     from flame_mdm.visualize.body import Mesh
 
 COST = ("lr", "grad_norm", "samples_per_second", "seconds_per_step", "gpu_memory_gib")
-"""Training curves about speed and optimization rather than losses."""
+"""Training curves of speed and optimization, which are not losses."""
 
 
 def write_report(folder: Path, mesh: Mesh | None = None) -> Path:
-    """Writes `report.html` into a run directory, and returns its path. The same folder gives the same bytes."""
+    """Writes `report.html` into a run directory and returns its path.
+
+    The same run gives the same bytes.
+    """
     from omegaconf import OmegaConf
 
     run = read_run(folder)
@@ -59,7 +62,7 @@ def write_report(folder: Path, mesh: Mesh | None = None) -> Path:
 
 
 def last(curve: Curve) -> float | None:
-    """Returns the value of the last step of a curve; None for an empty curve."""
+    """Returns the value at the last step of a curve; None for an empty curve."""
     return curve[max(curve)] if curve else None
 
 
@@ -80,8 +83,8 @@ def _player(run: Run, body: Mesh | None) -> str:
     from flame_mdm.formats.readers import read
     from flame_mdm.visualize import player_page
 
-    # Written again from the motions: `player.html` may be untrusted, and its scripts would run in
-    # the report.
+    # The player is written again from the motions: an existing `player.html` may be untrusted,
+    # and its scripts would run in the report.
     return player_page([read(path) for path in sorted(run.samples.glob("motion_*.npz"))], body=body)
 
 
@@ -96,7 +99,11 @@ def _chart(run: Run, name: str, families: list[str]) -> Markup:
 
 
 def charted(curves: Collection[str]) -> dict[str, dict[str, list[str]]]:
-    """Groups curves into charts: heading -> rest of the name (`loss`) -> families that share it (`train`, `val`)."""
+    """Groups curves into charts, by heading.
+
+    The curves of a heading are grouped by the rest of their name (`loss`); the families with this
+    name (`train`, `val`) share a chart.
+    """
     samples = "Samples for the fixed prompts"
     groups: dict[str, dict[str, list[str]]] = {
         "Losses": {},
@@ -106,7 +113,7 @@ def charted(curves: Collection[str]) -> dict[str, dict[str, list[str]]]:
     }
     for name in curves:
         family, _, rest = name.partition("/")
-        # "": a name without a family; runs write none
+        # "" = a name without a family, which runs do not write
         if rest.endswith(("/ci", "/real")) or rest in (
             "",
             "epochs",
@@ -150,13 +157,13 @@ def evaluation_title(result: Result) -> str:
 
 
 def labeled(name: str, value: Value | None) -> str:
-    """Returns the name of a metric with its unit, if it has one."""
+    """Returns the name of a metric with its unit, if any."""
     return f"{name} ({value.unit})" if value and value.unit else name
 
 
 def sampling(result: Result) -> str:
-    """Returns how the motions of a result were made: checkpoint or baseline, and options of the
-    sampler.
+    """Returns the origin of a result's motions:
+    checkpoint or baseline, and options of the sampler.
     """
     checkpoint = result.checkpoint
     words = [f"baseline {result.baseline}" if result.baseline else "motions from other systems"]
@@ -187,7 +194,7 @@ def marks(result: Result) -> list[str]:
 
 
 def printed(value: Value | None) -> str:
-    """Returns a value with its interval as text, – if there is none."""
+    """Returns a value with its interval as text; – without a value."""
     return interval(value.mean, value.half) if value else "–"
 
 

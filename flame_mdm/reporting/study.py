@@ -1,4 +1,4 @@
-"""User study: a page on which people rate motions, and the count of their answers."""
+"""User study: a page on which people rate motions, and counts of their answers."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from flame_mdm.visualize.body import Mesh
 
 QUESTION = "Which animation better fits the following description?"
-"""As in Tevet et al. 2023 (MDM), appendix D."""
+"""The question of Tevet et al. 2023 (MDM), appendix D."""
 
 # The 97.5 % quantile of the standard normal distribution, for 95 % intervals
 NORMAL_QUANTILE = 1.96
@@ -48,7 +48,7 @@ class Answers(Schema):
 
 
 class Pair(Schema):
-    """How often people preferred one run to another."""
+    """Counts of people's preferences between two runs."""
 
     a: str
     b: str
@@ -68,7 +68,7 @@ class Pair(Schema):
 
 
 class Ratings(Schema):
-    """The count that `flame-mdm compare ratings=...` writes."""
+    """The file of counts that `flame-mdm compare ratings=...` writes."""
 
     question: str = QUESTION
     pairs: list[Pair]
@@ -80,18 +80,19 @@ def rating_page(
     seed: int,
     body: Mesh | None = None,
 ) -> str:
-    """Returns a page that asks which of two motions fits a text better: the first run's or another run's.
+    """Returns a page that asks which of two motions fits a text better.
 
-    The page hides the names of the runs and saves the answers to a file for `tally`.
+    One motion is from the first run, the other one from another run. The page hides the names of
+    the runs, and saves the answers to a file for `tally`.
 
     Args:
         compared: two or more runs or folders of motions.
-        shown: the motions of each of them, by prompt.
-        seed: seed of the order of the pairs and of the sides on which their motions are shown.
+        shown: the motions of each run, by prompt.
+        seed: seed of the order of the pairs, and of the sides on which the motions are shown.
         body: the body to draw.
 
     Raises:
-        UserError: two runs have no prompt in common, apart from the empty one.
+        UserError: If two runs have no prompt in common, apart from the empty prompt.
     """
     draw = random.Random(seed)
     items: list[dict[str, Any]] = []
@@ -111,7 +112,7 @@ def _pairs(
     draw: random.Random,
     body: Mesh | None,
 ) -> list[dict[str, Any]]:
-    """Returns the questions about two runs: a motion of each for every prompt that both have."""
+    """Returns the questions about two runs: a pair of motions for every prompt that both have."""
     from flame_mdm.visualize import player_page
 
     (run_a, motions_a), (run_b, motions_b) = first, other
@@ -149,8 +150,8 @@ def tally(files: Sequence[Path]) -> list[Pair]:
     """Counts the answers of several raters, per pair of runs.
 
     Raises:
-        UserError: a file is malformed, a rater's answers to one page are given twice, or a rating
-            compares a run with itself.
+        UserError: If a file is malformed, if a rater's answers to one page are given twice, or if
+            a rating compares a run with itself.
     """
     answered: dict[tuple[str, str], Path] = {}
     pairs: dict[tuple[str, str], Pair] = {}
@@ -162,7 +163,8 @@ def tally(files: Sequence[Path]) -> list[Pair]:
         if (study, rater) in answered:
             earlier = answered[study, rater]
             raise UserError(
-                f"{path}: {rater} also answered this page in {earlier}. Give only one of them"
+                f"{path}: {rater} also answered this page in {earlier}. Give only one of these "
+                f"files"
             )
         answered[study, rater] = path
 
@@ -184,7 +186,10 @@ def tally(files: Sequence[Path]) -> list[Pair]:
 
 
 def wilson(wins: int, votes: int) -> tuple[float, float, float]:
-    """Returns the share of wins and the limits of its 95 % interval (Wilson 1927); votes are taken as independent."""
+    """Returns the share of wins and the limits of its 95 % interval (Wilson 1927).
+
+    Votes are assumed to be independent.
+    """
     if not votes:
         return 0.0, 0.0, 1.0
     z, share = NORMAL_QUANTILE, wins / votes

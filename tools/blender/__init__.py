@@ -1,4 +1,4 @@
-"""Extension of Blender: motions from a sentence, in the sidebar of the 3D view."""
+"""Blender extension that generates motions from a sentence, in the sidebar of the 3D view."""
 
 import json
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -18,7 +18,7 @@ from .skeleton import SMPL22
 
 FOLDER = Path(__file__).parent
 AXES = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-"""Converts y up, facing +z, to Blender's z up, facing -y."""
+"""Rotation from y up, facing +z, to Blender's z up, facing -y."""
 POOL = ThreadPoolExecutor(1)
 
 
@@ -27,10 +27,10 @@ POOL = ThreadPoolExecutor(1)
 
 @dataclass
 class Sampled:
-    """A motion: positions of SMPL's joints (F, 22, 3), their rotations (F, 22, 3, 3) in the world and offsets (22, 3).
+    """A sampled motion of SMPL's joints: positions, rotations and offsets.
 
     Attributes:
-        unknown: words that are new to the model.
+        unknown: words of the sentence that the model does not know.
     """
 
     joints: np.ndarray
@@ -73,10 +73,11 @@ def known_skeletons() -> list[dict[str, str]]:
 
 
 def read_armature(armature):
-    """Returns the rest pose of an armature at the origin, and its size.
+    """Returns the rest pose of an armature at the origin, and the size of the armature.
 
     Raises:
-        ValueError: If its bones belong to no known skeleton, or it is mirrored, scaled unevenly or not upright.
+        ValueError: If the bones belong to no known skeleton, or if the armature is mirrored,
+            scaled unevenly or not upright.
     """
     bones = sorted(armature.data.bones, key=lambda bone: len(bone.parent_recursive))
     names = [bone.name for bone in bones]
@@ -146,11 +147,12 @@ def animate(context, armature, name: str, motion: Sampled, own: bool) -> int:
     """Keys a motion in a new action, starting at the first frame of the scene, and returns the number of frames.
 
     Args:
-        context: of Blender.
+        context: Blender's context.
         armature: the armature.
-        name: of the action.
+        name: name of the action.
         motion: the motion.
-        own: the armature is one of `new_armature`: every joint gets the position that it has in the motion.
+        own: whether `new_armature` created the armature. Then every joint gets its position in
+            the motion.
     """
     pose, size = read_armature(armature)
     if own:
@@ -162,7 +164,7 @@ def animate(context, armature, name: str, motion: Sampled, own: bool) -> int:
     turns = np.swapaxes(rig.rest(), -1, -2) @ rig.local(world)
     scene, data = context.scene, armature.animation_data_create()
     if data.action:
-        data.action.use_fake_user = True  # the action before stays in the file
+        data.action.use_fake_user = True  # the previous action stays in the file
     data.action = bpy.data.actions.new(name)
     rate = scene.render.fps / scene.render.fps_base
     times = np.arange(round((len(world) - 1) / motion.fps * rate) + 1) * motion.fps / rate
@@ -229,7 +231,7 @@ class Generate(bpy.types.Operator):
     bl_idname, bl_label, bl_options = "flame_mdm.generate", "Generate", {"UNDO"}
     bl_description = "Generate a motion"
     running: Future[Sampled] | None = None
-    """The last one, which may still be running."""
+    """The last job, which may still be running."""
 
     @classmethod
     def poll(cls, context):

@@ -5,7 +5,7 @@ import math
 import re
 import string
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,15 +31,18 @@ from flame_mdm.reporting.tables.specs import (
 from flame_mdm.runs import made_by
 from flame_mdm.schemas import read_json
 
-NOT_VALID = "NOT VALID"  # state of a row that is shown, but not ranked
+NOT_VALID = "NOT VALID"  # state of a row that is shown but not ranked
 PUBLISHED_SPLIT = (
-    "published split: test clips are also used for training, or there are no validation clips"
+    "Published split: test clips are also used for training, or there are no validation clips."
 )
-FORCED = "forced: real motions do not have the values that the protocol expects"
+FORCED = "Forced: real motions do not have the values that the protocol expects."
 
 
 def build(name: str, spec: Config, results: Path) -> Table:
-    """Builds the table of a spec from existing results and published numbers; `UserError` if they do not match."""
+    """Builds the table of a spec from existing results and published numbers.
+
+    Raises `UserError` if they do not match.
+    """
     published = (
         _published(PUBLISHED, PUBLISHED.stat().st_mtime_ns).get(name, {})
         if PUBLISHED.exists()
@@ -69,14 +72,14 @@ def build(name: str, spec: Config, results: Path) -> Table:
 
 @functools.cache
 def _published(path: Path, changed: int) -> Config:
-    """Returns the published numbers, read once for all tables until the file changes."""
+    """Returns the published numbers, which are cached until the file changes."""
     return load_mapping(path)
 
 
 def _measured(name: str, part: Config, reported: Config | None, results: Path) -> Part:
     columns = {label: column.get("better", "none") for label, column in part["columns"].items()}
     values = [column["value"] for column in part["columns"].values()]
-    conditions: list[dict[str, str]] = []  # conditions of all rows; each has a footnote
+    conditions: list[dict[str, str]] = []  # conditions of all rows; each entry has a footnote
     lines: list[Line] = []
     truths: dict[str, Line] = {}
     missing: list[tuple[str, str]] = []
@@ -93,13 +96,13 @@ def _measured(name: str, part: Config, reported: Config | None, results: Path) -
         for evaluation, result in zip(needed, read, strict=True):
             if result is None:
                 commands = [made_by(path) for path in evaluation.absent.values()] or [
-                    "make tables evaluates it"
+                    "make tables evaluates this row"
                 ]
                 missing += [(line.label, command) for command in commands]
         timed = {
             path for path, value in zip(paths, values, strict=True) if value == "seconds_per_sample"
         }
-        letters: dict[str, str] = {}  # by column
+        letters: dict[str, str] = {}  # letters of footnotes by column
         for label, path, result in zip(columns, paths, read, strict=True):
             if result is not None:
                 letters[label] = _letter(
@@ -128,7 +131,10 @@ def _measured(name: str, part: Config, reported: Config | None, results: Path) -
 
 
 def _letter(facts: dict[str, str], conditions: list[dict[str, str]]) -> str:
-    """Returns the footnote letter of the conditions of a row, adding new ones to `conditions`."""
+    """Returns the footnote letter of the conditions of a row.
+
+    New conditions are added to `conditions`.
+    """
     if facts not in conditions:
         conditions.append(facts)
     again, index = divmod(conditions.index(facts), 26)
@@ -138,22 +144,24 @@ def _letter(facts: dict[str, str], conditions: list[dict[str, str]]) -> str:
 def _condition_notes(
     conditions: list[dict[str, str]], columns: Mapping[str, Mapping[str, None]]
 ) -> list[tuple[str, str]]:
-    """Returns the footnotes on conditions. One with up to three differences from the first lists only these.
+    """Returns the footnotes on conditions.
+
+    A footnote with up to three differences from the first footnote lists only the differences.
 
     Args:
         conditions: the conditions, in the order of their letters.
-        columns: the columns that were measured under the conditions of a letter; not listed if
+        columns: the columns that were measured under the conditions of a letter; no entry if
             these are all columns.
     """
     notes = []
     for facts in conditions:
         different = [
-            text or f"no {name}" for name, text in facts.items() if text != conditions[0][name]
+            text or f"No {name}." for name, text in facts.items() if text != conditions[0][name]
         ]
         text = (
-            f"as a, but {'; '.join(different)}"
+            f"As a, with these differences: {' '.join(different)}"
             if 0 < len(different) <= 3
-            else "; ".join(filter(None, facts.values()))
+            else " ".join(filter(None, facts.values()))
         )
         letter = _letter(facts, conditions)
         if letter in columns:
@@ -165,7 +173,9 @@ def _condition_notes(
 def _warnings(
     lines: Sequence[Line], values: Sequence[str], columns: Sequence[str]
 ) -> list[tuple[str, str]]:
-    """Returns the footnotes on invalid rows, on the choice of checkpoints, and on columns whose distances are 0."""
+    """Returns the footnotes on invalid rows, on the choice of checkpoints,
+    and on columns with distances of 0.
+    """
     invalid = [(line.label, line.facts.get("not valid because")) for line in lines]
     texts = [(label, f"NOT VALID: {reason}") for label, reason in invalid if reason]
     for line in lines:
@@ -194,7 +204,13 @@ def _by_text(lines: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
     labels: dict[str, dict[str, None]] = {}
     for label, text in lines:
         labels.setdefault(text, {})[label] = None
-    return [("", f"{'; '.join(rows)}: {text}") for text, rows in labels.items()]
+    return [("", f"{_listed(rows)}: {text}") for text, rows in labels.items()]
+
+
+def _listed(labels: Iterable[str]) -> str:
+    """Returns labels as a list whose separator is not part of a label."""
+    texts = list(labels)
+    return ("; " if any("," in text for text in texts) else ", ").join(texts)
 
 
 def _conditions(result: Result, timed: bool, shows_multimodality: bool) -> dict[str, str]:
@@ -203,51 +219,52 @@ def _conditions(result: Result, timed: bool, shows_multimodality: bool) -> dict[
     Args:
         result: the result.
         timed: whether the table shows its seconds per motion.
-        shows_multimodality: whether the table shows multimodality; if not, whether it was
-            measured does not matter.
+        shows_multimodality: whether the table shows multimodality. Otherwise, it does not matter
+            whether it was measured.
     """
     protocol, data, extractor, cost = result.protocol, result.data, result.extractor, result.cost
     checkpoint = result.checkpoint
     recipe = ""
     if checkpoint and checkpoint.recipe_changes:
-        recipe = f"the model differs from the recipe {checkpoint.experiment}: {', '.join(checkpoint.recipe_changes)}"
+        recipe = f"The model differs from the recipe {checkpoint.experiment}: {', '.join(checkpoint.recipe_changes)}."
     card = card_of(data, extractor.sha256 if extractor else None)
     shown = {k: v for k, v in result.changed.items() if k != "multimodality" or shows_multimodality}
     changed = ", ".join(f"{k} = {v}" for k, v in shown.items())
     smpl = result.skeleton and result.skeleton.smpl_sha256
-    skeleton = f"joints of SMPL's model file, sha256 {smpl[:12]}" if smpl else ""
+    skeleton = f"Joints have the bones of SMPL's model file, sha256 {smpl[:12]}." if smpl else ""
     if result.stand_in_skeleton:
-        skeleton = "joints of a stand-in skeleton, whose bones are not SMPL's"
+        skeleton = "Joints have the bones of a stand-in skeleton, not SMPL's bones."
     return {
-        "protocol": f"protocol {protocol.name} version {protocol.version}",
-        "data": f"{result.split} split of {data.dataset} (fingerprint {data.fingerprint})",
-        "limits": "{} to {} frames".format(*data.frames) if data.frames else "",
+        "protocol": f"Protocol {protocol.name}, version {protocol.version}.",
+        "data": f"Data: {result.split} split of {data.dataset} (fingerprint {data.fingerprint}).",
+        "limits": "Motions have {} to {} frames.".format(*data.frames) if data.frames else "",
         "metrics": _numbers(result),
-        "time": f"timed in batches of {cost.batch_size or 0:g} on {result.device}"
+        "time": f"Timed in batches of {cost.batch_size or 0:g} on {result.device}."
         if timed and cost
         else "",
-        "seed": f"seed {result.seed}",
-        "extractor": f"extractor sha256 {extractor.sha256[:12]}" if extractor else "no extractor",
-        "audit": f"audit {card}" if card else "not audited",
+        "seed": f"Seed {result.seed}.",
+        "extractor": f"Extractor sha256 {extractor.sha256[:12]}." if extractor else "No extractor.",
+        "audit": f"Audit: {card}." if card else "Not audited.",
         "exclusions": _left_out(data.excluded),
         "skeleton": skeleton,
-        "changes": f"differs from the protocol: {changed}" if changed else "",
+        "changes": f"Differs from the protocol: {changed}." if changed else "",
         "changes of the recipe": recipe,
         "published split": PUBLISHED_SPLIT if result.published_split else "",
         "force": FORCED if result.forced else "",
-        "warnings": "; ".join(result.warnings),
-        "quick run": "QUICK RUN, NOT FOR PUBLICATION" if result.quick else "",
+        "warnings": " ".join(f"Warning: {warning}." for warning in result.warnings),
+        "quick run": "QUICK RUN, NOT FOR PUBLICATION." if result.quick else "",
     }
 
 
 def _numbers(result: Result) -> str:
-    """Describes how many motions and replications most values have, and how many real motions have."""
+    """Describes the numbers of motions and replications of most values, and of real motions."""
     values = [value for value in (result.values or {}).values() if value and value.replications]
     if not values:
         return ""
-    first = values[0]  # later ones may have fewer motions
+    first = values[0]  # later values may have fewer motions
     count = first.n if first.n is not None else " + ".join(map(str, first.n_per_replication))
-    text = f"N = {count}, {first.replications} replications"
+    replications = f"{first.replications} replication{'' if first.replications == 1 else 's'}"
+    text = f"{replications} with N = {count} motions"
     real = next(
         (value.n for value in (result.ground_truth or {}).values() if value and value.n), None
     )
@@ -256,12 +273,12 @@ def _numbers(result: Result) -> str:
     sets = next((value.n_real for value in values if value.n_real is not None), None)
     if sets is not None and sets != first.n:
         text += f", compared with sets of {sets} real motions"
-    return text
+    return f"{text}."
 
 
 def _left_out(excluded: Mapping[str, int]) -> str:
     listed = ", ".join(f"{count:,} {reason}" for reason, count in excluded.items())
-    return f"excluded from the data set: {listed}" if listed else ""
+    return f"Excluded from the data set: {listed}." if listed else ""
 
 
 def _line(
@@ -325,7 +342,7 @@ def _line(
 
 
 def _counts(results: Sequence[Result | None], values: Sequence[str]) -> str:
-    """Returns the number of replications and motions of most metrics, and of those that have others."""
+    """Returns the numbers of replications and motions of most metrics, and the exceptions."""
     counts = {}
     for result, name in zip(results, values, strict=True):
         entry = (result.values or {}).get(name) if result else None
@@ -371,10 +388,10 @@ def _entry(values: Mapping[str, Value | None] | None, name: str) -> Cell | None:
 
 
 def _print_cells(lines: Sequence[Line], columns: int) -> None:
-    """Formats the numbers of each column with the same decimals, about three digits for the largest.
+    """Formats the numbers of each column with the same number of decimals.
 
-    Settings with at most one decimal keep their text. Numbers that would round to zero show two
-    significant digits.
+    The largest number has about three digits. Settings with at most one decimal keep their text.
+    Numbers that would round to zero show two significant digits.
     """
     for index in range(columns):
         cells = [
@@ -400,7 +417,9 @@ def _print_cells(lines: Sequence[Line], columns: int) -> None:
 
 
 def _rank(lines: Sequence[Line], columns: Mapping[str, str]) -> None:
-    """Marks best and second best among rows of the same kind with the same marks."""
+    """Marks the best and second-best values among rows
+    of the same kind with the same footnotes.
+    """
     for kind, real in (("measured", "real"), ("reported", "reported real")):
         for marks in {line.marks for line in lines}:
             same = [x for x in lines if x.marks == marks]
@@ -408,7 +427,7 @@ def _rank(lines: Sequence[Line], columns: Mapping[str, str]) -> None:
                 x for x in same if x.kind == kind and not x.state and not x.facts.get("baseline")
             ]
             truths = [x for x in same if x.kind == real]
-            if kind == "reported" and not truths:  # from a source that does not report real motions
+            if kind == "reported" and not truths:  # the source does not report real motions
                 truths = [x for x in lines if x.kind == real]
             for index, better in enumerate(columns.values()):
                 numbers = [cell.value if (cell := row.cells[index]) else None for row in rows]
@@ -431,7 +450,7 @@ def _reported(
                 f"{PUBLISHED}: {part}, {row['label']}: no column is called {', '.join(sorted(unknown))}"
             )
         source, evaluator = (row.get(key) or reported[key] for key in ("source", "evaluator"))
-        text = f"as reported: {source}; measured with {evaluator}"
+        text = f"Reported in {source}. Measured with {evaluator}."
         mark = notes.setdefault(text, "†" * (len(notes) + 1))
         cells = [
             Cell(str(v), _leading(str(v))) if (v := row["values"].get(c)) is not None else None
@@ -487,7 +506,7 @@ def _lengths(name: str, part: Config, results: Path) -> Part:
         facts = {"fingerprint": counted.fingerprint, "frames per second": _text(float(counted.fps))}
         lines.append(Line(dataset, "measured", [*cells], facts=facts))
         if counted.excluded:
-            notes.append(("", f"{dataset}; {_left_out(counted.excluded)}"))
+            notes.append(("", f"{dataset}: {_left_out(counted.excluded)}"))
         step = max(1, math.ceil(lengths[-1] / 40))
         histograms[dataset] = Histogram(
             step, np.bincount([length // step for length in lengths]).tolist()
@@ -496,7 +515,7 @@ def _lengths(name: str, part: Config, results: Path) -> Part:
 
 
 def _ratings(name: str, path: Path, reported: Config | None) -> Part:
-    """Builds the table of a user study: how often people preferred one model to another."""
+    """Builds the table of a user study, with people's preferences between models."""
     columns = {"Preferred": "none", "votes": "none", "raters": "none"}
     lines: list[Line] = []
     notes = [

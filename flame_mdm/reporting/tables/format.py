@@ -1,4 +1,7 @@
-"""Tables of results as Markdown, LaTeX, CSV and HTML, with figures. The same table gives the same bytes."""
+"""Writes tables of results as Markdown, LaTeX, CSV and HTML, with figures.
+
+The same table gives the same bytes.
+"""
 
 from __future__ import annotations
 
@@ -28,9 +31,10 @@ KINDS = {
     "reported real": "Real motions, as reported",
     "reported": "As reported",
 }
-NO_RESULTS = ("NOT VALID", "QUICK")  # states of rows whose values must not be mistaken for results
+# states of rows whose values must not be mistaken for results
+NO_RESULTS = ("NOT VALID", "QUICK")
 CARD = re.compile(r"(?<=\baudit )([\w./-]+\.html)")  # paths of audit cards in footnotes
-# Facts that rows listed together as sources have in common
+# Rows that agree in these facts share a line in the list of sources.
 SHARED = (
     "checkpoint sha256",
     "recipe",
@@ -40,7 +44,9 @@ SHARED = (
 
 @dataclass
 class Cell:
-    """Printed text of a cell, its number, half width of the 95 % interval, and rank: 1 = best, 2 = second best."""
+    """A cell: printed text, number, half width of the 95 % interval,
+    and rank (1 = best, 2 = second best).
+    """
 
     text: str
     value: float | None = None
@@ -50,14 +56,14 @@ class Cell:
 
 @dataclass
 class Line:
-    """One row of a table, with one cell per column; None if there is no value."""
+    """One row of a table, with one cell per column; None = no value."""
 
     label: str
     kind: str  # a key of `KINDS`
     cells: list[Cell | None]
-    marks: str = ""  # footnote marks; only rows with the same ones are compared
+    marks: str = ""  # footnote marks; only rows with the same marks are compared
     state: str = ""  # "" if the row is complete and valid, or a reason such as "no checkpoint"
-    options: dict[str, float] = field(default_factory=dict)  # for the x-axis of figures
+    options: dict[str, float] = field(default_factory=dict)  # options for the x-axis of figures
     facts: dict[str, str] = field(default_factory=dict)  # provenance of the values
 
 
@@ -66,9 +72,9 @@ class Part:
     """One table within the table of a paper."""
 
     name: str
-    columns: dict[str, str]  # label -> which values are better, a key of `ARROWS`
+    columns: dict[str, str]  # by label: which values are better, a key of `ARROWS`
     lines: list[Line]
-    # Mark, which may be empty, and text of each footnote
+    # Mark and text of each footnote; the mark may be empty
     notes: list[tuple[str, str]] = field(default_factory=list)
     figures: list[Figure] = field(default_factory=list)
     histograms: dict[str, Histogram] = field(default_factory=dict)
@@ -78,7 +84,10 @@ class Part:
 
 @dataclass
 class Table:
-    """A table of one or more parts, like one table of a paper; links are relative to the folder it is written to."""
+    """A table of one or more parts, like a table of a paper.
+
+    Links are relative to the folder of the written table.
+    """
 
     name: str
     title: str
@@ -116,7 +125,9 @@ def write(table: Table, out: Path) -> None:
 
 
 def rendered(table: Table, suffix: str) -> Markup:
-    """Returns a table as "md", "tex" (for booktabs and threeparttable), or "html" without the head of the page."""
+    """Returns a table as "md",
+    "tex" (for booktabs and threeparttable) or "html" (without a page).
+    """
     values = {
         "several": len(table.parts) > 1,
         "sources": _sources(table),
@@ -129,7 +140,7 @@ def rendered(table: Table, suffix: str) -> Markup:
 
 
 def _unranked(table: Table) -> str:
-    """Returns which rows of a table are not ranked among those with the same mark; "" if all are."""
+    """Returns the kinds of rows that are not ranked; "" if all rows are ranked."""
     lines = [line for part in table.parts for line in part.lines]
     kinds = []
     if any(line.facts.get("baseline") for line in lines):
@@ -140,7 +151,10 @@ def _unranked(table: Table) -> str:
 
 
 def _linked(table: Table, text: str) -> list[tuple[str, str]]:
-    """Splits a footnote into texts and their links; "" = no link, also to a card that is not on this machine."""
+    """Splits a footnote into texts and their links.
+
+    "" = no link, for plain text and for a card that is not on this machine.
+    """
     return [
         (
             part,
@@ -169,7 +183,10 @@ def _head(column: str, better: str) -> str:
 
 
 def _sources(table: Table) -> list[str]:
-    """Returns the provenance of rows. Those that agree in `SHARED` share a line, with `/` between other facts."""
+    """Returns the provenance of rows.
+
+    Rows that agree in `SHARED` share a line, with `/` between their other facts.
+    """
     rows = []
     for part in table.parts:
         lines = [line for line in part.lines if line.facts]
@@ -205,7 +222,7 @@ def _tex(text: str) -> str:
         "λ": r"$\lambda$",
         "β": r"$\beta$",
     }
-    # LaTeX reads brackets after \\ as its option, so that they are put into braces.
+    # LaTeX would read brackets after \\ as its option, so brackets are put into braces.
     special |= {c: "\\" + c for c in "&%$#_{}"} | {
         "[": "{[}",
         "]": "{]}",
@@ -214,7 +231,10 @@ def _tex(text: str) -> str:
 
 
 def comma_separated(table: Table) -> str:
-    """Returns the table as CSV: for each row, the number, interval and place of each cell, and its provenance."""
+    """Returns the table as CSV.
+
+    A row has the number, interval and rank of each cell, and the provenance.
+    """
     facts = list(
         dict.fromkeys(name for part in table.parts for line in part.lines for name in line.facts)
     )
@@ -248,8 +268,8 @@ def _inert(text: str) -> str:
 def draw(part: Part, figure: Figure) -> Markup | None:
     """Draws a figure of a part as SVG; None if it has no points.
 
-    Curves are named after rows; reported ones are dashed. If closer to real motions is better in
-    a column, real motions are a dotted line.
+    Curves have the names of rows; reported values are dashed. If the best value of a column is
+    the value of real motions, it is a dotted line.
     """
     panels = []
     for column in figure.y:
@@ -260,7 +280,7 @@ def draw(part: Part, figure: Figure) -> Markup | None:
 
 
 def _series(part: Part, figure: Figure, column: str) -> tuple[list[Series], list[float]]:
-    """Returns the points of a column by row, and its values for real motions."""
+    """Returns the points of a column by row, and the column's values for real motions."""
     index = list(part.columns).index(column)
     curves: dict[tuple[str, str], list[tuple[float, float, float]]] = {}
     levels = []
@@ -285,10 +305,10 @@ def _series(part: Part, figure: Figure, column: str) -> tuple[list[Series], list
 
 
 def ranks(values: Sequence[float | None], better: str, real: float | None) -> list[int]:
-    """Ranks values: 1 for the best, 2 for the second best, 0 for all others. A single value is not ranked.
+    """Ranks values: 1 for the best, 2 for the second best, 0 for all others.
 
-    `better` is higher, lower, real (closest to the value `real` of real motions) or none; a
-    missing value is None.
+    A single value is not ranked. `better` is higher, lower, real (closest to `real`, the value of
+    real motions) or none. A missing value is None.
     """
     if (
         better == "none"

@@ -1,4 +1,4 @@
-"""Hyperparameters of recipes, and tables of them next to their reported values."""
+"""Hyperparameters of recipes, and tables that show them next to reported values."""
 
 import inspect
 from functools import cache
@@ -16,14 +16,19 @@ HYPERPARAMETERS = LABELS["hyperparameters"]
 
 @cache
 def hyperparameters(name: str) -> dict[str, Any]:
-    """Returns the `HYPERPARAMETERS` of a recipe, by key. Unset ones have the default of their class."""
+    """Returns the `HYPERPARAMETERS` of a recipe by key.
+
+    Unset keys have the default of their class.
+    """
     config = compose(name)
     settings = {key: value(config, key) for key in HYPERPARAMETERS if "." in key} | _sizes(config)
     return {key: setting for key, setting in settings.items() if setting is not None}
 
 
 def value(config: Config, key: str) -> Any:
-    """Returns the value of a dotted key: from the recipe, or else the default of the class, or else None."""
+    """Returns the value of a dotted key in a recipe,
+    by default the default of the class, or None.
+    """
     *path, name = key.split(".")
     node: Any = config
     for part in path:
@@ -36,7 +41,10 @@ def value(config: Config, key: str) -> Any:
 
 
 def _sizes(config: Config) -> dict[str, float]:
-    """Returns the number of features, and of parameters of the denoiser in millions, without the language model."""
+    """Returns the number of features, and the number of parameters of the denoiser in millions.
+
+    The language model does not count.
+    """
     import torch
 
     features = instantiate(config["representation"]).features
@@ -63,7 +71,10 @@ def setting_text(value: Any) -> str:
 
 
 def settings_table(name: str, part: Config, reported: Config | None) -> Part:
-    """Builds a table of hyperparameters. The rows are keys or recipes, whichever are more."""
+    """Builds a table of hyperparameters.
+
+    The rows are keys if there are more keys than recipes, or else recipes.
+    """
     for key in part["keys"].values():
         if key not in HYPERPARAMETERS:
             raise UserError(

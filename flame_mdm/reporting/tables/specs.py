@@ -1,4 +1,4 @@
-"""Specs of tables, the files in experiments/tables, and the evaluations that they need."""
+"""Specs of tables (the files in experiments/tables) and the evaluations that they need."""
 
 import hashlib
 import itertools
@@ -20,7 +20,7 @@ from flame_mdm.schemas import ClosedSchema, Int, Number, Schema, check_shape
 SPECS = EXPERIMENTS / "tables"
 PUBLISHED = SPECS / "published.yaml"
 LABELS: dict[str, dict[str, str]] = read_yaml(Path(__file__).with_name("labels.yaml"))
-# Labels of the values that a column may show besides metrics, and of the x-axes of figures
+# Labels of further values for columns, which are not metrics, and for the x-axes of figures
 ABOUT = LABELS["values"]
 SWEPT = (
     "sampler",
@@ -32,7 +32,7 @@ SWEPT = (
     "strength",
     "batch_size",
 )
-"""Options of a row that may be lists; each value makes one row."""
+"""Options of a row that may be lists; each value of a list gives one row."""
 MOST_ROWS, MOST_COLUMNS, MOST_FIGURES = 1_000, 100, 100
 """Limits of a table: rows (with lists of options expanded), columns and plots. Tables of papers have about 20 rows."""
 
@@ -91,7 +91,7 @@ class RowSpec(Options):
             raise ValueError("a row needs one of ckpt, baseline and from_samples")
         for name in SWEPT:
             if [] in (getattr(self, name), *as_list(getattr(self, name))):
-                raise ValueError(f"{name} contains an empty list. Remove it")
+                raise ValueError(f"{name} contains an empty list. Remove this list")
         return self
 
 
@@ -126,7 +126,9 @@ def as_list(value: Any) -> list[Any]:
 
 
 class Figure(ClosedSchema):
-    """A figure that plots columns of a part over an option of its rows; with `points`, a scatter plot."""
+    """A figure that plots columns of a part over an option of its rows;
+    a scatter plot with `points`.
+    """
 
     part: str
     x: str
@@ -168,7 +170,7 @@ class Lengths(Schema):
 
 
 def spec_names() -> list[str]:
-    """Returns the names of the tables of this project, sorted by name and by the numbers in it."""
+    """Returns the names of this project's tables; numbers in names are sorted as numbers."""
     names = [path.stem for path in SPECS.glob("*.yaml") if path != PUBLISHED]
     return sorted(names, key=lambda name: re.sub(r"\d+", lambda number: number[0].zfill(3), name))
 
@@ -207,13 +209,15 @@ def load_mapping(path: Path) -> Config:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """An evaluation that a table shows: the label of its row, and the keys of `flame-mdm evaluate` that it sets."""
+    """An evaluation of a table: the label of its row, and its keys of `flame-mdm evaluate`."""
 
     label: str
     keys: Mapping[str, Any]
 
     def path(self, results: Path) -> Path:
-        """Returns the path of the result, a function of the keys alone, so that tables share results."""
+        """Returns the path of the result, which depends only on the keys,
+        so that tables share results.
+        """
         digest = hashlib.sha256(json.dumps(dict(self.keys), sort_keys=True).encode()).hexdigest()
         subject = self.keys.get("baseline") or self.keys.get("ckpt") or self.keys["from_samples"]
         name = re.sub(
@@ -226,7 +230,7 @@ class Evaluation:
 
     @property
     def absent(self) -> dict[str, str]:
-        """Files that do not exist, by what is missing: "no checkpoint"."""
+        """Missing files by the reason that a table shows, such as "no checkpoint"."""
         files = {"no checkpoint": "ckpt", "no samples": "from_samples", "no extractor": "extractor"}
         paths = {reason: str(self.keys.get(key) or "none") for reason, key in files.items()}
         return {
@@ -237,9 +241,9 @@ class Evaluation:
 
 
 def evaluations(part: Mapping[str, Any]) -> Iterator[tuple[dict[str, Any], list[Evaluation]]]:
-    """Yields the rows of a part, with lists of options expanded, each with one evaluation per column.
+    """Yields the rows of a part after expanding lists of options, with one evaluation per column.
 
-    The label of an expanded row lists the options that vary and that no column shows.
+    The label of an expanded row lists the options that vary and have no column.
     """
     shown = {column["value"] for column in part.get("columns", {}).values()}
     for row in part.get("rows", []):
@@ -259,5 +263,5 @@ def _evaluation(
     for level in (part, row, column):
         keys |= {name: level[name] for name in Options.model_fields if name in level}
     if "ckpt" in keys:
-        keys.pop("data", None)  # a checkpoint names its data set
+        keys.pop("data", None)  # the recipe of a checkpoint names the data set
     return Evaluation(row["label"], keys)

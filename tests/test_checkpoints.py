@@ -435,14 +435,14 @@ def test_every_weight_is_used_or_the_import_fails(subtests) -> None:
         (
             "mdm",
             {"context_len": 20, "pred_len": 40},
-            "context_len=20: known for trans_dec with bert, not for trans_enc",
+            "context_len=20: supported for trans_dec with bert, not for trans_enc",
         ),
-        ("mdm", {"pred_len": 40}, "context_len=0, pred_len=40: both are positive"),
-        ("mdm", {"emb_policy": "concat"}, "emb_policy=concat: known for trans_dec with bert"),
+        ("mdm", {"pred_len": 40}, "context_len=0, pred_len=40: both must be positive"),
+        ("mdm", {"emb_policy": "concat"}, "emb_policy=concat: supported for trans_dec with bert"),
         (
             "mdm",
             {"emb_before_mask": True},
-            "emb_before_mask=True: changes the model in a way that is not imported",
+            "emb_before_mask=True: changes the model in a way that cannot be imported",
         ),
         (
             "mdm",
@@ -799,6 +799,6 @@ def test_a_model_is_sampled_without_importing_lightning_and_the_compiler():
 def test_a_folder_of_runs_names_the_runs_below_it(tmp_path):
     (tmp_path / "x" / "default" / "checkpoints").mkdir(parents=True)
     with pytest.raises(
-        UserError, match=r"x: no run, but there are runs below it\. Give one: .*x/default$"
+        UserError, match=r"x: not a run, but it contains runs\. Give one of them: .*x/default$"
     ):
         find(tmp_path / "x")

@@ -379,7 +379,7 @@ def test_wrong_words_are_one_line(capsys, subtests):
         (["steps=1.5"], "steps=1.5: must be a whole number or a list"),
         (["loop=yes"], "loop=yes: must be true or false"),
         (["rate=nan"], "rate=nan: must be a finite number or null"),
-        (["rate=1,2"], "rate=1,2: several values. Give one, or a list: rate=[1,2]"),
+        (["rate=1,2"], "rate=1,2: several values. Give one value, or a list: rate=[1,2]"),
         (["which=first"], "which=first: must be one of last, best"),
         (["names='a"], "No closing quotation"),
         (["--fast"], "unknown option --fast"),
@@ -439,9 +439,12 @@ def test_evaluations_are_swept_and_launched(tmp_path, monkeypatch, capsys, subte
     for extra, message in (
         (["launch=slurm"], "launch=slurm: srun is not on this machine"),
         (["launch=nothing"], "no launch is called 'nothing'"),
-        (["--multirun", "out=a.json"], "out=a.json: 4 jobs would write it. Drop out="),
+        (["--multirun", "out=a.json"], "out=a.json: 4 jobs would write to it. Remove out="),
         (["--fast", "--multirun"], "unknown option --fast"),
-        ([], "guidance_scale=1,2.5: several values make a sweep, one job for each. Add --multirun"),
+        (
+            [],
+            "guidance_scale=1,2.5: several values make a sweep with one job per value. Add --multirun",
+        ),
     ):
         with subtests.test(extra=extra, message=message):
             assert main([*words, *extra]) == 1
@@ -607,7 +610,12 @@ def test_only_errors_that_the_user_can_fix_are_one_line(capsys, monkeypatch, sub
     ("gpus", "accelerator", "devices", "message"),
     [
         *(
-            (0, name, 1, f"trainer.accelerator={name}: {NO_GPU}. Drop it to train on the CPU")
+            (
+                0,
+                name,
+                1,
+                f"trainer.accelerator={name}: {NO_GPU}. Remove this key to train on the CPU",
+            )
             for name in ("gpu", "cuda")
         ),
         (1, "auto", 2, "trainer.devices=2: this machine has 1 GPU. Give at most trainer.devices=1"),

@@ -292,8 +292,8 @@ def test_a_model_that_cannot_be_a_teacher_gets_one_line(
     for words, says in (
         (["trainer.max_steps=4"], "no ckpt given. Write flame-mdm distill CKPT"),
         (["runs/no/model"], "runs/no/model: no such checkpoint"),
-        ([student], f"distilled already. Give its teacher, {trained}"),
-        (["process.ckpt"], "predicts noise, whose clean estimate is divided"),
+        ([student], f"a distilled model. Give its teacher, {trained}"),
+        (["process.ckpt"], "predicts noise, so computing the clean estimate divides"),
         (["untrained.ckpt"], "was not trained by this framework"),
         (
             [*own, "distillation.teacher=representation.ckpt"],
@@ -439,7 +439,9 @@ def test_what_is_no_adapter_of_the_base_is_refused(taught, tmp_path, subtests):
             save_file(load_file(taught / "limp.safetensors"), tmp_path / "x.safetensors", metadata)
             with pytest.raises(UserError, match=message):
                 flame_mdm.load(taught / "base.safetensors", adapter=tmp_path / "x.safetensors")
-    with pytest.raises(UserError, match="give one number, or one for each of 1 adapters"):
+    with pytest.raises(
+        UserError, match="give one number, or one number for each of the 1 adapters"
+    ):
         flame_mdm.load(
             taught / "base.safetensors", adapter=taught / "limp.safetensors", strength=[1, 2]
         )
@@ -512,7 +514,7 @@ def test_from_clips_to_a_prompt_and_resumed(
     assert any(value.any() for name, value in whole.items() if name.endswith(".up"))
     page = Path("whole/adaptation.html").read_text()
     assert "hobbles in limp style" in page
-    assert "sampling 10 motions of it instead" in capsys.readouterr().out
+    assert "sampling 10 motions from the base instead" in capsys.readouterr().out
     store, base = Store(next(Path("whole/data").glob("limp-*"))), flame_mdm.load(trained)
     np.testing.assert_array_equal(store.mean, base.representation.mean)
     assert {clip.captions[0] for clip in store.clips if not clip.source.startswith("prior/")} == {

@@ -242,7 +242,7 @@ REFUSED = {
     "train quickstart launch=slurm seed=1,2 logger=csv,nothing": "no logger is called 'nothing'",
     "train quickstart launch=slurm hydra.launcher.partitionn=gpu": "partitionn",
     "train quickstart launch=slurm": "launch=slurm: srun is not on this machine. Run the command where",
-    "train quickstart seed=0,1": "seed=0,1: several values make a sweep, one run for each. Add --multirun",
+    "train quickstart seed=0,1": "seed=0,1: several values make a sweep with one run per value. Add --multirun",
     "convert a b launch=slurm": "unknown config key 'launch'",
     "convert a b --multirun": "unknown option --multirun",
 }

@@ -203,7 +203,7 @@ def test_words_have_vectors_and_parts_of_speech(tmp_path, subtests):
             pickle.dumps({"a": 0}),
             "not the released GloVe vectors, which have one row each for sos, eos, unk",
         ),
-        (pickle.dumps({"unk": 0, "sos": 1, "eos": 99}), "each with a row"),
+        (pickle.dumps({"unk": 0, "sos": 1, "eos": 99}), "have one row each"),
     ):
         with subtests.test(content=content, message=message):
             index.write_bytes(content)

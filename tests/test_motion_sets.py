@@ -340,10 +340,13 @@ def test_an_invalid_description_is_refused_in_one_line(
         (["set=locomotoin"], "no such set. Did you mean locomotion?"),
         (
             ["set=locomotion", "text=a person walks"],
-            "text=a person walks: a set says what is sampled",
+            "text=a person walks: a set determines which motions are sampled",
         ),
-        (["set=locomotion", "samples=2"], "samples=2: a set says what is sampled"),
-        (["set=locomotion", "out=walk.fbx"], "out=walk.fbx: a set is several files. Name a folder"),
+        (["set=locomotion", "samples=2"], "samples=2: a set determines which motions are sampled"),
+        (
+            ["set=locomotion", "out=walk.fbx"],
+            "out=walk.fbx: a set has several files. Name a folder",
+        ),
         (["set=locomotion", "format=bvh"], 'format is "bvh"'),
         (["text=a person walks", "format=fbx"], "format=fbx is for sets"),
     ],

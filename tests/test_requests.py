@@ -209,7 +209,7 @@ def test_the_command_chooses_by_a_motion_clip(tmp_path, monkeypatch, capsys, sub
     for options, message in (
         (
             ["scorer=quickstart"],
-            "scorer=quickstart chooses among motions for a text: give text=... and candidates=8",
+            "scorer=quickstart chooses among motions for a text. Give text=... and candidates=8",
         ),
         (["scorer=none.ckpt", "candidates=2"], "scorer: none.ckpt: no such checkpoint. Give a run"),
         (["scorer=quickstart", "candidates=2"], "holds a motion generator, not a motion-CLIP"),
@@ -284,7 +284,7 @@ def test_a_sample_is_written_as_a_motion_file(tmp_path, monkeypatch, capsys):
     [
         (
             ["rig=unreal"],
-            "rig=unreal: a folder gets motions as they are. Name a file, such as out=walk.fbx",
+            "rig=unreal: motions in a folder are not converted. Name a file, such as out=walk.fbx",
         ),
         (
             ["walk.glb", "mp4=true"],

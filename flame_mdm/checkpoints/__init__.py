@@ -1,1 +1,3 @@
-"""Checkpoints and model files: reading, writing, loading, import of released weights, upload to the hub."""
+"""Checkpoints and model files:
+reading, writing, loading, import of released weights, and upload.
+"""

@@ -48,14 +48,18 @@ if TYPE_CHECKING:
     from flame_mdm.generator import MotionGenerator
 
 ORIGINAL, CHANGE = ".parametrizations.weight.original", ".parametrizations.weight.0."
-# Factor of the learned vectors of words. Rows of the word table are drawn from N(0, 1), so that
-# vectors have farther to go than changes of weights.
+# Factor of the learned vectors of words. Rows of the word table are drawn from N(0, 1), so
+# vectors must change more than weights.
 FARTHER = 10.0
-Paths = str | Path | Sequence[str | Path]  # one file, or several
+Paths = str | Path | Sequence[str | Path]  # one file or several files
 
 
 class About(TypedDict):
-    """Description of an adapter. It changes `rows` of the word table, one per word; `base` is the hash of its base."""
+    """Description of an adapter.
+
+    The adapter changes `rows` of the word table, one per word. `base` is the hash of the base
+    model's weights.
+    """
 
     name: str
     action: bool
@@ -67,7 +71,10 @@ class About(TypedDict):
 
 
 class Change(nn.Module):
-    """A change of a weight in training (see `changed`). Adapter files contain its parts if `kept` is True."""
+    """A change of a weight in training (see `changed`).
+
+    If `kept` is True, adapter files contain it.
+    """
 
     def __init__(self, rows: Sequence[int] = (), *, is_kept: bool = True, **parts: Tensor):
         super().__init__()
@@ -91,14 +98,19 @@ def changed(
 
 
 def word_rows(encoder: LearnedTokens, words: Iterable[str], vocabulary: Iterable[str]) -> list[int]:
-    """Returns one of the two table rows of each word: if possible, a row that no word of the vocabulary uses."""
+    """Returns one of the two table rows of each word,
+    if possible a row that no vocabulary word uses.
+    """
     used = {row for word in (START, *vocabulary) for row in hashed(word, encoder.buckets)}
     pairs = (hashed(word, encoder.buckets) for word in words)
     return [second if first in used and second not in used else first for first, second in pairs]
 
 
 def attach(model: MotionGenerator, about: About) -> None:
-    """Freezes a model and adds changes that start at 0; raises `UserError` if its denoiser has no transformer."""
+    """Freezes a model and adds changes, which start at 0.
+
+    Raises `UserError` if its denoiser has no transformer.
+    """
     model.requires_grad_(False)
     layers = [layer for layer in model.denoiser.modules() if isinstance(layer, TransformerLayer)]
     if not layers:
@@ -117,9 +129,9 @@ def attach(model: MotionGenerator, about: About) -> None:
 
 
 def copy_weights(model: MotionGenerator, base: str | Path) -> None:
-    """Copies the weights of a base to a model, which may have changes attached.
+    """Copies the weights of a base to a model, which may have attached changes.
 
-    `base` is a path or name, as `find` takes it.
+    `base` is a path or name, as in `find`.
     """
     state = model.state_dict()
     for name, value in read_merged(find(base))["state_dict"].items():
@@ -166,7 +178,7 @@ def copy_matching_weights(model: MotionGenerator, source: str | Path) -> tuple[i
 
 
 def write_adapter(path: Path, trained: Path) -> None:
-    """Writes the adapter in a checkpoint of its training, atomically."""
+    """Writes the adapter of a training checkpoint atomically."""
     from safetensors.torch import save
 
     checkpoint = read_checkpoint(trained)
@@ -183,7 +195,8 @@ def read_merged(
     strengths = [strength] * len(paths) if isinstance(strength, int | float) else list(strength)
     if len(strengths) != len(paths) or not all(math.isfinite(value) for value in strengths):
         raise UserError(
-            f"adapter strength {strength}: give one number, or one for each of {len(paths)} adapters"
+            f"adapter strength {strength}: give one number, or one number for each of the "
+            f"{len(paths)} adapters"
         )
     checkpoint = read_checkpoint(path)
     state = checkpoint["state_dict"]
@@ -201,11 +214,12 @@ def read_merged(
         about, changes = _read(Path(file))
         if about["base"] != base:
             raise UserError(
-                f"adapter={file}: made for the weights {about['base'][:12]}, not {base[:12]}. Give its base"
+                f"adapter={file}: made for the weights {about['base'][:12]}, not {base[:12]}. "
+                f"Give the model that it was made for"
             )
         _merge(plain, changes, about["rows"], weight, file)
         for key, more in (("vocabulary", about["words"]), ("captions", about["captions"])):
-            if key in facts and weight:  # the base leaves out words that it does not know
+            if key in facts and weight:  # the base ignores words that it does not know
                 facts[key] = list(dict.fromkeys([*more, *facts[key]]))
     return checkpoint | {"state_dict": plain, "config": config, "facts": facts}
 
@@ -240,7 +254,7 @@ def _read(path: Path) -> tuple[About, dict[str, Tensor]]:
     regular_file(path)
     metadata, changes = read_safetensors(path)
     if ADAPTER not in metadata:
-        raise UserError(f"adapter={path}: not an adapter. `flame-mdm adapt` writes them")
+        raise UserError(f"adapter={path}: not an adapter. Give a file that `flame-mdm adapt` wrote")
     check_weights(changes, path)
     try:
         return check_shape(parse_json(metadata[ADAPTER]), About), changes

@@ -1,4 +1,4 @@
-"""Sharing of models: export from a checkpoint, model card, upload to the Hugging Face hub."""
+"""Sharing of models: export from a checkpoint, model card, and upload to the Hugging Face hub."""
 
 import re
 from collections.abc import Mapping
@@ -20,7 +20,8 @@ from flame_mdm.safe_io import atomic_folder, read_text, read_yaml, regular_file,
 CARD = Path(__file__).with_name("card.md")
 MOTION_LICENSES = Path(__file__).parent.parent / "data" / "licenses.yaml"
 WRITTEN = {"README.md": "library_name: flame-mdm", "config.yaml": "The recipe of this model."}
-"""Files that `push` writes next to the model, and a text in each that identifies it as written by `push`.
+"""Files that `push` writes next to the model,
+and the texts in them by which `push` recognizes its files.
 
 The card also has the hash of the model file.
 """
@@ -31,7 +32,7 @@ def export(source: str | Path, out: str | Path, *, half: bool = False, **adapted
     """Writes the model of a checkpoint as a single .safetensors file and returns its path.
 
     Args:
-        source: what `flame_mdm.load` takes.
+        source: the model, as in `flame_mdm.load`.
         out: path of the file.
         half: whether weight matrices are stored in half precision. Vectors, such as the
             statistics of the
@@ -60,7 +61,10 @@ def export(source: str | Path, out: str | Path, *, half: bool = False, **adapted
 def push(
     source: str | Path, repository: str, folder: str | Path, *, upload: bool, private: bool
 ) -> Path:
-    """Writes a folder with model file, recipe and card, and uploads it to the hub as "user/name"; see `export`."""
+    """Writes a folder with model file, recipe and card, and uploads it to the hub as "user/name".
+
+    See `export` for the arguments.
+    """
     if not re.fullmatch(r"\w[\w.-]*/\w[\w.-]*", repository):
         raise UserError(f"{repository}: not a repository name. Write user/name")
     folder = Path(folder)
@@ -78,7 +82,7 @@ def push(
             HfApi().upload_folder(
                 repo_id=repository, folder_path=folder, allow_patterns=[FILE, *WRITTEN]
             )
-        # The client raises many kinds: no network, no token, no permission ...
+        # The client raises many kinds of errors: no network, no token, no permission, ...
         except Exception as error:
             message = f"{repository}: upload failed: {first_line(error)}. The files are in {folder}"
             raise UserError(message) from error
@@ -99,7 +103,7 @@ def _check_written(folder: Path) -> None:
 
 
 def card(model: Mapping[str, Any], repository: str, file_sha256: str) -> str:
-    """Returns the model card for the content of a model file, with the hash of the file."""
+    """Returns the model card for the content of a model file and the hash of the file."""
     from jinja2 import Template
 
     config, facts = model["config"], model["facts"]

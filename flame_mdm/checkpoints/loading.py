@@ -1,5 +1,5 @@
 # pyright: standard
-"""Loading of models: builds the parts, loads the weights."""
+"""Loading of models: builds the parts and loads the weights."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ NO_GPU = (
     if torch.version.cuda or torch.version.hip
     else "this PyTorch was built without CUDA"
 )
-"""The reason why no GPU can be used, for machines on which PyTorch has none."""
+"""The reason why no GPU can be used, for machines on which PyTorch has no GPU."""
 
 
 def load(
@@ -55,26 +55,28 @@ def load(
 ) -> MotionGenerator:
     """Loads a trained model for sampling.
 
-    The model is in evaluation mode, with averaged weights if its recipe averages them. No data set and no training code
-    is needed.
+    The model is in evaluation mode, with averaged weights if its recipe averages weights. Neither
+    a data set nor training code is needed.
 
     Args:
         source: a run directory; a .ckpt or .safetensors file; a folder with one .safetensors file; the name of a model
             in this package, such as "quickstart"; or "user/name[@revision]" on the Hugging Face hub. An existing path
             comes first.
         device: device of the weights, such as "cuda".
-        which: the checkpoint of a run directory, "last" or "best". Files have only one.
-        adapter: one or several files that `flame_mdm.adapt` wrote for this model. Default: none.
-        strength: strength of all adapters, or one number per adapter. 0 is the model without the adapter, 1 the model
-            as it was adapted.
+        which: the checkpoint of a run directory, "last" or "best". For files, it has no effect.
+        adapter: one or several files that `flame_mdm.adapt` wrote for this model. By default,
+            there is no adapter.
+        strength: strength of all adapters, or one number per adapter. 0 = the model without the
+            adapter; 1 = the model as it was adapted.
 
     Returns:
         The model, an argument of `flame_mdm.generate`, `edit` and `stream`.
 
     Raises:
         FileNotFoundError: If there is no such file or checkpoint.
-        UserError: If the file is damaged or holds no motion generator, its weights do not match its recipe, the model
-            cannot be downloaded, an adapter belongs to another model, or the machine has no such device.
+        UserError: If the file is damaged or holds no motion generator, if its weights do not
+            match its recipe, if the model cannot be downloaded, if an adapter belongs to another
+            model, or if the machine has no such device.
 
     Example:
         >>> import flame_mdm
@@ -90,7 +92,9 @@ def load(
 def load_task(
     path: Path, kind: type[Trained], device: str | torch.device = "cpu", **adapted: Any
 ) -> Trained:
-    """Loads the task of a .ckpt or .safetensors file in evaluation mode, with averaged weights if its recipe has them.
+    """Loads the task of a .ckpt or .safetensors file in evaluation mode.
+
+    The weights are averaged weights if the recipe averages weights.
 
     Args:
         path: the file.
@@ -99,15 +103,15 @@ def load_task(
         adapted: the keywords `adapter` and `strength` of `load`.
 
     Raises:
-        UserError: If the file is damaged or holds another kind of task, its weights do not match its recipe, or the
-            machine has no such device.
+        UserError: If the file is damaged or holds another kind of task, if its weights do not
+            match its recipe, or if the machine has no such device.
     """
     check_device(device)
     checkpoint = read_merged(path, **adapted)
     try:
         return _build(checkpoint, kind).eval().to(device)
     except Exception as error:  # a nonsensical recipe may fail anywhere
-        if isinstance(error, FileNotFoundError):  # the missing file is a text encoder's
+        if isinstance(error, FileNotFoundError):  # the missing file belongs to a text encoder
             raise
         kind_of_error = (
             ""
@@ -123,29 +127,32 @@ def check_device(device: str | torch.device) -> None:
         if torch.device(device).type == "meta":
             raise RuntimeError("no device that computes")
         torch.empty(0, device=device)
-    except (RuntimeError, AssertionError) as error:  # torch reports an absent device as either
+    # torch raises either error for a missing device
+    except (RuntimeError, AssertionError) as error:
         gpus = [f"cuda:{number}" for number in range(torch.cuda.device_count())]
         names = ", ".join(["cpu", *gpus]) + f" ({NO_GPU})" * (not gpus)
         raise UserError(
-            f"device={device}: this machine has only {names}. Drop device=, or change it"
+            f"device={device}: this machine only has {names}. Remove device=, or give another "
+            f"device"
         ) from error
 
 
 def _build(checkpoint: dict[str, Any], kind: type[Trained]) -> Trained:
     """Builds the model of a checkpoint with its weights.
 
-    Networks of this project are built on the meta device, so that a recipe takes no more memory than the weights in the
-    file. Other classes, which the user must trust, are built as in training.
+    This project's networks are built on the meta device, so that a recipe does not take more
+    memory than the weights in the file. Other classes, which the user must trust, are built as in
+    training.
     """
     config, state = checkpoint["config"], checkpoint["state_dict"]
     parts: Config = {name: config[name] for name in PARTS if name in config}
     trust(parts)
     classes: dict[str, Any] = dict(GENERATORS) if kind is MotionGenerator else {}
     targets = [str(node["_target_"]) for _, node in walk(parts) if "_target_" in node]
-    # imports modules here, since tensors that they create must not be on the meta device
+    # modules are imported before, since tensors that they create must not be on the meta device
     classes |= {target: get_class(target) for target in targets if target not in classes}
     model_class = classes[config["task"]["_target_"]]
-    if kind is MotionGenerator:  # a class of the user's
+    if kind is MotionGenerator:  # the user's own class
         model_class = getattr(model_class, "kind", model_class)
     if not issubclass(model_class, kind):
         noun = getattr(model_class, "noun", model_class.__name__)
@@ -170,7 +177,9 @@ def _build(checkpoint: dict[str, Any], kind: type[Trained]) -> Trained:
 
 
 class _CallLimit(TorchFunctionMode):
-    """Refuses more than `limit` calls of torch functions, so that a recipe of a million layers ends soon."""
+    """Refuses more than `limit` calls of torch functions,
+    so that a recipe of a million layers fails soon.
+    """
 
     def __init__(self, limit: int):
         super().__init__()
@@ -180,8 +189,8 @@ class _CallLimit(TorchFunctionMode):
         self.left -= 1
         if self.left < 0:
             raise UserError("its recipe describes a larger model than the weights saved with it")
-        # on the meta device, drawing numbers imports torch's compiler, which takes longer than
-        # building the model
+        # On the meta device, drawing numbers would import torch's compiler, which takes longer
+        # than building the model
         if func is torch.nn.init.normal_:
             return kwargs["tensor"] if kwargs else args[0]
         func = torch.empty if func is torch.randn else func

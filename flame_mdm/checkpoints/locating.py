@@ -1,4 +1,7 @@
-"""Files of models, found by path, run directory, name or hub id. This module does not import torch."""
+"""Finds the files of models by path, run directory, name or hub id.
+
+This module does not import torch.
+"""
 
 import re
 from pathlib import Path
@@ -13,15 +16,16 @@ Which = Literal["last", "best"]
 SHIPPED = {
     path.stem: path for path in sorted((Path(__file__).parents[1] / "models").glob("*.safetensors"))
 }
-"""Models in this package, by name; `docs/checkpoints.md` says how they were trained."""
+"""Models in this package, by name; `docs/checkpoints.md` describes their training."""
 
 
 def find(source: str | Path, which: Which = "last") -> Path:
-    """Returns the file of a model; raises `FileNotFoundError` or `UserError` if there is none.
+    """Returns the file of a model;
+    raises `FileNotFoundError` or `UserError` if there is no such file.
 
-    `source` is a file; a run directory, of which `which` names the checkpoint; a folder with one
+    `source` is a file; a run directory, in which `which` names the checkpoint; a folder with one
     .safetensors file; the name of a model in this package; or "user/name[@revision]" on the
-    Hugging Face hub. An existing path comes first.
+    Hugging Face hub. An existing path takes precedence.
     """
     path = Path(source)
     if path.is_dir():
@@ -40,10 +44,10 @@ def find(source: str | Path, which: Which = "last") -> Path:
         )
     from huggingface_hub import hf_hub_download, logging
 
-    logging.set_verbosity_error()  # otherwise it reports every attempt to reach the hub
+    logging.set_verbosity_error()  # the client would report every attempt to reach the hub
     try:
         return Path(hf_hub_download(match[1], FILE, revision=match[2]))
-    # The client raises many kinds: no network, no such repository, no permission ...
+    # The client raises many kinds of errors: no network, no such repository, no permission, ...
     except Exception as error:
         raise UserError(
             f"{source}: no such file or folder, and {FILE} of a model with this name cannot be downloaded from the "
@@ -68,7 +72,8 @@ def _find_in_folder(folder: Path, which: Which) -> Path:
     if len(weights) != 1:
         if runs := [run for run in sorted(folder.iterdir()) if (run / "checkpoints").is_dir()]:
             raise UserError(
-                f"{folder}: no run, but there are runs below it. Give one: {', '.join(map(str, runs))}"
+                f"{folder}: not a run, but it contains runs. Give one of them: "
+                f"{', '.join(map(str, runs))}"
             )
         names = ", ".join(file.name for file in weights) or "no .safetensors file"
         raise UserError(

@@ -1,8 +1,9 @@
 """File formats of models: checkpoints (.ckpt) of training, and model files (.safetensors).
 
 A model file holds the (averaged) weights, including the statistics of the features. Its metadata
-has a key `flame_mdm` with recipe, metadata of the data set and origin of the weights, as JSON,
-and a key `sha256` with the hash of that text and the weights. It contains no code.
+has two keys. `flame_mdm` is JSON with the recipe, the metadata of the data set and the origin of
+the weights. `sha256` is the hash of this JSON text and the weights. A model file contains no
+code.
 """
 
 from __future__ import annotations
@@ -31,17 +32,21 @@ FORMAT_KEY = "flame_mdm_format"  # key of the format in a checkpoint
 KEY = "flame_mdm"
 ADAPTER = "flame_mdm_adapter"
 FILE = "model.safetensors"
-# Maximum number of frames that a model file may declare: more than an hour at 20 per second
+# Maximum number of frames that a model file may declare: more than an hour at 20 frames per
+# second
 MOST_FRAMES = 100_000
 
 
 def read_model_file(path: Path) -> dict[str, Any]:
-    """Reads a model file as `config`, `facts`, `origin` and `state_dict`; raises `UserError` if it is damaged."""
+    """Reads `config`, `facts`, `origin` and `state_dict` from a model file.
+
+    Raises `UserError` if the file is damaged.
+    """
     metadata, state = read_safetensors(path)
     text = metadata.get(KEY)
     if ADAPTER in metadata:
         raise UserError(
-            f"{path}: an adapter, which changes a model. Name its base first: BASE adapter={path}"
+            f"{path}: an adapter, which changes a model. Name the model first: MODEL adapter={path}"
         )
     if text is None:
         raise UserError(
@@ -62,7 +67,9 @@ def read_model_file(path: Path) -> dict[str, Any]:
 
 
 def read_safetensors(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
-    """Returns metadata and tensors of a .safetensors file; raises `UserError` if it is damaged."""
+    """Returns the metadata and the tensors of a .safetensors file;
+    raises `UserError` if it is damaged.
+    """
     from safetensors import SafetensorError, safe_open
 
     try:
@@ -74,7 +81,10 @@ def read_safetensors(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
 
 
 def check_format(path: Path, number: Any) -> None:
-    """Raises `UserError` for a format other than `FORMAT`; version 0.1 wrote 1 or, in checkpoints, None."""
+    """Raises `UserError` for a format other than `FORMAT`.
+
+    Version 0.1 wrote format 1 or, in checkpoints, None.
+    """
     if number in (1, None):
         raise UserError(
             f"{path}: written by version 0.1 of flame_mdm, whose files this version does not read. Train or import "
@@ -117,7 +127,7 @@ class _Training(TypedDict, total=False):
 
 
 class _Licensed(TypedDict):
-    """The motions under one license."""
+    """Motions under one license."""
 
     license: str
     clips: int
@@ -145,7 +155,11 @@ class _Metadata(TypedDict):
 
 
 def checked(path: Path, content: Any) -> dict[str, Any]:
-    """Returns the content of a checkpoint or model file if it is a recipe of plain values, metadata and weights."""
+    """Checks that a checkpoint or model file holds a recipe
+    of plain values, metadata and weights.
+
+    Returns the content.
+    """
     if not isinstance(content, dict) or not {"config", "facts", "state_dict"} <= content.keys():
         raise UserError(
             f"{path}: not a checkpoint of this framework: it holds no recipe. Import released checkpoints with "
@@ -169,7 +183,10 @@ def checked(path: Path, content: Any) -> dict[str, Any]:
 
 
 def check_weights(weights: Mapping[Any, Any], path: Path) -> None:
-    """Raises `UserError` unless weights are dense real tensors by name, together not larger than the file at `path`."""
+    """Raises `UserError` unless weights are dense real tensors by name.
+
+    Together, they must not be larger than the file at `path`.
+    """
     import torch
 
     kinds = (torch.float64, torch.float32, torch.float16, torch.bfloat16)
@@ -185,7 +202,7 @@ def check_weights(weights: Mapping[Any, Any], path: Path) -> None:
             raise UserError(
                 f"{path}: damaged: its weights are not dense tensors of real numbers by name: {shown}"
             )
-    # The factor 2 allows for tensors that two names share, and that the file holds once.
+    # The factor 2 allows for tensors that two names share, since the file holds them only once.
     size = sum(value.numel() * value.element_size() for value in weights.values())
     if size > 2 * path.stat().st_size:
         raise UserError(f"{path}: damaged: its weights are declared to be larger than the file")
@@ -199,7 +216,10 @@ def write_model_file(
     facts: Mapping[str, Any],
     origin: Any,
 ) -> Path:
-    """Writes a model file atomically, to a .safetensors file or to `FILE` in a folder, and returns its path."""
+    """Writes a model file atomically and returns its path.
+
+    The file is a .safetensors file, or `FILE` in a folder.
+    """
     from safetensors.torch import save
 
     path = Path(out) if Path(out).suffix == ".safetensors" else Path(out) / FILE
@@ -217,7 +237,7 @@ def content_sha256(text: str, state: Mapping[str, Tensor]) -> str:
 
 
 def state_sha256(state: Mapping[str, Tensor]) -> str:
-    """Returns a hash of names, types, shapes and values of tensors, in the order of their names."""
+    """Returns a hash of the names, types, shapes and values of tensors, sorted by name."""
     import torch
 
     digest = hashlib.sha256()
@@ -237,12 +257,16 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def weights_sha256(path: Path) -> str:
-    """Returns the sha256 of the weights in a file, equal for a checkpoint and its model file."""
+    """Returns the sha256 of the weights in a file,
+    which is equal for a checkpoint and its model file.
+    """
     return state_sha256(read_checkpoint(path)["state_dict"])
 
 
 def without_own_paths(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns a recipe with default paths of data and run instead of absolute paths on this machine."""
+    """Returns a recipe with default paths of data and run,
+    instead of absolute paths on this machine.
+    """
     defaults = {
         config.get("data_root"): "data",
         config.get("run", {}).get("dir"): f"runs/{config['experiment']}/default",

@@ -37,17 +37,17 @@ RUNNER = Path(__file__).with_name("runner.py")
 # Maximum difference between the outputs of a graph and of PyTorch, relative to the largest
 # output. Float32 arithmetic in another order of operations differs by about 1e-6.
 TOLERANCE = 1e-4
-# Networks whose ONNX graphs need a fixed number of frames: shorter motions are padded to the
+# The ONNX graphs of these networks need a fixed number of frames, so motions are padded to the
 # longest one.
 FIXED_LENGTH = (
     MDMGRU,
     MDMUNet,
 )
-TINY = 1e-6  # probe of `to_x0` that no clipping of the clean estimate changes
+TINY = 1e-6  # an input of `to_x0` that is too small for clipping of the clean estimate
 
 
 def export_onnx(source: str | Path, out: str | Path, *, half: bool = False, **adapted: Any) -> Path:
-    """Writes a model as a folder of ONNX graphs that need numpy and onnxruntime alone.
+    """Writes a model as a folder of ONNX graphs that only need numpy and onnxruntime.
 
     The folder contains `runner.py`, which samples from the graphs. docs/export.md describes the
     files.
@@ -59,8 +59,8 @@ def export_onnx(source: str | Path, out: str | Path, *, half: bool = False, **ad
         adapted: adapters to merge into the weights, and their strengths, as in `flame_mdm.load`.
 
     Raises:
-        UserError: also if a part cannot be exported, or a graph does not compute what PyTorch
-            does.
+        UserError: As in `flame_mdm.load`. Also if a part cannot be exported, or if the outputs of
+            a graph differ from PyTorch's.
     """
     try:
         import onnxruntime  # noqa: F401
@@ -74,7 +74,7 @@ def export_onnx(source: str | Path, out: str | Path, *, half: bool = False, **ad
 
 
 def write_folder(model: MotionGenerator, out: str | Path, *, half: bool = False) -> None:
-    """Writes the folder of `export_onnx` for a model that is loaded."""
+    """Writes the folder of `export_onnx` for a loaded model."""
     content = description(model)
     with atomic_folder(out) as folder, torch.no_grad():
         for graph in ProgressBar(graphs(model), desc="graphs", unit="graph"):
@@ -89,7 +89,7 @@ def description(model: MotionGenerator) -> dict[str, Any]:
     """Returns the content of `model.json`, without the hashes of the graphs.
 
     Raises:
-        UserError: If a value is not within the limits of the runner, or the sampler cannot be
+        UserError: If a value is outside the limits of the runner, or the sampler cannot be
             exported.
     """
     representation = model.representation
@@ -137,41 +137,43 @@ def description(model: MotionGenerator) -> dict[str, Any]:
 
 
 class Probe:
-    """Denoiser, noise and `Guide` that record how a sampler combines noise and clean estimates.
+    """Records how a sampler combines noise and clean estimates.
 
-    `variance` is the network's output for a learned variance.
+    It takes the place of the denoiser, the noise and the `Guide`. `variance` is the network's
+    output for a learned variance.
     """
 
     # All exported samplers are linear: each noisy motion is a weighted sum of draws of noise and
-    # of clean estimates. So the sampler is run once on unit vectors instead of motions. Draw
-    # number n is unit vector n, and clean estimate number k is unit vector `calls` + 1 + k. A
-    # noisy motion (1, 1, 2 `calls` + 1) of this run then lists its weights, and `_plan` solves
-    # for the four numbers of each step. This works for any sampler without a formula of its own
-    # here.
+    # of clean estimates. The sampler is therefore run once on unit vectors instead of motions.
+    # Draw number n is unit vector n, and clean estimate number k is unit vector `calls` + 1 + k.
+    # The entries of a noisy motion (1, 1, 2 `calls` + 1) in this run are then its weights, and
+    # `_plan` solves for the four numbers of each step. No sampler needs its own formula here.
     def __init__(self, process: Process, calls: int, variance: float):
         self.process, self.calls, self.variance, self.output = process, calls, variance, variance
         self.time, self.draws = 0.0, 0
-        # For each call: x_t, the number of draws before it, and (t, p, q).
+        # For each call: x_t, the number of draws before the call, and (t, p, q).
         self.records: list[tuple[Tensor, int, list[float]]] = []
 
     def unit(self, number: int) -> Tensor:
-        """Returns the unit vector (1, 1, 2 * calls + 1) of a draw of noise or of a clean
-        estimate.
+        """Returns the unit vector (1, 1, 2 * calls + 1)
+        of a draw of noise or of a clean estimate.
         """
         return functional.one_hot(torch.tensor(number), 2 * self.calls + 1).double()[None, None]
 
     def noise(self, draw: int) -> Tensor:
-        """Returns a unit vector in place of a draw of noise, and counts the draws."""
+        """Returns a unit vector instead of a draw of noise, and counts the draws."""
         self.draws = draw + 1
         return self.unit(draw)
 
     def denoise(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
-        """Returns a constant in place of the denoiser's output, and keeps the time of the call."""
+        """Returns a constant instead of the denoiser's output,
+        and stores the time of the call.
+        """
         self.time = float(t[0])
         return x_t.new_full((1, 1, self.process.out_features(x_t.shape[-1])), self.output)
 
     def steer(self, clean: Callable[[Tensor], Tensor], x_t: Tensor) -> Tensor:
-        """Records the coefficients p and q of a call from two inputs of almost nothing."""
+        """Records the coefficients p and q of a call, from two tiny inputs."""
         if len(self.records) == self.calls:
             raise UserError("it chooses its own steps")
         # The clean estimate is p x + q y. With an output y = 0, it shows p; with x = 0, it shows
@@ -184,17 +186,17 @@ class Probe:
         return x_t
 
     def reach(self, x0_hat: Tensor) -> Tensor:
-        """Returns the unit vector of a clean estimate in place of the estimate."""
+        """Returns the unit vector of a clean estimate instead of the estimate."""
         return self.unit(self.calls + len(self.records))
 
 
 def sampling_plan(process: Process, options: SamplerOptions) -> list[list[float]]:
-    """Returns the sampling loop as rows of 7 numbers (t, p, q, a, b, c, d), one for each call of
-    the denoiser.
+    """Returns the sampling loop as rows of 7 numbers (t, p, q, a, b, c, d),
+    one per call of the denoiser.
 
-    The denoiser is called at time t and returns y, which gives the clean estimate x0 = p x + q y.
-    The next noisy motion is a x + b x0 + c x0' + d noise, with the clean estimate x0' of the call
-    before. Raises `UserError` for samplers that are not of this form.
+    The denoiser is called at time t and returns y. The clean estimate is x0 = p x + q y. The next
+    noisy motion is a x + b x0 + c x0' + d noise, where x0' is the clean estimate of the previous
+    call. Raises `UserError` for samplers without this form.
     """
     plans = [np.array(_plan(process, options, variance)) for variance in (0.0, 1.0)]
     if not np.array_equal(plans[0], plans[1]):
@@ -219,8 +221,9 @@ def _plan(process: Process, options: SamplerOptions, variance: float) -> list[li
     rows = []
     for number, (x_t, draws, row) in enumerate(probe.records):
         after, drawn, _ = (*probe.records, (end, probe.draws, []))[number + 1]
-        # The step must be a combination of these four: noisy motion, clean estimate, the estimate
-        # before it and fresh noise. What the step does not have is a column of zeros.
+        # The step must be a combination of four vectors: noisy motion, clean estimate, previous
+        # clean estimate, and fresh noise. A vector that the step does not have is a column of
+        # zeros.
         nothing = torch.zeros_like(x_t)
         columns = [
             x_t,
@@ -241,7 +244,10 @@ def _plan(process: Process, options: SamplerOptions, variance: float) -> list[li
 
 
 class Graph(NamedTuple):
-    """A module to export. `examples` are its inputs by name; `dimensions` names their axes of any length."""
+    """A module to export.
+
+    `examples` are inputs by name; `dimensions` names their axes of variable length.
+    """
 
     name: str
     module: nn.Module
@@ -251,11 +257,13 @@ class Graph(NamedTuple):
 
 
 class Call(nn.Module):
-    """One call of a model's denoiser, with its condition encoder and guidance, without a learned variance.
+    """One call of a model's denoiser with condition encoder and guidance,
+    without a learned variance.
 
-    Inputs are x_t (B, F, D), the time t (B,) as the denoiser gets it, lengths (B,) int64, and the
-    condition: actions (B,) int64, or rows of the word table (B, S, 2) int64 with the `counts`
-    (B,) of each caption. `ContinuingCall` also reads the frames before the motion.
+    Inputs are x_t (B, F, D), the time t (B,) in the denoiser's units, lengths (B,) int64, and the
+    condition. The condition consists of actions (B,) int64, or of rows of the word table (B, S,
+    2) int64 with the number of tokens `counts` (B,) of each caption. `ContinuingCall` also reads
+    the frames before the motion.
     """
 
     def __init__(self, model: MotionGenerator):
@@ -315,7 +323,7 @@ class Call(nn.Module):
 
 
 class ContinuingCall(Call):
-    """One call of a denoiser that continues frames, which are a further input."""
+    """One call of a denoiser that continues frames; these frames are a further input."""
 
     def forward(
         self,
@@ -344,7 +352,11 @@ class Function(nn.Module):
 
 
 def graphs(model: MotionGenerator) -> list[Graph]:
-    """Returns the graphs of a model: the guided denoiser, decoding to joints and, for SMPL's skeleton, to rotations."""
+    """Returns the graphs of a model:
+    the guided denoiser, and the decoders to joints and rotations.
+
+    Only SMPL's skeleton has rotations.
+    """
     representation = model.representation
     encoder = model.condition
     longest = model.facts["max_frames"]
@@ -392,7 +404,9 @@ def graphs(model: MotionGenerator) -> list[Graph]:
 
 
 def traced(graph: Graph) -> torch.export.ExportedProgram:
-    """Returns the operations of a graph's module, for inputs of any size along its named axes."""
+    """Returns the traced operations of a graph's module,
+    for inputs of any size along the named axes.
+    """
     dimensions = [graph.dimensions.get(name) for name in graph.examples]
     return torch.export.export(
         graph.module.eval(),
@@ -403,7 +417,10 @@ def traced(graph: Graph) -> torch.export.ExportedProgram:
 
 
 def write_graph(graph: Graph, path: Path, half: bool) -> None:
-    """Writes a graph; raises `UserError` if it does not compute what PyTorch does, for a batch of two or of one."""
+    """Writes a graph.
+
+    Raises `UserError` if its outputs differ from PyTorch's for a batch of two motions, or of one.
+    """
     import onnxruntime
 
     examples = list(graph.examples.values())
@@ -418,13 +435,13 @@ def write_graph(graph: Graph, path: Path, half: bool) -> None:
             )
             assert program is not None
             program.save(raw)
-        # onnxruntime optimizes in a second what takes PyTorch's exporter a minute.
+        # onnxruntime optimizes a graph in a second; PyTorch's exporter takes a minute.
         options = onnxruntime.SessionOptions()
         options.log_severity_level = 3
         options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_BASIC
         options.optimized_model_filepath = str(path)
         onnxruntime.InferenceSession(raw, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # the exporter raises many kinds
+    except Exception as error:  # the exporter raises many kinds of errors
         raise UserError(
             f"the {graph.name} cannot be exported to ONNX: {first_line(error)}"
         ) from error
@@ -450,7 +467,9 @@ def write_graph(graph: Graph, path: Path, half: bool) -> None:
 
 
 def _shrink(path: Path, half: bool) -> None:
-    """Removes the descriptions of the nodes; with `half`, stores matrices in half precision, with a cast."""
+    """Removes the descriptions of the nodes;
+    `half` also stores matrices in half precision, with a cast.
+    """
     import onnx
     from onnx import numpy_helper
 

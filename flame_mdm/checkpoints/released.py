@@ -1,7 +1,7 @@
 """Import of the checkpoints released by the authors of MDM, MFM and FLAME.
 
-Each learned weight is used exactly once, or the import fails. Frozen text encoders and sinusoids
-are skipped.
+Each learned weight must be used exactly once; otherwise, the import fails. Frozen text encoders
+and sinusoids are skipped.
 """
 
 from collections.abc import Mapping
@@ -31,25 +31,31 @@ NETWORKS = {
     "trans_dec": (MDMDecoder, "seqTransDecoder", theirs.DECODER_LAYER),
     "gru": (MDMGRU, "", {}),
 }
-"""Authors' name of each architecture of MDM -> our network, their name of its transformer, and the names in a layer."""
+"""The authors' names of MDM's architectures, with our networks, the authors' names of the
+transformers, and the names in a layer.
+"""
 NORMALIZED = ("humanml3d", "kit")
 PADDED_FRAMES, ACTION_FRAMES = 196, 60
-PREFIX_GUIDANCE = 7.5  # guidance scale of models that continue a prefix, in the authors' evaluation
+# guidance scale of models that continue a prefix, in the authors' evaluation
+PREFIX_GUIDANCE = 7.5
 ENCODERS = {"clip": "clip", "bert": "distilbert"}
 POOLER, ACTIONS = "lm.pooler.dense.", "embed_action.action_embedding"
 
 
 class Released(NamedTuple):
-    """A released network, and its weights by our names."""
+    """A released network, and its weights under our names."""
 
     network: type[Denoiser]
     features: tuple[int, int, int]  # in_features, out_features, cond_features
     options: dict[str, Any]
     state: dict[str, Tensor]
-    action_embedding: Tensor | None = None  # (actions, C), of the condition encoder
+    # (actions, C), action vectors of the condition encoder
+    action_embedding: Tensor | None = None
 
     def checked(self) -> Self:
-        """Returns itself; raises `UserError` unless the network has exactly these weights."""
+        """Returns this object; raises `UserError`
+        unless the network has exactly these weights.
+        """
         with torch.device("meta"):
             network = self.network(*self.features, **self.options)
         theirs.load_strictly(network, self.state, "released weights", assign=True)
@@ -57,15 +63,16 @@ class Released(NamedTuple):
 
 
 def import_mdm(state: Mapping[str, Tensor], args: Options, *, time_token: bool = False) -> Released:
-    """Converts a model of MDM or MFM: encoder, decoder, decoder with token, or GRU; text, actions
-    or nothing.
+    """Converts a model of MDM or MFM.
+
+    Its network is an encoder, a decoder, a decoder with token, or a GRU; its condition is text,
+    actions or nothing.
 
     Args:
-        state: weights, as `released_state` returns them. Sizes are read from their shapes.
+        state: weights from `released_state`. The sizes of the network are read from their shapes.
         args: options of the authors' code.
-        time_token: whether the decoder's input token is the time alone, as in the code since
-            February 2025.
-            The released model with an input token is older.
+        time_token: whether the decoder's input token contains only the time, as in the code since
+            February 2025. The released model with an input token is older.
     """
     network, stack, layer = NETWORKS[args.arch]
     dropped = ("sequence_pos_encoder.pe", "embed_timestep.sequence_pos_encoder.pe", "clip_model.")
@@ -101,7 +108,8 @@ def import_mdm(state: Mapping[str, Tensor], args: Options, *, time_token: bool =
             "context_frames": args.context_len,
             **_target_options(ours),
         }
-        if args.emb_trans_dec:  # the code that introduced DistilBERT has a token of the time alone
+        # in the code that introduced DistilBERT, the token contains only the time
+        if args.emb_trans_dec:
             options["input_token"] = "time" if time_token or distilbert else "condition"
     if (args.lambda_target_loc or args.multi_target_cond) and "target_encoder" not in options:
         raise ValueError(
@@ -113,7 +121,9 @@ def import_mdm(state: Mapping[str, Tensor], args: Options, *, time_token: bool =
 
 
 def _target_options(ours: Mapping[str, Tensor]) -> dict[str, Any]:
-    """Returns the options of the target encoder whose weights, by our names, are in a state dict."""
+    """Returns the options of the target encoder whose weights
+    are in a state dict, under our names.
+    """
     layers = sum(key.startswith("target.network.") and key.endswith(".weight") for key in ours) - 1
     if layers >= 0:
         return {"target_encoder": "single", "target_layers": layers}
@@ -176,8 +186,8 @@ def _flame_recipe(released: Released) -> tuple[Config, dict[str, Any]]:
     )
     config["task"] |= {"cond_drop_prob": 0.25, "guidance_scale": 8.0}
     config["optimizer"] |= {"weight_decay": 0.0}
-    # The authors' table of positions has one row more than the longest motion has frames: it
-    # begins with the time token.
+    # The authors' table of positions has one row for the time token, which comes first, and one
+    # row per frame of the longest motion.
     longest = released.options["max_frames"] - 1
     return config, {
         "actions": [],
@@ -210,8 +220,8 @@ def _mdm_recipe(kind: str, released: Released, args: Options) -> tuple[Config, d
     }
     if kind == "mfm":
         solver = args.ode_kwargs
-        # All methods other than dopri5 are Euler; "euler" uses torchdiffeq's float32 times, the
-        # others i / N.
+        # All methods except dopri5 are Euler's method. "euler" uses torchdiffeq's float32 times,
+        # the others use i / N.
         process["odeint_grid"] = solver.method == "euler"
         config["task"]["sampler"] = "dopri5" if solver.method == "dopri5" else "euler"
         config["task"]["num_inference_steps"] = int(1 / solver.step_size)
@@ -252,7 +262,10 @@ def import_released(
     time_token: bool = False,
     run_code: bool = False,
 ) -> Path:
-    """Converts a released checkpoint into a model file, and returns its path; see the keys of `flame-mdm import`."""
+    """Converts a released checkpoint to a model file and returns its path.
+
+    The arguments are keys of `flame-mdm import`.
+    """
     file = Path(file)
     if (args is None) != (kind in ("flame", "mclip")):
         needs = "takes no" if args else "needs a"
@@ -314,7 +327,10 @@ def _model(
     stats: str | Path | None,
     extra: dict[str, Any],
 ) -> MotionGenerator:
-    """Builds a model of a recipe with its weights, `extra` besides the network's, and the statistics in a folder."""
+    """Builds a model from a recipe, its weights and the statistics in a folder.
+
+    `extra` are weights of other parts than the network.
+    """
     plain(config, "the options of the released model")
     representation = instantiate(config["representation"])
     width = released.features[0]

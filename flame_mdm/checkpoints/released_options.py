@@ -1,5 +1,8 @@
 # pyright: standard
-"""Options of released models. Every option is read, known to have no effect on the model, or refused."""
+"""Options of released models.
+
+An option is read, ignored because it has no effect on the model, or refused.
+"""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,15 +18,15 @@ from flame_mdm.safe_io import read_yaml
 from flame_mdm.sampler_options import MAX_STEPS
 from flame_mdm.schemas import Number, Schema, check_shape
 
-# JSON is read as YAML 1.1, in which 2e-2 is a text
+# JSON is read as YAML 1.1, in which 2e-2 is text
 YamlNumber = Annotated[float, BeforeValidator(lambda x: float(x) if isinstance(x, str) else x)]
 
-# Options may be written as the name of an enumeration's value, in any case.
+# The value of an option may be the name of an enumeration's value, in upper or lower case.
 LowerCase = BeforeValidator(lambda x: x.lower() if isinstance(x, str) else x)
 
 
 class Solver(Schema):
-    """MFM's `ode_kwargs`."""
+    """Options `ode_kwargs` of MFM's solver."""
 
     method: str = "euler"
     step_size: Annotated[YamlNumber, Field(ge=1 / MAX_STEPS, le=1)] = 0.01
@@ -57,7 +60,10 @@ class Options(Schema):
 
 
 def read_options(path: str | Path | None, changes: dict[str, Any]) -> Options:
-    """Returns the options in a file of MDM or MFM, with `changes`; raises `UserError` naming the first invalid one."""
+    """Returns the options in a file of MDM or MFM, updated with `changes`.
+
+    Raises `UserError` for the first invalid option.
+    """
     options = {} if path is None else read_yaml(path)  # JSON is YAML
     if not isinstance(options, dict):
         raise UserError(f"{path}: not a mapping of options")
@@ -89,41 +95,46 @@ def _check_prefix(options: Options) -> None:
         if value not in (0, "add") and not decoder:
             kind = f"{options.arch} with {options.text_encoder_type}"
             raise ValueError(
-                f"{name}={value}: known for trans_dec with bert, not for {kind}. Import a model without it"
+                f"{name}={value}: supported for trans_dec with bert, not for {kind}. Import a "
+                f"model without this option"
             )
     if bool(options.context_len) != bool(options.pred_len):
         lengths = f"context_len={options.context_len}, pred_len={options.pred_len}"
         raise ValueError(
-            f"{lengths}: both are positive in a model that continues frames, or both 0. Correct the file"
+            f"{lengths}: both must be positive (a model that continues frames) or both 0. "
+            f"Correct the file"
         )
 
 
 def check_hyperparameters(checkpoint: Mapping[str, Any], kind: str) -> None:
-    """Raises `ValueError` for a hyperparameter of a checkpoint of FLAME's code that the import does not know."""
+    """Raises `ValueError` for an unknown hyperparameter in a checkpoint of FLAME's code."""
     options = checkpoint.get("hyper_parameters")
     if isinstance(options, Mapping):
         _check_known(options, (), NAMES["options"][kind], "hyper_parameters.")
 
 
 def _check_known(options: Mapping[Any, Any], read: Any, table: Config, prefix: str = "") -> None:
-    """Raises `ValueError` for an unknown option, or one with an effect that our model lacks."""
+    """Raises `ValueError` for an unknown option,
+    or for an option whose effect our model lacks.
+    """
     for name, value in options.items():
         shown = f"{prefix}{shortened(str(name), 40)}={shortened(str(value), 40)}"
         if name in table["neutral"]:
             neutral = table["neutral"][name]
             if value is not None and not _equal(value, neutral):
                 raise ValueError(
-                    f"{shown}: changes the model in a way that is not imported; known is {neutral}. Import a model "
-                    "without it"
+                    f"{shown}: changes the model in a way that cannot be imported; the "
+                    f"supported value is {neutral}. Import a model without this option"
                 )
         elif value is not None and name not in read and name not in table["unused"]:
             raise ValueError(
-                f"{shown}: an unknown option, which may change the network. Import a model without it"
+                f"{shown}: an unknown option, which may change the network. Import a model "
+                f"without this option"
             )
 
 
 def _equal(value: Any, neutral: Any) -> bool:
-    """Returns whether two values are equal; numbers may be texts, as 1e-5 in YAML 1.1."""
+    """Whether two values are equal. A number may be text, such as 1e-5 in YAML 1.1."""
     try:
         return value == neutral or (isinstance(neutral, float) and float(value) == neutral)
     except (TypeError, ValueError):

@@ -1,4 +1,4 @@
-"""Weights of files that the authors of a paper released: reading them, renaming them, and loading all of them."""
+"""Weights in files that the authors of a paper released: reading, renaming and loading them."""
 
 import re
 from collections.abc import Iterable, Mapping
@@ -22,10 +22,11 @@ ENCODER_LAYER, DECODER_LAYER = NAMES["encoder_layer"], NAMES["decoder_layer"]
 def read_released(
     path: Path, *, run_code: bool = False, advice: str = "Save only its state dict"
 ) -> Mapping[str, Any]:
-    """Reads a released file; with `run_code` also pickles of other objects, which runs any code in them.
+    """Reads a released file.
+    `run_code` also reads pickles of other objects, which runs any code in them.
 
-    Raises `UserError` if it is damaged, or holds such objects, with `advice` what to do about
-    them.
+    Raises `UserError` if the file is damaged, or if it holds such objects; `advice` is the end of
+    this message.
     """
     try:
         check_torch(path)
@@ -38,13 +39,13 @@ def read_released(
         raise UserError(
             f"{path}: {error}. The file contains objects of this package. Install the package"
         ) from error
-    except Exception as error:  # torch raises many kinds for damaged files
+    except Exception as error:  # torch raises many kinds of errors for damaged files
         unsafe = re.search(r"Unsupported global: GLOBAL (\S+)", str(error))
         if unsafe is None:
             raise UserError(f"{path}: damaged, or not a PyTorch file. Download it again") from error
         raise UserError(
-            f"{path}: holds Python objects ({unsafe[1]}) besides the weights, and reading them can run any "
-            f"code. {advice}"
+            f"{path}: holds Python objects ({unsafe[1]}) in addition to the weights, and "
+            f"reading them can run any code. {advice}"
         ) from error
     if not isinstance(content, Mapping):
         raise UserError(
@@ -54,7 +55,10 @@ def read_released(
 
 
 def read_weights(path: Path, key: str | None = None) -> dict[str, Tensor]:
-    """Returns the state dict in a released file, or under a key of it; raises `UserError` if there is none."""
+    """Returns the state dict in a released file, or under a key in it.
+
+    Raises `UserError` if there is no state dict.
+    """
     content = read_released(path)
     state = content if key is None else content.get(key)
     if not isinstance(state, Mapping) or not all(
@@ -69,9 +73,9 @@ def read_weights(path: Path, key: str | None = None) -> dict[str, Tensor]:
 def released_state(checkpoint: Mapping[str, Any], *, ema: bool = True) -> dict[str, Tensor]:
     """Returns the network's state dict in the content of a released file.
 
-    That is a flat state dict (MDM, MFM), {"model", "model_avg"} (MDM trained with `--use_ema`) or
-    FLAME's Lightning checkpoint with "state_dict". `ema` takes averaged weights if the file has
-    them, as in the authors' evaluation.
+    The content is a flat state dict (MDM, MFM), {"model", "model_avg"} (MDM trained with
+    `--use_ema`) or FLAME's Lightning checkpoint with "state_dict". `ema`: whether to take
+    averaged weights if the file has them, as in the authors' evaluation.
     """
     prefixes = ("ema_model.model.", "net.") if ema else ("net.",)
     if "model_avg" in checkpoint:
@@ -93,7 +97,9 @@ def released_state(checkpoint: Mapping[str, Any], *, ema: bool = True) -> dict[s
 def layer_names(
     state: Mapping[str, Tensor], stack: str, layer: Mapping[str, str]
 ) -> tuple[dict[str, str], int]:
-    """Returns prefix of each layer of a torch transformer -> prefix of our layer, and the number of layers."""
+    """Returns the number of layers,
+    and a mapping from prefixes of torch's layers to prefixes of ours.
+    """
     count = sum(
         key.startswith(f"{stack}.layers.") and key.endswith(".norm1.weight") for key in state
     )
@@ -102,7 +108,7 @@ def layer_names(
 
 
 def renamed(state: Mapping[str, Tensor], prefixes: Mapping[str, str]) -> dict[str, Tensor]:
-    """Replaces the prefix of every name; raises `ValueError` if a name has none of the prefixes."""
+    """Replaces the prefix of every name; raises `ValueError` if a name has no known prefix."""
     result, unknown = {}, []
     for key, value in state.items():
         theirs = next((prefix for prefix in prefixes if key.startswith(prefix)), None)
@@ -118,7 +124,10 @@ def renamed(state: Mapping[str, Tensor], prefixes: Mapping[str, str]) -> dict[st
 
 
 def shape_of(state: Mapping[str, Tensor], key: str, ndim: int = 2) -> torch.Size:
-    """Returns the shape of a weight; raises `ValueError` if it is missing, or has another number of dimensions."""
+    """Returns the shape of a weight.
+
+    Raises `ValueError` if the weight is missing, or has another number of dimensions.
+    """
     if key not in state:
         raise ValueError(
             f"released weights: {key} is missing: not a network of this kind, or a damaged file"
@@ -133,7 +142,10 @@ def shape_of(state: Mapping[str, Tensor], key: str, ndim: int = 2) -> torch.Size
 def load_strictly(
     network: Network, state: Mapping[str, Tensor], source: str | Path, *, assign: bool = False
 ) -> Network:
-    """Loads all weights into a network, and returns it in evaluation mode; a `UserError` begins with `source`."""
+    """Loads all weights into a network and returns it in evaluation mode.
+
+    The message of a `UserError` begins with `source`.
+    """
     try:
         network.load_state_dict(state, strict=True, assign=assign)
     except RuntimeError as error:

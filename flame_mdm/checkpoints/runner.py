@@ -1,4 +1,5 @@
-"""Sampling from a folder of `flame-mdm export CKPT OUT format=onnx`, with numpy and onnxruntime alone.
+"""Samples from a folder of `flame-mdm export CKPT OUT format=onnx`,
+with only numpy and onnxruntime.
 
 python runner.py FOLDER "a person walks forward" motion.npz seconds=3 seed=0
 
@@ -23,7 +24,7 @@ from typing import Any
 import numpy as np
 
 FORMAT = 1
-MIN_WORDS = 3  # least number of tokens of a graph, with padding
+MIN_WORDS = 3  # minimum number of tokens of a graph, including padding
 WORD = re.compile(r"[^\W_]+")
 NUMBERS = frozenset(
     [
@@ -43,12 +44,16 @@ NUMBERS = frozenset(
     ]
 )
 MASK = (1 << 64) - 1
-LONGEST = 600  # seconds of a motion of a model that continues frames
-GRAPHS = ("denoiser.onnx", "joints.onnx", "poses.onnx")  # the last one only for SMPL's joints
-MAX_DESCRIPTION = 64 * 2**20  # bytes of model.json
-MAX_GRAPH = 2**31  # bytes of an ONNX file, whose format has no larger ones
+LONGEST = 600  # default duration in seconds for a model that continues frames
+# the last graph exists only for SMPL's joints
+GRAPHS = ("denoiser.onnx", "joints.onnx", "poses.onnx")
+MAX_DESCRIPTION = 64 * 2**20  # maximum number of bytes of model.json
+MAX_GRAPH = 2**31  # maximum number of bytes of an ONNX file, the limit of the format
 EXTERNAL_DATA = re.compile(rb"(?:\x08|\x88\x80*\x00)location")
-"""Key that names the file of external data, after its length, which protobuf may write with more bytes than needed."""
+"""Pattern of the key that names a file of external data, after its length.
+
+protobuf may write the length with more bytes than needed.
+"""
 
 
 def _object(required: Sequence[str], **properties: dict[str, Any]) -> dict[str, Any]:
@@ -99,7 +104,10 @@ SCHEMA = _object(
     sha256=_object(GRAPHS[:2], **dict.fromkeys(GRAPHS, HASH)),
     digest=HASH,
 )
-"""JSON schema of `model.json`, in the subset of JSON Schema that `faults` reads. The web page has the same."""
+"""JSON schema of `model.json`, in the subset of JSON Schema that `faults` reads.
+
+The web page has the same schema.
+"""
 TYPES: dict[str, type | tuple[type, ...]] = {
     "object": dict,
     "array": list,
@@ -111,10 +119,11 @@ TYPES: dict[str, type | tuple[type, ...]] = {
 
 
 def faults(value: Any, schema: Mapping[str, Any], name: str = "") -> list[str]:
-    """Returns the dotted names of values that a JSON schema refuses; items have the name of their list.
+    """Returns the dotted names of values that a JSON schema refuses;
+    items have the name of their list.
 
-    The schema has types, bounds of numbers and of numbers of items, patterns of whole texts, and
-    required keys. Objects may have keys that are not in the schema.
+    The schema has types, bounds for numbers and for the number of items, patterns for whole
+    texts, and required keys. Objects may have keys that are not in the schema.
     """
     kind = schema["type"]
     if not _has_type(value, kind):
@@ -149,7 +158,9 @@ def _has_type(value: Any, kind: str) -> bool:
 
 
 def check(content: Any) -> None:
-    """Raises `ValueError` if the content of `model.json` is damaged, changed, or not within the limits of `SCHEMA`."""
+    """Raises `ValueError` if `model.json` is damaged, changed,
+    or not within the limits of `SCHEMA`.
+    """
     if not isinstance(content, dict):
         raise ValueError("model.json is damaged")
     if content.get("format") != FORMAT:
@@ -173,7 +184,9 @@ def check(content: Any) -> None:
 
 
 def read_file(path: Path, most: int) -> bytes:
-    """Returns the content of a regular file of up to `most` bytes; raises `ValueError` or `OSError`."""
+    """Returns the content of a regular file of up to `most` bytes;
+    otherwise raises `ValueError` or `OSError`.
+    """
     if path.exists() and not path.is_file():
         raise ValueError(f"{path.name} is a folder, a pipe or a device")
     with path.open("rb") as file:
@@ -184,13 +197,16 @@ def read_file(path: Path, most: int) -> bytes:
 
 
 def first_line(error: Exception) -> str:
-    """Returns the first line of an error's message, or its type if it has none."""
+    """Returns the first line of an error's message, or the type of an error without a message."""
     lines = str(error).strip().splitlines()
     return lines[0] if lines else type(error).__name__
 
 
 class Sampler:
-    """A model in a folder: `content` of `model.json`, and sessions of onnxruntime; `poses` is None except for SMPL."""
+    """A model in a folder: `content` of `model.json`, and sessions of onnxruntime.
+
+    `poses` is None except for SMPL.
+    """
 
     def __init__(self, folder: str | Path, threads: int = 1):
         """Opens a folder; raises `ValueError` if a file is missing, damaged, too large or of another version."""
@@ -220,7 +236,10 @@ class Sampler:
         return content
 
     def _session(self, name: str, threads: int) -> Any:
-        """Returns a session of a graph. Its weights are in the file: a graph may not name other files to read."""
+        """Returns the session of a graph.
+
+        The weights must be in its file: a graph may not name other files to read.
+        """
         import onnxruntime
 
         graph = read_file(self.folder / name, MAX_GRAPH)
@@ -235,26 +254,29 @@ class Sampler:
         options.add_session_config_entry("session.load_model_format", "ONNX")
         try:
             return onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
-        except Exception as error:  # onnxruntime raises its own kinds
+        except Exception as error:  # onnxruntime raises its own kinds of errors
             raise ValueError(f"{name} is damaged: {first_line(error)}") from error
 
     def unknown(self, text: str) -> list[str]:
-        """Returns the content words of a text that the model does not know; raises `ValueError` if it knows none."""
+        """Returns the content words of a text that the model does not know.
+
+        Raises `ValueError` if it knows no content word.
+        """
         seen, skipped = set(self.content["vocabulary"]), set(self.content["function_words"])
         content = [word for word in dict.fromkeys(words(text)) if seen and word not in skipped]
         unknown = [word for word in content if not known_form(word, seen)]
         if seen and unknown == content:
-            raise ValueError(f"'{text}': the model knows no word of it that says what happens")
+            raise ValueError(f"'{text}': the model knows no word for an action in this text")
         return unknown
 
     def generate(
         self, prompt: str = "", seconds: float | None = None, seed: int = 0, sample: int = 0
     ) -> np.ndarray:
-        """Returns normalized features (F, D) of one motion, for a text or an action; "" for an unconditional model.
+        """Returns normalized features (F, D) of one motion, for a text or an action.
 
-        `sample` numbers the motions of one text; `seconds` is by default up to 3, and at most 600
-        for a model that continues frames. Raises `ValueError` for an unknown length or action,
-        and if the result is not finite.
+        For an unconditional model, the prompt is "". `sample` numbers the motions of one text.
+        The default of `seconds` is up to 3; for a model that continues frames, the maximum is
+        600. Raises `ValueError` for an unknown length or action, and if the result is not finite.
         """
         content = self.content
         fps = content["fps"]
@@ -287,7 +309,9 @@ class Sampler:
         return x
 
     def _sample(self, inputs: dict[str, np.ndarray], frames: int, number: int) -> np.ndarray:
-        """Returns normalized features (F, D) of frames that are sampled together, from noise of a key."""
+        """Returns normalized features (F, D) of frames that are sampled together;
+        `key` determines the noise.
+        """
         content = self.content
         x, draw = normal(number, frames, content["features"]), 1
         before = np.zeros_like(x)
@@ -307,14 +331,15 @@ class Sampler:
         return x
 
     def decode(self, x: np.ndarray) -> np.ndarray:
-        """Returns joints (F, J, 3) in meters, y up, of normalized features (F, D)."""
+        """Returns the joints (F, J, 3) in meters, y up, of normalized features (F, D)."""
         shape = (1, len(x), len(self.content["skeleton"]["joints"]), 3)
         return self._run("joints", {"x": x[None]}, [shape])[0][0]
 
     def rotations(self, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns offsets (22, 3) from the parents in the rest pose (arms out), and local quaternions (F, 22, 4).
+        """Returns the rest pose and the local rotations, only for SMPL's 22 joints.
 
-        Quaternions are (w, x, y, z), the root's in the world. Only for SMPL's 22 joints.
+        Offsets (22, 3) from the parents are in the rest pose, with the arms out. Quaternions (F,
+        22, 4) are (w, x, y, z); the quaternion of the root is in the world.
         """
         if self.poses is None:
             raise ValueError("rotations are computed only for SMPL's 22 joints")
@@ -326,11 +351,14 @@ class Sampler:
     def _run(
         self, name: str, inputs: dict[str, np.ndarray], shapes: Sequence[tuple[int, ...]]
     ) -> list[np.ndarray]:
-        """Returns the outputs of a graph; raises `ValueError` if it cannot run, or has outputs of other shapes."""
+        """Returns the outputs of a graph.
+
+        Raises `ValueError` if it cannot run, or if its outputs have other shapes.
+        """
         session = getattr(self, name)
         try:
             outputs = session.run(None, inputs)
-        except Exception as error:  # onnxruntime raises its own kinds
+        except Exception as error:  # onnxruntime raises its own kinds of errors
             raise ValueError(
                 f"{name}.onnx cannot run: {first_line(error)}. Export the model again"
             ) from error
@@ -359,7 +387,7 @@ class Sampler:
 
 
 def digest(content: dict[str, Any]) -> str:
-    """Returns the hash of the content of `model.json` without its key "digest"."""
+    """Returns the hash of `model.json` without its key "digest"."""
     rest = {name: value for name, value in content.items() if name != "digest"}
     return hashlib.sha256(json.dumps(rest).encode()).hexdigest()
 
@@ -409,7 +437,7 @@ def mixed(counters: np.ndarray) -> np.ndarray:
 
 
 def normal(number: int, frames: int, features: int) -> np.ndarray:
-    """Returns standard normal noise (F, D) float32 of a key; see `flame_mdm.seeds.normal`."""
+    """Returns standard normal noise (F, D) float32 for a key; see `flame_mdm.seeds.normal`."""
     pairs = (features + 1) // 2
     first = mixed(mixed(np.array([number & MASK], np.uint64)))
     positions = np.arange(frames * pairs, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
@@ -425,10 +453,11 @@ def normal(number: int, frames: int, features: int) -> np.ndarray:
 
 
 def write(path: str | Path, **arrays: Any) -> None:
-    """Writes an .npz file under a temporary name that is renamed at the end; a failure leaves no files behind.
+    """Writes an .npz file under a temporary name, and renames it at the end.
 
-    A link at `path` is replaced, and the file it leads to stays as it is. Raises `ValueError` if
-    `path` is a folder, a pipe or a device, and `OSError` if the file cannot be written.
+    A failure leaves no files behind. A link at `path` is replaced; the file to which it leads
+    does not change. Raises `ValueError` if `path` is a folder, a pipe or a device, and `OSError`
+    if the file cannot be written.
     """
     path = Path(path)
     if path.suffix != ".npz":

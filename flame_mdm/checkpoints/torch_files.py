@@ -1,4 +1,4 @@
-"""Files of `torch.save`: sizes, checksums and keys are checked before PyTorch reads them."""
+"""Reads files of `torch.save` after checking their sizes, checksums and keys."""
 
 import io
 import pickle
@@ -11,14 +11,17 @@ from flame_mdm.errors import UserError
 from flame_mdm.safe_io import ZIP_ERRORS, naming, opened_zip, regular_file
 
 LARGEST_KEY = 2**60
-"""Integer keys must be smaller: any number of larger integers may share one hash."""
-LEGACY_PICKLES = 5  # pickles at the beginning of a file of PyTorch before 1.6, not an archive
-# Names of the codec with which PyTorch writes bytes; other codecs may take quadratic time
+"""Integer keys must be smaller than this: any number of larger integers may share one hash."""
+# number of pickles at the beginning of a file of PyTorch before 1.6, which is not an archive
+LEGACY_PICKLES = 5
+# Names of the codec with which PyTorch writes bytes. Other codecs may take quadratic time.
 CODECS = ("latin1", "latin-1")
 
 
 def read_torch(path: Path) -> Any:
-    """Returns the plain values and tensors in a file written by `torch.save`; code in the file is never executed."""
+    """Returns the plain values and tensors in a file of `torch.save`,
+    without executing code in the file.
+    """
     import torch
 
     check_torch(path)
@@ -28,7 +31,9 @@ def read_torch(path: Path) -> Any:
 
 
 def check_torch(path: Path) -> None:
-    """Checks sizes and checksums of an archive of `torch.save`, which `torch.load` does not check."""
+    """Checks the sizes and checksums of an archive of `torch.save`,
+    since `torch.load` does not check them.
+    """
     size = regular_file(path)
     if not _is_archive(path):
         return
@@ -49,12 +54,12 @@ def check_torch(path: Path) -> None:
 
 
 def check_keys(path: Path) -> None:
-    """Raises `UserError` if keys of a file that `torch.load(weights_only=True)` would read may share one hash.
+    """Raises `UserError` if keys in a file may share one hash.
 
-    A dictionary of such keys takes quadratic time: hours for a file of a megabyte. Text has
-    random hashes, and small whole numbers have different ones. The check ends without an error
-    where the pickle names an object that PyTorch refuses, because PyTorch stops there, too, and
-    says which.
+    A dictionary of such keys takes quadratic time in `torch.load(weights_only=True)`: hours for a
+    file of a megabyte. Text has random hashes, and small whole numbers have different hashes. If
+    the pickle names an object that PyTorch refuses, the check ends without an error there,
+    because PyTorch stops at the same place and names the object.
     """
     regular_file(path)
     damage = naming(path, Exception, prefix="damaged, or not a file of plain values and tensors: ")
@@ -76,7 +81,10 @@ def _is_archive(path: Path) -> bool:
 
 
 class _Named:
-    """A function or class that a pickle names, or an object made by it. Nothing is called."""
+    """A function or class that a pickle names, or an object that it would create.
+
+    Nothing is called.
+    """
 
     def __init__(self, name: str):
         self.name = name
@@ -88,11 +96,13 @@ class _Refused(Exception):
 
 CONTAINERS = ("collections.OrderedDict", "collections.Counter", "builtins.set")
 PLAIN = (*CONTAINERS, "_codecs.encode", "builtins.bytearray", "builtins.complex")
-"""What PyTorch lets a pickle name outside of its own modules."""
+"""Names outside of PyTorch's modules that PyTorch accepts in a pickle."""
 
 
 class _KeyCheck(pickle._Unpickler):
-    """Goes through one pickle in the way of PyTorch's restricted reader, and keeps no content of containers."""
+    """Reads a pickle like PyTorch's restricted reader,
+    without keeping the content of containers.
+    """
 
     stack: list[Any]
     append: Callable[[Any], None]
@@ -102,7 +112,7 @@ class _KeyCheck(pickle._Unpickler):
         super().__init__(file, encoding="bytes")
 
     def passes(self) -> bool:
-        """Whether the pickle was read to its end; False where PyTorch stops because of an unknown object."""
+        """Whether the pickle was read to its end; False if PyTorch stops at an unknown object."""
         try:
             self.load()
         except _Refused:
@@ -110,7 +120,7 @@ class _KeyCheck(pickle._Unpickler):
         return True
 
     def find_class(self, module_name: str, global_name: str, /) -> _Named:
-        # PyTorch writes the names of Python 2, as protocol 2 demands, and maps them in this way
+        # PyTorch writes Python 2's names, as protocol 2 demands, and maps them in the same way
         if (module_name, global_name) in NAME_MAPPING:
             module_name, global_name = NAME_MAPPING[module_name, global_name]
         name = f"{IMPORT_MAPPING.get(module_name, module_name)}.{global_name}"
@@ -158,8 +168,8 @@ class _KeyCheck(pickle._Unpickler):
     def _load_set(self) -> None:
         self.append(_Named("builtins.set"))
 
-    # Exactly the instructions that PyTorch's own reader knows, so that no file passes here and
-    # fails there.
+    # Exactly the instructions of PyTorch's own reader, so that a file that passes here does not
+    # fail there.
     dispatch = {  # pyright: ignore[reportAssignmentType]
         code[0]: pickle._Unpickler.dispatch[code[0]]
         for code in (
@@ -203,7 +213,10 @@ class _KeyCheck(pickle._Unpickler):
 
 
 def _check_container(name: str, arguments: Sequence[Any]) -> None:
-    """Checks the keys that a container gets when it is made: OrderedDict([(key, value), ...]) or set([key, ...])."""
+    """Checks the keys with which a container is created.
+
+    Such as OrderedDict([(key, value), ...]) or set([key, ...]).
+    """
     for content in arguments:
         if name == "collections.Counter" and not isinstance(content, dict):
             raise pickle.UnpicklingError("a counter that is not made from a dictionary")

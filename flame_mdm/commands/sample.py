@@ -59,7 +59,7 @@ class SampleSettings(OutputSettings, WritingSettings):
 
     OBJECTS: ClassVar = ("ckpt", "out")
     prompts: str | None = option(
-        None, "instead of text: a file with one prompt per line; each gets its own folder"
+        None, "instead of text: a file with one prompt per line; each prompt gets its own folder"
     )
     seconds: float | Sequence[float] | None = same_option(SamplingRequest, "seconds")
     frames: int | Sequence[int] | None = same_option(SamplingRequest, "frames")
@@ -69,20 +69,21 @@ class SampleSettings(OutputSettings, WritingSettings):
     path: str | None = same_option(SamplingRequest, "path")
     candidates: int = same_option(SamplingRequest, "candidates")
     set: str | None = option(
-        None, "instead of text: locomotion, or a .yaml file: docs/sampling.md#sets-for-game-engines"
+        None,
+        "instead of text: locomotion, or a .yaml file; see docs/sampling.md#sets-for-game-engines",
     )
-    format: str | None = option(None, "format of the files of a set: fbx, glb, usda, usdc or usdz")
+    format: str | None = option(None, "format of a set's files: fbx, glb, usda, usdc or usdz")
     scorer: str | None = option(
         None,
-        "claims, or a motion-CLIP: chooses the candidate that fits the text best",
+        "chooses the candidate that fits the text best: claims, or a motion-CLIP",
         scorer_source,
     )
     shared_noise: bool = same_option(SamplingRequest, "shared_noise")
     samples: int | None = option(
-        None, "motions per text or action; default 3, or 1 if OUT is a file"
+        None, "motions per text or action; default: 3, or 1 if OUT is a file"
     )
     out: str | None = option(
-        None, "a folder, default samples/<experiment>/<text>-<hash>; or a motion file"
+        None, "a folder or a motion file; default: the folder samples/<experiment>/<text>-<hash>"
     )
 
     @property
@@ -116,21 +117,24 @@ class SampleSettings(OutputSettings, WritingSettings):
                 if entry.name not in of_sets and value != entry.default:
                     shown = f"{entry.name}={shortened(str(value), 60)}"
                     raise UserError(
-                        f"{shown}: a set says what is sampled, and how it is cut. Omit {entry.name}"
+                        f"{shown}: a set determines which motions are sampled, and how they are "
+                        f"cut. Omit {entry.name}"
                     )
             if self.file is not None:
-                raise UserError(f"out={self.out}: a set is several files. Name a folder")
+                raise UserError(f"out={self.out}: a set has several files. Name a folder")
             return
         if self.format is not None:
             raise UserError(
-                f"format={self.format} is for sets; the ending of OUT is the format of one file"
+                f"format={self.format} is for sets. For one file, the ending of OUT determines "
+                f"the format"
             )
         if self.file is None:
             for key in ("rig", "root_motion", "resample", "character"):
                 if value := getattr(self, key):
                     advice = "Name a file, such as out=walk.fbx"
                     raise UserError(
-                        f"{key}={str(value).lower()}: a folder gets motions as they are. {advice}"
+                        f"{key}={str(value).lower()}: motions in a folder are not converted. "
+                        f"{advice}"
                     )
             return
         for key in ("prompts", "mp4", "trajectory"):
@@ -141,7 +145,7 @@ class SampleSettings(OutputSettings, WritingSettings):
                 )
 
     def set_content(self, source: str) -> MotionSet:
-        """Returns the description of a set, changed by the keys that say how it is written."""
+        """Returns the description of a set after applying the keys for written files."""
         from flame_mdm.sampling.motion_sets import changed, read_set
 
         keys = {"rig": self.rig, "format": self.format, "fps": self.resample}
@@ -150,12 +154,12 @@ class SampleSettings(OutputSettings, WritingSettings):
         )
 
     def conditions(self) -> list[str]:
-        """Returns the keys that say which motions are requested, a file of prompts and a set included."""
+        """Returns the keys that request motions, including a file of prompts and a set."""
         sources = [key for key in ("prompts", "set") if getattr(self, key) is not None]
         return [*super().conditions(), *sources]
 
     def request_for(self, prompts: PromptFile | None) -> SamplingRequest:
-        """Returns what is requested of the model, for the accepted prompts of a file if there is one."""
+        """Returns the request to the model; with a file of prompts, for its accepted prompts."""
         default = 3 if self.file is None else 1
         samples = default if self.samples is None else self.samples
         if prompts is None:
@@ -173,7 +177,8 @@ class SampleSettings(OutputSettings, WritingSettings):
             )
         if self.scorer is not None and (request.kind != "text" or self.candidates == 1):
             raise UserError(
-                f"scorer={self.scorer} chooses among motions for a text: give text=... and candidates=8"
+                f"scorer={self.scorer} chooses among motions for a text. Give text=... and "
+                f"candidates=8"
             )
         return request
 
@@ -194,8 +199,11 @@ def main(settings: SampleSettings) -> None:
 
 
 def _sample(settings: SampleSettings, request: SamplingRequest, prompts: PromptFile | None) -> None:
-    """Samples and writes the motions of a request; prompts of a file that the model cannot sample are refused."""
-    loaded = settings.load()  # finds the file before PyTorch is imported
+    """Samples and writes the motions of a request.
+
+    Prompts of a file that the model cannot sample are refused.
+    """
+    loaded = settings.load()  # a missing file is reported before PyTorch is imported
     character = settings.read_character()
     from flame_mdm.sampling.generation import sample
     from flame_mdm.sampling.output import SAMPLES, degenerate_notes, summary, write_motions
@@ -254,7 +262,7 @@ def _sample_set(settings: SampleSettings, source: str) -> None:
     """Samples and writes a set of clips."""
     content = settings.set_content(source)
     texts = [motion.text for motion in content.motions.values()]
-    _ = settings.request(texts=texts, samples=1)  # raises before the model is loaded
+    _ = settings.request(texts=texts, samples=1)  # raises errors before the model is loaded
     loaded = settings.load()
     from flame_mdm.sampling.motion_sets import make_set, write_set
     from flame_mdm.sampling.output import SAMPLES, default_folder
@@ -289,7 +297,9 @@ def _write_files(
     body: Mesh,
     facts: dict[str, Any],
 ) -> None:
-    """Writes the first motion as `file`; further ones have numbers in their names, walk_2.fbx, walk_3.fbx."""
+    """Writes the first motion as `file`,
+    and further motions with numbers: walk_2.fbx, walk_3.fbx.
+    """
     for number, motion in enumerate(motions, 1):
         path = file if number == 1 else file.with_stem(f"{file.stem}_{number}")
         written = settings.at_rate(motion)
@@ -297,7 +307,10 @@ def _write_files(
 
 
 def _score(source: str, model: MotionGenerator) -> Score:
-    """Returns the score of candidates by claims or by a motion-CLIP; `UserError` if it cannot read their motions."""
+    """Returns the function that scores candidates, by claims or by a motion-CLIP.
+
+    Raises `UserError` if it cannot read the model's motions.
+    """
     if source == CLAIMS:
         return claims_score(model)
     from evaluators.extractors import MotionCLIPExtractor
@@ -311,7 +324,10 @@ def _score(source: str, model: MotionGenerator) -> Score:
 
 
 def claims_score(model: MotionGenerator) -> Score:
-    """Returns the score of candidates by the claims of their texts; `UserError` for motions on another skeleton."""
+    """Returns the function that scores candidates by the claims of their texts.
+
+    Raises `UserError` for motions of another skeleton.
+    """
     from flame_mdm.representations.skeleton import SMPL22
     from flame_mdm.sampling.referee.judging import claim_score
 
@@ -331,7 +347,10 @@ def _folders(
     digest: str,
     motions: Sequence[Motion],
 ) -> dict[Path, list[Motion]]:
-    """Returns the folders to write, with the motions of each; a prompt that is listed twice has one folder."""
+    """Returns the folders to write with their motions.
+
+    A prompt that is listed twice has one folder.
+    """
     from flame_mdm.sampling.output import default_folder
 
     request = resolved.request
@@ -364,7 +383,9 @@ def _distance(targets: Targets, motions: Sequence[Motion]) -> str:
 
 
 def _gallery(prompts: PromptFile, folders: Mapping[Path, list[Motion]], body: Mesh) -> str:
-    """Writes the page that shows the first motion of each prompt; returns the line that names it."""
+    """Writes the page that shows the first motion of each prompt;
+    returns a message with its path.
+    """
     from flame_mdm.visualize import write_player
 
     page = next(iter(folders)).with_name(f"{Path(prompts.path).stem}.html")

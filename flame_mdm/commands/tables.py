@@ -1,4 +1,6 @@
-"""`flame-mdm tables [NAME ...]`: renders tables and figures from results, and evaluates what is missing."""
+"""`flame-mdm tables [NAME ...]`:
+renders tables and figures from results; evaluates missing results.
+"""
 
 import os
 from collections.abc import Mapping, Set
@@ -24,25 +26,26 @@ INVALID = 3  # exit code if a requested row is not valid
 class TablesSettings:
     """usage: flame-mdm tables [NAME ...] [evaluate=false] [out=FOLDER]
 
-    Renders tables and figures as Markdown, LaTeX, CSV and HTML. A table is described by a file in experiments/tables,
-    or by your own file, which names checkpoints, a protocol and columns. Checkpoints without a result are evaluated
-    first; evaluate=false uses existing results only. Output is deterministic: the same results give the same bytes.
-    Exit codes: 0; 1 = wrong input, or an evaluation failed; 3 = a requested row is NOT VALID, the tables are written.
+    Renders tables and figures as Markdown, LaTeX, CSV and HTML. A table is described by a file in
+    experiments/tables, or by your own file, which names checkpoints, a protocol and columns.
+    Checkpoints without a result are evaluated first; evaluate=false only uses existing results.
+    The same results give the same bytes. Exit codes: 0 = success; 1 = wrong input, or an
+    evaluation failed; 3 = the tables are written, but a requested row is NOT VALID.
     """
 
     OBJECTS: ClassVar = ("table",)
     table: list[str] | None = option(
         None, "names in experiments/tables, or paths of specs; default: all"
     )
-    evaluate: bool = option(True, "evaluate what is missing; false = render existing results only")
+    evaluate: bool = option(True, "evaluate missing results; false = only render existing results")
     out: str = option("runs/tables", "folder of the tables")
     results: str = option("runs/results", "folder of the results")
     device: str | None = option(
-        None, "device of the evaluations, such as cpu or cuda; default: cuda if there is one"
+        None, "device of the evaluations, such as cpu or cuda; default: cuda if available"
     )
     batch_size: int = option(64, "motions per batch")
     force: bool = option(
-        False, "generate even if real motions miss the values that the protocol expects"
+        False, "generate even if real motions do not have the values that the protocol expects"
     )
     data_root: str = option(
         "", "folder of the prepared data sets; default: the checkpoint's, or FLAME_MDM_DATA"
@@ -85,13 +88,16 @@ def main(settings: TablesSettings) -> None:
 def evaluate_missing(
     specs: Mapping[str, Config], results: Path, settings: TablesSettings
 ) -> list[str]:
-    """Runs evaluations whose results are missing or outdated, and counts lengths; returns one line per failure."""
+    """Runs evaluations with missing or outdated results, and counts lengths.
+
+    Returns one line per failure.
+    """
     from evaluators.evaluation import evaluate
     from evaluators.evaluation_request import EvaluationRequest
     from evaluators.protocol import protocol_config
 
     listed: dict[Path, Evaluation] = {}
-    shown: dict[Path, set[str]] = {}  # values that the tables show of each result
+    shown: dict[Path, set[str]] = {}  # values of each result that the tables show
     for part in (part for spec in specs.values() for part in spec["parts"].values()):
         for dataset in part.get("lengths", []):
             count_lengths(dataset, results, settings)
@@ -129,7 +135,9 @@ def evaluate_missing(
 
 
 def shows_multimodality(evaluation: Evaluation, values: Set[str]) -> bool:
-    """Returns whether `values` need several motions per prompt, which take most of the time of an evaluation."""
+    """Whether `values` need several motions per prompt,
+    which take most of the time of an evaluation.
+    """
     from evaluators.protocol import protocol_config
 
     several = protocol_config(evaluation.keys["protocol"]).get("multimodality") or {"metrics": {}}
@@ -139,13 +147,13 @@ def shows_multimodality(evaluation: Evaluation, values: Set[str]) -> bool:
 def outdated(path: Path, evaluation: Evaluation, values: Set[str] = frozenset()) -> bool:
     """Returns whether a result must be measured again.
 
-    That is the case if its checkpoint, extractor or motion files have changed, if SMPL's model file is available now,
-    or if it lacks metrics that need several motions per prompt.
+    A result is outdated if its checkpoint, extractor or motion files have changed, if SMPL's
+    model file has become available, or if it lacks metrics that need several motions per prompt.
 
     Args:
         path: the result.
         evaluation: the evaluation that a table needs.
-        values: the values that tables show of the result.
+        values: the values of the result that tables show.
     """
     from evaluators.sources import sample_files, sha256_of_samples
     from flame_mdm.checkpoints.model_files import weights_sha256
@@ -172,7 +180,7 @@ def outdated(path: Path, evaluation: Evaluation, values: Set[str] = frozenset())
 
 
 def count_lengths(dataset: str, results: Path, settings: TablesSettings) -> None:
-    """Writes the motion lengths of a data set to `results`; prints a message if the data set is not prepared."""
+    """Writes the motion lengths of a data set to `results`, or prints that it is not prepared."""
     nodes = compose_data(
         dataset, data_root=settings.data_root or os.environ.get("FLAME_MDM_DATA", "data")
     )

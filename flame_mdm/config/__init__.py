@@ -1,7 +1,8 @@
-"""Configuration: command lines, recipes composed by Hydra, checks against signatures, instantiation.
+"""Configuration: command lines, recipes composed by Hydra,
+checks against signatures, instantiation.
 
-Nothing here imports torch or Lightning, so that `--help` and errors about misspelled keys are
-immediate.
+These modules do not import torch or Lightning, so that `--help` and errors about misspelled keys
+are immediate.
 """
 
 from flame_mdm.config.building import (

@@ -1,4 +1,6 @@
-"""Instantiation of configurations, checks of untrusted ones, reading and writing of configuration files."""
+"""Instantiates configurations, checks untrusted configurations,
+and reads and writes their files.
+"""
 
 import ast
 import copy
@@ -31,26 +33,30 @@ MODULES = {
     "representation": ("flame_mdm.representations",),
     "data": ("flame_mdm.data",),
 }
-"""Modules whose classes a configuration from a checkpoint may name, by part of the configuration."""
+"""Modules whose classes a checkpoint's configuration may name, by part of the configuration."""
 RENAMED = {
     "flame_mdm.task.MotionGeneration": "flame_mdm.task.GeneratorTask",
     "flame_mdm.training.distillation.ConsistencyDistillation": "flame_mdm.training.distillation.DistillationTask",
 }
-"""Names of classes in configurations of version 0.2, and their names today."""
+"""Names of classes in configurations of version 0.2, and their current names."""
 ADAPTED = {"flame_mdm.task.GeneratorTask": "flame_mdm.training.adaptation.AdaptationTask"}
-"""Tasks of adaptations, whose configurations have a key `base`: in version 0.2, and today."""
+"""Tasks of adaptations, whose configurations have a key `base`: in version 0.2, and currently."""
 MOST_VALUES, MOST_LEVELS = 1_000_000, 50
-"""Limits of a configuration in a file: number of values, and depth of nested mappings and lists."""
+"""Limits of a configuration file: number of values, and depth of nested mappings and lists."""
 RUN_DIR = "${run.dir}"
-"""Placeholder for the run directory in a saved `config.yaml`, so that `run.dir=...` changes all paths in it."""
+"""Placeholder for the run directory in a saved `config.yaml`.
+
+With it, `run.dir=...` changes all paths in the run directory.
+"""
 
 
 def plain(config: Any, where: str | Path, *, but: str = "") -> None:
-    """Checks that the content of the untrusted file `where` has only plain values and no interpolations.
+    """Checks that the content of the untrusted file `where` only
+    has plain values and no interpolations.
 
-    Hydra and OmegaConf resolve interpolations (`${...}`), which can run any code and read any environment variable. The
-    one in `but` is allowed at the beginning of a text. Raises `UserError`, also if the content is nested too deeply, or
-    contains itself.
+    Hydra and OmegaConf resolve interpolations (`${...}`), which can run any code and read any
+    environment variable. The interpolation `but` is allowed at the beginning of a text. Raises
+    `UserError`, also if the content is nested too deeply, or contains itself.
     """
     count = 0
 
@@ -67,8 +73,9 @@ def plain(config: Any, where: str | Path, *, but: str = "") -> None:
                 check_value(name, path)
         elif isinstance(value, str) and "${" in value.removeprefix(but):
             raise UserError(
-                f"{where}: {'.'.join(path) or 'a key'} holds an interpolation, {shortened(value, 60)}. Write the value "
-                "itself: such files may only hold plain values"
+                f"{where}: {'.'.join(path) or 'a key'} holds an interpolation, "
+                f"{shortened(value, 60)}. Write the value itself: this file may only hold plain "
+                f"values"
             )
         elif not isinstance(value, str | int | float | None):
             raise UserError(
@@ -79,7 +86,9 @@ def plain(config: Any, where: str | Path, *, but: str = "") -> None:
 
 
 def renamed(config: Config) -> Config:
-    """Returns a configuration with the current names of its classes; an earlier version may have written it."""
+    """Returns a configuration, perhaps of an earlier version,
+    with the current names of its classes.
+    """
     task = config.get("task")
     if not isinstance(task, Mapping):
         return config
@@ -100,7 +109,10 @@ def read_saved(path: Path) -> Config:
 
 
 def movable(config: Config) -> Config:
-    """Returns a configuration with `RUN_DIR` for the run directory, so that `run.dir` changes all paths in it."""
+    """Returns a configuration with `RUN_DIR` for the run directory.
+
+    `run.dir` then changes all paths in the run directory.
+    """
     folders = {str(config["run"]["dir"]): RUN_DIR}
     return {
         name: value if name == "run" else moved(value, folders) for name, value in config.items()
@@ -126,7 +138,8 @@ def instantiate(node: Config, offered: Mapping[str, Any] | None = None, /, **der
 
     Args:
         node: the mapping.
-        offered: further arguments, of which the object gets those that its class or function takes.
+        offered: further arguments. The object gets the arguments that its class or function
+            takes.
         derived: further arguments, all of which the object gets.
     """
     name = node.get("_target_") if isinstance(node, Mapping) else None
@@ -174,11 +187,12 @@ def save(config: Config, path: Path, head: str = "") -> None:
 
 
 def trust(config: Config) -> None:
-    """Checks that parts of a configuration from a checkpoint only name classes of their kind, with legal arguments.
+    """Checks that the parts
+    of a checkpoint's configuration only name legal classes and arguments.
 
-    A class is of the kind of a part if it is defined in a module that `MODULES` lists for this part, or named by a file
-    in the folder of `experiments/` for this part. The environment variable FLAME_MDM_TRUST adds packages, separated by
-    commas. Nothing that the configuration names is imported here.
+    A class is legal for a part if `MODULES` lists its module for this part, or if a file in the
+    part's folder of `experiments/` names it. The environment variable FLAME_MDM_TRUST adds
+    packages, separated by commas. This check does not import the classes.
     """
     names = [name.strip() for name in os.environ.get("FLAME_MDM_TRUST", "").split(",")]
     added = [name for name in names if name]

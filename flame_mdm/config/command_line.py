@@ -1,4 +1,6 @@
-"""Command lines: a dataclass per command declares its keys; signals, errors and exit codes."""
+"""Command lines, with one dataclass per command that declares its keys;
+signals, errors, exit codes.
+"""
 
 import os
 import re
@@ -20,24 +22,26 @@ from flame_mdm.safe_io import FULL
 from flame_mdm.signals import stoppable
 
 Settings = TypeVar("Settings")
-"""Dataclass of a command: its docstring is the usage, its fields made by `option` are the keys.
+"""Dataclass of a command. Its docstring is the usage; its fields made by `option` are the keys.
 
-`OBJECTS` names the keys of the leading words that have no key. The last one takes all remaining words if it is a list.
-`SWEEPS` is True if the command takes --multirun and launch=, as in `flame_mdm.config.jobs`.
-A field `composed` receives the words for Hydra: keys with a dot, such as `data.source.path`, and keys and options in
-`COMPOSED`.
+`OBJECTS` names the keys for leading words without a key. If the last of these keys is a list, it
+takes all remaining words. `SWEEPS` is True if the command takes --multirun and launch=, as in
+`flame_mdm.config.jobs`. A field `composed` receives the words for Hydra: keys with a dot, such as
+`data.source.path`, and the keys and options in `COMPOSED`.
 """
 
-STOP = (signal.SIGINT, signal.SIGTERM)  # signals that end a command after it has cleaned up
+STOP = (signal.SIGINT, signal.SIGTERM)  # signals after which a command cleans up and ends
 
-TEXT = ("str", "str | None")  # annotations of keys whose values are any text
+TEXT = ("str", "str | None")  # annotations of keys that take any text
 
-BUG = 70  # exit code of a bug, as in sysexits.h
+BUG = 70  # exit code for a bug, as in sysexits.h
 
 NO_MEMORY = re.compile(
     "allocate memory|out of memory|bad_alloc|start new thread|create a primitive|failed to map"
 )
-"""Messages of errors caused by a lack of memory: from torch, from threads, and from libraries that fail to load."""
+"""Messages of errors that a lack of memory causes in torch,
+in threads, and in loading libraries.
+"""
 
 
 def run(command: Callable[[Settings], None], kind: type[Settings], argv: Sequence[str]) -> int:
@@ -51,7 +55,7 @@ def run(command: Callable[[Settings], None], kind: type[Settings], argv: Sequenc
 
 
 def checked_settings(kind: type[Settings], words: Sequence[str]) -> Settings:
-    """Returns settings as `read_settings` does, after the checks that their fields declare."""
+    """Returns settings like `read_settings`, after the checks that their fields declare."""
     settings = read_settings(kind, words)
     for entry in fields(kind):  # type: ignore[arg-type]
         value, check = getattr(settings, entry.name), entry.metadata.get("check")
@@ -61,10 +65,10 @@ def checked_settings(kind: type[Settings], words: Sequence[str]) -> Settings:
 
 
 def read_settings(kind: type[Settings], words: Sequence[str]) -> Settings:
-    """Returns settings.
+    """Reads the settings of a command from its words.
 
-    Texts are taken literally, lists of texts are split as in a shell, and other values have
-    Hydra's grammar.
+    Text is taken literally, lists of texts are split as in a shell, and other values have Hydra's
+    grammar.
     """
     annotations = _annotations(kind)
     values: dict[str, Any] = {}
@@ -120,16 +124,18 @@ def _value(key: str, text: str, annotation: str, sweeps: bool) -> Any:
             ) from error
         if not names or not all(names):
             raise UserError(
-                f"{key}={text}: no name given. Give at least one; separate several by spaces"
+                f"{key}={text}: no name given. Give at least one name; separate several names "
+                f"with spaces"
             )
         return names
     override = parse([f"{key}={text}"])[0]
     if override.is_sweep_override() and sweeps:
         raise UserError(
-            f"{key}={text}: several values make a sweep, one job for each. Add --multirun, or give one"
+            f"{key}={text}: several values make a sweep with one job per value. Add --multirun, "
+            f"or give one value"
         )
     if override.is_sweep_override():
-        raise UserError(f"{key}={text}: several values. Give one, or a list: {key}=[{text}]")
+        raise UserError(f"{key}={text}: several values. Give one value, or a list: {key}=[{text}]")
     value = override.value()
     check_kind(key, value, annotation)
     return value
@@ -141,7 +147,7 @@ def is_text(kind: type[Any], key: str) -> bool:
 
 
 def with_keys(kind: type[Any], words: Sequence[str]) -> list[str]:
-    """Adds the keys of the objects of a command to the leading words that have no key."""
+    """Adds the keys of a command's objects to its leading words, which have no key."""
     objects, annotations = getattr(kind, "OBJECTS", ()), _annotations(kind)
     leading = list(takewhile(_is_object, words))
     rest = list(words[len(leading) :])
@@ -153,8 +159,10 @@ def with_keys(kind: type[Any], words: Sequence[str]) -> list[str]:
         leading[len(objects) - 1 :] = [shlex.join(leading[len(objects) - 1 :])]
     for key in objects[: len(leading)]:
         if any(word.startswith(f"{key}=") for word in rest):
-            raise UserError(f"{key} is given twice: once without a key, and as {key}=. Remove one")
-    # Surplus words remain unchanged; they are refused later because they have no value.
+            raise UserError(
+                f"{key} is given twice: once without a key, and as {key}=. Remove one of them"
+            )
+    # Surplus words remain unchanged. They are refused later, because they have no value.
     keyed = [f"{key}={word}" for key, word in zip(objects, leading, strict=False)]
     return keyed + leading[len(objects) :] + rest
 
@@ -196,10 +204,10 @@ def _help(kind: type[Any]) -> list[str]:
 
 
 def make_variables() -> list[str]:
-    """Returns the variables given to make, as words: `EXP` names the recipe, other upper-case names are keys.
+    """Returns the variables given to make as words.
 
-    Make passes them in MAKEFLAGS after ` -- `, latest first, with escaped spaces and doubled
-    dollar signs.
+    `EXP` names the recipe; other upper-case names are keys. Make passes the variables in
+    MAKEFLAGS after ` -- `, latest first, with escaped spaces and doubled dollar signs.
     """
     variables = (" " + os.environ.get("MAKEFLAGS", "")).partition(" -- ")[2]
     words = [
@@ -213,12 +221,11 @@ def make_variables() -> list[str]:
 
 
 def guarded(action: Callable[[], None], signums: Sequence[int] = ()) -> int:
-    """Runs `action` and returns the exit code; a signal of `signums` ends it after it has cleaned
-    up.
+    """Runs `action` and returns the exit code.
 
-    Prints an error that the user can fix as one line and returns 1; FLAME_MDM_TRACEBACK=1 prints
-    the traceback first. Any other exception is a bug: prints the traceback and how to report it,
-    and returns `BUG`.
+    A signal of `signums` ends the action after it has cleaned up. Prints an error that the user
+    can fix as one line and returns 1; FLAME_MDM_TRACEBACK=1 prints the traceback first. Any other
+    exception is a bug: prints the traceback with a request to report it, and returns `BUG`.
     """
     try:
         with stoppable(signums):
@@ -231,7 +238,7 @@ def guarded(action: Callable[[], None], signums: Sequence[int] = ()) -> int:
     except Exception as error:
         verbose = os.environ.get("FLAME_MDM_TRACEBACK") == "1"
         if isinstance(error, MemoryError) and not verbose:
-            # frees what the frames hold: printing a line takes memory, too
+            # frees the variables of the frames, since printing a line takes memory, too
             error.__traceback__ = None
         line = explanation(error)
         if line is None or verbose:
@@ -248,7 +255,10 @@ def guarded(action: Callable[[], None], signums: Sequence[int] = ()) -> int:
 
 
 def explanation(error: Exception) -> str | None:
-    """Returns the line for an error that the user can fix: a `UserError`, a file or a lack of memory. None = a bug."""
+    """Returns the line for an error that the user can fix; None for a bug.
+
+    Such errors are a `UserError`, errors of files, and a lack of memory.
+    """
     if isinstance(error, UserError):
         return first_line(error)
     if isinstance(error, MemoryError) or NO_MEMORY.search(str(error)):

@@ -27,11 +27,14 @@ from flame_mdm.config.signatures import (
 from flame_mdm.errors import UserError, did_you_mean, first_line
 from flame_mdm.safe_io import read_yaml
 
-LAUNCH = "launch"  # the folder of `experiments/` with launchers, which start jobs on a cluster
+LAUNCH = "launch"  # folder of `experiments/` with launchers, which start jobs on a cluster
 
 
 def groups() -> list[str]:
-    """Returns the replaceable parts of a recipe: folders of `experiments/` whose files are options, not recipes."""
+    """Returns the replaceable parts of a recipe.
+
+    They are folders of `experiments/` whose files are options, not recipes.
+    """
     folders = {name.partition("/")[0] for name in recipes()}
     return sorted(p.name for p in EXPERIMENTS.iterdir() if p.is_dir() and p.name not in folders)
 
@@ -50,7 +53,7 @@ def compose(name: str, overrides: Sequence[str] = ()) -> Config:
         overrides: words such as `denoiser=mdm_unet` or `optimizer.lr=1e-4`.
 
     Raises:
-        UserError: for an unknown recipe, group or key, or a value of the wrong type.
+        UserError: For an unknown recipe, group or key, or for a value of the wrong type.
     """
     source = find_recipe(name)
     return resolve(source, *prepare_overrides(source, overrides))
@@ -75,7 +78,8 @@ class ConfigSource(NamedTuple):
     folder: Path
     # Name of the file in `folder` without its suffix; None = an empty configuration
     stem: str | None
-    saved: bool = False  # whether it is a resolved configuration, whose parts cannot be replaced
+    # whether the configuration is resolved, so that its parts cannot be replaced
+    saved: bool = False
 
 
 def prepare_overrides(
@@ -88,7 +92,7 @@ def prepare_overrides(
     """
     parsed = parse(overrides)
     _check_groups(parsed, recipe)
-    if recipe.saved:  # its parts are fixed, so that the launcher is an addition
+    if recipe.saved:  # the parts are fixed, so the launcher is added
         parsed = parse(
             [f"+{word}" if word.startswith(f"{LAUNCH}=") else word for word in overrides]
         )
@@ -99,7 +103,7 @@ def prepare_overrides(
     if recipe.stem and not recipe.saved:
         first.append(f"experiment={recipe.stem}")
     if not parsed:
-        return first, {}  # nothing to compare with the recipe
+        return first, {}  # there is nothing to compare with the recipe
     parts = [o for o in parsed if _is_group(o)]
     composed = resolve(recipe, [*first, *map(first_choice, parts)])
     keys = [_legal(composed, o) for o in parsed if not _is_group(o)]
@@ -107,7 +111,7 @@ def prepare_overrides(
 
 
 def first_choice(override: Override) -> str:
-    """Returns the override; for a sweep, the override with its first value."""
+    """Returns the override. The override of a sweep is returned with its first value only."""
     if override.is_sweep_override():
         return f"{override.get_key_element()}={choices(override)[0]}"
     return str(override.input_line)
@@ -126,8 +130,8 @@ def _options(group: str) -> list[str]:
 
 
 def find_recipe(name: str) -> ConfigSource:
-    """Returns where the recipe of an experiment is: a .yaml file, or a name such as
-    `humanml3d/mdm`.
+    """Returns the location of an experiment's recipe:
+    a .yaml file, or a name such as `humanml3d/mdm`.
 
     Raises `UserError` for a name or file that does not exist.
     """
@@ -135,7 +139,7 @@ def find_recipe(name: str) -> ConfigSource:
         path = Path(name).resolve()
         if not path.is_file():
             raise UserError(
-                f"{name}: no such file. EXP takes an experiment or the path of a config.yaml"
+                f"{name}: no such file. Give EXP an experiment or the path of a config.yaml"
             )
         content = read_yaml(path)
         if not isinstance(content, dict):
@@ -156,7 +160,7 @@ def find_recipe(name: str) -> ConfigSource:
 def quoted(word: str) -> str:
     """Returns a word `key=value` whose value Hydra takes literally."""
     key, _, value = word.partition("=")
-    # Hydra takes a backslash literally, except right before a quote, where it has to be doubled.
+    # Hydra takes a backslash literally, except right before a quote, where it must be doubled.
     escaped = re.sub(r"(\\*)('|$)", lambda m: m[1] * 2 + ("\\'" if m[2] else ""), value).replace(
         "${", "\\${"
     )
@@ -164,8 +168,9 @@ def quoted(word: str) -> str:
 
 
 def parse(overrides: Sequence[str]) -> list[Override]:
-    """Parses overrides in Hydra's grammar; raises `UserError` with advice if one cannot be
-    parsed.
+    """Parses overrides in Hydra's grammar.
+
+    If an override cannot be parsed, raises a `UserError` with advice.
     """
     try:
         return OverridesParser.create().parse_overrides(list(overrides))
@@ -203,8 +208,7 @@ def _check_groups(overrides: Sequence[Override], recipe: ConfigSource) -> None:
 def resolve(source: ConfigSource, overrides: list[str], base: Config | None = None) -> Config:
     """Composes a configuration with prepared overrides.
 
-    If `base` is given, checks the configuration: values must have the types of the values in
-    `base`.
+    If `base` is given, the values must have the types of the values in `base`.
     """
     config = compose_unchecked(source, overrides)
     if base is not None:
@@ -215,7 +219,9 @@ def resolve(source: ConfigSource, overrides: list[str], base: Config | None = No
 
 
 def compose_unchecked(source: ConfigSource, overrides: list[str]) -> Config:
-    """Composes a configuration with prepared overrides; raises `UserError` if Hydra cannot."""
+    """Composes a configuration with prepared overrides;
+    raises `UserError` for errors of Hydra.
+    """
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(version_base="1.3", config_dir=str(source.folder)):
@@ -227,7 +233,10 @@ def compose_unchecked(source: ConfigSource, overrides: list[str]) -> Config:
 
 
 def _legal(config: Config, override: Override) -> str:
-    """Returns the override as text for Hydra; raises `UserError` if neither recipe nor `_target_` has its key."""
+    """Returns an override as text for Hydra.
+
+    Raises `UserError` if neither the recipe nor a `_target_` has its key.
+    """
     line = str(override.input_line)
     if (
         override.is_delete()

@@ -1,4 +1,4 @@
-"""Command lines that run several jobs: sweeps over values of their keys, and jobs for a launcher."""
+"""Command lines with several jobs: sweeps over values of keys, and jobs for a launcher."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -23,15 +23,18 @@ from flame_mdm.safe_io.paths import check_tree
 Settings = TypeVar("Settings")
 
 FOLDER = Path("runs") / "sweeps"
-"""Folder of the logs of jobs that a launcher starts; each job writes its results where it would without a launcher."""
+"""Folder for the logs of jobs that a launcher starts.
+
+Each job writes its results to the same place as without a launcher.
+"""
 
 
 def run_jobs(command: Callable[[Settings], None], kind: type[Settings], argv: Sequence[str]) -> int:
     """Runs a command line `[OBJECT [OUT]] key=value ... [--multirun]` and returns the exit code.
 
     With `--multirun`, values separated by commas are a sweep: one job per combination, one after
-    the other. `launch=...` passes the jobs of a sweep, or the only job, to that launcher, and
-    waits for them. The values of keys that take any text, such as paths, are never split.
+    the other. `launch=...` passes the jobs of a sweep, or the only job, to a launcher, and waits
+    for them. Values of keys that take any text, such as paths, are never split.
     """
     words = make_variables() if "--from-make" in argv else list(argv)
     asks_for_help = any(word in ("-h", "--help") for word in words)
@@ -53,7 +56,7 @@ def _serve(
     jobs = [checked_settings(kind, list(combination)) for combination in combinations]
     out = vars(jobs[0]).get("out")
     if len(jobs) > 1 and out is not None:
-        raise UserError(f"out={out}: {len(jobs)} jobs would write it. Drop out=")
+        raise UserError(f"out={out}: {len(jobs)} jobs would write to it. Remove out=")
 
     starts = [partial(guarded, partial(command, job), STOP) for job in jobs]
     if launcher:
@@ -63,7 +66,7 @@ def _serve(
         changed = " ".join(word for word in combinations[number - 1] if word not in keyed)
         say(f"job {number} of {len(starts)}: {changed}")
         codes.append(start())
-        if codes[-1] > 128:  # a signal ends the whole sweep
+        if codes[-1] > 128:  # a signal ends all jobs of the sweep
             return
 
 
@@ -72,7 +75,7 @@ def _is_of_launcher(word: str) -> bool:
 
 
 def _alternatives(kind: type[Any], word: str) -> list[str]:
-    """Returns a word `key=value` once per value that it lists."""
+    """Returns one word `key=value` for each value that a word lists."""
     key, separator, _ = word.partition("=")
     if not separator or is_text(kind, key):
         return [word]
@@ -85,7 +88,7 @@ def _launch(jobs: Sequence[Callable[[], int]], words: Sequence[str]) -> None:
     launchers = [word.partition("=")[2] for word in words if word.startswith(f"{LAUNCH}=")]
     check_launcher(launchers)
     say(f"waiting for the jobs; their output is in {FOLDER}/.submitit")
-    check_tree(FOLDER)  # Hydra and the launchers open files in it in place
+    check_tree(FOLDER)  # Hydra and the launchers open files in this folder in place
 
     def job(config: Any) -> None:
         if code := jobs[config["job"]]():

@@ -1,7 +1,7 @@
 """Checks of recipes against the signatures of the classes and functions that they name.
 
-Signatures are read from source files, so that misspelled keys are reported immediately, and
-naming a class in a recipe does not run its code.
+Signatures are read from source files. Misspelled keys are therefore reported immediately, and a
+class in a recipe is checked without running its code.
 """
 
 import ast
@@ -21,7 +21,10 @@ Config = dict[str, Any]
 
 
 def check(config: Config) -> None:
-    """Raises `UserError` with the nearest legal keys if a `_target_` does not exist, or does not take an argument."""
+    """Raises `UserError` if a `_target_` does not exist, or does not take an argument.
+
+    The message has the nearest legal keys.
+    """
     for path, node in walk(config):
         if "_target_" not in node:
             continue
@@ -42,7 +45,7 @@ KINDS: dict[str, tuple[type | tuple[type, ...], str]] = {
     "str": (str, "a text"),
     "None": (type(None), "null"),
 }
-"""The values that an annotation allows: their types, and a description."""
+"""Types of the values that an annotation allows, and a description of the values."""
 SEQUENCES, TUPLES = ("list", "List", "Sequence"), ("tuple", "Tuple")
 
 
@@ -62,19 +65,21 @@ TOP_LEVEL = {
     "ema": "dict[str, Any] | None",
     "logger": "dict[str, Any] | None",
 }
-"""The kinds of values of the keys of a recipe that are not arguments of a `_target_`."""
+"""Kinds of values for the keys of a recipe that are not arguments of a `_target_`."""
 
 ARGUMENTS = {
     "losses": "flame_mdm.losses.MotionLosses",
     "ema": "flame_mdm.training.averaging.MovingAverage",
 }
-"""Keys of a recipe whose mapping has arguments of a class: the class."""
+"""Keys of a recipe whose mapping has the arguments of a class, with this class."""
 
-DERIVED = ("to_joints", "feet", "edges")  # arguments of these classes that no recipe has
+DERIVED = ("to_joints", "feet", "edges")  # arguments of these classes that recipes must not have
 
 
 def check_top_level(config: Config) -> None:
-    """Raises `UserError` for unknown keys and wrong values outside of the mappings with a `_target_`."""
+    """Raises `UserError` for unknown keys and wrong values outside
+    of mappings with a `_target_`.
+    """
     for key, annotation in TOP_LEVEL.items():
         group, _, name = key.rpartition(".")
         node = config.get(group) if group else config
@@ -89,14 +94,17 @@ def check_top_level(config: Config) -> None:
             if name not in legal:
                 raise UserError(f"unknown config key '{key}.{name}'. Available: {', '.join(legal)}")
             check_kind(f"{key}.{name}", value, legal[name])
-    # A recipe may define additional keys that other keys refer to.
+    # A recipe may define additional keys to which other keys refer.
     for key in config.keys() - TOP_LEVEL.keys():
         if near := difflib.get_close_matches(str(key), TOP_LEVEL, 1, 0.75):
             raise UserError(f"unknown config key '{key}'. Did you mean {near[0]}?")
 
 
 def check_kind(key: str, value: Any, annotation: str) -> None:
-    """Raises `UserError` if the annotation of a parameter rules out a value. Unknown annotations allow any value."""
+    """Raises `UserError` if the annotation of a parameter rules out a value.
+
+    Unknown annotations allow any value.
+    """
     required = []
     kinds = _alternatives(ast.parse(annotation or "Any", mode="eval").body)
     # A configuration cannot contain a tensor: in a union, only the other types are checked.
@@ -112,7 +120,7 @@ def check_kind(key: str, value: Any, annotation: str) -> None:
 def _alternatives(annotation: ast.expr) -> list[ast.expr]:
     if isinstance(annotation, ast.BinOp):
         return [*_alternatives(annotation.left), *_alternatives(annotation.right)]
-    # A string is a forward reference: the annotation is parsed from it.
+    # A string is a forward reference, from which the annotation is parsed.
     if isinstance(annotation, ast.Constant) and isinstance(annotation.value, str):
         return _alternatives(ast.parse(annotation.value, mode="eval").body)
     if isinstance(annotation, ast.Subscript):
@@ -125,7 +133,9 @@ def _alternatives(annotation: ast.expr) -> list[ast.expr]:
 
 
 def _mismatch(value: Any, kind: ast.expr) -> str:
-    """Returns what an annotation without unions requires, if the value does not meet it; otherwise ""."""
+    """Returns the requirement of an annotation without unions;
+    "" if the value meets the requirement.
+    """
     name = _name(kind)
     if name in KINDS:
         types, description = KINDS[name]
@@ -166,7 +176,10 @@ def _mismatch(value: Any, kind: ast.expr) -> str:
 
 
 def _mismatch_of_items(items: Sequence[Any], kinds: Sequence[ast.expr]) -> str:
-    """Returns what the annotation of a tuple requires, such as `tuple[float, float]`, if the items do not meet it."""
+    """Returns the requirement of a tuple's annotation, such as `tuple[float, float]`.
+
+    "" = the items meet the requirement.
+    """
     if isinstance(kinds[-1], ast.Constant) and kinds[-1].value is ...:
         kinds = [kinds[0]] * len(items)
     if len(items) != len(kinds):
@@ -190,8 +203,9 @@ def _name(node: ast.expr) -> str:
 
 
 def check_same_kinds(base: Config, config: Config, path: str = "") -> None:
-    """Checks keys that no signature describes:
-    raises `UserError` if an override changes the type of the recipe's value.
+    """Checks keys without a signature.
+
+    Raises `UserError` if an override changes the type of the recipe's value.
     """
     for name, value in base.items():
         key = f"{path}{name}"
@@ -215,7 +229,9 @@ def check_same_kinds(base: Config, config: Config, path: str = "") -> None:
 def walk(
     node: Any, path: tuple[str, ...] = ()
 ) -> Iterator[tuple[tuple[str, ...], Mapping[str, Any]]]:
-    """Yields the path and the content of each mapping in a configuration, itself first."""
+    """Yields the path and the content of each mapping in a configuration,
+    beginning with the whole configuration.
+    """
     if isinstance(node, Mapping):
         yield path, node
         for name, child in node.items():
@@ -226,10 +242,15 @@ def walk(
 
 
 def unknown_key(config: Config, parts: Sequence[str], depth: int, node: Any) -> str:
-    """Returns the error message for a key whose part `parts[depth]`, in the parent `node`, is unknown."""
+    """Returns the error message for a key with the unknown part `parts[depth]`
+    in the parent `node`.
+    """
     key = ".".join(parts)
     if parts[0] == "data" and not depth:
-        return f"{key} belongs to a data set, and none is named. Add data=NAME, such as data=folder"
+        return (
+            f"{key} belongs to a data set, but no data set is named. Add data=NAME, such as "
+            "data=folder"
+        )
     siblings = {str(name) for name in node} if isinstance(node, Mapping) else set()
     siblings |= parameters(node["_target_"]) if "_target_" in siblings else set()
     near = difflib.get_close_matches(parts[depth], siblings - {parts[depth]}, 3, 0.6)
@@ -244,13 +265,17 @@ def unknown_key(config: Config, parts: Sequence[str], depth: int, node: Any) -> 
 
 
 def parameters(target: str) -> frozenset[str]:
-    """Returns the argument names of a class or function, read from its source; "**" stands for any argument."""
+    """Returns the argument names of a class or function from its source;
+    "**" stands for any argument.
+    """
     return frozenset(_signature(target))
 
 
 @functools.cache
 def _signature(target: str) -> dict[str, str]:
-    """Returns the arguments of a class or function: name -> annotation, "" without one."""
+    """Returns the names of the arguments of a class or function,
+    with their annotations ("" = none).
+    """
     module, _, name = target.rpartition(".")
     node = definition(module, name)
     if node is None:
@@ -293,7 +318,10 @@ def definition(
 
 
 def _top_level(node: ast.AST) -> Iterator[ast.AST]:
-    """Yields the statements of a module, including its `if` and `try` blocks, but not its classes and functions."""
+    """Yields the statements of a module, including `if` and `try` blocks.
+
+    Statements in classes and functions are left out.
+    """
     for child in ast.iter_child_nodes(node):
         yield child
         if isinstance(child, ast.If | ast.Try | ast.ExceptHandler | ast.With):
@@ -301,8 +329,10 @@ def _top_level(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def source_file(module: str) -> Path | None:
-    """Returns the source file of a module; None if there is none, or the name is not one of a module."""
-    # with a slash, a name could be any file's
+    """Returns the source file of a module;
+    None without a file, or if the name is not a module's name.
+    """
+    # a name with a slash could name any file
     if not all(part.isidentifier() for part in module.split(".")):
         return None
     relative = Path(*module.split("."))
@@ -347,7 +377,7 @@ def _arguments(module: str, node: ast.AST) -> dict[str, str]:
 
 
 def _inherited(module: str, node: ast.ClassDef) -> dict[str, str]:
-    # `Base[Kind]`, a generic class for one kind of values, has the arguments of `Base`.
+    # The generic class `Base[Kind]`, for one kind of values, has the arguments of `Base`.
     bases = [base.value if isinstance(base, ast.Subscript) else base for base in node.bases]
     parents = [definition(module, _name(base)) for base in bases]
     names: dict[str, str] = {}

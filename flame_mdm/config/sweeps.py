@@ -1,4 +1,6 @@
-"""The command line of `train`, which Hydra composes; sweeps; and jobs that Hydra's launchers start."""
+"""The command line of `train`, which Hydra composes,
+with sweeps and jobs of Hydra's launchers.
+"""
 
 import shutil
 import sys
@@ -19,18 +21,18 @@ from flame_mdm.config.signatures import Config
 from flame_mdm.errors import UserError, say
 from flame_mdm.safe_io.paths import check_tree
 
-SWEEP = ("-m", "--multirun")  # options that make values separated by commas a sweep
+SWEEP = ("-m", "--multirun")  # with these options, values separated by commas are a sweep
 QUIET = ["hydra/job_logging=disabled", "hydra/hydra_logging=disabled", "hydra.output_subdir=null"]
 
-# Signals that end training before the first step; then training handles them itself
+# Signals that end training before the first step. From the first step, training handles signals
+# itself.
 INTERRUPT = STOP[:1]
 
 
 def run_recipe(command: Callable[[Config], None], usage: str, argv: Sequence[str]) -> int:
     """Runs a command line `RECIPE key=value ... [--multirun]` and returns the exit code.
 
-    `launch=...` passes each job of a sweep, or the only job, to that launcher, and waits for
-    them.
+    `launch=...` passes each job of a sweep, or the only job, to a launcher, and waits for them.
     """
     words = make_variables() if "--from-make" in argv else list(argv)
     if not words or any(word in ("-h", "--help") for word in words):
@@ -65,7 +67,8 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
     lists = [str(o.input_line) for o in parsed if o.is_sweep_override()]
     if lists and not sweep:
         raise UserError(
-            f"{lists[0]}: several values make a sweep, one run for each. Add --multirun, or give one value"
+            f"{lists[0]}: several values make a sweep with one run per value. Add --multirun, "
+            f"or give one value"
         )
     config = composition.resolve(
         recipe, [composition.first_choice(o) for o in parsed] if sweep else overrides, base
@@ -77,7 +80,7 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
         )
 
     def start(config: Config, task: Sequence[str]) -> int:
-        # Lightning starts further processes with these words.
+        # Lightning starts further processes with these words of the command line.
         sys.argv = [sys.argv[0], "train", name, *task, quoted(f"run.dir={config['run']['dir']}")]
         codes.append(guarded(lambda: command(config), INTERRUPT))
         return codes[-1]
@@ -88,7 +91,8 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
 
     def job(_: object) -> None:
         hydra = HydraConfig.get()
-        HydraConfig.instance().cfg = None  # otherwise Lightning adds words for Hydra's command line
+        # otherwise, Lightning would add words for Hydra's command line
+        HydraConfig.instance().cfg = None
         task = [
             str(word)
             for word in hydra.overrides.task
@@ -97,7 +101,7 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
         code = start(
             composition.compose(name, [*task, quoted(f"run.dir={hydra.runtime.output_dir}")]), task
         )
-        # After a signal, the whole sweep ends. A failed job ends it only if a launcher ran the
+        # A signal ends the whole sweep. A failed job ends the sweep only if a launcher ran the
         # job.
         if code > 128 or (launcher and code):
             raise SystemExit(code)
@@ -111,7 +115,8 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
     check_launcher(launcher)
     if launcher:
         say(f"waiting for the jobs; their output is in {config['run']['dir']}/.submitit")
-    check_tree(Path(config["run"]["dir"]))  # Hydra and the launchers open files in it in place
+    # Hydra and the launchers open files in this folder in place
+    check_tree(Path(config["run"]["dir"]))
     hydra_sweep(job, recipe.folder, recipe.stem, [*output, *overrides])
 
 
@@ -129,10 +134,10 @@ def hydra_sweep(
     """Runs the jobs of a sweep with Hydra.
 
     Args:
-        job: receives the composed configuration of each job.
+        job: function that receives the composed configuration of each job.
         folder: folder of the configuration.
-        stem: name of its file without suffix; None = an empty configuration.
-        words: overrides, some of them with several values.
+        stem: name of the configuration file without suffix; None = an empty configuration.
+        words: overrides, some of which have several values.
     """
     sys.argv = [sys.argv[0], "--multirun", *words, *QUIET]
     GlobalHydra.instance().clear()
@@ -144,8 +149,10 @@ LATE = ("val_check_interval", "log_every_n_steps", "accumulate_grad_batches")
 
 
 def _check_whole(config: Config, name: str) -> None:
-    """Raises `UserError` if a recipe lacks a part, or has a value that training would refuse late."""
-    plain(config, name)  # otherwise the checkpoints of the run would be refused
+    """Raises `UserError` if a recipe lacks a part,
+    or has a value that training would only refuse later.
+    """
+    plain(config, name)  # otherwise, the checkpoints of the run would be refused
     parts = ["trainer", "data", "representation", "task", "optimizer"]
     parts += [key for key in ("denoiser", "process", "condition") if key in config]
     lacking = [key for key in ("experiment", "seed", "ema", "logger") if key not in config]
@@ -158,7 +165,8 @@ def _check_whole(config: Config, name: str) -> None:
         lacking += ["trainer.max_steps"] * ("max_steps" not in config["trainer"])
     if lacking:
         raise UserError(
-            f"{name}: no {lacking[0]}. Set it, or begin with the defaults of another recipe, or with /base"
+            f"{name}: {lacking[0]} is missing. Set it, or begin with the defaults of another "
+            f"recipe, or with /base"
         )
     for key, value in config.get("denoiser", {}).items():
         if isinstance(value, int) and value < 0:

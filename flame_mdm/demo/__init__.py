@@ -1,1 +1,4 @@
-"""The page that asks for a motion in the browser; `flame-mdm demo` serves it."""
+"""The demo: a page on which users request motions in the browser.
+
+`flame-mdm demo` serves the page.
+"""

@@ -1,4 +1,7 @@
-"""Server of the demo: the page, motion files, and the limits of both. It needs the extra `demo` (gradio)."""
+"""Server of the demo: the page, motion files, and their limits.
+
+It requires the extra `demo` (gradio).
+"""
 
 import asyncio
 import os
@@ -34,8 +37,8 @@ from flame_mdm.demo.studio_page import build_page
 from flame_mdm.errors import UserError, first_line, one_line, say
 from flame_mdm.visualize import player_page
 
-# Open pages that gradio remembers; it keeps half a megabyte for each, and the page needs none of
-# it
+# Number of open pages that gradio remembers. It stores half a megabyte per page, which the demo
+# does not need.
 SESSIONS = 64
 # Maximum number of motion files written at the same time, and maximum number of requests that wait for a file
 WRITERS = 2
@@ -53,7 +56,10 @@ def serve(
     device: str | None = None,
     hosts: Collection[str] = (),
 ) -> None:
-    """Serves the page of `Studio(sources)` until interrupted; raises `UserError` if the port or a model is unusable."""
+    """Serves the page of `Studio(sources)` until interrupted.
+
+    Raises `UserError` if the port or a model is unusable.
+    """
     import torch
 
     try:
@@ -76,13 +82,17 @@ def serve(
 
 
 def connection_limits(hosts: Collection[str]) -> ConnectionLimits:
-    """Returns the limits of connections. All visitors have one address behind a web server, whose names are `hosts`."""
+    """Returns the limits of connections.
+
+    With `hosts`, the demo is behind a web server with these names, so that all visitors have one
+    address.
+    """
     limits = ConnectionLimits()
     return replace(limits, per_address=limits.total) if hosts else limits
 
 
 class Server(uvicorn.Server):
-    """Ends the streams to open pages before it waits for the running requests."""
+    """A server that ends the streams to open pages before it waits for running requests."""
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         self.config.app.closing.set()  # type: ignore[union-attr]
@@ -95,11 +105,11 @@ def source(name: str) -> str:
 
 
 class Writers:
-    """Bounds the number of motion files that are written at the same time.
+    """Limits the number of motion files that are written at the same time.
 
     Attributes:
-        turns: held while a file is written.
-        waiting: number of requests for a file, including the requests that hold a turn.
+        turns: semaphore that is held while a file is written.
+        waiting: number of requests for a file, including requests whose file is being written.
     """
 
     def __init__(self) -> None:
@@ -108,12 +118,14 @@ class Writers:
 
     @property
     def is_full(self) -> bool:
-        """Whether no further request may wait."""
+        """Whether further requests are refused."""
         return self.waiting >= WAITING_FILES
 
 
 def add_live(app: FastAPI, live: LiveStreams, writers: Writers) -> None:
-    """Adds the blocks of streams at `/live`, their files, and the page of their player."""
+    """Adds the blocks of streams at `/live`,
+    the files of streams, and the page of their player.
+    """
     waiting = 0
 
     @app.get("/live.html")
@@ -154,7 +166,9 @@ def add_live(app: FastAPI, live: LiveStreams, writers: Writers) -> None:
 
 
 def web_app(studio: Studio, hosts: Collection[str] = ()) -> Guard:
-    """Returns the application: the page at `/`, files at `/motion.bvh?...` with the query string of a link."""
+    """Returns the application: the page at `/`,
+    and files at `/motion.bvh?...` with the query string of a link.
+    """
     app = FastAPI(openapi_url=None)
     writers = Writers()
 
@@ -171,7 +185,7 @@ def web_app(studio: Studio, hosts: Collection[str] = ()) -> Guard:
                 raise UserError(f"motion={one_line(number[:20])}: not a number of a motion")
             request = parse_query([pair for pair in pairs if pair[0] not in options])
             async with writers.turns:
-                await web.body()  # a disconnection is reported after the body
+                await web.body()  # a disconnection is only reported after the body
                 if await web.is_disconnected():
                     return Response(status_code=499)
                 content = await run_in_threadpool(
@@ -192,7 +206,8 @@ def web_app(studio: Studio, hosts: Collection[str] = ()) -> Guard:
         add_live(app, studio.live, writers)
     blocks = build_page(studio)
     blocks.state_session_capacity = SESSIONS
-    blocks.has_launched = True  # otherwise gradio does not check which files it may read
+    # without this setting, gradio does not check which files it may read
+    blocks.has_launched = True
     gr.mount_gradio_app(
         app,
         blocks,

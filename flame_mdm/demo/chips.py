@@ -1,4 +1,7 @@
-"""What was understood of a text, as HTML: a chip per action and attribute, which one click changes."""
+"""The meaning that the demo understood from a text, as HTML.
+
+There is a chip for each action and attribute, which one click changes.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -16,15 +19,15 @@ SHOWN = ("direction", "speed", "count", "side")  # attributes with a chip
 
 
 def chips(abilities: Abilities, parts: Sequence[Part], readings: Sequence[Reading]) -> str:
-    """Returns the chips of a text: its actions in their order, their attributes, and the words that change nothing.
+    """Returns the chips of a text: its actions in order, their attributes, and ignored words.
 
-    The options of a chip are texts in which its word is replaced; they take the place of the text
-    in the form.
+    The options of a chip are texts with another word for its action or attribute. A chosen text
+    replaces the text in the form.
 
     Args:
-        abilities: actions and attributes of the model, to choose from.
+        abilities: actions and attributes of the model, from which the user chooses.
         parts: words and seconds of the parts of the text.
-        readings: what was understood of each part.
+        readings: the meaning of each part.
     """
     rows = []
     for number, reading in enumerate(readings):
@@ -73,7 +76,9 @@ def _step(
 
 
 def _action_label(action: str) -> str:
-    """Returns the words for an action without its usual direction, which a chip beside it may contradict."""
+    """Returns the words for an action without its usual direction,
+    which another chip may contradict.
+    """
     return predicate(Mention(action)).removesuffix(f" {actions()[action].usual}")
 
 

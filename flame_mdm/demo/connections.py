@@ -1,4 +1,6 @@
-"""Connections of the demo's server: deadlines, and limits of their number in total and per address."""
+"""Connections of the demo's server, with deadlines,
+and limits on the number in total and per address.
+"""
 
 import asyncio
 from dataclasses import dataclass
@@ -16,18 +18,18 @@ class ConnectionLimits:
     """Limits of the connections of a server.
 
     A connection is *waiting* until the headers of a request are complete, and again after the
-    answer. When a limit of their number is reached, the connection that has waited longest is
-    closed in favor of a new one. If none is waiting, the request of the new connection gets
-    status 503.
+    answer. When the maximum number of connections is reached, a new connection replaces the
+    connection that has waited longest. If no connection is waiting, the request of the new
+    connection gets status 503.
 
     Attributes:
         total: maximum number of open connections.
-        per_address: maximum number of open connections of one address, or of one IPv6 network of
-            64 bits.
+        per_address: maximum number of open connections per address, or per IPv6 network of 64
+            bits.
         header_seconds: maximum waiting time of a connection, however many bytes of the headers
             arrive.
         idle_seconds: maximum waiting time after an answer, if nothing arrives.
-        stall_seconds: maximum number of seconds in which a client reads nothing of an answer.
+        stall_seconds: maximum number of seconds during which a client does not read an answer.
     """
 
     total: int = 256
@@ -38,7 +40,7 @@ class ConnectionLimits:
 
 
 def server_settings(app: ASGIApp, limits: ConnectionLimits) -> uvicorn.Config:
-    """Returns the settings of a server of `app` within `limits`."""
+    """Returns the settings of a server for `app` with these limits."""
     options: dict[str, Any] = {
         "http": partial(Connection, limits=limits),
         "ws": "none",
@@ -50,7 +52,7 @@ def server_settings(app: ASGIApp, limits: ConnectionLimits) -> uvicorn.Config:
 
 
 class Connection(H11Protocol):
-    """A connection within `ConnectionLimits`."""
+    """A connection that observes `ConnectionLimits`."""
 
     def __init__(self, *arguments: Any, limits: ConnectionLimits, **keywords: Any):
         super().__init__(*arguments, **keywords)
@@ -60,8 +62,8 @@ class Connection(H11Protocol):
         self.stall: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Watches a new connection, and ends the idlest ones if there are too many, of its
-        network or of all.
+        """Watches a new connection,
+        and closes the longest-waiting connections if there are too many.
         """
         super().connection_made(transport)
         self.network = _network(self.client[0]) if self.client else None
@@ -81,7 +83,7 @@ class Connection(H11Protocol):
         super().connection_lost(exc)
 
     def handle_events(self) -> None:
-        """Handles received data and starts or stops the timers, depending on what is awaited."""
+        """Handles received data, and starts or stops the timers."""
         super().handle_events()
         self._watch()
 
@@ -91,26 +93,28 @@ class Connection(H11Protocol):
         self._watch()
 
     def pause_writing(self) -> None:
-        """Starts the timer that ends a connection whose client does not read."""
+        """Starts the timer that closes the connection if the client does not read."""
         super().pause_writing()
         # The client does not read: closing would wait for it, too.
         self.stall = self.loop.call_later(self.limits.stall_seconds, self.transport.abort)
 
     def resume_writing(self) -> None:
-        """Stops this timer: the client reads again."""
+        """Stops this timer, since the client reads again."""
         super().resume_writing()
         if self.stall is not None:
             self.stall.cancel()
             self.stall = None
 
     def close(self) -> None:
-        """Closes the connection; it no longer counts."""
+        """Closes the connection, which no longer counts."""
         self._stop_timers()
         self.connections.discard(self)
         self.transport.close()
 
     def _watch(self) -> None:
-        """Starts the deadline when the connection begins to wait, and stops it when it has a request."""
+        """Starts the deadline when the connection begins to wait,
+        and stops it when a request has arrived.
+        """
         if self.transport.is_closing():
             return
 
@@ -122,7 +126,7 @@ class Connection(H11Protocol):
             self.deadline = None
 
     def _make_room(self, group: "list[Connection]", limit: int) -> None:
-        """Closes the connections of a group that have waited longest, as many as exceed the limit."""
+        """Closes the connections of a group that have waited longest, down to the limit."""
         excess = len(group) - limit
         if excess <= 0:
             return
@@ -146,7 +150,9 @@ class Connection(H11Protocol):
 
 
 def _network(address: str) -> IPv4Address | IPv6Network:
-    """Returns an address, or the network of 64 bits of an IPv6 address: one subscriber has all of its addresses."""
+    """Returns an address, or the 64-bit network of an IPv6 address,
+    since a subscriber has a whole network.
+    """
     parsed = ip_address(address.partition("%")[0])
     if isinstance(parsed, IPv6Address):
         return parsed.ipv4_mapped or IPv6Network((parsed, 64), strict=False)

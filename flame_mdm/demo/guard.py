@@ -1,4 +1,6 @@
-"""Guard of the demo's server: it passes on what the page itself requests, and refuses everything else."""
+"""Guard of the demo's server:
+it passes on requests of the page itself, and refuses all others.
+"""
 
 import asyncio
 import ipaddress
@@ -17,9 +19,10 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from flame_mdm.demo.request import MAX_TEXT, PLAIN
 
-MAX_BODY = 64 * 1024  # maximum number of bytes of a request's body, counted as they arrive
-BODY_TIME = 10.0  # maximum number of seconds in which a body arrives
-MAX_PATH = 200  # maximum number of characters of an address's path; names of files have at most 255
+MAX_BODY = 64 * 1024  # maximum number of bytes in the body of a request, counted as they arrive
+BODY_TIME = 10.0  # maximum number of seconds until the body has arrived
+# maximum number of characters in the path of an address; names of files have at most 255
+MAX_PATH = 200
 READ = re.compile(
     r"/|/theme\.css|/favicon\.ico|/manifest\.json|/(assets|static)(/[\w-]+(\.[\w-]+)*)+|/motion\.\w{3}"
     r"|/live\.(html|bvh|glb)|/gradio_api/(queue/data|heartbeat/\w{1,40})",
@@ -34,19 +37,25 @@ HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
 }
-"""Of every response. Nothing is loaded from other servers, and only Hugging Face may show the page in a frame."""
+"""Headers of every response.
+
+Nothing is loaded from other servers, and only Hugging Face may show the page in a frame.
+"""
 
 Id = Annotated[str, StringConstraints(pattern=r"^\w{1,40}$")]
 
 
 class Post(BaseModel):
-    """A request's body; values are not converted, and keys that are not listed are refused."""
+    """The body of a request. Values are not converted, and unknown keys are refused."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
 
 
 class Call(Post):
-    """A call of one of the page's functions; its arguments are texts, never objects that could name a file."""
+    """A call of a function of the page.
+
+    Its arguments are texts, never objects that could name a file.
+    """
 
     data: Annotated[list[Annotated[str, Field(max_length=20_000)]], Field(max_length=1)]
     fn_index: int
@@ -56,20 +65,22 @@ class Call(Post):
 
 
 class Reset(Post):
-    """The page's note that it no longer waits for a call."""
+    """A message from the page that it no longer waits for a call."""
 
     event_id: Id
 
 
 class Cancellation(Reset):
-    """A cancellation of a waiting or running call."""
+    """The cancellation of a waiting or running call."""
 
     session_hash: Id
     fn_index: int
 
 
 class LiveCall(Post):
-    """A request for the frames of a stream from frame `begin` on; `stream` is "" for a new stream."""
+    """A request for the frames of a stream, starting at frame `begin`;
+    `stream` is "" for a new stream.
+    """
 
     stream: Annotated[str, StringConstraints(pattern=r"^([0-9a-f]{32})?$")]
     text: Annotated[str, StringConstraints(min_length=1, max_length=MAX_TEXT, pattern=PLAIN)]
@@ -83,16 +94,17 @@ POSTS: dict[str, type[Post]] = {
     "/gradio_api/queue/join": Call,
     "/gradio_api/run/predict": Call,
 }
-"""What the page sends with POST."""
+"""The requests that the page sends with POST."""
 
 
 class Guard:
-    """ASGI middleware that checks host, origin, path, size and content of a request before the application sees it.
+    """ASGI middleware that checks a request before the application gets it.
 
-    `hosts` are names of this server, besides localhost and addresses in numbers: another name is
-    one that somebody else pointed at this computer (DNS rebinding). `calls` are the functions of
-    the page that may be called: number -> path, and whether arguments are accepted. `is_open`
-    says whether a session has called a function, so that its results can be read.
+    It checks host, origin, path, size and content. `hosts` are the names of this server, in
+    addition to localhost and numeric addresses. A request with another name may come from a name
+    that somebody else pointed at this computer (DNS rebinding). `calls` maps the numbers of the
+    page's callable functions to their path, and to a check of the arguments. `is_open` tells
+    whether a session has called a function, so that its results can be read.
     """
 
     def __init__(
@@ -147,7 +159,10 @@ class Guard:
         return await self.app(scope, replay, send_headers)
 
     async def _until_closing(self, receive: Receive) -> Message:
-        """Returns the next message; a disconnection once the server stops, so that streams to open pages end."""
+        """Returns the next message.
+
+        Once the server stops, it is a disconnection, so that open streams end.
+        """
         tasks = [asyncio.ensure_future(receive()), asyncio.ensure_future(self.closing.wait())]
         try:
             done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -163,7 +178,7 @@ class Guard:
             line = "this demo is not served under that name. Start it with hosts=NAME"
             raise HTTPException(HTTPStatus.MISDIRECTED_REQUEST, line)
         origin = headers.get("origin", f"http://{host}")
-        # a proxy may have replaced the host, but not the origin
+        # a proxy may replace the host, but does not replace the origin
         same = _network_location(origin) == host.lower() or _host_name(origin) in self.hosts
         if not same or (
             path != "/" and headers.get("sec-fetch-site", "none") not in ("same-origin", "none")
@@ -222,7 +237,9 @@ async def _body(request: Request) -> bytes:
 
 
 def _network_location(address: str) -> str:
-    """Returns host and port of an address, lowercased; "" for one that is not valid, such as http://[."""
+    """Returns host and port of an address in lower case;
+    "" for an invalid address, such as http://[.
+    """
     try:
         return urlsplit(address).netloc.lower()
     except ValueError:

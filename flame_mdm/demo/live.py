@@ -1,4 +1,4 @@
-"""Streams of motion for visitors: a bounded number, one block at a time, with files of the last minute."""
+"""Streams of motion for visitors. Their number is limited; blocks are computed one at a time."""
 
 import secrets
 import tempfile
@@ -19,24 +19,24 @@ from flame_mdm.visualize.player import packed_motion
 
 MAX_STREAMS = 16
 IDLE = 120.0  # seconds without a request after which a stream ends
-LONGEST = 3600.0  # seconds of one stream
-# Blocks that a stream may compute at once, and per second on average
+LONGEST = 3600.0  # maximum duration of a stream in seconds
+# Maximum number of blocks that a stream may compute at once, and per second on average
 BURST, RATE = 8.0, 2.0
-KEPT = 60.0  # seconds of a stream that can be downloaded
-BEFORE = 10  # frames before a block that the rotations of its first frames depend on
+KEPT = 60.0  # duration in seconds of the part of a stream that can be downloaded
+BEFORE = 10  # number of frames before a block on which the rotations of its first frames depend
 ENDINGS = (".bvh", ".glb")
 
 
 @dataclass
 class LiveStream:
-    """A stream of a visitor, and what is kept of it.
+    """A visitor's stream and the data that is kept for it.
 
     Attributes:
         stream: the stream.
         used: time in seconds of the last request.
-        joints: (F, J, 3) the last minute.
+        joints: (F, J, 3) joints of the last minute.
         text: the current text.
-        allowance: number of blocks that it may compute now.
+        allowance: number of blocks that the stream may compute now.
     """
 
     stream: Stream
@@ -51,7 +51,7 @@ class LiveStreams:
 
     Args:
         model: a model that continues frames.
-        clock: returns the time in seconds.
+        clock: function that returns the time in seconds.
     """
 
     def __init__(self, model: MotionGenerator, clock: Callable[[], float] = time.monotonic):
@@ -60,12 +60,12 @@ class LiveStreams:
         self._working = Lock()
 
     def block(self, name: str, text: str, begin: int) -> dict[str, Any]:
-        """Returns the frames of a stream from a frame on, in the format of the player.
+        """Returns the frames of a stream, starting at frame `begin`, in the format of the player.
 
         Args:
-            name: the stream; "" begins a new one, whose name is in the result.
-            text: what the person does.
-            begin: number of the first frame; later frames of the stream are dropped.
+            name: name of the stream; "" = begin a new stream, whose name is in the result.
+            text: description of the motion.
+            begin: number of the first frame. Frames that the stream has after it are dropped.
 
         Raises:
             UserError: If the text is not understood, the stream has ended, or a limit is reached.
@@ -90,7 +90,7 @@ class LiveStreams:
         return {"stream": name, "from": begin, "frames": len(block.joints), "motion": motion}
 
     def file(self, name: str, ending: str) -> bytes:
-        """Returns a file of the last minute of a stream.
+        """Returns a motion file of the last minute of a stream.
 
         Raises:
             UserError: If the stream has ended, or files do not have this ending.
@@ -108,7 +108,7 @@ class LiveStreams:
             return path.read_bytes()
 
     def _opened(self, name: str, text: str) -> tuple[str, LiveStream]:
-        """Returns a stream and its name, after ending the streams that nobody reads."""
+        """Returns a stream and its name, after ending streams that nobody reads."""
         now = self.clock()
         self._streams = {
             other: live for other, live in self._streams.items() if now - live.used <= IDLE
@@ -129,7 +129,9 @@ class LiveStreams:
         return self._streams[name]
 
     def _count(self, live: LiveStream) -> None:
-        """Counts a block; raises `UserError` if a stream computes more blocks than anybody can watch."""
+        """Counts a block; raises `UserError` if a stream computes more blocks
+        than a visitor can watch.
+        """
         now = self.clock()
         live.allowance = min(BURST, live.allowance + RATE * (now - live.used))
         live.used = now

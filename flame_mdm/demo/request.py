@@ -1,4 +1,6 @@
-"""Requests of the demo, within the limits of a public page; links and Python programs that make the same motions."""
+"""Requests of the demo within the limits of a public page,
+with links and equivalent Python programs.
+"""
 
 import json
 from collections.abc import Iterable
@@ -18,7 +20,7 @@ from pydantic import (
 from flame_mdm.errors import UserError, did_you_mean, one_line, shortened
 from flame_mdm.sampling.motion_request import path_targets, read_parts, read_path
 
-# Limits of one request, so that no visitor occupies the machine for minutes.
+# Limits of one request, so that a visitor cannot occupy the machine for minutes.
 MAX_TEXT = 300
 MAX_SECONDS = 30
 MAX_SAMPLES = 4
@@ -26,10 +28,10 @@ MAX_STEPS = 1000
 MAX_EDITS = 8
 MAX_SEED = 2**31 - 1
 MAX_FIELDS = 50  # maximum number of fields of a query string
-MAX_WAY_POINTS, FAR = 16, 20.0  # a path: way points, and meters along x and z
-PLUS = " + "  # between the names of a model and of its adapter
+MAX_WAY_POINTS, FAR = 16, 20.0  # limits of a path: number of waypoints, and meters along x and z
+PLUS = " + "  # separator between the names of a model and its adapter
 PLAIN = r"^[^\x00-\x1f\x7f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]*$"
-"""Text without control characters, including characters that change the direction of writing."""
+"""Text without control characters and without characters that change the direction of writing."""
 
 Text = Annotated[str, StringConstraints(strip_whitespace=True, max_length=MAX_TEXT, pattern=PLAIN)]
 Samples = Annotated[int, Field(ge=1, le=MAX_SAMPLES)]
@@ -47,14 +49,14 @@ Path = Annotated[
     BeforeValidator(lambda value: read_path(value) if isinstance(value, str) else value),
     PlainSerializer(lambda path: " ".join(f"{x},{z}" for x, z in path)),
 ]
-"""Way points; in a link and on the page "x,z x,z ..."."""
+"""Waypoints, written as "x,z x,z ..." in a link and on the page."""
 
 
 class DemoEdit(BaseModel):
-    """An edit of one of the motions so far, by number; see `flame_mdm.sampling.motion_request.EditRequest`.
+    """An edit of a previous motion, given by its number.
 
-    `text` is what the person does in the new part; "" = unconditioned. A variation of the entire
-    motion keeps text, parts and path of the request.
+    See `flame_mdm.sampling.motion_request.EditRequest`. `text` describes the new part; "" =
+    unconditioned. A variation of the entire motion keeps text, parts and path of the request.
     """
 
     model_config = RULES
@@ -68,7 +70,9 @@ class DemoEdit(BaseModel):
 
 
 class DemoRequest(BaseModel):
-    """Everything that determines the motions that the demo shows; the keys have the names of `flame-mdm sample`."""
+    """Everything that determines the motions in the demo,
+    with the same keys as `flame-mdm sample`.
+    """
 
     model_config = RULES
     model: str = "quickstart"
@@ -93,12 +97,18 @@ class DemoRequest(BaseModel):
         return urlencode([*pairs.items(), *(("edit", text) for text in edits)])
 
     def targets(self, kind: str) -> dict[str, Any]:
-        """Returns the targets of `flame_mdm.generate` that lead along the path, for a model trained on `kind`."""
+        """Returns the targets of `flame_mdm.generate` along the path,
+        for a model trained on `kind`.
+        """
         parts = read_parts(self.text) if self.text and kind != "none" else [("", None)]
         return path_targets(self.path, sum(seconds or self.seconds for _, seconds in parts))
 
     def steps(self, kind: str) -> list[tuple[int | None, dict[str, Any]]]:
-        """Returns (number of the motion to edit, None at first; keywords of `generate` or `edit`) for each step."""
+        """Returns the steps: for each, the number of the motion to edit,
+        and keywords of `generate` or `edit`.
+
+        In the first step, which generates, the number is None.
+        """
         shared = self.model_dump(
             include={"guidance_scale", "num_inference_steps", "sampler"}, exclude_none=True
         )
@@ -120,15 +130,15 @@ class DemoRequest(BaseModel):
                 )
             else:
                 steps.append((part.motion, keywords(part, part.text, **editing)))
-        # Cleanup is left out with a path: it moves the root off the way points, by 0.3 m in one
-        # example.
+        # With a path, there is no cleanup: it moves the root away from the waypoints, by 0.3 m in
+        # one example.
         if self.cleanup and not self.path:
             steps[-1][1]["cleanup"] = True
         return steps
 
     def python(self, kind: str, device: str) -> str:
-        """Returns Python code that makes the same motions; `kind` is the kind of condition of the
-        model.
+        """Returns Python code that makes the same motions;
+        `kind` is the model's kind of condition.
         """
         model, _, adapter = self.model.partition(PLUS)
         options = ("" if device == "cpu" else f", {device!r}") + (
@@ -153,7 +163,10 @@ def query_pairs(query: str) -> list[tuple[str, str]]:
 
 
 def parse_query(pairs: Iterable[tuple[str, str]]) -> DemoRequest:
-    """Returns the request of a link's query string; raises `UserError`. Keys with "__" belong to the host."""
+    """Returns the request in the query string of a link; raises `UserError` if it is invalid.
+
+    Keys with "__" belong to the host.
+    """
     values: dict[str, Any] = {}
     edits: list[Any] = []
     for key, value in pairs:
@@ -165,21 +178,24 @@ def parse_query(pairs: Iterable[tuple[str, str]]) -> DemoRequest:
                     f"edit={_shown(value)}: not an edit of this page. Copy the whole link"
                 ) from None
         elif key in values:
-            raise UserError(f"{_shown(key)} is given twice. Remove one")
+            raise UserError(f"{_shown(key)} is given twice. Remove one of them")
         elif not key.startswith("__"):
             values[key] = value
     return checked(values | ({"edits": edits} if edits else {}))
 
 
 def checked(values: dict[str, Any]) -> DemoRequest:
-    """Returns a request; empty values are left to the defaults. A `UserError` quotes the invalid value."""
+    """Returns a request; empty values become the defaults.
+
+    The `UserError` quotes an invalid value.
+    """
     try:
         return DemoRequest(
             **{key: value for key, value in values.items() if value not in (None, "")}
         )
     except ValidationError as error:
         first: Any = error.errors()[0]
-        if first["type"] == "value_error":  # an error of `read_path`
+        if first["type"] == "value_error":  # the error comes from `read_path`
             raise first["ctx"]["error"] from None
         name = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":

@@ -1,4 +1,6 @@
-"""Motions for the page: one request at a time on the model, the latest results in memory."""
+"""Motions for the page: the model handles one request at a time;
+the latest results stay in memory.
+"""
 
 import tempfile
 import time
@@ -22,10 +24,11 @@ from flame_mdm.sampling.generation import generate
 from flame_mdm.sampling.motion_request import SamplingRequest, read_parts
 from flame_mdm.sampling.resolution import resolve
 
-# Number of requests whose motions stay in memory; a download or an edit of them needs no model
+# Number of requests whose motions stay in memory, so that a download or an edit does not need the
+# model again
 KEPT = 64
-TIME_LIMIT = 300.0  # maximum number of seconds that one request may occupy the model
-# Files to download, and their names on the page
+TIME_LIMIT = 300.0  # maximum number of seconds for which a request may occupy the model
+# Formats of downloads, and their names on the page
 FORMATS = {
     ".bvh": "BVH",
     ".fbx": "FBX",
@@ -36,9 +39,9 @@ FORMATS = {
 
 
 class Studio:
-    """Makes the motions of requests with the models `sources`, and with no others.
+    """Makes the motions of requests, only with the models in `sources`.
 
-    A source is what `load` takes, or "MODEL + ADAPTER".
+    A source is an argument of `load`, or "MODEL + ADAPTER".
     """
 
     def __init__(self, sources: Sequence[str], device: str):
@@ -52,8 +55,9 @@ class Studio:
         self.live = LiveStreams(model) if model.denoiser.context_frames else None
 
     def model(self, name: str) -> MotionGenerator:
-        """Returns a model by its name on the page, loaded at its first use; raises `UserError`
-        for other names.
+        """Returns a model by its name on the page; raises `UserError` for other names.
+
+        A model is loaded at its first use.
         """
         if name not in self.files:
             near = did_you_mean(name, self.files)
@@ -65,15 +69,17 @@ class Studio:
             model = load(self.files[name], self.device, adapter=[adapter] if adapter else ())
             if model.conditioned_on == "text" and Reader.fits(model.facts):
                 reader = self._readers[name] = Reader(model.facts)
-                # The tables of the language are read now, so that the first answer does not wait
-                # for them.
+                # The tables of the language are read in advance, so that the first answer does
+                # not wait for them.
                 for action in reader.abilities.actions:
                     reader.abilities.choices(action)
             self._models[name] = model
         return self._models[name]
 
     def reader(self, name: str) -> Reader | None:
-        """Returns the reader of a model whose captions have single actions; None for other models."""
+        """Returns the reader of texts for a model whose captions have single actions;
+        None for other models.
+        """
         self.model(name)
         return self._readers.get(name)
 
@@ -83,7 +89,10 @@ class Studio:
         report: Callable[[int], None] = lambda calls: None,
         stop: Event | None = None,
     ) -> Sequence[Motion]:
-        """Returns the motions of a request, from memory if possible; `report` gets the number of network calls."""
+        """Returns the motions of a request, from memory if possible.
+
+        `report` is called with the number of network calls.
+        """
         with self._working:
             model = self.model(request.model)
             steps, cleanup = _plan(model, request)
@@ -124,7 +133,10 @@ class Studio:
         return _cleaned(model, motions) if cleanup else motions
 
     def understood(self, request: DemoRequest) -> DemoRequest:
-        """Returns the request with a sentence of several actions as a sequence; raises the errors of `generate`."""
+        """Returns the request; a sentence with several actions becomes a sequence.
+
+        Raises the errors of `generate`.
+        """
         if not request.text or (model := self.model(request.model)).conditioned_on != "text":
             return request
         check_length(request)
@@ -133,14 +145,16 @@ class Studio:
         return checked(request.model_dump() | {"text": text})
 
     def readings(self, request: DemoRequest) -> list[Reading]:
-        """Returns what was understood of each part of a request's text; [] for models that read any words."""
+        """Returns the meaning of each part of a request's text;
+        [] for models that read any words.
+        """
         reader = self.reader(request.model)
         if reader is None or not request.text or not request.split:
             return []
         return [reader.read(words) for words, _ in read_parts(request.text)]
 
     def advice(self, request: DemoRequest) -> list[str]:
-        """Returns lines about words that the model has never seen or does not read."""
+        """Returns messages about words that the model has never seen or does not read."""
         model = self.model(request.model)
         if model.conditioned_on != "text" or self.readings(request):
             return []
@@ -155,7 +169,10 @@ class Studio:
     def file(
         self, request: DemoRequest, number: int, extension: str, rig: str | None = None
     ) -> bytes:
-        """Returns the bytes of a file of motion `number`, from memory, so that it waits for nobody's request."""
+        """Returns the bytes of a file of motion `number`.
+
+        The motion must be in memory, so that a download does not wait for requests.
+        """
         if extension not in FORMATS:
             raise UserError(
                 f"{one_line(extension[:20])}: not a format of this page. Use {', '.join(FORMATS)}"
@@ -167,14 +184,14 @@ class Studio:
                 motions = self._made.get((request.model, repr(steps)))
         if model is None or motions is None:
             raise UserError(
-                "this motion is not in memory. Open its link, and download it from there"
+                "this motion is not in memory anymore. Open its link, and download it from there"
             )
         motion = _numbered(_cleaned(model, motions) if cleanup else motions, number)
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder, f"motion{extension}")
             try:
                 motion.save(path, rig=rig)
-            except UserError as error:  # a visitor must not see where files are written
+            except UserError as error:  # visitors must not see where files are written
                 raise UserError(str(error).replace(str(path), path.name)) from error
             return path.read_bytes()
 

@@ -1,4 +1,7 @@
-"""The page: form, player, edits, downloads, links. `page.js` writes the links; the server reads and answers them."""
+"""The page of the demo: form, player, edits, downloads and links.
+
+`page.js` writes the links; the server reads and answers them.
+"""
 
 import math
 import re
@@ -30,7 +33,7 @@ from flame_mdm.sampling.referee.judging import evidence_marks, try_judge
 from flame_mdm.visualize import player_page
 from flame_mdm.visualize.render import thumbnail
 
-QUEUE = 64  # maximum number of waiting requests; further ones are told to come back
+QUEUE = 64  # maximum number of waiting requests; further requests are refused
 FORM = [
     "model",
     "text",
@@ -53,7 +56,10 @@ PROGRAMS = {
     "Mixamo FBX": ("fbx", "&amp;rig=mixamo"),
     "Mixamo GLB": ("glb", "&amp;rig=mixamo"),
 }
-"""Buttons for programs: the ending of the file, and the skeleton in its address. Others are under "More"."""
+"""Buttons for programs: the ending of the file, and the skeleton in its address.
+
+Other formats are under "More".
+"""
 EXAMPLES = 12
 EMPTY = '<div class="empty">Describe a motion, then press Generate</div>'
 EDITORS = """<div id="parts"><div class="head"><span>Action</span><span>Seconds</span></div>
@@ -148,7 +154,9 @@ def build_page(studio: Studio) -> gr.Blocks:
 
 
 def _with_live(studio: Studio) -> SimpleNamespace:
-    """Returns the components of the page after placing them in a tab, next to the tab of the stream."""
+    """Places the components of the page in a tab,
+    next to the tab of the stream, and returns them.
+    """
     fps = studio.model(next(iter(studio.files))).representation.fps
     with gr.Tabs():
         with gr.Tab("Motion"):
@@ -162,7 +170,7 @@ def _with_live(studio: Studio) -> SimpleNamespace:
 
 
 def _layout(studio: Studio) -> SimpleNamespace:
-    """Returns the components of the page by name, after placing them in the current `gr.Blocks`."""
+    """Places the components of the page in the current `gr.Blocks`, and returns them by name."""
     names = list(studio.files)
     model = studio.model(names[0])
     samplers, examples = list(model.process.samplers), _examples(model)
@@ -246,7 +254,7 @@ def _result(
     kind = studio.model(request.model).conditioned_on
     names = [f"Motion {number + 1}" if len(motions) > 1 else "" for number in range(len(motions))]
     scene = [replace(motion, id=name) for motion, name in zip(motions, names, strict=True)]
-    if request.edits:  # next to the motion before the last edit
+    if request.edits:  # shown next to the motion before the last edit
         *before, last = request.edits
         original = studio.motions(request.model_copy(update={"edits": tuple(before)}))[last.motion]
         scene.insert(0, replace(original, id="before", text=f"before: {original.text}"))
@@ -283,7 +291,7 @@ def _result(
 
 
 def _verdicts(name: str, motion: Motion) -> str:
-    """Returns what the referee says about the claims of a motion's text; "" if there is none."""
+    """Returns the referee's verdicts on the claims of a motion's text; "" without claims."""
     judgment = try_judge(motion)
     if judgment is None:
         return ""
@@ -304,7 +312,10 @@ def _understood(studio: Studio, request: DemoRequest) -> str:
 
 
 def _refusal(error: NotUnderstood) -> str:
-    """Returns the message about a text without a known action; the nearest actions are buttons with pictures."""
+    """Returns the message about a text without a known action.
+
+    The nearest actions are buttons with pictures.
+    """
     message = (
         f'<p class="error" role="alert">{escape(one_line(error.message))}. Nearest in meaning:</p>'
     )
@@ -312,14 +323,17 @@ def _refusal(error: NotUnderstood) -> str:
 
 
 def _still(text: str) -> str:
-    """Returns the address of a picture of the action in a caption; "" without a picture."""
+    """Returns the address of the picture for the action in a caption; "" without a picture."""
     names = actions()[understand(text).mentions[0].action].names
     drawn = (prompt for prompt, attributes in prompts() if attributes["action"] in names)
     return next((_picture(prompt) for prompt in drawn), "")
 
 
 def _note(kind: str, line: str) -> str:
-    """Returns a message; a suggested text is a button that replaces the text of the form."""
+    """Returns a message.
+
+    A suggested text in it is a button that replaces the text of the form.
+    """
     shown = re.sub(
         r"Did you mean &#x27;(.+?)&#x27;\?$",
         r'<button type="button">\1</button>',
@@ -334,7 +348,9 @@ def _links(files: Sequence[tuple[str, str]]) -> str:
 
 
 def _examples(model: MotionGenerator) -> dict[str, str]:
-    """Returns texts or actions of the training data, and the address of a picture of each; "" = no picture."""
+    """Returns texts or actions of the training data with the addresses of their pictures;
+    "" = no picture.
+    """
     if model.facts.get("dataset") == "synthetic" and model.conditioned_on == "text":
         actions = {str(attributes["action"]): text for text, attributes in reversed(prompts())}
         texts = [

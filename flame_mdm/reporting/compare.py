@@ -223,8 +223,10 @@ def differences(first: Result, second: Result) -> list[list[str]] | str:
         return f"not compared: not valid: {invalid[0]}"
     paired = [(r.seed, r.data.frames, r.skeleton) for r in (first, second)]
     if paired[0] != paired[1]:
-        return "not compared: the seeds, limits of length or skeletons differ, so the motions "
-        "are not paired"
+        return (
+            "not compared: the seeds, limits of length or skeletons differ, so the motions "
+            "are not paired"
+        )
     one, two = first.values or {}, second.values or {}
     rows = [_difference(name, one[name], two[name]) for name in sorted(one.keys() & two.keys())]
     return [row for row in rows if row] or (

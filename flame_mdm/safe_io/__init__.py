@@ -1,9 +1,9 @@
-"""Atomic writes, hashes, locks, and reading files from other people.
+"""Atomic writes, hashes, locks, and safe reading of files from other people.
 
-Every file that may come from other people is read or checked here first: it must be a regular
-file of limited size, and the sizes that it declares must match its bytes. Functions that read a
-path raise `FileNotFoundError` if it does not exist, and `UserError` if it is not a regular file or
-its content is refused.
+A file that may come from other people is read or checked with this module first. It must be a
+regular file of limited size, and the sizes that it declares must match its bytes. Functions that
+read a path raise `FileNotFoundError` if it does not exist, and `UserError` if it is not a regular
+file or its content is refused.
 """
 
 from __future__ import annotations
@@ -32,44 +32,54 @@ if TYPE_CHECKING:  # `--help` must not import NumPy
 
 MEBIBYTE = 2**20
 TEXT_LIMIT = 512 * MEBIBYTE
-"""Maximum size of a text or JSON file. The largest known, BABEL's annotations, has 175 MiB."""
+"""Maximum size of a text or JSON file.
+
+The largest known file, BABEL's annotations, has 175 MiB.
+"""
 YAML_LIMIT = MEBIBYTE // 4
-"""Maximum size of a YAML file: recipes, skeletons, protocols and table specs are far smaller, and parsing is slow."""
+"""Maximum size of a YAML file, since parsing is slow.
+
+Recipes, skeletons, protocols and table specs are far smaller.
+"""
 # Maximum number of keys and values in a YAML file after its aliases are expanded
 YAML_NODES = 100_000
 YAML_DIGITS = 20  # maximum number of characters of an integer in a YAML file; 2^63 has 19
 ARRAYS_LIMIT = 128 * MEBIBYTE
-"""Total size that the arrays of a compressed file may always have. Beyond that, they may have up to `INFLATION` times
-the size of the file; motion data compresses less than 10 times."""
+"""Total size that the arrays of a compressed file may always have.
+
+Larger arrays may have up to `INFLATION` times the size of the file. Motion data is compressed by
+a factor of less than 10.
+"""
 INFLATION = 20
-# Beginning of the file that replaces one in Git LFS
+# Beginning of a pointer file, which replaces a file in Git LFS
 GIT_LFS = b"version https://git-lfs.github.com/spec/"
 POINTER_LIMIT = 1024  # pointer files are smaller than this number of bytes
 
 ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError)
 """Errors that `zipfile` raises for damaged, encrypted and unusually compressed archives."""
 DIRECTORY_LIMIT = 16 * MEBIBYTE
-"""Maximum size of the directory of a zip archive in bytes. Each of its entries becomes a Python object."""
+"""Maximum size of the directory of a zip archive in bytes. Each entry becomes a Python object."""
 # Maximum number of members of an archive. HumanML3D, the largest data set in archives, has
 # 90,000.
 MAX_MEMBERS = 200_000
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # numbers of errors of a full disk
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # error numbers of a full disk
 
 
 @contextmanager
 def atomic_write(path: str | Path, *, within: str | Path | None = None) -> Iterator[Path]:
-    """Yields a temporary path next to `path` that is renamed to `path` at the end; a failure leaves no files behind.
+    """Yields a temporary path next to `path` that is renamed to `path` at the end.
 
-    The temporary name is unique, so that several processes can write the same file; the last one
-    wins. A link at `path` is replaced, and the file it leads to stays as it is.
+    A failure leaves no files behind. The temporary name is unique, so that several processes can
+    write the same file; the last process wins. A link at `path` is replaced; the file to which it
+    leads does not change.
 
     Args:
         path: file to write.
-        within: folder that contains `path`, and that other people may have filled: links must not
+        within: folder that contains `path` and that other people may have filled. Links must not
             lead out of it.
 
-    Raises `UserError` if a link leads out of `within`, `path` is a pipe or a device, or the file
-    cannot be written, for instance because the disk is full.
+    Raises `UserError` if a link leads out of `within`, if `path` is a pipe or a device, or if the
+    file cannot be written, for instance because the disk is full.
     """
     path = Path(path)
     if within is not None:
@@ -85,8 +95,8 @@ def atomic_write(path: str | Path, *, within: str | Path | None = None) -> Itera
 
 @contextmanager
 def atomic_folder(path: str | Path, *, within: str | Path | None = None) -> Iterator[Path]:
-    """Yields a temporary folder whose files are moved to the folder `path` at the end, all or
-    none.
+    """Yields a temporary folder whose files are moved to the folder `path` at the end:
+    all files or none.
 
     If `path` exists, files of the same names are replaced and other files are kept. Temporary
     folders that killed processes left behind are removed. `within` is the folder that links must
@@ -112,10 +122,10 @@ def atomic_folder(path: str | Path, *, within: str | Path | None = None) -> Iter
 
 @contextmanager
 def _temporary(path: Path) -> Iterator[Path]:
-    """Yields a unique path next to `path`, in a folder that is created, and removes what is there at the end.
+    """Yields a unique path next to `path`, and removes the file at this path at the end.
 
-    Errors that name it name `path` instead, and an `OSError` that names either of them or a
-    folder above becomes a `UserError`.
+    The folder is created. Errors with the unique path get `path` instead. An `OSError` about
+    either path, or about a folder above, becomes a `UserError`.
     """
     temporary = path
     try:
@@ -136,7 +146,9 @@ def _temporary(path: Path) -> Iterator[Path]:
 
 
 def write_failure(error: BaseException, path: Path) -> str:
-    """Returns why a file could not be written, and the free space if the disk may be full."""
+    """Returns the reason why a file could not be written,
+    and the free space if the disk may be full.
+    """
     reason = getattr(error, "strerror", None) or first_line(error)
     if getattr(error, "errno", None) not in FULL:
         return reason
@@ -146,7 +158,10 @@ def write_failure(error: BaseException, path: Path) -> str:
 
 @contextmanager
 def made_folder(folder: Path) -> Iterator[None]:
-    """Creates a folder and its parents; those created here are removed at the end if they are empty."""
+    """Creates a folder and its parents.
+
+    At the end, created folders are removed if they are empty.
+    """
     created = [part for part in (folder, *folder.parents) if not part.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -158,7 +173,7 @@ def made_folder(folder: Path) -> Iterator[None]:
 
 
 def write_text(path: str | Path, text: str, *, within: str | Path | None = None) -> None:
-    """Writes a UTF-8 text file atomically. `within` is the folder that links must not leave."""
+    """Writes a UTF-8 text file atomically. Links must not lead out of the folder `within`."""
     with atomic_write(path, within=within) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
@@ -168,14 +183,16 @@ def write_json(
 ) -> None:
     """Writes a JSON file atomically. NaN and infinity raise `ValueError`.
 
-    `within` is the folder that links must not leave.
+    Links must not lead out of the folder `within`.
     """
     write_text(path, json.dumps(content, indent=indent, allow_nan=False) + "\n", within=within)
 
 
 @contextmanager
 def naming(name: object, *errors: type[Exception], prefix: str = "") -> Iterator[None]:
-    """Adds the name of a file to every `UserError` that does not contain it, and turns `errors` into such errors."""
+    """Adds the name of a file to every `UserError` without it,
+    and converts `errors` to such errors.
+    """
     try:
         yield
     except UserError as error:
@@ -188,12 +205,13 @@ def naming(name: object, *errors: type[Exception], prefix: str = "") -> Iterator
 
 @contextmanager
 def locked(path: Path, busy: Callable[[str], object], advice: str) -> Iterator[str]:
-    """Holds a lock file that names process and host; yields the process that died and left the file behind, or "".
+    """Holds a lock file that names process and host.
 
-    If another process holds the lock, calls `busy` with its name, which raises, or returns to
-    wait. `advice` is for file systems without locks. The operating system releases the lock when
-    a process ends in any way. POSIX record locks also hold between hosts on NFS and Lustre,
-    unlike the locks of `filelock`. Windows has neither.
+    Yields the name of a dead process that left the file behind, or "". If another process holds
+    the lock, `busy` is called with its name; `busy` raises an error, or returns to wait. `advice`
+    is for file systems without locks. The operating system releases the lock when the process
+    ends, for any reason. The lock is a POSIX record lock, which also works between hosts on NFS
+    and Lustre, unlike the locks of `filelock`. Windows has no such locks.
     """
     while True:
         with made_folder(path.parent), open_in_place(path) as file:
@@ -209,8 +227,8 @@ def locked(path: Path, busy: Callable[[str], object], advice: str) -> Iterator[s
                     say(f"{path}: this file system has no locks ({error.strerror}); {advice}")
             try:
                 if not os.path.samestat(os.fstat(file.fileno()), path.stat()):
-                    continue  # another process holds a new file
-            except FileNotFoundError:  # the previous process has removed it
+                    continue  # another process holds a new lock file
+            except FileNotFoundError:  # the previous process has removed the file
                 continue
             with suppress(OSError):  # a full disk
                 file.truncate(0)
@@ -231,7 +249,7 @@ def sha256(path: str | Path) -> str:
 
 
 def regular_file(path: str | Path, limit: int | None = None) -> int:
-    """Returns the size in bytes, at most `limit`, of a regular file or of the target of a link."""
+    """Returns the size in bytes, at most `limit`, of a regular file or of a link's target."""
     try:
         status = Path(path).stat()
     except (FileNotFoundError, NotADirectoryError):
@@ -249,7 +267,7 @@ def regular_file(path: str | Path, limit: int | None = None) -> int:
         raise UserError(f"{path}: {kind}, not a file")
     if limit is not None and status.st_size > limit:
         raise UserError(
-            f"{path}: {_size(status.st_size)}, but such a file may have at most {_size(limit)}"
+            f"{path}: the file has {_size(status.st_size)}, but at most {_size(limit)} are allowed"
         )
     if status.st_size < POINTER_LIMIT and _begins(path, GIT_LFS):
         raise UserError(
@@ -259,16 +277,18 @@ def regular_file(path: str | Path, limit: int | None = None) -> int:
 
 
 def _begins(path: str | Path, content: bytes) -> bool:
-    """Returns whether a file that can be read begins with `content`."""
+    """Whether a readable file begins with `content`."""
     try:
         with Path(path).open("rb") as file:
             return file.read(len(content)) == content
-    except OSError:  # its reader says why
+    except OSError:  # the reader of the file reports the reason
         return False
 
 
 def read_text(path: str | Path, limit: int = TEXT_LIMIT) -> str:
-    """Returns a UTF-8 text file of at most `limit` bytes; raises `UserError` otherwise."""
+    """Returns the content of a UTF-8 text file of
+    at most `limit` bytes; otherwise raises `UserError`.
+    """
     regular_file(path, limit)
     with (
         naming(path, UnicodeDecodeError, prefix="not a UTF-8 text file: "),
@@ -278,13 +298,17 @@ def read_text(path: str | Path, limit: int = TEXT_LIMIT) -> str:
 
 
 def read_json(path: str | Path, limit: int = TEXT_LIMIT) -> Any:
-    """Returns the content of a JSON file without NaN, infinity and lone surrogates."""
+    """Returns the content of a JSON file, which must not contain NaN,
+    infinity and lone surrogates.
+    """
     with naming(path, ValueError, prefix="not a JSON file: "):
         return parse_json(read_text(path, limit))
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Returns the content of a JSON text; raises `ValueError` for what `read_json` refuses."""
+    """Returns the content of a JSON text;
+    raises `ValueError` for content that `read_json` refuses.
+    """
 
     def refuse(constant: str) -> None:
         raise ValueError(f"{constant} is not a JSON number")
@@ -292,7 +316,7 @@ def parse_json(text: str | bytes) -> Any:
     try:
         content = json.loads(text, parse_constant=refuse)
         if "\\u" in (text if isinstance(text, str) else text.decode()):
-            # Fails for a lone surrogate, which could not be written again.
+            # Encoding fails for a lone surrogate, which could not be written again.
             json.dumps(content, ensure_ascii=False).encode()
     except RecursionError:
         raise ValueError("nested too deeply") from None
@@ -300,7 +324,7 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def read_yaml(path: str | Path) -> Any:
-    """Returns the plain content of a YAML file; interpolations such as `${a}` are kept as texts."""
+    """Returns the plain content of a YAML file. Interpolations such as `${a}` remain text."""
     import yaml
     from omegaconf import OmegaConf
 
@@ -309,7 +333,7 @@ def read_yaml(path: str | Path) -> Any:
         nodes = _nodes(yaml.compose(text, yaml.SafeLoader), {})
         if nodes > YAML_NODES:
             raise ValueError(f"more than {YAML_NODES:,} values after its aliases are expanded")
-        # OmegaConf reads numbers such as 1e-4, which YAML 1.1 takes for text.
+        # OmegaConf reads numbers such as 1e-4, which are text in YAML 1.1.
         content = OmegaConf.create(text) if text.strip() else None
         return OmegaConf.to_container(content) if content is not None else None
     except Exception as error:  # YAML and OmegaConf raise many kinds of errors for invalid files
@@ -318,12 +342,14 @@ def read_yaml(path: str | Path) -> Any:
 
 
 def _nodes(node: Any, counted: dict[int, float]) -> float:
-    """Returns the number of nodes of a YAML file with its aliases expanded; infinite if one contains itself."""
+    """Returns the number of nodes of a YAML file
+    after expanding its aliases; infinite for cycles.
+    """
     if id(node) not in counted:
         counted[id(node)] = math.inf
         content = node.value if node is not None else ""
         if getattr(node, "tag", "").endswith(":int") and len(content) > YAML_DIGITS:
-            # As keys, large integers could be chosen so that all have the same hash.
+            # An attacker could choose large integers as keys that all have the same hash.
             raise ValueError(
                 f"a whole number of more than {YAML_DIGITS} digits: {content[:YAML_DIGITS]}…"
             )
@@ -347,8 +373,7 @@ def read_npz(
         only: names of the arrays that are read; None = all.
 
     Raises:
-        UserError: if the file is damaged, contains objects, or is larger than the limits of this
-            module.
+        UserError: If the file is damaged, contains objects, or exceeds the limits of this module.
     """
     from numpy.lib import format as npy
 
@@ -384,7 +409,7 @@ def read_npy(source: Path | IO[bytes], *, mmap: bool = False) -> np.ndarray:
 
 @contextmanager
 def _opened(source: Path | IO[bytes]) -> Iterator[tuple[IO[bytes], int]]:
-    """Yields a file of arrays and its size; errors that are raised for damaged content become `UserError`."""
+    """Yields a file of arrays and its size. Errors for damaged content become `UserError`."""
     with ExitStack() as stack:
         name = ""
         if isinstance(source, Path):
@@ -401,7 +426,10 @@ def _opened(source: Path | IO[bytes]) -> Iterator[tuple[IO[bytes], int]]:
 
 
 def _check_array(file: IO[bytes], size: int, name: str) -> int:
-    """Returns the number of elements of an .npy file, whose header must declare its `size` in bytes."""
+    """Returns the number of elements of an .npy file.
+
+    Its header must match its `size` in bytes.
+    """
     from numpy.lib import format as npy
 
     try:
@@ -430,12 +458,12 @@ def _check_array(file: IO[bytes], size: int, name: str) -> int:
 
 @contextmanager
 def opened_zip(file: IO[bytes]) -> Iterator[zipfile.ZipFile]:
-    """Opens a zip archive for reading; raises `UserError` if it has more than `MAX_MEMBERS`
-    members.
+    """Opens a zip archive for reading;
+    raises `UserError` if it has more than `MAX_MEMBERS` members.
 
-    `zipfile` reads the directory of the archive at once and makes an object for each entry, even
-      if the archive
-    states a smaller number. Therefore the directory is limited in bytes, too.
+    `zipfile` reads the directory of the archive at once and creates an object for each entry,
+    even if the archive states a smaller number of entries. Therefore, the size of the directory
+    is limited, too.
     """
     directory = _DirectoryReader(file)
     with zipfile.ZipFile(cast(IO[bytes], directory)) as archive:
@@ -453,7 +481,9 @@ def check_members(count: int) -> None:
 
 
 class _DirectoryReader:
-    """A file from which only a limited number of bytes is read at once, until `limit` is None."""
+    """A file from which only a limited number of bytes can be read at once,
+    until `limit` is None.
+    """
 
     def __init__(self, file: IO[bytes]):
         self.file, self.limit = file, DIRECTORY_LIMIT
@@ -470,7 +500,7 @@ class _DirectoryReader:
 def check_member(member: zipfile.ZipInfo) -> None:
     """Refuses members of a zip archive that are not deflated.
 
-    `zipfile` limits the unpacked bytes of deflated members only.
+    `zipfile` only limits the unpacked bytes of deflated members.
     """
     if member.flag_bits & 1 or member.compress_type not in (
         zipfile.ZIP_STORED,

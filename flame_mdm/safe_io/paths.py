@@ -1,7 +1,7 @@
-"""Names under which files may be written in a folder that other people may have filled.
+"""Paths for writing safely in a folder that other people may have filled.
 
-Links must not lead out of the folder, a file that is written in place must have one name only,
-and temporary names are unique.
+Links must not lead out of the folder. A file that is written in place must have only one name.
+Temporary names are unique.
 """
 
 from __future__ import annotations
@@ -21,10 +21,15 @@ from typing import IO
 
 from flame_mdm.errors import UserError
 
-SECOND_NAME = "a file with a second name elsewhere (hard link), which would be changed, too. Replace it by a copy"
+SECOND_NAME = (
+    "a file with a second name (hard link), which would be changed, too. Replace it with a copy"
+)
 
 WANDB_LINKS = re.compile(r"wandb/(latest-run|debug[\w-]*\.log|[\w-]+/logs/debug[\w-]*\.log)")
-"""Links of wandb in a run directory, to its logs. It replaces them and writes a resumed run into another folder."""
+"""Links of wandb from a run directory to its logs.
+
+wandb replaces them and writes a resumed run into another folder.
+"""
 
 _tokens: set[str] = set()
 """Random parts in the names of temporary files and folders that this process is writing."""
@@ -40,10 +45,11 @@ def check_within(path: str | Path, root: str | Path) -> None:
 
 
 def check_tree(folder: Path) -> None:
-    """Checks a folder of somebody else before libraries write into it, which open their files in place.
+    """Checks a folder from somebody else before libraries write into it.
 
-    Raises `UserError` if the folder contains a link that leads out of it, a pipe, a device, or a
-    file with a second name (hard link), through which a file elsewhere would be changed.
+    Libraries open files in place. Raises `UserError` if the folder contains a link that leads out
+    of it, a pipe, a device, or a file with a second name (hard link), through which a file
+    elsewhere would be changed.
     """
     for parent, folders, files in os.walk(folder):
         for name in (*folders, *files):
@@ -65,8 +71,9 @@ def check_tree(folder: Path) -> None:
 def open_in_place(path: Path) -> IO[str]:
     """Opens a text file for reading and appending, and creates it if it does not exist.
 
-    Writing in place changes a file that has other names, so that links are not followed. Raises
-    `UserError` if the path is a link, no regular file, or a file with a second name (hard link).
+    Writing in place also changes the file under its other names, so links are not followed.
+    Raises `UserError` if the path is a link, not a regular file, or a file with a second name
+    (hard link).
     """
     flags = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
     try:
@@ -91,7 +98,7 @@ def open_in_place(path: Path) -> IO[str]:
 
 @contextmanager
 def temporary_beside(path: Path) -> Iterator[Path]:
-    """Yields a unique path next to `path`, and removes what is there at the end."""
+    """Yields a unique path next to `path`, and removes the file at this path at the end."""
     token = secrets.token_hex(8)
     temporary = path.with_name(f".{path.stem[:80]}.{_machine()}-{os.getpid()}-{token}{path.suffix}")
     _tokens.add(token)
@@ -104,7 +111,9 @@ def temporary_beside(path: Path) -> Iterator[Path]:
 
 @functools.cache
 def _machine() -> str:
-    """Returns eight hexadecimal digits that stand for the host and, in a container, its numbering of processes."""
+    """Returns eight hexadecimal digits that identify the host and,
+    in a container, its process namespace.
+    """
     numbering = ""
     with suppress(OSError):  # a system without /proc
         numbering = str(Path("/proc/self/ns/pid").readlink())
@@ -112,14 +121,14 @@ def _machine() -> str:
 
 
 def remove_abandoned(folder: Path, path: Path | None = None, *, is_locked: bool = False) -> None:
-    """Removes temporary files and folders whose process died, so that it could not remove them.
+    """Removes temporary files and folders that dead processes left behind.
 
     Args:
         folder: folder of the temporary files and folders.
-        path: only those written for this file or folder; None = for any.
-        is_locked: whether this process holds the lock that writers of such files need. Then the
-            files of processes on other machines are removed, too. Otherwise they stay: these
-            processes may be alive.
+        path: only temporary files for this file or folder are removed; None = for any.
+        is_locked: whether this process holds the lock that writers of such files need. If it
+            does, files of processes on other machines are removed, too. Otherwise, they remain,
+            since these processes may be alive.
     """
     if not folder.is_dir():
         return
@@ -138,7 +147,7 @@ def remove_abandoned(folder: Path, path: Path | None = None, *, is_locked: bool 
 
 
 def _lives(process: int) -> bool:
-    """Returns whether another process of this machine exists."""
+    """Whether another process exists on this machine."""
     if process == os.getpid():
         return False
     try:
@@ -151,7 +160,7 @@ def _lives(process: int) -> bool:
 
 
 def _remove(path: Path) -> None:
-    """Removes a temporary file or folder; of a link, only the link itself."""
+    """Removes a temporary file or folder. For a link, only the link itself is removed."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:

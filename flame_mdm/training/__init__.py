@@ -1,1 +1,1 @@
-"""Training: checkpointing, safeguards, callbacks, loggers, provenance."""
+"""Training: checkpointing, safeguards, callbacks, loggers and provenance."""

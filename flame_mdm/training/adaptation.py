@@ -38,9 +38,9 @@ from flame_mdm.task import GeneratorTask
 from flame_mdm.training.start import train
 from flame_mdm.visualize import player_page
 
-SAMPLED = 300  # motions sampled from a model whose training data are not there
-COMPARED = 32  # clips with which the page compares models
-# Parts that are taken from the recipe of the base.
+SAMPLED = 300  # number of motions that are sampled from a model if its training data is missing
+COMPARED = 32  # number of clips with which the page compares models
+# Parts that the recipe takes from the base.
 OF_BASE = (
     "task",
     "losses",
@@ -52,15 +52,15 @@ OF_BASE = (
 
 
 class AdaptationTask(GeneratorTask):
-    """Trains a model further on a few clips of the user, and on clips of what it knows."""
+    """Trains a model further on the user's few clips, and on clips of its own data."""
 
     def pretrain(self) -> None:
-        """Does nothing: the text encoder is trained already."""
+        """Does nothing, since the text encoder is trained already."""
 
     def dropped(self, batch: MotionBatch) -> Tensor:
-        """Draws as in other training, but keeps the captions of the user's clips.
+        """Draws the dropped captions, but never drops captions of the user's clips.
 
-        If they got the null condition, guidance would lead away from the taught clips.
+        With the null condition on these clips, guidance would lead away from them.
         """
         is_kept = torch.tensor([name.startswith(KEPT) for name in batch.ids])
         return super().dropped(batch) & sent(is_kept, self.device)
@@ -84,8 +84,9 @@ def adapt(
 ) -> Path:
     """Teaches a text-conditioned model the motions in a folder; resumes an interrupted run.
 
-    The model is trained on the user's clips and on clips of its own data, so that it does not forget those. Prompts ask
-    for the new motions with "in NAME style". `docs/own-motion.md` is the guide.
+    The model is trained on the user's clips and on clips of its own data, so that it does not
+    forget its data. Prompts request the new motions with "in NAME style". `docs/own-motion.md` is
+    the guide.
 
     Args:
         base: the model to adapt: a run directory, a .ckpt or .safetensors file, the name of a model in this package, or
@@ -93,22 +94,23 @@ def adapt(
         source: folder of motions with captions.
         name: name of the style, one word of letters and digits.
         out: run directory. Default: runs/adapt/NAME.
-        action: the clips show an action that the model does not know, instead of a style.
-        full: train all weights; the result is a model file instead of an adapter.
-        force: accept clips that drift upward or float.
-        rank: rank of the changes of the weights, 1 or more; more for motions far from what the model knows.
+        action: whether the clips show an action that the model does not know, instead of a style.
+        full: whether to train all weights. The result is then a model file instead of an adapter.
+        force: whether to accept clips that drift upward or float.
+        rank: rank of the changes of the weights, 1 or more. Increase it for motions that differ
+            much from the model's training data.
         data_root: folder of the prepared data sets. If it lacks the data set of the base, 300 motions are sampled from
             the base instead.
         overrides: overrides of `experiments/adapt.yaml`, such as "trainer.max_steps=2000".
 
     Returns:
-        Path of the adapter, or with `full` of the model file: OUT/NAME.safetensors. The page OUT/adaptation.html
-        compares motions before and after.
+        Path of the adapter or, with `full`, path of the model file: OUT/NAME.safetensors. The
+        page OUT/adaptation.html compares motions before and after training.
 
     Raises:
         FileNotFoundError: If there is no such model or folder.
-        UserError: If the name is not one word, the model is distilled or not conditioned on text, the folder has no
-            captions, or its clips drift or float.
+        UserError: If the name is not one word, if the model is distilled or not conditioned on
+            text, if the folder has no captions, or if its clips drift or float.
 
     Example:
         >>> import flame_mdm
@@ -119,7 +121,8 @@ def adapt(
     file, out = find(base), Path(out or f"runs/adapt/{name}")
     if not re.fullmatch(r"[^\W_]+", name):
         raise UserError(
-            f"name={name}: give one word of letters and digits, since prompts say 'in {name} style'"
+            f"name={name}: give one word of letters and digits, since prompts contain 'in "
+            f"{name} style'"
         )
     task = load_task(file, GeneratorTask)
     model = task.generator
@@ -127,12 +130,14 @@ def adapt(
         raise UserError(f"{base}: a distilled model. Adapt its teacher, and distill the result")
     if model.conditioned_on != "text":
         raise UserError(
-            f"{base}: conditioned on {model.conditioned_on}; adapt needs a model conditioned on text"
+            f"{base}: conditioned on {model.conditioned_on}. Give a model that is conditioned "
+            f"on text"
         )
     captions = sorted({text for note in Folder(str(source)).notes.values() for text in note.texts})
     if not captions:
         raise UserError(
-            f"{source}: no captions. Write what happens into NAME.txt next to each motion, or captions.csv"
+            f"{source}: no captions. Describe each motion in NAME.txt next to it, or in "
+            f"captions.csv"
         )
     if not force:
         check_clips(source, model.representation.fps)
@@ -142,7 +147,7 @@ def adapt(
         str(base),
         None if full else _about(model, captions, name, rank, file, action),
     )
-    # With a vocabulary, the model would refuse texts whose words are taught here.
+    # With a vocabulary, the model would refuse texts with the new words.
     model.facts.pop("vocabulary", None)
     prior = _prior(model, Path(data_root), out / "data", captions)
     config["data"]["source"] |= {"path": str(source), "prior": str(prior)}
@@ -162,7 +167,7 @@ def adapt(
         )
 
     write_results()
-    # All processes wait here: the launcher ends them when the first one exits.
+    # All processes wait here, since the launcher ends them when the first process exits.
     if torch.distributed.is_initialized():
         torch.distributed.barrier()
     return path
@@ -189,22 +194,24 @@ def _about(
 def _recipe(
     model: MotionGenerator, captions: Sequence[str], name: str, out: Path, overrides: Sequence[str]
 ) -> Config:
-    """Returns the recipe of an adaptation; raises `UserError` for overrides of what the base
-    determines.
+    """Returns the recipe of an adaptation.
+
+    Raises `UserError` for overrides of parts that the base determines.
     """
     if fixed := [word for word in overrides if word.partition(".")[0] in OF_BASE]:
         raise UserError(
-            f"{fixed[0]}: an adaptation keeps the {fixed[0].partition('.')[0]} of its base. Drop it"
+            f"{fixed[0]}: an adaptation keeps the {fixed[0].partition('.')[0]} of its base. "
+            f"Remove this override"
         )
-    recipe = ConfigSource(EXPERIMENTS, "adapt")  # checked by the caller, once it is complete
+    recipe = ConfigSource(EXPERIMENTS, "adapt")  # the caller checks the complete recipe
     config = resolve(recipe, *prepare_overrides(recipe, [quoted(f"run.dir={out}"), *overrides]))
     config |= {part: model.config[part] for part in OF_BASE if part in model.config}
-    if config["task"]["_target_"] in GENERATORS:  # not a class of the user's
+    if config["task"]["_target_"] in GENERATORS:  # not the user's own class
         config["task"] = config["task"] | {"_target_": TASK}
     config["experiment"] = f"adapt/{name}"
     config["run"]["name"] = config["data"]["name"] = name
 
-    # Crop, kind of motion and learning rate are the base's. A released model has no data, so that
+    # Crop, kind of motion and learning rate come from the base. A released model has no data, so
     # its crops are as long as its longest motion, in units of 4 frames.
     data, longest = model.config.get("data") or {}, model.facts["max_frames"] // 4 * 4
     config["data"]["crop"] = data.get("crop") or config["data"]["crop"] | {"max_frames": longest}
@@ -213,7 +220,8 @@ def _recipe(
     kind = "smpl" if needs_rotations(model.representation) else "joints"
     config["data"]["source"]["motion"] = kind
 
-    # Samples show three captions of the lesson, and three of the base in the new style.
+    # Samples show three captions of the user's clips, and three captions of the base in the new
+    # style.
     few = captions[:: ceil_div(len(captions), 3)]
     texts = [*few, *list(model.facts.get("captions", ()))[:3]]
     config["callbacks"]["samples"]["prompts"] = [styled(text, name) for text in texts]
@@ -221,10 +229,10 @@ def _recipe(
 
 
 def _prior(model: MotionGenerator, root: Path, out: Path, captions: Sequence[str]) -> Path:
-    """Returns the folder of the store of what the base knows.
+    """Returns the folder of the store with data of the base.
 
-    It is the store of the base's training data if that is in `root`, otherwise a store of samples
-    in `out`.
+    It is the store of the base's training data if `root` has this store, otherwise a store of
+    samples in `out`.
     """
     representation = model.representation
     folder = root / f"{(model.config.get('data') or {}).get('name')}-{representation.name}"
@@ -235,7 +243,8 @@ def _prior(model: MotionGenerator, root: Path, out: Path, captions: Sequence[str
     folder = out / f"prior-{representation.name}"
     if not (folder / "store.json").exists():
         say(
-            f"the training data of the base are not in {root}: sampling {SAMPLED} motions of it instead"
+            f"the training data of the base is not in {root}: sampling {SAMPLED} motions from "
+            f"the base instead"
         )
         write_store(
             folder,

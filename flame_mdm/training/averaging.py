@@ -11,19 +11,19 @@ from flame_mdm.errors import UserError
 
 
 class MovingAverage(WeightAveraging):
-    """Exponential moving average of the weights, which replaces them in validation and in the saved model.
+    """Exponential moving average of the weights, for validation and for the saved model.
 
-    By default it computes the same as Lightning's `EMAWeightAveraging`, but with one call for all
-    parameters: that class walks through all modules in every step, and on CUDA waits for the
-    device. Buffers are not averaged.
+    By default, it computes the same average as Lightning's `EMAWeightAveraging`, but with one
+    call for all parameters. Lightning's class walks through all modules in every step, and on
+    CUDA waits for the device. Buffers are not averaged.
 
     Args:
         decay: average = decay * average + (1 - decay) * weights, from 0 to 1.
-        update_every_n_steps: updates are at the multiples of this number of steps.
+        update_every_n_steps: the average is updated at multiples of this number of steps.
         update_starting_at_step: up to this step, updates copy the weights instead of averaging
-            them; so does the first.
-        from_initial_weights: the average starts from the weights before the first step, as in
-            MDM's code, so that the first update is an average, too.
+            them. The first update always copies them.
+        from_initial_weights: whether the average starts from the weights before the first step,
+            as in MDM's code. Then the first update is an average, too.
     """
 
     def __init__(
@@ -34,7 +34,7 @@ class MovingAverage(WeightAveraging):
         from_initial_weights: bool = False,
     ):
         if not 0 <= decay <= 1:
-            raise UserError(f"ema.decay={decay}: must be from 0 to 1")
+            raise UserError(f"ema.decay={decay}: give a number from 0 to 1")
         super().__init__(use_buffers=False)
         self.average = get_ema_multi_avg_fn(decay)
         self.update_every_n_steps = update_every_n_steps
@@ -45,21 +45,27 @@ class MovingAverage(WeightAveraging):
         self.begun = False
 
     def averaged(self) -> Any:
-        """Returns the copy of the task that has the averages; during validation, it has the weights instead."""
+        """Returns the copy of the task with the averages.
+
+        During validation, it has the weights instead.
+        """
         assert self._average_model is not None
         return self._average_model.module
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Collects the parameters of model and average once: looking them up takes time."""
+        """Collects the parameters of model and average once, since looking them up takes time."""
         self.averages = [p.detach() for p in self.averaged().parameters()]
         self.weights = [p.detach() for p in pl_module.parameters()]
         for copy, module in zip(self.averaged().modules(), pl_module.modules(), strict=True):
-            copy._buffers = module._buffers  # shared, so that both always have the current ones
+            # shared buffers, so that both models always have the current buffers
+            copy._buffers = module._buffers
         updates = int(self._average_model.n_averaged)  # type: ignore[union-attr]
         self.begun = updates > 0 or (self.from_initial_weights and trainer.global_step > 0)
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
-        """Copies the initial weights before the first step: by now, pretraining or a teacher has set them."""
+        """Copies the initial weights before the first step,
+        after pretraining or a teacher has set them.
+        """
         if self.from_initial_weights and not self.begun:
             self._copy_weights()
             self.begun = True

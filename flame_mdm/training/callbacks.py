@@ -1,4 +1,4 @@
-"""Training callbacks: checkpointing, interruption, progress, measurements, samples and the report."""
+"""Training callbacks: checkpointing, interruption, progress, measurements, samples and report."""
 
 import shlex
 import signal
@@ -42,15 +42,17 @@ from flame_mdm.task import GeneratorTask, Task
 from flame_mdm.training.loggers import log_video
 from flame_mdm.training.provenance import device_name
 
-REAL = 64  # training clips that metrics of samples are compared with
-UNCONDITIONED = 4  # motions without a prompt
-# Meters. Samples for different prompts differ by more, even if a model has learned little
+REAL = 64  # number of training clips with which the metrics of samples are compared
+UNCONDITIONED = 4  # number of motions without a prompt
+# In meters. Even if a model has learned little, its samples for different prompts differ by more.
 SAME = 0.01
 Values = Mapping[str, float]  # values by metric, or by metric/part
 
 
 class Interrupted(Exception):
-    """Raised when a signal stopped training at the end of a step, after a checkpoint was written."""
+    """Raised after a signal stopped training at the end
+    of a step and a checkpoint was written.
+    """
 
     def __init__(self, signum: int, step: int):
         super().__init__(f"{signal.Signals(signum).name} at step {step}")
@@ -58,11 +60,12 @@ class Interrupted(Exception):
 
 
 class Checkpoints(Checkpoint):
-    """Writes `last.ckpt` periodically, at the last step and when interrupted; keeps a checkpoint `keep_every_n_steps`.
+    """Writes `last.ckpt` periodically, at the last step and when interrupted.
 
-    Signals stop training at the end of the current step (`StopRequest`); with several processes,
-    at the end of the next one. Validation is never interrupted, since averaged weights replace
-    the trained ones meanwhile.
+    `keep_every_n_steps` is the number of steps between checkpoints that are kept. Signals stop
+    training at the end of the current step (`StopRequest`); with several processes, at the end of
+    the next step. Validation is never interrupted, since averaged weights replace the trained
+    weights during validation.
     """
 
     def __init__(self, folder: str, every_n_steps: int, keep_every_n_steps: int | None = None):
@@ -78,19 +81,22 @@ class Checkpoints(Checkpoint):
         self.step = -1
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Begins to note signals."""
+        """Starts to record signals instead of ending the process."""
         self.step = trainer.global_step
         self.stop.install()
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
-        """Saves a checkpoint if it is due, or if any process received a signal, and then stops."""
+        """Saves a checkpoint if it is due.
+
+        If any process received a signal, saves one and stops.
+        """
         if trainer.global_step == self.step:  # gradients are still being accumulated
             return
         self.step = trainer.global_step
         signum = self.stop.signum
         if trainer.world_size > 1:
-            # All processes act on the signal exchanged in the previous step. Reading the one of
-            # this step would wait for the step to end on the device.
+            # All processes act on the signal that was exchanged in the previous step. Reading the
+            # signal of this step would wait until the device has finished the step.
             signum, received = int(self.exchanged), torch.tensor(signum, device=pl_module.device)
             torch.distributed.all_reduce(received, torch.distributed.ReduceOp.MAX)
             self.exchanged = received
@@ -112,13 +118,13 @@ class Checkpoints(Checkpoint):
 
 
 class Measurements(Callback):
-    """Logs gradient norm, learning rate and speed every `trainer.log_every_n_steps`, without slowing other steps.
+    """Logs gradient norm, learning rate and speed every `trainer.log_every_n_steps`.
 
-    The norm of all gradients is measured before clipping. Seconds per step leave out validation.
-    Adds `facts.training` to checkpoints: `hours` of training so far, including validation;
-    `processes`, the number of processes; `device`, `speed` and `precision`; and `memory_gib`, the
-    peak memory. On CUDA, this is the memory of tensors; on other devices, the memory of the first
-    process.
+    Other steps are not slowed. The norm of all gradients is measured before clipping. Seconds per
+    step do not include validation. Adds `facts.training` to checkpoints: `hours` of training so
+    far, including validation; `processes`, the number of processes; `device`, `speed` and
+    `precision`; and `memory_gib`, the peak memory. On CUDA, this is the memory of tensors; on
+    other devices, the memory of the first process.
     """
 
     def __init__(self) -> None:
@@ -129,7 +135,7 @@ class Measurements(Callback):
     def on_load_checkpoint(
         self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
     ) -> None:
-        """Continues the sums of the run before it was interrupted."""
+        """Restores the sums of the run from before its interruption."""
         self.earlier = checkpoint["facts"].get("training", {})
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -138,13 +144,13 @@ class Measurements(Callback):
         self.first = trainer.global_step
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Restarts the clock of the speed, which leaves out validation."""
+        """Restarts the clock of the speed, which does not include validation."""
         self.since, self.first = time.perf_counter(), trainer.global_step
 
     def on_save_checkpoint(
         self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
     ) -> None:
-        """Adds duration and peak memory so far to the facts in the checkpoint."""
+        """Adds the duration and the peak memory so far to the facts in the checkpoint."""
         if pl_module.device.type == "cuda":
             memory = torch.cuda.max_memory_allocated(pl_module.device) / 2**30
         else:
@@ -195,7 +201,7 @@ class Report(Callback):
         self.folder = folder
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Prints the last losses, writes the report, and prints which commands to run next."""
+        """Prints the last losses, writes the report, and prints the commands to run next."""
         if not trainer.is_global_zero:
             return
         texts = {"train/loss": "on the last batch", "val/loss": "on the validation clips"}
@@ -223,7 +229,9 @@ class Report(Callback):
 
 
 def _extractor_in_package(config: Config, facts: Mapping[str, Any]) -> str:
-    """Returns the name of the extractor in the package that measures the motions of a model; "" if there is none."""
+    """Returns the name of the package's extractor for the motions of a model;
+    "" without such an extractor.
+    """
     name = f"motion_clip_{facts.get('dataset')}"
     if name not in SHIPPED or "captions" not in facts:
         return ""
@@ -232,7 +240,9 @@ def _extractor_in_package(config: Config, facts: Mapping[str, Any]) -> str:
 
 
 def explain_metrics(values: Values, real: Values, metrics: Mapping[str, Metric]) -> list[str]:
-    """Returns lines that explain metrics by their docstrings, with values of generated and real motions."""
+    """Returns lines that explain metrics with their docstrings,
+    and values of generated and real motions.
+    """
     lines = []
     for name, metric in metrics.items():
         shown = {key: value for key, value in values.items() if key.partition("/")[0] == name}
@@ -253,13 +263,13 @@ class Progress(Callback):
     bar: ProgressBar | None = None
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Shows the bar, at the current step of a resumed run."""
+        """Shows the bar; in a resumed run, at its current step."""
         self.bar = ProgressBar(
             desc="training",
             initial=trainer.global_step,
             total=trainer.max_steps if trainer.max_steps > 0 else None,
             unit="step",
-            smoothing=0,  # validation and sampling, which take part of the time, count as well
+            smoothing=0,  # the remaining time includes validation and sampling
             dynamic_ncols=True,
             disable=not trainer.is_global_zero,
         )
@@ -289,10 +299,10 @@ class Progress(Callback):
 
 
 def are_same(motions: Sequence[Motion]) -> bool:
-    """Returns whether motions differ by less than `SAME`, which shows that a network ignores its input.
+    """Whether motions differ by less than `SAME`, which shows that the network ignores its input.
 
-    A learning rate that is too high can end in a network that returns one pose for every prompt and
-    noise. Its loss is finite and even falls a little, so that curves alone do not show it.
+    A learning rate that is too high can produce a network that returns one pose for every prompt
+    and noise. Its loss is finite and even falls a little, so curves do not show the failure.
     """
     if len(motions) < 2:
         return False
@@ -302,7 +312,8 @@ def are_same(motions: Sequence[Motion]) -> bool:
 
 
 class SampleMotions(Callback):
-    """Samples fixed prompts with fixed noise: writes files to the run directory and logs a video.
+    """Samples fixed prompts with fixed noise,
+    writes files to the run directory, and logs a video.
 
     Args:
         folder: folder of the samples. Samples of a step are in a subfolder such as
@@ -310,11 +321,11 @@ class SampleMotions(Callback):
         every_n_steps: minimum number of steps between samples, which are drawn at validation and
             after training.
         prompts: texts, action names, or (text, requested attributes) pairs; None =
-            `UNCONDITIONED` motions. If a model is conditioned on actions and no prompt is one of
-            them, its first actions are used instead.
-        seconds: length of the motions.
-        metrics: torchmetrics by name; their `update` takes some of joints (B, F, J, 3), mask
-            (B, F), keys, requested.
+            `UNCONDITIONED` motions. If a model is conditioned on actions and no prompt is an
+            action, its first actions are used instead.
+        seconds: length of the motions in seconds.
+        metrics: torchmetrics by name. Their `update` takes some of these arguments: joints (B, F,
+            J, 3), mask (B, F), keys, requested.
     """
 
     def __init__(
@@ -353,7 +364,7 @@ class SampleMotions(Callback):
             self.prompts = [(action, {"action": action}) for action in actions[: len(self.prompts)]]
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
-        """Writes samples if they are due and no validation will do so."""
+        """Writes samples if they are due and there will be no validation to write them."""
         if not len(trainer.datamodule.val):  # type: ignore[attr-defined]  # a data set without validation clips
             self._write_if_due(trainer, pl_module)
 
@@ -381,7 +392,9 @@ class SampleMotions(Callback):
             )
 
     def write(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Samples a share of the motions on each process; the first process measures, writes and logs them."""
+        """Samples a share of the motions in each process;
+        the first process measures, writes and logs them.
+        """
         assert isinstance(pl_module, GeneratorTask)
         step = trainer.global_step
         folder = self.folder / f"step_{step:07d}"
@@ -431,7 +444,9 @@ class SampleMotions(Callback):
         return sample(model, resolve(request, model, check_words=False))
 
     def _measure_real(self, clips: Clips, task: LightningModule) -> Values:
-        """Computes all metrics of up to `REAL` training clips, which have the attributes that all prompts request."""
+        """Computes all metrics of up to `REAL` training clips
+        with the attributes that all prompts request.
+        """
         assert isinstance(task, GeneratorTask)
         names = [set(requested) for _, requested in self.prompts]
         common, all_names = (
@@ -449,11 +464,13 @@ class SampleMotions(Callback):
         return self.measure(joints, attributes) if chosen else {}
 
     def measure(self, motions: Sequence[Tensor], requested: Sequence[dict[str, Any]]) -> Values:
-        """Computes all metrics of motions (F, J, 3), in meters; leaves out those without a value."""
+        """Computes all metrics of motions (F, J, 3) in meters;
+        metrics without a value are left out.
+        """
         values: dict[str, float] = {}
         for name, metric in self.metrics.items():
             metric.reset()
-            # returns False: no synchronization, this process has all motions
+            # returns False: metrics are not synchronized, since this process has all motions
             metric.distributed_available_fn = bool
             for key, (motion, attributes) in enumerate(zip(motions, requested, strict=True)):
                 mask = torch.ones(1, len(motion), dtype=torch.bool)

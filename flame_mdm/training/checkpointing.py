@@ -1,8 +1,8 @@
 """Atomic checkpoints, and resuming from them.
 
-A run directory may come from somebody else. Reading a checkpoint runs no code and takes no more
-memory than the file, and only files in the folder of the checkpoints are removed, even if the
-state of a callback names others.
+A run directory may come from somebody else. Reading a checkpoint does not run code, and does not
+take more memory than the file. Only files in the folder of the checkpoints are removed, even if
+the state of a callback names other files.
 """
 
 import math
@@ -44,31 +44,40 @@ class Resumed(NamedTuple):
 
 
 class AtomicCheckpoints(TorchCheckpointIO):
-    """Writes checkpoints to a temporary file, synced and then renamed; keeps the former last one as `previous.ckpt`."""
+    """Writes checkpoints to a temporary file, which is synced and renamed.
+
+    The former last checkpoint is kept as `previous.ckpt`.
+    """
 
     def __init__(self, folder: Path, resumed: Resumed | None = None):
         super().__init__()
         self.folder, self.resumed = folder, resumed
 
     def load_checkpoint(self, path: Any, *args: Any, **options: Any) -> dict[str, Any]:
-        """Returns the content of the checkpoint that the run resumes from, as `newest` checked it."""
+        """Returns the content of the checkpoint from which the run resumes;
+        `newest` has checked it.
+        """
         assert self.resumed is not None
         content = self.resumed.content
-        # The checkpoint is let go: it takes as much memory as the model and its optimizer.
+        # The checkpoint is released, since it takes as much memory as the model and its
+        # optimizer.
         self.resumed = None
         return content
 
     def remove_checkpoint(self, path: Any) -> None:
         """Removes a checkpoint, but only from the folder of this run."""
         path = Path(path)
-        # Paths are compared after links and `..` are resolved.
+        # Paths are compared after resolving links and `..`.
         if path.is_file() and path.parent.resolve() == self.folder.resolve():
             path.unlink()
 
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None
     ) -> None:
-        """Writes a checkpoint; raises `UserError` if that fails, as on a full disk. Earlier ones stay."""
+        """Writes a checkpoint; raises `UserError` if it cannot be written.
+
+        Earlier checkpoints remain.
+        """
         path = Path(path)
         check_within(path.parent, self.folder.parent)
         try:
@@ -81,7 +90,7 @@ class AtomicCheckpoints(TorchCheckpointIO):
                 if path.name == LAST and path.exists():
                     path.replace(path.with_name(PREVIOUS))
                 temporary.replace(path)
-        except (OSError, RuntimeError) as error:  # torch reports a failed write as either
+        except (OSError, RuntimeError) as error:  # torch raises either error for a failed write
             reason = write_failure(
                 error if isinstance(error, OSError) else error.__context__ or error, path
             )
@@ -92,7 +101,9 @@ class AtomicCheckpoints(TorchCheckpointIO):
 
 
 def newest(folder: Path) -> Resumed | None:
-    """Returns the checkpoint to resume from: the last one, or the previous one if the last is damaged."""
+    """Returns the checkpoint from which to resume:
+    the last one, or the previous one if it is damaged.
+    """
     paths = [folder / name for name in (LAST, PREVIOUS) if (folder / name).exists()]
     for path in paths:
         try:
@@ -118,9 +129,10 @@ def newest(folder: Path) -> Resumed | None:
 
 
 def check_optimizers(resumed: Resumed, optimizer: torch.optim.Optimizer) -> None:
-    """Raises `UserError` if the saved state of the optimizer and its schedule does not fit the recipe.
+    """Raises `UserError` if the saved state of the optimizer
+    and its schedule does not fit the recipe.
 
-    PyTorch takes over any values, and would fail in the first step of the training.
+    PyTorch accepts any values, and would fail in the first step of the training.
     """
     try:
         misfits = list(_misfits(resumed.content, optimizer))
@@ -132,7 +144,7 @@ def check_optimizers(resumed: Resumed, optimizer: torch.optim.Optimizer) -> None
 
 
 def _misfits(content: dict[str, Any], optimizer: torch.optim.Optimizer) -> Iterator[str]:
-    """Yields what is wrong with the saved state of the optimizer and its schedule."""
+    """Yields a message for each fault in the saved state of the optimizer and its schedule."""
     usual = optimizer.param_groups[0]
     weights = [weight for group in optimizer.param_groups for weight in group["params"]]
     for state in content.get("optimizer_states") or []:
@@ -151,7 +163,7 @@ def _misfits(content: dict[str, Any], optimizer: torch.optim.Optimizer) -> Itera
 
 
 def _is_alike(value: Any, usual: Any) -> bool:
-    """Returns whether a saved option of an optimizer has the same kind as the usual value."""
+    """Whether a saved option of an optimizer has the same type as the usual value."""
     if isinstance(usual, bool) or usual is None:
         return value is None or isinstance(value, bool)
     if isinstance(usual, int | float):
@@ -165,7 +177,9 @@ def _is_alike(value: Any, usual: Any) -> bool:
 
 
 def _is_state(value: Any, weight: Tensor) -> bool:
-    """Returns whether a saved value can be the state of a weight: a number, or a tensor no larger than the weight."""
+    """Whether a saved value can be the state of a weight:
+    a number, or a tensor up to the weight's size.
+    """
     if isinstance(value, Tensor):
         return value.numel() <= max(1, weight.numel()) and not value.dtype.is_complex
     return isinstance(value, int | float)
@@ -192,7 +206,7 @@ def _check_version(version: Any, path: Path) -> None:
 
 
 def _tensors(content: Any, name: str) -> Iterator[tuple[str, Tensor]]:
-    """Yields all tensors in nested mappings and lists, by the keys that lead to them."""
+    """Yields all tensors in nested mappings and lists, with the keys that lead to them."""
     if isinstance(content, Tensor):
         yield name, content
     elif isinstance(content, dict | list | tuple):

@@ -1,5 +1,5 @@
 # pyright: standard
-"""Training of models that sample in one to four steps, from a teacher that takes more."""
+"""Training of models that sample in one to four steps, from a teacher that takes more steps."""
 
 import copy
 from collections.abc import Sequence
@@ -23,10 +23,10 @@ from flame_mdm.training.averaging import MovingAverage
 
 
 class DistillationTask(GeneratorTask):
-    """Trains a student to sample in one to four steps, with the guidance built in.
+    """Trains a student to sample in one to four steps, with built-in guidance.
 
-    The student starts as its teacher, with the same parts, data and captions; the teacher is only
-    needed in training. The text encoder is not trained, and nothing has dropout.
+    The student starts with its teacher's weights, and has the same parts, data and captions. The
+    teacher is only needed in training. The text encoder is not trained, and there is no dropout.
     `experiments/distillation/consistency.yaml` explains the section `distillation`.
     """
 
@@ -36,29 +36,31 @@ class DistillationTask(GeneratorTask):
     def build(
         cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()
     ) -> Self:
-        """Builds the task of a recipe, with a text encoder that is not trained."""
+        """Builds the task of a recipe without training its text encoder."""
         task = super().build(config, representation, actions=actions)
         task.generator.condition.requires_grad_(False)
         return task.eval()
 
     def train(self, mode: bool = True) -> Self:
-        """Stays in evaluation mode: dropout would be noise in the targets."""
+        """Stays in evaluation mode, since dropout would add noise to the targets."""
         return super().train(False)
 
     def setup(self, stage: str) -> None:
-        """Loads the teacher and starts from its weights."""
+        """Loads the teacher; training starts from its weights."""
         super().setup(stage)
         self.start_from_teacher()
 
     def start_from_teacher(self) -> None:
-        """Reads the teacher, and takes over its weights; raises `UserError` if there is none or it does not fit."""
+        """Reads the teacher and copies its weights;
+        raises `UserError` if it is missing or does not fit.
+        """
         options = self.config["distillation"]
         name = options["teacher"]
         try:
             path = find(name)
         except FileNotFoundError as error:
             raise UserError(
-                f"distillation.teacher={error}. Train it first, or name another"
+                f"distillation.teacher={error}. Train the teacher first, or name another one"
             ) from error
         teacher = read_teacher(path)
         theirs, ours = (
@@ -80,7 +82,7 @@ class DistillationTask(GeneratorTask):
         self.facts["teacher"] = weights_sha256(path)
         scale = options["guidance_scale"]
         self.teacher_guidance = teacher.sampler_options.guidance_scale if scale is None else scale
-        # In lists, since they are not parts of the student.
+        # In lists, since they are not submodules of the student.
         denoiser = self.generator.denoiser
         self.teacher, self.target = [copy.deepcopy(denoiser).requires_grad_(False)], [denoiser]
 
@@ -98,7 +100,7 @@ class DistillationTask(GeneratorTask):
         self.teacher[0].to(self.device)
 
     def on_train_start(self) -> None:
-        """Takes the targets from the moving average of the weights, if the recipe has one."""
+        """Computes the targets with the averaged weights, if the recipe averages weights."""
         super().on_train_start()
         for callback in self.trainer.callbacks:  # type: ignore[attr-defined]
             if isinstance(callback, MovingAverage):
@@ -109,7 +111,7 @@ class DistillationTask(GeneratorTask):
                 self.target = [average.generator.denoiser]
 
     def pretrain(self) -> None:
-        """Does nothing: the text encoder is the teacher's."""
+        """Does nothing, since the text encoder comes from the teacher."""
 
     def loss_terms(
         self,
@@ -118,7 +120,10 @@ class DistillationTask(GeneratorTask):
         u: Tensor | None = None,
         noise: Tensor | None = None,
     ) -> dict[str, Tensor]:
-        """See `GeneratorTask.loss_terms`. Validation, which gives u, is at the times of the last grid."""
+        """See `GeneratorTask.loss_terms`.
+
+        Validation, which passes u, uses the times of the last grid.
+        """
         trainer, counts = self._trainer, self.config["distillation"]["intervals"]
         progress, is_validation = 1.0, u is not None
         if not is_validation and trainer is not None and trainer.max_steps > 0:
@@ -159,16 +164,18 @@ class DistillationTask(GeneratorTask):
 
 
 def read_teacher(path: Path) -> MotionGenerator:
-    """Loads a model that can be a teacher; raises `UserError` if it predicts noise, or is a student itself."""
+    """Loads a teacher; raises `UserError` if it predicts noise, or is a student itself."""
     teacher = load_task(path, MotionGenerator)
     if isinstance(teacher, DistilledGenerator):
         raise UserError(
-            f"{path}: distilled already. Give its teacher, {teacher.config['distillation']['teacher']}"
+            f"{path}: a distilled model. Give its teacher, "
+            f"{teacher.config['distillation']['teacher']}"
         )
     if teacher.process.prediction == "epsilon":
         raise UserError(
-            f"{path}: predicts noise, whose clean estimate is divided by almost nothing at the noisiest times. Give a "
-            "model that predicts the clean motion or the velocity (MDM, MFM)"
+            f"{path}: predicts noise, so computing the clean estimate divides by almost 0 at "
+            f"the noisiest times. Give a model that predicts the clean motion or the velocity "
+            f"(MDM, MFM)"
         )
     return teacher
 

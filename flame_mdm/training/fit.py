@@ -1,4 +1,4 @@
-"""Training of a recipe: assembles data, task, callbacks and trainer, and handles interruptions and errors."""
+"""Training of a recipe: assembles data, task, callbacks and trainer, and handles errors."""
 
 import logging
 import os
@@ -31,7 +31,10 @@ from flame_mdm.training.speed import accelerate
 
 
 def fit(folder: Path, config: Config) -> None:
-    """Trains a recipe in its run directory, from the newest checkpoint if there is one."""
+    """Trains a recipe in its run directory.
+
+    Training resumes from the newest checkpoint, if any.
+    """
     _quiet()
     check_devices(config["trainer"])
     torch.set_float32_matmul_precision("high")
@@ -73,11 +76,11 @@ def fit(folder: Path, config: Config) -> None:
     loggers = [instantiate(config["logger"])] if config["logger"] else []
     plugins: list[Any] = [checkpoints]
     if SLURMEnvironment.detect() and not TorchElasticEnvironment.detect():
-        # Lightning would save during a step, to a file that it then prefers to `last.ckpt`.
+        # Lightning would save during a step, to a file that it would then prefer to `last.ckpt`.
         plugins.append(SLURMEnvironment(auto_requeue=False))
     trainer: Trainer = instantiate(
         config["trainer"]
-        | {"precision": precision, "enable_progress_bar": False},  # `Progress` instead
+        | {"precision": precision, "enable_progress_bar": False},  # replaced with `Progress`
         logger=[*loggers, History(folder, step)],
         callbacks=callbacks,
         plugins=plugins,
@@ -118,12 +121,17 @@ def fit(folder: Path, config: Config) -> None:
 
 
 def check_devices(trainer: Config) -> None:
-    """Raises `UserError` if this machine lacks the GPUs of a recipe; `auto` starts at most one process per CPU core."""
+    """Raises `UserError` if this machine lacks the devices of a recipe.
+
+    On a CPU, there is at most one process per core.
+    """
     accelerator, devices = trainer.get("accelerator", "auto"), trainer.get("devices", 1)
     has_mps = torch.backends.mps.is_available() and accelerator in ("auto", "gpu")
     gpus, cores = 1 if has_mps else torch.cuda.device_count(), os.cpu_count() or 1
     if accelerator in ("gpu", "cuda") and not gpus:
-        raise UserError(f"trainer.accelerator={accelerator}: {NO_GPU}. Drop it to train on the CPU")
+        raise UserError(
+            f"trainer.accelerator={accelerator}: {NO_GPU}. Remove this key to train on the CPU"
+        )
     most = gpus if gpus and accelerator != "cpu" else cores
     if accelerator in ("gpu", "cuda", "auto") and isinstance(devices, int) and devices > most:
         there = f"this machine has {most} " + (
@@ -170,13 +178,13 @@ def _check_same_data(resumed: Resumed, data: MotionDataModule) -> None:
 def _quiet() -> None:
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
     for message in (
-        ".*isinstance\\(treespec, LeafSpec\\).*",  # Lightning's own
+        ".*isinstance\\(treespec, LeafSpec\\).*",  # warnings of Lightning
         ".*does not have many workers.*",
         ".*module\\(s\\) in eval mode at the start of training.*",  # a student without dropout
         ".*Checkpoint directory .* exists and is not empty.*",
-        # Lightning warns if the run directory was moved. The next validation decides again which
-        # checkpoint is best.
+        # Lightning warns if the run directory was moved. The next validation determines the best
+        # checkpoint again.
         "The dirpath has changed.*",
-        ".*sync_dist=True.*",  # the metrics are means over all processes already
+        ".*sync_dist=True.*",  # the metrics already are means over all processes
     ):
         warnings.filterwarnings("ignore", message)

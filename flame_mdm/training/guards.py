@@ -1,4 +1,6 @@
-"""Safeguards for long runs: run lock, divergence detection, explanations of lost processes and exhausted memory."""
+"""Safeguards for long runs:
+run lock, divergence detection, and explanations of killed processes.
+"""
 
 import re
 import shutil
@@ -19,10 +21,10 @@ from flame_mdm.safe_io.paths import check_tree, remove_abandoned
 
 @contextmanager
 def only_run(folder: Path) -> Iterator[None]:
-    """Holds the lock `run.lock` in the run directory, which somebody else may have filled.
+    """Holds the lock `run.lock` in the run directory.
 
-    Raises `UserError` if a process on any host holds the lock, or links in the directory lead out
-    of it.
+    The directory may come from somebody else. Raises `UserError` if a process on any host holds
+    the lock, or if links in the directory lead out of it.
     """
 
     def refuse(owner: str) -> None:
@@ -40,22 +42,22 @@ def only_run(folder: Path) -> Iterator[None]:
         try:
             yield
         finally:
-            # Without a configuration, training never started, and the folder holds only files of
+            # Without a configuration, training never started, and the folder only holds files of
             # loggers.
             if new and not (folder / "config.yaml").exists():
                 shutil.rmtree(folder, ignore_errors=True)
 
 
 class BadLoss(Callback):
-    """Stops training when a loss is not finite or explodes, before it reaches a checkpoint.
+    """Stops training when a loss is not finite or explodes, before a checkpoint is written.
 
     A loss explodes if it exceeds `factor` times the median of the previous interval.
-    `bad_batch.json` in the run directory describes the first bad batch: the step, and for each
-    process the number of the batch, the ids of its clips and its loss.
+    `bad_batch.json` in the run directory describes the first bad batch: it contains the step and,
+    for each process, the number of the batch, the ids of the clips and the loss.
 
     Args:
         folder: the run directory.
-        factor: how many times a loss may exceed the usual loss.
+        factor: maximum ratio of a loss to the usual loss.
     """
 
     def __init__(self, folder: str, factor: float = 1000.0):
@@ -73,7 +75,9 @@ class BadLoss(Callback):
         batch: MotionBatch,
         batch_idx: int,
     ) -> None:
-        """Keeps the loss of the batch on its device, and checks all kept losses now and then."""
+        """Stores the loss of the batch on its device,
+        and checks all stored losses at the log interval.
+        """
         loss = outputs["loss"] if isinstance(outputs, Mapping) else outputs
         self.seen.append((trainer.global_step, batch_idx, batch.ids, loss.detach().float()))
         if (batch_idx + 1) % trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
@@ -82,11 +86,15 @@ class BadLoss(Callback):
     def on_save_checkpoint(
         self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
     ) -> None:
-        """Checks the losses first, so that no checkpoint holds weights after a bad loss."""
+        """Checks the losses before a checkpoint is written,
+        so that it cannot hold weights after a bad loss.
+        """
         self.check(trainer)
 
     def check(self, trainer: Trainer) -> None:
-        """Raises `UserError` if a loss since the last check is bad, on all processes at the same step."""
+        """Raises `UserError` in all processes at the same step,
+        if a loss since the last check is bad.
+        """
         if not self.seen:
             return
         recent = torch.stack([loss for *_, loss in self.seen])
@@ -123,8 +131,10 @@ class BadLoss(Callback):
 
 
 def lost_worker(error: BaseException) -> UserError | None:
-    """Returns an explanation if an error means that a data loading process died, otherwise None."""
-    # If the worker dies while a checkpoint is written, its error is the cause of another error.
+    """Returns an explanation for errors that mean
+    that a data loading process died, otherwise None.
+    """
+    # If a worker dies while a checkpoint is written, its error is the cause of another error.
     message = f"{error} {error.__cause__ or ''}"
     lost = re.search(
         r"DataLoader worker \(pid.*?\) (is killed by signal|exited unexpectedly)", message
@@ -133,13 +143,14 @@ def lost_worker(error: BaseException) -> UserError | None:
     if lost is None and not isinstance(error, ConnectionError | EOFError):
         return None
     return UserError(
-        "a data loading process was killed, as happens when memory runs out, or ended unexpectedly. Run the same "
-        "command to resume from the last checkpoint. Lower data.num_workers; 0 loads in the main process"
+        "a data loading process was killed, perhaps because memory ran out, or ended "
+        "unexpectedly. Lower data.num_workers (0 = load in the main process), and run the same "
+        "command to resume from the last checkpoint"
     )
 
 
 def out_of_memory(error: BaseException, step: int) -> UserError | None:
-    """Returns an explanation if an error means that memory is exhausted, otherwise None."""
+    """Returns an explanation for errors that mean that memory is exhausted, otherwise None."""
     if not isinstance(error, torch.OutOfMemoryError) and "can't allocate memory" not in str(error):
         return None
     return UserError(

@@ -20,7 +20,10 @@ from flame_mdm.schemas import read_json
 
 
 class History(Logger):
-    """Appends all logged values to `metrics.jsonl` in the run folder; a run that resumes drops lines after `step`."""
+    """Appends all logged values to `metrics.jsonl` in the run directory.
+
+    A resumed run drops the lines after `step`.
+    """
 
     def __init__(self, folder: str | Path, step: int = 0):
         super().__init__()
@@ -34,16 +37,19 @@ class History(Logger):
 
     @property
     def version(self) -> str:
-        """No version: all parts of a run share one file."""
+        """Empty, since all parts of a run share one file."""
         return ""
 
     @rank_zero_only
     def log_hyperparams(self, *args: Any, **kwargs: Any) -> None:
-        """Does nothing, since hyperparameters are in `config.yaml`."""
+        """Does nothing, since the hyperparameters are in `config.yaml`."""
 
     @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
-        """Appends a line of metrics; first drops lines after the step at which a run is resumed."""
+        """Appends a line of metrics.
+
+        In a resumed run, lines after the resumed step are dropped before.
+        """
         if not self.begun:
             kept = [line for line in records(self.path) if line["step"] <= self.step]
             write_text(self.path, "".join(json.dumps(line) + "\n" for line in kept))
@@ -53,18 +59,21 @@ class History(Logger):
 
 
 class TensorBoardRun(TensorBoardLogger):
-    """TensorBoard logger without Lightning's `epoch`, which is always 0: training is one pass over drawn batches."""
+    """TensorBoard logger without Lightning's `epoch`.
+
+    The epoch is always 0, since training is one pass over drawn batches.
+    """
 
     @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
-        """Logs metrics without the epoch, which endless batches do not have."""
+        """Logs metrics without the epoch."""
         super().log_metrics(
             {name: value for name, value in metrics.items() if name != "epoch"}, step
         )
 
 
 class Kept(TypedDict, total=False):
-    """Content of `wandb.json`: the id of the run, its last step, and the number of its rows."""
+    """Content of `wandb.json`: the id of the run, the last step, and the number of rows."""
 
     id: str
     step: int | None
@@ -72,7 +81,10 @@ class Kept(TypedDict, total=False):
 
 
 class WandbRun(WandbLogger):
-    """Weights & Biases logger that continues the same wandb run when training is resumed, and logs no step twice."""
+    """Weights & Biases logger that continues its wandb run when training is resumed.
+
+    No step is logged twice.
+    """
 
     def __init__(self, save_dir: str, **options: Any):
         self.path = Path(save_dir) / "wandb.json"
@@ -86,14 +98,14 @@ class WandbRun(WandbLogger):
         super().__init__(
             save_dir=save_dir, **{"id": kept.get("id") or secrets.token_hex(4), **options}
         )
-        self._wandb_init.pop("anonymous")  # wandb warns about it even if it is not set
+        self._wandb_init.pop("anonymous")  # wandb warns about this variable even if it is not set
 
     @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, Any], step: int | None = None) -> None:
-        """Logs metrics; skips steps that an earlier part of a resumed run logged already."""
+        """Logs metrics, except for steps that an earlier part of a resumed run has logged."""
         if step is not None and step < self.logged_step:
             return
-        # W&B numbers the rows of an offline part from 0 again.
+        # Weights & Biases numbers the rows of an offline part from 0 again.
         if self.experiment.step < self.rows:
             self.experiment.log({}, step=self.rows)
         super().log_metrics(metrics, step)

@@ -23,7 +23,9 @@ PACKAGES = ("flame-mdm", "torch", "lightning", "torchmetrics", "transformers", "
 
 
 class WriteProvenance(Callback):
-    """Writes and logs `config.yaml` and `provenance.json` at the start of training, and prints a short summary."""
+    """Writes and logs `config.yaml` and `provenance.json`
+    at the start of training; prints a summary.
+    """
 
     def __init__(self, config: Config):
         self.config = config
@@ -86,7 +88,7 @@ class WriteProvenance(Callback):
 
 
 def device_name(trainer: Trainer) -> str:
-    """Returns the number of processes and the device of each, such as "1 x NVIDIA H200", "1 x AMD EPYC, 2 threads"."""
+    """Returns the number of processes and their device, such as "1 x AMD EPYC, 2 threads"."""
     where = trainer.strategy.root_device
     name = torch.cuda.get_device_name(where) if where.type == "cuda" else where.type
     if where.type == "cpu":
@@ -114,6 +116,6 @@ def _git(*words: str) -> str | None:
         result = subprocess.run(
             ["git", *words], capture_output=True, text=True, cwd=folder, check=False
         )
-    except FileNotFoundError:  # no git on this machine
+    except FileNotFoundError:  # this machine has no git
         return None
     return result.stdout.strip() if result.returncode == 0 else None

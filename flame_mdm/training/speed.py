@@ -10,11 +10,16 @@ from flame_mdm.errors import say
 from flame_mdm.task import GeneratorTask, Task
 
 COMPILED_FROM = 5000
-"""Minimum number of training steps for which the network is compiled: shorter runs would not make up for the time."""
+"""Minimum number of training steps for which the network is compiled.
+
+Shorter runs would not make up for the time of the compilation.
+"""
 PAD_MULTIPLE = 32
-"""Batches of a compiled network are padded to multiples of this number of frames, since each length is compiled."""
-# Maximum number of lengths and modes for which the network is compiled; torch stops at 8 by
-# default
+"""Batches of a compiled network are padded to multiples of this number of frames.
+
+The network is compiled once per length.
+"""
+# Maximum number of lengths and modes for which the network is compiled; torch's default is 8
 MOST_SHAPES = 64
 
 
@@ -27,7 +32,7 @@ def accelerate(task: Task, data: MotionDataModule, config: Config) -> str:
     On a CPU: bfloat16 if it has instructions for products in it; `CheapDropout`; `attention`,
     without dropout of its weights. Compilation made no difference there.
 
-    A precision in the recipe other than 32-true stays.
+    If the recipe has another precision than 32-true, it is kept.
     """
     trainer, supported = config["trainer"], False
     device = trainer["accelerator"]
@@ -42,9 +47,13 @@ def accelerate(task: Task, data: MotionDataModule, config: Config) -> str:
     if device == "cuda":
         supported = torch.cuda.is_bf16_supported(including_emulation=False)
         if isinstance(task, GeneratorTask) and trainer["max_steps"] >= COMPILED_FROM:
-            say("compiling the network: the first steps take longer, and less so in later runs")
+            say(
+                "compiling the network: the first steps take longer. In later runs, compilation "
+                "takes less time"
+            )
             denoiser = task.generator.denoiser
-            if denoiser.mask_padding:  # otherwise, padding changes what it learns
+            # networks without this attribute would learn from the padding
+            if denoiser.mask_padding:
                 data.pad_multiple = max(data.pad_multiple, PAD_MULTIPLE)
             torch._dynamo.config.recompile_limit = MOST_SHAPES
             denoiser.compile(dynamic=False)
@@ -56,7 +65,7 @@ def accelerate(task: Task, data: MotionDataModule, config: Config) -> str:
 
 
 def _simplify(network: nn.Module) -> None:
-    """Replaces all dropout by `CheapDropout`, and attention by `attention`."""
+    """Replaces all dropout layers with `CheapDropout`, and attention with `attention`."""
     for module in list(network.modules()):
         if isinstance(module, Attention):
             module.attend = attention
@@ -66,10 +75,10 @@ def _simplify(network: nn.Module) -> None:
 
 
 class CheapDropout(nn.Module):
-    """Dropout that takes four decisions from one 64-bit random number, with a probability rounded to 2^-16.
+    """Dropout that makes four decisions with one 64-bit random number.
 
-    On a CPU, torch draws one random number per element in a single thread, which takes a fifth of
-    a training step.
+    The probability is rounded to a multiple of 2^-16. On a CPU, torch draws one random number per
+    element in a single thread, which takes a fifth of a training step.
     """
 
     def __init__(self, p: float):
@@ -78,7 +87,9 @@ class CheapDropout(nn.Module):
         self.threshold = round(p * 2**16) - 2**15
 
     def forward(self, x: Tensor) -> Tensor:
-        """Returns `x` with elements dropped and the others scaled; unchanged in evaluation."""
+        """Returns `x` with some elements dropped and the others scaled;
+        in evaluation mode, returns `x`.
+        """
         if not self.training or self.p == 0:
             return x
         words = torch.empty((x.numel() + 3) // 4, dtype=torch.int64).random_(-(2**63), None)
@@ -93,7 +104,7 @@ def attention(
     attn_mask: Tensor | None = None,
     dropout_p: float = 0.0,
 ) -> Tensor:
-    """Computes `scaled_dot_product_attention` by two matrix products; ignores `dropout_p`.
+    """Computes `scaled_dot_product_attention` with two matrix products; ignores `dropout_p`.
 
     On a CPU, torch's fused attention takes up to twice as long in float32, and 3 to 5 times as
     long in bfloat16.

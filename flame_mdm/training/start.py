@@ -1,4 +1,4 @@
-"""Start of a training run in its directory, or its continuation. This module does not import torch."""
+"""Starts or resumes a training run in its directory. This module does not import torch."""
 
 from contextlib import nullcontext
 from pathlib import Path
@@ -26,11 +26,16 @@ FREE = (
     "trainer.limit_val_batches",
     "trainer.enable_progress_bar",
 )
-"""Keys that may differ when a run is resumed: they change neither the model nor its training."""
+"""Keys that may differ when a run is resumed,
+since they change neither the model nor its training.
+"""
 
 
 def train(config: Config) -> None:
-    """Trains the composed experiment, or resumes the run in its directory; an interruption raises `SystemExit`."""
+    """Trains the composed experiment, or resumes the run in its directory.
+
+    An interruption raises `SystemExit`.
+    """
     folder = Path(config["run"]["dir"])
     if (folder / "config.yaml").exists():
         _check_same(folder, config)
@@ -45,10 +50,10 @@ def train(config: Config) -> None:
 
 
 def recipe_changes(config: Config) -> list[str]:
-    """Returns "key=value" of the keys in which a model's configuration differs from the recipe
-    that it names.
+    """Returns "key=value" for each key in which a configuration differs
+    from the recipe that it names.
 
-    Keys that may differ when a run is resumed and the seed are not compared. Neither are keys
+    Some keys are not compared: keys that may differ when a run is resumed, the seed, and keys
     that the configuration lacks, because another version wrote it. If the class of a part
     differs, the other keys of this part are left out. A recipe that is not in `experiments/` has
     no changes.

@@ -1,4 +1,4 @@
-"""What is drawn: figures, and bodies, whose mesh is skinned to a motion."""
+"""Figures and bodies for players and pictures. The mesh of a body is skinned to a motion."""
 
 from __future__ import annotations
 
@@ -14,14 +14,17 @@ from flame_mdm.representations.skeleton import JOINT, SMPL22, Skeleton
 from flame_mdm.safe_io import naming, read_npz
 
 TWISTED = {"hip": 0.4, "shoulder": 0.4, "elbow": 0.55}
-"""Limbs with a helper bone, by their first joint, and the share of the twist that the bone takes. It is the
-twist of the hip or shoulder or, for the elbow, of the wrist."""
+"""Limbs with a helper bone, by their first joint,
+and the share of a twist that the helper bone takes.
+
+The twist is the twist of the hip or shoulder; for the elbow, it is the twist of the wrist.
+"""
 HELPERS = tuple(
     (JOINT[f"{side}_{name}"], share)
     for side in ("left", "right")
     for name, share in TWISTED.items()
 )
-"""Joint and share of the twist of each bone after the 22 joints."""
+"""Joint, and share of the twist, for each bone after the 22 joints."""
 # The joint at which each bone begins
 ANCHORS = (
     *range(len(SMPL22)),
@@ -39,17 +42,18 @@ SKIN, HAIR, SHIRT, TROUSERS, SHOES = MATERIALS = (
 
 @dataclass(eq=False, repr=False)
 class Figure:
-    """Joints in motion, which players and pictures draw; `flame_mdm.formats.motion.Motion` is one.
+    """Moving joints that players and pictures draw, such as a `flame_mdm.formats.motion.Motion`.
 
     Attributes:
         joints: (F, J, 3) joint positions in meters, y up, floor at y = 0.
         fps: frames per second.
         skeleton: names and parents of the J joints; the prefixes `left_` and `right_` mark the
             sides.
-        text: the caption, or the name of the action; "" if there is none.
-        id: name of the motion: a clip, a file, or text and sample number, which determine the
-            noise.
-        contacts: (F, N) bool, True if a joint of `skeleton.feet` is on the floor; None = unknown.
+        text: the caption or the name of the action; "" without either.
+        id: name of the motion: the name of a clip or file, or the text and sample number, which
+            determine the noise.
+        contacts: (F, N) bool, True = this joint of `skeleton.feet` is on the floor; None =
+            unknown.
     """
 
     joints: np.ndarray
@@ -60,9 +64,10 @@ class Figure:
     contacts: np.ndarray | None = field(default=None, kw_only=True)
 
     def try_fit(self, body: Mesh | None = None) -> tuple[FittedBody | None, str]:
-        """Returns a body that moves like the joints and "", or None and the reason why a skeleton is drawn.
+        """Returns a body that moves like the joints, and "";
+        or None, and the reason why a skeleton is drawn.
 
-        `body` is the mesh; None = the mannequin. Joints alone show no body.
+        `body` is the mesh; None = the mannequin. Without rotations, joints show no body.
         """
         return None, "the rotations of its joints are unknown"
 
@@ -80,12 +85,15 @@ def sides(skeleton: Skeleton) -> list[int]:
 
 
 def head(skeleton: Skeleton) -> int | None:
-    """Returns the number of the head joint, None if the skeleton has none."""
+    """Returns the number of the head joint; None if the skeleton has no head."""
     return skeleton.joints.index("head") if "head" in skeleton.joints else None
 
 
 def radii(skeleton: Skeleton) -> list[float]:
-    """Returns the radius of the body around each joint in meters, which grows with the number of its descendants."""
+    """Returns the radius of the body around each joint in meters.
+
+    The radius grows with the number of the joint's descendants.
+    """
     below = [0] * len(skeleton.parents)
     for joint in reversed(range(1, len(below))):
         below[skeleton.parents[joint]] += below[joint] + 1
@@ -93,11 +101,13 @@ def radii(skeleton: Skeleton) -> list[float]:
 
 
 class Mesh:
-    """A closed mesh in its stored pose, an A-pose with the pelvis at 0; as `tools/mannequin.py` writes it.
+    """A closed mesh in its stored pose:
+    an A-pose with the pelvis at 0. `tools/mannequin.py` writes it.
 
     Attributes:
         points: (V, 3) in meters; `normals` (V, 3), `colors` (V, 3) from 0 to 255.
-        weights: (V, 28), of the 22 joints of SMPL and `HELPERS`; at most four are not 0.
+        weights: (V, 28) weights of SMPL's 22 joints and of `HELPERS`; at most four per point are
+            not 0.
         triangles: (T, 3), counterclockwise seen from outside.
         turns: (28, 3, 3), rotation of each bone in the world from the rest pose of SMPL to the
             stored pose.
@@ -125,7 +135,11 @@ class Mesh:
 
 
 def largest_weights(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the four bones (V, 4) with the largest of weights (V, B), and integers (V, 4) that add up to 255."""
+    """Returns the four bones (V, 4) with the largest weights,
+    and integer weights (V, 4) with a sum of 255.
+
+    The input is (V, B).
+    """
     bones = np.argsort(-weights, axis=1, kind="stable")[:, :4]
     most = np.take_along_axis(weights, bones, 1)
     most = np.floor(255 * most / most.sum(1, keepdims=True) + 0.5).astype(int)
@@ -140,7 +154,7 @@ def mannequin() -> Mesh:
 
 
 def read_body(name: str) -> Mesh:
-    """Returns the mannequin, or the body in a file; raises `UserError` if the file is damaged."""
+    """Returns the mannequin or the body in a file; raises `UserError` if the file is damaged."""
     with naming(name, KeyError, ValueError, IndexError, prefix="not a body: "):
         return mannequin() if name == "mannequin" else Mesh(Path(name))
 
@@ -150,16 +164,20 @@ class FittedBody:
     """A body with the bone lengths of a clip, and its motion. F frames, B = 28 bones."""
 
     mesh: Mesh
-    # (22, 3, 3), linear map of each joint's part of the stored mesh to the clip's proportions
+    # (22, 3, 3), linear map from each joint's part of the stored mesh to the proportions of the
+    # clip
     fit: np.ndarray
-    joints: np.ndarray  # (22, 3) of the stored pose with the clip's bone lengths, pelvis at 0
-    points: np.ndarray  # (V, 3) of the mesh in this pose
+    # (22, 3), joints of the stored pose with the bone lengths of the clip, pelvis at 0
+    joints: np.ndarray
+    points: np.ndarray  # (V, 3), points of the mesh in this pose
     # (22, 3, 3), rotation of each part of the mesh at rest: soles are flat, the head is upright
     neutral: np.ndarray
     turns: np.ndarray  # (F, B, 3, 3), rotation of each bone from the stored pose to each frame
-    starts: np.ndarray  # (F, B, 3), where each bone begins: at the motion's joints, lifted
+    starts: np.ndarray  # (F, B, 3), start of each bone: the joints of the motion, lifted
     lift: (
-        float  # height in meters of the body's joints above the motion's: the thickness of the sole
+        # height in meters by which the body's joints are above the motion's joints: the thickness
+        # of the sole
+        float
     )
 
     def skinned(self, frame: int) -> tuple[np.ndarray, np.ndarray]:

@@ -55,17 +55,19 @@ def player_page(
 ) -> str:
     """Returns a self-contained HTML page that plays motions side by side in 3D, with a shared clock and camera.
 
-    Motions that no body fits are shown as skeletons, with the reason in their caption. Positions
-    are rounded to millimeters, or to 1/65534 of the span of a motion.
+    If a body does not fit a motion, a skeleton is shown, and the caption has the reason.
+    Positions are rounded to millimeters, or to 1/65534 of the span of a motion.
 
     Args:
-        motions: of any skeletons, lengths and frame rates; `title` is the heading of the page.
-        about: HTML of a collapsible section below the heading; its texts must be escaped.
+        motions: the motions, of any skeletons, lengths and frame rates; `title` is the heading of
+            the page.
+        about: HTML of a collapsible section below the heading. Texts in it must already be
+            escaped.
         columns: motions per row; 0 = as many as fit into the window.
         groups: for each motion, a name to filter by, such as its split; "" = none.
-        beside: for each motion, the id of an earlier one to show it next to, such as its
-            original; "" = none.
-        marks: for each motion, spans of its time line to mark: first frame, end (exclusive), kind
+        beside: for each motion, the id of an earlier motion next to which it is shown, such as
+            its original; "" = none.
+        marks: for each motion, spans to mark on the time line: first frame, end (exclusive), kind
             and description.
         body: the body to draw; None = the mannequin.
     """
@@ -93,7 +95,10 @@ def player_page(
 
 
 def packed_motion(motion: Figure, begin: int = 0) -> dict[str, Any]:
-    """Returns the frames of a motion from `begin` on for the player; frames before only determine rotations."""
+    """Returns the frames of a motion for the player, starting at `begin`.
+
+    Earlier frames only determine rotations.
+    """
     return _packed(motion, "", "", (), None, begin)
 
 
@@ -134,10 +139,10 @@ def _packed(
 
 
 def _packed_body(body: FittedBody, begin: int) -> dict[str, Any]:
-    """Returns proportions, and for each frame and bone a quaternion in 32 bits, exact to about 0.1 degrees.
+    """Returns proportions, and a quaternion of 32 bits for each frame and bone.
 
-    The two highest bits tell which of x, y, z, w is largest; the others, from -0.71 to 0.71,
-    follow in 10 bits each.
+    The quaternions are exact to about 0.1 degrees. The two highest bits tell which of x, y, z and
+    w is largest. The three other components, from -0.71 to 0.71, follow with 10 bits each.
     """
     quaternions = Rotation.from_matrix(body.turns[begin:].reshape(-1, 3, 3)).as_quat()
     largest = np.abs(quaternions).argmax(1)

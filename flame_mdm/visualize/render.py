@@ -25,26 +25,27 @@ LINE = (205, 211, 219)
 TEXT = (28, 36, 48)
 FAINT = (102, 112, 133)
 SHADOW, TRAIL, CONTACT = (212, 216, 222), (122, 91, 208), (15, 157, 107)
-NEAR = 0.3  # nothing nearer to the camera than this, in meters, is drawn
-# Angles of the camera, which is in front of the body, to the left and above
+NEAR = 0.3  # objects nearer to the camera than this, in meters, are not drawn
+# Angles of the camera, which is in front of the body, to its left and above it
 YAW, PITCH = 0.6, 0.24
 TOWARD = np.array(
     [math.sin(YAW) * math.cos(PITCH), math.sin(PITCH), math.cos(YAW) * math.cos(PITCH)]
 )
 RIGHT = np.array([math.cos(YAW), 0, -math.sin(YAW)])
-# Number of the color space of HD video, which players assume where a large video does not name
-# one
+# Number of the color space of HD video, which players assume for large videos without a color
+# space
 BT709 = 1
-SMOOTH = 2  # images are drawn this many times larger and then reduced
+SMOOTH = 2  # images are drawn larger by this factor and then reduced
 
 
 def write_gif(
     path: str | Path, motions: Sequence[Figure], size: int = 256, body: Mesh | None = None
 ) -> None:
-    """Writes a looping animation of motions side by side, with captions below, in panels of `size` pixels.
+    """Writes a looping animation of motions side by side, with captions below.
 
-    It has the highest frame rate of the motions, but at most 50 per second, the limit of the
-    format. A motion that ends earlier stays at its last frame. `body` None = the mannequin.
+    Each motion has a panel of `size` pixels. The animation has the highest frame rate of the
+    motions, but at most 50 frames per second, the limit of the format. A motion that ends earlier
+    stays at its last frame. `body` is the body to draw; None = the mannequin.
     """
     path = target(path, motions)
     fps = max(motion.fps for motion in motions)
@@ -54,8 +55,8 @@ def write_gif(
         image.quantize(palette=palette, dither=Image.Dither.NONE)
         for image in _video(motions, fps, size, body)
     ]
-    # GIF counts in hundredths of a second: round the times, not the durations, so that errors do
-    # not add up
+    # GIF counts in hundredths of a second. Times are rounded, not durations, so that errors do
+    # not add up.
     times = np.rint(100 * np.arange(len(images) + 1) / fps).astype(int)
     options = {"append_images": images[1:], "duration": (10 * np.diff(times)).tolist(), "loop": 0}
     with atomic_write(path) as temporary:
@@ -79,7 +80,7 @@ def write_mp4(
         av.open(str(temporary), "w", "mp4", {"movflags": "+faststart"}) as file,
     ):
         stream = file.add_stream("libx264", Fraction(fps).limit_denominator(1001), {"crf": "20"})
-        stream.thread_count = 1  # makes the bytes independent of the number of cores
+        stream.thread_count = 1  # with one thread, the bytes do not depend on the number of cores
         context = stream.codec_context
         context.colorspace = context.color_primaries = context.color_trc = BT709
         for image in _video(motions, fps, size, body):
@@ -102,7 +103,10 @@ def contact_sheet(
     size: int = 192,
     body: Mesh | None = None,
 ) -> None:
-    """Writes one PNG with a row per motion: `frames` poses of `size` pixels, equally spaced in time, and a caption."""
+    """Writes one PNG with a row per motion.
+
+    A row has `frames` poses of `size` pixels, equally spaced in time, and a caption.
+    """
     path = target(path, motions)
     rows = []
     for motion in motions:
@@ -126,7 +130,10 @@ def contact_sheet(
 
 
 def thumbnail(motion: Figure, height: int = 120) -> bytes:
-    """Returns the pose that differs most from the first one as a WebP image, `height` pixels high and 0.7 as wide."""
+    """Returns a WebP image of the pose that differs most from the first pose.
+
+    The image is `height` pixels high and 0.7 times as wide.
+    """
     poses = motion.joints - motion.joints[:, :1] * [1, 0, 1]
     frame = int(np.linalg.norm(poses - poses[0], axis=2).sum(1).argmax())
     image = _figure(motion, motion.try_fit()[0], frame, round(height / 0.92))
@@ -138,7 +145,10 @@ def thumbnail(motion: Figure, height: int = 120) -> bytes:
 
 
 def _palette() -> Image.Image:
-    """Returns one palette of all colors and their blends at smoothed edges, so that colors do not flicker."""
+    """Returns one palette for all frames, so that colors do not flicker.
+
+    The palette has all colors, and their blends at smoothed edges.
+    """
     drawn = np.array(
         [*SIDE_COLORS.values(), *RIM_COLORS.values(), LINE, TEXT, FAINT, SHADOW, TRAIL, CONTACT]
     )
@@ -156,7 +166,7 @@ def _palette() -> Image.Image:
 def _video(
     motions: Sequence[Figure], fps: float, size: int, mesh: Mesh | None
 ) -> Iterator[Image.Image]:
-    """Yields images of the panels side by side, one every 1 / fps seconds, with a progress bar."""
+    """Yields images of the panels side by side, one per 1 / fps seconds, with a progress bar."""
     seconds = max(len(motion.joints) / motion.fps for motion in motions)
     columns = len(motions) if len(motions) < 4 else min(4, math.ceil(math.sqrt(len(motions))))
     bodies = [motion.try_fit(mesh)[0] for motion in motions]
@@ -169,7 +179,7 @@ def _video(
 
     with ThreadPoolExecutor(min(len(motions), os.cpu_count() or 1)) as pool:
         for tick in range(count):
-            # past its end, a motion stays at its last frame
+            # after its end, a motion stays at its last frame
             now = [
                 min(int(tick / fps * motion.fps + 1e-6), len(motion.joints) - 1)
                 for motion in motions
@@ -187,7 +197,10 @@ def _video(
 
 
 def _figure(motion: Figure, body: FittedBody | None, frame: int, size: int) -> Image.Image:
-    """Draws one pose (without a body, the skeleton) on the ground; the camera follows the smoothed root."""
+    """Draws one pose on the ground, as a body or skeleton.
+
+    The camera follows the smoothed root.
+    """
     side = size * SMOOTH
     image = Image.new("RGB", (side, side), PAPER)
     pen = ImageDraw.Draw(image)
@@ -248,7 +261,9 @@ def _figure(motion: Figure, body: FittedBody | None, frame: int, size: int) -> I
 
 
 def _camera(center: np.ndarray, side: int) -> Callable[[np.ndarray], np.ndarray]:
-    """Returns the projection of points (N, 3) in meters to (N, 4): x, y, pixels per meter and depth."""
+    """Returns a function that projects points (N, 3) in meters to (N, 4):
+    x, y, pixels per meter and depth.
+    """
 
     def project(points: np.ndarray) -> np.ndarray:
         offset = points - center
@@ -263,7 +278,7 @@ def _camera(center: np.ndarray, side: int) -> Callable[[np.ndarray], np.ndarray]
 
 
 def _shaded(normals: np.ndarray, colors: np.ndarray) -> np.ndarray:
-    """Returns colors (V, 3) lit from above left of the camera."""
+    """Returns colors (V, 3) with light from the upper left of the camera."""
     light = TOWARD - 0.7 * RIGHT + [0, 1.2, 0]
     lit = np.maximum(normals @ (light / np.linalg.norm(light)), 0)
     return np.clip(colors * (0.5 + 0.12 * normals[:, 1] + 0.52 * lit)[:, None], 0, 255)
@@ -272,11 +287,11 @@ def _shaded(normals: np.ndarray, colors: np.ndarray) -> np.ndarray:
 def _rasterize(
     image: np.ndarray, at: np.ndarray, depth: np.ndarray, colors: np.ndarray, triangles: np.ndarray
 ) -> None:
-    """Draws triangles into an image, the nearest one at each pixel, with colors interpolated between their corners.
+    """Draws triangles into an image, the nearest triangle at each pixel.
 
-    The image is (height, width, 3) uint8; `at` (V, 2) are pixel coordinates, y down; `depth` (V,)
-    distances from the camera; `colors` (V, 3) from 0 to 255. Triangles (T, 3) seen from inside,
-    clockwise, are not drawn.
+    Colors are interpolated between the corners. The image is (height, width, 3) uint8. `at` (V,
+    2) are pixel coordinates, y down; `depth` (V,) are distances from the camera; `colors` (V, 3)
+    are from 0 to 255. Triangles (T, 3) that are seen from inside, clockwise, are not drawn.
     """
     lowest = np.clip(np.floor(at.min(0)), 0, image.shape[1::-1]).astype(int)
     highest = np.clip(np.ceil(at.max(0)), lowest, image.shape[1::-1]).astype(int)
@@ -289,8 +304,8 @@ def _rasterize(
     high = np.clip(np.floor(np.maximum(np.maximum(a, b), c) + 0.5), 0, [width, height]).T
     wide, tall = np.maximum(high - low, 0).astype(int)
     count = np.where(seen, wide * tall, 0)
-    # shares of the second and third corner at a pixel: linear functions of its column and row in
-    # the bounding box
+    # The shares of the second and third corner at a pixel are linear functions of the pixel's
+    # column and row in the bounding box.
     twice = np.where(seen, twice, 1)
     right, down = low + 0.5 - a.T
     table = [right * cy - down * cx, cy, -cx, down * bx - right * by, -by, bx]
@@ -367,7 +382,9 @@ def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 
 
 def _lines(motion: Figure, body: FittedBody | None, width: int, size: int) -> list[str]:
-    """Returns at most three lines of a motion's caption, and one more if it is drawn as a skeleton."""
+    """Returns at most three lines of a motion's caption,
+    and a fourth line if it is drawn as a skeleton.
+    """
     lines, font = [""], _font(size)
     # The caption has room for three lines.
     for word in shortened(motion.text or motion.id, width).split():
@@ -382,7 +399,7 @@ def _lines(motion: Figure, body: FittedBody | None, width: int, size: int) -> li
 
 
 def _caption(texts: Sequence[str], width: int, lines: int, size: int) -> Image.Image:
-    """Draws lines of text with room for `lines` lines; it is drawn once for all frames."""
+    """Draws lines of text with room for `lines` lines, once for all frames."""
     line = round(max(10, size // 18) * 1.35)
     image = Image.new("RGB", (width, lines * line + 10), PAPER)
     pen = ImageDraw.Draw(image)

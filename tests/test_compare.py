@@ -110,7 +110,7 @@ def test_what_is_not_paired_has_no_difference(three, tmp_path, capsys, subtests)
     put(three[0], values=values)
     for changes, message in (
         (None, "No evaluation in common"),
-        ({"seed": 1}, "not compared: other seed"),
+        ({"seed": 1}, "not compared: the seeds"),
         (
             {"data": result()["data"] | {"frames": [24, 40]}},
             "not compared: the seeds, limits of length or skeletons differ",

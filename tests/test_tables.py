@@ -583,11 +583,11 @@ def test_footnotes_of_rows_with_several_protocols_name_their_columns(tmp_path):
     (part,) = build("mfm_figure_4", spec, tmp_path).parts
     notes = dict(note for note in part.notes if note[0])
     assert notes["a"].startswith(
-        "NFE, FID, Training hours, Peak memory of training, GiB: protocol text_to_motion_t2m"
+        "NFE, FID, Training hours, Peak memory of training, GiB: Protocol text_to_motion_t2m"
     )
     assert notes["b"].startswith("Seconds per motion: ")
-    assert notes["†"].endswith("as run by Hu et al. on an unnamed device")
-    assert notes["††"].endswith("as run by Chen et al. on one V100"), (
+    assert notes["†"].endswith("as run by Hu et al. on an unnamed device.")
+    assert notes["††"].endswith("as run by Chen et al. on one V100."), (
         "the value that Hu et al. quote"
     )
 

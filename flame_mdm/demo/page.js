@@ -1,4 +1,4 @@
-const FAR = 20  // meters that a way point may be from the start
+const FAR = 20  // meters that a waypoint may be from the start
 const parse = (text) => text.split('|').map((part) => part.match(/^([^]*?)(?:@([^@]*))?$/).slice(1).map((s) => (s || '').trim()))
 const duration = (text, seconds) => parse(text).reduce((sum, part) => sum + (parseFloat(part[1]) || seconds), 0)
 
@@ -44,7 +44,7 @@ const editor = (() => {
     const meters = way.reduce((sum, [x, z], index) => sum + Math.hypot(x - line[index][0], z - line[index][1]), 0)
     document.querySelector('#floor output').textContent = way.length
       ? `${meters.toFixed(1)} m in ${+seconds.toFixed(2)} s: ${(meters / seconds).toFixed(1)} m/s`
-      : 'Seen from above. Click to add way points, in order; click one to remove it.'
+      : 'Seen from above. Click to add waypoints, in order; click one to remove it.'
   }
 
   document.addEventListener('input', (event) => {

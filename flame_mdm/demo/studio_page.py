@@ -187,7 +187,7 @@ def _layout(studio: Studio) -> SimpleNamespace:
             }
             ui.text = gr.Textbox(next(iter(examples)), label="What the person does", **options)
             gr.HTML(EDITORS, js_on_load="editor()")
-            label = "Way points: meters to the left, meters ahead"
+            label = "Waypoints: meters to the left, meters ahead"
             ui.path = gr.Textbox(
                 label=label, placeholder="0,1 0.5,2", max_length=MAX_TEXT, elem_id="path"
             )

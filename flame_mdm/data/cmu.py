@@ -1,4 +1,4 @@
-"""The CMU motion capture database with captions of HumanML3D and KIT-ML, or of the user.
+"""The CMU motion capture database, with captions of HumanML3D and KIT-ML or of the user.
 
 The motions are from http://mocap.cs.cmu.edu, free for all uses, as ASF/AMC or converted to BVH.
 Captions: Guo et al., CVPR 2022 (HumanML3D), and Plappert et al., Big Data 2016 (KIT-ML).

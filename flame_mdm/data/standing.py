@@ -1,4 +1,4 @@
-"""A person who stands still, which a stream continues at its start."""
+"""A motion of a person who stands still. By default, streams start from it."""
 
 import numpy as np
 from torch import Tensor

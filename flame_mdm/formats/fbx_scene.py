@@ -273,7 +273,7 @@ class _Scene:
 
     def motion(self, animation: str | int | None) -> AnimatedNodes:
         name, layer = choose(self.takes(), animation)
-        animated = {  # by curve node: model and property
+        animated = {  # model and property of each curve node
             node: (model, target)
             for model in self.models
             for node, target in self.below[model]

@@ -24,7 +24,7 @@ from flame_mdm.formats.grounding import (
 )
 
 Kind = Literal["loop", "start", "stop", "turn"]
-# Minimum and maximum cycle of a gait in seconds
+# Minimum and maximum duration of a gait cycle in seconds
 CYCLE = (0.5, 1.8)
 # A gait is steady above this fraction of its full speed
 STEADY = 0.85
@@ -42,7 +42,7 @@ SETTLED = 0.12
 MARGIN = 0.15
 # Seconds in which the first or the last pose of a clip changes into the motion
 FADE = 0.5
-# Minimum and maximum turn relative to the requested turn
+# Minimum and maximum angle of a turn, relative to the requested angle
 OVERSHOOT = (0.6, 1.6)
 # Minimum length of a start or stop in seconds
 PART = 0.5

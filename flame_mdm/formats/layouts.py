@@ -27,14 +27,14 @@ UP = {
     "z": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
     "-y": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
 }
-# Minimum, maximum and usual leg of an adult, in meters: hip to knee to ankle
+# Minimum, maximum and usual length of an adult's leg, in meters: hip to knee to ankle
 LEG, USUAL_LEG = (
     (0.6, 1.2),
     0.83,
 )
-# Minimum leg of a child in meters, at about one year
+# Minimum length of a child's leg in meters, at about one year
 CHILD = 0.25
-# Minimum foot in meters, ankle to toes
+# Minimum length of a foot in meters, ankle to toes
 FOOT = 0.02
 # If left and right limbs differ by more than this ratio, the joints are not in the assumed order.
 UNEQUAL = 1.5

@@ -7,7 +7,7 @@ from flame_mdm.formats import fbx_scene, glb_animation
 from flame_mdm.formats.animated import AnimatedNodes
 
 TIP = re.compile(r"[_. ]?(end|nub|tip)(site)?$", re.IGNORECASE)
-"""Names of programs for the node at the tip of the last bone. BVH files call it an end site."""
+"""Suffixes of the node at the tip of the last bone, which BVH files call an end site."""
 
 
 def read(path: Path, animation: str | None = None) -> AnimatedNodes:

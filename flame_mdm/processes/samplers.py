@@ -215,7 +215,7 @@ def blended(
     its noise again.
 
     Args:
-        sampler: a sampler of diffusion.
+        sampler: a diffusion sampler.
         x: (B, F, D) noisy motion at the first step.
         run: the run.
         steps: the steps to take, from noisy to clean.

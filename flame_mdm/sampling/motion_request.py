@@ -154,7 +154,7 @@ class EditRequest:
 class SamplingRequest:
     """Motions to sample: keywords of `flame_mdm.generate`.
 
-    They are sampled for texts or actions. Without both, they are unconditioned.
+    They are sampled for texts or actions. If neither is given, they are unconditioned.
 
     A text or action may have several parts with their seconds, "walks forward @3 | turns left |
     sits down @2". They are generated together as one motion, in overlapping windows; see

@@ -233,7 +233,7 @@ class Schedule:
 
     @classmethod
     def of_parts(cls, conditions: Sequence[str], lengths: Sequence[int]) -> Self:
-        """Returns the schedule of consecutive parts with these numbers of frames."""
+        """Returns the schedule of consecutive parts; `lengths` are their numbers of frames."""
         schedule, begin = cls(conditions[0]), 0
         for condition, length in zip(conditions[1:], lengths, strict=False):
             begin += length

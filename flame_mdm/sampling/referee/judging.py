@@ -122,8 +122,8 @@ def judge(
         fps: frames per second; required for joints.
 
     Raises:
-        UserError: If the motion has another skeleton, is shorter than 0.4 seconds or not finite,
-            if there is no text, or if joints are given without `fps`.
+        UserError: If the motion has another skeleton, is shorter than 0.4 seconds, or is not
+            finite. Also if there is no text, or if joints are given without `fps`.
     """
     if isinstance(motion, Motion):
         if motion.skeleton != SMPL22:

@@ -143,7 +143,8 @@ def group_of(claim: Claim) -> str:
 def threshold_key(claim: Claim) -> str:
     """Returns the name of the thresholds of a claim.
 
-    It is the kind, and whether the claim states a side, direction or speed.
+    It consists of the kind and the stated speed. Without a speed, it says whether the claim states
+    a side or a direction.
     """
     if claim.parts:
         return ORDER

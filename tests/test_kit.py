@@ -173,7 +173,7 @@ def test_every_eighth_frame_is_kept(stem, tmp_path):
         ),
         (
             lambda f: np.savetxt(f / "00001_fke.csv", np.zeros((90, 63)), delimiter=","),
-            r"63\)\. Each needs a row number",
+            r"63\), not a row number",
         ),
         (
             lambda f: np.savetxt(f / "00001_fke.csv", np.full((90, 64), math.nan), delimiter=","),

@@ -157,6 +157,6 @@ def read_joints(path: Path, step: int = 8) -> np.ndarray:
         rows = np.loadtxt(lines, delimiter=",", ndmin=2)
         if rows.shape[1] != 64 or not len(rows) or not np.isfinite(rows).all():
             raise UserError(
-                f"rows have shape {rows.shape}. Each needs a row number and 63 coordinates, all of them finite"
+                f"rows have shape {rows.shape}, not a row number and 63 coordinates each, or are not finite"
             )
     return (rows[:, 1:].reshape(-1, 21, 3) / UNITS_PER_METER).astype(np.float32)

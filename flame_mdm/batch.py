@@ -103,7 +103,7 @@ class Condition:
             drop: (B,) bool, True = replace the condition of this sample.
         """
         if self.null is None:
-            raise ValueError("this condition has no null to drop to")
+            raise ValueError("this condition has no null condition, so samples cannot be dropped")
         null = self.null
         pooled = torch.where(drop[:, None], null.pooled.to(self.pooled), self.pooled)
         if self.token_mask is None:

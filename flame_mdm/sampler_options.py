@@ -39,7 +39,8 @@ class SamplerOptions:
     )
     sampler: str | None = option(
         None,
-        "ancestral, ddim, dpm_solver_pp_2m; euler, midpoint, heun, rk4, dopri5; consistency. null = the recipe's",
+        "for diffusion: ancestral, ddim, dpm_solver_pp_2m; for flow matching: euler, midpoint, heun, rk4, dopri5; for "
+        "distilled models: consistency. Default: the recipe's",
     )
     num_inference_steps: int | Sequence[int] | None = option(
         None,

@@ -121,7 +121,7 @@ def read(file: Path | bytes, name: str) -> Recording:
             or gender.size != 1
         ):
             raise UserError(
-                f"{RELEASE}: it has poses {poses.shape} and trans {translation.shape}, not (F, 156) and (F, 3)"
+                f"{RELEASE}: shapes of poses {poses.shape} and trans {translation.shape}, not (F, 156) and (F, 3)"
             )
         if any(
             array.dtype.kind not in "fiu" or not np.isfinite(array).all()

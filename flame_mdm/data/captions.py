@@ -39,7 +39,7 @@ def table_rows(
             where = f"{path}, line {rows.line_num}"
             if None in row or None in row.values():
                 raise UserError(
-                    f"{where}: the row has not one cell per column. Put texts that contain a comma in quotes"
+                    f"{where}: the row needs one cell per column. Put texts that contain a comma in quotes"
                 )
             yield where, {name: cell.strip() for name, cell in row.items()}
 

@@ -162,9 +162,10 @@ def measure(settings: Settings) -> Section:
     return section(
         "Evaluation",
         f"""`{PROTOCOL}` with {motions:,} motions of HumanML3D's lengths, {protocol.replications} replications,
-        {repeated} of which measure multimodality, without networks: reading and decoding of motions, and metrics.
-        {torch.get_num_threads()} threads, medians of {rounds} alternating rounds. FID alone takes {motions:,}
-        features of width {WIDTH} in batches of {BATCH}, medians of 10 alternating rounds.""",
+        {repeated} of which measure multimodality, without networks. The time is spent on
+        reading and decoding motions, and on metrics. {torch.get_num_threads()} threads, medians of {rounds}
+        alternating rounds. FID alone takes {motions:,} features of width {WIDTH}
+        in batches of {BATCH}, medians of 10 alternating rounds.""",
         f"An evaluation of the size of HumanML3D takes {total / 60:.1f} minutes plus the networks; torchmetrics' FID "
         f"takes {distances[0]['ratio']:.1f} times as long as the framework's.",
         {"protocol": table, "FID alone": distances},

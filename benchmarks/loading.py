@@ -97,11 +97,11 @@ def measure(settings: Settings) -> Section:
     return section(
         "Loading of batches",
         f"""{BATCH} clips per batch, {lengths:.0f} frames of {shown[0].x.shape[2]} features on average, padded to
-        {frames:.0f}. Resident batches (`data.resident=true`) are gathered from memory; the loader collates clips,
-        in the training process or in workers. A training step of the small MDM encoder takes {1000 * wait:.0f} ms
-        of one core. The target is {GOAL:,} clips per second and worker. Medians of {rounds} alternating rounds of
-        {count} batches.""",
-        f"A resident batch is ready {load / gather:.1f} times as fast as one of the loader, and takes "
+        {frames:.0f}. Resident batches (`data.resident=true`) are gathered from memory. The loader collates clips in the
+        training process or in workers. A training step of the small MDM encoder takes {1000 * wait:.0f} ms of one core.
+        The target is {GOAL:,}
+        clips per second and worker. Medians of {rounds} alternating rounds of {count} batches.""",
+        f"A resident batch is ready {load / gather:.1f} times as fast as a batch of the loader, and takes "
         f"{gather / wait:.1%} of the time of a small training step.",
         {"batches": rows},
     )

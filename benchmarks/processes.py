@@ -94,7 +94,7 @@ def measure(settings: Settings) -> Section:
         f"""The same batches of {CLIPS} clips, by one process and by two with {CLIPS // 2} clips each (DDP, gloo), one
         thread per process, on {cores} cores. With one core per process, the ideal ratio is 0.5. Medians of {rounds}
         alternating runs of {steps} steps.""",
-        f"Two processes take {two / one:.2f} times the time of one for the same batch.",
+        f"For the same batch, two processes take {two / one:.2f} times the time of one process.",
         {"steps": ratios({"one": one, "two": two}, "one", "processes")},
     )
 

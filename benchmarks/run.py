@@ -42,11 +42,11 @@ ON_REQUEST = ("quality",)  # requires trained models
 HEAD = """# Speed
 
 `make bench` measures the speed of the framework and writes this page and [speed.json](speed.json). Every comparison is
-a ratio of measurements that alternate in one run, on an idle machine unless the section says otherwise; the absolute
-figures next to it hold for that machine alone. `make bench ONLY=host,steps` repeats some sections, and `make bench
-DEVICE=cuda` adds the sections of a GPU. With `MDM_REPO=PATH`, a clone of the authors' code, their training step is
-measured next to the framework's. Sections that name a commit were measured by a script of that commit.
-[Which options to choose](../speed.md) is a page of its own.
+a ratio of measurements that alternate in one run, on an idle machine unless the section states otherwise. The absolute
+figures next to it hold only for that machine. `make bench ONLY=host,steps` repeats some sections, and `make bench
+DEVICE=cuda` adds the sections of a GPU. With `MDM_REPO=PATH`, a clone of the authors' code, the authors' training step
+is measured, too. Sections that name a commit were measured by a script of that commit. Another page explains [which
+options to choose](../speed.md).
 """
 
 

@@ -45,7 +45,7 @@ def measure(settings: Settings) -> Section:
         "Text encoding",
         f"""A batch of {size} captions, encoded by sentence-BERT (MiniLM, with tokens) or read from the cache of frozen
         encoders. Medians of {rounds} alternating rounds.""",
-        f"A batch of cached captions is {times['encoded'] / times['cached']:.0f} times as fast as encoding it.",
+        f"Reading a batch of cached captions is {times['encoded'] / times['cached']:.0f} times as fast as encoding it.",
         {"captions": ratios(times, "cached", "captions", "ms")},
     )
 

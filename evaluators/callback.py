@@ -128,7 +128,7 @@ class Evaluate(Callback):
 
 
 def _find_extractor(source: str) -> None:
-    """Raises `UserError` if an extractor does not exist; the message says how to get it."""
+    """Raises `UserError` if an extractor does not exist; the message explains how to get it."""
     try:
         find(source)
     except (UserError, FileNotFoundError) as error:

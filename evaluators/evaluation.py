@@ -38,7 +38,7 @@ def evaluate(request: EvaluationRequest) -> None:
     data or the extractor is wrong, and nothing is generated. The guide is `docs/evaluation.md`.
 
     Args:
-        request: what is evaluated and how; its fields are the keys of `flame-mdm evaluate`.
+        request: the keys of `flame-mdm evaluate`.
 
     Raises:
         UserError: If model, data, protocol and extractor do not match, or if real motions do not

@@ -1,5 +1,5 @@
 # pyright: standard
-"""The evaluator: one feature pass over motions, many metrics."""
+"""The evaluator computes many metrics with one feature pass over the motions."""
 
 from __future__ import annotations
 
@@ -266,7 +266,7 @@ class Evaluator:
 
     @cached_property
     def declared(self) -> dict[str, SampleMetric]:
-        """The metrics by name, for their declarations."""
+        """The metrics by name, to read their declared properties."""
         return make_metrics(self.metrics)
 
     def unit_of(self, name: str) -> str:

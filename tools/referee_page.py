@@ -21,13 +21,13 @@ this folder.
 
 Thresholds come from one half of the recordings, these figures from the other half. A claim of a caption counts as true
 of its motion. A falsified claim states the other side, direction or speed, one repetition more or fewer, the reverse
-order, another duration, or the other end of the motion, and is taken to be false. Wrong captions count as errors.
-Patterns and measurements were corrected while the errors on both halves were known, so that the figures are optimistic
-for other data. The last correction concerns CMU: "kicking his legs" was read as both legs at the same time, which made
-one of 30 decided claims false (96.7 %). It was corrected after it had been seen.
+order, another duration, or the other end of the motion. It counts as false. Wrong captions count as errors. Patterns
+and measurements were corrected while the errors on both halves were known, so the figures are optimistic for other
+data. The last correction concerns CMU: "kicking his legs" was read as both legs at the same time, which made one of 30
+decided claims false (96.7 %). It was corrected after it had been seen.
 
 CMU's captions come from HumanML3D's test split and from KIT-ML, for the recordings at hand. Bandai-Namco's captions
-are templates of its labels, so that its many clips have few different sentences. Read the sets one by one.
+are templates of its labels, so its many clips have few different sentences. Read the figures of each set separately.
 """
 
 
@@ -107,10 +107,10 @@ def crossed_table(by_name: Mapping[tuple[str, str], dict[str, Any]]) -> list[str
             lines.append(f"| {title} | {both_shares(row)} |")
     lines += [
         "",
-        "CMU's figures are below the targets. Three of its four falsified claims that are not judged false state the",
-        "other direction of motions that go both ways; the fourth is about squats, of which the referee counts two",
-        "where the caption states three. True claims that are judged false: these squats, a jog in place, and a walk",
-        "at 1.8 m/s that one caption calls slow and another one brisk.",
+        "CMU's figures are below the targets. Four of its falsified claims are not judged false. Three of them state",
+        "the other direction of motions that go both ways. The fourth is about squats: the caption states three, but",
+        "the referee counts two. The true claims that are judged false are about these squats, a jog in place, and a",
+        "walk at 1.8 m/s that one caption calls slow and another one brisk.",
     ]
     return lines
 
@@ -119,11 +119,11 @@ def built_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """Returns the figures of built claims about durations, the start and the end."""
     lines = [
         "",
-        "Captions hardly state a duration, a start or an end. These claims are built, not written by people: a",
-        "recording whose captions state nothing but that the body walks, runs or stands still is cut to two, three and",
-        "four seconds. Falsified claims state twice the duration, or half of it. In recordings of walks, the person is",
-        "assumed to stand upright at the start and at the end, so that lying there is a falsified claim. The other",
-        "tables do not contain these claims.",
+        "Captions hardly ever state a duration, a start or an end. Therefore, these claims are built, not written by",
+        "people: if the captions of a recording only state that the body walks, runs or stands still, it is cut to",
+        "two, three and four seconds. Falsified claims state twice the duration, or half of it. In recordings of",
+        "walks, the person is assumed to stand upright at the start and at the end, so lying there is a falsified",
+        "claim. The other tables do not contain these claims.",
         "",
         "| claim | true claims judged true | falsified claims judged false |",
         "|---|---:|---:|",
@@ -166,9 +166,10 @@ def systems_table(content: Mapping[str, Any]) -> list[str]:
     lines = ["", "## Systems", ""]
     both = sum(row["top3"] is not None for row in content["rows"])
     lines += [
-        "Shares of decided claims that are true, and R-precision (`MotionsForText`, top 3, motion-CLIP of the",
-        f"package) on the same motions, at most {content['motions']} per row. Over the {both} rows that have both,",
-        f"the rank correlation is {content['rank_correlation']:.2f}. Motions of models are at most three seconds",
+        "The table has the shares of decided claims that are true, and R-precision (`MotionsForText`, top 3,",
+        "motion-CLIP of the package) on the same motions, at most",
+        f"{content['motions']} per row. Over the {both} rows with both values, the rank correlation is",
+        f"{content['rank_correlation']:.2f}. Motions of models are at most three seconds",
         "long, which is too short for some turns. The model on Bandai-Namco is small and was trained for eleven",
         "minutes on one thread. A model on CMU has no row: the recordings at hand have only 23 clips to train on.",
         "FLAME, MFM and DiP have no row: no checkpoints were at hand.",
@@ -185,7 +186,7 @@ def systems_table(content: Mapping[str, Any]) -> list[str]:
 
 def eye_table(verdicts: list[dict[str, Any]]) -> list[str]:
     agreed = sum(verdict["agrees"] for verdict in verdicts)
-    lines = ["", "## Verdicts looked at", ""]
+    lines = ["", "## Verdicts checked by eye", ""]
     lines.append(
         f"{len(verdicts)} verdicts on motions of the second half, at most one per motion and spread over the kinds, "
         f"were compared with twelve pictures of each motion: {agreed} agree."

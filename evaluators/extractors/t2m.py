@@ -216,7 +216,7 @@ class _Recurrent(nn.Module):
         self.hidden = nn.Parameter(torch.randn(2, 1, hidden))
 
     def encode(self, x: Tensor, lengths: Tensor) -> Tensor:
-        """(B, N, in_features) of which the first `lengths` (B,) are real -> (B, embedding)."""
+        """Encodes sequences (B, N, in_features) with `lengths` (B,) as vectors (B, embedding)."""
         packed = pack_padded_sequence(
             self.input_emb(x), lengths.cpu(), batch_first=True, enforce_sorted=False
         )
@@ -241,7 +241,7 @@ class _TextEncoder(_Recurrent):
         self.pos_emb = nn.Linear(len(PARTS_OF_SPEECH), self.WORD)
 
     def forward(self, vectors: Tensor, parts: Tensor, lengths: Tensor) -> Tensor:
-        """(B, N, 300) and (B, N, 15), of which the first `lengths` (B,) are real -> (B, embedding)."""
+        """Encodes words (B, N, 300) and (B, N, 15) with `lengths` (B,) as vectors (B, embedding)."""
         return self.encode(vectors + self.pos_emb(parts), lengths)
 
 

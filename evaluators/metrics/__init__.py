@@ -6,11 +6,11 @@ Every `update` takes some of these inputs by name, for B generated and R real mo
 | name | shape | content |
 |---|---|---|
 | generated | (B, E) | features of generated motions |
-| text | (B, E) | features of the texts they were generated for |
-| text_keys | (B,) int64 | keys of those captions; equal captions have equal keys |
-| captions | B strings | those captions |
+| text | (B, E) | features of the requested texts |
+| text_keys | (B,) int64 | keys of the requested texts; equal texts have equal keys |
+| captions | B strings | the requested texts |
 | logits | (B, A) | class scores of generated motions |
-| labels | (B,) int64 | classes they were generated for |
+| labels | (B,) int64 | requested classes |
 | groups | (B,) int64 | keys of the prompts, if several motions are generated per prompt |
 | requested | B mappings | requested attributes, see `attributes` |
 | sides | B pairs of strings | requested content and side, in the Bandai set, see `attributes` |

@@ -73,7 +73,7 @@ class MBenchQuality(PublishedPhysics):
 
     - `jitter_degree`: mean length of the second difference of joint positions, plus the mean
       length of the second difference of positions relative to the root.
-    - `dynamic_degree`: computed likewise from the first difference; higher = more motion.
+    - `dynamic_degree`: the same for the first difference of the positions; higher = more motion.
     - `ground_penetration`: mean depth of the toes that are deeper than 5 mm, otherwise 0.
     - `foot_sliding`: mean step over the ground of toes in contact.
     - `foot_floating`: frames in which the body moves without a foot that carries it, per frame.

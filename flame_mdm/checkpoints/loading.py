@@ -149,7 +149,7 @@ def _build(checkpoint: dict[str, Any], kind: type[Trained]) -> Trained:
     trust(parts)
     classes: dict[str, Any] = dict(GENERATORS) if kind is MotionGenerator else {}
     targets = [str(node["_target_"]) for _, node in walk(parts) if "_target_" in node]
-    # modules are imported before, since tensors that they create must not be on the meta device
+    # modules are imported first, since tensors that they create must not be on the meta device
     classes |= {target: get_class(target) for target in targets if target not in classes}
     model_class = classes[config["task"]["_target_"]]
     if kind is MotionGenerator:  # the user's own class

@@ -113,7 +113,8 @@ def import_mdm(state: Mapping[str, Tensor], args: Options, *, time_token: bool =
             options["input_token"] = "time" if time_token or distilbert else "condition"
     if (args.lambda_target_loc or args.multi_target_cond) and "target_encoder" not in options:
         raise ValueError(
-            "released weights: embed_target_cond is missing, the encoder of targets that the options name"
+            "released weights: embed_target_cond is missing, but the options name an encoder of "
+            "targets"
         )
     return Released(
         network, (in_features, out_features, cond_features), options, ours, embedding

@@ -151,7 +151,7 @@ class _KeyCheck(pickle._Unpickler):
         elif name == "builtins.bytearray" and not all(
             isinstance(value, bytes | _Named) for value in arguments
         ):
-            raise pickle.UnpicklingError("an array of bytes without its bytes")
+            raise pickle.UnpicklingError("an array of bytes without content")
         elif name == "_codecs.encode" and _text(arguments[1]) not in CODECS:
             raise pickle.UnpicklingError("bytes in an unknown encoding")
 

@@ -11,10 +11,10 @@ from flame_mdm.config.options import option, required
 class AdaptSettings(ModelSettings):
     """usage: flame-mdm adapt CKPT [OUT] source=FOLDER name=limp [trainer.max_steps=2000] [key=value ...]
 
-    Teaches a trained model the motions in a folder; the model keeps what it knows. Prompts that
-    end with "in limp style" then request such motions. Writes the adapter OUT/limp.safetensors,
-    for `sample` and `load`, and a page that compares motions before and after training. Run the
-    same command to resume. docs/own-motion.md explains the steps.
+    Teaches a trained model the motions in a folder; the model keeps its other abilities. Prompts
+    that end with "in limp style" then request such motions. Writes the adapter
+    OUT/limp.safetensors, for `sample` and `load`, and a page that compares motions before and
+    after training. Run the same command to resume. docs/own-motion.md explains the steps.
     """
 
     OBJECTS: ClassVar = ("ckpt", "out")

@@ -39,7 +39,7 @@ class CompareSettings(BodySettings):
 
     Compares runs side by side on one page: configuration differences, curves, evaluations and
     motions for the same prompts. If the runs have results of the same protocol, data and
-    extractor, prints the difference of each metric with its 95 % interval, and says whether the
+    extractor, prints the difference of each metric with its 95 % interval, and whether the
     interval contains 0. Instead of a run, a FOLDER of motion files may be given, such as real
     motions (`browse motions=FOLDER`) or motions of another program. The runs are then sampled for
     the captions and lengths of these motions. rate=true writes a blind user study instead: a page

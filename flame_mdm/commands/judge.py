@@ -1,4 +1,4 @@
-"""`flame-mdm judge MOTION|FOLDER text="..."`: judges whether motions do what a sentence says."""
+"""`flame-mdm judge MOTION|FOLDER text="..."`: judges whether motions show what a sentence states."""
 
 from __future__ import annotations
 

@@ -209,9 +209,9 @@ def locked(path: Path, busy: Callable[[str], object], advice: str) -> Iterator[s
 
     Yields the name of a dead process that left the file behind, or "". If another process holds
     the lock, `busy` is called with its name; `busy` raises an error, or returns to wait. `advice`
-    is for file systems without locks. The operating system releases the lock when the process
-    ends, for any reason. The lock is a POSIX record lock, which also works between hosts on NFS
-    and Lustre, unlike the locks of `filelock`. Windows has no such locks.
+    is part of the error for file systems without locks. The operating system releases the lock
+    when the process ends, for any reason. The lock is a POSIX record lock, which also works
+    between hosts on NFS and Lustre, unlike the locks of `filelock`. Windows has no such locks.
     """
     while True:
         with made_folder(path.parent), open_in_place(path) as file:

@@ -29,8 +29,8 @@ def accelerate(task: Task, data: MotionDataModule, config: Config) -> str:
     On CUDA: bfloat16 if the device supports it, and a compiled denoiser in runs of
     `COMPILED_FROM` steps or more.
 
-    On a CPU: bfloat16 if it has instructions for products in it; `CheapDropout`; `attention`,
-    without dropout of its weights. Compilation made no difference there.
+    On a CPU: bfloat16 if the CPU has instructions for its products; `CheapDropout`; and
+    `attention`, without dropout of the attention weights. Compilation made no difference there.
 
     If the recipe has another precision than 32-true, it is kept.
     """

@@ -76,7 +76,7 @@ class SamplerOptions:
 
     def chosen(self) -> dict[str, Any]:
         """Returns the options that are not None, as plain values."""
-        values = {option.name: getattr(self, option.name) for option in fields(self)}
+        values = {entry.name: getattr(self, entry.name) for entry in fields(SamplerOptions)}
         return {
             k: list(v) if isinstance(v, tuple) else v for k, v in values.items() if v is not None
         }

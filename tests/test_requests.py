@@ -13,6 +13,8 @@ from support.refusals import error_of, one_line_error
 
 import flame_mdm
 from flame_mdm.__main__ import main
+from flame_mdm.commands.sample import SampleSettings
+from flame_mdm.conditions import prompts
 from flame_mdm.errors import UserError
 from flame_mdm.formats.faults import find_faults
 from flame_mdm.formats.motion import Motion
@@ -66,6 +68,13 @@ def test_keywords_go_to_the_request_that_has_them():
         SamplingRequest.of("generate", keywords)
 
 
+def test_settings_of_a_command_pass_on_the_chosen_options_of_the_sampler_alone():
+    settings = SampleSettings(ckpt="quickstart", text=TEXT, eta=0.5, num_inference_steps=[0, 5, 9])
+    assert settings.chosen() == {"num_inference_steps": [0, 5, 9], "eta": 0.5}
+    expected = SamplerOptions(num_inference_steps=(0, 5, 9), eta=0.5)
+    assert settings.request(samples=1).options == expected
+
+
 def test_a_request_is_resolved_once_and_reads_its_targets_once(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "t.json").write_text('{"root": [{"time": 1, "position": [0.2, 0.6]}]}')
@@ -73,7 +82,7 @@ def test_a_request_is_resolved_once_and_reads_its_targets_once(tmp_path, monkeyp
     with (
         patch.object(resolution, "read_targets", wraps=read_targets) as read,
         patch.object(
-            resolution.Reader, "read", autospec=True, side_effect=resolution.Reader.read
+            prompts.Reader, "read", autospec=True, side_effect=prompts.Reader.read
         ) as understood,
     ):
         assert main(["sample", "quickstart", *words]) == 0

@@ -101,10 +101,10 @@ class Motion(PosedFigure):
     def __post_init__(self) -> None:
         name, skeleton = f"motion {self.id!r}", self.skeleton
         self.joints = np.asarray(self.joints, dtype=np.float32)
-        shape = self.joints.shape
-        if shape[1:] != (len(skeleton), 3) or not shape[0]:
+        shape, expected = self.joints.shape, (len(skeleton.joints), 3)
+        if shape[1:] != expected or not shape[0]:
             raise UserError(
-                f"{name}: joints have shape {shape}, {skeleton.name} needs (frames, {len(skeleton)}, 3)"
+                f"{name}: joints have shape {shape}, {skeleton.name} needs (frames, {expected[0]}, 3)"
             )
         if not np.isfinite(self.joints).all():
             frame, joint, _ = np.argwhere(~np.isfinite(self.joints))[0]

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from flame_mdm.batch import Edit, MotionBatch, length_mask, pad_to
+from flame_mdm.batch import Edit, MotionBatch, length_mask, pad_to, sent
 from flame_mdm.errors import UserError
 from flame_mdm.formats.cleanup import cleaned
 from flame_mdm.formats.faults import find_faults
@@ -173,11 +173,14 @@ def _sample(
     """Samples a batch of motions."""
     if model.denoiser.context_frames:
         return _sample_streams(model, resolved, rows)
-    request = resolved.request
+    request, representation = resolved.request, model.representation
     lengths = [row.prompt.frames for row in rows]
     conditions = [row.prompt.conditions for row in rows]
-    mask = length_mask(torch.tensor([sum(frames) for frames in lengths])).to(model.device)
-    x = torch.zeros(*mask.shape, model.representation.features, device=mask.device)
+    totals = [sum(frames) for frames in lengths]
+    x = representation.mean.new_zeros(
+        len(rows), max(totals), representation.features, dtype=torch.float32
+    )
+    mask = sent(length_mask(torch.tensor(totals)), x.device)
     batch = MotionBatch(x=x, mask=mask, ids=[row.id for row in rows])
 
     covering = windows(model, request, conditions, lengths) if resolved.is_sequence else None

@@ -9,20 +9,13 @@ import torch
 from torch import Tensor
 
 from flame_mdm.batch import Edit
-from flame_mdm.conditions.language.reading import Reader, Reading
-from flame_mdm.conditions.vocabulary import (
-    advice,
-    check_known,
-    in_parts,
-    unknown_words,
-    unread_words,
-)
+from flame_mdm.conditions.prompts import ReadPrompt, read_prompt
+from flame_mdm.conditions.vocabulary import advice
 from flame_mdm.errors import UserError, shortened
 from flame_mdm.formats.motion import Motion
 from flame_mdm.generator import MotionGenerator
 from flame_mdm.sampling.motion_request import (
     TRAINED_ON,
-    Part,
     SamplingRequest,
     is_timed,
     path_targets,
@@ -60,15 +53,6 @@ class ResolvedPrompt:
     unknown: tuple[str, ...] = ()
     summary: str = ""
     changes: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class _Parts:
-    """Parts of a prompt: words, seconds, captions for the model, and what was understood."""
-
-    parts: Sequence[Part]
-    captions: tuple[str, ...]
-    readings: tuple[Reading, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -117,10 +101,10 @@ def resolve(
         UserError: If the model cannot do what is requested.
     """
     _check_model(request, model)
-    read: dict[int, _Parts] = {}
+    read: dict[int, ReadPrompt] = {}
     for number, prompt in enumerate(request.prompts):
         with _collected(refused, number):
-            read[number] = _parts(request, model, prompt, check_words)
+            read[number] = _read(request, model, prompt, check_words)
 
     is_timed_prompt = any(is_timed(prompt.parts) for prompt in read.values())
     is_sequence = request.loop or request.after is not None or is_timed_prompt
@@ -142,16 +126,15 @@ def resolve(
                 loop=request.loop,
             )
             frames = (shared + first, *others)
-            unknown = _unknown_words(prompt, model) if request.kind == "text" else ()
             resolved[number] = ResolvedPrompt(
                 text,
                 is_split,
                 prompt.captions,
                 frames,
                 texts,
-                unknown,
-                summary=", then ".join(reading.summary() for reading in prompt.readings),
-                changes=tuple(line for reading in prompt.readings for line in reading.warnings()),
+                prompt.unknown,
+                prompt.summary,
+                prompt.changes,
             )
 
     targets = _targets(request, model, list(resolved.values()))
@@ -204,65 +187,33 @@ def _check_windows(model: MotionGenerator) -> None:
         )
 
 
-def _parts(
+def _read(
     request: SamplingRequest, model: MotionGenerator, prompt: str, check_words: bool
-) -> _Parts:
-    """Returns the parts of a prompt. A sentence with several actions has one part per action."""
+) -> ReadPrompt:
+    """Returns a prompt as the model reads it. Each action of a sentence is a part."""
     if request.kind == "none":
-        return _Parts([(prompt, None)], (prompt,))
-    splits = (
-        request.split and model.representation.relative and "|" not in prompt and "@" not in prompt
-    )
-    if request.kind == "text" and check_words and Reader.fits(model.facts):
-        return _checked(_read(Reader(model.facts), prompt, splits), model)
-
+        return ReadPrompt([(prompt, None)], (prompt,))
     parts = read_parts(prompt)
-    if request.kind == "text" and splits:
-        sentences = in_parts(prompt, model.facts.get("verbs", ()))
-        parts = [(sentence, None) for sentence in sentences] if len(sentences) > 1 else parts
-    for condition, _ in parts:
-        if request.kind == "text" and check_words:
-            check_known(condition, model.facts)
-        if request.kind == "action" and condition not in (actions := model.facts["actions"]):
-            raise UserError(
-                f"unknown action '{condition}'; this model knows: {', '.join(actions) or 'none'}"
-            )
-    return _checked(_Parts(parts, tuple(condition for condition, _ in parts)), model)
-
-
-def _read(reader: Reader, prompt: str, splits: bool) -> _Parts:
-    """Returns the parts of a prompt for a model of single actions.
-
-    Unless it is split, a prompt keeps its parts. If a part names several actions, the model gets
-    its words unchanged.
-    """
-    if splits:
-        reading = reader.read(prompt)
-        if len(reading.texts) == 1:
-            return _Parts(read_parts(prompt), reading.captions, (reading,))
-        return _Parts([(words, None) for words in reading.texts], reading.captions, (reading,))
-
-    parts = read_parts(prompt)
-    readings = tuple(reader.read(words) for words, _ in parts)
-    pairs = zip(parts, readings, strict=True)
-    captions = tuple(
-        read.captions[0] if len(read.captions) == 1 else words for (words, _), read in pairs
-    )
-    return _Parts(parts, captions, readings)
-
-
-def _checked(parts: _Parts, model: MotionGenerator) -> _Parts:
-    if is_timed(parts.parts):
+    if request.kind == "action":
+        for name, _ in parts:
+            if name not in (actions := model.facts["actions"]):
+                raise UserError(
+                    f"unknown action '{name}'; this model knows: {', '.join(actions) or 'none'}"
+                )
+        read = ReadPrompt(parts, tuple(name for name, _ in parts))
+    else:
+        is_plain = "|" not in prompt and "@" not in prompt
+        read = read_prompt(
+            prompt,
+            parts,
+            model.facts,
+            model.condition.max_words,
+            splits=request.split and model.representation.relative and is_plain,
+            check_words=check_words,
+        )
+    if is_timed(read.parts):
         _check_windows(model)
-    return parts
-
-
-def _unknown_words(prompt: _Parts, model: MotionGenerator) -> tuple[str, ...]:
-    words = [word for reading in prompt.readings for word in reading.ignored]
-    for text in prompt.captions:
-        words += [] if prompt.readings else unknown_words(text, model.facts)
-        words += unread_words(text, model.condition.max_words)
-    return tuple(words)
+    return read
 
 
 def _warnings(prompts: Sequence[ResolvedPrompt], model: MotionGenerator) -> list[str]:

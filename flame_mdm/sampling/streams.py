@@ -17,9 +17,8 @@ import torch
 from torch import Tensor
 
 from flame_mdm.batch import Condition, Edit, MotionBatch
-from flame_mdm.conditions.language.reading import Reader
+from flame_mdm.conditions.prompts import read_prompt
 from flame_mdm.conditions.target import SLOTS
-from flame_mdm.conditions.vocabulary import check_known
 from flame_mdm.data.standing import standing
 from flame_mdm.errors import UserError
 from flame_mdm.formats.cleanup import cleanup as clean_joints
@@ -521,11 +520,8 @@ def read_text(model: MotionGenerator, text: str) -> str:
         raise UserError(
             f"text={text}: this model is conditioned on {model.conditioned_on}, not on text"
         )
-    if Reader.fits(model.facts):
-        captions = Reader(model.facts).read(text).captions
-        return captions[0] if len(captions) == 1 else text
-    check_known(text, model.facts)
-    return text
+    (caption,) = read_prompt(text, [(text, None)], model.facts).captions
+    return caption
 
 
 def starting_point(

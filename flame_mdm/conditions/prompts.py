@@ -1,0 +1,105 @@
+# pyright: standard
+"""Prompts as models read them: parts with captions, what was understood, and words that a model does not know."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from flame_mdm.conditions.language.reading import Reader, Reading
+from flame_mdm.conditions.vocabulary import check_known, in_parts, unknown_words, unread_words
+
+
+@dataclass(frozen=True)
+class ReadPrompt:
+    """A prompt as a model reads it.
+
+    Attributes:
+        parts: words of each part, and its seconds if the prompt gives them.
+        captions: what the model reads for each part.
+        unknown: words that the model has never seen in training, or does not read.
+        summary: what was understood, in one line; "" unless the model's captions have single actions.
+        changes: lines about what is sampled differently from what the prompt says.
+    """
+
+    parts: Sequence[tuple[str, float | None]]
+    captions: tuple[str, ...]
+    unknown: tuple[str, ...] = ()
+    summary: str = ""
+    changes: tuple[str, ...] = ()
+
+
+def read_prompt(
+    prompt: str,
+    parts: Sequence[tuple[str, float | None]],
+    facts: Mapping[str, Any],
+    max_words: int | None = None,
+    *,
+    splits: bool = False,
+    check_words: bool = True,
+) -> ReadPrompt:
+    """Returns a text as a model reads it.
+
+    Args:
+        prompt: the text.
+        parts: words of its parts, "walks @3 | sits", and their seconds if the text gives them.
+        facts: facts of the model.
+        max_words: maximum number of words that the model reads in a caption; None = no limit.
+        splits: whether a sentence of several actions becomes one part per action; for texts of a single part.
+        check_words: whether the model's words for actions replace the words of the text, and a text is refused if
+            the model knows no word of it that says what happens.
+
+    Raises:
+        UserError: If the model does not know what a part says.
+
+    Example:
+        >>> read = read_prompt("walks happily", [("walks happily", None)], {"vocabulary": ["walks"]})
+        >>> read.captions, read.unknown
+        (('walks happily',), ('happily',))
+    """
+    if check_words and Reader.fits(facts):
+        return _with_actions(Reader(facts), prompt, parts, max_words, splits)
+
+    if splits and len(sentences := in_parts(prompt, facts.get("verbs", ()))) > 1:
+        parts = [(sentence, None) for sentence in sentences]
+    captions = tuple(words for words, _ in parts)
+    unknown: list[str] = []
+    for text in captions:
+        if check_words:
+            check_known(text, facts)
+        unknown += unknown_words(text, facts) + unread_words(text, max_words)
+    return ReadPrompt(parts, captions, tuple(unknown))
+
+
+def _with_actions(
+    reader: Reader,
+    prompt: str,
+    parts: Sequence[tuple[str, float | None]],
+    max_words: int | None,
+    splits: bool,
+) -> ReadPrompt:
+    """Returns a text as a model of single actions reads it.
+
+    Unless it is split, a text keeps its parts. If one of them names several actions, the model reads its words as they
+    are.
+    """
+    readings: list[Reading]
+    if splits:
+        reading = reader.read(prompt)
+        readings, captions = [reading], reading.captions
+        if len(reading.texts) > 1:
+            parts = [(words, None) for words in reading.texts]
+    else:
+        readings = [reader.read(words) for words, _ in parts]
+        pairs = zip(parts, readings, strict=True)
+        captions = tuple(
+            read.captions[0] if len(read.captions) == 1 else words for (words, _), read in pairs
+        )
+    ignored = [word for reading in readings for word in reading.ignored]
+    unread = [word for text in captions for word in unread_words(text, max_words)]
+    return ReadPrompt(
+        parts,
+        captions,
+        unknown=(*ignored, *unread),
+        summary=", then ".join(reading.summary() for reading in readings),
+        changes=tuple(line for reading in readings for line in reading.warnings()),
+    )

@@ -100,6 +100,8 @@ class Model:
     facts: dict[str, Any]
     # Number of training steps of the loaded checkpoint; None if unknown
     steps: int | None = None
+    # SHA-256 of the file that it was loaded from; "" if it was not loaded
+    sha256: str = ""
 
     def add_facts(self, facts: Mapping[str, Any]) -> None:
         """Adds facts about the training data."""
@@ -125,6 +127,8 @@ class MotionGenerator(Model, nn.Module):
     """
 
     noun = "a motion generator"
+    #: The condition that the model was trained with.
+    conditioned_on: Literal["none", "text", "action"]
 
     def __init__(self, parts: Parts, sampler_options: SamplerOptions):
         super().__init__()
@@ -132,13 +136,26 @@ class MotionGenerator(Model, nn.Module):
         self.condition, self.representation = parts.condition, parts.representation
         self.denoiser, self.process = parts.denoiser, parts.process
         self.sampler_options = sampler_options
+        self.conditioned_on = parts.condition.reads if parts.condition.features else "none"
         self.config, self.facts = {}, {}
 
     @classmethod
     def build(
-        cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()
+        cls,
+        config: Config,
+        representation: Representation,
+        *,
+        actions: Sequence[str] = (),
+        facts: Mapping[str, Any] | None = None,
     ) -> Self:
-        """Builds the generator of a recipe; `actions` are the names of the data's actions."""
+        """Builds the generator of a recipe.
+
+        Args:
+            config: the recipe.
+            representation: features of a motion.
+            actions: names of the actions in the training data.
+            facts: further facts about the training data; see `add_facts`. Default: none.
+        """
         parts = Parts.build(config, representation, len(actions))
         section = config["task"]
         defaults = sampling_defaults(
@@ -148,6 +165,7 @@ class MotionGenerator(Model, nn.Module):
         )
         generator = cls(parts, defaults)
         generator.config, generator.facts = config, {"actions": list(actions)}
+        generator.add_facts(facts or {})
         return generator
 
     def add_facts(self, facts: Mapping[str, Any]) -> None:
@@ -164,11 +182,6 @@ class MotionGenerator(Model, nn.Module):
     def describe(self) -> str:
         """Returns the name of the denoiser's class."""
         return type(self.denoiser).__name__
-
-    @property
-    def conditioned_on(self) -> Literal["none", "text", "action"]:
-        """The condition that the model was trained with."""
-        return self.condition.reads if self.condition.features else "none"
 
     def check_request(self, options: SamplerOptions | None, unconditioned: bool) -> None:
         """Checks arguments of `generate`; some kinds of models override this.

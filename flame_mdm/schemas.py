@@ -2,12 +2,14 @@
 
 import functools
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from flame_mdm import safe_io
+from flame_mdm.config import plain
 from flame_mdm.errors import UserError, did_you_mean
 
 # Maximum integer in a file. Larger integers overflow when they are plotted or logged.
@@ -82,6 +84,20 @@ def check_shape(content: Any, kind: type[T] | Any, strict: bool = True) -> T:
         return _adapter(kind).validate_python(content, strict=strict)
     except ValidationError as error:
         raise ValueError(_first_error(error, content)) from error
+
+
+def check_plain(content: Mapping[str, Any], kind: type[T] | Any, path: Path) -> T:
+    """Returns content of the untrusted file at `path` as `check_shape` does, if all its values are plain.
+
+    Raises `UserError`, also if the content is nested too deeply, or contains itself.
+    """
+    # before the shape, whose check would follow content that contains itself
+    for name, value in content.items():
+        plain(value, f"{path}: {name}")
+    try:
+        return check_shape(content, kind)
+    except ValueError as error:
+        raise UserError(f"{path}: damaged: {error}") from error
 
 
 def _too_large(content: Any) -> str:

@@ -43,9 +43,21 @@ class Task(Model, LightningModule):
 
     @classmethod
     def build(
-        cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()
+        cls,
+        config: Config,
+        representation: Representation,
+        *,
+        actions: Sequence[str] = (),
+        facts: Mapping[str, Any] | None = None,
     ) -> Self:
-        """Builds the task of a recipe. Sizes that depend on other parts are set here."""
+        """Builds the task of a recipe. Sizes that depend on other parts are set here.
+
+        Args:
+            config: the recipe.
+            representation: features of a motion.
+            actions: names of the actions in the training data.
+            facts: further facts about the training data; see `add_facts`. Default: none.
+        """
         raise NotImplementedError
 
     def encoder(self) -> ConditionEncoder:
@@ -203,9 +215,14 @@ class GeneratorTask(Task):
 
     @classmethod
     def build(
-        cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()
+        cls,
+        config: Config,
+        representation: Representation,
+        *,
+        actions: Sequence[str] = (),
+        facts: Mapping[str, Any] | None = None,
     ) -> Self:
-        """Builds the task of a recipe; `actions` are the names of the actions in its data."""
+        """Builds the task of a recipe; see `Task.build`."""
         parts = Parts.build(config, representation, len(actions))
         section = {name: value for name, value in config["task"].items() if name != "_target_"}
         task = cls(
@@ -218,6 +235,7 @@ class GeneratorTask(Task):
         # One object for both, so that facts added in training are also available in sampling.
         task.config = task.generator.config = config
         task.facts = task.generator.facts = {"actions": list(actions)}
+        task.add_facts(facts or {})
         return task
 
     def encoder(self) -> ConditionEncoder:

@@ -30,6 +30,7 @@ from flame_mdm.checkpoints.released import import_flame, import_mdm
 from flame_mdm.checkpoints.released_options import Options, check_hyperparameters, read_options
 from flame_mdm.errors import UserError
 from flame_mdm.generator import MotionGenerator
+from flame_mdm.safe_io import sha256
 from flame_mdm.sampling.generation import generate
 
 MDM = ["mdm_trans_enc", "mdm_trans_dec", "mdm_trans_dec_emb", "mdm_trans_dec_bert", "mdm_gru"]
@@ -704,6 +705,18 @@ def test_a_model_file_is_the_checkpoint(trained, data_root, tmp_path, capsys, su
     assert {value.dtype for value in load_file(half).values() if value.ndim > 1} == {torch.float16}
     torch.testing.assert_close(load(half).state_dict(), before.state_dict(), atol=1e-3, rtol=1e-3)
     assert model_files.read_model_file(half)["origin"]["half_precision"]
+
+
+def test_a_loaded_model_has_the_hash_of_its_file_and_a_built_one_the_facts_about_its_data():
+    model = load("quickstart")
+    assert model.sha256 == sha256(find("quickstart"))
+
+    built = MotionGenerator.build(
+        model.config, model.representation, actions=["walk"], facts={"vocabulary": ["walks"]}
+    )
+    assert built.facts == {"actions": ["walk"], "vocabulary": ["walks"]}
+    assert built.condition.seen == {"walks"}
+    assert built.sha256 == ""
 
 
 def test_damaged_foreign_and_absent_files_are_one_line(trained, tmp_path, subtests):

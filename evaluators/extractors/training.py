@@ -44,9 +44,14 @@ class ExtractorTask(Task, Generic[Network]):
 
     @classmethod
     def build(
-        cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()
+        cls,
+        config: Config,
+        representation: Representation,
+        *,
+        actions: Sequence[str] = (),
+        facts: Mapping[str, Any] | None = None,
     ) -> Self:
-        """Builds the task of a recipe; `actions` are the names of the actions in the data."""
+        """Builds the task of a recipe; see `flame_mdm.task.Task.build`."""
         options = {name: value for name, value in config["task"].items() if name != "_target_"}
         options |= {
             "representation": representation,
@@ -55,6 +60,7 @@ class ExtractorTask(Task, Generic[Network]):
         }
         task = cls(**options | cls.parts(config, representation, actions))
         task.config, task.facts = config, {"actions": list(actions)}
+        task.add_facts(facts or {})
         return task
 
     def encoder(self) -> ConditionEncoder:

@@ -18,6 +18,7 @@ from flame_mdm.config import Config, instantiate, trust
 from flame_mdm.config.signatures import walk
 from flame_mdm.errors import UserError
 from flame_mdm.generator import DistilledGenerator, MotionGenerator
+from flame_mdm.safe_io import regular_file, sha256
 
 if TYPE_CHECKING:
     from flame_mdm.task import Task
@@ -107,9 +108,11 @@ def load_task(
             match its recipe, or if the machine has no such device.
     """
     check_device(device)
+    regular_file(path)
+    digest = sha256(path)
     checkpoint = read_merged(path, **adapted)
     try:
-        return _build(checkpoint, kind).eval().to(device)
+        model = _build(checkpoint, kind).eval().to(device)
     except Exception as error:  # a nonsensical recipe may fail anywhere
         if isinstance(error, FileNotFoundError):  # the missing file belongs to a text encoder
             raise
@@ -119,6 +122,8 @@ def load_task(
             else f"cannot build the model: {type(error).__name__}: "
         )
         raise UserError(f"{path}: {kind_of_error}{error}") from error
+    model.sha256 = digest
+    return model
 
 
 def check_device(device: str | torch.device) -> None:
@@ -163,8 +168,8 @@ def _build(checkpoint: dict[str, Any], kind: type[Trained]) -> Trained:
             stack.enter_context(torch.device("meta"))
             stack.enter_context(_CallLimit(20_000 + 50 * len(state)))
         representation = instantiate(config["representation"])
-        model = model_class.build(config, representation, actions=checkpoint["facts"]["actions"])
-    model.add_facts(checkpoint["facts"])
+        facts = checkpoint["facts"]
+        model = model_class.build(config, representation, actions=facts["actions"], facts=facts)
     kinds = {name: value.dtype for name, value in model.state_dict().items()}
     state = {name: value.to(kinds.get(name, value.dtype)) for name, value in state.items()}
     try:

@@ -18,10 +18,10 @@ from pydantic import Field
 from typing_extensions import TypedDict
 
 from flame_mdm.checkpoints.torch_files import read_torch
-from flame_mdm.config import moved, plain, renamed
+from flame_mdm.config import moved, renamed
 from flame_mdm.errors import UserError
 from flame_mdm.safe_io import atomic_write, parse_json
-from flame_mdm.schemas import Number, check_shape
+from flame_mdm.schemas import Number, check_plain
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -170,12 +170,7 @@ def checked(path: Path, content: Any) -> dict[str, Any]:
         for name in ("config", "facts", "origin", "global_step")
         if name in content
     }
-    for name, value in metadata.items():
-        plain(value, f"{path}: {name}")
-    try:
-        check_shape(metadata, _Metadata)
-    except ValueError as error:
-        raise UserError(f"{path}: damaged: {error}") from error
+    check_plain(metadata, _Metadata, path)
     if not isinstance(content["state_dict"], dict):
         raise UserError(f"{path}: damaged: its weights are not a mapping of tensors")
     check_weights(content["state_dict"], path)

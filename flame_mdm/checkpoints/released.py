@@ -357,8 +357,7 @@ def _model(
                 f"{file}: shape {tuple(value.shape)}, expected ({width},) finite numbers, positive in Std.npy"
             )
         extra[f"representation.{name}"] = torch.from_numpy(value).float()
-    model = MotionGenerator.build(config, representation, actions=facts["actions"])
-    model.add_facts(facts)
+    model = MotionGenerator.build(config, representation, actions=facts["actions"], facts=facts)
     model.denoiser.load_state_dict(released.state)
     model.load_state_dict(extra, strict=False)
     return model.eval()

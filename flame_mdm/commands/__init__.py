@@ -19,7 +19,6 @@ from flame_mdm.config import EXPERIMENTS, Config, compose_data
 from flame_mdm.config.options import option, required, same_option
 from flame_mdm.errors import UserError, did_you_mean, first_line, say
 from flame_mdm.formats import ADVICE, ENDINGS, motion_files, unread
-from flame_mdm.safe_io import sha256
 from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.sampling.motion_request import EditRequest, SamplingRequest
 
@@ -198,6 +197,14 @@ class BodySettings:
         body_name,
     )
 
+    def read_body(self) -> Mesh | None:
+        """Reads `body`; None = the mannequin, which is drawn where no body is given."""
+        if self.body == "mannequin":
+            return None
+        from flame_mdm.formats.people import load_body
+
+        return load_body(self.body)
+
 
 @dataclass(frozen=True, kw_only=True)
 class WritingSettings:
@@ -244,11 +251,10 @@ class WritingSettings:
 
 @dataclass(frozen=True)
 class LoadedModel:
-    """A model for sampling, the hash of its file, and the body to draw."""
+    """A model for sampling, and the body to draw; None = the mannequin."""
 
     model: MotionGenerator
-    sha256: str
-    body: Mesh
+    body: Mesh | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -288,7 +294,7 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
         }
         return SamplingRequest(
             **keywords,
-            options=SamplerOptions(**self._fields(SamplerOptions)),
+            options=SamplerOptions(**self.chosen()),
             editing=EditRequest(**self._fields(EditRequest))
             if isinstance(self, EditRequest)
             else None,
@@ -311,7 +317,6 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
         import torch
 
         from flame_mdm.checkpoints.loading import load
-        from flame_mdm.formats.people import load_body
         from flame_mdm.sampling.output import refuse_no_condition
 
         adapters = self.adapters()
@@ -319,8 +324,7 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
         model = load(file, device, **adapters)
         if not self.conditions():
             refuse_no_condition(model)
-        body = load_body(self.body)
-        return LoadedModel(model, sha256(file), body)
+        return LoadedModel(model, self.read_body())
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -44,10 +44,9 @@ def main(settings: BrowseSettings) -> None:
     node = settings.data_node(settings.source)
 
     from flame_mdm.data.store import Store
-    from flame_mdm.formats.people import load_body
     from flame_mdm.reporting.browse import choose, find, write_clips, write_page
 
-    body = load_body(settings.body)
+    body = settings.read_body()
     representation = instantiate(settings.nodes["representation"])
     data = instantiate(node, representation=representation)
     if (data.folder / STORE).exists() and data.source.named_by_recipe:

@@ -99,10 +99,9 @@ def _count(files: Sequence[Path], out: str) -> None:
 
 def _compare(folders: Sequence[Path], settings: CompareSettings) -> None:
     compared = find(folders)
-    from flame_mdm.formats.people import load_body
     from flame_mdm.sampling.referee.judging import evidence_marks
 
-    body = load_body(settings.body)
+    body = settings.read_body()
     shown = _motions(compared, settings)
     if settings.rate:
         out = settings.out or "runs/rate.html"

@@ -101,11 +101,10 @@ def _convert(
     settings: ConvertSettings, path: Path, out: Path, character: Character | BvhCharacter | None
 ) -> None:
     from flame_mdm.formats.layouts import head_height, leg_length
-    from flame_mdm.formats.people import load_body
     from flame_mdm.formats.readers import read
     from flame_mdm.representations.skeleton import SMPL22
 
-    body = load_body(settings.body)
+    body = settings.read_body()
     motion = read(path, settings.fps, settings.unit, settings.up, animation=settings.animation)
     if out.exists() and out.samefile(path):
         raise UserError(

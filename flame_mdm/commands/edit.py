@@ -50,7 +50,7 @@ def main(settings: EditSettings) -> None:
     from flame_mdm.sampling.reading import read_motion
 
     loaded = settings.load()
-    model, digest = loaded.model, loaded.sha256
+    model = loaded.model
     original = read_motion(
         model.representation,
         settings.motion,
@@ -71,10 +71,11 @@ def main(settings: EditSettings) -> None:
     title = f"edit {Path(original.id).stem} {edits[0].text}"
     general = (settings.motion, settings.cut, settings.adapter, settings.adapter_strength)
     folder = Path(
-        settings.out or default_folder(model, title, digest, replace(request, samples=1), *general)
+        settings.out
+        or default_folder(model, title, model.sha256, replace(request, samples=1), *general)
     )
     shown = replace(original, text=f"original: {original.text or original.id}")
-    facts = {"seed": settings.seed, "checkpoint": digest, "keep": edits[0].keep}
+    facts = {"seed": settings.seed, "checkpoint": model.sha256, "keep": edits[0].keep}
     write_motions(
         folder,
         [shown, *edits],

@@ -74,10 +74,9 @@ class InspectSettings(BodySettings, FileSettings, DataSettings):
 def main(settings: InspectSettings) -> None:
     """Prints the faults of motion files and writes a player that shows them."""
     from flame_mdm.formats.faults import LIMITS, find_faults
-    from flame_mdm.formats.people import load_body
     from flame_mdm.visualize import write_player
 
-    body = load_body(settings.body)
+    body = settings.read_body()
     failures: list[str] = []
     if settings.data is None:
         name, total, motions = read_motions(settings.motion, settings, failures)

@@ -46,11 +46,10 @@ class JudgeSettings(BodySettings, FileSettings):
 
 
 def main(settings: JudgeSettings) -> None:
-    from flame_mdm.formats.people import load_body
     from flame_mdm.sampling.referee.judging import judge
     from flame_mdm.visualize import write_player
 
-    body = load_body(settings.body)
+    body = settings.read_body()
     failures: list[str] = []
     name, total, motions = read_motions(settings.motion, settings, failures)
     judged: list[tuple[Motion, Judgment]] = []

@@ -27,8 +27,6 @@ def main(settings: ReportSettings) -> None:
     """Writes the page of each run."""
     for folder in settings.runs:
         check_run(Path(folder))
-    from flame_mdm.formats.people import load_body
-
-    body = load_body(settings.body)
+    body = settings.read_body()
     for folder in settings.runs:
         say(write_report(Path(folder), body))

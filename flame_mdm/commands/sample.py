@@ -232,14 +232,14 @@ def _sample(settings: SampleSettings, request: SamplingRequest, prompts: PromptF
     stages = [] if settings.trajectory else None
     motions = sample(model, resolved, score=score, stages=stages)
     say(*degenerate_notes(motions))
-    facts = {"seed": settings.seed, "checkpoint": loaded.sha256}
+    facts = {"seed": settings.seed, "checkpoint": loaded.model.sha256}
     if settings.file is not None:
         _write_files(settings, settings.file, motions, character, loaded.body, facts)
         if resolved.targets is not None:
             say(_distance(resolved.targets, motions))
         return
 
-    folders = _folders(settings, resolved, model, loaded.sha256, motions)
+    folders = _folders(settings, resolved, model, motions)
     for folder, written in folders.items():
         write_motions(
             folder,
@@ -278,11 +278,11 @@ def _sample_set(settings: SampleSettings, source: str) -> None:
             settings.adapter,
             settings.adapter_strength,
         )
-        folder = default_folder(loaded.model, Path(source).stem, loaded.sha256, *general)
+        folder = default_folder(loaded.model, Path(source).stem, loaded.model.sha256, *general)
     else:
         folder = Path(settings.out)
     check_within(folder, settings.out or SAMPLES)
-    facts = {"set": Path(source).stem, "seed": settings.seed, "checkpoint": loaded.sha256}
+    facts = {"set": Path(source).stem, "seed": settings.seed, "checkpoint": loaded.model.sha256}
     write_set(folder, clips, content, facts, loaded.body)
     say(
         f"{len(clips.clips)} clips, each with its path and in place: {folder / 'player.html'}, set.png, set.json"
@@ -294,7 +294,7 @@ def _write_files(
     file: Path,
     motions: Sequence[Motion],
     character: Character | BvhCharacter | None,
-    body: Mesh,
+    body: Mesh | None,
     facts: dict[str, Any],
 ) -> None:
     """Writes the first motion as `file`,
@@ -344,7 +344,6 @@ def _folders(
     settings: SampleSettings,
     resolved: ResolvedRequest,
     model: MotionGenerator,
-    digest: str,
     motions: Sequence[Motion],
 ) -> dict[Path, list[Motion]]:
     """Returns the folders to write with their motions.
@@ -356,7 +355,7 @@ def _folders(
     request = resolved.request
     shared = replace(request, texts=None, actions=None, seconds=None, frames=None, samples=1)
     general = (
-        digest,
+        model.sha256,
         request.kind,
         shared,
         settings.scorer,
@@ -382,7 +381,7 @@ def _distance(targets: Targets, motions: Sequence[Motion]) -> str:
     return f"distance from the targets: mean {mean(distances):.1f} cm, max {max(distances):.1f} cm"
 
 
-def _gallery(prompts: PromptFile, folders: Mapping[Path, list[Motion]], body: Mesh) -> str:
+def _gallery(prompts: PromptFile, folders: Mapping[Path, list[Motion]], body: Mesh | None) -> str:
     """Writes the page that shows the first motion of each prompt;
     returns a message with its path.
     """

@@ -292,7 +292,7 @@ def rig_clips(clips: list[Clip], rig: str | None, body: Mesh | None = None) -> l
 
 
 def write_set(
-    folder: Path, clips: MadeSet, content: MotionSet, facts: Mapping[str, Any], body: Mesh
+    folder: Path, clips: MadeSet, content: MotionSet, facts: Mapping[str, Any], body: Mesh | None
 ) -> list[str]:
     """Writes all files of a set into a folder, or none. Returns their names.
 

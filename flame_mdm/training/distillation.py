@@ -2,7 +2,7 @@
 """Training of models that sample in one to four steps, from a teacher that takes more steps."""
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -34,10 +34,15 @@ class DistillationTask(GeneratorTask):
 
     @classmethod
     def build(
-        cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()
+        cls,
+        config: Config,
+        representation: Representation,
+        *,
+        actions: Sequence[str] = (),
+        facts: Mapping[str, Any] | None = None,
     ) -> Self:
         """Builds the task of a recipe without training its text encoder."""
-        task = super().build(config, representation, actions=actions)
+        task = super().build(config, representation, actions=actions, facts=facts)
         task.generator.condition.requires_grad_(False)
         return task.eval()
 

@@ -98,7 +98,8 @@ def resolve(
             happens.
 
     Raises:
-        UserError: If the model cannot do what is requested.
+        UserError: If the model cannot do what is requested. The process checks the sampler and its
+            options later, when it samples.
     """
     _check_model(request, model)
     read: dict[int, ReadPrompt] = {}
@@ -161,8 +162,7 @@ def _collected(refused: dict[int, UserError] | None, number: int) -> Iterator[No
 
 
 def _check_model(request: SamplingRequest, model: MotionGenerator) -> None:
-    """Checks the conditions of all prompts: sampler, kind of condition, and windows."""
-    model.process.find_sampler(request.options.over(model.sampler_options))
+    """Checks the conditions of all prompts: kind of condition, streams, and windows."""
     if model.denoiser.context_frames:
         check_streams(model)
         if request.loop:

@@ -320,6 +320,10 @@ class MotionGenerator(Model, nn.Module):
         )
 
 
+FADE = 0.5
+"""Seconds over which a jump between two blocks of a stream fades away."""
+
+
 class Blocks:
     """Motions that grow by blocks; each block continues the last frames of the one before.
 
@@ -334,6 +338,8 @@ class Blocks:
         seed: seed of the noise.
         replication: number of the repetition, to sample several motions per id.
         unconditioned: the conditions are null conditions already.
+        fade: number of frames after a seam over which a jump between two blocks fades away, see
+            `joined`; 0 = blocks as DiP's code has them.
 
     Raises:
         UserError: If the prefix is missing or has another shape.
@@ -349,6 +355,7 @@ class Blocks:
         seed: int = 0,
         replication: int = 0,
         unconditioned: bool = False,
+        fade: int = 0,
     ):
         expected = (len(ids), model.denoiser.context_frames, model.representation.features)
         if prefix is None or tuple(prefix.shape) != expected:
@@ -358,6 +365,7 @@ class Blocks:
             )
         self.model, self.ids, self.prefix, self.options = model, list(ids), prefix, options
         self.seed, self.replication, self.unconditioned = seed, replication, unconditioned
+        self.fade = fade
         self.number = 0  # number of the next block
 
     @torch.no_grad()
@@ -382,6 +390,11 @@ class Blocks:
         cond = replace(cond, prefix=prefix)
         denoise = model.guided(cond, self.options, self.unconditioned)
         x = model.process.sample(denoise, noise, mask, cond, self.options, edit=edit)
+        if self.fade:
+            after = x.clone()
+            pose = model.representation.pose
+            after[..., pose] = joined(prefix[..., pose], x[..., pose], self.fade)
+            x = after if edit is None else torch.where(edit.keep, x, after)
 
         self.number += 1
         context = prefix.shape[1]
@@ -390,6 +403,34 @@ class Blocks:
         rows = torch.arange(len(x), device=x.device)[:, None]
         self.prefix = torch.cat([prefix, x], 1)[rows, last]
         return x
+
+
+def joined(before: Tensor, x: Tensor, fade: int) -> Tensor:
+    """Removes the jump between frames and the block that continues them.
+
+    The block is moved so that the step at the seam is the mean of the steps before and after it,
+    and returns to where it was over the next frames ("inertialization", Bollo 2018).
+
+    Args:
+        before: (B, C, D) features of the frames before the block.
+        x: (B, P, D) features of the block.
+        fade: number of frames over which the block returns.
+
+    Returns:
+        The moved block (B, P, D).
+
+    Example:
+        >>> before, x = torch.zeros(1, 1, 1), torch.tensor([8.0, 8.0, 8.0, 8.0, 8.0])[None, :, None]
+        >>> joined(before, x, fade=4).flatten().tolist()
+        [0.0, 1.25, 4.0, 6.75, 8.0]
+    """
+    count = min(fade, x.shape[1])
+    steps = [frames.diff(dim=1).sum(1) for frames in (before[:, -2:], x[:, :2])]
+    jump = before[:, -1] + (steps[0] + steps[1]) / 2 - x[:, 0]
+    share = torch.arange(count, device=x.device, dtype=x.dtype) / fade
+    weight = (1 - share) ** 2 * (1 + 2 * share)
+    moved = x[:, :count] + weight[:, None] * jump[:, None]
+    return torch.cat([moved, x[:, count:]], 1)
 
 
 class DistilledGenerator(MotionGenerator):

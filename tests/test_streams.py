@@ -90,11 +90,39 @@ def test_blocks_continue_in_the_world_where_the_frames_before_them_end(model, wa
     knowing.denoiser = Recalling(knowing.representation.normalize(features))
     begun = decoded(knowing.representation, features[:CONTEXT], "", "begun")
     running = stream(knowing, "a person walks", begun, block=block)
+    running._streams.blocks.fade = 0  # the oracle has no jumps
     blocks = list(islice(running, (len(features) - CONTEXT) // block))
     assert all(len(piece.joints) == block for piece in blocks)
     whole = decoded(knowing.representation, features, "", "whole").joints
     new = joints(blocks)
     assert_same(new, whole[CONTEXT : CONTEXT + len(new)])
+
+
+def test_a_motion_without_jumps_is_hardly_changed_where_blocks_meet(model, walk):
+    knowing = built()
+    features = torch.from_numpy(walk.features)
+    knowing.denoiser = Recalling(knowing.representation.normalize(features))
+    begun = decoded(knowing.representation, features[:CONTEXT], "", "begun")
+    new = joints(islice(stream(knowing, "a person walks", begun), 1))
+    whole = decoded(knowing.representation, features, "", "whole").joints
+    assert_same(new, whole[CONTEXT : CONTEXT + len(new)], 0.02)
+
+
+def test_a_seam_has_no_greater_step_than_a_block(model, walk):
+    """The network has random weights, so that its blocks do not continue each other by themselves."""
+    sizes = {}
+    for fade in (0, 10):
+        running = stream(model, "a person walks", walk, block=BLOCK)
+        running._streams.blocks.fade = fade
+        blocks = list(islice(running, 8))
+        features = np.concatenate([block.features for block in blocks])[
+            :, model.representation.pose
+        ]
+        steps = np.abs(np.diff(features, axis=0)).mean(1)
+        at_seam = np.arange(1, 8) * BLOCK - 1
+        sizes[fade] = steps[at_seam].mean() / np.delete(steps, at_seam).mean()
+    assert sizes[0] > 1.5
+    assert sizes[10] < 1.05
 
 
 def test_a_motion_may_stand_anywhere_when_a_stream_continues_it(model, walk):
@@ -335,8 +363,13 @@ def test_online_cleanup_waits_for_one_block_and_has_no_jump_between_blocks(walk)
     )
     knowing.denoiser = Recalling(knowing.representation.normalize(noisy))
     begun = decoded(knowing.representation, noisy[:CONTEXT], "", "begun")
-    running = stream(knowing, "a person walks", begun, block=10, cleanup=True)
-    raw = joints(islice(stream(knowing, "a person walks", begun, block=10), 4))
+    running, plain = (
+        stream(knowing, "a person walks", begun, block=10, cleanup=cleanup)
+        for cleanup in (True, False)
+    )
+    for one in (running, plain):
+        one._streams.blocks.fade = 0  # only cleanup removes the noise
+    raw = joints(islice(plain, 4))
     first = next(running)
     assert (running.frames, len(first.joints), first.cleanup, len(first.features)) == (
         20,

@@ -25,7 +25,7 @@ from flame_mdm.denoisers.gru import MDMGRU
 from flame_mdm.denoisers.unet import MDMUNet
 from flame_mdm.errors import UserError, first_line
 from flame_mdm.formats.poses import solve_checked
-from flame_mdm.generator import MotionGenerator
+from flame_mdm.generator import FADE, MotionGenerator
 from flame_mdm.processes import Process
 from flame_mdm.processes.guidance import classifier_free_guidance
 from flame_mdm.progress import ProgressBar
@@ -106,6 +106,12 @@ def description(model: MotionGenerator) -> dict[str, Any]:
     if denoiser.context_frames:
         start = torch.from_numpy(standing(representation, denoiser.context_frames).features)
         context["start"] = representation.normalize(start.to(model.device)).tolist()
+        pose = representation.pose
+        context["fade"] = {
+            "frames": round(FADE * representation.fps),
+            "begin": pose.start,
+            "end": pose.stop,
+        }
     content = {
         "format": FORMAT,
         "experiment": model.config["experiment"],

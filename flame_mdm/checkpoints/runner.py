@@ -93,6 +93,12 @@ SCHEMA = _object(
     max_frames=_number(2, 10_000),
     padded_frames=_number(0, 10_000),
     start=_array(_array(_number(-1e9, 1e9, "number"), 2000, 1), 9_999, 1),
+    fade=_object(
+        ("frames", "begin", "end"),
+        frames=_number(1, 9_999),
+        begin=_number(0, 2000),
+        end=_number(0, 2000),
+    ),
     skeleton=_object(
         ["joints", "parents", "feet"],
         joints=_array({"type": "string"}, 1000, 1),
@@ -300,7 +306,8 @@ class Sampler:
             for number in range(math.ceil(frames / block)):
                 prefix = {"prefix": x[None, -context:]}
                 noise = key("noise", seed, 0, f"{name}\x1f{number}")
-                x = np.concatenate([x, self._sample(inputs | prefix, block, noise)])
+                after = self._sample(inputs | prefix, block, noise)
+                x = np.concatenate([x, joined(x[-2:], after, content.get("fade"))])
             x = x[context : context + frames]
         if not np.isfinite(x).all():
             raise ValueError(
@@ -434,6 +441,19 @@ def mixed(counters: np.ndarray) -> np.ndarray:
     x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return x ^ (x >> np.uint64(31))
+
+
+def joined(before: np.ndarray, x: np.ndarray, fade: Mapping[str, int] | None) -> np.ndarray:
+    """See `flame_mdm.generator.joined`; `before` (2, D) are the frames before the block x (F, D)."""
+    if fade is None:
+        return x
+    share = np.arange(min(fade["frames"], len(x)), dtype=np.float32) / np.float32(fade["frames"])
+    weight = (1 - share) ** 2 * (1 + 2 * share)
+    jump = before[-1] + (before[-1] - before[0] + x[1] - x[0]) / 2 - x[0]
+    moved = x.copy()
+    pose = slice(fade["begin"], fade["end"])
+    moved[: len(share), pose] += weight[:, None] * jump[pose]
+    return moved
 
 
 def normal(number: int, frames: int, features: int) -> np.ndarray:

@@ -81,6 +81,8 @@ class Representation(nn.Module, ABC):
     relative: bool = True
     #: Columns of the features by name.
     slices: Mapping[str, slice] = {}
+    #: Columns of the pose, without the steps of the root and without velocities and contacts.
+    pose: slice
 
     def __init__(self, name: str, features: int, fps: float, skeleton: Skeleton):
         super().__init__()
@@ -89,6 +91,7 @@ class Representation(nn.Module, ABC):
                 f"representation.fps={fps}: frames per second must be a number from 1 to 1000"
             )
         self.name, self.features, self.fps, self.skeleton = name, features, fps, skeleton
+        self.pose = slice(0, features)
         self.register_buffer("mean", torch.zeros(features))
         self.register_buffer("std", torch.ones(features))
 

@@ -107,6 +107,8 @@ class HumanML(Representation):
         self.slices = {
             name: slice(end - widths[name], end) for name, end in zip(widths, ends, strict=True)
         }
+        last = "positions" if self.essential else "rotations"
+        self.pose = slice(self.slices["root_height"].start, self.slices[last].stop)
         self.legacy, self.bone_lengths = variant == "legacy", bone_lengths
         self.units_per_metre, self.contact_threshold = units_per_metre, contact_threshold
 

@@ -23,7 +23,7 @@ from flame_mdm.data.standing import standing
 from flame_mdm.errors import UserError
 from flame_mdm.formats.cleanup import cleanup as clean_joints
 from flame_mdm.formats.motion import Motion
-from flame_mdm.generator import Blocks, MotionGenerator
+from flame_mdm.generator import FADE, Blocks, MotionGenerator
 from flame_mdm.representations import Representation
 from flame_mdm.representations.rotation import rotate_y
 from flame_mdm.sampler_options import SamplerOptions
@@ -304,7 +304,10 @@ class Streams(Iterator[list[Motion]]):
         options = options.over(model.sampler_options)
         model.process.find_sampler(options)
         self.model, self.kind = model, kind
-        self.blocks = Blocks(model, ids, prefix, options, seed=seed, unconditioned=kind == "none")
+        fade = round(FADE * model.representation.fps)
+        self.blocks = Blocks(
+            model, ids, prefix, options, seed=seed, unconditioned=kind == "none", fade=fade
+        )
         self.schedules = [Schedule(condition) for condition in conditions]
         self.frames = [0] * len(ids)
         self.placement = (

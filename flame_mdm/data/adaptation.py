@@ -130,7 +130,7 @@ def check_clips(path: str | Path, fps: float) -> None:
 
 
 def fault_of(joints: np.ndarray, fps: float) -> str:
-    """Returns how far the floor of a clip rises or its body floats.
+    """Returns how far the floor of a clip rises, or how high its body floats.
 
     The result is "" within the limits `DRIFT` and `FLOAT`.
 

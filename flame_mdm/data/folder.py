@@ -348,7 +348,7 @@ def _animations(name: str, path: Path) -> Iterator[tuple[str, MotionFile]]:
 
 
 def _read_table(path: Path, notes: dict[str, Note], exclude: Collection[str]) -> None:
-    """Adds the rows of a table to the notes of the motions, without motions in `exclude`."""
+    """Adds the rows of a table to the notes of the motions. Motions in `exclude` are skipped."""
     for where, cells in table_rows(path):
         with naming(where):
             if cells["id"] not in exclude:

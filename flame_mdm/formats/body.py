@@ -122,7 +122,7 @@ def local_rotations(body: FittedBody) -> np.ndarray:
 def proportions(body: Mesh, offsets: np.ndarray) -> tuple[np.ndarray, float]:
     """Returns the linear map (22, 3, 3) of each part of a body, and the scale of its widths.
 
-    The maps lead to a clip's `offsets` (22, 3) at rest.
+    With these maps, the body has a clip's `offsets` (22, 3) at rest.
     """
     # The limbs determine the size of the body. Hips and shoulders follow the clip's own widths.
     # The trunk blends both widths from bottom to top. Limbs are stretched only along their bones.

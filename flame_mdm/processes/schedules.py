@@ -50,10 +50,11 @@ def linear_betas(num_train_timesteps: int) -> Tensor:
 
 
 def with_more_noise(betas: Tensor, noise_scale: float) -> Tensor:
-    """Returns noise variances (T,) whose ratio of noise to signal is `noise_scale` times as large at each step.
+    """Returns noise variances (T,) with more noise.
 
-    This shifts the logarithm of the signal-to-noise ratio (Hoogeboom et al. 2023, "simple
-    diffusion", section 2.2). The variances are clipped at 0.999.
+    At each step, the ratio of noise to signal is multiplied by `noise_scale`. This shifts the
+    logarithm of the signal-to-noise ratio (Hoogeboom et al. 2023, "simple diffusion", section 2.2).
+    The variances are clipped at 0.999.
 
     Example:
         >>> before, after = (Schedule(b) for b in (cosine_betas(50), with_more_noise(cosine_betas(50), 4)))

@@ -55,9 +55,9 @@ def stream(
         start: the motion to continue: a motion, a file, or "dataset:id", a clip of a prepared
             data set. Only its last frames are used. Default: a person who stands still.
         seed: seed of the noise.
-        block: number of frames per block, at most as many as the model predicts at once, which is
-            the default. Shorter blocks react sooner to a new text, but cost more per second of
-            motion.
+        block: number of frames per block. The maximum and the default are the frames that the
+            model predicts at once. Shorter blocks react sooner to a new text, but cost more per
+            second of motion.
         cleanup: smooth motions, constant bone lengths, feet that do not slide. A block is
             returned after the next block was computed, because it must fit that block.
         options: `guidance_scale`, `sampler`, `num_inference_steps`, `eta` and `spacing`. Default:

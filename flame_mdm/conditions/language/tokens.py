@@ -64,10 +64,10 @@ def is_known(word: str) -> bool:
 def is_foreign(tokens: Sequence[Token]) -> bool:
     """Returns whether a sentence is in another language than English.
 
-    A sentence is foreign if most of its letters are not Latin. It is also foreign if two things
-    are true: fewer than half of its words are English, and one of its words has an accent or is
-    typical of another language. `phrases.yaml` lists typical words. English words among them do
-    not count.
+    A sentence is foreign if most of its letters are not Latin. It is also foreign if fewer than
+    half of its words are English and, in addition, one of its words has an accent or is typical
+    of another language. `phrases.yaml` lists typical words. English words among them do not
+    count.
     """
     words = [token.word for token in tokens if token.is_word]
     letters = [char for word in words for char in word if char.isalpha()]
